@@ -27,7 +27,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
 from telegrams import encode_scan
 
-from lrfcal_lib.calibrate.reconstruct import Painter, View
+from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
@@ -35,9 +35,9 @@ from lrfcal_lib.preprocess.survey import survey, views_of
 from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, split_stream
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.solvers import solve_camera
-from lrfcal_lib.solvers.joint import converged, of_placements, solve_joint
+from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Unknowns, gather, move_state
-from lrfcal_lib.solvers.joint_residuals import joint_blocks
+from lrfcal_lib.solvers.joint_residuals import minimum, named_blocks
 from lrfcal_lib.solvers.joint_start import start_states, thin
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -135,12 +135,12 @@ def with_gtsam(count):
     for p in range(count):
         groups = {name: {k: v[[p]] for k, v in getattr(data, name).items()} for name in ("face", "beam", "view")}
         piece = replace(data, **groups, middle=data.middle[[p]], direction=data.direction[[p]])
-        pieces.append((of_placements(start, [p]), piece))
+        pieces.append((start.of_placements([p]), piece))
 
     def error(p, values, jacobians):
         at, piece = pieces[p]
         moved = move_state(at, (values.atVector(0), values.atVector(p + 1)[None]), unknowns)
-        parts = [whiten(block) for block in joint_blocks(moved, piece, unknowns)]
+        parts = [whiten(block) for block in named_blocks(moved, piece, unknowns).values()]
         r, J = (np.concatenate(rows, axis=1)[0] for rows in zip(*parts, strict=True))
         if jacobians is not None:
             jacobians[0], jacobians[1] = np.asfortranarray(J[:, :c]), np.asfortranarray(J[:, c:])
@@ -158,7 +158,7 @@ def with_gtsam(count):
         own = np.stack([found.atVector(p + 1) for p in range(count)])
         return move_state(start, (found.atVector(0), own), unknowns)
 
-    apart = np.abs(run().cameras - converged(start, data, unknowns, 1e-4).cameras).max()
+    apart = np.abs(run().cameras - minimum(start, data, unknowns, 1e-4).state.cameras).max()
     assert apart < 1e-4, f"GTSAM and we end in different places, {apart}"
     return run
 

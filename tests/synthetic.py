@@ -72,12 +72,9 @@ def camera_observations(rng, rig, poses, *, noise=0.0, sigma_px=0.2, source="lrf
     faces = [_face(rng, board, c, source, face) for board, c in zip(boards, crossings, strict=True)]
     outlines, given = [board.apply(flat(CORNERS)) for board in boards], {}
     for name, group, spread in (("crossing", crossings, flown), ("plane", faces, flown), ("scene", outlines, 1e-3)):
-        points, covariance, half_step = measured(rng, np.concatenate(group), noise, spread)
+        points, covariance, _ = measured(rng, np.concatenate(group), noise, spread)
         given |= {f"{name}_points": points, f"{name}_covariance": covariance}
         given[f"{name}_placement"] = np.repeat(numbers, [len(x) for x in group])
-        if name == "crossing":
-            spacing = half_step[:, :, None] * half_step[:, None, :] / 3
-            given |= {"crossing_half_step": half_step, "crossing_noise": covariance - spacing}
     given |= _images(rng, poses, model, edges, noise, sigma_px, pattern)
     off = noise * rng.normal(size=(len(poses), 6)) * SIGMA_BOARD
     known = [

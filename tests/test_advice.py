@@ -12,6 +12,7 @@ from lrfcal_lib.judge.verdict import verdict
 from lrfcal_lib.judge.weaknesses import diagnose
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.simulate.draw import bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
 
@@ -118,10 +119,10 @@ def test_a_camera_that_never_sees_the_board(good):
     rig, poses, _ = good
     obs = seen(rig, poses, np.random.default_rng(3))
     obs = obs.keep(view=obs.view_camera == 0)
-    with pytest.raises(DegenerateGeometry, match="camera 'right' never sees the board"):
+    with pytest.raises(DegenerateGeometry, match="camera 'right': never sees the board"):
         solve_joint(obs)
     found = verdict(solve_joint(obs, required=False), models_of(rig), suggest=False)
-    assert found.sentences()[0].startswith("Use this calibration with care: camera 'right' never sees the board")
+    assert found.sentences()[0].startswith("Use this calibration with care: camera 'right': never sees the board")
     assert set(found.errors[2.0].pixels) == {"left"}
 
 
@@ -139,21 +140,21 @@ def test_a_motion_that_nothing_determines(good):
     assert any("right" in words for words in solution.unobservable), solution.unobservable
 
 
-def test_misfit_model_error_and_noise_are_named(good):
+def test_misfit_model_error_and_noise_are_named(good, monkeypatch):
     solution = good[2]
+    warnings = ("the data ask for the scale of the pitch",)
+    monkeypatch.setattr(type(solution), "warnings", property(lambda self: warnings))
     inner = replace(solution.solution, covariance_placements=25 * solution.solution.covariance, converged=False)
-    bad = replace(
-        solution, misfit=solution.misfit | {3: 30.0}, excluded={9: "placement 9: left out"}, solution=inner,
-        warnings=("the data ask for the scale of the pitch",),
-        noise=solution.noise | {"face_scale": 2.6},
-    )  # fmt: skip
+    lost = Problem(Stage.JOINT, ProblemKind.CONTRADICTS, "left out", 9)
+    misfit = solution.misfit | {3: 30.0}
+    bad = replace(solution.with_levels(face_scale=2.6), misfit=misfit, excluded=(lost,), solution=inner)
     words = {r.kind: r.words for r in diagnose(bad)}
     assert words["misfit"].startswith("placements fit much worse than the others: 3 (5.")
     assert words["warning"] == "the data ask for the scale of the pitch"
     assert words["excluded"] == "placement 9: left out" and "has not converged" in words["convergence"]
     assert "5.0 times more than noise explains" in words["model error"]
     assert words["noise"] == "residuals are larger than the stated noise (ranges 2.6 times)"
-    absurd = replace(bad, noise=solution.noise | {"view_scale": 11.0, "face_share": 0.05})
+    absurd = bad.with_levels(face_scale=1.0, view_scale=11.0, face_share=0.05)
     found = {r.kind: r for r in diagnose(absurd)}
     assert found["noise"].answer == "no" and found["dependent"].words.startswith("only 5 % of the errors of ranges")
     blurred = {r.kind: r for r in diagnose(replace(absurd, lens_scale=4.0))}  # intrinsics are as uncertain

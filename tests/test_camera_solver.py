@@ -78,7 +78,7 @@ def test_every_method_refuses_one_placement_only(name):
     ("name", "prefix", "count", "words"),
     [
         *((name, "crossing_", n, f"{n} crossings of scan lines with edges, at least {n + 1} needed")
-          for name, n in (("line", 5), ("line_ml", 6), ("wasielewski_strauss", 5))),
+          for name, n in (("line", 5), ("wasielewski_strauss", 5))),
         ("bauermann", "scene_", 2, "2 scene points, at least 3 needed"),
         ("lines", "scene_", 2, "unknown method 'lines': use one of line_printed, line_last_beam, line,"),
     ],

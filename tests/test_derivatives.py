@@ -1,7 +1,6 @@
 """Derivatives that are worked out by hand are those of differences: one table of all residuals."""
 # ruff: noqa: B007,B023 (each function is used before the next one is made)
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from lrfcal_lib.model import camera
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.preprocess import intrinsics
 from lrfcal_lib.solvers import lines, pitch, planes, platform
-from lrfcal_lib.solvers.joint_model import SENSOR, Unknowns, gather, move_state
+from lrfcal_lib.solvers.joint_model import SENSOR, Levels, Unknowns, gather, move_state
 from lrfcal_lib.solvers.joint_residuals import named_blocks
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
@@ -47,16 +46,6 @@ def camera_methods():
         yield block(np.zeros(6)).jacobian, lambda s: block(s).residuals, 6
         r, J = whiten(block(np.zeros(6)))  # with what the weights change
         yield J.T @ r, lambda s: 0.5 * np.sum(whiten(block(s))[0] ** 2), 6
-
-
-def intervals():
-    rig, obs = camera_case(3, noise=1.0)
-    state = np.concatenate([pose_array(rig.T_camera_lrf), [[0.4], [0.0], [0.0]]], axis=1)
-    sight, lengths = residuals.sight_normals(obs.crossing_lines, obs.model)
-    frozen = (obs, sight, *lines.freeze_intervals(state, obs, sight, lengths, 0.2))
-    block = lines.interval_block(state, *frozen)
-    score = block.jacobian.T @ block.residuals
-    yield score, lambda s: np.sum(lines.interval_block(lines.move_biased(state, s), *frozen).cost), 7
 
 
 def board_planes():
@@ -88,28 +77,24 @@ def tilt_axis():
 
 
 def recorded_pitch():
-    data = pitch.gather(*pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))[1])
+    cameras, *_ = pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))[1]
+    rows = pitch.gather(list(cameras.values()), np.arange(1, 6))
     pose = pose_array(RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec([1.5, 0.1, 0.2])))
-    state = np.array([pose, pose]), 0.01, np.full(5, 0.02), np.full(5, 0.03)
-    for name in pitch.MODELS:
-        shared, count = 12 + (name == "direction"), pitch.pitch_blocks(state, data, name)[0].jacobian.shape[-1]
+    each = np.eye(5)[rows.placement]
+    for by_unknown in (each[:, :0], np.concatenate([each, each * rows.pitch[:, None]], axis=1)):
+        k = by_unknown.shape[1]
 
         def blocks(s):
-            moved = pitch.move_pitch_state(state, (s[:shared], np.tile(s[shared:], (5, 1))), name)
-            return pitch.pitch_blocks(moved, data, name)
+            poses = move_pose(np.array([pose, pose]), s[:12].reshape(2, 6))
+            return pitch.pitch_blocks((poses, np.full(k, 0.02) + s[12:]), rows, by_unknown)
 
-        for i, block in enumerate(blocks(np.zeros(count))):
-            yield block.jacobian, lambda s: blocks(s)[i].residuals, count
+        for i, block in enumerate(blocks(np.zeros(12 + k))):
+            if block.residuals.size:
+                yield block.jacobian, lambda s: blocks(s)[i].residuals, 12 + k
 
 
 def single_beams():
-    """Cost, score and information of beams and of pairs of them, as the margin moves by its sigma."""
-    for sigma, half in ((0.0004, 0.001), (0.003, 0.005)):
-        def interval(s):
-            return edge_likelihood.interval_terms(MARGINS + sigma * s + half, MARGINS + sigma * s - half, sigma)
-
-        found = interval(0.0)
-        yield sigma * found[1][:, None], lambda s: interval(s[0])[0], 1
+    """Cost, score and information of beams, as the margin moves by its sigma."""
     for hit in (True, False):
         for lapse in (0.0, 0.01):
             def beam(s):
@@ -131,7 +116,7 @@ def joint_estimate():
         off = own.normal(0, 0.03, EVERY.shared), own.normal(0, 0.03, (3, EVERY.own))
         state = move_state(truth, off, EVERY)
         for lapse in (0, 0.05):
-            data = replace(gather(obs), lapse=lapse)
+            data = gather(obs, Levels(lapse=lapse))
 
             def block(s):
                 step = s[: EVERY.shared], np.tile(s[EVERY.shared :], (3, 1))
@@ -171,7 +156,7 @@ def images():
     yield jacobian, lambda s: intrinsics.predict(intrinsics.moved(state, s), points, basis)[0], count
 
 
-@pytest.mark.parametrize("cases", [projection, camera_methods, intervals, board_planes, tilt_axis, recorded_pitch,
+@pytest.mark.parametrize("cases", [projection, camera_methods, board_planes, tilt_axis, recorded_pitch,
                                    single_beams, joint_estimate, chain_of_a_rig, images])  # fmt: skip
 def test_derivatives_are_those_of_differences(cases):
     for number, (found, function, count) in enumerate(cases()):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lrfcal_lib.fit.edge_likelihood import beam_terms, disc_edge, disc_share, interval_terms
+from lrfcal_lib.fit.edge_likelihood import beam_terms, disc_edge, disc_share
 
 MARGINS = np.array([-0.03, -0.011, -0.004, -0.001, 0.0, 0.002, 0.006, 0.02])
 
@@ -34,7 +34,6 @@ def test_edge_of_a_disc_inverts_its_share():
 def test_tails_are_finite(margin):
     for hit in (True, False):
         assert all(np.isfinite(v).all() for v in beam_terms(np.array([margin]), 1e-3, hit, 1e-3))
-    assert all(np.isfinite(v).all() for v in interval_terms(np.array([margin + 0.01]), np.array([margin]), 1e-3))
 
 
 def test_a_lapse_bounds_what_one_beam_costs():

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
-from lrfcal_lib.solvers.joint_noise import pose_by_intrinsics
+from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 
 CORNERS = np.array([[0.05 * i, 0.05 * j, 0.0] for i in range(5) for j in range(4)])
 MODEL = CameraModel(1280, 960, 900.0, 905.0, 641.0, 478.0, np.array([-0.2, 0.08, 0.001, -0.001, 0.0]))

@@ -9,6 +9,7 @@ from joint_draws import draw, rng
 
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.joint_model import Levels
 from lrfcal_lib.solvers.joint_noise import beam_share, side_level
 from lrfcal_lib.solvers.joint_residuals import SIDE_FREEDOM, named_blocks
 
@@ -53,7 +54,7 @@ def test_sides_that_beams_hardly_show_do_not_pull_their_scale_down(true, start):
         x, prior = most_likely(y, known, level)
         hessian = np.zeros((200, 9, 9))
         hessian[:, range(9), range(9)] = np.concatenate([np.ones((200, 6)), known + prior], axis=1)
-        level = side_level(x, SimpleNamespace(side_sigma=level, beam=used), hessian, np.zeros((200, 9)))
+        level = side_level(x, SimpleNamespace(levels=Levels(side_sigma=level), beam=used), hessian, np.zeros((200, 9)))
     assert level == pytest.approx(true, rel=0.15)
 
 
@@ -70,9 +71,9 @@ def test_beams_about_sharp_edges_say_no_more_than_their_spacing():
 def test_beams_that_all_contradict_their_edges_still_have_a_share():
     """Bearings of the other sense: the cost of beams is bent the other way, and a share below 0 ended in a traceback."""
     found = solve_joint(draw(rng(3), 6)[0], required=False)
-    data = replace(found.data, lapse=0.01)
+    data = found.with_levels(lapse=0.01).data
     block = named_blocks(found.state, data, found.unknowns)["beam"]
     cost = np.full(block.cost.shape, 4.0)
     own = np.zeros((6, *[block.jacobian.shape[-1] - found.unknowns.shared] * 2))
     contradicted = replace(block, residuals=np.sqrt(2 * cost), cost=cost)
-    assert 0 < beam_share(found.state, data, contradicted, found.unknowns, own) < 0.01
+    assert 0 < beam_share(found.state, data, contradicted, found.unknowns.shared, own) < 0.01

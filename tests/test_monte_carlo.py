@@ -83,6 +83,18 @@ def test_what_leaves_no_bound_is_named():
         bound(none(obs, "beam"), truth, Unknowns(2, 3, sensor=SENSOR))
 
 
+# single shots
+
+
+def test_neither_rule_for_the_edge_point_suits_every_bias_and_the_better_one_beats_planes_on_the_average():
+    """In the draws of notebook 08."""
+    table = pd.read_csv(GOLDEN / "sim_lms221" / "single_shots.csv").set_index(["step_deg", "bias", "method"])
+    rotation = table.rotation_median_deg.unstack("method")
+    rules = rotation[["line_last_beam", "line"]]
+    assert set(rules.idxmin(axis=1)) == {"line_last_beam", "line"}
+    assert rotation.zhang_pless.mean() > 1.5 * rules.min(axis=1).mean()
+
+
 # the estimator
 
 

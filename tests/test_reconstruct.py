@@ -10,11 +10,15 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import binom
 from shared import DATA
 
-from lrfcal_lib.calibrate import reconstruct as rec
+from lrfcal_lib.calibrate import cloud as clouds
+from lrfcal_lib.calibrate.mixed import mixed
+from lrfcal_lib.calibrate.painting import Painter, View
+from lrfcal_lib.calibrate.reconstruct import GREY, reconstruct
 from lrfcal_lib.evaluate.export import write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.camera import CameraModel, fold, project
 from lrfcal_lib.model.kinematics import AS_RECORDED
+from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN
 from lrfcal_lib.session.read import Sweep, open_session
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate import beam
@@ -33,7 +37,7 @@ LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), STEP, 0.005, spot_exit=0.0
 
 
 def view(image, model=MODEL, pose=STILL, number=0, camera="left"):
-    return rec.View(number, camera, pose, model, np.asarray(image, np.uint8))
+    return View(number, camera, pose, model, np.asarray(image, np.uint8))
 
 
 def plain_image(level=90):
@@ -46,7 +50,7 @@ def grid(z, half=0.2, n=40):
 
 
 def paint(points, *views, step=0.04, noise=0.03):
-    painter = rec.Painter(views, step, noise)
+    painter = Painter(views, step, noise)
     painter.hide(points)
     return painter.paint(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)))
 
@@ -78,7 +82,7 @@ def test_compiled_loops_do_what_plain_numpy_does(model):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     turned = RigidTransform.from_rotation(Rotation.from_rotvec([0.1, 0.2, 0]))
     one = view(rng.integers(10, 240, (48, 64, 3)), model, turned)
-    painter = rec.Painter([one], 0.02, 0.03)
+    painter = Painter([one], 0.02, 0.03)
     painter.hide(points)
     colors, seen, source = painter.paint(points, normals)
     expected, their_colors = plainly(points, normals, one, 0.02, 0.03)
@@ -98,7 +102,7 @@ def test_exposures_are_compared_and_taken_off():
     for k, ((x, y), gain) in enumerate(zip(shifts, (1.0, 1.5, 0.7, 2.0), strict=True)):
         at = np.roll(base, np.rint([50 * y, 50 * x]).astype(int), (0, 1))
         views.append(view(np.rint(at * fall * gain), pose=RigidTransform.from_translation([x, y, 0]), number=k))
-    painter, ahead = rec.Painter(views, 0.02, 0.03), np.tile([0.0, 0, -1], (len(points), 1))
+    painter, ahead = Painter(views, 0.02, 0.03), np.tile([0.0, 0, -1], (len(points), 1))
     painter.hide(points)
     painter.compare_exposures(points, ahead)
     gains = np.exp(painter.exposures[:, 0])
@@ -127,14 +131,14 @@ def step_edge(bearing, pitch):
 
 
 def whole(sweep, views=(), **options):
-    return rec.join(rec.reconstruct(sweep, views, STILL, AS_RECORDED, lrf=LRF, **options))
+    return clouds.join(reconstruct(sweep, views, STILL, AS_RECORDED, lrf=LRF, **options))
 
 
 def test_mixed_pixels_go_and_sound_points_stay():
     clean, noisy = scan(step_edge)
     y = clean.ranges * np.sin(BEARINGS) * np.cos(PITCH)[:, None]
     air = np.minimum(np.abs(y - 1.8), np.abs(y - 2.3))
-    gone = rec.mixed(noisy.ranges, (STEP, STEP), LRF)
+    gone = mixed(noisy.ranges, (STEP, STEP), LRF)
     assert (gone[air > 0.03] > 0).mean() > 0.8 and (gone[air < 0.003] > 0).mean() < 0.01
     flagged = (gone > 0) & (air > 0.03)
     assert np.abs((noisy.ranges - gone)[flagged] - 1.8).mean() < 0.1  # they hide from about where the nearer one is
@@ -175,7 +179,7 @@ def test_mixed_pixels_of_a_furnished_room():
     placement, session = placements_of(setup)[-1], open_session(DATA / "sim_lms221")
     sweep, sigma = session.sweep(placement.number), setup.rig.beam.sigma_range
     off, pull = spots_alone(setup, placement, lines)
-    gone = rec.mixed(sweep.ranges, (STEP, STEP), session.lrf)[lines] > 0
+    gone = mixed(sweep.ranges, (STEP, STEP), session.lrf)[lines] > 0
     there = np.isfinite(sweep.ranges[lines])
     bad, good = there & (off > 5 * sigma), there & (off < sigma) & (pull < sigma)
     assert bad.sum() > 800 and good.sum() > 25_000
@@ -187,7 +191,7 @@ def test_a_plain_wall_loses_next_to_nothing_and_a_pinpoint_sensor_nothing():
     assert whole(noisy).removed < 0.001 * noisy.ranges.size
     _, edge = scan(step_edge)
     info = replace(LRF, spot_exit=None, spot_divergence=None)
-    assert rec.join(rec.reconstruct(edge, (), STILL, AS_RECORDED, lrf=info)).removed == 0
+    assert clouds.join(reconstruct(edge, (), STILL, AS_RECORDED, lrf=info)).removed == 0
 
 
 def test_normals_point_to_the_sensor_up_to_the_edge():
@@ -200,13 +204,14 @@ def test_blocks_are_the_whole(monkeypatch, tmp_path):
     _, noisy = scan(step_edge)
     views = [view(plain_image(), pose=AHEAD), view(plain_image(140), pose=AHEAD, number=1)]
     at_once = whole(noisy, views)
-    monkeypatch.setattr(rec, "BLOCK", 9 * len(BEARINGS))
-    blocks = list(rec.reconstruct(noisy, views, STILL, AS_RECORDED, lrf=LRF))
+    monkeypatch.setattr("lrfcal_lib.calibrate.reconstruct.BLOCK", 9 * len(BEARINGS))
+    monkeypatch.setattr("lrfcal_lib.calibrate.reconstruct.KEPT", 36 * len(BEARINGS))
+    blocks = list(reconstruct(noisy, views, STILL, AS_RECORDED, lrf=LRF))
     assert len(blocks) == 6
-    for name in rec.ROWS:
-        np.testing.assert_allclose(getattr(rec.join(blocks), name), getattr(at_once, name), atol=1e-6, err_msg=name)
-    assert rec.write_ply(tmp_path / "blocks.ply", iter(blocks)) == len(at_once.points)
-    rec.write_ply(tmp_path / "whole.ply", rec.join(blocks))
+    for name in clouds.ROWS:
+        np.testing.assert_allclose(getattr(clouds.join(blocks), name), getattr(at_once, name), atol=1e-6, err_msg=name)
+    assert clouds.write_ply(tmp_path / "blocks.ply", iter(blocks)) == len(at_once.points)
+    clouds.write_ply(tmp_path / "whole.ply", clouds.join(blocks))
     assert (tmp_path / "blocks.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
 
 
@@ -214,7 +219,7 @@ def test_what_no_image_saw_is_flagged_and_points_tell_where_they_come_from():
     _, noisy = scan(step_edge)
     noisy = replace(noisy, intensities=np.full(noisy.ranges.shape, 7.0))
     cloud = whole(noisy, [view(plain_image(), pose=AHEAD, number=5)])
-    assert 0.2 < cloud.seen.mean() < 1 and (cloud.colors[~cloud.seen] == rec.GREY).all()
+    assert 0.2 < cloud.seen.mean() < 1 and (cloud.colors[~cloud.seen] == GREY).all()
     assert set(np.unique(cloud.image)) == {-1, 5} and (cloud.intensity == 7).all()
     back = np.stack([np.cos(cloud.bearing), np.sin(cloud.bearing)], -1) * cloud.range[:, None]
     np.testing.assert_allclose(cloud.points[:, 0], back[:, 0], atol=1e-9)
@@ -225,7 +230,7 @@ def test_a_moving_head_has_a_pitch_for_every_beam():
     _, noisy = scan(wall(2.0), spot=False)
     still, moving = whole(noisy), whole(noisy, continuous=True)
     rise = np.arctan2(moving.points[:, 2], moving.points[:, 1]) - np.arctan2(still.points[:, 2], still.points[:, 1])
-    rate, turn = STEP / 0.5, rec.MIRROR_TURN
+    rate, turn = STEP / 0.5, MIRROR_TURN
     assert np.abs(rise).max() < rate * 6 * turn and np.abs(rise[still.bearing == BEARINGS[120]]).max() < 1e-9
     later = (BEARINGS[124] - BEARINGS[120]) / (2 * np.pi) * turn  # a degree on: the same turn of the mirror
     np.testing.assert_allclose(rise[still.bearing == BEARINGS[124]], rate * later, rtol=1e-6)
@@ -256,9 +261,9 @@ def test_files_hold_everything_and_say_frame_and_units(tmp_path):
     import open3d as o3d
 
     cloud = whole(scan(step_edge)[1], [view(plain_image(), pose=AHEAD)])
-    rec.write_ply(tmp_path / "deep" / "c.ply", cloud, ["session made up"])
+    clouds.write_ply(tmp_path / "deep" / "c.ply", cloud, ["session made up"])
     head = (tmp_path / "deep" / "c.ply").read_bytes().split(b"end_header")[0].decode()
-    assert all(f"comment {words}" in head for words in (rec.FRAME, rec.UNITS, "session made up"))
+    assert all(f"comment {words}" in head for words in (*clouds.ABOUT, "session made up"))
     write_pcd(tmp_path / "c.pcd", tmp_path / "deep" / "c.ply")
     for file in ("deep/c.ply", "c.pcd"):
         back = o3d.t.io.read_point_cloud(str(tmp_path / file))
@@ -280,7 +285,7 @@ def test_real_sweeps_are_the_published_clouds(real_data, number):
     bearings, pitch = np.radians(raw["beam_deg"]), np.radians(raw["tilt_deg"])
     lrf = LrfInfo("SICK", (bearings[0], bearings[-1]), bearings[1] - bearings[0], 0.01)
     sweep = Sweep(1, ranges, bearings, pitch, np.arange(len(pitch)) * 0.1)
-    cloud = rec.join(rec.reconstruct(sweep, (), STILL, AS_RECORDED, lrf=lrf))
+    cloud = clouds.join(reconstruct(sweep, (), STILL, AS_RECORDED, lrf=lrf))
     published = np.loadtxt(real_data / "kurt3d" / f"scan{number:03d}.3d")[np.isfinite(ranges).ravel()] / 100
     miss = np.linalg.norm(cloud.points - published[:, [0, 2, 1]] * [1, 1, -1], axis=1)
     assert miss.max() < 1e-4 and np.median(miss) < 1e-5

@@ -37,7 +37,7 @@ fig, ax = plt.subplots()
 ax.plot(session.sweep(1).ranges[0])
 notebook.save(fig, "ranges", "One scan line <of many>.")
 notebook.finding("mean_range", 2.0, "Mean range", "m", digits=1)
-notebook.table(pd.DataFrame({"method": ["joint", "line_ml"], "error_mm": [-2.0, float("nan")]}), "errors", digits=1)
+notebook.table(pd.DataFrame({"method": ["joint", "line"], "error_mm": [-2.0, float("nan")]}), "errors", digits=1)
 """
 JUDGED = """
 record = {"answer": "yes", "expected_error_at_m": {"1": {"cloud_mm": 2.0, "left_px": 1.0},
@@ -171,7 +171,7 @@ def test_nothing_is_cut_off_and_nothing_fetched(finished, stored, browser, width
 
 def test_tables_and_findings_are_kept_as_data_and_only_what_a_report_wrote_is_removed(finished):
     out, _ = finished
-    assert (out / "tables" / "errors.csv").read_text() == "method,error_mm\njoint,-2\nline_ml,\n"
+    assert (out / "tables" / "errors.csv").read_text() == "method,error_mm\njoint,-2\nline,\n"
     found = [(f["notebook"], f["key"], f["value"]) for f in json.loads((out / "findings.json").read_text())]
     assert found == [("00_good", "mean_range", 2.0), ("01_bad", "early", "found before the failure")]
     assert not (out / "parts").exists() and not (out / "figures" / "stale.png").exists()

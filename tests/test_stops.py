@@ -6,7 +6,7 @@ from joint_draws import MOUNTS, draw, rng
 
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.joint_model import Unknowns, gather
+from lrfcal_lib.solvers.joint_model import Levels, Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import view_block
 
 STOP = np.radians(0.010)
@@ -16,7 +16,7 @@ STOP = np.radians(0.010)
 def test_whitened_views_are_those_of_the_whole_covariance(mount):
     """Noise of each view, and one error of the pitch for both cameras at each of three stops."""
     obs, truth, _ = draw(rng(1), 3, mount=mount)
-    data = gather(obs, sigma_pitch=0.3, view_scale=np.array([1.0, 2.0]))
+    data = gather(obs, Levels(sigma_pitch=0.3, view_scale=2.0))
     block = view_block(truth, data, Unknowns(2, 3))
     p, v = data.view["used"].shape
     for i in range(p):
@@ -24,7 +24,7 @@ def test_whitened_views_are_those_of_the_whole_covariance(mount):
         g = block.by_pitch[i]
         for a in range(v):
             rows = slice(6 * a, 6 * a + 6)
-            whole[rows, rows] += data.view["covariance"][i, a] * data.view_scale[data.view["camera"][i, a]] ** 2
+            whole[rows, rows] += data.view["covariance"][i, a] * data.levels.view_scale**2
             for b in np.flatnonzero(data.view["pitch"][i] == data.view["pitch"][i, a]):
                 whole[rows, 6 * b : 6 * b + 6] += 0.3**2 * np.outer(g[a], g[b])
         np.testing.assert_allclose(block.white[i] @ block.white[i], r_squared(block.residuals[i], whole), rtol=1e-6)

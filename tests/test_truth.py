@@ -3,10 +3,13 @@
 import json
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from shared import QUICK, ROOT
 
-from lrfcal_lib.evaluate.truth import axis_errors, camera_errors, read_truth
+from lrfcal_lib.calibrate.observe import platform_observations
+from lrfcal_lib.evaluate.truth import axis_errors, camera_errors, on_true_edges, read_truth
+from lrfcal_lib.model import geometry
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 
@@ -34,3 +37,14 @@ def test_only_evaluate_reads_the_truth():
     for path in (ROOT / "lrfcal_lib").rglob("*.py"):
         if "truth.json" in path.read_text():
             assert path.parent.name in ("evaluate", "simulate", "session"), path
+
+
+def test_points_on_the_true_edges_are_straight_about_the_true_axis(quick):
+    observations = platform_observations(quick.prepared)
+    truth = read_truth(quick.prepared.session)
+    moved = on_true_edges(observations, truth)
+    assert 0 < np.linalg.norm(moved.edge_points - observations.edge_points, axis=1).max() < 0.06
+    for placement, number in {*zip(moved.edge_placement, moved.edge_number, strict=True)}:
+        rows = (moved.edge_placement == placement) & (moved.edge_number == number)
+        points = geometry.lrf_to_platform(moved.edge_points[rows], moved.edge_pitch[rows], truth.T_head_lrf)
+        assert geometry.fit_line(points)[2] < 1e-8

@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from lrfcal_lib.calibrate import reconstruct
 from lrfcal_lib.calibrate.cameras import CalibratedRig
+from lrfcal_lib.calibrate.cloud import Cloud, join
+from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
+from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.session.read import Session
 
 MARGIN = 20  # scan lines and beams about a board that are worked on with it
 
 
-def color_cloud(
-    calibration: Calibration, method: str | None = None, scene: bool = False
-) -> reconstruct.Cloud:
+def color_cloud(calibration: Calibration, method: str | None = None, scene: bool = False) -> Cloud:
     """Sweeps of a session as one coloured cloud in the platform frame.
 
     Parameters
@@ -27,12 +27,12 @@ def color_cloud(
     -------
     Cloud
     """
-    return reconstruct.join(cloud_blocks(calibration, method, scene))
+    return join(cloud_blocks(calibration, method, scene))
 
 
 def cloud_blocks(
     calibration: Calibration, method: str | None = None, scene: bool = False
-) -> Iterator[reconstruct.Cloud]:
+) -> Iterator[Cloud]:
     """Coloured points of a session, block by block.
 
     Parameters
@@ -74,7 +74,7 @@ def cloud_blocks(
         views = views_of(session, rig, placement)
         if mask is not None:
             sweep, mask = _about(sweep, mask)
-        yield from reconstruct.reconstruct(
+        yield from reconstruct(
             sweep,
             views,
             rig.T_head_lrf,
@@ -103,7 +103,7 @@ def _about(sweep, mask):
     return cut, mask[lines, beams]
 
 
-def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[reconstruct.View]:
+def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]:
     """The images of a placement as a rig poses them; without those of which no pitch is known.
 
     Parameters
@@ -131,9 +131,7 @@ def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[recon
         number = session.image_records.index(record)
         T_camera_platform = rig.camera_at(record.camera, pitch)
         image = session.read_image(record)
-        views.append(
-            reconstruct.View(number, record.camera, T_camera_platform, camera.model, image)
-        )
+        views.append(View(number, record.camera, T_camera_platform, camera.model, image))
     if records and not views:
         raise ValueError(
             f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; "

@@ -138,7 +138,7 @@ def case_of(joint, observations, placement):
     lines = np.array([rough.lines.get(name, [1.0, 0.0, -1.0]) for name in edges])
     lines *= -np.where(lines[:, 2:] > 0, 1.0, -1.0)  # outwards: the face is in the middle
     obs = obs.keep(beam=np.isin(obs.beam_edge, told))
-    data = joint_model.gather(obs, **solution.data.levels | {"prior": None})
+    data = joint_model.gather(obs, replace(solution.data.levels, prior=None))
     own = {
         "boards": rough.T_platform_plane[None, :3],
         "sweeps": np.zeros((1, 2)),

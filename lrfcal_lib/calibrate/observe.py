@@ -13,19 +13,20 @@ from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, tilt
 from lrfcal_lib.model.kinematics import AS_RECORDED, Corrections, SourceFrame
 from lrfcal_lib.model.observations import (
+    LENS,
     CameraObservations,
     JointObservations,
     PlatformObservations,
 )
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.intrinsics import raised_points
+from lrfcal_lib.preprocess.outline_in_images import side_lines
 from lrfcal_lib.preprocess.pattern_in_image import SMALL_SQUARE_PX
 from lrfcal_lib.preprocess.prepared import VARIANTS, DroppedSide
 from lrfcal_lib.preprocess.survey import all_views, small_squares
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
-from lrfcal_lib.solvers.joint_noise import LENS, pose_by_intrinsics
+from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_start import thin
 
 ONE_SCAN = "one_scan"
@@ -175,12 +176,8 @@ class RecordedSource:
 
     def covariance(self, covariance, pitch):
         """Covariances (n, 3, 3) of measured points, turned into the source frame."""
-        R = self.rotation(pitch)
+        R = self.frame.rotation(self.corrections.pitch(self.placement, pitch))
         return R @ covariance @ R.swapaxes(-1, -2)
-
-    def rotation(self, pitch):
-        """Rotation matrices (n, 3, 3) from the LRF at a recorded pitch (n,) to the source frame."""
-        return self.frame.rotation(self.corrections.pitch(self.placement, pitch))
 
     def by_pitch(self, p_lrf, pitch):
         """Derivative (n, 3) of :meth:`points` by an error of the recorded pitch, metres a
@@ -256,8 +253,6 @@ def _crossings(prepared, placement, view, source, sides):
             "points": source.points(p_lrf, pitch),
             "pitch": pitch,
             "covariance": source.covariance(scanned.covariance[rows], pitch) + pitch_error,
-            "noise": source.covariance(scanned.noise[rows], pitch) + pitch_error,
-            "half_step": (source.rotation(pitch) @ scanned.half_step[rows][..., None])[..., 0],
             "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
             "background": scanned.background[rows],
             "lines": np.tile(edge.line, (n, 1)),

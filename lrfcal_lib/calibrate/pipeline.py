@@ -40,7 +40,8 @@ from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.session.cache import cached, spread
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.solvers import METHODS, SHIPPED, best_method, row_of
-from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
+from lrfcal_lib.solvers.joint import solve_again, solve_joint
+from lrfcal_lib.solvers.joint_solution import JointSolution
 from lrfcal_lib.solvers.pitch import PitchErrors, estimate_pitch_errors
 
 LAPSE = 0.01  # share of beams about an edge that something else than the edge decides

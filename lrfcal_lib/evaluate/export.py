@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
+from lrfcal_lib.calibrate.cloud import write_ply
 from lrfcal_lib.calibrate.clouds import cloud_blocks
 from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
-from lrfcal_lib.calibrate.reconstruct import write_ply
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
@@ -83,7 +83,7 @@ def calibration_record(calibration, method, judged=None):
         }
         record["sensor"] = sensor | {
             "noise": joint.noise,
-            "excluded": list(joint.excluded.values()),
+            "excluded": [str(problem) for problem in joint.excluded],
         }
     return record
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 from scipy.special import logit
 from scipy.stats import binom, chi2
 
@@ -19,13 +19,14 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
 )
 from lrfcal_lib.model.observations import CameraObservations
-from lrfcal_lib.preprocess.board_in_scan import fit_lines, row_ends
+from lrfcal_lib.preprocess.board_in_scan import fit_lines
 from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
+from lrfcal_lib.preprocess.surfaces import row_ends
+from lrfcal_lib.simulate.draw import ShotSetup
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import in_stated_gauge
 from lrfcal_lib.solvers.joint_model import JointState, gather
 from lrfcal_lib.solvers.joint_residuals import named_blocks
-from lrfcal_lib.solvers.lines import edge_bias
 
 INTERVAL = 0.9
 HALF_WIDTH = 1.6448536269514722  # standard normal: 90 % of it lies within
@@ -287,53 +288,62 @@ def _freedom(C):
     return np.trace(C) ** 2 / np.sum(C * C)
 
 
-def observations(shots, setup, last_beam=False):
+def observations(shots: dict, setup: ShotSetup, last_beam: bool = False) -> CameraObservations:
     """Drawn shots as the preprocessing makes CameraObservations of a scan line, trials first.
 
-    Two crossings a placement, at the last beams on the board or half a beam step outside, and 24
-    face points. `shots` and `setup` as in :func:`lrfcal_lib.simulate.draw.draw_shots`.
+    Parameters
+    ----------
+    shots : dict of ndarray
+        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
+    setup : ShotSetup
+        What they were drawn from.
+    last_beam : bool
+        Crossings are at the last beams on the board instead of half a beam step outside.
+
+    Returns
+    -------
+    CameraObservations
+        Of t trials with two crossings and `FACE` face points a placement.
     """
     ranges = shots["ranges"]
     bearings = setup.bearings()
     t, p, _ = ranges.shape
-    flat = ranges.reshape(t * p, -1)
-    half = np.array([-0.5, 0.5]) * setup.step
-    lines, information = fit_lines(flat, bearings)
-    ends = bearings[np.stack(row_ends(np.isfinite(flat))[1:], axis=1)]
-    ray = polar_to_points(1.0, ends if last_beam else ends + half)
-    across = np.cross([0.0, 0.0, 1.0], ray)
-    u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
-    r = 1 / np.sum(u * ray, axis=-1)  # to the fitted line
-    by_bearing = -(r**2) * np.sum(u * across, axis=-1)  # the range's change
-    turned = r[..., None] * across + by_bearing[..., None] * ray
-    covariance = np.linalg.inv(information) * setup.sigma_range**2  # of u
-    flat_ray = ray[..., :2]
-    variance = r**4 * np.einsum("nei,nij,nej->ne", flat_ray, covariance, flat_ray)
-    noise = variance[..., None, None] * _outer(ray)
-    found = {
-        "points": r[..., None] * ray,
-        "half_step": turned * half[:, None],
-        "noise": noise,
-        "covariance": noise + _outer(turned * setup.step * UNIFORM),
-        "radius": setup.radius(r),
-        "background": 0 * r,
-        "line_sigma": np.full(r.shape, setup.sigma_px),
-    }
-    crossings = {}
-    for name, values in found.items():
-        crossings[f"crossing_{name}"] = values.reshape((t, 2 * p) + values.shape[2:])
-    points, covariance = _face_points(ranges, bearings, setup.sigma_range)
+    points, covariance = _crossing_points(ranges.reshape(t * p, -1), setup, last_beam)
+    face, face_covariance = _face_points(ranges, bearings, setup.sigma_range)
     return CameraObservations(
         setup.model,
-        **crossings,
+        crossing_points=points.reshape(t, 2 * p, 3),
+        crossing_covariance=covariance.reshape(t, 2 * p, 3, 3),
+        crossing_line_sigma=np.full((t, 2 * p), setup.sigma_px),
         crossing_lines=shots["lines"].reshape(t, 2 * p, 3),
         crossing_placement=np.repeat(np.arange(p), 2),
-        plane_points=points.reshape(t, -1, 3),
-        plane_covariance=covariance.reshape(t, -1, 3, 3),
+        plane_points=face.reshape(t, -1, 3),
+        plane_covariance=face_covariance.reshape(t, -1, 3, 3),
         plane_placement=np.repeat(np.arange(p), FACE),
         board_poses=shots["boards"],
         board_covariance=shots["board_covariance"],
     )
+
+
+def _crossing_points(ranges, setup, last_beam):
+    """Where the lines fitted to scan lines (n, B) end, (n, 2, 3), and their covariances."""
+    bearings = setup.bearings()
+    lines, information = fit_lines(ranges, bearings)
+    _, first, last = row_ends(np.isfinite(ranges))
+    ends = bearings[np.stack([first, last], axis=1)]
+    if not last_beam:
+        ends = ends + np.array([-0.5, 0.5]) * setup.step
+    ray = polar_to_points(1.0, ends)
+    across = np.cross([0.0, 0.0, 1.0], ray)
+    u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
+    r = 1 / np.sum(u * ray, axis=-1)  # to the fitted line u . p = 1
+    by_bearing = -(r**2) * np.sum(u * across, axis=-1)  # the range's change
+    turned = r[..., None] * across + by_bearing[..., None] * ray
+    of_line = np.linalg.inv(information) * setup.sigma_range**2
+    flat_ray = ray[..., :2]
+    variance = r**4 * np.einsum("nei,nij,nej->ne", flat_ray, of_line, flat_ray)
+    spacing = _outer(turned * setup.step * UNIFORM)
+    return r[..., None] * ray, variance[..., None, None] * _outer(ray) + spacing
 
 
 def _face_points(ranges, bearings, sigma_range):
@@ -355,55 +365,44 @@ def _outer(v):
     return v[..., :, None] * v[..., None, :]
 
 
-def solve_shots(shots, setup, T0, methods=("line", "line_ml", "zhang_pless")):
-    """All trials from start values `T0`, one a trial, by method, 'line_last_beam' first.
+def shots_table(shots: dict, setup: ShotSetup, rng: np.random.Generator) -> pd.DataFrame:
+    """Errors of lines by both rules for the edge point, and of planes, over drawn single shots.
 
-    Solutions with a trial axis.
+    Parameters
+    ----------
+    shots : dict of ndarray
+        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
+    setup : ShotSetup
+        What they were drawn from.
+    rng : numpy.random.Generator
+        Draws the start values, some degrees and centimetres off the truth.
+
+    Returns
+    -------
+    DataFrame
+        Columns method, rotation_median_deg, translation_median_mm, nees (mean normalised squared
+        error of the pose over 6).
     """
+    true = shots["T_camera_lrf"]
+    turn = Rotation.from_rotvec(rng.normal(0, 0.05, (len(true), 3))).as_matrix()
+    shift = rng.normal(0, 0.05, (len(true), 3))
+    near = np.concatenate([turn @ true[..., :3], true[..., 3:] + shift[..., None]], axis=-1)
+    T0 = pose_transform(near)
     half = observations(shots, setup)
-    last = observations(shots, setup, last_beam=True)
-    out = {"line_last_beam": solve_camera(last, "line", T0)}
-    for method in methods:
-        out[method] = solve_camera(half, method, T0)
-    return out
-
-
-def shots_table(shots, setup, solutions):
-    """Errors of every method over the trials.
-
-    Columns method, rotation_median_deg, rotation_rms_deg, translation_median_mm,
-    translation_rms_mm, nees (mean normalised squared error of the pose over 6), bias_error (median
-    absolute error of the edge bias in spot radii, NaN for methods without), converged (share).
-    """
+    solutions = {
+        "line_last_beam": solve_camera(observations(shots, setup, last_beam=True), "line", T0),
+        "line": solve_camera(half, "line", T0),
+        "zhang_pless": solve_camera(half, "zhang_pless", T0),
+    }
     rows = []
     for method, solution in solutions.items():
-        error = pose_errors(pose_array(solution.transform), shots["T_camera_lrf"])
-        covariance = solution.covariance[..., :6, :6]
-        normalised = np.linalg.solve(covariance, error[..., None])[..., 0]
-        squares = np.sum(error * normalised, axis=-1)
-        turn, shift = np.split(error, 2, axis=1)
-        angle = np.degrees(np.linalg.norm(turn, axis=-1))
-        distance = 1e3 * np.linalg.norm(shift, axis=-1)
-        bias_error = np.nan
-        if method == "line_ml":
-            bias_error = np.median(np.abs(edge_bias(solution)[0] - setup.bias))
+        error = pose_errors(pose_array(solution.transform), true)
+        normalised = np.linalg.solve(solution.covariance, error[..., None])[..., 0]
         row = {
             "method": method,
-            "rotation_median_deg": np.median(angle),
-            "rotation_rms_deg": np.sqrt(np.mean(angle**2)),
-            "translation_median_mm": np.median(distance),
-            "translation_rms_mm": np.sqrt(np.mean(distance**2)),
-            "nees": np.mean(squares) / 6,
-            "bias_error": bias_error,
-            "converged": np.mean(solution.converged),
+            "rotation_median_deg": np.degrees(np.median(np.linalg.norm(error[:, :3], axis=1))),
+            "translation_median_mm": 1000 * np.median(np.linalg.norm(error[:, 3:], axis=1)),
+            "nees": np.mean(np.sum(error * normalised, axis=-1)) / 6,
         }
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def start_near(shots, rng):
-    """Start values some degrees and centimetres off the truth, a stack of RigidTransform."""
-    truth = pose_transform(shots["T_camera_lrf"])
-    turn = Rotation.from_rotvec(rng.normal(0, 0.05, (len(truth), 3)))
-    moved = truth.translation + rng.normal(0, 0.05, (len(truth), 3))
-    return RigidTransform.from_components(moved, turn * truth.rotation)

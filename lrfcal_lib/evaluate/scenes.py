@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lrfcal_lib.calibrate.cloud import join
 from lrfcal_lib.calibrate.clouds import views_of
-from lrfcal_lib.calibrate.reconstruct import join, reconstruct
+from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of, range_noise, spread
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, tilt

@@ -284,8 +284,8 @@ def pitch_models_table(errors):
     """
     rows = []
     for model in errors.models.values():
-        mean = 1000 * np.mean(list(model.rms.values()))
-        rows.append((model.name, model.n_parameters, mean, model.F, model.p_value))
+        rms_mm = 1000 * model.plane_rms
+        rows.append((model.name, model.n_parameters, rms_mm, model.F, model.p_value))
     return pd.DataFrame(rows, columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"])
 
 

@@ -1,13 +1,14 @@
 """What a simulated session was made with, and the errors of calibrations against it."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.session.stated import TransformStated, board_from_json, from_json, naming, read_json
 
 
@@ -71,3 +72,26 @@ def axis_errors(T_head_lrf, truth):
     true = geometry.axis_of(truth.T_head_lrf)
     angle, offset = geometry.axis_difference(geometry.axis_of(T_head_lrf), true)
     return np.rad2deg(angle), 1000 * offset
+
+
+def on_true_edges(observations: PlatformObservations, truth: Truth) -> PlatformObservations:
+    """The same observations, the points of each side moved onto the board's true edge.
+
+    With these points the edges are straight about the true axis at the recorded pitch: what an
+    estimate is off then is no error of edge points or pitch.
+    """
+    lines = truth.board.lines()
+    points = observations.edge_points.copy()
+    sides = np.column_stack([observations.edge_placement, observations.edge_number])
+    for placement, number in np.unique(sides, axis=0):
+        rows = (sides == (placement, number)).all(axis=1)
+        pitch = observations.edge_pitch[rows]
+        board = truth.boards[placement]
+        moved = geometry.lrf_to_platform(points[rows], pitch, truth.T_head_lrf)
+        flat = board.inv().apply(moved)[:, :2]
+        away = flat @ lines[:, :2].T + lines[:, 2]
+        edge = np.median(np.abs(away), axis=0).argmin()
+        flat = flat - away[:, [edge]] * lines[edge, :2]
+        on_edge = board.apply(np.column_stack([flat, np.zeros(len(flat))]))
+        points[rows] = truth.T_head_lrf.inv().apply(geometry.tilt(on_edge, -pitch))
+    return replace(observations, edge_points=points)

@@ -98,25 +98,3 @@ def beam_terms(margin, sigma, hit, lapse=0.0):
         cost = -np.logaddexp(np.log(lapse), np.log1p(-2 * lapse) + log_p)
         weight = np.exp(np.log1p(-2 * lapse) + log_p + cost)
     return cost, -weight * sign * mills / sigma, weight * mills * (z + mills) / sigma**2
-
-
-def interval_terms(inner, outer, sigma):
-    """Negative log likelihood that readings flip between two beams: ``P = Phi(inner / sigma) -
-    Phi(outer / sigma)``.
-
-    A uniform distribution over the interval, blurred; `inner` and `outer` are the margins (see
-    :func:`beam_terms`) of the last beam on the board and the first one off it. Returned are cost,
-    score and observed information by a shift of both margins, as by :func:`beam_terms`.
-    """
-    a = np.asarray(outer, float) / sigma
-    b = np.asarray(inner, float) / sigma
-    flip = a + b > 0  # mirrored, so that both tails stay on the side where log_ndtr is exact
-    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
-    upper = log_ndtr(b)
-    lower = log_ndtr(a)
-    log_p = upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-15)))
-    pb, pa = (np.exp(-0.5 * z**2 - log_p) / ROOT_2PI for z in (b, a))
-    ratio = pb - pa
-    curvature = ratio**2 + (b * pb - a * pa)
-    score = np.where(flip, 1.0, -1.0) * ratio / sigma
-    return -log_p, score, np.maximum(curvature, 0.0) / sigma**2

@@ -12,10 +12,13 @@ Jacobian at the point moved onto its constraint, which a block hands over as `co
 weights are frozen while a step is judged and renewed for the next one.
 """
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from lrfcal_lib.fit.result import Solution
@@ -24,6 +27,13 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 CAUCHY = 2.385  # 95 % efficiency for normal errors
 # eigenvalues of scaled normal equations below this share of the largest are rounding errors
 RANK = 1e-13
+OWN_RANK = 1e-13  # the same of what a placement owns
+FIRST_DAMPING = 1e-7  # of the normal equations' diagonal
+LEAST_DAMPING = 1e-12
+MOST_DAMPING = 1e14
+SMALL_DAMPING = 10.0  # a step with more is short because it is held, not because it has arrived
+PARTAKES = 0.05  # share of a direction's largest component from which an unknown takes part in it
+LARGE_CHI2 = 0.001  # chance alone exceeds chi-square so seldom where the stated noise is right
 
 
 @dataclass(frozen=True)
@@ -86,14 +96,6 @@ def whiten(block, jacobian=True):
     return block.white, (block.white_jacobian if jacobian else None)
 
 
-def robust(z, loss):
-    """Value (``z^2`` near zero) and weight of a loss at residuals in units of the scale."""
-    if loss != "cauchy":
-        raise ValueError(f"unknown loss {loss!r}: use None or 'cauchy'")
-    square = (z / CAUCHY) ** 2
-    return CAUCHY**2 * np.log1p(square), 1.0 / (1.0 + square)
-
-
 def medians(values, used):
     """Medians of the used values (..., n) of every row, 0 where there are none.
 
@@ -108,91 +110,133 @@ def medians(values, used):
 
 
 def _weigh(block, loss, scale, axes):
-    """Robust weights (..., n) of a block at its own state, None without, and the loss value
-    summed over the trial.
+    """Robust weights (..., n) of a block at its own state, None without, and half the loss summed
+    over the trial.
     """
+    if block.cost is not None:
+        return None, block.cost.sum(axis=axes)
     r = block.white
+    if loss is None:
+        return None, 0.5 * (r * r).sum(axis=axes)
     d = block.size
-    if block.cost is not None or loss is None:
-        return None, (r * r if block.cost is None else 2 * block.cost).sum(axis=axes)
     squares = np.sum(r.reshape(r.shape[:-1] + (-1, d)) ** 2, axis=-1)
-    count = np.broadcast_to(
-        np.asarray(d if block.count is None else block.count, float), squares.shape
-    )
+    count = np.asarray(d if block.count is None else block.count, float)
+    count = np.broadcast_to(count, squares.shape)
     z = np.sqrt(squares / count)  # sizes of groups of residuals that are judged together
     if scale == "auto":
-        inside = block.whitener != 0 if d == 1 else np.any(block.whitener != 0, axis=(-1, -2))
-        sizes, index = np.unique(count, return_inverse=True)
-        usual = np.sqrt(chdtri(sizes, 0.5) / sizes)[index].reshape(count.shape)
-        wide = z.shape[: z.ndim + min(np.atleast_1d(axes))]
-        level = medians((z / usual).reshape(*wide, -1), (inside & (z == z)).reshape(*wide, -1))
-        scale = np.maximum(np.expand_dims(level, axes), 1e-9)
-    value, weights = robust(z / scale, loss)
-    return np.repeat(weights, d, axis=-1), np.sum(count * scale**2 * value, axis=axes)
+        scale = _level(z, count, block, axes)
+    square = (z / scale / CAUCHY) ** 2
+    value = np.sum(count * scale**2 * CAUCHY**2 * np.log1p(square), axis=axes)
+    return np.repeat(1 / (1 + square), d, axis=-1), 0.5 * value
+
+
+def _level(z, count, block, axes):
+    """Usual size of residuals z (..., n) in their standard deviations, by the median of a trial."""
+    inside = block.whitener != 0
+    if block.size > 1:
+        inside = inside.any(axis=(-1, -2))
+    sizes, index = np.unique(count, return_inverse=True)
+    usual = np.sqrt(chdtri(sizes, 0.5) / sizes)[index].reshape(count.shape)
+    wide = (*z.shape[: z.ndim + min(np.atleast_1d(axes))], -1)
+    level = medians((z / usual).reshape(wide), (inside & (z == z)).reshape(wide))
+    return np.maximum(np.expand_dims(level, axes), 1e-9)
 
 
 def _blocks(evaluate, state):
-    found = evaluate(state)
-    return [found] if isinstance(found, Block) else list(found)
+    """What a problem hands over, as a list."""
+    blocks = evaluate(state)
+    if isinstance(blocks, Block):
+        return [blocks]
+    return list(blocks)
 
 
-def linearise(blocks, loss, scale, axes):
-    """Normal equations and cost of whitened, robustly weighted blocks, and the roots of the
-    weights (None without).
+class Linearised(NamedTuple):
+    """Whitened, robustly weighted blocks at a state.
+
+    Normal equations (..., k, k) and (..., k), the cost, and of each block the roots of its weights
+    (None without).
     """
-    hessian = 0.0
-    gradient = 0.0
-    cost = 0.0
+
+    hessian: np.ndarray
+    gradient: np.ndarray
+    cost: np.ndarray
+    roots: list
+
+
+def linearise(blocks: Iterable[Block], loss=None, scale=1.0, axes=(-2, -1)) -> Linearised:
+    """Normal equations of blocks with the placement as leading axis, or of trials.
+
+    Parameters
+    ----------
+    blocks : iterable of Block
+    loss, scale
+        See :func:`minimise`.
+    axes : int or tuple of int
+        Over which the cost is summed: placements and residuals, or -1 for residuals of trials.
+    """
+    hessian = gradient = cost = 0.0
     roots = []
     for block in blocks:
         weights, value = _weigh(block, loss, scale, axes)
-        r, J = whiten(block)
-        roots.append(None if weights is None else np.sqrt(weights))
+        r = block.white
+        J = block.white_jacobian
+        root = None
         if weights is not None:
-            r = roots[-1] * r
-            J = roots[-1][..., None] * J
+            root = np.sqrt(weights)
+            r = root * r
+            J = root[..., None] * J
+        roots.append(root)
         transposed = J.swapaxes(-1, -2)
         hessian = hessian + transposed @ J
         gradient = gradient + (transposed @ r[..., None])[..., 0]
-        cost = cost + 0.5 * value
-    return hessian, gradient, cost, roots
+        cost = cost + value
+    return Linearised(hessian, gradient, cost, roots)
 
 
 def _frozen_cost(blocks, roots, axes):
     """Half the sum of squares with the robust weights of an earlier state."""
     total = 0.0
     for block, root in zip(blocks, roots, strict=True):
+        if block.cost is not None:
+            total = total + block.cost.sum(axis=axes)
+            continue
         r = block.white if root is None else root * block.white
-        total = total + (
-            0.5 * (r * r).sum(axis=axes) if block.cost is None else block.cost.sum(axis=axes)
-        )
+        total = total + 0.5 * (r * r).sum(axis=axes)
     return total
 
 
-def eliminate(hessian, gradient, shared, rcond=1e-13):
+def eliminate(
+    hessian: np.ndarray, gradient: np.ndarray, shared: int, regular: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Schur complement: what each placement says about the shared unknowns once its own are
     eliminated.
 
-    The first `shared` = c unknowns of the normal equations (p, k, k), (p, k) are common to all
-    placements; eigenvalues of the placements' own blocks below `rcond` are no information (None:
-    the blocks are regular). Returned are the reduced equations (p, c, c), (p, c) and ``back`` (p, k
-    - c, c + 1): a step x of the shared unknowns goes with ``-(back[..., c] + back[..., :c] x)`` of
-    a placement's own.
+    Parameters
+    ----------
+    hessian, gradient : ndarray, shapes (p, k, k), (p, k)
+        Normal equations; the first `shared` = c unknowns are common to all placements.
+    shared : int
+    regular : bool
+        The placements' own blocks can be solved as they are. Otherwise rounding errors among their
+        eigenvalues are no information.
+
+    Returns
+    -------
+    reduced : ndarray, shape (p, c, c)
+    gradient : ndarray, shape (p, c)
+    back : ndarray, shape (p, k - c, c + 1)
+        A step x of the shared unknowns goes with ``-(back[..., c] + back[..., :c] x)`` of a
+        placement's own.
     """
     c = shared
     known = np.concatenate([hessian[:, c:, :c], gradient[:, c:, None]], axis=-1)
     own = hessian[:, c:, c:]
-    back = (
-        np.linalg.solve(own, known)
-        if rcond is None
-        else np.linalg.pinv(own, rcond=rcond, hermitian=True) @ known
-    )
-    across = hessian[:, :c, c:]
-    return (
-        hessian[:, :c, :c] - across @ back[..., :c],
-        gradient[:, :c] - (across @ back[..., c:])[..., 0],
-        back,
-    )
+    if regular:
+        back = np.linalg.solve(own, known)
+    else:
+        back = np.linalg.pinv(own, rcond=OWN_RANK, hermitian=True) @ known
+    taken = hessian[:, :c, c:] @ back
+    return hessian[:, :c, :c] - taken[..., :c], gradient[:, :c] - taken[..., c], back
 
 
 def reduced_hessian(hessian, shared):
@@ -214,26 +258,39 @@ def _step(hessian, gradient, damping, shared):
     if shared is None:
         step = whole = -np.linalg.solve(damped, gradient[..., None])[..., 0]
     else:
-        reduced, right, back = eliminate(damped, gradient, shared, rcond=None)
+        reduced, right, back = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
         step = common, -(back[..., shared] + back[..., :shared] @ common)
         whole = np.concatenate([np.broadcast_to(common, (len(back), shared)), step[1]], axis=-1)
     length = np.vecdot(whole, (hessian @ whole[..., None])[..., 0])
     promised = -np.vecdot(whole, gradient) - 0.5 * length
-    return (step, length, promised) if shared is None else (step, np.sum(length), np.sum(promised))
+    if shared is None:
+        return step, length, promised
+    return step, np.sum(length), np.sum(promised)
+
+
+class Minimum(NamedTuple):
+    """Where a minimisation ended, trial by trial, and the cost before each iteration and at the
+    end.
+    """
+
+    state: Any
+    converged: bool | np.ndarray
+    iterations: int
+    cost_history: np.ndarray
 
 
 def minimise(
-    evaluate,
-    state,
-    retract,
+    evaluate: Callable,
+    state: Any,
+    retract: Callable,
     *,
-    shared=None,
-    loss=None,
-    scale=1.0,
-    max_iterations=60,
-    tolerance=1e-8,
-):
+    shared: int | None = None,
+    loss: str | None = None,
+    scale: float | str = 1.0,
+    max_iterations: int = 60,
+    tolerance: float = 1e-8,
+) -> Minimum:
     """Run the damped Gauss-Newton iteration.
 
     Parameters
@@ -253,62 +310,74 @@ def minimise(
     tolerance : float
         A trial has converged when a step is shorter than this many standard deviations of the
         estimate.
-
-    Returns
-    -------
-    state, converged, iterations, cost_history
     """
+    if loss not in (None, "cauchy"):
+        raise ValueError(f"unknown loss {loss!r}: use None or 'cauchy'")
     axes = -1 if shared is None else (-2, -1)
     blocks = _blocks(evaluate, state)
-    hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
-    history = [cost]
-    converged = np.zeros(np.shape(cost), bool)
-    damping = np.full(np.shape(cost), 1e-7)
-    iteration = 0
-    while iteration < max_iterations and not converged.all():
-        iteration += 1
-        step, length, promised = _step(hessian, gradient, damping, shared)
+    at = linearise(blocks, loss, scale, axes)
+    history = [at.cost]
+    converged = np.zeros(np.shape(at.cost), bool)
+    damping = np.full(np.shape(at.cost), FIRST_DAMPING)
+    while len(history) <= max_iterations and not converged.all():
+        step, length, promised = _step(at.hessian, at.gradient, damping, shared)
         trial = retract(state, step)
         tried = _blocks(evaluate, trial)
-        before = cost if loss is None else _frozen_cost(blocks, roots, axes)
-        after = _frozen_cost(tried, roots, axes)
+        before = at.cost if loss is None else _frozen_cost(blocks, at.roots, axes)
+        after = _frozen_cost(tried, at.roots, axes)
         accepted = after <= before * (1 + 1e-12) + 1e-26
         small = (length < tolerance**2) | (length < 1e-14 * before)
-        converged = converged | (small & np.isfinite(after) & (damping < 10.0))
+        converged = converged | (small & np.isfinite(after) & (damping < SMALL_DAMPING))
         if accepted.all():
             state = trial
             blocks = tried
         elif accepted.any():
-            state = np.where(
-                accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim)), trial, state
-            )
+            chosen = accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim))
+            state = np.where(chosen, trial, state)
             blocks = _blocks(evaluate, state)
-        hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
-        history.append(cost)
-        # less damping where the linear model keeps its promise, more where it overshoots (large
-        # residuals)
-        gain = np.where(
-            promised > 3e-15 * before, (before - after) / np.maximum(promised, 1e-300), 1.0
-        )
-        kept = np.where(gain > 0.8, 0.1, 1.0) * damping
-        worse = np.maximum(np.where(accepted, 4.0, 10.0) * damping, 1e-4)
-        damping = np.minimum(
-            np.maximum(np.where(accepted & (gain > 0.5), kept, worse), 1e-12), 1e14
-        )
-    return (
-        state,
-        (bool(converged) if converged.ndim == 0 else converged),
-        iteration,
-        np.array(history),
-    )
+        at = linearise(blocks, loss, scale, axes)
+        history.append(at.cost)
+        gain = np.ones_like(before)
+        np.divide(before - after, promised, out=gain, where=promised > 3e-15 * before)
+        damping = _next_damping(damping, gain, accepted)
+    if converged.ndim == 0:
+        converged = bool(converged)
+    return Minimum(state, converged, len(history) - 1, np.array(history))
 
 
-def minimise_in_rounds(freeze, state, retract, rounds, **options):
+def _next_damping(damping, gain, accepted):
+    """Less where the linear model keeps its promise, more where it overshoots (large residuals).
+
+    `gain` is the fall of the cost beside the promised one.
+    """
+    kept = np.where(gain > 0.8, 0.1, 1.0) * damping
+    worse = np.maximum(np.where(accepted, 4.0, 10.0) * damping, 1e-4)
+    return np.clip(np.where(accepted & (gain > 0.5), kept, worse), LEAST_DAMPING, MOST_DAMPING)
+
+
+def minimise_in_rounds(
+    freeze: Callable, state: Any, retract: Callable, rounds: int, **options
+) -> tuple[Callable, Any, list[np.ndarray]]:
     """Minimise a few times with what depends on the state frozen anew (weights, say).
 
-    `freeze` makes a problem, ``(state, round) -> evaluate``; `options` are those of
-    :func:`minimise`. Returns the problem that is left to solve, the state there, and the cost
-    histories so far.
+    Parameters
+    ----------
+    freeze : callable
+        Makes a problem, ``(state, round) -> evaluate``.
+    state, retract
+        See :func:`minimise`.
+    rounds : int
+    **options
+        Those of :func:`minimise`.
+
+    Returns
+    -------
+    evaluate : callable
+        The problem that is left to solve.
+    state
+        Where to begin.
+    earlier : list of ndarray
+        Cost histories so far.
     """
     earlier = []
     for number in range(rounds):
@@ -317,43 +386,89 @@ def minimise_in_rounds(freeze, state, retract, rounds, **options):
     return freeze(state, rounds), state, earlier
 
 
-def solve(
-    evaluate,
-    start,
-    retract,
-    *,
-    names,
-    method,
-    read,
-    scales=None,
-    words=None,
-    groups=None,
-    freedom=None,
-    shared=None,
-    loss=None,
-    scale=1.0,
-    required=True,
-    n_observations=None,
-    limit=1.0,
-    chi2_rest=0.0,
-    earlier=(),
-    **options,
-):
-    """Minimise (see :func:`minimise` and its options), then report covariances and what was not
-    observed: a Solution.
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """What is asked about the unknowns of a problem: names, units, words, placements.
 
-    `names` are those of the unknowns reported (with `shared`, the shared ones), `read` makes
-    ``(transform or None, parameters)`` of a state, `scales` and `limit` are those of
-    :func:`null_space`, `words` puts a direction (k,) into words (the names with its largest
-    components by default). `groups` tell the placement of every residual, or of every few in a row,
-    for `covariance_placements`; with `shared` the leading axis is the placement. `freedom` and
-    `n_observations` are by default those of the residuals; `chi2_rest` is chi-square that no
-    unknown can change (compressed away), `earlier` are cost histories of earlier rounds.
-
-    Raises DegenerateGeometry naming unobservable motions when `required` (single problems only),
-    and ValueError when residuals at the start are not finite.
+    Attributes
+    ----------
+    names : sequence of str
+        Of the unknowns reported (with `shared`, the shared ones).
+    method : str
+        For messages.
+    read : callable
+        Makes ``(transform or None, parameters)`` of a state.
+    scales, limit
+        See :func:`null_space`.
+    words : callable, optional
+        Puts a direction (k,) into words; by default the names with its largest components.
+    groups : ndarray, optional
+        The placement of every residual, or of every few in a row, for `covariance_placements`; with
+        `shared` the leading axis is the placement.
+    freedom, n_observations : int, optional
+        By default those of the residuals.
+    chi2_rest : float
+        Chi-square that no unknown can change (compressed away).
+    required : bool
+        Refuse what leaves a motion open (single problems only).
     """
-    axes = -1 if shared is None else (-2, -1)
+
+    names: Sequence[str]
+    method: str
+    read: Callable
+    scales: ArrayLike | None = None
+    limit: float = 1.0
+    words: Callable | None = None
+    groups: np.ndarray | None = None
+    freedom: int | None = None
+    n_observations: int | None = None
+    chi2_rest: float | np.ndarray = 0.0
+    required: bool = True
+
+    def open_motions(self, hessian, scales):
+        """Motions that normal equations (k, k) of one problem leave open, in words."""
+        if hessian.ndim > 2:
+            return ()
+        directions = null_space(hessian, scales, self.limit)[0]
+        words = self.words or (lambda direction: name_words(direction, self.names))
+        motions = tuple(words(direction) for direction in directions)
+        if self.required and motions:
+            open_motions = "; ".join(motions)
+            raise DegenerateGeometry(f"{self.method}: the data do not determine {open_motions}")
+        return motions
+
+
+def solve(
+    evaluate: Callable,
+    start: Any,
+    retract: Callable,
+    *,
+    shared: int | None = None,
+    loss: str | None = None,
+    scale: float | str = 1.0,
+    earlier: Sequence[np.ndarray] = (),
+    **asked,
+) -> Solution:
+    """Minimise, then report covariances and what was not observed.
+
+    Parameters
+    ----------
+    evaluate, start, retract, shared, loss, scale
+        See :func:`minimise`.
+    earlier : sequence of ndarray
+        Cost histories of earlier rounds.
+    **asked
+        Fields of :class:`Question`; `max_iterations` and `tolerance` of :func:`minimise`.
+
+    Raises
+    ------
+    DegenerateGeometry
+        Naming unobservable motions, when `required`.
+    ValueError
+        When residuals at the start are not finite.
+    """
+    steps = {name: asked.pop(name) for name in ("max_iterations", "tolerance") if name in asked}
+    question = Question(**asked)
     last = [None, None]
 
     def once(state):
@@ -364,53 +479,22 @@ def solve(
 
     if not all(np.isfinite(block.residuals).all() for block in once(start)):
         raise ValueError(
-            f"{method}: residuals at the start value are not finite: check the observations and T0"
+            f"{question.method}: residuals at the start value are not finite: check the "
+            "observations and T0"
         )
-    options |= {"shared": shared, "loss": loss, "scale": scale}
-    state, converged, iterations, history = minimise(once, start, retract, **options)
-    parts = [(*whiten(block), _weigh(block, loss, scale, axes)[0]) for block in once(state)]
-    parts = [(r, J, np.ones_like(r) if weights is None else weights) for r, J, weights in parts]
-    r, J, weights = (
-        np.concatenate([p[i] for p in parts], axis=-1 if i != 1 else -2) for i in range(3)
+    options = {"shared": shared, "loss": loss, "scale": scale}
+    minimum = minimise(once, start, retract, **options, **steps)
+    costs = [costs[:-1] for costs in earlier]
+    minimum = minimum._replace(
+        iterations=minimum.iterations + sum(map(len, costs)),
+        cost_history=np.concatenate([*costs, minimum.cost_history]),
     )
-    hessians, scores = _by_placement(r, J, weights, groups, shared)
-    hessian = np.sum(hessians, axis=-3)
-    scales = np.ones(hessian.shape[-1]) if scales is None else np.asarray(scales)
-    lost = null_space(hessian, scales, limit)[0] if hessian.ndim == 2 else ()
-    lost = tuple(
-        (words or (lambda direction: name_words(direction, names)))(direction) for direction in lost
-    )
-    if required and lost:
-        raise DegenerateGeometry(f"{method}: the data do not determine " + "; ".join(lost))
-    chi2 = np.sum(weights * r**2, axis=axes) + chi2_rest
-    if freedom is None:
-        own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
-        freedom = r.size // chi2.size - own
-    too_large = (freedom > 0) & (chi2 > chdtri(max(freedom, 1), 0.001))
-    inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
-    transform, parameters = read(state)
-    return Solution(
-        transform,
-        parameters,
-        tuple(names),
-        converged,
-        iterations=iterations + sum(len(costs) - 1 for costs in earlier),
-        cost_history=np.concatenate([*(costs[:-1] for costs in earlier), history]),
-        residuals=r,
-        jacobian=J,
-        weights=weights,
-        covariance=_covariance(hessian, scales, lost) * inflation[..., None, None],
-        covariance_placements=None
-        if groups is None and shared is None
-        else placement_covariance(hessians, scores)[0],
-        unobservable=lost,
-        method=method,
-        n_observations=n_observations or r.shape[-1],
-        chi2=chi2,
-        inflation=inflation,
-        state=state,
-        n_placements=hessians.shape[-3],
-    )
+    blocks = once(minimum.state)
+    axes = -1 if shared is None else (-2, -1)
+    roots = linearise(blocks, loss, scale, axes).roots
+    pairs = zip(blocks, roots, strict=True)
+    weights = [np.ones_like(b.white) if root is None else root**2 for b, root in pairs]
+    return _solution(question, minimum, blocks, np.concatenate(weights, axis=-1), shared)
 
 
 def _by_placement(r, J, weights, groups, shared):
@@ -419,23 +503,60 @@ def _by_placement(r, J, weights, groups, shared):
     """
     weighted = weights[..., None] * J
     if groups is not None:  # rows of a placement together, padded with what counts nothing
-        groups = np.repeat(groups, r.shape[-1] // len(groups))
-        number = np.bincount(groups)
-        used = np.arange(number.max()) < number[number > 0, None]
-        index = np.zeros(used.shape, int)
-        index[used] = np.argsort(groups, kind="stable")
+        rows = np.arange(r.shape[-1])
+        placement = np.repeat(np.unique(groups, return_inverse=True)[1], len(rows) // len(groups))
+        together = pad({"row": rows, "placement": placement}, placement.max() + 1)
+        index = together["row"]
         r = r[..., index]
         J = J[..., index, :]
-        weighted = weighted[..., index, :] * used[..., None]
+        weighted = weighted[..., index, :] * together["used"][..., None]
     weighted = weighted.swapaxes(-1, -2)
     hessians = weighted @ J
     scores = (weighted @ r[..., None])[..., 0]
     if shared is not None:
         return reduced_hessian(hessians, shared), scores[:, :shared]
-    return (
-        (hessians, scores)
-        if groups is not None
-        else (hessians[..., None, :, :], scores[..., None, :])
+    if groups is None:
+        return hessians[..., None, :, :], scores[..., None, :]
+    return hessians, scores
+
+
+def _solution(question, minimum, blocks, weights, shared):
+    """The Solution at a minimum, from the blocks and their robust weights (..., n) there."""
+    r = np.concatenate([block.white for block in blocks], axis=-1)
+    J = np.concatenate([block.white_jacobian for block in blocks], axis=-2)
+    hessians, scores = _by_placement(r, J, weights, question.groups, shared)
+    hessian = np.sum(hessians, axis=-3)
+    scales = np.ones(hessian.shape[-1])
+    if question.scales is not None:
+        scales = np.asarray(question.scales)
+    motions = question.open_motions(hessian, scales)
+    chi2 = np.sum(weights * r**2, axis=-1 if shared is None else (-2, -1)) + question.chi2_rest
+    freedom = question.freedom
+    if freedom is None:
+        own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
+        freedom = r.size // chi2.size - own
+    too_large = (freedom > 0) & (chi2 > chdtri(max(freedom, 1), LARGE_CHI2))
+    inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
+    covariance_placements = None
+    if question.groups is not None or shared is not None:
+        covariance_placements = placement_covariance(hessians, scores)[0]
+    transform, parameters = question.read(minimum.state)
+    return Solution(
+        transform,
+        parameters,
+        tuple(question.names),
+        **minimum._asdict(),
+        residuals=r,
+        jacobian=J,
+        weights=weights,
+        covariance=_covariance(hessian, scales, motions) * inflation[..., None, None],
+        covariance_placements=covariance_placements,
+        unobservable=motions,
+        method=question.method,
+        n_observations=question.n_observations or r.shape[-1],
+        chi2=chi2,
+        inflation=inflation,
+        n_placements=hessians.shape[-3],
     )
 
 

@@ -59,3 +59,10 @@ class ViewBlock(Block):
         views = white.reshape(*h.shape[:-1], -1)
         common = self.same @ np.sum(h * views, axis=2)
         return (views - h * common[:, :, None]).reshape(white.shape)
+
+    @property
+    def log_determinant(self):
+        """Of the covariance of whitened views: what the pitch of the stops adds to it."""
+        _, square = self.white_by_pitch
+        number = np.maximum(self.same.sum(axis=-1), 1)  # every stop counts once
+        return np.sum(np.log1p(self.sigma_pitch**2 * square) / number)

@@ -15,8 +15,8 @@ from lrfcal_lib.model.geometry import (
     axis_of,
     transform_difference,
 )
-from lrfcal_lib.solvers.joint import JointSolution
 from lrfcal_lib.solvers.joint_model import SENSOR
+from lrfcal_lib.solvers.joint_solution import JointSolution
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations

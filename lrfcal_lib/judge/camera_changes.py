@@ -12,7 +12,8 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.preprocess.intrinsics import adjust_robust, raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
-from lrfcal_lib.solvers.joint import JointSolution, solve_joint
+from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.joint_solution import JointSolution
 
 POSE = 6  # numbers of a camera's pose
 BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong

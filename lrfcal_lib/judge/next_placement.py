@@ -11,7 +11,7 @@ from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of, columns_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
-from lrfcal_lib.solvers.joint import JointSolution
+from lrfcal_lib.solvers.joint_solution import JointSolution
 
 # how a board leans out of the upright plane that faces the LRF: turns about its x and y, degrees
 LEANS = {

@@ -409,7 +409,7 @@ def exchanged_placements(calibration):
     lost = [
         p
         for p in session.board_placements
-        if p in prepared.left_out or p in joint.solution.excluded
+        if p in prepared.left_out or p in joint.solution.excluded_placements
     ]
     scans = {}
     for placement in lost[:MOST_LOST]:

@@ -20,7 +20,8 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
     tilt,
 )
-from lrfcal_lib.solvers.joint import SCALES, UNSEEN, JointSolution
+from lrfcal_lib.solvers.joint import SCALES, UNSEEN
+from lrfcal_lib.solvers.joint_solution import JointSolution
 
 # what may be wrong about the way of a beam: radians and metres; metres, a fraction, radians
 COLUMNS = (*AXIS_NAMES, *POSE_NAMES, "range_offset", "pitch_scale", "pitch_by_direction")

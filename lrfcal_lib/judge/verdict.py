@@ -36,7 +36,7 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
-from lrfcal_lib.solvers.joint import JointSolution
+from lrfcal_lib.solvers.joint_solution import JointSolution
 from lrfcal_lib.solvers.planes import rival_words
 
 FIRST = {

@@ -12,7 +12,7 @@ from lrfcal_lib.judge.next_placement import group_sigma, sights
 from lrfcal_lib.judge.placements import placements_table
 from lrfcal_lib.model.problem import LEAVES_OUT
 from lrfcal_lib.preprocess.prepared import Prepared
-from lrfcal_lib.solvers.joint import JointSolution
+from lrfcal_lib.solvers.joint_solution import JointSolution
 
 # placements: too few, and few
 FEWEST = 3
@@ -143,7 +143,7 @@ def large_residuals(solution) -> Iterator[Finding]:
         words = f"placements fit much worse than the others: {', '.join(misfits)}"
         yield Finding(CARE, Kind.MISFIT, words)
     if solution.excluded:
-        yield Finding(CARE, Kind.EXCLUDED, "; ".join(solution.excluded.values()))
+        yield Finding(CARE, Kind.EXCLUDED, "; ".join(map(str, solution.excluded)))
 
     ratio = scatter_over_placements(solution)
     worst = max(ratio, key=ratio.__getitem__)
@@ -313,9 +313,12 @@ def left_out(calibration: Calibration, method: str) -> LeftOut:
     table = placements_table(prepared, calibration.observations).set_index("placement")
     used = set(table.index[table.used]) - set(prepared.left_out)
     excluded = {}
+    images = []
     if method == "joint":
-        used = set(calibration.joint.solution.boards)
-        excluded = calibration.joint.solution.excluded
+        solution = calibration.joint.solution
+        used = set(solution.boards)
+        excluded = solution.excluded_placements
+        images = [str(problem) for problem in solution.excluded if problem.camera is not None]
     placements = {}
     for number in table.index:
         if number not in used:
@@ -324,6 +327,5 @@ def left_out(calibration: Calibration, method: str) -> LeftOut:
     parts = [str(problem) for problem in prepared.problems if problem.kind not in LEAVES_OUT]
     lost = LeftOut(len(table), placements, parts)
     if lost.many:  # otherwise a finding says it
-        images = [words for key, words in excluded.items() if key not in table.index]
         return replace(lost, parts=parts + images)
     return lost

@@ -1,10 +1,11 @@
 """Pinhole camera with lens distortion: projection, undistortion, straight lines in pixels."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 # in the order of CameraModel.parameters
 INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
@@ -49,20 +50,24 @@ class CameraModel:
         """(fx, fy, cx, cy, k1..k5), shape (9,)."""
         return np.r_[self.fx, self.fy, self.cx, self.cy, self.distortion]
 
-    def with_parameters(self, values, covariance=None, rms_px=None):
-        """The same image size with other intrinsics, given in the order of `parameters`."""
-        fx, fy, cx, cy = (float(v) for v in values[:4])
-        return CameraModel(
-            self.width,
-            self.height,
-            fx,
-            fy,
-            cx,
-            cy,
-            np.asarray(values[4:9], float),
-            covariance,
-            rms_px,
-        )
+    def with_parameters(
+        self,
+        values: ArrayLike,
+        covariance: np.ndarray | None = None,
+        rms_px: float | None = None,
+    ) -> "CameraModel":
+        """The same image size with other intrinsics.
+
+        Parameters
+        ----------
+        values : array_like, shape (9,)
+            In the order of `parameters`.
+        covariance : ndarray, shape (9, 9), optional
+        rms_px : float, optional
+        """
+        matrix = dict(zip(INTRINSIC_NAMES[:4], map(float, values[:4]), strict=True))
+        distortion = np.asarray(values[4:9], float)
+        return replace(self, **matrix, distortion=distortion, covariance=covariance, rms_px=rms_px)
 
 
 def pinhole(p_camera, model):
@@ -143,43 +148,31 @@ def project(p_camera, model):
     return distorted * [model.fx, model.fy] + [model.cx, model.cy]
 
 
-def project_jacobians(p_camera, model):
-    """Derivatives of :func:`project` at points (..., 3) in front of the camera.
+def project_jacobians(p_camera: ArrayLike, model: CameraModel) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of :func:`project` at points in front of the camera.
+
+    Parameters
+    ----------
+    p_camera : array_like, shape (..., 3)
+        Camera frame, metres.
+    model : CameraModel
 
     Returns
     -------
     by_point : ndarray, shape (..., 2, 3)
+        Pixels per metre.
     by_intrinsics : ndarray, shape (..., 2, 9)
         In the order of `CameraModel.parameters`.
     """
     p_camera = np.asarray(p_camera, float)
-    k1, k2, k3, k4, k5 = model.distortion
-    z = p_camera[..., 2]
-    x = p_camera[..., 0] / z
-    y = p_camera[..., 1] / z
-    r2 = x * x + y * y
-    growth, shift_x, shift_y = lens_terms(x, y, *model.distortion)
-    radial = 1 + growth
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k5 * r2))  # of radial by r2, twice
-
-    xx = radial + slope * x * x + 2 * k3 * y + 6 * k4 * x  # distorted x by x
-    xy = slope * x * y + 2 * k3 * x + 2 * k4 * y  # distorted x by y, and y by x
-    yy = radial + slope * y * y + 6 * k3 * y + 2 * k4 * x  # distorted y by y
-    u_by_point = np.stack([xx / z, xy / z, -(xx * x + xy * y) / z], axis=-1) * model.fx
-    v_by_point = np.stack([xy / z, yy / z, -(xy * x + yy * y) / z], axis=-1) * model.fy
-
-    zero = np.zeros_like(x)
-    one = np.ones_like(x)
-    x_by_k = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], axis=-1)
-    y_by_k = np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], axis=-1)
-    u_by_matrix = np.stack([x * radial + shift_x, zero, one, zero], axis=-1)  # fx, fy, cx, cy
-    v_by_matrix = np.stack([zero, y * radial + shift_y, zero, one], axis=-1)
-    u_by_intrinsics = np.concatenate([u_by_matrix, model.fx * x_by_k], axis=-1)
-    v_by_intrinsics = np.concatenate([v_by_matrix, model.fy * y_by_k], axis=-1)
-
-    by_point = np.stack([u_by_point, v_by_point], axis=-2)
-    by_intrinsics = np.stack([u_by_intrinsics, v_by_intrinsics], axis=-2)
-    return by_point, by_intrinsics
+    shape = (*p_camera.shape[:-1], 2)
+    if p_camera.size == 0:
+        return np.zeros((*shape, 3)), np.zeros((*shape, 9))
+    still = np.zeros(3)
+    flat = p_camera.reshape(-1, 1, 3)
+    J = cv2.projectPoints(flat, still, still, model.matrix, model.distortion)[1]
+    J = J.reshape(*shape, -1)  # by rotation (3), translation (3), focal lengths, centre, lens
+    return J[..., 3:6], J[..., 6:15]
 
 
 def undistort(uv, model):

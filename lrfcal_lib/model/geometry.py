@@ -296,18 +296,8 @@ def pose_transform(pose, proper=False):
 
 
 def exp_rotation(w):
-    """Rotation matrices of rotation vectors, shape (..., 3) -> (..., 3, 3); Rodrigues' formula."""
-    x, y, z = np.asarray(
-        w, float
-    ).T  # by component: numbers are many times faster than small arrays
-    half = 0.5 * np.sqrt(x * x + y * y + z * z + 1e-300)
-    sine = np.sin(half) / half
-    a = sine * np.cos(half)  # sin(angle) / angle
-    b = 0.5 * sine * sine  # (1 - cos(angle)) / angle^2
-    first = [1 - b * y * y - b * z * z, b * x * y + a * z, b * x * z - a * y]
-    second = [b * x * y - a * z, 1 - b * x * x - b * z * z, b * y * z + a * x]
-    third = [b * x * z + a * y, b * y * z - a * x, 1 - b * x * x - b * y * y]
-    return np.array([first, second, third]).T  # they are the columns
+    """Rotation matrices of rotation vectors, shape (..., 3) -> (..., 3, 3)."""
+    return Rotation.from_rotvec(w).as_matrix()
 
 
 def log_rotation(R):

@@ -9,6 +9,7 @@ from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
+LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 ROUGH_NOISE = 1e-4 * np.eye(3)  # a centimetre every way, for points whose covariance is not told
 
 
@@ -98,9 +99,6 @@ class CameraObservations(_Groups):
     crossing_across : ndarray of bool, shape (n,)
         Where the edge was found across the scan lines (the sweep enters or leaves the board there):
         its place hangs on the recorded pitch. The paper uses none of these.
-    crossing_half_step, crossing_noise : ndarray, shapes (n, 3), (n, 3, 3)
-        From halfway between the last beam on the board and the first off it to the latter, metres;
-        the covariance without this spacing of the beams.
     crossing_radius, crossing_background : ndarray, shape (n,)
         Of the beam's spot there, metres (5 mm by default), and what the background adds to the log
         odds at which a reading flips from the board to it (see
@@ -161,8 +159,6 @@ class CameraObservations(_Groups):
     crossing_edge: np.ndarray = rows(of="crossing", each="")
     crossing_pitch: np.ndarray = rows(of="crossing")
     crossing_across: np.ndarray = rows(of="crossing", each=False)
-    crossing_half_step: np.ndarray = rows(3, of="crossing")
-    crossing_noise: np.ndarray = rows(3, 3, of="crossing")
     crossing_radius: np.ndarray = rows(of="crossing", each=0.005)
     crossing_background: np.ndarray = rows(of="crossing")
     plane_points: np.ndarray = rows(3, of="plane")

@@ -26,6 +26,8 @@ class ProblemKind(Enum):
     NO_OUTLINE = auto()  # the images do not show where the board ends
     SMALL_SQUARES = auto()  # of the pattern, in images of a camera
     NO_RESULT = auto()  # by a method
+    TOO_LITTLE = auto()  # neither images nor edges enough for the pose of a board
+    CONTRADICTS = auto()  # placement or image: all others, in the joint estimate
 
 
 LEAVES_OUT = {ProblemKind.NO_BOARD, ProblemKind.OTHER_PLANE}  # the whole placement

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
-from lrfcal_lib.model.geometry import AHEAD, polar_to_points, tilt
+from lrfcal_lib.model.geometry import AHEAD, polar_to_points, pose_array, tilt
 
 # corners of a pattern that fills the triangle, metres, where the board has none
 PLACES = [(i, j, 0) for i in range(5) for j in range(6) if i + j < 7]
@@ -100,24 +100,30 @@ def bench(rng, cameras=("left", "right"), **settings):
     return Bench(head, poses, **settings)
 
 
-def board_poses(rng, count, distances=(1.0, 2.5)):
-    """Poses ``T_platform_board`` of boards ahead of the rig, facing it, turned in their plane."""
-    limits = np.array(
-        [
-            (0.0, 2 * np.pi),  # turn in the plane, radians
-            (-0.6, 0.6),  # lean about x and y, radians
-            (-0.6, 0.6),
-            (-0.35, 0.35),  # to the right and up, of the distance
-            (-0.1, 0.1),
-            distances,
-        ]
-    )
-    poses = []
-    for spin, *lean, right, up, away in rng.uniform(*limits.T, (count, 6)):
-        face = _facing(spin, lean)
-        centre = np.array([right, 1.0, up]) * away
-        poses.append(RigidTransform.from_components(centre - face.apply([0.105, 0.127, 0.0]), face))
-    return poses
+def board_poses(
+    rng: np.random.Generator, count: int, distances: tuple[float, float] = (1.0, 2.5)
+) -> list[RigidTransform]:
+    """Poses ``T_platform_board`` of boards ahead of the rig, facing it, turned in their plane.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    count : int
+    distances : tuple of float
+        Least and largest, metres.
+    """
+    limits = [
+        (0.0, 2 * np.pi),  # turn in the plane, radians
+        (-0.6, 0.6),  # lean about x and y, radians
+        (-0.6, 0.6),
+        (-0.35, 0.35),  # to the right and up, of the distance
+        (-0.1, 0.1),
+        distances,
+    ]
+    drawn = rng.uniform(*np.transpose(limits), (count, len(limits)))
+    right, up, away = drawn[:, 3:].T
+    centre = np.column_stack([right * away, away, up * away])
+    return list(_posed(drawn[:, 0], drawn[:, 1:3], centre, [0.105, 0.127, 0.0]))
 
 
 def observe(bench, poses, rng, *, images=3, span=None, noise=1.0):
@@ -268,8 +274,20 @@ def _views(bench, pose, at, rng, noise):
     return {"camera": camera, "pitch": pitch, "pose": pose, "covariance": covariance}
 
 
-def draw_shots(setup, rng, trials, placements=20):
+def draw_shots(
+    setup: ShotSetup, rng: np.random.Generator, trials: int, placements: int = 20
+) -> dict[str, np.ndarray]:
     """Draw calibration sessions of single shots: one scan line and one image a placement.
+
+    A beam reads the board while its ray passes an edge line at less than `bias` radii outside, give
+    or take the softness. Placements whose crossings come near a corner are drawn anew.
+
+    Parameters
+    ----------
+    setup : ShotSetup
+    rng : numpy.random.Generator
+    trials, placements : int
+        Sessions t, and shots p of each.
 
     Returns
     -------
@@ -283,83 +301,57 @@ def draw_shots(setup, rng, trials, placements=20):
     ------
     ValueError
         If hardly any board is crossed on two edges and seen by the camera.
-
-    Notes
-    -----
-    A beam reads the board while its ray passes an edge line at less than `bias` radii outside, give
-    or take the softness. Placements whose crossings come near a corner are drawn anew.
     """
-    turn = Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3)))
-    rotation = turn.as_matrix() @ AHEAD.as_matrix()
+    rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3))) * AHEAD
     centre = np.array([0.12, 0.03, 0.12]) + rng.normal(0, 0.01, (trials, 3))
-    rig = np.concatenate([rotation, -rotation @ centre[..., None]], axis=-1)
+    T_camera_lrf = RigidTransform.from_components(-rotation.apply(centre), rotation)
     parts = []
     missing = np.full(trials, placements)
     for _ in range(MOST_ROUNDS):
-        who = np.repeat(np.arange(trials), 2 * missing)
-        good, found = _candidates(setup, rng, rig[who])
-        before = np.cumsum(good) - good
-        rank = before - before[np.searchsorted(who, who)]  # among the good ones of its trial
-        keep = good & (rank < missing[who])
-        found["who"] = who
-        parts.append({name: value[keep] for name, value in found.items()})
-        missing = missing - np.bincount(who[keep], minlength=trials)
         if not missing.any():
             break
-    else:
+        trial = np.repeat(np.arange(trials), 2 * missing)
+        usable, shots = _shots(setup, rng, T_camera_lrf[trial])
+        parts.append({name: value[usable] for name, value in shots.items()})
+        parts[-1]["trial"] = trial[usable]
+        missing = np.maximum(missing - np.bincount(trial[usable], minlength=trials), 0)
+    if missing.any():
         raise ValueError(
             f"boards at {setup.distances} m are hardly ever crossed on two edges and seen by "
             "the camera"
         )
-    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    order = np.argsort(whole.pop("who"), kind="stable")
-    shaped = {
-        name: value[order].reshape((trials, placements) + value.shape[1:])
-        for name, value in whole.items()
-    }
-    return {"T_camera_lrf": rig} | shaped
+
+    drawn = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    trial = drawn.pop("trial")
+    order = np.argsort(trial, kind="stable")
+    first = np.searchsorted(trial[order], np.arange(trials))
+    kept = order[first[:, None] + np.arange(placements)]
+    shots = {name: value[kept] for name, value in drawn.items()}
+    return {"T_camera_lrf": pose_array(T_camera_lrf)} | shots
 
 
-def _candidates(setup, rng, rig):
-    """Which shots, one for each rig of a stack, are good, and the shots."""
-    count = len(rig)
+def _shots(setup, rng, T_camera_lrf):
+    """Which shots, one for each of some rigs, can be used, and the shots."""
     board = setup.board
-    model = setup.model
-    bearings = setup.bearings()
-    turn, shift = _boards_ahead(setup, rng, count)
-    rays = polar_to_points(np.ones(len(bearings)), bearings) @ turn
-    u, ranges = _beside(board, -(shift[:, None] @ turn), rays)
-    radius = setup.radius(ranges)
-    own = 0.0
-    if setup.spread:
-        own = setup.spread * rng.standard_normal((count, 1, u.shape[-1]))
-    soft = (setup.bias + setup.softness * rng.standard_normal(ranges.shape)) * radius
-    hit = (u - own * radius[..., None]).max(axis=-1) < soft
-    hit &= ranges > 0
-    last = hit.shape[1] - 1
-    first_hit = hit.argmax(axis=1)
-    last_hit = last - hit[:, ::-1].argmax(axis=1)
-    ends = np.stack([first_hit, last_hit], axis=1)
-    across = np.take_along_axis(u / radius[..., None], ends[..., None], axis=1)
-    edges = across.argmax(axis=-1)
-    second = np.sort(across, axis=-1)[..., -2]
-    good = hit.sum(axis=1) >= FEWEST_BEAMS
-    good &= (first_hit > 0) & (last_hit < last)
-    good &= (edges[:, 0] != edges[:, 1]) & (second < -CLEAR).all(axis=1)
-    R, t = np.split(rig, [3], axis=-1)
-    pose = np.concatenate([R @ turn, R @ shift[..., None] + t], axis=-1)
-    corners = board.corners @ np.swapaxes(pose[..., :2], 1, 2)
-    corners = corners + pose[:, None, :, 3]
-    uv = pinhole(corners, model)
-    inside = (uv > 0) & (uv < [model.width, model.height])
-    good &= inside.all(axis=(1, 2)) & (corners[..., 2] > 0).all(axis=1)
-    boards, covariance = _seen_poses(setup, pose, rng, 1.0)
+    T_lrf_board = _boards_ahead(setup, rng, len(T_camera_lrf))
+    ranges, hit, ends, usable = _ends_of_scan_lines(setup, rng, T_lrf_board)
+    edges = ends.argmax(axis=-1)
+    second = np.sort(ends, axis=-1)[..., -2]
+    usable &= (edges[:, 0] != edges[:, 1]) & (second < -CLEAR).all(axis=1)
+
+    true = pose_array(T_camera_lrf * T_lrf_board)
+    corners = board.corners @ np.swapaxes(true[..., :2], 1, 2) + true[:, None, :, 3]
+    uv = pinhole(corners, setup.model)
+    inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
+    usable &= inside.all(axis=(1, 2)) & (corners[..., 2] > 0).all(axis=1)
+
+    boards, covariance = _seen_poses(setup, true, rng, 1.0)
     noisy = ranges + setup.sigma_range * rng.standard_normal(ranges.shape)
-    homography = model.matrix @ pose[..., [0, 1, 3]]  # from the board's plane to pixels
+    homography = setup.model.matrix @ true[..., [0, 1, 3]]  # from the board's plane to pixels
     lines = board.lines()[edges] @ np.linalg.inv(homography)  # normals out of the board
     lines /= np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
     lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
-    return good, {
+    return usable, {
         "ranges": np.where(hit, noisy, np.nan),
         "lines": lines,
         "edges": edges,
@@ -368,23 +360,48 @@ def _candidates(setup, rng, rig):
     }
 
 
+def _ends_of_scan_lines(setup, rng, T_lrf_board):
+    """Of one scan line over each board: exact ranges (n, B), which beams hit, distances (n, 2, E)
+    in spot radii of the first and the last of these from the edges, and whether there are enough.
+    """
+    bearings = setup.bearings()
+    R = T_lrf_board.rotation.as_matrix()
+    rays = polar_to_points(np.ones(len(bearings)), bearings) @ R
+    origin = -T_lrf_board.translation[:, None] @ R
+    distances, ranges = _beside(setup.board, origin, rays)
+    radii = distances / setup.radius(ranges)[..., None]
+    of_edges = 0.0
+    if setup.spread:
+        of_edges = setup.spread * rng.standard_normal((len(R), 1, radii.shape[-1]))
+    flips = setup.bias + setup.softness * rng.standard_normal(ranges.shape)
+    hit = ((radii - of_edges).max(axis=-1) < flips) & (ranges > 0)
+    last = len(bearings) - 1
+    first_hit = hit.argmax(axis=1)
+    last_hit = last - hit[:, ::-1].argmax(axis=1)
+    ends = np.stack([first_hit, last_hit], axis=1)
+    enough = (hit.sum(axis=1) >= FEWEST_BEAMS) & (first_hit > 0) & (last_hit < last)
+    return ranges, hit, np.take_along_axis(radii, ends[..., None], axis=1), enough
+
+
 def _boards_ahead(setup, rng, count):
-    """Rotations (n, 3, 3) and origins (n, 3) of boards in the LRF frame that face it."""
-    spin = rng.uniform(0, 2 * np.pi, (count, 1))[:, 0]
-    turn = _facing(spin, rng.uniform(-0.6, 0.6, (count, 2))).as_matrix()
+    """Poses ``T_lrf_board`` of boards that face the LRF."""
+    spin = rng.uniform(0, 2 * np.pi, count)
+    lean = rng.uniform(-0.6, 0.6, (count, 2))
     away = rng.uniform(*setup.distances, count)
     right = rng.uniform(-0.35, 0.35, count) * away
     up = rng.uniform(-0.12, 0.12, count)
-    centre = np.column_stack([right, away, up])
-    return turn, centre - turn @ np.append(setup.board.corners.mean(axis=0), 0.0)
+    middle = np.append(setup.board.corners.mean(axis=0), 0.0)
+    return _posed(spin, lean, np.column_stack([right, away, up]), middle)
 
 
-def _facing(spin, lean):
-    """Rotation of boards that face the LRF, leant about x and y, then turned in their plane."""
-    lean = np.asarray(lean)
-    leant = np.concatenate([lean, np.zeros(lean.shape[:-1] + (1,))], axis=-1)
-    turned = np.asarray(spin)[..., None] * np.array([0, 0, 1.0])
-    return AHEAD * Rotation.from_rotvec(leant) * Rotation.from_rotvec(turned)
+def _posed(spin, lean, centre, middle):
+    """Poses of boards with their middle (board frame) at a centre (n, 3), which face the LRF but
+    for a lean (n, 2) about x and y, and are turned in their plane by a spin (n,).
+    """
+    leant = np.column_stack([lean, np.zeros(len(lean))])
+    turned = np.outer(spin, [0.0, 0.0, 1.0])
+    facing = AHEAD * Rotation.from_rotvec(leant) * Rotation.from_rotvec(turned)
+    return RigidTransform.from_components(centre - facing.apply(middle), facing)
 
 
 def _beside(board, origin, rays):

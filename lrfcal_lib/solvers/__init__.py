@@ -65,9 +65,6 @@ METHODS = {
         along=True,
     ),
     "line": Method("half_step", "crossing", 6, "lines, half step", line_block),
-    "line_ml": Method(
-        "half_step", "crossing", 7, "lines, likelihood", lines.interval_block, lines.estimate_likely
-    ),
     "zhang_pless_printed": Method(
         "half_step",
         "plane",

@@ -1,6 +1,9 @@
-"""What the joint estimate moves about: its state, its unknowns, its observations side by side."""
+"""The joint model: what moves, what of it is unknown, and the observations it is compared with.
 
-from dataclasses import MISSING, dataclass, fields, replace
+Poses of equations (4) to (6) and (16); residuals are in :mod:`lrfcal_lib.solvers.joint_residuals`.
+"""
+
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,10 +13,12 @@ from lrfcal_lib.fit.least_squares import pad
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import move_pose
+from lrfcal_lib.model.observations import JointObservations
 
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "pitch_by_direction")
 SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
 LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the odds
+SOFTEST = np.log([1e-3, 10.0])  # spot radii, limits of the softness
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,12 @@ class JointState:
     sweeps: np.ndarray
     sides: np.ndarray
 
+    def of_placements(self, rows) -> "JointState":
+        """The state of some placements (indices, or a mask)."""
+        return replace(
+            self, boards=self.boards[rows], sweeps=self.sweeps[rows], sides=self.sides[rows]
+        )
+
 
 @dataclass(frozen=True)
 class Unknowns:
@@ -54,61 +65,101 @@ class Unknowns:
     cameras: int
     edges: int
     axis: bool = True
-    sensor: tuple = ("range_offset", "edge_log_odds", "edge_log_softness")
+    sensor: tuple[str, ...] = SENSOR[:3]
     sweep: str = "none"
     poses: bool = True
     sides: bool = False
 
     @property
-    def mask(self):
+    def mask(self) -> np.ndarray:
         """Of the full set of shared columns, those that are unknown."""
         sensor = [name in self.sensor for name in SENSOR]
         return np.array([self.axis] * 4 + [self.poses] * 6 * self.cameras + sensor)
 
     @cached_property
-    def columns(self):
+    def columns(self) -> dict[str, slice]:
         """Where the unknowns stand in a Jacobian: first the shared ones, then the placement's
         own.
         """
         widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras * self.poses}
         widths |= {name: int(name in self.sensor) for name in SENSOR}
         widths |= {"board": 6, "sweep": SWEEPS[self.sweep], "sides": self.edges * self.sides}
-        ends = np.cumsum(list(widths.values())).tolist()
-        return {
-            name: slice(end - width, end)
-            for (name, width), end in zip(widths.items(), ends, strict=True)
-        }
+        columns = {}
+        end = 0
+        for name, width in widths.items():
+            columns[name] = slice(end, end + width)
+            end += width
+        return columns
 
     @property
-    def shared(self):
+    def shared(self) -> int:
         """Number of unknowns common to all placements."""
         return self.columns["board"].start
 
     @property
-    def own(self):
+    def own(self) -> int:
         """Number of unknowns of one placement."""
         return self.columns["sides"].stop - self.shared
 
-    def names(self, cameras):
-        """Names of the shared unknowns."""
-        every = [*AXIS_NAMES, *(f"{c}_{n}" for c in cameras for n in geometry.POSE_NAMES), *SENSOR]
-        return tuple(np.array(every)[self.mask].tolist())
+    def names(self, cameras) -> tuple[str, ...]:
+        """Names of the shared unknowns, of cameras with these names."""
+        poses = [f"{camera}_{name}" for camera in cameras for name in geometry.POSE_NAMES]
+        every = np.array([*AXIS_NAMES, *poses, *SENSOR])
+        return tuple(every[self.mask].tolist())
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Noise levels and what is expected.
+
+    Attributes
+    ----------
+    face_scale : float
+        Factor on the stated standard deviations of ranges.
+    view_scale : float
+        The same of all cameras' board poses.
+    sigma_pitch : float
+        Standard deviation of the recorded pitch at a stop, radians: what a head at rest is off by
+        (see :mod:`lrfcal_lib.fit.stops`).
+    face_share, beam_share : float
+        Share of independent errors per observation, below one where neighbours repeat each other's.
+    lapse : float
+        Share of beams that say nothing, see :func:`lrfcal_lib.fit.edge_likelihood.beam_terms`.
+    sweep_sigma : tuple of float
+        Of the sweeps' own offset (radians) and stretch.
+    side_sigma : float
+        Scale of the sides' deviations of the log odds, Student's t.
+    prior : PlatformPrior or None
+        The stated platform, which yields where the data contradict it.
+    """
+
+    face_scale: float = 1.0
+    view_scale: float = 1.0
+    sigma_pitch: float = 0.0
+    face_share: float = 1.0
+    beam_share: float = 1.0
+    lapse: float = 0.0
+    sweep_sigma: tuple[float, float] = (np.radians(0.5), 0.05)
+    side_sigma: float = 0.35
+    prior: PlatformPrior | None = None
 
 
 @dataclass(frozen=True)
 class JointData:
     """Observations padded by placement: arrays (p, n, ...), `used` marks what is no padding.
 
-    `face`, `beam` and `view` hold the fields of that group of JointObservations, with ``ray`` (LRF
-    frame) or, for views, ``whitener`` (p, v, 6, 6); `lines` (e, 3) are the board's, `middle` and
-    `direction` (p,) the sweeps'. Then come factors on the stated standard deviations of ranges and
-    of each camera's views, the standard deviation of the recorded pitch at a stop (what a head at
-    rest is off by, radians; see :mod:`lrfcal_lib.fit.stops`), shares of independent errors per
-    observation (below one where neighbours repeat each other's errors), `lapse` (see
-    :func:`beam_terms`), what is expected of the sweeps' own offset (radians) and stretch, the scale
-    of the sides' deviations of the log odds (Student's t with `SIDE_FREEDOM` degrees of freedom:
-    most backgrounds are alike, some are dark), and the stated platform, which yields where the data
-    contradict it.
+    Attributes
+    ----------
+    face, beam, view : dict of str to ndarray
+        Fields of that group of JointObservations, with ``ray`` (LRF frame) or, for views,
+        ``whitener`` (p, v, 6, 6).
+    lines : ndarray, shape (e, 3)
+        Sides of the board.
+    middle, direction : ndarray, shape (p,)
+        Of the sweeps.
+    on_head : ndarray of bool, shape (c,)
+        Whether cameras are fixed to the head.
+    levels : Levels
     """
 
     face: dict
@@ -118,59 +169,43 @@ class JointData:
     middle: np.ndarray
     direction: np.ndarray
     on_head: np.ndarray
-    face_scale: float = 1.0
-    view_scale: np.ndarray | None = None
-    sigma_pitch: float = 0.0
-    face_share: float = 1.0
-    beam_share: float = 1.0
-    lapse: float = 0.0
-    sweep_sigma: tuple = (np.radians(0.5), 0.05)
-    side_sigma: float = 0.35
-    prior: PlatformPrior | None = None
-
-    @property
-    def levels(self):
-        """Noise levels and prior: all that has a default."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.default is not MISSING}
+    levels: Levels
 
 
-def gather(obs, **levels):
-    """JointObservations as padded arrays, a JointData, with noise levels other than those
-    stated.
-    """
+def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
+    """Observations as padded arrays, with noise levels other than those stated."""
     count = len(obs.placements)
-    face, beam, view = (pad(obs.group(name), count) for name in ("face", "beam", "view"))
+    face = pad(obs.group("face"), count)
+    beam = pad(obs.group("beam"), count)
     for group in (face, beam):
         group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
-    view["covariance"] = np.where(view["used"][..., None, None], view["covariance"], np.eye(6))
-    view["whitener"] = (
-        np.linalg.inv(np.linalg.cholesky(view["covariance"])) * view["used"][..., None, None]
-    )
-    view["pose"] = np.where(view["used"][..., None, None], view["pose"], np.eye(4))
-    on_head = np.array([m == "head" for m in obs.mounts], bool)
-    levels = {"view_scale": np.ones(len(obs.cameras))} | levels
-    return JointData(face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, **levels)
+    view = pad(obs.group("view"), count)
+    padding = ~view["used"][..., None, None]
+    covariance = np.where(padding, np.eye(6), view["covariance"])
+    view["whitener"] = np.where(padding, 0.0, np.linalg.inv(np.linalg.cholesky(covariance)))
+    view["pose"] = np.where(padding, np.eye(4), view["pose"])
+    on_head = np.array([mount == "head" for mount in obs.mounts], bool)
+    return JointData(face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, levels)
 
 
-def move_state(state, step, unknowns):
+def move_state(state: JointState, step: tuple, unknowns: Unknowns) -> JointState:
     """Retraction of the joint estimate: shared increments (c,) and those of each placement (p,
     l).
     """
     full = np.zeros(len(unknowns.mask))
     full[unknowns.mask] = step[0]
-    c = len(state.cameras)
-    sensor = state.sensor + full[4 + 6 * c :]
+    axis, cameras, sensor = np.split(full, [4, len(full) - len(SENSOR)])
+    boards, sweep, sides = np.split(step[1], [6, 6 + SWEEPS[unknowns.sweep]], axis=1)
+    sensor = state.sensor + sensor
     sensor[1] = np.clip(sensor[1], -LARGEST_ODDS, LARGEST_ODDS)
-    sensor[2] = np.clip(sensor[2], np.log(1e-3), np.log(10.0))
-    count = SWEEPS[unknowns.sweep]
+    sensor[2] = np.clip(sensor[2], *SOFTEST)
     sweeps = state.sweeps.copy()
-    sweeps[:, :count] += step[1][:, 6 : 6 + count]
-    return replace(
-        state,
-        head=move_head(state.head, full[:4]),
-        cameras=move_pose(state.cameras, full[4 : 4 + 6 * c].reshape(c, 6)) if c else state.cameras,
+    sweeps[:, : sweep.shape[1]] += sweep
+    return JointState(
+        head=move_head(state.head, axis),
+        cameras=move_pose(state.cameras, cameras.reshape(-1, 6)),
         sensor=sensor,
-        boards=move_pose(state.boards, step[1][:, :6]),
+        boards=move_pose(state.boards, boards),
         sweeps=sweeps,
-        sides=state.sides + step[1][:, 6 + count :] if unknowns.sides else state.sides,
+        sides=state.sides + sides if unknowns.sides else state.sides,
     )

@@ -1,213 +1,38 @@
 """Errors of the recorded pitch, found from the boards that cameras on the base see."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtrc
 
-from lrfcal_lib.fit.least_squares import Block, pad, solve
+from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.residuals import sight_normals
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
+    POSE_NAMES,
     DegenerateGeometry,
+    cross,
+    fit_plane,
     gradient_by_pose,
+    move_pose,
     pose_array,
-    pose_transform,
+    pose_parameters,
+    tilt,
 )
+from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.planes import start_from_planes
 
-# of the pitch: the first is shared, the others each sweep's own
-ERRORS = ("direction", "offset", "stretch")
-MODELS = {
-    "none": (),
-    "direction": ("direction",),
-    "sweep": ("offset",),
-    "sweep_stretch": ("offset", "stretch"),
-}
 # independent numbers: a plane's distance and two angles; an edge's offset and angle
 PLANE_NUMBERS = 3
 EDGE_NUMBERS = 2
-# offset, stretch: hold what one sweep cannot show (and the common offset)
-PRIOR = np.array([np.radians(5.0), 0.5])
-SIGMA = 0.003  # metres, of one independent number; the level of the noise comes from the residuals
+POSE_NUMBERS = 6
+FEWEST = 4  # placements, to compare sweeps
+# offset (radians) and stretch: hold what one sweep cannot show, and the common offset
+PRIOR = (np.radians(5.0), 0.5)
+# metres, of one independent number: weighs the data against `PRIOR`; their level comes from the
+# residuals
+SIGMA = 0.003
 LEVEL = 0.01  # a larger model must beat the last one wanted with this p-value
-
-
-@dataclass(frozen=True)
-class PitchData:
-    """All observations by placement, padded to (p, n).
-
-    `faces` holds ``points`` (platform frame, at the recorded pitch), ``pitch``, ``used``, and
-    ``weight``: root of a point's share in the mean square of its placement's face, or of its edge.
-    `edges` the same of each camera's crossings, and ``sight``, unit normals of the planes of sight.
-    `boards` (c, p, 3, 4) are ``T_camera_board``.
-    """
-
-    placements: np.ndarray
-    direction: np.ndarray
-    middle: np.ndarray
-    faces: dict
-    edges: list
-    boards: np.ndarray
-    cameras: tuple
-
-    @property
-    def n_numbers(self):
-        """Independent numbers in the data; errors of the LRF are common to all cameras: once."""
-        edges = max(np.round(np.sum(e["weight"] ** 2)) for e in self.edges)
-        return int(PLANE_NUMBERS * len(self.placements) + EDGE_NUMBERS * edges)
-
-
-def gather(cameras, direction, middle):
-    """Observations of the placements that all cameras know; the faces are those of the first."""
-    every = list(cameras.values())
-    for name, obs in cameras.items():
-        if obs.source != "platform":
-            raise ValueError(
-                f"camera '{name}' has source '{obs.source}': pitch errors need cameras fixed to "
-                "the platform"
-            )
-    placements = every[0].plane_placement
-    for obs in every:
-        placements = np.intersect1d(placements, obs.placements)
-    if len(placements) < 4:
-        raise DegenerateGeometry(
-            f"{len(placements)} placements seen by the LRF and all cameras: at least 4 needed to "
-            "compare sweeps"
-        )
-    edges = []
-    boards = []
-    for obs in every:
-        group = obs.group("crossing")
-        group["sight"] = sight_normals(obs.crossing_lines, obs.model)[0]
-        edges.append(_shared_out(group, ("placement", "edge"), placements))
-        order = np.argsort(obs.placements)
-        rows = order[np.searchsorted(obs.placements, placements, sorter=order)]
-        boards.append(obs.board_poses[rows, :3])
-    direction = np.array([direction[p] for p in placements.tolist()])
-    middle = np.array([middle[p] for p in placements.tolist()])
-    faces = _shared_out(every[0].group("plane"), ("placement",), placements)
-    return PitchData(placements, direction, middle, faces, edges, np.array(boards), tuple(cameras))
-
-
-def _shared_out(group, part, placements):
-    """A group padded by placement; the rows of a part (alike in these columns) weigh 1 together."""
-    kept = np.isin(group["placement"], placements)
-    number = np.zeros(kept.sum(), int)
-    for key in part:
-        names, value = np.unique(group[key][kept], return_inverse=True)
-        number = number * len(names) + value
-    _, index, count = np.unique(number, return_inverse=True, return_counts=True)
-    columns = {key: group[key][kept] for key in ("points", "pitch", "sight") if key in group}
-    columns["placement"] = np.searchsorted(placements, group["placement"][kept])
-    columns["weight"] = 1 / np.sqrt(count[index])
-    return pad(columns, len(placements))
-
-
-def corrected_points(group, data, state):
-    """Platform points with the recorded pitch corrected, and their derivative by the pitch."""
-    _, direction, offset, stretch = state
-    away = group["pitch"] - data.middle[:, None]
-    common = direction * data.direction + offset
-    change = common[:, None] + stretch[:, None] * away
-    q = geometry.tilt(group["points"], change)
-    return q, np.stack([0 * change, -q[..., 2], q[..., 1]], axis=-1)
-
-
-def plane_distances(state, data):
-    """Distances (p, n) of face points from boards' planes and of crossings from their sights.
-
-    Yields for each camera twice: group, distances, and Jacobian by the poses of all cameras 6 c and
-    by `ERRORS` 3.
-    """
-    for i, board in enumerate(data.boards):
-        normal = np.broadcast_to(board[:, None, :, 2], data.faces["points"].shape)
-        yield _camera_distances(state, data, i, data.faces, normal, board[:, None, :, 3])
-        yield _camera_distances(state, data, i, data.edges[i], data.edges[i]["sight"], 0.0)
-
-
-def _camera_distances(state, data, camera, group, normal, point):
-    """One yield of :func:`plane_distances`: distances from planes through points of a camera."""
-    poses = state[0]
-    pose = poses[camera]
-    q, by_pitch = corrected_points(group, data, state)
-    rotated = q @ pose[:, :3].T
-    r = np.sum(normal * (rotated + pose[:, 3] - point), axis=-1)
-    slope = np.sum((normal @ pose[:, :3]) * by_pitch, axis=-1)
-    away = group["pitch"] - data.middle[:, None]
-    J = np.zeros(r.shape + (6 * len(poses) + len(ERRORS),))
-    J[..., 6 * camera : 6 * camera + 6] = gradient_by_pose(rotated, normal)
-    J[..., -3] = slope * data.direction[:, None]
-    J[..., -2] = slope
-    J[..., -1] = slope * away
-    return group, r, J
-
-
-def pitch_blocks(state, data, name):
-    """Residuals in metres by placement with analytic Jacobian, and weak priors, of a model.
-
-    The state are camera poses (c, 3, 4), offset by direction, offsets (p,), stretches (p,).
-    Unknowns are 6 of each camera and the model's; what belongs to single sweeps is their own.
-    """
-    cameras = len(state[0])
-    columns = [*range(6 * cameras), *(6 * cameras + ERRORS.index(error) for error in MODELS[name])]
-    sigma = SIGMA * np.sqrt(cameras)
-    blocks = []
-    for group, r, J in plane_distances(state, data):
-        blocks.append(Block(r, J[..., columns], group["weight"] / sigma))
-    own = sum(error != "direction" for error in MODELS[name])
-    if own:
-        values = np.stack(state[2:], axis=1)[:, :own]
-        k = len(columns)
-        J = np.broadcast_to(np.eye(k)[k - own :], values.shape + (k,))
-        blocks.append(Block(values, J, np.broadcast_to(1 / PRIOR[:own], values.shape)))
-    return blocks
-
-
-def move_pitch_state(state, step, name):
-    """Retraction of the pitch models."""
-    poses, direction, offset, stretch = state
-    common, own = step
-    by_pose, direction_step = np.split(common, [6 * len(poses)])
-    steps = dict(zip(MODELS[name], [*direction_step, *own.T], strict=True))
-    return (
-        geometry.move_pose(poses, by_pose.reshape(-1, 6)),
-        direction + steps.get("direction", 0.0),
-        offset + steps.get("offset", 0.0),
-        stretch + steps.get("stretch", 0.0),
-    )
-
-
-def misfit(data, state):
-    """What the models are compared by (m^2), and rms distances of face points by camera, metres.
-
-    Sum over the placements of the mean square distance of the fitted scan plane from the camera's
-    plane, and over their edges of the mean square distance of the crossings from the planes of
-    sight; mean over the cameras.
-    """
-    q, _ = corrected_points(data.faces, data, state)
-    used = data.faces["used"]
-    count = used.sum(axis=1)
-    within = used[..., None]
-    middle = np.sum(q * within, axis=1, keepdims=True) / count[:, None, None]
-    away = (q - middle) * within
-    flat = np.linalg.svd(away, full_matrices=False)[2][:, 2]
-    # what the scan scatters about its own plane tells nothing of the pitch
-    scatter = np.sum(flat[:, None] * away, axis=-1)
-    total = 0.0
-    rms = {}
-    distances = plane_distances(state, data)
-    for name, pose, board in zip(data.cameras, state[0], data.boards, strict=True):
-        _, r, _ = next(distances)
-        edges, d, _ = next(distances)
-        r = r * used
-        rms[name] = float(np.sqrt(np.sum(r**2) / used.sum()))
-        side = np.sign(np.sum((board[..., 2] @ pose[:, :3]) * flat, axis=1))
-        without_scatter = (r - scatter * side[:, None]) * used
-        total += np.sum(np.sum(without_scatter**2, axis=1) / count)
-        total += np.sum((d * edges["weight"]) ** 2)
-    return float(total) / len(state[0]), rms
 
 
 @dataclass(frozen=True)
@@ -221,11 +46,16 @@ class PitchModel:
         offset each), or 'sweep_stretch' (an offset and a stretch about the middle each).
     offset, offset_sigma, stretch : ndarray, shape (p,)
         Radians to *add* to the recorded pitch of each placement, and relative: the corrected pitch
-        is ``pitch + offset + stretch (pitch - middle)``.
-    transforms : dict of str to RigidTransform
-        ``T_camera_platform``.
-    misfit, rms
-        Of :func:`misfit`.
+        is ``pitch + offset + stretch (pitch - middle)``. Offsets of single sweeps are those from
+        their mean.
+    misfit : float
+        What the models are compared by, in units of `SIGMA`: sum over the placements of the mean
+        square distance of the fitted scan plane from the camera's plane, and over their edges of
+        the mean square distance of the crossings from the planes of sight; mean over the cameras.
+    plane_rms : float
+        Root mean square distance of scan planes from the cameras' planes, metres.
+    n_parameters : int
+    converged : bool
     F, p_value : float
         Test against the model before (nan for the first): would the misfit fall so much by chance?
     """
@@ -234,9 +64,8 @@ class PitchModel:
     offset: np.ndarray
     offset_sigma: np.ndarray
     stretch: np.ndarray
-    transforms: dict[str, RigidTransform]
     misfit: float
-    rms: dict[str, float]
+    plane_rms: float
     n_parameters: int
     converged: bool
     F: float = np.nan
@@ -244,10 +73,10 @@ class PitchModel:
 
     def tested(self, small, numbers):
         """The model with F and p-value against a smaller one, of so many independent numbers."""
-        if small is None or self.n_parameters <= small.n_parameters or numbers <= self.n_parameters:
-            return self
         more = self.n_parameters - small.n_parameters
         free = numbers - self.n_parameters
+        if more <= 0 or free <= 0:
+            return self
         F = (small.misfit - self.misfit) / more / (self.misfit / free)
         return replace(self, F=float(F), p_value=float(fdtrc(more, free, max(F, 0.0))))
 
@@ -278,7 +107,26 @@ class PitchErrors:
     wanted: str
 
 
-def estimate_pitch_errors(cameras, direction, middle):
+class _Rows(NamedTuple):
+    """Points (n, 3) at their recorded pitch (platform frame), and the planes of a camera that they
+    should lie in: faces in those of boards, crossings in planes of sight.
+    """
+
+    points: np.ndarray
+    scatter: np.ndarray  # (n, 3), from the plane that fits the points of a face best
+    normal: np.ndarray  # (n, 3), camera frame
+    distance: np.ndarray  # of the plane from the camera, metres
+    pitch: np.ndarray
+    placement: np.ndarray  # index
+    camera: np.ndarray  # index
+    # root of a point's share in the mean square of its face, or of its edge
+    weight: np.ndarray
+    on_face: np.ndarray
+
+
+def estimate_pitch_errors(
+    cameras: dict[str, CameraObservations], direction: dict[int, int], middle: dict[int, float]
+) -> PitchErrors:
     """Estimate errors of the recorded pitch together with the cameras' poses, in nested models.
 
     Parameters
@@ -302,80 +150,198 @@ def estimate_pitch_errors(cameras, direction, middle):
     ValueError
         When a camera is not fixed to the platform.
     """
-    data = gather(cameras, direction, middle)
+    placements = _common_placements(cameras)
+    turn = np.array([direction[p] for p in placements.tolist()])
+    rows = gather(list(cameras.values()), placements)
+    each = np.eye(len(placements))[rows.placement]
+    away = rows.pitch - np.array([middle[p] for p in placements.tolist()])[rows.placement]
+    # columns: by how much the unknowns of a model change the pitch of each row
+    columns = {"none": each[:, :0]}
+    if {-1, 1} <= set(turn.tolist()):
+        columns["direction"] = turn[rows.placement, None]
+    columns["sweep"] = each
+    columns["sweep_stretch"] = np.concatenate([each, each * away[:, None]], axis=1)
+
+    poses = np.array([pose_array(start_from_planes(obs))[0] for obs in cameras.values()])
+    numbers = _count_numbers(rows, len(poses), len(placements))
     models = {}
-    turn = (np.nan, np.nan)
-    before = None
-    wanted = None
-    poses = [pose_array(start_from_planes(obs))[0] for obs in cameras.values()]
-    zeros = 0.0 * data.middle
-    state = (np.array(poses), 0.0, zeros, zeros)
-    numbers = data.n_numbers
-    for name in MODELS:
-        if name == "direction" and not {-1, 1} <= set(data.direction.tolist()):
-            continue
-        if name.startswith("sweep"):
-            state = (state[0], 0.0, state[2] + state[1] * data.direction, state[3])
-        state, sigma, model = _solve_model(name, data, state)
+    by_direction = (np.nan, np.nan)
+    wanted = before = None
+    for name, by_unknown in columns.items():
+        solution = _solve(name, rows, by_unknown, poses)
+        model = _model(name, solution, rows, turn, numbers)
         if name == "direction":
-            turn = float(state[1]), sigma
-        model = model.tested(before, numbers)
+            by_direction = (float(solution.parameters[-1]), float(model.offset_sigma[0]))
+        if before is not None:
+            model = model.tested(before, numbers)
         if wanted is None or model.tested(wanted, numbers).p_value < LEVEL:
             wanted = model
-        models[name] = model
-        before = model
-    return PitchErrors(data.placements, data.direction, *turn, models, wanted.name)
+        models[name] = before = model
+    return PitchErrors(placements, turn, *by_direction, models, wanted.name)
 
 
-def _solve_model(name, data, state):
-    """Solve one model: state, standard deviation of the last shared unknown, PitchModel.
+def _common_placements(cameras):
+    """Numbers of the placements that the LRF and all cameras see."""
+    placements = next(iter(cameras.values())).plane_placement
+    for name, obs in cameras.items():
+        if obs.source != "platform":
+            raise ValueError(
+                f"camera '{name}' has source '{obs.source}': pitch errors need cameras fixed to "
+                "the platform"
+            )
+        placements = np.intersect1d(placements, obs.placements)
+    if len(placements) < FEWEST:
+        raise DegenerateGeometry(
+            f"{len(placements)} placements seen by the LRF and all cameras: at least {FEWEST} "
+            "needed to compare sweeps"
+        )
+    return placements
+
+
+def gather(cameras, placements):
+    """The rows of all cameras; the faces are those of the first."""
+    faces = cameras[0].keep(plane=np.isin(cameras[0].plane_placement, placements))
+    face = np.searchsorted(placements, faces.plane_placement)
+    scatter = np.zeros(faces.plane_points.shape)
+    for index in range(len(placements)):
+        points = faces.plane_points[face == index]
+        normal, distance, _ = fit_plane(points)
+        scatter[face == index] = np.outer(points @ normal - distance, normal)
+    parts = []
+    for number, obs in enumerate(cameras):
+        order = np.argsort(obs.placements)
+        known = order[np.searchsorted(obs.placements[order], placements)]
+        board = obs.board_poses[known][face]
+        on_board = _Rows(
+            points=faces.plane_points,
+            scatter=scatter,
+            normal=board[:, :3, 2],
+            distance=np.vecdot(board[:, :3, 2], board[:, :3, 3]),
+            pitch=faces.plane_pitch,
+            placement=face,
+            camera=np.full(len(face), number),
+            weight=_shares(face),
+            on_face=np.ones(len(face), bool),
+        )
+        edges = obs.keep(crossing=np.isin(obs.crossing_placement, placements))
+        placement = np.searchsorted(placements, edges.crossing_placement)
+        _, edge = np.unique(edges.crossing_edge, return_inverse=True)
+        on_sight = _Rows(
+            points=edges.crossing_points,
+            scatter=np.zeros((len(placement), 3)),
+            normal=sight_normals(edges.crossing_lines, edges.model)[0],
+            distance=np.zeros(len(placement)),
+            pitch=edges.crossing_pitch,
+            placement=placement,
+            camera=np.full(len(placement), number),
+            weight=_shares(placement + len(placements) * edge),
+            on_face=np.zeros(len(placement), bool),
+        )
+        parts += [on_board, on_sight]
+    return _Rows(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _shares(part):
+    """Weights of rows by the part they belong to: the squares of one part's sum up to 1."""
+    _, index, count = np.unique(part, return_inverse=True, return_counts=True)
+    return 1 / np.sqrt(count[index])
+
+
+def _count_numbers(rows, cameras, placements):
+    """Independent numbers; errors of the LRF are common to all cameras, and count once."""
+    squares = np.where(rows.on_face, 0.0, rows.weight**2)
+    edges = np.bincount(rows.camera, squares, minlength=cameras).max()
+    return PLANE_NUMBERS * placements + EDGE_NUMBERS * round(edges)
+
+
+def pitch_blocks(state, rows, by_unknown):
+    """Distances of points from their planes, and the unknowns of the pitch with their prior.
+
+    The state are poses of the cameras (c, 3, 4), and unknowns that change the pitch of the rows by
+    ``by_unknown @ unknowns``; the Jacobian has 6 columns of each camera, then the unknowns.
+    """
+    poses, errors = state
+    cameras = len(poses)
+    pose = poses[rows.camera]
+    q = tilt(rows.points, by_unknown @ errors)
+    rotated = np.einsum("nij,nj->ni", pose[:, :, :3], q)
+    by_angle = np.einsum("nij,nj->ni", pose[:, :, :3], cross(np.array([1.0, 0.0, 0.0]), q))
+    distances = np.vecdot(rows.normal, rotated + pose[:, :, 3]) - rows.distance
+    of_camera = np.arange(6 * cameras) // 6 == rows.camera[:, None]
+    by_pose = np.tile(gradient_by_pose(rotated, rows.normal), (1, cameras)) * of_camera
+    by_error = np.vecdot(rows.normal, by_angle)[:, None] * by_unknown
+    weight = rows.weight / (SIGMA * np.sqrt(cameras))
+    prior = np.repeat(PRIOR, rows.placement.max() + 1)[: len(errors)]
+    columns = np.eye(6 * cameras + len(errors))[6 * cameras :]
+    return [
+        Block(distances, np.concatenate([by_pose, by_error], axis=1), weight),
+        Block(errors, columns, 1 / prior),
+    ]
+
+
+def _solve(name, rows, by_unknown, poses):
+    """The Solution of one model, the cameras and unknowns of the pitch together."""
+    first = 6 * len(poses)
+    count = by_unknown.shape[1]
+    sweeps = np.arange(count) % (rows.placement.max() + 1)
+
+    def read(state):
+        """No transform, and all unknowns."""
+        return None, np.concatenate([pose_parameters(state[0]).ravel(), state[1]])
+
+    def move(state, step):
+        """Retraction of poses and unknowns of the pitch."""
+        return move_pose(state[0], step[:first].reshape(-1, 6)), state[1] + step[first:]
+
+    return solve(
+        lambda state: pitch_blocks(state, rows, by_unknown),
+        (poses, np.zeros(count)),
+        move,
+        names=[*POSE_NAMES] * len(poses) + ["pitch"] * count,
+        method=f"pitch_{name}",
+        read=read,
+        groups=np.concatenate([rows.placement, sweeps]),
+        required=False,
+        limit=10.0,
+    )
+
+
+def _model(name, solution, rows, turn, numbers):
+    """What a Solution says about the pitch.
 
     The stated sigmas only weigh faces against edges, the level comes from the residuals.
     """
-    names = [f"{c}_{n}" for c in data.cameras for n in geometry.POSE_NAMES]
+    poses, errors = solution.state
+    p = len(turn)
+    unit = SIGMA * np.sqrt(len(poses))  # metres, of a residual
+    distances = solution.residuals[: len(rows.weight)] / rows.weight * unit
+    # what a scan scatters about its own plane tells nothing of the pitch
+    scatter = np.einsum("nij,nj->ni", poses[rows.camera][:, :, :3], rows.scatter)
+    away = distances - np.vecdot(rows.normal, scatter)
+    misfit = float(np.sum((rows.weight * away / unit) ** 2))
+    # the offset common to all sweeps goes with the cameras' poses
+    free = {"none": 0, "direction": 1, "sweep": p - 1, "sweep_stretch": 2 * p - 1}[name]
+    level = misfit / max(numbers - POSE_NUMBERS - free, 1)
+    known = replace(solution, covariance=level / solution.inflation * solution.covariance)
+    offset = np.zeros(p)
+    sigma = np.zeros(p)
+    stretch = np.zeros(p)
     if name == "direction":
-        names.append("direction_offset")
-
-    def read(state):
-        """No transform, and the shared unknowns."""
-        values = np.r_[geometry.pose_parameters(state[0]).ravel(), state[1]]
-        return None, values[: len(names)]
-
-    found = solve(
-        lambda s: pitch_blocks(s, data, name),
-        state,
-        lambda s, step: move_pitch_state(s, step, name),
-        names=names,
-        read=read,
-        required=False,
-        method=f"pitch_{name}",
-        shared=len(names),
-        limit=10.0,
-        freedom=data.n_numbers - 6,
-    )
-    poses, direction, offset, stretch = found.state
-    p = len(data.placements)
-    total, rms = misfit(data, found.state)
-    level = total / max(data.n_numbers - 6, 1) / SIGMA**2 / found.inflation
-    sigma = float(replace(found, covariance=level * found.covariance).trusted_sigma[-1])
-    parameters = 6 + {"none": 0, "direction": 1, "sweep": p - 1, "sweep_stretch": 2 * p - 1}[name]
-    offset = direction * data.direction + offset
-    offset_sigma = np.full(p, sigma if name == "direction" else 0.0)
-    if name.startswith("sweep"):  # from the scatter of the residuals, what is shared held
-        offset = offset - offset.mean()
-        own = found.jacobian[..., 6 * len(poses) :]
-        inverse = np.linalg.inv(np.swapaxes(own, -1, -2) @ own)
-        variance = total / max(data.n_numbers - parameters, 1)
-        offset_sigma = np.sqrt(inverse[:, 0, 0] * variance) / SIGMA
-    model = PitchModel(
+        offset = errors * turn
+        sigma = np.full(p, known.trusted_sigma[-1])
+    elif name != "none":
+        centre = np.eye(p) - 1 / p
+        first = 6 * len(poses)
+        offset = centre @ errors[:p]
+        sigma = np.sqrt(np.diag(centre @ known.covariance[first:, first:][:p, :p] @ centre))
+        stretch[: len(errors) - p] = errors[p:]
+    return PitchModel(
         name,
         offset=offset,
-        offset_sigma=offset_sigma,
+        offset_sigma=sigma,
         stretch=stretch,
-        transforms=dict(zip(data.cameras, map(pose_transform, poses), strict=True)),
-        misfit=total,
-        rms=rms,
-        n_parameters=parameters,
-        converged=bool(found.converged),
+        misfit=misfit,
+        plane_rms=float(np.sqrt(np.mean(distances[rows.on_face] ** 2))),
+        n_parameters=POSE_NUMBERS + free,
+        converged=bool(solution.converged),
     )
-    return found.state, sigma, model

@@ -1,0 +1,222 @@
+"""Points take their colours from images: what hides what, and the exposures of the images."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.calibrate import colouring
+from lrfcal_lib.fit.robust import TUKEY, robust_sigma
+from lrfcal_lib.model.camera import CameraModel, fold, project
+from lrfcal_lib.model.geometry import pose_array
+
+SHARE = 1 << 15  # points that a thread takes at a time
+WORKERS = min(os.cpu_count() or 1, 8)
+LEAST_CELL = 2.0  # pixels of a depth buffer
+LEVELS = (12.0, 230.0)  # of grey: between these the exposures of images are compared
+EXPOSURE_ROUNDS = 4
+LEAST_SCATTER = 1e-3  # of the logarithm of a brightness
+HELD = 1e-3  # points' worth of a gain of one where no point compares
+
+
+@dataclass(frozen=True)
+class View:
+    """An image as it sees the platform frame.
+
+    Attributes
+    ----------
+    number : int
+        What points coloured from it remember.
+    camera : str
+    T_camera_platform : RigidTransform
+    model : CameraModel
+    image : ndarray of uint8, shape (height, width, 3)
+        Blue, green, red as OpenCV reads it. ValueError if it has another size than the model.
+    """
+
+    number: int
+    camera: str
+    T_camera_platform: RigidTransform
+    model: CameraModel
+    image: np.ndarray
+
+    def __post_init__(self):
+        height, width = self.image.shape[:2]
+        model = self.model
+        if (width, height) != (model.width, model.height):
+            raise ValueError(
+                f"camera '{self.camera}' has {model.width} x {model.height} pixels, its image "
+                f"{width} x {height}: intrinsics hold for one image size only"
+            )
+
+
+class Painter:
+    """Colours points from images: first everything that may hide something goes through
+    :meth:`hide`.
+
+    Parameters
+    ----------
+    views : sequence of View
+    step : float
+        Radians between neighbouring points as the sensor sees them: the resolution at which points
+        hide others.
+    noise : float
+        Metres by which a point may lie behind another one of the same surface.
+    """
+
+    def __init__(self, views: Sequence[View], step: float, noise: float):
+        self.views = views
+        self.exposures = np.zeros((len(views), 2))
+        self.buffers = []  # of depth, one a thread
+        self.eyes = []
+        for view, exposure in zip(views, self.exposures, strict=True):
+            pose = _single(pose_array(view.T_camera_platform))
+            cell = max(LEAST_CELL, 2 * step * view.model.fx)
+            rows, columns = (int(n / cell) + 1 for n in view.image.shape[:2])
+            buffer = np.full((WORKERS, rows * columns), np.inf, np.float32)
+            self.buffers.append(buffer)
+            self.eyes.append(
+                colouring.Eye(
+                    pose=pose,
+                    centre=-pose[:, :3].T @ pose[:, 3],
+                    lens=_single(np.r_[view.model.parameters, fold(view.model)]),
+                    image=view.image,
+                    cell=cell,
+                    nearest=buffer[0],
+                    noise=noise,
+                    exposure=exposure,
+                    number=view.number,
+                )
+            )
+
+    def hide(self, points: np.ndarray) -> None:
+        """Let points (n, 3) hide what is behind them."""
+
+        def work(rows, worker):
+            """Some points, into the depth buffers of one thread."""
+            part = _single(points[rows])
+            for eye, buffer in zip(self.eyes, self.buffers, strict=True):
+                colouring.hide(part, eye._replace(nearest=buffer[worker]))
+
+        _share(work, len(points))
+        for buffer in self.buffers:
+            np.min(buffer, axis=0, out=buffer[0])
+
+    def paint(
+        self, points: np.ndarray, normals: np.ndarray, only: slice = slice(None)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Colour points.
+
+        Parameters
+        ----------
+        points, normals : ndarray, shape (n, 3)
+            Metres; unit vectors, NaN where unknown.
+        only : slice
+            Of the views.
+
+        Returns
+        -------
+        colors : ndarray, shape (n, 3)
+            Red, green, blue; NaN where no image sees the point.
+        seen : ndarray of bool, shape (n,)
+        source : ndarray of int, shape (n,)
+            The number of the image that counts most, -1 for none.
+        """
+        n = len(points)
+        colors = np.empty((n, 3), np.float32)
+        seen = np.empty(n, bool)
+        source = np.full(n, -1, np.int32)
+
+        def work(rows, _):
+            """Some points, seen by all images."""
+            part = _single(points[rows])
+            facing = _single(normals[rows])
+            sums = np.zeros((len(part), 4), np.float32)
+            best = np.zeros(len(part), np.float32)
+            for eye in self.eyes[only]:
+                colouring.paint(part, facing, eye, sums, best, source[rows])
+            colouring.finish(sums, colors[rows], seen[rows])
+
+        _share(work, n)
+        return colors, seen, source
+
+    def compare_exposures(self, points: np.ndarray, normals: np.ndarray) -> None:
+        """Estimate gain and fall-off towards the corners of every image from points that several
+        images see.
+
+        The log of a brightness is that of the surface, plus one number an image, plus one a camera
+        times the squared distance from the principal point. Robust least squares; the gains are one
+        in the mean.
+        """
+        if len(self.views) < 2 or not len(points):
+            return
+        _, camera = np.unique([view.camera for view in self.views], return_inverse=True)
+        shape = (len(self.views), len(points))
+        logs = np.full(shape, np.nan)
+        radii = np.full(shape, np.nan)
+        darkest, brightest = LEVELS
+        for k, view in enumerate(self.views):
+            colors, _, _ = self.paint(points, normals, slice(k, k + 1))
+            grey = colors.mean(axis=1)
+            logs[k] = np.log(np.where((grey > darkest) & (grey < brightest), grey, np.nan))
+            model = view.model
+            uv = project(view.T_camera_platform.apply(points), model)
+            corner = 0.25 * (model.width**2 + model.height**2)
+            radii[k] = np.sum((uv - [model.cx, model.cy]) ** 2, axis=1) / corner
+        gain, falloff = _compared(logs, radii, camera)
+        self.exposures[:, 0] = gain - gain.mean()
+        self.exposures[:, 1] = np.minimum(falloff, 0.0)[camera]
+
+
+def _compared(logs, radii, camera):
+    """Gain (v,) of images and fall-off (c,) of cameras that bring the logs (v, n) of the same
+    points together.
+
+    `radii` (v, n) are squared distances from the middle, `camera` (v,) is the number of an image's
+    camera. What no point compares is zero.
+    """
+    images = len(logs)
+    use = np.isfinite(logs)
+    for _ in range(EXPOSURE_ROUNDS):
+        use &= use.sum(axis=0) > 1
+        image, point = np.nonzero(use)
+        row = np.arange(len(image))
+        design = np.zeros((len(image), images + camera.max() + 1))
+        design[row, image] = 1.0
+        design[row, images + camera[image]] = radii[use]
+        J = _about_means(design, point)
+        y = _about_means(logs[use][:, None], point)[:, 0]
+        unknowns = np.linalg.solve(J.T @ J + HELD * np.eye(J.shape[1]), J.T @ y)
+        miss = y - J @ unknowns
+        if len(miss):
+            use[use] = np.abs(miss) < TUKEY * robust_sigma(miss, least=LEAST_SCATTER)
+    return unknowns[:images], unknowns[images:]
+
+
+def _about_means(rows, group):
+    """Rows (m, k) without the mean of their group: the brightness of a surface is nobody's
+    concern.
+    """
+    count = np.maximum(np.bincount(group), 1)
+    sums = np.stack([np.bincount(group, column) for column in rows.T], axis=1)
+    return rows - (sums / count[:, None])[group]
+
+
+def _single(array):
+    return np.ascontiguousarray(array, np.float32)
+
+
+def _share(work: Callable, count: int):
+    """Call ``work(rows, worker)`` for slices of so many rows, in threads: the compiled loops free
+    the interpreter.
+    """
+
+    def every_other(worker):
+        for start in range(worker * SHARE, count, WORKERS * SHARE):
+            work(slice(start, start + SHARE), worker)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        list(pool.map(every_other, range(WORKERS)))

@@ -1,0 +1,92 @@
+"""What errors of the intrinsics, which all images share, do to the joint estimate."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.fit.least_squares import OWN_RANK, pad
+from lrfcal_lib.fit.result import Solution
+from lrfcal_lib.model.camera import CameraModel, project_jacobians
+from lrfcal_lib.model.observations import LENS, JointObservations
+from lrfcal_lib.solvers.joint_model import JointData, Unknowns
+from lrfcal_lib.solvers.joint_residuals import among_cameras, view_block
+
+LEAST_CORNERS = 6  # of a pattern, for the derivative of its pose by the intrinsics
+
+
+def pose_by_intrinsics(
+    T_camera_board: RigidTransform, corners: np.ndarray, model: CameraModel
+) -> np.ndarray:
+    """How the pose of a board that fits given pixels changes with the intrinsics.
+
+    Parameters
+    ----------
+    T_camera_board : RigidTransform
+    corners : ndarray, shape (k, 3)
+        Those of the pattern that were seen, board frame, metres.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (6, 9)
+        Derivative of the increments ``[w, v]`` of T_camera_board; zeros with fewer than six
+        corners.
+    """
+    if len(corners) < LEAST_CORNERS:
+        return np.zeros((6, LENS))
+    turned = T_camera_board.rotation.apply(corners)
+    by_point, by_lens = project_jacobians(turned + T_camera_board.translation, model)
+    by_pose = np.concatenate([np.cross(turned[:, None, :], by_point), by_point], axis=-1)
+    return -np.linalg.lstsq(by_pose.reshape(-1, 6), by_lens.reshape(-1, LENS), rcond=None)[0]
+
+
+class LensShare(NamedTuple):
+    """What errors of the intrinsics do; zeros where they are exact.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (c, c)
+        Of the shared unknowns, from those of the intrinsics.
+    counted : ndarray, shape (c, c)
+        What the scatter of views that these errors cause has added to the covariance through the
+        scale of views, as far as that exceeds the stated noise: the intrinsics would count twice.
+    scatter : float
+        Of views in stated standard deviations: what no unknown can take up of the error that all
+        views of a camera share.
+    """
+
+    covariance: np.ndarray
+    counted: np.ndarray
+    scatter: float
+
+
+def lens_share(
+    obs: JointObservations, found: Solution, data: JointData, unknowns: Unknowns
+) -> LensShare:
+    """The LensShare of a solution."""
+    c = unknowns.shared
+    if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
+        return LensShare(np.zeros((c, c)), np.zeros((c, c)), 0.0)
+    block = view_block(found.state, data, unknowns)
+    J = block.white_jacobian
+    J_own = J[..., c:]
+    camera = data.view["camera"]
+    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(camera))["lens"]
+    by_lens = among_cameras(lens, camera, len(obs.cameras))
+    shift = block.whitened(by_lens.reshape(*J.shape[:2], -1))
+    spread = block_diag(*obs.lens_covariance)
+    hessian = np.swapaxes(found.jacobian, -1, -2) @ found.jacobian
+    own = np.linalg.pinv(hessian[:, c:, c:], rcond=OWN_RANK, hermitian=True)
+    reduced = J[..., :c] - J_own @ own @ hessian[:, c:, :c]
+    finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
+    gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
+    left = shift - reduced @ gain - J_own @ (own @ (np.swapaxes(J_own, -1, -2) @ shift))
+    square = np.sum(left @ spread * left)
+    level = data.levels.view_scale**2
+    taken = np.sum((J_own @ own) * J_own) + np.sum((reduced @ finite) * reduced)
+    square *= level / max(6 * len(obs.view_camera) - taken, 1.0)  # rows that are left to show it
+    share = np.clip(level - 1, 0, square) / level
+    counted = share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite
+    return LensShare(gain @ spread @ gain.T, counted, float(np.sqrt(square)))

@@ -1,0 +1,125 @@
+"""The start value of the joint estimate that leads to the best minimum, among closed forms."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    pose_array,
+    pose_transform,
+)
+from lrfcal_lib.model.observations import JointObservations
+from lrfcal_lib.model.problem import Problem
+from lrfcal_lib.solvers.joint_contradictions import (
+    CONTRADICTION,
+    FEW_STEPS,
+    LARGEST_SHARE,
+    face_misses,
+    left_out_share,
+    refuse_contradiction,
+    without_contradictions,
+)
+from lrfcal_lib.solvers.joint_model import JointState, Levels, Unknowns, gather
+from lrfcal_lib.solvers.joint_residuals import minimum
+from lrfcal_lib.solvers.joint_start import start_states, state_of
+
+GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
+ROUGH_MISS = 0.08  # metres, of a start value's boards from where images put them
+
+
+@dataclass(frozen=True)
+class Start:
+    """A start value of the joint estimate.
+
+    Attributes
+    ----------
+    kept : JointObservations
+        Without what contradicts it.
+    state : JointState
+    left_out : list of Problem
+    settled : bool
+        Whether more steps with the coarse unknowns would change nothing.
+    badness : float
+        Mean half squared residual of what is kept; the share that is left out counts against it.
+    """
+
+    kept: JointObservations
+    state: JointState
+    left_out: list[Problem]
+    settled: bool
+    badness: float
+
+
+def best_start(
+    obs: JointObservations, unknowns: Unknowns, levels: Levels, T0: RigidTransform | None = None
+) -> Start:
+    """The most promising start value.
+
+    More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows
+    which ones are wrong.
+    """
+    data = gather(obs, levels)
+    tried = []
+    misses = []
+    for number, states in enumerate(start_states(obs, T0)):
+        for state in states:
+            if not unknowns.axis:
+                heads = (T0, obs.T_head_lrf, RigidTransform.identity())
+                known = next(head for head in heads if head is not None)
+                state = replace(state, head=pose_array(known))
+            rows = np.arange(len(state.boards))
+            misses.append(np.median(face_misses(state, data, state.boards, rows)))
+            tried.append(agreeing_start(obs, state, data, unknowns))
+        if min(start.badness for start in tried) < GOOD_START and (T0 is None or number):
+            break
+    chosen = int(np.argmin([start.badness for start in tried]))
+    best = tried[chosen]
+    if misses[chosen] > ROUGH_MISS:
+        refuse_contradiction(best.state, gather(best.kept), ROUGH_MISS)
+    if left_out_share(obs, best.left_out) > LARGEST_SHARE:
+        names = []
+        for problem in best.left_out[:8]:
+            name = str(problem.placement)
+            if problem.camera is not None:
+                name += f" in camera '{problem.camera}'"
+            names.append(name)
+        raise DegenerateGeometry(
+            f"{len(best.left_out)} placements or images of {len(obs.placements)} placements "
+            f"contradict the others: images put boards elsewhere than scans ({', '.join(names)}); "
+            "check that images and scans carry the right numbers"
+        )
+    return best
+
+
+def coarse(unknowns: Unknowns) -> Unknowns:
+    """The unknowns without those of the edges: from far away, beams on the wrong side would blow
+    up the softness.
+    """
+    of_edges = ("edge_log_odds", "edge_log_softness")
+    sensor = tuple(name for name in unknowns.sensor if name not in of_edges)
+    return replace(unknowns, sensor=sensor, sides=False)
+
+
+def agreeing_start(obs, state, data, unknowns):
+    """A few steps without what contradicts a start value; what a rough one leaves out is judged
+    again by the rest.
+
+    The better one of both attempts, a Start: what still contradicts may have led the rest astray.
+    """
+    attempts = []
+    for _ in range(2):
+        kept, fitting, left_out = without_contradictions(obs, state, data)
+        cut = gather(kept, data.levels) if left_out else data
+        found = minimum(fitting, cut, coarse(unknowns), steps=FEW_STEPS)
+        share = left_out_share(obs, left_out)
+        count = len(kept.face_range) + len(kept.beam_hit) + len(kept.view_pitch)
+        cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / count
+        badness = cost * (1 + CONTRADICTION * share)
+        attempts.append(Start(kept, found.state, left_out, found.converged, badness))
+        if not left_out or share > LARGEST_SHARE:
+            break
+        cameras = [pose_transform(pose) for pose in found.state.cameras]
+        state = state_of(obs, pose_transform(found.state.head), cameras)
+    return min(attempts, key=lambda start: start.badness)

@@ -1,0 +1,428 @@
+"""What the joint estimate hands over: the rig, how well it is known, and what may be doubted."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.fit.edge_likelihood import disc_edge
+from lrfcal_lib.fit.least_squares import Block, eliminate, linearise
+from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.geometry import pose_array, pose_parameters, pose_transform
+from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
+from lrfcal_lib.model.observations import JointObservations
+from lrfcal_lib.model.problem import Problem
+from lrfcal_lib.solvers.joint_model import (
+    SENSOR,
+    SWEEPS,
+    JointData,
+    JointState,
+    Unknowns,
+    gather,
+)
+from lrfcal_lib.solvers.joint_noise import on_board
+from lrfcal_lib.solvers.joint_residuals import named_blocks
+
+WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
+    "range_offset": "the range offset",
+    "edge_log_odds": "the edge bias",
+    "edge_log_softness": "the softness of the edges",
+    "pitch_scale": "the scale of the pitch",
+    "pitch_by_direction": "the pitch offset by sweep direction",
+}
+SWEEP_HELD = (0.0, 0.0)  # standard deviations of what is not unknown
+NAMED = 0.3  # share of a direction's largest component from which an unknown is named
+# scatter of residuals in stated standard deviations that still agrees with the statement
+NOISE_LIMITS = (0.5, 2.0)
+ASKED = 20.0  # squared score in standard deviations: chance alone exceeds it once in 100 000 times
+# standard deviations of an axis nobody should rely on
+WEAK_DIRECTION = np.radians(1.0)
+WEAK_OFFSET = 0.020  # metres
+RANK = 1e-14  # of information: below this share of the largest eigenvalue is nothing
+
+
+class Held(NamedTuple):
+    """An error of the recorded pitch that may have been held at zero: what is worth a word."""
+
+    name: str
+    least: float
+    words: str
+    unit: float
+    unit_words: str
+
+
+HELD = (
+    Held("pitch_scale", 0.001, "the scale of the pitch", 100.0, "%"),
+    Held(
+        "pitch_by_direction",
+        np.radians(0.01),
+        "a pitch offset by sweep direction",
+        np.degrees(1.0),
+        "deg",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Score:
+    """What placements say about the shared unknowns, all that is their own eliminated.
+
+    Attributes
+    ----------
+    information : ndarray, shape (p, c, c)
+    gradient : ndarray, shape (p, c)
+        Of half the sum of squares.
+    """
+
+    information: np.ndarray
+    gradient: np.ndarray
+
+
+@dataclass(frozen=True)
+class JointSolution:
+    """The joint estimate.
+
+    Attributes
+    ----------
+    solution : Solution
+        Of the shared unknowns (covariances, names, convergence).
+    observations : JointObservations
+        Without what is left out.
+    data, unknowns : JointData, Unknowns
+        Padded observations with the noise levels used, and what was unknown; for `solvers` only.
+    excluded : tuple of Problem
+        Placements, cameras and single images left out, with the reason.
+    misfit : dict of int to float
+        Normalised squared residuals of each placement (1 is what the noise explains).
+    lens : ndarray, shape (c, c)
+        The part of the covariances that comes from the intrinsics, which all placements share.
+    lens_scale : float
+        By how much errors of the intrinsics let board poses in images scatter, in stated standard
+        deviations.
+    """
+
+    solution: Solution
+    observations: JointObservations
+    data: JointData
+    unknowns: Unknowns
+    excluded: tuple[Problem, ...]
+    misfit: dict[int, float]
+    lens: np.ndarray
+    lens_scale: float
+
+    @property
+    def excluded_placements(self) -> dict[int, str]:
+        """Why placements are left out, in words, by their numbers."""
+        whole = [problem for problem in self.excluded if problem.camera is None]
+        return {problem.placement: str(problem) for problem in whole}
+
+    @property
+    def state(self) -> JointState:
+        """Everything that moved."""
+        return self.solution.state
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last step was small."""
+        return bool(self.solution.converged)
+
+    @property
+    def unobservable(self) -> tuple[str, ...]:
+        """Motions that the data do not determine, in words."""
+        return self.solution.unobservable
+
+    @cached_property
+    def T_head_lrf(self) -> RigidTransform:
+        """In the gauge of the stated platform (rotation about the axis and shift along it cannot
+        be observed).
+        """
+        return pose_transform(self.state.head)
+
+    @cached_property
+    def transforms(self) -> dict[str, RigidTransform]:
+        """``T_camera_lrf`` or ``T_camera_platform`` by camera."""
+        poses = map(pose_transform, self.state.cameras)
+        return dict(zip(self.observations.cameras, poses, strict=True))
+
+    @cached_property
+    def boards(self) -> dict[int, RigidTransform]:
+        """``T_platform_board`` by placement."""
+        poses = pose_transform(self.state.boards)
+        return dict(zip(self.observations.placements.tolist(), poses, strict=True))
+
+    @property
+    def board_poses(self) -> np.ndarray:
+        """``T_platform_board`` in the order of the observations' placements, shape (p, 3, 4)."""
+        return self.state.boards
+
+    @property
+    def sensor(self) -> dict[str, float]:
+        """Range offset (m), log odds and log softness of the edge, pitch scale, pitch offset by
+        direction (rad).
+        """
+        return dict(zip(SENSOR, self.state.sensor.tolist(), strict=True))
+
+    @property
+    def sweeps(self) -> dict[int, np.ndarray]:
+        """Offset (rad) and stretch of the recorded pitch of each sweep, by placement."""
+        return dict(zip(self.observations.placements.tolist(), self.state.sweeps, strict=True))
+
+    @property
+    def sweep_sigma(self) -> tuple[float, float]:
+        """Standard deviations of the pitch's offset (radians) and stretch of every sweep; 0 where
+        held.
+        """
+        number = SWEEPS[self.unknowns.sweep]
+        offset, stretch = (*self.data.levels.sweep_sigma[:number], *SWEEP_HELD[number:])
+        return offset, stretch
+
+    @property
+    def side_odds(self) -> np.ndarray:
+        """By how much the log odds of each side differ from the sensor's, shape (p, e)."""
+        return self.state.sides
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Factors on the stated standard deviations, and shares of independent errors, as
+        estimated.
+        """
+        names = ["face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma"]
+        if self.observations.cameras:
+            names.append("view_scale")
+        return {name: float(getattr(self.data.levels, name)) for name in names}
+
+    @property
+    def axis(self) -> geometry.TiltAxis:
+        """The tilt axis in the LRF frame."""
+        return geometry.axis_of(self.T_head_lrf)
+
+    @property
+    def sigma(self) -> dict[str, float]:
+        """Standard deviations to rely on of the shared unknowns, by name."""
+        return dict(zip(self.solution.names, self.solution.trusted_sigma.tolist(), strict=True))
+
+    @property
+    def edge_bias(self) -> float:
+        """Where readings flip with a background as far and bright as the board, spot radii
+        outside the edge.
+        """
+        return float(disc_edge(self.sensor["edge_log_odds"])[0])
+
+    @property
+    def corrections(self) -> Corrections:
+        """Errors of what was recorded, as far as they were estimated: range offset, scale and
+        sweeps of the pitch.
+        """
+        turn = self.sensor["pitch_by_direction"] * self.observations.direction
+        sweeps = {}
+        for row, (placement, (offset, stretch)) in enumerate(self.sweeps.items()):
+            middle = self.observations.middle[row]
+            sweeps[placement] = SweepPitch(turn[row] + offset, stretch, middle)
+        return Corrections(self.sensor["range_offset"], self.sensor["pitch_scale"], sweeps)
+
+    def columns(self, prefix: str) -> list[int]:
+        """Indices of the shared unknowns whose names begin so."""
+        return [i for i, name in enumerate(self.solution.names) if name.startswith(prefix)]
+
+    def covariance(self, *prefixes: str) -> np.ndarray:
+        """Covariance to rely on of groups of shared unknowns, e.g. 'left_' or 'axis'.
+
+        See `Solution.trusted`.
+        """
+        index = sum(map(self.columns, prefixes), [])
+        return self.solution.trusted[np.ix_(index, index)]
+
+    def camera_at(self, name: str, pitch: ArrayLike) -> RigidTransform:
+        """``T_camera_platform`` of a camera while the head stands at a pitch (radians), or at
+        several.
+        """
+        mount = self.observations.mounts[self.observations.cameras.index(name)]
+        return camera_at(self.transforms[name], mount, self.T_head_lrf, pitch)
+
+    def camera(self, name: str) -> Solution:
+        """The pose of one camera as a `Solution` like those of the other methods."""
+        index = self.columns(f"{name}_")
+        both = np.ix_(index, index)
+        whole = self.solution
+        by_placements = whole.covariance_placements
+        if by_placements is not None:
+            by_placements = by_placements[both]
+        pose = pose_array(self.transforms[name])
+        return replace(
+            whole,
+            transform=self.transforms[name],
+            parameters=pose_parameters(pose),
+            names=geometry.POSE_NAMES,
+            jacobian=whole.jacobian[..., index],
+            state=pose,
+            covariance=whole.covariance[both],
+            covariance_placements=by_placements,
+        )
+
+    @cached_property
+    def blocks(self) -> dict[str, Block]:
+        """Residuals by name at the solution; for `solvers` only."""
+        return named_blocks(self.state, self.data, self.unknowns)
+
+    def residuals(self, group: str) -> np.ndarray:
+        """Residuals in the order of the observations.
+
+        Parameters
+        ----------
+        group : {'face', 'view'}
+
+        Returns
+        -------
+        ndarray, shape (m, 1) or (v, 6)
+            Of ranges to faces, metres, or of poses in images, radians and metres.
+        """
+        if group not in self.blocks:
+            return np.zeros((0, {"face": 1, "view": 6}[group]))
+        used = getattr(self.data, group)["used"]
+        return self._in_order(group, self.blocks[group].residuals.reshape(*used.shape, -1))
+
+    def face_points(self) -> np.ndarray:
+        """Measured points of the faces in the frames of their boards, metres, shape (m, 3)."""
+        return self._in_order("face", on_board(self.state, self.data))
+
+    def _in_order(self, group, padded):
+        """Rows of a group in the order of the observations, shape (p, n, k) -> (m, k)."""
+        placement = getattr(self.observations, f"{group}_placement")
+        rows = np.zeros((len(placement), padded.shape[-1]))
+        rows[np.argsort(placement, kind="stable")] = padded[getattr(self.data, group)["used"]]
+        return rows
+
+    def with_levels(self, **levels) -> "JointSolution":
+        """The same estimate at other noise levels, fields of
+        :class:`lrfcal_lib.solvers.joint_model.Levels` by name.
+        """
+        levels = replace(self.data.levels, **levels)
+        return replace(self, data=replace(self.data, levels=levels))
+
+    def information(self) -> np.ndarray:
+        """What every placement says about the shared unknowns, shape (p, c, c)."""
+        return self.score().information
+
+    def score(self, changed: JointObservations | None = None, step: float = 1.0) -> Score:
+        """What every placement says about the shared unknowns and, tested, about one more.
+
+        Parameters
+        ----------
+        changed : JointObservations, optional
+            As they would be if the truth were off by one unknown more.
+        step : float
+            The value of that unknown there.
+        """
+        blocks = self.blocks
+        shared = self.unknowns.shared
+        if changed is not None:
+            data = gather(changed, self.data.levels)
+            after = named_blocks(self.state, data, self.unknowns)
+            blocks = {}
+            for name, block in self.blocks.items():
+                by_one_more = (after[name].white - block.white) / step
+                J = np.insert(block.white_jacobian, shared, by_one_more, axis=-1)
+                blocks[name] = Block(block.white, J, np.ones_like(block.white))
+            shared += 1
+        hessian, gradient, *_ = linearise(blocks.values())
+        return Score(*eliminate(hessian, gradient, shared)[:2])
+
+    def board_information(self) -> np.ndarray:
+        """What the scans of every placement say about the pose of its board, shape (p, 6, 6).
+
+        By increments ``[w, v]`` of ``T_platform_board``, with everything else known.
+        """
+        scans = [self.blocks[group] for group in ("face", "beam") if group in self.blocks]
+        board = self.unknowns.columns["board"]
+        hessian = linearise(scans).hessian
+        return hessian[:, board, board]
+
+    def held_at_zero(self) -> Iterator[tuple[Held, float, float]]:
+        """Errors of the pitch that were held at zero, their squared scores (standard deviations)
+        and the values they would take.
+
+        Each one is tested by itself, with all that was estimated free.
+        """
+        names = [term.name for term in HELD]
+        sensor = tuple(dict.fromkeys((*self.unknowns.sensor, *names)))
+        wider = replace(self.unknowns, sensor=sensor)
+        blocks = named_blocks(self.state, self.data, wider)
+        hessian, gradient, *_ = linearise(blocks.values())
+        reduced, score, _ = eliminate(hessian, gradient, wider.shared)
+        names = wider.names(self.observations.cameras)
+        estimated = [names.index(name) for name in self.solution.names]
+        for term in HELD:
+            if term.name in self.solution.names:
+                continue
+            free = [*estimated, names.index(term.name)]
+            information = reduced.sum(axis=0)[np.ix_(free, free)]
+            covariance = np.linalg.pinv(information, rcond=RANK, hermitian=True)
+            step = -(covariance @ score.sum(axis=0)[free])[-1]
+            yield term, float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)
+
+    def _scatter(self):
+        """Groups of observations in words, the field that states their noise, and the size of their
+        whitened residuals: 1 agrees with it.
+        """
+        if "face" in self.blocks:
+            z = self.blocks["face"].white[self.data.face["used"]]
+            yield "ranges", "face_sigma", np.sqrt(np.mean(z**2) / self.data.levels.face_share)
+        if "view" in self.blocks:
+            camera = self.data.view["camera"]
+            z = self.blocks["view"].white.reshape(camera.shape + (6,))
+            for number, name in enumerate(self.observations.cameras):
+                mine = self.data.view["used"] & (camera == number)
+                # more views than placements: what a board's own pose takes up is minor
+                if mine.sum() > len(camera):
+                    what = f"poses of the board in camera '{name}'"
+                    yield what, "view_covariance", np.sqrt(np.mean(z[mine] ** 2))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is suspicious beyond convergence and unobservable motions, in words: noise that
+        contradicts what is stated, a weak axis, errors of the pitch that the data ask for.
+        """
+        words = []
+        for what, stated, level in self._scatter():
+            if not NOISE_LIMITS[0] < level < NOISE_LIMITS[1]:
+                words.append(
+                    f"the {what} scatter {level:.2g} times what is stated ({stated}): standard "
+                    "deviations of the result are off alike; noise='estimate' takes the level from "
+                    "the residuals"
+                )
+        if self.unknowns.axis:
+            turn, shift = np.linalg.norm(self.solution.sigma[:4].reshape(2, 2), axis=1)
+            if turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET:
+                words.append(
+                    f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, "
+                    f"{1000 * shift:.0f} mm): sweep over a larger pitch range, take images at more "
+                    "pitch angles, or state the platform with its accuracy"
+                )
+        for term, square, value in self.held_at_zero():
+            if square > ASKED and abs(value) > term.least:
+                words.append(
+                    f"the data ask for {term.words}, about {term.unit * value:+.2f} "
+                    f"{term.unit_words}, which was held at zero"
+                )
+        return tuple(words)
+
+    def __repr__(self):
+        return f"JointSolution({len(self.boards)} placements, {self.solution!r})"
+
+
+def joint_words(direction: np.ndarray, names: tuple[str, ...], cameras: tuple[str, ...]) -> str:
+    """A direction of the shared unknowns in words."""
+    direction = np.asarray(direction) / np.max(np.abs(direction))
+    large = np.abs(direction) > NAMED
+    words = []
+    for camera in cameras:
+        index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
+        if large[index].any():
+            words.append(geometry.motion_words(direction[index], camera))
+    words += [WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS]
+    return " with ".join(words)
