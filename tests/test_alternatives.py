@@ -18,7 +18,7 @@ from lrfcal_lib.judge.alternatives import (
     not_an_offset,
     weigh,
 )
-from lrfcal_lib.judge.diagnosis import lens_findings
+from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.geometry import hat
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose

@@ -12,7 +12,8 @@ from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.outline import platform_of
 from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
 from lrfcal_lib.fit.residuals import plane_residuals_m
-from lrfcal_lib.judge.camera_changes import LEVER, NOISY, camera_changes, large_changes
+from lrfcal_lib.judge.alternatives import guesses_of
+from lrfcal_lib.judge.camera_changes import LEVER, camera_changes, explains, large_changes
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
@@ -167,7 +168,7 @@ def changes_of_cameras(calibration):
     prepared = calibration.prepared
     joint = calibration.joint
     changes = [] if joint is None else camera_changes(joint.solution, prepared, joint.settings)
-    if changes or explains(joint):
+    if changes or (joint is not None and explains(joint.solution)):
         return changes
     views = {camera: list(own.values()) for camera, own in prepared.views.items()}
     obs = observe_joint(prepared, views)
@@ -181,15 +182,7 @@ def explained(faults: list[Fault]) -> bool:
 
 def hopeless(joint):
     """Whether a JointCalibration (or None) explains so little that something may be misread."""
-    return not explains(joint) or bool(joint.solution.unobservable)
-
-
-def explains(joint):
-    """Whether a JointCalibration (or None) leaves residuals that are anything like the noise."""
-    if joint is None or not joint.solution.converged:
-        return False
-    noise = joint.solution.noise
-    return max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
+    return joint is None or not explains(joint.solution) or bool(joint.solution.unobservable)
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:
@@ -349,11 +342,7 @@ def _misread(prepared, fitting, misses, stated):
 
 def _far_from_guess(prepared, found):
     """How far cameras stand from where session.json guesses them, metres; 0 without guesses."""
-    guesses = {
-        name: camera.guess
-        for name, camera in prepared.session.cameras.items()
-        if camera.guess is not None
-    }
+    guesses = guesses_of(prepared.session)
     total = 0.0
     for camera in guesses.keys() & found.keys():
         turn, shift = transform_difference(found[camera].transform, guesses[camera])

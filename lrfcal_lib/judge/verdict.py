@@ -10,8 +10,8 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.judge.alternatives import places_of_cameras
-from lrfcal_lib.judge.diagnosis import lens_findings
 from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief
+from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_placement
 from lrfcal_lib.judge.recording_faults import explained, recording_faults
 from lrfcal_lib.judge.statements import contradicts_stated
