@@ -2,7 +2,7 @@
 cause and remedy.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtr, stdtrit
 
-from lrfcal_lib.judge.findings import Kind
+from lrfcal_lib.judge.findings import Kind, by_sign
 from lrfcal_lib.model.geometry import (
     axis_difference,
     axis_of,
@@ -209,7 +209,7 @@ class Doubt:
 def weigh(
     solution: JointSolution,
     admitted_offset: float,
-    stated: dict[str, Alternative] = ALTERNATIVES,
+    stated: Mapping[Kind, Alternative] = ALTERNATIVES,
 ) -> list[Doubt]:
     """Every alternative tested by itself, all that was estimated free, the likeliest first.
 
@@ -270,7 +270,7 @@ def doubt_about(kind, alternative, solution, admitted_offset):
     words = alternative.words.format(
         size=f"{abs(value) * alternative.unit:.2g}",
         sigma=f"{sigma * alternative.unit:.2g}",
-        sign=alternative.signs[int(value < 0)],
+        sign=by_sign(value, *alternative.signs),
     )
     return Doubt(
         kind=kind,
@@ -433,9 +433,9 @@ def places_of_cameras(solution: JointSolution) -> list[str]:
     sentences = []
     for camera in solution.transforms:
         x, y, z = 1000 * _seat(solution, camera)
-        side = "right" if x > 0 else "left"
-        before = "in front of" if y > 0 else "behind"
-        above = "above" if z > 0 else "below"
+        side = by_sign(x, "right", "left")
+        before = by_sign(y, "in front of", "behind")
+        above = by_sign(z, "above", "below")
         sentences.append(
             f"Seen along the middle beam, camera '{camera}' is {abs(x):.0f} mm to the {side} of, "
             f"{abs(y):.0f} mm {before} and {abs(z):.0f} mm {above} the range finder."

@@ -113,7 +113,7 @@ def camera_changes(
         In the order in which they were found, the clearest first.
     """
     cameras = list(solution.observations.cameras)  # of the poses
-    changes = []
+    changes: list[CameraChange] = []
     while len(changes) < MOST_CHANGES and (step := likeliest_step(solution)):
         camera = cameras[step.camera]
         parted = with_change(solution.observations, step, camera, prepared, settings)
@@ -248,7 +248,8 @@ def _chance_of_step(score, columns, row):
     repeated = np.concatenate([np.arange(shared), columns])
     kept = np.ones((count, len(repeated)))
     kept[~later, shared:] = 0.0
-    whole = score.information[:, repeated][:, :, repeated] * kept[:, :, None] * kept[:, None, :]
+    both = kept[:, :, None] * kept[:, None, :]
+    whole = both * score.information[:, repeated[:, None], repeated]
     gradient = score.gradient[:, repeated] * kept
 
     covariance = np.linalg.pinv(whole.sum(axis=0), rcond=RCOND, hermitian=True)
@@ -282,13 +283,15 @@ def change_between(solution, first, later, camera, prepared):
     change = solution.transforms[later] * solution.transforms[first].inv()
     shift = solution.transforms[later].translation - solution.transforms[first].translation
     both = solution.covariance(f"{first}_", f"{later}_")
-    spread = both[:POSE, :POSE] + both[POSE:, POSE:] - both[:POSE, POSE:] - both[POSE:, :POSE]
+    later_less_first = np.hstack([-np.eye(POSE), np.eye(POSE)])
+    spread = later_less_first @ both @ later_less_first.T
     sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
     both_parts = np.concatenate([change.rotation.as_rotvec(), shift])
     square = both_parts @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ both_parts
 
     views = obs.view_camera == index
-    middles = obs.view_pose[views, :3, :2] @ obs.corners.mean(axis=0) + obs.view_pose[views, :3, 3]
+    middle = [*obs.corners.mean(axis=0), 0.0]
+    middles = RigidTransform.from_matrix(obs.view_pose[views]).apply(middle)
     motion = project(middles, model) - project(change.inv().apply(middles), model)
     rows = np.unique(obs.view_placement[views])
     earlier = np.unique(obs.view_placement[obs.view_camera == obs.cameras.index(first)])

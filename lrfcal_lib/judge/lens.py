@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind
+from lrfcal_lib.judge.findings import Finding, Kind, no_if
 from lrfcal_lib.model.camera import CameraModel, fold, lens_terms, project
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -55,12 +55,14 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
                 "intrinsics of another image size"
             )
         if faults:
-            wide = 2 * np.arctan2(model.width / 2, model.fx) > WIDE
+            remedy = REMEDY
+            if 2 * np.arctan2(model.width / 2, model.fx) > WIDE:
+                remedy = REMEDY_WIDE
             words = (
                 f"the lens of camera '{camera}' is not that of its model ({'; '.join(faults)}): "
-                f"{REMEDY_WIDE if wide else REMEDY}"
+                f"{remedy}"
             )
-            findings.append(Finding(NO if other_size else CARE, Kind.LENS, words))
+            findings.append(Finding(no_if(other_size), Kind.LENS, words))
     return findings
 
 
@@ -79,7 +81,9 @@ def common_miss(views, points, model):
         if len(of_part) >= LENS_CORNERS:
             noise = of_part.var(axis=0).sum() / len(of_part)
             squares.append(np.sum(of_part.mean(axis=0) ** 2) - noise)
-    return np.sqrt(max(np.mean(squares), 0.0)) if squares else 0.0
+    if not squares:
+        return 0.0
+    return np.sqrt(max(np.mean(squares), 0.0))
 
 
 def reach_of_fold(model: CameraModel) -> float:

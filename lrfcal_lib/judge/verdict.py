@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.judge.alternatives import places_of_cameras
-from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief
+from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief, no_if
 from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_placement
 from lrfcal_lib.judge.recording_faults import explained, recording_faults
@@ -198,7 +198,7 @@ def judge(calibration: Calibration, method: str | None = None, *, suggest: bool 
     findings = []
     faults = recording_faults(calibration)
     for fault in faults:
-        findings.append(Finding(NO if fault.severe else CARE, fault.kind, fault.words))
+        findings.append(Finding(no_if(fault.severe), fault.kind, fault.words))
     findings += lens_findings(prepared)
     doubt = 0.0
     # also where the joint estimate is not handed over: a wrong size may be why
@@ -209,7 +209,7 @@ def judge(calibration: Calibration, method: str | None = None, *, suggest: bool 
     if method is None:
         return _refused(calibration, findings)
 
-    if method == "joint":
+    if method == "joint" and joint is not None:
         field = prepared.session.lrf.field_of_view
         judged = verdict(
             joint.solution, prepared.models, suggest=suggest, doubt=doubt, field_of_view=field
@@ -225,11 +225,11 @@ def judge(calibration: Calibration, method: str | None = None, *, suggest: bool 
     findings += sides_elsewhere(prepared)
     axis = calibration.platform.axis_with(method)
     notes = [f"Handed over: the cameras of the method '{method}' and the axis '{axis}'."]
-    if method == "joint":
+    scatter = []
+    if method == "joint" and joint is not None:
         notes += places_of_cameras(joint.solution)
-    notes.append(lost.note)
-    if method == "joint":
-        notes += _scatter_note(len(joint.solution.boards))
+        scatter = _scatter_note(len(joint.solution.boards))
+    notes += [lost.note, *scatter]
     return replace(judged.because(findings), notes=tuple(notes))
 
 
@@ -327,9 +327,9 @@ def _expected(ways, models, noise):
     large = errors[WORKING].words(POOR_MM, POOR_PX)
     if not large:
         return judged
-    answer = NO if errors[WORKING].words(BAD_MM, BAD_PX) else CARE
+    severe = bool(errors[WORKING].words(BAD_MM, BAD_PX))
     words = f"the expected error at {WORKING:g} m is {large}"
-    return judged.because([Finding(answer, Kind.ERROR, words)])
+    return judged.because([Finding(no_if(severe), Kind.ERROR, words)])
 
 
 def _refused(calibration, findings):
