@@ -9,9 +9,9 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtri
 
-from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.calibrate.outline import platform_of
+from lrfcal_lib.calibrate.observe_joint import observe_joint
 from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
+from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.judge.alternatives import guesses_of
 from lrfcal_lib.judge.camera_changes import LEVER, camera_changes, explains, large_changes

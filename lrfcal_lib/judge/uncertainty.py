@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lrfcal_lib.fit.least_squares import null_space, reduced_hessian
+from lrfcal_lib.fit.covariance import null_space
+from lrfcal_lib.fit.least_squares import reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
@@ -103,7 +104,7 @@ def chain_of(solution: JointSolution, camera: str | None = None) -> Chain:
     scales = np.array([SCALES.get(name, 1.0) for name in estimate.names])[order]
     whole = solution.information().sum(axis=0)[np.ix_(order, order)]
     hessian = reduced_hessian((whole * scales[:, None] * scales)[None], len(links))[0]
-    motions, _ = null_space(hessian, np.ones(len(links)), UNSEEN)
+    motions = null_space(hessian, np.ones(len(links)), UNSEEN)
     unseen = np.zeros((len(motions), len(COLUMNS)))
     unseen[:, known] = motions * scales[: len(links)]
 
