@@ -14,7 +14,7 @@ from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
 from lrfcal_lib.drivers.rig_file import RigFileError, read_rig_file, rig_of
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
-from lrfcal_lib.judge.verdict import YES, judge, sight_of, verdict
+from lrfcal_lib.judge.verdict import YES, judge, verdict
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.solvers import CANDIDATES
@@ -143,7 +143,7 @@ def advise(session):
         solution = calibrate_jointly(prepared).solution
     except DegenerateGeometry as error:
         return f"not determined yet: {error}"
-    judged = verdict(solution, prepared.models, **sight_of(prepared))
+    judged = verdict(solution, prepared.models, field_of_view=prepared.session.lrf.field_of_view)
     if judged.answer == YES:
         return ""
     return f"put the {judged.suggestion.words()}" if judged.suggestion else judged.no_suggestion

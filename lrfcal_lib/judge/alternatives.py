@@ -34,6 +34,10 @@ FAR_SHIFT = 0.3
 # log odds; sides are expected to deviate no more than this while statements are weighed
 ALIKE = 0.15
 LEVER = 0.2  # metres, weighs turns against shifts
+CHECK = (
+    "check its statement; bearings or pitch of the other sense, or exchanged folders of cameras "
+    "look like this"
+)
 # of the best alternative's likelihood ratio: another one explains the data nearly as well
 AS_GOOD = 0.6
 
@@ -328,35 +332,56 @@ def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):
     )
 
 
-def far_from_stated(joint):
-    """What lies far from where session.json puts it (JointCalibration): list of words and by what
-    angle (radians).
+@dataclass(frozen=True)
+class Far:
+    """Something that lies far from where it is stated: in words, and by what angle (radians)."""
+
+    words: str
+    angle: float
+
+
+def far_from_stated(joint) -> list[Far]:
+    """What lies far from where session.json puts it.
 
     A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of
     the other sense turns the axis about: only the statement of the platform, a camera's guess, or
     its name can tell.
+
+    Parameters
+    ----------
+    joint : JointCalibration
     """
+    far = far_axis(joint) + far_cameras(joint)
+    return far or exchanged_sides(joint.solution)
+
+
+def far_axis(joint):
+    """The tilt axis, if it is Far from where it is stated."""
     session = joint.prepared.session
     solution = joint.solution
-    far = []
-    why = (
-        "check its statement; bearings or pitch of the other sense, or exchanged folders of "
-        "cameras look like this"
-    )
-    if session.T_head_lrf is not None and joint.settings["axis"]:
-        found = axis_difference(solution.axis, axis_of(session.T_head_lrf))
-        own = np.sqrt(np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1))
-        if np.any(found > FAR * np.hypot(session.platform_sigma, own)):
-            far.append(
-                (
-                    f"the tilt axis lies {_apart(*found)} from where session.json states it: {why}",
-                    found[0],
-                )
-            )
+    if session.T_head_lrf is None or not joint.settings["axis"]:
+        return []
+    apart = axis_difference(solution.axis, axis_of(session.T_head_lrf))
+    variance = np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1)
+    sigma = np.hypot(session.platform_sigma, np.sqrt(variance))
+    if np.all(apart <= FAR * sigma):
+        return []
+    words = f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
+    return [Far(words, apart[0])]
+
+
+def far_cameras(joint):
+    """Cameras that are Far from where they are guessed, or stand where another one is guessed."""
+    solution = joint.solution
     guesses = {
-        name: found.guess for name, found in session.cameras.items() if found.guess is not None
+        name: camera.guess
+        for name, camera in joint.prepared.session.cameras.items()
+        if camera.guess is not None
     }
-    for camera in (name for name in solution.transforms if name in guesses):
+    far = []
+    for camera in solution.transforms:
+        if camera not in guesses:
+            continue
         apart = {
             name: transform_difference(solution.transforms[camera], guess)
             for name, guess in guesses.items()
@@ -364,28 +389,28 @@ def far_from_stated(joint):
         turn, shift = apart[camera]
         nearest = min(apart, key=lambda name: apart[name][0] * LEVER + apart[name][1])
         if turn > FAR_TURN or shift > FAR_SHIFT:
-            far.append(
-                (f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {why}", turn)
-            )
+            words = f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {CHECK}"
+            far.append(Far(words, turn))
         elif nearest != camera:
-            far.append(
-                (
-                    f"camera '{camera}' stands where camera '{nearest}' is said to stand: "
-                    "exchanged folders?",
-                    turn,
-                )
+            words = (
+                f"camera '{camera}' stands where camera '{nearest}' is said to stand: were the "
+                "folders exchanged?"
             )
-    sides = {camera: _seat(solution, camera)[0] for camera in solution.transforms if not far}
-    for left, right in permutations(sides, 2):
-        if "left" in left.lower() and "right" in right.lower() and sides[left] > sides[right]:
-            off = 1000 * (sides[left] - sides[right])
-            far.append(
-                (
-                    f"camera '{left}' sits {off:.0f} mm to the right of camera '{right}': "
-                    "exchanged folders?",
-                    0.0,
-                )
+            far.append(Far(words, turn))
+    return far
+
+
+def exchanged_sides(solution):
+    """Cameras that are called left and right, and stand the other way round."""
+    far = []
+    for left, right in permutations(solution.transforms, 2):
+        offset = _seat(solution, left)[0] - _seat(solution, right)[0]
+        if "left" in left.lower() and "right" in right.lower() and offset > 0:
+            words = (
+                f"camera '{left}' is {1000 * offset:.0f} mm to the right of camera '{right}': were "
+                "the folders exchanged?"
             )
+            far.append(Far(words, 0.0))
     return far
 
 
@@ -398,17 +423,21 @@ def _apart(angle, distance):
     return f"{np.degrees(angle):.1f} deg and {1000 * distance:.0f} mm"
 
 
-def places_of_cameras(solution):
-    """Where the cameras of a JointSolution stand, in words: who mixed up their folders sees it
-    here.
+def places_of_cameras(solution: JointSolution) -> list[str]:
+    """Where the cameras stand, in words: who mixed up their folders sees it here.
+
+    Parameters
+    ----------
+    solution
     """
-    words = []
+    sentences = []
     for camera in solution.transforms:
         x, y, z = 1000 * _seat(solution, camera)
-        sides = ((x, "right", "left"), (y, "before", "behind"), (z, "above", "below"))
-        places = [f"{abs(v):.0f} mm {names[int(v < 0)]}" for v, *names in sides]
-        words.append(
-            f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the "
-            "range finder."
+        side = "right" if x > 0 else "left"
+        before = "in front of" if y > 0 else "behind"
+        above = "above" if z > 0 else "below"
+        sentences.append(
+            f"Seen along the middle beam, camera '{camera}' is {abs(x):.0f} mm to the {side} of, "
+            f"{abs(y):.0f} mm {before} and {abs(z):.0f} mm {above} the range finder."
         )
-    return words
+    return sentences

@@ -2,16 +2,17 @@
 
 import numpy as np
 
-from lrfcal_lib.model.camera import fold, lens_terms, project
+from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind
+from lrfcal_lib.model.camera import CameraModel, fold, lens_terms, project
 from lrfcal_lib.preprocess.intrinsics import raised_points
+from lrfcal_lib.preprocess.prepared import Prepared
+from lrfcal_lib.solvers.pitch import PitchErrors
 
 SIGNIFICANT = 3.0  # standard deviations of an offset by sweep direction
-# of an image; corners in a part; pixels
-LENS_PARTS = np.array([6, 4])
-LENS_CORNERS = 20
-LENS_MISS = 0.15
+LENS_PARTS = np.array([6, 4])  # columns and rows that an image is cut into
+LENS_CORNERS = 20  # corners of the chessboard in a part, at least
+LENS_MISS = 0.15  # pixels that corners of a part may miss by alike
 OFF_MIDDLE = 0.2  # of the image's size
-OTHER_SIZE = "as with intrinsics of another image size"
 WIDE = np.radians(80.0)  # across an image, by the focal length: five numbers hardly hold it
 REMEDY = "state intrinsics of this image size, or take sharp images with the chessboard all over"
 REMEDY_WIDE = (
@@ -19,82 +20,114 @@ REMEDY_WIDE = (
 )
 
 
-def lens_words(prepared):
-    """Cameras whose lens its model does not fit, one sentence each by camera, from the corners of
-    the chessboard.
+def lens_findings(prepared: Prepared) -> list[Finding]:
+    """Cameras whose lens its model does not fit, as the corners of the chessboard show it.
 
-    What corners miss by on the average over parts of the image is of the lens: noise and waves of
-    the sheet differ from view to view. And radii that the model folds back inside the image.
+    Parameters
+    ----------
+    prepared
+
+    Returns
+    -------
+    list of Finding
+        One a camera.
     """
-    out = {}
-    for camera, views in prepared.views.items() if prepared.board.pattern else ():
-        model = prepared.models[camera]
-        seen = [v for v in views.values() if v.pixels is not None and not v.reason]
-        if not seen:
+    if prepared.board.pattern is None:
+        return []
+    findings = []
+    for camera, model in prepared.models.items():
+        views = prepared.views[camera].values()
+        views = [view for view in views if view.pixels is not None and not view.reason]
+        if not views:
             continue
-        points = raised_points(prepared.board.pattern, prepared.relief)
-        uv = np.concatenate([v.pixels for v in seen])
-        off = uv - np.concatenate([project(v.T_camera_board.apply(points), model) for v in seen])
-        part = np.floor(LENS_PARTS * uv / [model.width, model.height])
-        parts = []
-        for own in np.unique(part[np.isfinite(off).all(axis=1)], axis=0):
-            mine = off[(part == own).all(axis=1)]
-            if len(mine) >= LENS_CORNERS:
-                parts.append(np.sum(mine.mean(axis=0) ** 2) - mine.var(axis=0).sum() / len(mine))
-        alike = np.sqrt(max(np.mean(parts), 0.0)) if parts else 0.0
-        ends = np.array([[0, 0], [0, model.height], [model.width, 0], [model.width, model.height]])
-        corner = np.linalg.norm((ends - [model.cx, model.cy]) / [model.fx, model.fy], axis=1).max()
-        r = np.sqrt(fold(model))
-        reach = np.inf
-        if np.isfinite(r):
-            k1, k2, _, _, k5 = model.distortion
-            # recorded radius of the fold
-            reach = r * (1 + lens_terms(r, 0.0, k1, k2, 0.0, 0.0, k5)[0]) / corner
-        words = [f"corners of the chessboard miss by {alike:.2f} px alike"] * int(alike > LENS_MISS)
-        words += [
-            f"the model folds back at {100 * reach:.0f} % of the way to the image's corners"
-        ] * int(reach < 1)
-        if (
-            np.abs(np.array([model.cx / model.width, model.cy / model.height]) - 0.5).max()
-            > OFF_MIDDLE
-        ):
-            words.append(
-                f"its middle ({model.cx:.0f}, {model.cy:.0f}) is far from the image's, {OTHER_SIZE}"
+        faults = []
+        miss = common_miss(views, raised_points(prepared.board.pattern, prepared.relief), model)
+        if miss > LENS_MISS:
+            faults.append(f"all corners of the chessboard miss by {miss:.2f} px alike")
+        reach = reach_of_fold(model)
+        if reach < 1:
+            faults.append(
+                f"the model folds back at {100 * reach:.0f} % of the way to the image's corners"
             )
-        if words:
+        middle = np.array([model.cx / model.width, model.cy / model.height])
+        other_size = np.abs(middle - 0.5).max() > OFF_MIDDLE
+        if other_size:
+            faults.append(
+                f"its middle ({model.cx:.0f}, {model.cy:.0f}) is far from the image's, as with "
+                "intrinsics of another image size"
+            )
+        if faults:
             wide = 2 * np.arctan2(model.width / 2, model.fx) > WIDE
-            remedy = REMEDY_WIDE if wide else REMEDY
-            lens = f"the lens of camera '{camera}' is not that of its model"
-            out[camera] = f"{lens} ({'; '.join(words)}): {remedy}"
-    return out
+            words = (
+                f"the lens of camera '{camera}' is not that of its model ({'; '.join(faults)}): "
+                f"{REMEDY_WIDE if wide else REMEDY}"
+            )
+            findings.append(Finding(NO if other_size else CARE, Kind.LENS, words))
+    return findings
 
 
-def pitch_words(errors):
-    """Sentences about the recorded pitch (PitchErrors or None).
+def common_miss(views, points, model):
+    """What corners (k, 3) miss by alike in parts of the images (BoardViews), pixels.
 
-    None without errors that the data ask for.
+    That is of the lens: noise and waves of the sheet differ from view to view.
+    """
+    uv = np.concatenate([view.pixels for view in views])
+    expected = [project(view.T_camera_board.apply(points), model) for view in views]
+    miss = uv - np.concatenate(expected)
+    part = np.floor(LENS_PARTS * uv / [model.width, model.height])
+    squares = []
+    for here in np.unique(part[np.isfinite(miss).all(axis=1)], axis=0):
+        of_part = miss[(part == here).all(axis=1)]
+        if len(of_part) >= LENS_CORNERS:
+            noise = of_part.var(axis=0).sum() / len(of_part)
+            squares.append(np.sum(of_part.mean(axis=0) ** 2) - noise)
+    return np.sqrt(max(np.mean(squares), 0.0)) if squares else 0.0
+
+
+def reach_of_fold(model: CameraModel) -> float:
+    """Recorded radius at which a lens model folds back, relative to the image's corners.
+
+    Parameters
+    ----------
+    model
+    """
+    r = np.sqrt(fold(model))
+    if not np.isfinite(r):
+        return np.inf
+    far = np.maximum([model.cx, model.cy], [model.width - model.cx, model.height - model.cy])
+    corner = np.linalg.norm(far / [model.fx, model.fy])
+    k1, k2, _, _, k5 = model.distortion
+    return float(r * (1 + lens_terms(r, 0.0, k1, k2, 0.0, 0.0, k5)[0]) / corner)
+
+
+def pitch_words(errors: PitchErrors | None) -> list[str]:
+    """What data say about errors of the recorded pitch, a sentence each.
+
+    Parameters
+    ----------
+    errors
+        None where nothing can be said.
     """
     if errors is None or errors.wanted == "none":
         return []
-    each = errors.models[errors.wanted]
-    out = []
+    wanted = errors.models[errors.wanted]
+    sentences = []
     offset, sigma = np.rad2deg([errors.direction_offset, errors.direction_sigma])
     if np.isfinite(offset) and abs(offset) > SIGNIFICANT * sigma:
-        out.append(
+        sentences.append(
             "the pitch depends on the direction of the sweep: upward and downward sweeps differ "
-            "by "
-            f"{2 * abs(offset):.2f} +- {2 * sigma:.2f} deg"
+            f"by {2 * abs(offset):.2f} +- {2 * sigma:.2f} deg"
         )
-    if errors.wanted.startswith("sweep"):
-        out.append(
-            f"every sweep has a pitch offset of its own: {np.rad2deg(np.std(each.offset)):.2f} "
-            "deg (sd)"
+    if errors.wanted in ("sweep", "sweep_stretch"):
+        offsets = np.rad2deg(np.std(wanted.offset))
+        sentences.append(
+            f"every sweep has a pitch offset of its own: {offsets:.2f} deg (standard deviation)"
         )
     if errors.wanted == "sweep_stretch":
-        low = 100 * each.stretch.min()
-        high = 100 * each.stretch.max()
-        out.append(
+        low = 100 * wanted.stretch.min()
+        high = 100 * wanted.stretch.max()
+        sentences.append(
             f"every sweep is stretched by an amount of its own: {low:+.1f} to {high:+.1f} % of "
             "the pitch"
         )
-    return out
+    return sentences
