@@ -119,10 +119,10 @@ def test_a_camera_that_never_sees_the_board(good):
     rig, poses, _ = good
     obs = seen(rig, poses, np.random.default_rng(3))
     obs = obs.keep(view=obs.view_camera == 0)
-    with pytest.raises(DegenerateGeometry, match="camera 'right' never sees the board"):
+    with pytest.raises(DegenerateGeometry, match="camera 'right': it never sees the board"):
         solve_joint(obs)
     found = verdict(solve_joint(obs, required=False), models_of(rig), suggest=False)
-    assert found.sentences()[0].startswith("Use this calibration with care: camera 'right' never sees the board")
+    assert found.sentences()[0].startswith("Use this calibration with care: camera 'right': it never sees the board")
     assert set(found.errors[2.0].pixels) == {"left"}
 
 
