@@ -484,9 +484,10 @@ def solve(
     )
     blocks = once(minimum.state)
     axes = -1 if shared is None else (-2, -1)
-    roots = linearise(blocks, loss, scale, axes).roots
-    pairs = zip(blocks, roots, strict=True)
-    weights = [np.ones_like(b.white) if root is None else root**2 for b, root in pairs]
+    weights = []
+    for block in blocks:
+        of_block = _weigh(block, loss, scale, axes)[0]
+        weights.append(np.ones_like(block.white) if of_block is None else of_block)
     return _solution(question, minimum, blocks, np.concatenate(weights, axis=-1), shared)
 
 
