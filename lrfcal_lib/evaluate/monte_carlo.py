@@ -135,9 +135,9 @@ def monte_carlo(draw, solve, seeds):
             names = found.solution.names
         if names != found.solution.names:
             raise ValueError(f"seed {seed} estimates {found.solution.names}, earlier ones {names}")
-        error = state_errors(found.state, truth, found.unknowns)
+        errors = state_errors(found.state, truth, found.unknowns)
         limit = bound(obs, truth, found.unknowns)
-        rows.append((int(seed), error, found.solution.covariance, limit))
+        rows.append((int(seed), errors, found.solution.covariance, limit))
     if not rows:
         last = list(failed.values())[-1] if failed else "no seed given"
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")

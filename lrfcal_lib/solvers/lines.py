@@ -1,5 +1,6 @@
 """Cameras from lines (equations 16 to 21), after Wasielewski and Strauss, and after Bauermann."""
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -130,8 +131,8 @@ def estimate_pose(
 
         return plain
 
-    problem = partial(residual, obs=obs)
-    earlier = []
+    problem: Callable[[np.ndarray], Block] = partial(residual, obs=obs)
+    earlier: list[np.ndarray] = []
     if not weighted:
         problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
     placements = obs.group(uses)["placement"]
@@ -178,7 +179,7 @@ def _start_from_sights(points, lines, obs):
 
     for loss in (None, "cauchy"):
         options = {"loss": loss, "scale": "auto", "max_iterations": 40}
-        poses = minimise(evaluate, poses, move_pose, **options)[0]
+        poses = minimise(evaluate, poses, move_pose, **options).state
     depth = apply_pose(poses, points)[..., 2]
     ahead = (depth > 0).mean(axis=1) > AHEAD
     if not ahead.any():

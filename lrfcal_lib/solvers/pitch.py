@@ -166,17 +166,16 @@ def estimate_pitch_errors(
     numbers = _count_numbers(rows, len(poses), len(placements))
     models = {}
     by_direction = (np.nan, np.nan)
-    wanted = before = None
     for name, by_unknown in columns.items():
         solution = _solve(name, rows, by_unknown, poses)
         model = _model(name, solution, rows, turn, numbers)
         if name == "direction":
             by_direction = (float(solution.parameters[-1]), float(model.offset_sigma[0]))
-        if before is not None:
-            model = model.tested(before, numbers)
-        if wanted is None or model.tested(wanted, numbers).p_value < LEVEL:
+        if name == "none":
+            wanted = before = model
+        if model.tested(wanted, numbers).p_value < LEVEL:
             wanted = model
-        models[name] = before = model
+        models[name] = before = model.tested(before, numbers)
     return PitchErrors(placements, turn, *by_direction, models, wanted.name)
 
 

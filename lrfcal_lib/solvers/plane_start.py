@@ -1,5 +1,6 @@
 """Start values of a camera from planes: minimal and closed forms, and the choice among minima."""
 
+from functools import partial
 from itertools import combinations
 from math import comb
 
@@ -74,9 +75,9 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     def evaluate(pose):
         return plane_block(pose, triangles / ROUGH_SIGMA, sets.boards, None, sets.number)
 
-    options = {"max_iterations": 12, "tolerance": 0.01}
-    robust, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", **options)
-    plain, *_ = minimise(evaluate, robust, move_pose, **options)
+    rough = partial(minimise, evaluate, retract=move_pose, max_iterations=12, tolerance=0.01)
+    robust = rough(state=best, loss="cauchy", scale="auto").state
+    plain = rough(state=robust).state
     minima = np.concatenate([robust, plain, best])
     sizes = sizes_of_minima(_squares(minima, triangles, sets), sets.number)
     apart = np.array(_apart(minima, np.argsort(sizes)))

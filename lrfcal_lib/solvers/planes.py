@@ -182,7 +182,8 @@ def compress(sets: PlaneSets, weights) -> np.ndarray:
     """Triangles of the weighted rows ``[p, 1]``, shape (..., p, 4, 4), from reciprocal standard
     deviations.
     """
-    return np.linalg.qr(_with_one(sets.points) * (weights * sets.used)[..., None], mode="r")
+    rows = _with_one(sets.points) * (weights * sets.used)[..., None]
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def _noise_across(sets, planes):
@@ -345,7 +346,7 @@ def estimate_with_lens(
     error = plane_error(obs, solution)
     numbers = int(np.sum(plane_sets(obs).number) + visible.sum())
     state = (pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3])
-    earlier = []
+    earlier: list[np.ndarray] = []
     for _ in range(2):
         planes, rest = _planes_at(obs, state, error)
         solution = solve(

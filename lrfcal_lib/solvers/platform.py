@@ -111,7 +111,7 @@ def solve_platform(
     placement with one edge serves too when it has face points.
     """
     gauge = start_head(T0)
-    earlier = []
+    earlier: list[np.ndarray] = []
     for final in (False, True):  # the second time in the gauge of the axis of the first
         boards = prepare_boards(obs, gauge)
         on_edges = int(boards.edge["used"].sum())
@@ -356,7 +356,7 @@ def solve_projected(
         )
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
     scatter = 1.0
-    earlier = []
+    earlier: list[np.ndarray] = []
     for final in (False, True):  # the second time with the scatter of the first
         solution = solve(
             partial(
