@@ -9,7 +9,6 @@ import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case, camera_observations
 
-from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
 from lrfcal_lib.model import observations
 from lrfcal_lib.model.geometry import (
@@ -161,7 +160,7 @@ def test_scipy_agrees(name, weighted):
         if name == "planes":
             return plane_residuals_m(obs, pose_transform(pose))
         block = RESIDUALS[name](pose, obs)
-        return whiten(block)[0] if weighted else block.residuals
+        return block.white if weighted else block.residuals
 
     theirs = scipy.optimize.least_squares(residuals, np.zeros(6), **options)
     ours = solve_camera(obs, "zhang_pless" if name == "planes" else name, rig.T_camera_lrf, weighted=weighted)

@@ -18,6 +18,7 @@ from lrfcal_lib.judge.alternatives import (
     far_from_stated,
     not_an_offset,
     places_of_cameras,
+    step_not_told,
 )
 from lrfcal_lib.judge.diagnosis import OTHER_SIZE, lens_words
 from lrfcal_lib.judge.next_placement import (
@@ -353,6 +354,9 @@ def judge(calibration, method=None, **options):
         *places,
         words,
     )
+    if method == "joint" and not sizes:
+        words = step_not_told(joint.solution, prepared.session.lrf.admitted_offset)
+        notes += (words,) if words else ()
     if method == "joint" and FEWEST <= (n := len(joint.solution.boards)) < MANY:
         known = 100 / np.sqrt(2 * (n - 1))
         within = stdtrit(n - 1, 0.95)
