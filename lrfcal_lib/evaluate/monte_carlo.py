@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import logit
 from scipy.stats import binom, chi2
 
@@ -183,9 +183,9 @@ def bound(obs, truth, unknowns):
         if name == "beam":  # expected: over both readings, weighted by how likely each is
             chance = np.exp(-block.cost)[..., None]
             other = missed[name].white_jacobian
-            hessian = hessian + np.swapaxes(other, -1, -2) @ ((1 - chance) * other)
+            hessian = hessian + other.mT @ ((1 - chance) * other)
             J = np.sqrt(chance) * J
-        hessian = hessian + np.swapaxes(J, -1, -2) @ J
+        hessian = hessian + J.mT @ J
     total = np.sum(reduced_hessian(hessian, unknowns.shared), axis=0)
     scale = 1 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))
     values, vectors = np.linalg.eigh(total * scale[:, None] * scale)
@@ -275,7 +275,7 @@ def _judge(trials, index, factor):
         "rmse_over_crb": rmse / crb,
         "stated_over_crb": stated / crb,
         "coverage": np.mean(np.abs(e) < half_width),
-        "nees": np.mean(np.sum(e * normalised, axis=-1)) / len(index),
+        "nees": np.mean(np.vecdot(e, normalised)) / len(index),
     }
     row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(chi2.ppf(LIMITS, free) / free)
     row["coverage_low"], row["coverage_high"] = binom.ppf(LIMITS, seen, INTERVAL) / seen
@@ -336,12 +336,12 @@ def _crossing_points(ranges, setup, last_beam):
     ray = polar_to_points(1.0, ends)
     across = np.cross([0.0, 0.0, 1.0], ray)
     u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
-    r = 1 / np.sum(u * ray, axis=-1)  # to the fitted line u . p = 1
-    by_bearing = -(r**2) * np.sum(u * across, axis=-1)  # the range's change
+    r = 1 / np.vecdot(u, ray)  # to the fitted line u . p = 1
+    by_bearing = -(r**2) * np.vecdot(u, across)  # the range's change
     turned = r[..., None] * across + by_bearing[..., None] * ray
     of_line = np.linalg.inv(information) * setup.sigma_range**2
     flat_ray = ray[..., :2]
-    variance = r**4 * np.einsum("nei,nij,nej->ne", flat_ray, of_line, flat_ray)
+    variance = r**4 * np.vecdot(flat_ray @ of_line, flat_ray)
     spacing = _outer(turned * setup.step * UNIFORM)
     return r[..., None] * ray, variance[..., None, None] * _outer(ray) + spacing
 
@@ -384,10 +384,10 @@ def shots_table(shots: dict, setup: ShotSetup, rng: np.random.Generator) -> pd.D
         error of the pose over 6).
     """
     true = shots["T_camera_lrf"]
-    turn = Rotation.from_rotvec(rng.normal(0, 0.05, (len(true), 3))).as_matrix()
+    near = pose_transform(true)
+    turn = Rotation.from_rotvec(rng.normal(0, 0.05, (len(true), 3)))
     shift = rng.normal(0, 0.05, (len(true), 3))
-    near = np.concatenate([turn @ true[..., :3], true[..., 3:] + shift[..., None]], axis=-1)
-    T0 = pose_transform(near)
+    T0 = RigidTransform.from_components(near.translation + shift, turn * near.rotation)
     half = observations(shots, setup)
     solutions = {
         "line_last_beam": solve_camera(observations(shots, setup, last_beam=True), "line", T0),
@@ -402,7 +402,7 @@ def shots_table(shots: dict, setup: ShotSetup, rng: np.random.Generator) -> pd.D
             "method": method,
             "rotation_median_deg": np.degrees(np.median(np.linalg.norm(error[:, :3], axis=1))),
             "translation_median_mm": 1000 * np.median(np.linalg.norm(error[:, 3:], axis=1)),
-            "nees": np.mean(np.sum(error * normalised, axis=-1)) / 6,
+            "nees": np.mean(np.vecdot(error, normalised)) / 6,
         }
         rows.append(row)
     return pd.DataFrame(rows)

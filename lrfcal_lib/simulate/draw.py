@@ -341,7 +341,7 @@ def _shots(setup, rng, T_camera_lrf):
     usable &= (edges[:, 0] != edges[:, 1]) & (second < -CLEAR).all(axis=1)
 
     true = pose_array(T_camera_lrf * T_lrf_board)
-    corners = board.corners @ np.swapaxes(true[..., :2], 1, 2) + true[:, None, :, 3]
+    corners = board.corners @ true[..., :2].mT + true[:, None, :, 3]
     uv = pinhole(corners, setup.model)
     inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
     usable &= inside.all(axis=(1, 2)) & (corners[..., 2] > 0).all(axis=1)
@@ -425,16 +425,16 @@ def _seen_poses(devices, true, rng, noise):
     """Poses (n, 3, 4) of boards as their pattern tells them, and their covariances."""
     pattern = devices.board.pattern
     corners = CORNERS if pattern is None else pattern.points()
-    turned = corners @ np.swapaxes(true[..., :3], -1, -2)
+    turned = corners @ true[..., :3].mT
     points = turned + true[:, None, :, 3]
     by_point = project_jacobians(points.reshape(-1, 3), devices.model)[0]
     by_point = by_point.reshape(points.shape[:2] + (2, 3))
     J = np.concatenate([np.cross(turned[:, :, None], by_point), by_point], axis=-1)
     J = J.reshape(len(true), 2 * len(corners), 6)
-    information = np.swapaxes(J, -1, -2) @ J
+    information = J.mT @ J
     covariance = np.linalg.inv(information) * devices.sigma_px**2
-    unit = rng.standard_normal((len(true), 6, 1))
-    error = noise * (np.linalg.cholesky(covariance) @ unit)[..., 0]
+    unit = rng.standard_normal((len(true), 6))
+    error = noise * np.matvec(np.linalg.cholesky(covariance), unit)
     rotation = Rotation.from_rotvec(error[:, :3]).as_matrix() @ true[..., :3]
     translation = true[..., 3:] + error[:, 3:, None]
     return np.concatenate([rotation, translation], axis=-1), covariance
