@@ -7,6 +7,7 @@ solver.
 """
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -87,8 +88,19 @@ class ShotSetup(Devices):
         return np.radians(40) + self.step * np.arange(count)
 
 
-def bench(rng, cameras=("left", "right"), **settings):
-    """A :class:`Bench` like the paper's, mounted wrongly by some degrees and centimetres."""
+def bench(
+    rng: np.random.Generator, cameras: Sequence[str] = ("left", "right"), **settings
+) -> Bench:
+    """A rig like the paper's, mounted wrongly by some degrees and centimetres.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    cameras : sequence of str
+        Their names.
+    **settings
+        Other attributes of :class:`Bench`.
+    """
     turn = Rotation.from_rotvec([0.0, *rng.normal(0, 0.02, 2)])
     head = RigidTransform.from_components([0.0, *rng.normal(0, 0.05, 2)], turn)
     poses = {}
@@ -127,13 +139,21 @@ def board_poses(
     return list(_posed(drawn[:, 0], drawn[:, 1:3], centre, [0.105, 0.127, 0.0]))
 
 
-def observe(bench, poses, rng, *, images=3, span=None, noise=1.0):
+def observe(
+    bench: Bench,
+    poses: Sequence[RigidTransform],
+    rng: np.random.Generator,
+    *,
+    images: int = 3,
+    span: float | None = None,
+    noise: float = 1.0,
+) -> dict:
     """Draw what the rig records of boards.
 
     Parameters
     ----------
     bench : Bench
-    poses : list of RigidTransform
+    poses : sequence of RigidTransform
         ``T_platform_board``.
     rng : numpy.random.Generator
     images : int
