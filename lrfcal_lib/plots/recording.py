@@ -369,7 +369,8 @@ def seen_points(
 
 def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
     """Recorded pixels (STRETCH, 2) of an ImageEdge, which is a straight line without the lens."""
-    uv = np.linspace(*edge.ends, STRETCH)
+    first, last = edge.ends
+    uv = np.linspace(first, last, STRETCH)
     focal = np.array([model.fx, model.fy])
     centre = np.array([model.cx, model.cy])
     return distort((uv - centre) / focal, model.distortion) * focal + centre

@@ -1,6 +1,6 @@
 """Drawings in space, and coloured clouds as a camera sees them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
@@ -112,7 +112,7 @@ def space(
         ax.set_axis_off()
 
 
-def sphere(ax: Axes3D, centre: ArrayLike, radius: float) -> None:
+def sphere(ax: Axes3D, centre: np.ndarray, radius: float) -> None:
     """The set a point allows, figure 3 (a): the surface of a sphere.
 
     Parameters
@@ -239,7 +239,9 @@ def pixels(seen: np.ndarray, size: tuple[int, int], focal: float | None = None) 
     return (focal or width) * seen[:, :2] / seen[:, 2:] + centre
 
 
-def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> RigidTransform:
+def look_at(
+    eye: ArrayLike, target: ArrayLike, up: Sequence[float] = (0.0, 0.0, 1.0)
+) -> RigidTransform:
     """The view from one point to another for :func:`render`.
 
     Parameters
@@ -260,7 +262,8 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
         If eye and target coincide, or `up` is the line of sight.
     """
     eye = np.asarray(eye, float)
-    ahead = np.subtract(target, eye)
+    target = np.asarray(target, float)
+    ahead = target - eye
     right = np.cross(ahead, up)
     distance = np.linalg.norm(ahead)
     if np.linalg.norm(right) <= PARALLEL * distance:

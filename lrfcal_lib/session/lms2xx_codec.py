@@ -177,17 +177,17 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
     Every place that looks like a beginning is checked by its CRC; of overlapping ones the first
     counts. By chance one in 65536 of the places inside other bytes passes.
     """
-    data = np.frombuffer(data, np.uint8)
-    offset = np.flatnonzero(data[: max(len(data) - 3, 0)] == STX)
-    offset = offset[(data[offset + 1] >= DEVICE) == replies]
-    length = word(data, offset + 2) + OVERHEAD
+    values = np.frombuffer(data, np.uint8)
+    offset = np.flatnonzero(values[: max(len(values) - 3, 0)] == STX)
+    offset = offset[(values[offset + 1] >= DEVICE) == replies]
+    length = word(values, offset + 2) + OVERHEAD
     plausible = (length > OVERHEAD) & (length <= LONGEST)
     offset = offset[plausible]
     length = length[plausible]
     ends = offset + length
-    whole = ends <= len(data)
+    whole = ends <= len(values)
     good = np.zeros(len(offset), bool)
-    good[whole] = check_crc(data, offset[whole], length[whole])
+    good[whole] = check_crc(values, offset[whole], length[whole])
     if np.any(offset[good][1:] < ends[good][:-1]):  # seldom
         free = 0
         for row in np.flatnonzero(good):
@@ -198,8 +198,8 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
     before = np.searchsorted(offset[good], offset, side="right") - 1
     inside = (before >= 0) & (offset < np.append(ends[good], 0)[before])
     begun = offset[~whole & (offset >= used)]
-    tail = max(len(data) - 3, int(used))  # too few bytes to state a length
-    begun = np.r_[begun, tail + np.flatnonzero(data[tail:] == STX), len(data)]
+    tail = max(len(values) - 3, int(used))  # too few bytes to state a length
+    begun = np.r_[begun, tail + np.flatnonzero(values[tail:] == STX), len(values)]
     rejected = whole & ~good & ~inside
     return Stream(offset[good], length[good], offset[rejected], int(begun[0]))
 

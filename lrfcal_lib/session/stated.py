@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import pydantic
@@ -504,6 +504,17 @@ def _lens(lens, info):
     return lens and lens.made(info.data.get("width"), info.data.get("height"))
 
 
+if TYPE_CHECKING:
+    Lens = CameraModel | None
+else:  # stated without the size of the image, which stands beside it
+    Lens = Annotated[
+        LensStated | None,
+        AfterValidator(_lens),
+        PlainSerializer(model_to_json),
+        Field(alias="intrinsics"),
+    ]
+
+
 @dataclass(frozen=True)
 class CameraInfo:
     """A camera of the rig.
@@ -526,12 +537,7 @@ class CameraInfo:
     mount: Literal["head", "platform"]
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1), AfterValidator(_few_pixels)]
-    model: Annotated[
-        LensStated | None,
-        AfterValidator(_lens),
-        PlainSerializer(model_to_json),
-        Field(alias="intrinsics"),
-    ] = None
+    model: Lens = None
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
 
