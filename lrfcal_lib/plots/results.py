@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,13 +16,16 @@ from lrfcal_lib.plots.recording import COLORS, SERIES, color_of, series
 BINS = 8  # of distances, with as many residuals each
 LEVELS = 5
 LEAST_HEIGHT = 20.0  # degrees of a map: that of a head which hardly moves would be a line
-SPREAD = {"capsize": 2, "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]}}  # of bars
+SPREAD: dict[str, Any] = {
+    "capsize": 2,
+    "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]},
+}  # of bars
 WORST = 4.0  # times the median: a placement that fits so badly is an outlier
 SHOWN = 6  # least known combinations of unknowns
 ROW = 64  # letters
 
 
-def by_placement(ax: Axes, names: Sequence, label: str) -> None:
+def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
     """Ticks and labels of an axis of placements; the zero of what is drawn over them."""
     ax.set(xlabel="placement", ylabel=label, xticks=np.arange(len(names)), xticklabels=names)
     ax.grid(False, axis="x")
@@ -124,7 +128,7 @@ def parameter_comparison(
     ax.set_xlabel(label)
 
 
-def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float] | np.ndarray]) -> None:
+def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
     """Errors of edge lengths: a dot an edge, the mean a bar.
 
     Parameters
@@ -287,7 +291,7 @@ def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
     by_placement(ax, list(misfit), "chi-square per degree of freedom")
     if len(misfit) > 15:
-        ax.set_xticks(rows[::2], list(misfit)[::2])
+        ax.set_xticks(rows[::2], [str(name) for name in list(misfit)[::2]])
     title = f"all placements fit alike, the worst {values.max():.1f}"
     if bad.any():
         title = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
@@ -378,12 +382,14 @@ def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollecti
     limit
         Where colours end, and at its negative where there are negative values.
     """
-    shades = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
+    shades: dict[str, Any] = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
     if np.nanmin(values, initial=0.0) < 0:
         shades = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     bearing = np.degrees(cloud.bearing)
     pitch = np.degrees(cloud.pitch)
-    drawn = ax.scatter(bearing, pitch, 2.5, values, "s", linewidths=0, rasterized=True, **shades)
+    drawn = ax.scatter(
+        bearing, pitch, 2.5, values, marker="s", linewidths=0, rasterized=True, **shades
+    )
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
     ax.set(xlim=(bearing.max(), bearing.min()), ylim=(pitch.min(), pitch.max()))
     return drawn
