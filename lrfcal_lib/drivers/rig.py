@@ -148,13 +148,13 @@ class Rig(Closed):
         if devices.lrf.interlaced:  # it chooses its own
             skipped.add("variant")
         settings = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
-        camera = camera or partial(_camera, stated)
+        open_camera: Callable = camera or partial(_camera, stated)
         openers: dict[str, Callable] = {
             "head": partial(PanTilt, devices.head.port, devices.head, host=host),
             "lrf": partial(LMS2xx, devices.lrf.port, host=host, **settings),
         }
         for name in stated.cameras:
-            openers[f"camera '{name}'"] = partial(camera, name)
+            openers[f"camera '{name}'"] = partial(open_camera, name)
         with contextlib.ExitStack() as stack:
             opened = []
             for name, opener in openers.items():

@@ -163,8 +163,7 @@ class EmulatedWorld:
             self._still_key = key
             bearings = np.radians(quarters / 4)
             self._still = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
-        ideal, energy, dazzled = self._still
-        return lrf.measured(rig.beam, ideal, energy, dazzled, self._rng)
+        return lrf.measured(rig.beam, self._still, self._rng)
 
 
 def scaled(rig: Rig, width: int) -> Rig:

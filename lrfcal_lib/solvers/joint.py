@@ -155,7 +155,7 @@ def solve_joint(
         raise DegenerateGeometry("no placement to calibrate with")
     obs, left_out = without_blind_cameras(obs, required)
     unknowns = chosen.unknowns(obs)
-    levels = Levels(sweep_sigma=tuple(chosen.sweep_sigma))
+    levels = Levels(sweep_sigma=chosen.sweep_sigma)
     coarsely_settled = False
     if start is None:
         obs, lost = without_lost_placements(obs)

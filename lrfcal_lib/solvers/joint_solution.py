@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.edge_likelihood import disc_edge
-from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
+from lrfcal_lib.fit.least_squares import Block, eliminate, linearise
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import pose_array, pose_parameters, pose_transform
@@ -297,11 +297,11 @@ class JointSolution:
         rows[np.argsort(placement, kind="stable")] = padded[getattr(self.data, group)["used"]]
         return rows
 
-    def with_levels(self, **levels) -> "JointSolution":
+    def with_levels(self, **changed) -> "JointSolution":
         """The same estimate at other noise levels, fields of
         :class:`lrfcal_lib.solvers.joint_model.Levels` by name.
         """
-        levels = replace(self.data.levels, **levels)
+        levels = replace(self.data.levels, **changed)
         return replace(self, data=replace(self.data, levels=levels))
 
     def information(self) -> np.ndarray:
@@ -332,29 +332,15 @@ class JointSolution:
         hessian, gradient, *_ = linearise(blocks.values())
         return Score(*eliminate(hessian, gradient, shared)[:2])
 
-    def forecast(
-        self, observations: JointObservations, boards: np.ndarray, weight: np.ndarray, like: int
-    ) -> np.ndarray:
-        """Information on the shared unknowns from placements that were not recorded, (n, c, c).
+    def board_information(self) -> np.ndarray:
+        """What the scans of every placement say about the pose of its board, shape (p, 6, 6).
 
-        Parameters
-        ----------
-        observations : JointObservations
-            Of n placements; measured ranges do not matter.
-        boards : ndarray, shape (n, 3, 4)
-            ``T_platform_board``.
-        weight : ndarray, shape (n,)
-            How many beams about the edges each one stands for.
-        like : int
-            Number of the placement whose backgrounds they have.
+        By increments ``[w, v]`` of ``T_platform_board``, with everything else known.
         """
-        row = list(self.boards).index(like)
-        data = gather(observations, self.data.levels)
-        data.beam["used"] = data.beam["used"] * weight[:, None]
-        state = self.state.of_placements(np.full(len(boards), row))
-        state = replace(state, boards=boards, sweeps=np.zeros_like(state.sweeps))
-        hessian = linearise(named_blocks(state, data, self.unknowns).values()).hessian
-        return reduced_hessian(hessian, self.unknowns.shared)
+        scans = [self.blocks[group] for group in ("face", "beam") if group in self.blocks]
+        board = self.unknowns.columns["board"]
+        hessian = linearise(scans).hessian
+        return hessian[:, board, board]
 
     def held_at_zero(self) -> Iterator[tuple[Held, float, float]]:
         """Errors of the pitch that were held at zero, their squared scores (standard deviations)
@@ -368,12 +354,12 @@ class JointSolution:
         blocks = named_blocks(self.state, self.data, wider)
         hessian, gradient, *_ = linearise(blocks.values())
         reduced, score, _ = eliminate(hessian, gradient, wider.shared)
-        names = wider.names(self.observations.cameras)
-        estimated = [names.index(name) for name in self.solution.names]
+        every = wider.names(self.observations.cameras)
+        estimated = [every.index(name) for name in self.solution.names]
         for term in HELD:
             if term.name in self.solution.names:
                 continue
-            free = [*estimated, names.index(term.name)]
+            free = [*estimated, every.index(term.name)]
             information = reduced.sum(axis=0)[np.ix_(free, free)]
             covariance = np.linalg.pinv(information, rcond=RANK, hermitian=True)
             step = -(covariance @ score.sum(axis=0)[free])[-1]
