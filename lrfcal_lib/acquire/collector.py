@@ -237,13 +237,19 @@ class Collector(Closed):
         return self.rig is not None and self.rig.stated.devices.control is not None
 
     @property
+    def limits_deg(self) -> Any:
+        """Lowest and highest pitch of the head."""
+        rig, _ = self._needed()
+        return rig.stated.devices.head.pitch_limits_deg
+
+    @property
     def finished(self) -> tuple[int, ...]:
         """Numbers of the placements that are recorded and safe."""
         if self.recording is None:
             return ()
         return self.recording.finished
 
-    def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> Rig:
+    def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> None:
         """Open a rig and a session; one that was recorded with the same rig goes on.
 
         Parameters
@@ -272,7 +278,6 @@ class Collector(Closed):
             self.view = View()
             self.lights = {}
             self._advice = ""
-        return opened
 
     def close(self) -> None:
         """Stop the head, finish the session, close all devices; a second call does nothing.
