@@ -24,9 +24,9 @@ from lrfcal_lib.preprocess.board_in_image import (
     pose_with_edges,
     view_board,
 )
+from lrfcal_lib.preprocess.bundle import adjust, waves
 from lrfcal_lib.preprocess.edges_in_image import picked_edge, refine_edge
 from lrfcal_lib.preprocess.intrinsics import (
-    adjust,
     board_pose,
     estimate_intrinsics,
     estimate_relief,
@@ -347,13 +347,13 @@ def test_third_radial_term_stays_out_unless_the_images_need_it():
 
 def test_waves_of_the_sheet_are_found_and_only_where_there_are_any():
     points, poses = PATTERN.points(), view_poses(12, seed=5)
-    basis = intrinsics.waves(points)
-    waves = basis @ basis.T @ (0.001 * np.sin(40 * points[:, 0]) * np.cos(25 * points[:, 1]))
-    bumpy = pixels_of(poses, 0.02, points=points + waves[:, None] * [0, 0, 1])
+    basis = waves(points)
+    heights = basis @ basis.T @ (0.001 * np.sin(40 * points[:, 0]) * np.cos(25 * points[:, 1]))
+    bumpy = pixels_of(poses, 0.02, points=points + heights[:, None] * [0, 0, 1])
     result = estimate_intrinsics(bumpy, PATTERN, SIZE, relief=True)
-    np.testing.assert_allclose(result.relief, waves, atol=2e-4)
+    np.testing.assert_allclose(result.relief, heights, atol=2e-4)
     assert abs(result.models[0].fx - MODEL.fx) < 4 * np.sqrt(result.models[0].covariance[0, 0])
-    np.testing.assert_allclose(estimate_relief(bumpy, PATTERN, MODEL).relief, waves, atol=2e-4)
+    np.testing.assert_allclose(estimate_relief(bumpy, PATTERN, MODEL).relief, heights, atol=2e-4)
     assert not estimate_relief(pixels_of(poses, 0.05), PATTERN, MODEL).relief.any()
 
 
@@ -673,7 +673,7 @@ def test_opencv_stereo_pairs(real_data):
         files = [folder / f"{camera}{i:02d}.jpg" for i in range(1, 15) if i != 10]
         corners.append([find_pattern(cv2.imread(str(file)), pattern) for file in files])
         result = estimate_intrinsics(corners[-1], pattern, SIZE)
-        assert result.rms_px < rms
+        assert result.models[0].rms_px < rms
         models += result.models
     assert models[0].fx == pytest.approx(535.9, abs=4)
     transform, _ = stereo(*corners, pattern, models)

@@ -112,7 +112,7 @@ class Prepared:
     problems: tuple[Problem, ...] = ()
 
     @property
-    def left_out(self) -> dict[int, str]:
+    def left_out(self) -> dict[int | None, str]:
         """Why whole placements are left out, by placement."""
         return {p.placement: p.words for p in self.problems if p.kind in LEAVES_OUT}
 

@@ -34,8 +34,8 @@ def straight_runs(
     """
     rng = np.random.default_rng(0)
     left = np.arange(len(points))
-    runs = []
-    directions = []
+    runs: list[np.ndarray] = []
+    directions: list[np.ndarray] = []
     for _ in range(2 * MOST_RUNS):
         if len(left) < FEWEST_POINTS or len(runs) == MOST_RUNS:
             break
