@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from lrfcal_lib.evaluate.tables import rms, unit_of
-from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
+from lrfcal_lib.evaluate.truth import axis_errors, camera_errors, sigmas
 from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.judge.next_placement import outline
@@ -192,8 +192,8 @@ def _predicted(solution, camera):
 def joint_errors(joint, truth):
     """Errors of axis and cameras against the Truth, beside their predicted sigmas.
 
-    Columns what, rotation_error_deg, rotation_sigma_deg, translation_error_mm,
-    translation_sigma_mm; no axis where it was not estimated.
+    Columns what, rotation_error_deg, rotation_sigma_deg, rotation_pull (error over sigma), and the
+    same of the translation in millimetres; no axis where it was not estimated.
     """
     solution = joint.solution
     rows = []
@@ -201,7 +201,9 @@ def joint_errors(joint, truth):
         turn, shift = axis_errors(solution.T_head_lrf, truth)
         rows.append(_error_row("tilt axis", turn, shift, solution.covariance("axis_", "offset_")))
     for camera in solution.transforms:
-        turn, shift = camera_errors(solution.camera(camera), truth, camera).values()
+        errors = camera_errors(solution.camera(camera), truth, camera)
+        turn = errors["rotation_error_deg"]
+        shift = errors["translation_error_mm"]
         covariance = solution.covariance(f"{camera}_")
         rows.append(_error_row(f"camera {camera}", turn, shift, covariance))
     return pd.DataFrame(rows)
@@ -209,11 +211,13 @@ def joint_errors(joint, truth):
 
 def _error_row(what, turn_deg, shift_mm, covariance):
     """Errors of a pose, or of an axis, beside the sigma of both from its covariance (2 k, 2 k)."""
-    turn_variance, shift_variance = np.diag(covariance).reshape(2, -1).sum(axis=1)
+    turn_sigma, shift_sigma = sigmas(covariance) * [np.rad2deg(1.0), 1000.0]
     return {
         "what": what,
         "rotation_error_deg": turn_deg,
-        "rotation_sigma_deg": np.rad2deg(np.sqrt(turn_variance)),
+        "rotation_sigma_deg": turn_sigma,
+        "rotation_pull": turn_deg / turn_sigma,
         "translation_error_mm": shift_mm,
-        "translation_sigma_mm": 1000 * np.sqrt(shift_variance),
+        "translation_sigma_mm": shift_sigma,
+        "translation_pull": shift_mm / shift_sigma,
     }

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
+from lrfcal_lib.evaluate.truth import axis_errors, camera_errors, sigmas
 from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model import geometry
@@ -124,8 +124,8 @@ def method_comparison(observations, solutions, truth=None, joint=None):
     -------
     DataFrame
         camera, method, n_placements, edge_median_px, edge_rms_px, plane_rms_mm,
-        left_out_edge_rms_px, left_out_plane_rms_mm; with truth also rotation_error_deg,
-        translation_error_mm.
+        left_out_edge_rms_px, left_out_plane_rms_mm; with truth also the columns of
+        :func:`lrfcal_lib.evaluate.truth.camera_errors`.
     """
     rows = []
     for (camera, name), solution in solutions.items():
@@ -180,7 +180,8 @@ def platform_calibration_table(platform, truth=None):
     """The tilt axis by every method (PlatformCalibration) with sigmas, and in the paper's chart.
 
     Columns method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and
-    axis_offset_error_mm of the method. The four numbers of the axis are its angles out of and
+    axis_offset_error_mm of the method, and both over their standard deviations
+    (axis_direction_pull, axis_offset_pull). The four numbers of the axis are its angles out of and
     within the scan plane and its offsets within and across it; phi and t_y are the same axis in the
     paper's chart.
     """
@@ -192,8 +193,14 @@ def platform_calibration_table(platform, truth=None):
         found[method,] = names, [*axis.parameters, *phi, ty], sigma
     table = _parameter_table(["method"], found)
     if truth is not None:
-        errors = {method: axis_errors(platform.transform(method), truth) for (method,) in found}
+        errors = {}
+        for method, axis in platform.axes.items():
+            direction, offset = axis_errors(platform.transform(method), truth)
+            direction_sigma, offset_sigma = sigmas(axis.covariance)
+            pulls = np.radians(direction) / direction_sigma, offset / (1000 * offset_sigma)
+            errors[method] = direction, offset, *pulls
         columns = ["axis_direction_error_deg", "axis_offset_error_mm"]
+        columns += ["axis_direction_pull", "axis_offset_pull"]
         table[columns] = [errors[method] for method in table.method]
     return table
 

@@ -57,14 +57,32 @@ def _pose(stated):
 
 
 def camera_errors(solution, truth, camera):
-    """Rotation (degrees) and translation error (millimetres) of a camera, by column.
+    """Errors of a camera's pose against the truth, by column; empty without truth.
 
-    None without truth.
+    Columns rotation_error_deg, translation_error_mm, and both over their standard deviations:
+    rotation_pull, translation_pull. A pull of 1 is what a standard deviation promises.
     """
     if truth is None:
         return {}
     angle, distance = geometry.transform_difference(solution.transform, truth.cameras[camera])
-    return {"rotation_error_deg": np.rad2deg(angle), "translation_error_mm": 1000 * distance}
+    turn_sigma, shift_sigma = sigmas(solution.trusted[:6, :6])
+    return {
+        "rotation_error_deg": np.rad2deg(angle),
+        "translation_error_mm": 1000 * distance,
+        "rotation_pull": angle / turn_sigma,
+        "translation_pull": distance / shift_sigma,
+    }
+
+
+def sigmas(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations of the length of a turn (radians) and of a shift (metres).
+
+    Parameters
+    ----------
+    covariance : shape (2 k, 2 k)
+        Of turns, then shifts.
+    """
+    return np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
 
 
 def axis_errors(T_head_lrf, truth):

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtri
 
-from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.calibrate.outline import platform_of
+from lrfcal_lib.calibrate.observe_joint import observe_joint
 from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
+from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.judge.camera_changes import LEVER, NOISY, camera_changes, large_changes
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference

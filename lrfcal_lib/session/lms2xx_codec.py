@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 STX = 0x02
 # address bytes of telegrams to and from a device with the address of the factory
@@ -94,21 +95,47 @@ def times_power(power):
     return (table << 1) ^ np.where(table & 0x8000, 0x8005, 0).astype(np.uint16)
 
 
-def encode_telegram(code, data=b"", *, status=None, address=None):
-    """Bytes of a telegram; `status` makes it a reply, addresses are 0x00 to the device and 0x80 for
-    replies by default.
+def encode_telegram(
+    code: int, data: bytes = b"", *, status: int | None = None, address: int | None = None
+) -> bytes:
+    """Bytes of a telegram.
 
-    ValueError for numbers that are no bytes.
+    Parameters
+    ----------
+    code
+        Of the command or reply.
+    data
+        After it.
+    status
+        Makes it a reply.
+    address
+        By default 0x00 to the device, and 0x80 for replies.
+
+    Raises
+    ------
+    ValueError
+        For numbers that are no bytes.
     """
-    address = (HOST if status is None else DEVICE) if address is None else address
-    body = bytes([code]) + bytes(data) + (b"" if status is None else bytes([status]))
+    if address is None:
+        address = HOST if status is None else DEVICE
+    body = bytes([code, *data])
+    if status is not None:
+        body += bytes([status])
     raw = bytes([STX, address]) + len(body).to_bytes(2, "little") + body
     return raw + crc16(raw).to_bytes(2, "little")
 
 
-def parse_telegram(raw):
-    """The Telegram in bytes from the start byte to the CRC; TelegramError if start, length or CRC
-    is wrong.
+def parse_telegram(raw: bytes) -> Telegram:
+    """The telegram in bytes from the start byte to the CRC.
+
+    Parameters
+    ----------
+    raw
+
+    Raises
+    ------
+    TelegramError
+        If start, length or CRC is wrong.
     """
     raw = bytes(raw)
     if len(raw) < OVERHEAD + 1 or raw[0] != STX:
@@ -126,17 +153,19 @@ def parse_telegram(raw):
         raise TelegramError(
             f"CRC {sent:04X} sent, {computed:04X} computed: damaged on the line, ask again"
         )
-    reply = raw[1] >= DEVICE and len(raw) > OVERHEAD + 1
-    return Telegram(raw[4], raw[5:-3] if reply else raw[5:-2])
+    data = raw[5:-2]
+    if raw[1] >= DEVICE:
+        data = data[:-1]  # without the status
+    return Telegram(raw[4], data)
 
 
-def split_stream(data, *, replies=True):
+def split_stream(data: bytes, *, replies: bool = True) -> Stream:
     """Find the telegrams in a byte stream, whatever lies between them.
 
     Parameters
     ----------
-    data : bytes-like
-    replies : bool
+    data
+    replies
         Only what devices send (address byte 0x80 and above); otherwise only what hosts send.
 
     Returns
@@ -163,14 +192,16 @@ def split_stream(data, *, replies=True):
         free = 0
         for row in np.flatnonzero(good):
             good[row] = offset[row] >= free
-            free = ends[row] if good[row] else free
+            if good[row]:
+                free = ends[row]
     used = ends[good].max(initial=0)
     before = np.searchsorted(offset[good], offset, side="right") - 1
     inside = (before >= 0) & (offset < np.append(ends[good], 0)[before])
     begun = offset[~whole & (offset >= used)]
     tail = max(len(data) - 3, int(used))  # too few bytes to state a length
-    begun = [*begun.tolist(), *(tail + np.flatnonzero(data[tail:] == STX)).tolist(), len(data)][0]
-    return Stream(offset[good], length[good], offset[whole & ~good & ~inside], begun)
+    begun = np.r_[begun, tail + np.flatnonzero(data[tail:] == STX), len(data)]
+    rejected = whole & ~good & ~inside
+    return Stream(offset[good], length[good], offset[rejected], int(begun[0]))
 
 
 def word(data, at):
@@ -183,9 +214,9 @@ def check_crc(data, offset, length):
     good = np.zeros(len(offset), bool)
     for rows in alike(length):
         for first in range(0, len(rows), CHUNK):
-            some = rows[first : first + CHUNK]
-            raw = cut(data, offset[some], length[some[0]])
-            good[some] = crc16(raw[:, :-2]) == word(data, offset[some] + length[some[0]] - 2)
+            chunk = rows[first : first + CHUNK]
+            raw = cut(data, offset[chunk], length[rows[0]])
+            good[chunk] = crc16(raw[:, :-2]) == word(raw.T, -2)
     return good
 
 
@@ -205,7 +236,6 @@ def cut(data, offset, length):
     return np.lib.stride_tricks.sliding_window_view(data, int(length))[offset]
 
 
-MIRROR_TURN = 1 / 75.08  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real device
 SCAN = 0xB0
 METRES = {"cm": 0.01, "mm": 0.001}
 UNITS = ("cm", "mm")
@@ -294,57 +324,93 @@ def special_values(words, mode):
     return special, REASON_BELOW_TOP[mode.top - counts[special]]
 
 
-def encode_values(ranges, *, unit="mm", mode=0, reasons=None):
-    """Values of a scan as a device sends them, without flags, ndarray of uint16.
+def encode_values(
+    ranges: ArrayLike, *, unit: str = "mm", mode: int = 0, reasons: ArrayLike | None = None
+) -> np.ndarray:
+    """Values of a scan as a device sends them, without flags.
 
     Parameters
     ----------
-    ranges : array_like
+    ranges
         Metres, rounded to the unit. Whatever is larger than the mode can hold, inf included,
         becomes 'larger than maximum'; NaN becomes 'not valid'.
-    unit : {'cm', 'mm'}
-    mode : int
+    unit
+        'cm' or 'mm'.
+    mode
         Measuring mode, 0 to 6.
-    reasons : array_like of int, optional
+    reasons
         Index into `REASONS` for each value; where it is not 0 the range does not count.
+
+    Returns
+    -------
+    ndarray of uint16
+        Of the shape of the ranges.
     """
     ranges = np.asarray(ranges, float)
-    mode = MODES[mode]
-    reasons = np.zeros(ranges.shape, int) if reasons is None else np.asarray(reasons, int)
+    top = MODES[mode].top
     counts = np.rint(np.nan_to_num(ranges, nan=0, posinf=1e9) / METRES[unit])
-    reasons = np.where(
-        reasons > 0, reasons, np.where(np.isnan(ranges), 1, BEYOND * (counts > mode.largest))
-    )
-    return np.where(reasons > 0, mode.top - BELOW_TOP[reasons], counts).astype(np.uint16)
+    why = np.where(counts > MODES[mode].largest, BEYOND, 0)
+    why[np.isnan(ranges)] = REASONS.index("not valid")
+    if reasons is not None:
+        why = np.where(reasons, reasons, why)
+    return np.where(why, top - BELOW_TOP[why], counts).astype(np.uint16)
 
 
 def encode_words(
-    words, *, unit="mm", partial=-1, indices=None, status=0x10, address=DEVICE, code=SCAN, head=b""
-):
-    """Telegram 0xB0 of values that are encoded already, or one of another code, with bytes before
-    the values.
+    words: ArrayLike,
+    *,
+    unit: str = "mm",
+    partial: int = -1,
+    indices: tuple[int, int] | None = None,
+    status: int = 0x10,
+    address: int = DEVICE,
+    code: int = SCAN,
+    head: bytes = b"",
+) -> bytes:
+    """Telegram 0xB0 of values that are encoded already, or one like it.
 
     Parameters
     ----------
-    words : array_like of uint16, shape (B,) or (B, 2)
-    unit : {'cm', 'mm'}
-    partial : int
+    words
+        Of uint16, shape (B,) or (B, 2).
+    unit
+        'cm' or 'mm'.
+    partial
         0 to 3 for the quarters of a degree of an interlaced scan, -1 for a whole scan.
-    indices : tuple of int, optional
+    indices
         Real-time indices: scan and telegram, modulo 256.
+    status, address, code
+        Of the telegram.
+    head
+        Before the values.
     """
-    count = len(words) | UNITS.index(unit) << 14 | (0 if partial < 0 else 1 << 13 | partial << 11)
-    tail = b"" if indices is None else bytes(i % 256 for i in indices)
-    data = head + count.to_bytes(2, "little") + np.asarray(words, "<u2").tobytes() + tail
+    values = np.asarray(words, "<u2")
+    count = len(values) | UNITS.index(unit) << 14
+    if partial >= 0:
+        count |= 1 << 13 | partial << 11
+    tail = bytes(i % 256 for i in indices or ())
+    data = head + count.to_bytes(2, "little") + values.tobytes() + tail
     return encode_telegram(code, data, status=status, address=address)
 
 
-def decode_scan(raw, mode=0):
-    """One scan out of the whole telegram 0xB0, Scans with one row, in a measuring mode that the
-    telegram does not tell.
+def decode_scan(raw: bytes, mode: int = 0) -> Scans:
+    """One scan out of the whole telegram 0xB0.
 
-    TelegramError if it is damaged, another telegram, or its number of values does not fit its
-    length.
+    Parameters
+    ----------
+    raw
+    mode
+        Measuring mode, which the telegram does not tell.
+
+    Returns
+    -------
+    Scans
+        With one row.
+
+    Raises
+    ------
+    TelegramError
+        If it is damaged, another telegram, or its number of values does not fit its length.
     """
     telegram = parse_telegram(raw)
     if telegram.code != SCAN:
@@ -358,16 +424,24 @@ def decode_scan(raw, mode=0):
     return found[0]
 
 
-def decode_scans(data, offset, length, mode=0):
+def decode_scans(
+    data: bytes | np.ndarray,
+    offset: np.ndarray,
+    length: np.ndarray,
+    mode: int = 0,
+    rows: np.ndarray | None = None,
+) -> list[Scans]:
     """The scans among the telegrams of a stream, many at once. CRCs are not looked at again.
 
     Parameters
     ----------
-    data : bytes-like
-    offset, length : ndarray of int, shape (n,)
+    data
+    offset, length
         As of :func:`split_stream`.
-    mode : int
+    mode
         Measuring mode.
+    rows
+        Of the telegrams to look at; all by default.
 
     Returns
     -------
@@ -381,47 +455,66 @@ def decode_scans(data, offset, length, mode=0):
             f"measuring mode {mode:#04x} is none of 0x00 to 0x06: set one of those (command 77)"
         )
     data = np.frombuffer(data, np.uint8)
-    length = np.asarray(length)
-    rows = np.flatnonzero(length >= 10)
+    rows = np.arange(len(offset)) if rows is None else rows
+    rows = rows[length[rows] >= 10]
     rows = rows[data[offset[rows] + 4] == SCAN]
     head = word(data, offset[rows] + 5)
     extra = length[rows] - 10 - 2 * (head & 0x3FF)
     sound = np.isin(extra, (0, 2)) & (head < 1 << 15)
     rows = rows[sound]
     head = head[sound]
-    extra = extra[sound]
-    out = []
-    for group in alike(head & 0xE3FF, extra):
-        at = offset[rows[group]]
-        head_of = head[group]
-        indexed = extra[group[0]] > 0
-        values = int(head_of[0] & 0x3FF)
-        unit = UNITS[head_of[0] >> 14]
-        words = np.empty((len(at), values), np.uint16)
-        ranges = np.empty((len(at), values))
-        for first in range(0, len(at), CHUNK):
-            some = slice(first, first + CHUNK)
-            words[some] = cut(data, at[some] + 7, 2 * values).view("<u2")
-            np.multiply(words[some] & np.uint16(MODES[mode].top), METRES[unit], out=ranges[some])
-            special, reasons = special_values(words[some], mode)
-            ranges[some][special] = np.where(reasons == BEYOND, np.inf, np.nan)
-        last = at + 7 + 2 * values + 2 * indexed
-        indices = (data[last - k].astype(int) if indexed else np.full(len(at), -1) for k in (2, 1))
-        partial = np.where(head_of >> 13 & 1, head_of >> 11 & 3, -1)
-        out.append(Scans(rows[group], words, ranges, unit, mode, partial, *indices))
-    return out
+    indexed = extra[sound] > 0
+    scans = []
+    for group in alike(head & 0xE3FF, indexed):
+        chosen = rows[group]
+        begin = offset[chosen] + 7
+        scans.append(_decoded(data, chosen, begin, head[group], indexed[group[0]], mode))
+    return scans
+
+
+def _decoded(data, rows, at, head, indexed, mode):
+    """Scans of the same number of values, which begin at these places of a stream."""
+    values = int(head[0] & 0x3FF)
+    unit = UNITS[head[0] >> 14]
+    words = np.empty((len(at), values), np.uint16)
+    ranges = np.empty((len(at), values))
+    for first in range(0, len(at), CHUNK):
+        chunk = slice(first, first + CHUNK)
+        words[chunk] = cut(data, at[chunk], 2 * values).view("<u2")
+        np.multiply(words[chunk] & np.uint16(MODES[mode].top), METRES[unit], out=ranges[chunk])
+        special, reasons = special_values(words[chunk], mode)
+        ranges[chunk][special] = np.where(reasons == BEYOND, np.inf, np.nan)
+    partial = np.where(head >> 13 & 1, head >> 11 & 3, -1)
+    indices = np.full((2, len(at)), -1)
+    if indexed:
+        indices[:] = cut(data, at + 2 * values, 2).T
+    return Scans(rows, words, ranges, unit, mode, partial, *indices)
 
 
 # values of a whole scan -> first bearing and step in quarters of a degree
 GRIDS = {101: (160, 4), 201: (160, 2), 401: (160, 1), 181: (0, 4), 361: (0, 2)}
 
 
-def scan_quarters(values, partial=-1):
-    """Bearings of the values of a scan in quarters of a degree, shape (values,): 0 at the right,
-    360 ahead; ascending.
+def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
+    """Bearings of the values of a scan in quarters of a degree: 0 right, 360 ahead, ascending.
 
-    The number of values tells the variant (angle and resolution) of the device. TelegramError if
-    none sends that many.
+    The number of values tells the variant (angle and resolution) of the device.
+
+    Parameters
+    ----------
+    values
+        Their number.
+    partial
+        0 to 3 of an interlaced scan, -1 for a whole scan.
+
+    Returns
+    -------
+    ndarray of int, shape (values,)
+
+    Raises
+    ------
+    TelegramError
+        If no variant sends that many.
     """
     if partial >= 0 and values != 181 - (partial > 0):
         raise TelegramError(
@@ -496,17 +589,35 @@ class Configuration:
         """'cm' or 'mm'."""
         return unit_of(self.block[6:])
 
-    def changed(self, *, measuring_mode=None, unit=None, realtime_indices=None):
-        """The same Configuration with other values; what is None stays."""
+    def changed(
+        self,
+        *,
+        measuring_mode: int | None = None,
+        unit: str | None = None,
+        realtime_indices: bool | None = None,
+    ) -> "Configuration":
+        """The same Configuration with other values; what is None stays.
+
+        Parameters
+        ----------
+        measuring_mode
+            Key of `MODES`.
+        unit
+            'cm' or 'mm'.
+        realtime_indices
+            Whether scans carry their indices.
+        """
         block = bytearray(self.block)
         if realtime_indices is not None:
-            block[4] = block[4] & ~2 | 2 * bool(realtime_indices)
-        block[5] = block[5] if measuring_mode is None else measuring_mode
-        block[6] = block[6] if unit is None else UNITS.index(unit)
+            block[4] = block[4] & ~2 | 2 * realtime_indices
+        if measuring_mode is not None:
+            block[5] = measuring_mode
+        if unit is not None:
+            block[6] = UNITS.index(unit)
         return Configuration(bytes(block))
 
 
-def encode_configuration(configuration):
+def encode_configuration(configuration: Configuration) -> bytes:
     """Reply 0xF4, as a device sends it; a recorded session begins with it (it states the measuring
     mode).
     """
@@ -527,9 +638,17 @@ def reply_data(raw, code, shortest):
     return telegram.data
 
 
-def parse_status(raw):
-    """DeviceStatus of the whole telegram 0xB1; TelegramError if it is damaged, another reply, or
-    too short.
+def parse_status(raw: bytes) -> DeviceStatus:
+    """What the whole telegram 0xB1 says.
+
+    Parameters
+    ----------
+    raw
+
+    Raises
+    ------
+    TelegramError
+        If it is damaged, another reply, or too short.
     """
     # counted as in the manual, which calls the code 0
     data = bytes([STATUS]) + reply_data(raw, STATUS, 123)
@@ -543,20 +662,33 @@ def parse_status(raw):
     )
 
 
-def parse_type(raw):
-    """Model, order number and firmware out of the type reply 0xBA, such as ('LMS200', '301063',
-    'V02.10').
+def parse_type(raw: bytes) -> tuple[str, ...]:
+    """Model, order number and firmware out of the type reply 0xBA.
+
+    Parameters
+    ----------
+    raw
+
+    Returns
+    -------
+    tuple of str
+        Such as ('LMS200', '301063', 'V02.10').
     """
     return tuple(part.strip() for part in text(reply_data(raw, TYPE, 1)).split(";"))
 
 
-def parse_configuration(raw):
+def parse_configuration(raw: bytes) -> Configuration:
     """Configuration out of the replies 0xF4 (read) or 0xF7 (written).
 
-    TelegramError if it is damaged, another reply, or shorter than the measuring mode and the unit
-    need.
+    Parameters
+    ----------
+    raw
+
+    Raises
+    ------
+    TelegramError
+        If it is damaged, another reply, or shorter than the measuring mode and the unit need.
     """
-    written = bytes(raw[4:5]) == bytes([CONFIGURED])
-    return Configuration(
-        reply_data(raw, CONFIGURED, 8)[1:] if written else reply_data(raw, CONFIGURATION, 7)
-    )
+    if raw[4:5] == bytes([CONFIGURED]):
+        return Configuration(reply_data(raw, CONFIGURED, 8)[1:])
+    return Configuration(reply_data(raw, CONFIGURATION, 7))

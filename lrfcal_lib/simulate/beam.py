@@ -1,9 +1,11 @@
 """A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes."""
 
 import math
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field, NonNegativeFloat, NonNegativeInt
+from pydantic.dataclasses import dataclass
 
 from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.session.lms2xx_codec import MODES, REASONS, encode_values
@@ -13,6 +15,7 @@ from lrfcal_lib.simulate.scene import need
 NOT_VALID, DAZZLED, WEAK = (REASONS.index(words) for words in ("not valid", "dazzled", "noise"))
 # deg, 1/100 deg: of telegram 0x3B
 VARIANTS = ((100, 25), (100, 50), (100, 100), (180, 50), (180, 100))
+UNITS = {0.001: "mm", 0.01: "cm"}  # by metres a count
 RAYS_AT_ONCE = 1 << 19
 
 
@@ -28,9 +31,11 @@ class Beam:
     angles: tuple[int, ...] = (100, 180)
     # diameter of the spot at the window, metres, and its growth with distance, radians (technical
     # description)
-    spot_exit: float = 0.016
-    divergence: float = 0.0119
-    sigma_range: float = 0.010  # statistical error, 1 sigma, metres (technical description)
+    spot_exit: NonNegativeFloat = 0.016
+    divergence: NonNegativeFloat = 0.0119
+    sigma_range: NonNegativeFloat = (
+        0.010  # statistical error, 1 sigma, metres (technical description)
+    )
     systematic: float = 0.0  # constant error of this one device, metres
     # largest systematic error that the maker admits, by unit, metres
     systematic_bound: tuple[tuple[float, float], ...] = ((0.001, 0.035), (0.01, 0.05))
@@ -40,15 +45,15 @@ class Beam:
     unit: float = 0.001  # metres a count: 0.001 or 0.01
     # surfaces nearer together than this along the beam give one reading (telegram listing, 10.2:
     # about 1 m)
-    pulse: float = 1.0
+    pulse: NonNegativeFloat = 1.0
     # weakest echo that is a range: the 10 % reflectivity that the maker states the greatest range
     # for, there
-    least_energy: float = 0.1 / 30.0**2
+    least_energy: NonNegativeFloat = 0.1 / 30.0**2
     # an echo is taken when it has this share of the strongest one. Assumed: the receiver's gain
     # follows the strongest
     # echo; the maker states nothing. It widens what stands before a brighter background.
-    least_share: float = 0.25
-    rings: int = 4  # of sub-rays over the spot, 1 + 3 rings (rings + 1) of them
+    least_share: Annotated[float, Field(ge=0, le=1)] = 0.25
+    rings: NonNegativeInt = 4  # of sub-rays over the spot, 1 + 3 rings (rings + 1) of them
 
     def __post_init__(self):
         known = [variant for variant in VARIANTS if variant[0] in self.angles]
@@ -56,20 +61,10 @@ class Beam:
         listed = ", ".join(f"{angle}/{step / 100:g}" for angle, step in known)
         words = f"no whole scans of {variant}; it can be set to {listed}"
         need((self.field_of_view, self.resolution) in known, f"{self.name} has {words}")
-        for name in ("spot_exit", "divergence", "sigma_range", "pulse", "least_energy"):
-            value = getattr(self, name)
-            need(
-                0 <= value < math.inf,
-                f"{self.name}: {name} is {value}, it must be zero or positive",
-            )
         bound = dict(self.systematic_bound).get(self.unit)
         need(bound, f"{self.name}: the unit is 0.001 or 0.01 m, got {self.unit}")
         offset = f"{self.name}: a systematic error of {self.systematic} m"
         need(abs(self.systematic) <= bound, f"{offset} is beyond the maker's {bound} m")
-        share = f"least_share is {self.least_share}, a share lies between 0 and 1"
-        need(0 <= self.least_share <= 1, f"{self.name}: {share}")
-        rings = f"{self.rings} rings of rays cannot fill the spot, take 0 (one ray) or more"
-        need(self.rings >= 0, f"{self.name}: {rings}")
 
     @property
     def rays(self):
@@ -93,7 +88,7 @@ class Beam:
     @property
     def unit_name(self):
         """'mm' or 'cm'."""
-        return "mm" if self.unit < 0.005 else "cm"
+        return UNITS[self.unit]
 
     def info(self, made):
         """What a session states of it, an LrfInfo; `made` is how ('simulated')."""

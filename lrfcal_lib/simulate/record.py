@@ -15,12 +15,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.session.lms2xx_codec import (
-    MIRROR_TURN,
-    Configuration,
-    encode_configuration,
-    encode_words,
-)
+from lrfcal_lib.model.kinematics import MIRROR_TURN
+from lrfcal_lib.session.lms2xx_codec import Configuration, encode_configuration, encode_words
 from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.session.write import SessionWriter, write_file

@@ -4,8 +4,11 @@ import json
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import pydantic
+from pydantic import Field, InstanceOf, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -24,7 +27,7 @@ CLOSE = (0.22, 0.45)  # metres from the camera to a board that is held close
 PLACES = 3  # stream of random numbers
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class Platform:
     """A pitching platform that lies a little about its pitch.
 
@@ -32,26 +35,20 @@ class Platform:
     """
 
     # play of the gear, radians: the head hangs back by half of it against the direction of motion
-    backlash: float = 0.0
-    stretch: float = 0.0  # the head turns 1 + stretch times as far as the platform says
-    latency: float = 0.0  # seconds by which the measured pitch is older than its time stamp
+    backlash: NonNegativeFloat = 0.0
+    stretch: Annotated[float, Field(gt=-0.5, lt=0.5)] = (
+        0.0  # the head turns 1 + stretch times as far as the platform says
+    )
+    latency: NonNegativeFloat = (
+        0.0  # seconds by which the measured pitch is older than its time stamp
+    )
     # standard deviation of where the head comes to rest about where it should, radians
-    noise: float = 0.0
-    encoder_step: float = 0.0  # of the measured pitch, radians; 0 for none
-    speed: float = math.radians(5.0)  # of continuous motion, radians a second
-    settle: float = 0.4  # seconds from a command to rest in stop-and-go
+    noise: NonNegativeFloat = 0.0
+    encoder_step: NonNegativeFloat = 0.0  # of the measured pitch, radians; 0 for none
+    speed: PositiveFloat = math.radians(5.0)  # of continuous motion, radians a second
+    settle: NonNegativeFloat = 0.4  # seconds from a command to rest in stop-and-go
     # least and greatest pitch, radians
     limits: tuple[float, float] = (-math.radians(60), math.radians(60))
-
-    def __post_init__(self):
-        for name in ("backlash", "latency", "noise", "encoder_step", "settle"):
-            value = getattr(self, name)
-            need(0 <= value < math.inf, f"platform: {name} is {value}, it must be zero or positive")
-        need(
-            0 < self.speed < math.inf, f"platform: speed is {self.speed} rad/s, it must be positive"
-        )
-        share = f"stretch is {self.stretch}, a share of the angle (0.01 is one per cent)"
-        need(abs(self.stretch) < 0.5, f"platform: {share}")
 
     def stop(self, commanded, direction, rng):
         """True and measured pitch (n,) at rest at commanded angles, from below (+1) or above.
@@ -171,32 +168,21 @@ class Rig:
         return np.all(ahead & inside.all(axis=-1), axis=-1)
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class Setup:
     """A recording to simulate; everything follows from it."""
 
     name: str
     seed: int
-    rig: Rig
+    rig: InstanceOf[Rig]
     pairs: int  # pairs of board placements
     distances: tuple[float, float]  # of the board, metres
-    step: float = math.radians(0.25)  # between the stops of a sweep, radians
-    intrinsics_views: int = 20  # images of the board held close, a camera
+    step: PositiveFloat = math.radians(0.25)  # between the stops of a sweep, radians
+    intrinsics_views: NonNegativeInt = 20  # images of the board held close, a camera
     # first pitch, last pitch and step of the sweep of the room, radians; empty for none
-    room_sweep: tuple[float, ...] = ()
+    room_sweep: tuple[float, float, float] | tuple[()] = ()
     room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
-    quality: int = 95  # of JPEG, 1 to 100
-
-    def __post_init__(self):
-        name = f"setup '{self.name}'"
-        views = self.intrinsics_views
-        sweep = self.room_sweep
-        need(self.step > 0, f"{name}: the pitch step is {self.step} rad, it must be positive")
-        need(1 <= self.quality <= 100, f"{name}: JPEG quality is 1 to 100, got {self.quality}")
-        need(views >= 0, f"{name}: {views} intrinsics views; 0 or more are possible")
-        need(
-            len(sweep) in (0, 3), f"{name}: room_sweep is (first, last, step) or empty, got {sweep}"
-        )
+    quality: Annotated[int, Field(ge=1, le=100)] = 95  # of JPEG
 
 
 def printed_triangle():

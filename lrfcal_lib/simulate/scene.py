@@ -11,9 +11,12 @@ rebuilt from them to the byte.
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import open3d as o3d
+import pydantic
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -427,7 +430,7 @@ def board_on_stand(board, T_platform_board, ring):
     return [sheet, *(Thing(rod(*each), (plain, (0.4, 0.41, 0.43))) for each in rods)]
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class Exposure:
     """How a camera turns light into numbers."""
 
@@ -435,26 +438,15 @@ class Exposure:
     # linear, as machine vision
     # cameras have it; automatic exposure puts the brightest 0.2 % of the image at bright within
     # these limits.
-    gain: tuple[float, float] = (70.0, 300.0)
-    bright: float = 235.0  # grey level
+    gain: tuple[Annotated[float, Field(gt=0)], float] = (70.0, 300.0)
+    bright: NonNegativeFloat = 235.0  # grey level
     # standard deviation of the point spread of lens and sensor together, pixels
-    blur_px: float = 0.7
+    blur_px: NonNegativeFloat = 0.7
     # variance in grey levels squared is read_noise^2 + shot_noise * level
-    read_noise: float = 0.8
-    shot_noise: float = 0.008
-    vignetting: float = 0.15  # loss of light in the corners of the image, a share
-    samples: int = 3  # rays across a pixel and down a pixel, where the pixel is not plain
-
-    def __post_init__(self):
-        need(
-            0 < self.gain[0] <= self.gain[1],
-            f"gain is {self.gain}: two positive levels, the smaller first",
-        )
-        for name in ("bright", "blur_px", "read_noise", "shot_noise", "vignetting"):
-            need(
-                getattr(self, name) >= 0, f"{name} is {getattr(self, name)}: it cannot be negative"
-            )
-        need(self.samples >= 1, f"samples is {self.samples}: at least one ray a pixel is needed")
+    read_noise: NonNegativeFloat = 0.8
+    shot_noise: NonNegativeFloat = 0.008
+    vignetting: NonNegativeFloat = 0.15  # loss of light in the corners of the image, a share
+    samples: PositiveInt = 3  # rays across a pixel and down a pixel, where the pixel is not plain
 
 
 class Imager:
