@@ -5,9 +5,9 @@
 import numpy as np
 import pytest
 from joint_draws import draw, rng
+from rendered_boards import MODEL, PATTERN, pose_of, view_poses
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case, numeric
-from test_image import MODEL, PATTERN, pose_of, view_poses
 from test_platform import ROUGH, TRUTH, make, pairs, pitched
 from test_uncertainty import CAMERA, moved_points, random_chain
 
