@@ -154,7 +154,9 @@ def waves(points: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (k, k - 3)
     """
-    return np.linalg.svd(np.column_stack([np.ones(len(points)), points[:, :2]]))[0][:, 3:]
+    planes = np.column_stack([np.ones(len(points)), points[:, :2]])
+    u, _, _ = np.linalg.svd(planes)
+    return u[:, 3:]
 
 
 def adjust(

@@ -308,7 +308,9 @@ def _median_line(lines, ends):
     normal = np.median(lines[:, :2], axis=0)
     normal /= np.linalg.norm(normal)
     # where every line crosses the normals raised at the two ends
-    offsets = -(lines[:, :2] @ ends.T + lines[:, 2:]) / (lines[:, :2] @ normal)[:, None]
+    distance = lines[:, :2] @ ends.T + lines[:, 2:]
+    cosine = lines[:, :2] @ normal
+    offsets = -distance / cosine[:, None]
     a, b = ends + np.median(offsets, axis=0)[:, None] * normal
     return outward_line(a, b, normal), _spread(offsets.mean(axis=1))
 

@@ -81,8 +81,8 @@ def _without_gaps(run, order):
     if len(run) == 0:
         return run
     along = run[np.argsort(order[run], kind="stable")]
-    gaps = np.diff(order[along], prepend=order[along[0]]) > max(LONGEST_GAP, 0.1 * len(run))
-    part = np.cumsum(gaps)
+    steps = np.diff(order[along], prepend=order[along[0]])
+    part = np.cumsum(steps > max(LONGEST_GAP, 0.1 * len(run)))
     return np.sort(along[part == np.bincount(part).argmax()])
 
 
