@@ -86,7 +86,8 @@ class Bundle:
         lens_end, mount_end, pose_end, _ = self.ends
         for i, (lens, mount) in enumerate(zip(self.lenses, self.mounting, strict=True)):
             mounted = rotate_points(mount, p_first)
-            model = CameraModel(1, 1, *lens[:4], lens[4:])
+            fx, fy, cx, cy = lens[:4]
+            model = CameraModel(1, 1, fx, fy, cx, cy, lens[4:])
             by_point, by_lens = project_jacobians(mounted + mount[:, 3], model)
             # the derivatives by fx and fy are the distorted normalised coordinates themselves
             distorted = np.stack([by_lens[..., 0, 0], by_lens[..., 1, 1]], axis=-1)

@@ -93,7 +93,8 @@ def edge_cells(
         "across": across,
         "step": np.where(across, median_step(sweep.pitch), median_step(sweep.bearings)),
     }
-    return np.rec.fromarrays([*columns.values()], names=[*columns])[keep]
+    names = ",".join(columns)
+    return np.rec.fromarrays([*columns.values()], names=names)[keep]  # type: ignore[call-overload]
 
 
 def _readings(scan, cells, k, board, radius, close):

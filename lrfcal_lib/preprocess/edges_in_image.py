@@ -183,8 +183,9 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
         raise ValueError(
             f"edge '{name}' was picked with two points {length:.2f} px apart: pick them far apart"
         )
+    line = outward_line(ends[0], ends[1], centre - inner)
     covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
-    return ImageEdge(name, outward_line(*ends, centre - inner), covariance, centre, ends, 2, 0.0)
+    return ImageEdge(name, line, covariance, centre, ends, n_points=2, rms_px=0.0)
 
 
 def loops():

@@ -426,7 +426,7 @@ def spread_views(pixels, count: int) -> list[int]:
     pixels = np.asarray(pixels, float)
     flat = pixels.reshape(len(pixels), -1)
     size = np.ptp(pixels, axis=1).prod(axis=1)
-    chosen = []
+    chosen: list[int] = []
     nearest = np.full(len(flat), np.inf)
     while len(chosen) < min(count, len(flat)):
         chosen.append(int(np.argmax(nearest if chosen else size)))
