@@ -1,7 +1,7 @@
-"""Figures of results: bars, strips, maps, uncertainty, diagnosis."""
+"""Figures of results: bars, strips and points."""
 
-import textwrap
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,15 +13,14 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots.recording import COLORS, SERIES, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
-LEVELS = 5
-LEAST_HEIGHT = 20.0  # degrees of a map: that of a head which hardly moves would be a line
-SPREAD = {"capsize": 2, "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]}}  # of bars
+SPREAD: dict[str, Any] = {
+    "capsize": 2,
+    "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]},
+}  # of bars
 WORST = 4.0  # times the median: a placement that fits so badly is an outlier
-SHOWN = 6  # least known combinations of unknowns
-ROW = 64  # letters
 
 
-def by_placement(ax: Axes, names: Sequence, label: str) -> None:
+def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
     """Ticks and labels of an axis of placements; the zero of what is drawn over them."""
     ax.set(xlabel="placement", ylabel=label, xticks=np.arange(len(names)), xticklabels=names)
     ax.grid(False, axis="x")
@@ -65,7 +64,7 @@ def residual_strips(
         ax.bar(column, 2 * rms, 0.8, -rms, color=color, alpha=0.2, linewidth=0)
         at = column + 0.6 * _side_by_side(len(values))
         ax.plot(at, values, ".", color=color, markersize=2.5)
-    by_placement(ax, names, label)
+    by_placement(ax, names.tolist(), label)
     limit = 1.08 * max(np.abs(residuals).max(), 1e-12)
     ax.set_ylim(-limit, limit)
 
@@ -124,7 +123,7 @@ def parameter_comparison(
     ax.set_xlabel(label)
 
 
-def edge_errors(ax: Axes, errors: Mapping[str, ArrayLike]) -> None:
+def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
     """Errors of edge lengths: a dot an edge, the mean a bar.
 
     Parameters
@@ -177,100 +176,6 @@ def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
     ax.legend()
 
 
-def projection_map(ax, found, index=0, name=""):
-    """Standard deviation over an image of where points of the LRF project, at a map's distance.
-
-    `found` is a SigmaMap of :func:`lrfcal_lib.judge.uncertainty.projection_sigma`; inf and NaN
-    stay white.
-    """
-    _sigma_map(ax, found, index, "px", name)
-    ax.invert_yaxis()
-    ax.set(xlabel="u [px]", ylabel="v [px]")
-
-
-def point_map(ax, found, index=0):
-    """Standard deviation of points over the field of view, of ``uncertainty.point_sigma``."""
-    _sigma_map(ax, found, index, "mm", "cloud", np.degrees(1.0), 1000.0)
-    middle = np.mean(ax.get_ylim())
-    height = max(np.ptp(ax.get_ylim()), LEAST_HEIGHT)
-    ax.set_ylim(middle - height / 2, middle + height / 2)
-    ax.invert_xaxis()
-    ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]")
-
-
-def _sigma_map(ax, found, index, unit, name, angle=1.0, scale=1.0):
-    """Colours and labelled lines of equal standard deviation.
-
-    `angle` and `scale` are factors to the units shown.
-    """
-    at = (angle * found.columns, angle * found.rows)
-    good = np.ma.masked_invalid(scale * found.sigma[index])
-    shading = "nearest" if good.count() < good.size else "gouraud"
-    top = good.max() if good.count() else 1.0
-    mesh = ax.pcolormesh(*at, good, cmap="viridis", shading=shading, vmin=0.0, vmax=top)
-    ax.grid(False)
-    if good.count() and good.max() > 1.05 * good.min():
-        lines = ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8)
-        ax.clabel(lines, fontsize=8, fmt="%.3g")
-    label = f"standard deviation [{unit}]"
-    ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.8, format="%.3g")
-    ax.set_aspect("equal")
-    rms = scale * found.rms()[index]
-    size = f"{rms:.2g} {unit} rms" if np.isfinite(rms) else "no bound"
-    ax.set_title(f"{name} at {found.distances[index]:g} m: {size}")
-
-
-def point_parts(ax, found):
-    """What axis, range offset and pitch add to the error of a point, by distance.
-
-    SigmaMap of ``point_sigma``.
-    """
-    rms = {name: np.sqrt(np.mean(part**2, axis=(1, 2))) for name, part in found.parts.items()}
-    shown = {name: value for name, value in rms.items() if np.any(value > 0)}
-    dots = {"marker": "o", "markersize": 3.5}
-    for index, (name, value) in enumerate(shown.items()):
-        style = ":" if name == "range noise" else "--"
-        color = SERIES[index % len(SERIES)]
-        ax.plot(found.distances, 1000 * value, style, color=color, label=name, **dots)
-    whole = 1000 * found.rms()
-    if np.any(whole > 0):
-        ax.plot(found.distances, whole, "-", color=COLORS["truth"], label="calibration", **dots)
-    ax.set(xlabel="distance [m]", ylabel="standard deviation [mm]")
-    ax.set_ylim(0, 1.35 * ax.get_ylim()[1])
-    ax.set_title(f"calibration: {whole[-1]:.2g} mm at {found.distances[-1]:g} m")
-    ax.legend(ncols=2, loc="upper left")
-
-
-def observability_bars(ax: Axes, directions: Sequence) -> None:
-    """The least known combinations of unknowns, in words.
-
-    Parameters
-    ----------
-    ax
-    directions
-        Of ``next_placement.observability``, the least known first.
-    """
-    shown = directions[:SHOWN]
-    sigma = 1000 * np.array([direction.sigma for direction in shown])
-    known = np.isfinite(sigma)
-    longest = 1.15 * sigma[known].max(initial=0.0) or 1.0
-    for row, value in enumerate(sigma):
-        if known[row]:
-            ax.barh(row, value, 0.6, color=COLORS["fit"])
-            ax.text(value, row, f" {value:.2g} mm", va="center")
-        else:
-            ax.barh(row, longest, 0.6, color=COLORS["outlier"])
-            ax.text(0.0, row, " not determined", va="center", color="white")
-    title = f"{(~known).sum()} motions are not determined"
-    if known.all():
-        title = f"least known: {sigma[0]:.2g} mm at 2 m"
-    ax.set_title(title)
-    ax.set(xlim=(0, 1.12 * longest), xlabel="standard deviation at 2 m [mm]")
-    rows_of(ax, [textwrap.fill(direction.words, ROW) for direction in shown])
-    ax.tick_params(axis="y", labelsize=8)
-    ax.grid(False, axis="y")
-
-
 def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     """Normalised mean squared residuals by placement; 1 is what the noise explains.
 
@@ -287,7 +192,7 @@ def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
     by_placement(ax, list(misfit), "chi-square per degree of freedom")
     if len(misfit) > 15:
-        ax.set_xticks(rows[::2], list(misfit)[::2])
+        ax.set_xticks(rows[::2], [str(name) for name in list(misfit)[::2]])
     title = f"all placements fit alike, the worst {values.max():.1f}"
     if bad.any():
         title = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
@@ -378,12 +283,14 @@ def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollecti
     limit
         Where colours end, and at its negative where there are negative values.
     """
-    shades = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
+    shades: dict[str, Any] = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
     if np.nanmin(values, initial=0.0) < 0:
         shades = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     bearing = np.degrees(cloud.bearing)
     pitch = np.degrees(cloud.pitch)
-    drawn = ax.scatter(bearing, pitch, 2.5, values, "s", linewidths=0, rasterized=True, **shades)
+    drawn = ax.scatter(
+        bearing, pitch, 2.5, values, marker="s", linewidths=0, rasterized=True, **shades
+    )
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
     ax.set(xlim=(bearing.max(), bearing.min()), ylim=(pitch.min(), pitch.max()))
     return drawn

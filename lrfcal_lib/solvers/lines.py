@@ -1,5 +1,6 @@
 """Cameras from lines (equations 16 to 21), after Wasielewski and Strauss, and after Bauermann."""
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -130,7 +131,7 @@ def estimate_pose(
 
         return plain
 
-    problem = partial(residual, obs=obs)
+    problem: Callable[..., Block] = partial(residual, obs=obs)
     earlier = []
     if not weighted:
         problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)

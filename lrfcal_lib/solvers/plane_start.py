@@ -2,6 +2,7 @@
 
 from itertools import combinations
 from math import comb
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -74,7 +75,7 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     def evaluate(pose):
         return plane_block(pose, triangles / ROUGH_SIGMA, sets.boards, None, sets.number)
 
-    options = {"max_iterations": 12, "tolerance": 0.01}
+    options: dict[str, Any] = {"max_iterations": 12, "tolerance": 0.01}
     robust, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", **options)
     plain, *_ = minimise(evaluate, robust, move_pose, **options)
     minima = np.concatenate([robust, plain, best])

@@ -182,7 +182,8 @@ def compress(sets: PlaneSets, weights) -> np.ndarray:
     """Triangles of the weighted rows ``[p, 1]``, shape (..., p, 4, 4), from reciprocal standard
     deviations.
     """
-    return np.linalg.qr(_with_one(sets.points) * (weights * sets.used)[..., None], mode="r")
+    rows = _with_one(sets.points) * (weights * sets.used)[..., None]
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def _noise_across(sets, planes):
