@@ -323,7 +323,8 @@ def placements_of(setup: Setup) -> list[Placement]:
     out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
     if setup.room_sweep:
         number = 2 * setup.pairs + 1
-        out.append(Placement(number, None, setup.room_sweep[:2], setup.room_images))
+        first, last, _ = setup.room_sweep
+        out.append(Placement(number, None, (first, last), setup.room_images))
     return out
 
 
