@@ -15,10 +15,10 @@ def run(args):
         case "check":
             return check(args)
         case "calibrate":
-            from lrfcal_lib.evaluate.export import calibrate_session
-            from lrfcal_lib.session.cache import all_processors
+            from lrfcal_lib.report.calibrate import calibrate_session
+            from lrfcal_lib.session.workers import side_by_side
 
-            with all_processors():
+            with side_by_side():
                 return calibrate_session(args.session, args.out)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate

@@ -29,6 +29,7 @@ from telegrams import encode_scan
 
 from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
+from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
 from lrfcal_lib.preprocess.survey import survey, views_of
 from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, split_stream
@@ -37,7 +38,7 @@ from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Unknowns, gather, move_state
 from lrfcal_lib.solvers.joint_residuals import minimum, named_blocks
-from lrfcal_lib.solvers.joint_start import start_states, thin
+from lrfcal_lib.solvers.joint_start import start_states
 
 ROOT = Path(__file__).resolve().parent.parent
 FULL = {

@@ -39,8 +39,9 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess.survey import views_of
 from lrfcal_lib.session.importers import import_lasersetero
 from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
-from lrfcal_lib.session.write import SessionRecorder, SessionWriter, finish
+from lrfcal_lib.session.write import SessionWriter, finish
 
 SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])
@@ -100,7 +101,7 @@ def make_sessions(folder):
     (folder / "rig").mkdir()
     rig = rig_data(placements=[{"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}])
     rig["devices"]["head"] |= HeadSettings(degrees_per_second=4.0, repeat_s=0.5).model_dump(mode="json")
-    rig["devices"]["cameras"]["left"] |= {"exposure": 0.01, "fps": 10, "silence_s": 10}
+    rig["devices"]["cameras"]["left"] |= {"exposure": 0.01, "silence_s": 10}
     (folder / "rig" / "rig.json").write_text(json.dumps(rig))
     write_source(folder / "import", np.random.default_rng(0))
     (folder / "outside").mkdir()

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from shared import QUICK, until
+from shared import QUICK
 
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
@@ -140,40 +140,3 @@ def test_what_was_made_of_a_session_can_be_the_first_argument(folder, session):
     for shift in (0.0, 0.0, 0.001):
         stage.run(SimpleNamespace(prepared=SimpleNamespace(session=session), shift=shift))
     assert stage.calls == 2
-
-
-@pytest.fixture
-def two(monkeypatch):
-    """Loops are shared by two processes, whatever this machine has and whoever asks."""
-    monkeypatch.setattr(cache, "_processes", 2)
-
-
-def test_a_loop_is_shared_in_order(two, tmp_path):
-    def work(i):
-        (tmp_path / str(os.getpid())).touch()
-        until(lambda: len(list(tmp_path.iterdir())) == 2)  # both take part
-        return i
-
-    assert cache.spread(work, range(10)) == list(range(10))
-    assert cache.spread(lambda i: cache.spread(lambda k: k + i, range(3)), range(2)) == [[0, 1, 2], [1, 2, 3]]
-    assert cache.spread(abs, []) == [] and cache.spread(abs, [-1]) == [1] and cache._processes == 2
-
-
-def test_what_another_process_cannot_do_is_done_here(two):
-    here = os.getpid()
-
-    def work(i):
-        time.sleep(0.01)
-        if os.getpid() != here:
-            os._exit(1)  # as if the kernel had ended it
-        return i
-
-    def fail(i):
-        time.sleep(0.01)
-        raise ValueError(f"item {i}")
-
-    assert cache.spread(work, range(6)) == list(range(6))
-    with pytest.raises(ValueError, match="item 0"):
-        cache.spread(fail, range(6))
-    with pytest.raises(ChildProcessError):
-        os.waitpid(-1, 0)  # none is left

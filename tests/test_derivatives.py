@@ -65,8 +65,9 @@ def tilt_axis():
             return platform.projected_block(move_head(head, s), obs, pairs(obs, range(1, 21)), printed=printed)
 
         yield block(np.zeros(4)).jacobian, lambda s: block(s).residuals, 4
-    *data, boards, _ = platform.prepare_boards(make(8, count=4, noise=1.0), ROUGH)
-    state = head, np.array(list(boards.values())), np.full((4, 2), 0.02)
+    boards = platform.prepare_boards(make(8, count=4, noise=1.0), ROUGH)
+    data = boards.edge, boards.face
+    state = head, boards.poses, np.full((4, 2), 0.02)
 
     def blocks(s):
         return platform.platform_blocks(platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1)))), *data, 1e-3)

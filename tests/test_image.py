@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
-from lrfcal_lib.calibrate import observe
+from lrfcal_lib.calibrate import naming
 from lrfcal_lib.evaluate.stereo import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
@@ -237,10 +237,10 @@ def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
 def test_where_all_cameras_contradict_a_scan_small_squares_are_a_cause(monkeypatch, side, named):
     views = {c: {4: BoardView(c, placement=4, pixels=pixels_of_squares(side))} for c in ("left", "right")}
     data = SimpleNamespace(placements=np.array([4]), select=lambda inliers: None)
-    monkeypatch.setattr(observe, "observe", lambda prepared, camera: data)
-    monkeypatch.setattr(observe, "find_outlying_placements", lambda obs: ([], {4: 0.02}))
-    monkeypatch.setattr(observe, "solve_camera", lambda obs, method: SimpleNamespace(transform=None))
-    (problem,) = observe.rough_poses(SimpleNamespace(views=views, board=SHEET))[1]
+    monkeypatch.setattr(naming, "observe", lambda prepared, camera: data)
+    monkeypatch.setattr(naming, "find_outlying_placements", lambda obs: ([], {4: 0.02}))
+    monkeypatch.setattr(naming, "solve_camera", lambda obs, method: SimpleNamespace(transform=None))
+    (problem,) = naming.rough_poses(SimpleNamespace(views=views, board=SHEET))[1]
     assert problem.placement == 4 and "another surface" in problem.words
     assert ("or the images: squares below 9 px" in problem.words) == named
 
@@ -472,7 +472,7 @@ def test_the_order_of_corners_follows_the_outline():
         for start in pattern_orders(PATTERN):
             orders = exact[start][pattern_orders(PATTERN)]
             poses = RigidTransform.concatenate([first_pose(PATTERN.points(), pixels, MODEL) for pixels in orders])
-            np.testing.assert_array_equal(orders[np.argmax(order_scores(picture, SHEET, MODEL, orders, poses))], exact)
+            np.testing.assert_array_equal(orders[np.argmax(order_scores(picture, SHEET, MODEL, poses))], exact)
 
 
 def test_line_covariance_tells_the_error_over_noise():

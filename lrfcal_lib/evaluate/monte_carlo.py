@@ -128,8 +128,8 @@ def monte_carlo(draw, solve, seeds):
         obs, truth = draw(np.random.default_rng(seed))
         try:
             found = solve(obs)
-        except DegenerateGeometry as error:
-            failed[int(seed)] = str(error)
+        except DegenerateGeometry as reason:
+            failed[int(seed)] = str(reason)
             continue
         if names is None:
             names = found.solution.names

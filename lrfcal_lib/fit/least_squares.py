@@ -175,7 +175,7 @@ def linearise(blocks: Iterable[Block], loss=None, scale=1.0, axes=(-2, -1)) -> L
     axes : int or tuple of int
         Over which the cost is summed: placements and residuals, or -1 for residuals of trials.
     """
-    hessian = gradient = cost = 0.0
+    hessian = gradient = cost = np.zeros(())
     roots = []
     for block in blocks:
         weights, value = _weigh(block, loss, scale, axes)
@@ -351,7 +351,7 @@ def minimise(
         np.divide(before - after, promised, out=gain, where=promised > 3e-15 * before)
         damping = _next_damping(damping, gain, accepted)
     if converged.ndim == 0:
-        converged = bool(converged)
+        converged = converged[()]
     return Minimum(state, converged, len(history) - 1, np.array(history))
 
 
@@ -492,7 +492,7 @@ def solve(
             f"{question.method}: residuals at the start value are not finite: check the "
             "observations and T0"
         )
-    options = {"shared": shared, "loss": loss, "scale": scale}
+    options: dict[str, Any] = {"shared": shared, "loss": loss, "scale": scale}
     minimum = minimise(once, start, retract, **options, **steps)
     costs = [costs[:-1] for costs in earlier]
     minimum = minimum._replace(

@@ -75,3 +75,13 @@ class Finding:
 def brief(value: float) -> str:
     """A number with two digits, or more before the point."""
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
+
+
+def no_if(severe: bool) -> Answer:
+    """What a finding makes of the verdict: 'no' where it is severe, else 'with care'."""
+    return NO if severe else CARE
+
+
+def by_sign(value: float, positive: str, negative: str) -> str:
+    """One of two words by the sign of a value."""
+    return positive if value > 0 else negative

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of, columns_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
@@ -66,9 +67,9 @@ class Suggestion:
         distance, bearing, elevation, turn, lean = self.place
         parts = [f"board {distance:.1f} m ahead"]
         if bearing:
-            parts.append(f"{abs(bearing):.0f} deg to the {'left' if bearing > 0 else 'right'}")
+            parts.append(f"{abs(bearing):.0f} deg to the {by_sign(bearing, 'left', 'right')}")
         if elevation:
-            parts.append(f"{abs(elevation):.0f} deg {'up' if elevation > 0 else 'down'}")
+            parts.append(f"{abs(elevation):.0f} deg {by_sign(elevation, 'up', 'down')}")
         if turn:
             parts.append(f"turned by {turn:.0f} deg in its plane")
         words = ", ".join([*parts, list(LEANS)[int(lean)]])
@@ -128,10 +129,12 @@ def suggest_placement(
     before = total_sigma(known, solution)
     after = total_sigma(known + added, solution)
     best = int(np.argmin(after))
+    if "head" not in solution.observations.mounts:
+        pitches = pitches[:, :0]
     return Suggestion(
         T_platform_board=geometry.pose_transform(boards[best]),
         place=tuple(grid[best].tolist()),
-        pitches=pitches[best] if "head" in solution.observations.mounts else np.zeros(0),
+        pitches=pitches[best],
         gain=float(1 - after[best] / before),
         median_gain=float(1 - np.median(after) / before),
     )
@@ -156,7 +159,9 @@ def scales_of(solution: JointSolution) -> np.ndarray:
     names = np.array(solution.solution.names)
     scales = np.where(np.isin(names, turns), 1 / RADIUS, 1.0)
     radii = solution.observations.beam_radius
-    spot = np.median(radii) if len(radii) else USUAL_SPOT
+    spot = USUAL_SPOT
+    if len(radii):
+        spot = np.median(radii)
     return np.where(names == "edge_log_odds", 2 / spot, scales)
 
 

@@ -14,7 +14,7 @@ from lrfcal_lib.judge.alternatives import (
     far_from_stated,
     not_an_offset,
 )
-from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind
+from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, by_sign, no_if
 from lrfcal_lib.judge.weaknesses import ABSURD
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
@@ -71,8 +71,8 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
         range_doubt = max(range_doubt, abs(solution.sensor["range_offset"]))
     findings += [*beyond, *beyond_spot(solution), *pitch_turns_otherwise(solution)]
     for far in far_from_stated(joint):
-        answer = NO if far.angle > np.pi / 2 else CARE
-        findings.append(Finding(answer, Kind.FAR_FROM_STATED, far.words))
+        severe = far.angle > np.pi / 2
+        findings.append(Finding(no_if(severe), Kind.FAR_FROM_STATED, far.words))
     return findings, range_doubt
 
 
@@ -97,7 +97,7 @@ def finding_of(doubts):
     large = best.kind in SIZES and abs(best.value) > LARGE_SIZE
     causes = "; or ".join(doubt.words for doubt in doubts)
     words = f"statements contradict the data: {causes}"
-    return Finding(NO if certain and large else CARE, best.kind, words)
+    return Finding(no_if(certain and large), best.kind, words)
 
 
 def beyond_admitted(joint) -> Iterator[Finding]:
@@ -113,8 +113,8 @@ def beyond_admitted(joint) -> Iterator[Finding]:
             "errors count this as an error of every range), the unit of the ranges and the angular "
             "step"
         )
-        answer = NO if abs(offset) > 2 * admitted + margin else CARE
-        yield Finding(answer, Kind.RANGE_OFFSET, words)
+        severe = abs(offset) > 2 * admitted + margin
+        yield Finding(no_if(severe), Kind.RANGE_OFFSET, words)
 
 
 def beyond_spot(solution) -> Iterator[Finding]:
@@ -136,7 +136,7 @@ def pitch_turns_otherwise(solution) -> Iterator[Finding]:
     if abs(scale) > max(CONTRADICTS * sigma, LARGE_SCALE):
         words = (
             f"the platform turns {100 * abs(scale):.1f} +- {100 * sigma:.1f} % "
-            f"{'more' if scale > 0 else 'less'} than its recorded pitch says: check its gear or "
+            f"{by_sign(scale, 'more', 'less')} than its recorded pitch says: check its gear or "
             "encoder (the estimate has taken this off)"
         )
         yield Finding(CARE, Kind.PITCH_SCALE, words)
@@ -168,8 +168,8 @@ def falsified(joint: JointCalibration) -> pd.DataFrame:
                 solution = solve_joint(obs, required=False, **joint.settings)
             offset = solution.sensor["range_offset"]
             findings, _ = contradicts_stated(replace(joint, solution=solution))
-            doubted = findings[0].words if findings else "nothing"
+            doubted = [finding.words for finding in findings] or ["nothing"]
         except DegenerateGeometry as error:
-            doubted = f"refused: {error}"
-        rows.append((name, 1000 * offset, doubted))
+            doubted = [f"refused: {error}"]
+        rows.append((name, 1000 * offset, doubted[0]))
     return pd.DataFrame(rows, columns=["falsified", "range_offset_mm", "doubted"])

@@ -231,7 +231,7 @@ def carried(
     bearing: ArrayLike,
     pitch: ArrayLike,
     distance: ArrayLike,
-    image_pitch: ArrayLike = 0.0,
+    image_pitch: float | np.ndarray = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ends of beams in the frame of an image, and what moves them.
 
@@ -240,7 +240,7 @@ def carried(
     chain
     bearing, pitch, distance : array_like, shape (...)
         Of the beams: radians, and metres from the mirror.
-    image_pitch : array_like
+    image_pitch
         Of a camera on the head, radians.
 
     Returns

@@ -9,9 +9,9 @@ from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
-from lrfcal_lib.judge.alternatives import places_of_cameras
-from lrfcal_lib.judge.diagnosis import lens_findings
-from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief
+from lrfcal_lib.judge.alternatives import places_of_cameras, step_not_told
+from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief, no_if
+from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_placement
 from lrfcal_lib.judge.recording_faults import explained, recording_faults
 from lrfcal_lib.judge.statements import contradicts_stated
@@ -37,7 +37,7 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint_solution import JointSolution
-from lrfcal_lib.solvers.planes import rival_words
+from lrfcal_lib.solvers.plane_start import rival_words
 
 FIRST = {
     YES: "This calibration can be trusted",
@@ -198,9 +198,10 @@ def judge(calibration: Calibration, method: str | None = None, *, suggest: bool 
     findings = []
     faults = recording_faults(calibration)
     for fault in faults:
-        findings.append(Finding(NO if fault.severe else CARE, fault.kind, fault.words))
+        findings.append(Finding(no_if(fault.severe), fault.kind, fault.words))
     findings += lens_findings(prepared)
     doubt = 0.0
+    contradictions: list[Finding] = []
     # also where the joint estimate is not handed over: a wrong size may be why
     if joint is not None and not explained(faults):
         contradictions, doubt = contradicts_stated(joint)
@@ -209,7 +210,7 @@ def judge(calibration: Calibration, method: str | None = None, *, suggest: bool 
     if method is None:
         return _refused(calibration, findings)
 
-    if method == "joint":
+    if method == "joint" and joint is not None:
         field = prepared.session.lrf.field_of_view
         judged = verdict(
             joint.solution, prepared.models, suggest=suggest, doubt=doubt, field_of_view=field
@@ -225,12 +226,15 @@ def judge(calibration: Calibration, method: str | None = None, *, suggest: bool 
     findings += sides_elsewhere(prepared)
     axis = calibration.platform.axis_with(method)
     notes = [f"Handed over: the cameras of the method '{method}' and the axis '{axis}'."]
-    if method == "joint":
+    more_notes = []
+    if method == "joint" and joint is not None:
         notes += places_of_cameras(joint.solution)
-    notes.append(lost.note)
-    if method == "joint":
-        notes += _scatter_note(len(joint.solution.boards))
-    return replace(judged.because(findings), notes=tuple(notes))
+        if not contradictions:
+            admitted = prepared.session.lrf.admitted_offset
+            more_notes.append(step_not_told(joint.solution, admitted))
+        more_notes.append(_scatter_note(len(joint.solution.boards)))
+    notes += [lost.note, *more_notes]
+    return replace(judged.because(findings), notes=tuple(filter(None, notes)))
 
 
 def verdict(
@@ -327,9 +331,9 @@ def _expected(ways, models, noise):
     large = errors[WORKING].words(POOR_MM, POOR_PX)
     if not large:
         return judged
-    answer = NO if errors[WORKING].words(BAD_MM, BAD_PX) else CARE
+    severe = bool(errors[WORKING].words(BAD_MM, BAD_PX))
     words = f"the expected error at {WORKING:g} m is {large}"
-    return judged.because([Finding(answer, Kind.ERROR, words)])
+    return judged.because([Finding(no_if(severe), Kind.ERROR, words)])
 
 
 def _refused(calibration, findings):
@@ -359,15 +363,15 @@ def _refused(calibration, findings):
 
 
 def _scatter_note(placements):
-    """How well the scatter over placements is itself known, as a list of notes."""
+    """How well the scatter over placements is itself known; '' where many tell it."""
     if not FEWEST <= placements < MANY:
-        return []
+        return ""
     known = 100 / np.sqrt(2 * (placements - 1))
     within = stdtrit(placements - 1, 0.95)
-    return [
+    return (
         f"The scatter over {placements} placements is itself known to {known:.0f} % only: 90 % of "
         f"errors lie within {within:.1f} of its standard deviations, not 1.6."
-    ]
+    )
 
 
 def _without_joint(calibration, method, doubt):

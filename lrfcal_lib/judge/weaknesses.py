@@ -7,7 +7,7 @@ import numpy as np
 
 from lrfcal_lib.calibrate.pipeline import Calibration, largest_range
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind
+from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, no_if
 from lrfcal_lib.judge.next_placement import group_sigma, sights
 from lrfcal_lib.judge.placements import placements_table
 from lrfcal_lib.model.problem import LEAVES_OUT
@@ -75,7 +75,7 @@ def weak_placements(solution) -> Iterator[Finding]:
     count = len(solution.boards)
     if count < FEW:
         words = f"{count} placements only, {FEW} or more are needed to see errors of the model"
-        yield Finding(NO if count < FEWEST else CARE, Kind.PLACEMENTS, words)
+        yield Finding(no_if(count < FEWEST), Kind.PLACEMENTS, words)
 
 
 def weak_pitch(solution) -> Iterator[Finding]:
@@ -159,7 +159,7 @@ def large_residuals(solution) -> Iterator[Finding]:
     large = [f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED]
     if large:
         words = f"residuals are larger than the stated noise ({', '.join(large)})"
-        yield Finding(NO if max(noise.values()) > ABSURD else CARE, Kind.NOISE, words)
+        yield Finding(no_if(max(noise.values()) > ABSURD), Kind.NOISE, words)
 
     # beams about an edge always repeat errors: they share a background
     share = solution.noise["face_share"]
@@ -312,9 +312,9 @@ def left_out(calibration: Calibration, method: str) -> LeftOut:
     prepared = calibration.prepared
     table = placements_table(prepared, calibration.observations).set_index("placement")
     used = set(table.index[table.used]) - set(prepared.left_out)
-    excluded = {}
-    images = []
-    if method == "joint":
+    excluded: dict[int, str] = {}
+    images: list[str] = []
+    if method == "joint" and calibration.joint is not None:
         solution = calibration.joint.solution
         used = set(solution.boards)
         excluded = solution.excluded_placements

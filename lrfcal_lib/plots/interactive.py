@@ -1,50 +1,64 @@
 """A scene to turn in a browser, one offline page: points, frames, boards and camera frusta."""
 
-import numpy as np
+from collections.abc import Mapping
+from os import PathLike
 
-from lrfcal_lib.plots.recording import AXES_RGB, COLORS, color_of
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.plots.recording import AXES_RGB, COLORS, closed, color_of
 
 MOST_POINTS = 150_000  # that browsers turn smoothly
+GAP = np.full((1, 3), np.nan)  # where a line breaks
+Line = tuple[str, np.ndarray]
 
 
-def scene_page(path, points, colors, seen, lines, eye=(-0.3, -1.5, 0.55)):
+def scene_page(
+    path: str | PathLike,
+    points: np.ndarray,
+    colors: np.ndarray,
+    seen: np.ndarray,
+    lines: Mapping[str, Line],
+    eye: tuple[float, float, float] = (-0.3, -1.5, 0.55),
+) -> None:
     """Write a page that needs no other file and no network.
 
     Parameters
     ----------
-    path : path
-    points : ndarray, shape (n, 3)
-        Metres; every so many are left out beyond `MOST_POINTS`.
-    colors : ndarray of uint8, shape (n, 3)
-    seen : ndarray of bool, shape (n,)
-        The others are hidden until one clicks on them in the legend.
-    lines : dict of str to (str, ndarray of shape (m, 3))
-        What else to draw, by its name in the legend: a colour and a line, NaN rows where it breaks.
-    eye : tuple of float
+    path
+    points
+        Shape (n, 3), metres; every so many are left out beyond `MOST_POINTS`.
+    colors
+        Of uint8, shape (n, 3).
+    seen
+        Of bool, shape (n,): the others are hidden until one clicks on them in the legend.
+    lines
+        What else to draw, by its name in the legend: a colour and points (m, 3), NaN rows where
+        the line breaks.
+    eye
         Where one looks from at first, in widths of the scene from its middle.
     """
     import plotly.graph_objects as go
 
+    figure = go.Figure()
     every = -(-len(points) // MOST_POINTS) or 1
-    clouds = []
-    for name, which, shown in (
-        ("points", seen, True),
-        ("points that no image saw", ~seen, "legendonly"),
-    ):
-        x, y, z = np.asarray(points[which][::every], np.float32).T
-        shades = [
-            f"#{value:06x}"
-            for value in (colors[which][::every].astype(int) @ [65536, 256, 1]).tolist()
-        ]
-        dots = {"mode": "markers", "marker": {"size": 1.6, "color": shades}}
-        clouds.append(go.Scatter3d(x=x, y=y, z=z, name=name, visible=shown, **dots))
+    clouds = {"points": (seen, True), "points that no image saw": (~seen, "legendonly")}
+    for name, (which, shown) in clouds.items():
+        rgb = colors[which][::every].astype(int)
+        shades = [f"#{value:06x}" for value in (rgb @ [1 << 16, 1 << 8, 1]).tolist()]
+        figure.add_scatter3d(
+            **_xyz(points[which][::every]),
+            name=name,
+            visible=shown,
+            mode="markers",
+            marker={"size": 1.6, "color": shades},
+        )
     for name, (color, line) in lines.items():
-        x, y, z = np.asarray(line, np.float32).T
-        clouds.append(
-            go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": color, "width": 4}, name=name)
+        figure.add_scatter3d(
+            **_xyz(line), mode="lines", line={"color": color, "width": 4}, name=name
         )
     axes = {f"{axis}axis": {"title": f"{axis} [m]"} for axis in "xyz"}
-    figure = go.Figure(clouds)
     view = {"eye": dict(zip("xyz", eye, strict=True)), "up": {"x": 0, "y": 0, "z": 1}}
     figure.update_layout(
         scene={**axes, "aspectmode": "data", "camera": view},
@@ -52,39 +66,50 @@ def scene_page(path, points, colors, seen, lines, eye=(-0.3, -1.5, 0.55)):
         legend={"itemsizing": "constant", "x": 0, "y": 1},
         hovermode=False,
     )
-    figure.write_html(
-        path, include_plotlyjs=True, full_html=True, div_id="scene", default_height="100vh"
-    )
+    figure.write_html(path, div_id="scene", default_height="100vh")
 
 
-def rig_lines(T_head_lrf, cameras, boards=None, size=0.15):
+def _xyz(points):
+    return dict(zip("xyz", np.asarray(points, np.float32).T, strict=True))
+
+
+def rig_lines(
+    T_head_lrf: RigidTransform,
+    cameras: Mapping[str, tuple[RigidTransform, CameraModel]],
+    boards: Mapping[str, np.ndarray] | None = None,
+    size: float = 0.15,
+) -> dict[str, Line]:
     """Lines of :func:`scene_page` that show a rig and boards in the platform frame.
 
-    `cameras` are (``T_camera_platform``, CameraModel) by name, `boards` corners (n, 3) by name;
-    `size` in metres.
+    Parameters
+    ----------
+    T_head_lrf
+    cameras
+        ``T_camera_platform`` and intrinsics by name.
+    boards
+        Corners (n, 3) by name, metres.
+    size
+        Of a frame's axes, metres.
     """
-    gap = np.full((1, 3), np.nan)
-    lines = {}
-    lines["tilt axis"] = COLORS["platform"], np.array([[-4 * size, 0.0, 0.0], [4 * size, 0.0, 0.0]])
+    lines = {"tilt axis": (COLORS["platform"], np.outer([-4 * size, 4 * size], [1.0, 0.0, 0.0]))}
     frames = {"lrf": T_head_lrf} | {name: T.inv() for name, (T, _) in cameras.items()}
-    for axis, color in enumerate(AXES_RGB):
-        ends = [
-            np.vstack([T.apply(np.outer([0, size], np.eye(3)[axis])), gap]) for T in frames.values()
-        ]
-        lines[f"{'xyz'[axis]} of {', '.join(frames)}"] = color, np.vstack(ends)
+    for letter, axis, color in zip("xyz", np.eye(3), AXES_RGB, strict=True):
+        arrows = [np.vstack([T.apply([0 * axis, size * axis]), GAP]) for T in frames.values()]
+        lines[f"{letter} of {', '.join(frames)}"] = (color, np.vstack(arrows))
     for name, (T, model) in cameras.items():
-        u = np.array([0, model.width, model.width, 0, 0])
-        v = np.array([0, 0, model.height, model.height, 0])
-        rim = (
-            np.stack([(u - model.cx) / model.fx, (v - model.cy) / model.fy, np.ones(5)], axis=1)
-            * 3
-            * size
-        )
-        legs = [np.vstack([np.zeros(3), corner, gap]) for corner in rim[:4]]
-        lines[f"view of {name}"] = color_of(name), T.inv().apply(np.vstack([rim, gap, *legs]))
+        lines[f"view of {name}"] = (color_of(name), T.inv().apply(_frustum(model, 3 * size)))
     if boards:
-        lines["boards"] = (
-            COLORS["fit"],
-            np.vstack([np.vstack([c, c[:1], gap]) for c in boards.values()]),
-        )
+        outlines = [np.vstack([closed(corners), GAP]) for corners in boards.values()]
+        lines["boards"] = (COLORS["fit"], np.vstack(outlines))
     return lines
+
+
+def _frustum(model, depth):
+    """The edges of what a camera sees up to a depth, metres, in its own frame."""
+    u = np.array([0, model.width, model.width, 0])
+    v = np.array([0, 0, model.height, model.height])
+    rim = depth * np.stack(
+        [(u - model.cx) / model.fx, (v - model.cy) / model.fy, np.ones(4)], axis=1
+    )
+    legs = [np.vstack([np.zeros(3), corner, GAP]) for corner in rim]
+    return np.vstack([closed(rim), GAP, *legs])

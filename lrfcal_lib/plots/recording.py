@@ -1,10 +1,15 @@
 """Figures of what was recorded: scans, range images, pictures, edges; a colour for each sensor."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.patches import Rectangle
 
-from lrfcal_lib.model.board import outline_lines
-from lrfcal_lib.model.camera import distort
+from lrfcal_lib.model.board import Board, outline_lines
+from lrfcal_lib.model.camera import CameraModel, distort
 from lrfcal_lib.model.geometry import polar_to_points
 
 COLORS = {
@@ -20,28 +25,58 @@ COLORS = {
 }
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#b5378a", "#e69f00", "#56b4e9", "#7a5c3e", "#222222")
 AXES_RGB = ("#d62728", "#2ca02c", "#1f5fd6")  # x, y, z of every frame
-
-
-def color_of(name, index=0):
-    """The colour of a sensor or role, or the `index`-th colour of a series for any other name."""
-    return COLORS.get(name, SERIES[index % len(SERIES)])
-
-
 PLANES = {"xz": (0, 2), "yz": (1, 2), "xy": (0, 1)}
 BESIDE = 14  # beams shown on either side of the end of a board
 ABOUT = 6.0  # degrees shown on either side of a board
-# a picture whose brightest hundredth is darker is brightened, by this factor at most
-BRIGHT = 150
-GAIN = 5.0
+BRIGHT = 150  # grey level: a picture whose brightest hundredth is darker is brightened
+GAIN = 5.0  # by this factor at most
+STRETCH = 61  # points of an edge as the lens bends it
+CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}  # text about its place
+DARK = {"facecolor": "#333333", "edgecolor": "none"}  # behind white text in a picture
 
 
-def range_image(ax, sweep, mask=None, limits=None):
+def series(index: int) -> str:
+    """The colour of the `index`-th thing of a series."""
+    return SERIES[index % len(SERIES)]
+
+
+def color_of(name: str, index: int = 0) -> str:
+    """The colour of a sensor or role.
+
+    Parameters
+    ----------
+    name
+        A key of `COLORS`, or any other name.
+    index
+        Of the colour in a series, for any other name.
+    """
+    return COLORS.get(name, series(index))
+
+
+def closed(corners: np.ndarray) -> np.ndarray:
+    """Corners (n, d) of a polygon with the first one at the end as well."""
+    return np.vstack([corners, corners[:1]])
+
+
+def range_image(
+    ax: Axes,
+    sweep,
+    mask: np.ndarray | None = None,
+    limits: tuple[float, float] | None = None,
+) -> QuadMesh:
     """A sweep as the rig sees it: range over bearing (to the left as in the scene) and pitch.
 
-    Returns what was drawn. With a pitch that stands still, scan lines are numbered instead. `mask`
-    (L, B) is what was found to be the board; it is outlined, and bearings far from it are cut off.
-    With `limits` (two ranges, metres) several sweeps share their colours, and the colour bar is
-    left to the caller.
+    With a pitch that stands still, scan lines are numbered instead.
+
+    Parameters
+    ----------
+    ax
+    sweep : Sweep
+    mask
+        Beams (L, B) on the board: it is outlined, and bearings far from it are cut off.
+    limits
+        Two ranges, metres, by which several sweeps share their colours; the colour bar is then
+        left to the caller.
     """
     bearing = np.degrees(sweep.bearings)
     order = np.argsort(sweep.pitch, kind="stable")
@@ -50,11 +85,14 @@ def range_image(ax, sweep, mask=None, limits=None):
     if np.ptp(sweep.pitch) > 0:
         height = np.degrees(sweep.pitch)
         ax.set(ylabel="pitch [deg]", aspect="equal")
-    low, high = limits or (None, None)
-    looks = {"shading": "nearest", "rasterized": True, "vmin": low, "vmax": high}
-    drawn = ax.pcolormesh(bearing, height[order], sweep.ranges[order], **looks)
+    drawn = ax.pcolormesh(
+        bearing, height[order], sweep.ranges[order], shading="nearest", rasterized=True
+    )
     if limits is None:
         ax.figure.colorbar(drawn, ax=ax, label="range [m]", shrink=0.9)
+    else:
+        drawn.set_clim(*limits)
+
     shown = np.isfinite(sweep.ranges).any(axis=0)
     if mask is not None and mask.any():
         _outlined(ax, bearing, height[order], mask[order])
@@ -70,41 +108,65 @@ def range_image(ax, sweep, mask=None, limits=None):
 def _outlined(ax, bearing, height, mask):
     """Draw the border of a mask (L, B) over bearing and height in white; of one line its beams."""
     if len(mask) == 1:
-        ax.plot(bearing[mask[0]], np.repeat(height, mask.sum()), ".", color="white", markersize=2)
+        on = bearing[mask[0]]
+        ax.plot(on, np.repeat(height, len(on)), ".", color="white", markersize=2)
     else:
-        looks = {"levels": [0.5], "colors": "white", "linewidths": 1}
-        ax.contour(bearing, height, mask.astype(float), **looks)
+        ax.contour(bearing, height, mask.astype(float), levels=[0.5], colors="white", linewidths=1)
 
 
-def scan_line(ax, sweep, line, mask, fitted=None):
-    """One scan line, a row of ``sweep.ranges``, in the scan plane.
+def scan_line(
+    ax: Axes, sweep, line: int, mask: np.ndarray, fitted: np.ndarray | None = None
+) -> None:
+    """One scan line in the scan plane.
 
-    `mask` (L, B) has the beams on the board, `fitted` (L, B) the ranges of a fitted line, see
-    BoardScan.
+    Parameters
+    ----------
+    ax
+    sweep : Sweep
+    line
+        Row of its ranges.
+    mask
+        Beams (L, B) on the board.
+    fitted
+        Ranges (L, B) of a fitted line, metres; see BoardScan.
     """
     points = polar_to_points(sweep.ranges[line], sweep.bearings)[:, :2]
     on = mask[line]
-    ax.plot(*points[~on].T, ".", color=COLORS["raw"], label="scene" if on.any() else "returns")
+    rest = "scene" if on.any() else "returns"
+    ax.plot(*points[~on].T, ".", color=COLORS["raw"], label=rest)
     ax.plot(*points[on].T, ".", color=COLORS["lrf"], label="board")
     if fitted is not None:
         on_line = polar_to_points(fitted[line], sweep.bearings)[on, :2]
         ax.plot(*on_line.T, color=COLORS["fit"], label="fitted line")
-    ax.plot(0, 0, marker="^", color=COLORS["lrf"], markersize=8, linestyle="none", label="LRF")
+    ax.plot(0, 0, "^", color=COLORS["lrf"], markersize=8, label="LRF")
     to_scale(ax, "x [m]", "y [m]")
     ax.legend()
 
 
-def to_scale(ax, x, y):
-    """Equal scales and labels."""
+def to_scale(ax: Axes, x: str, y: str) -> None:
+    """Equal scales, and the labels `x` and `y`."""
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel=x, ylabel=y)
 
 
-def edge_of_line(ax, scan, line, end=1, edges=()):
-    """Where a scan line of a BoardScan leaves the board: ranges raw, filtered, fitted (figure 5).
+def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) -> None:
+    """Where a scan line leaves the board: ranges raw, filtered and fitted, figure 5.
 
-    `end` is +1 for the end at the larger bearings, -1 for the other one. Crossings of this line and
-    end in `edges` (a sequence of ScanEdges) are drawn as upright lines.
+    Parameters
+    ----------
+    ax
+    scan : BoardScan
+    line
+        Row of its ranges.
+    end
+        +1 for the end at the larger bearings, -1 for the other one.
+    edges : sequence of ScanEdges
+        Their crossings of this line and end are drawn as upright lines.
+
+    Raises
+    ------
+    ValueError
+        If no beam of the line is on the board.
     """
     on = np.flatnonzero(scan.mask[line])
     if on.size == 0:
@@ -115,57 +177,78 @@ def edge_of_line(ax, scan, line, end=1, edges=()):
     near = np.abs(beams - last) <= BESIDE
     board = near & scan.mask[line]
     bearing = np.degrees(scan.sweep.bearings)
-    raw = {"color": COLORS["raw"], "markersize": 5, "label": "raw"}
-    filtered = {"color": COLORS["filtered"], "markersize": 3, "label": "filtered"}
-    fitted = {"color": COLORS["fit"], "label": "line fitted to the board"}
-    ax.plot(bearing[near], scan.sweep.ranges[line, near], "o", **raw)
-    ax.plot(bearing[board], scan.filtered[line, board], "o", **filtered)
-    ax.plot(bearing[board], scan.fitted[line, board], "-", **fitted)
-    for index, found in enumerate(edges):
-        for x, y, _ in found.points[(found.line == line) & (found.end == end)]:
-            style = ("--", "-", ":")[index % 3]
+    raw = scan.sweep.ranges[line]
+    filtered = scan.filtered[line]
+    fitted = scan.fitted[line]
+    ax.plot(bearing[near], raw[near], "o", color=COLORS["raw"], markersize=5, label="raw")
+    ax.plot(
+        bearing[board],
+        filtered[board],
+        "o",
+        color=COLORS["filtered"],
+        markersize=3,
+        label="filtered",
+    )
+    ax.plot(bearing[board], fitted[board], color=COLORS["fit"], label="line fitted to the board")
+    for index, crossed in enumerate(edges):
+        style = ("--", "-", ":")[index % 3]
+        label = crossed.variant.replace("_", " ")
+        here = (crossed.line == line) & (crossed.end == end)
+        for x, y, _ in crossed.points[here]:
             at = np.degrees(np.arctan2(y, x))
-            label = found.variant.replace("_", " ")
             ax.axvline(at, color=COLORS["lrf"], linestyle=style, label=label)
     ax.invert_xaxis()
     ax.set(xlabel="bearing [deg]", ylabel="range [m]")
     ax.legend()
 
 
-def crossings(ax, edges):
-    """Edge crossings (ScanEdges) of a sweep, one colour a straight side; side -1 crossed out."""
+def crossings(ax: Axes, edges) -> None:
+    """Edge crossings of a sweep, one colour a straight side; those of no side crossed out.
+
+    Parameters
+    ----------
+    ax
+    edges : ScanEdges
+    """
     x, y, _ = edges.points.T
-    points = np.degrees(np.column_stack([np.arctan2(y, x), edges.pitch]))
-    for index, side in enumerate(np.unique(edges.side[edges.side >= 0])):
-        color = SERIES[index % len(SERIES)]
-        ax.plot(*points[edges.side == side].T, ".", color=color, label=f"side {side}")
-    if (edges.side < 0).any():
-        ax.plot(*points[edges.side < 0].T, "x", color=COLORS["outlier"], label="not used")
+    points = np.degrees([np.arctan2(y, x), edges.pitch])
+    unused = edges.side < 0
+    for index, side in enumerate(np.unique(edges.side[~unused])):
+        of_side = points[:, edges.side == side]
+        ax.plot(*of_side, ".", color=series(index), label=f"side {side}")
+    if unused.any():
+        ax.plot(*points[:, unused], "x", color=COLORS["outlier"], label="not used")
     ax.legend()
     ax.invert_xaxis()
     to_scale(ax, "bearing [deg]", "pitch [deg]")
 
 
-def projection(ax, edges, plane, lines=None):
+def projection(ax: Axes, edges: dict, plane: str, lines: dict | None = None) -> None:
     """Edge points in one coordinate plane of the platform, figure 4 (b) to (d).
 
     Parameters
     ----------
-    ax : Axes
-    edges : dict of str to ndarray, shape (n, 3)
-        Points by edge, metres.
-    plane : str
-        'xz', 'yz' or 'xy'; a ValueError for another one.
-    lines : dict of str to (point, direction), optional
-        Fitted lines in space, drawn over the extent of their points.
+    ax
+    edges
+        Points (n, 3) by edge, metres.
+    plane
+        'xz', 'yz' or 'xy'.
+    lines
+        Fitted lines in space by edge, (point, direction), drawn over the extent of their points.
+
+    Raises
+    ------
+    ValueError
+        For another plane.
     """
     if plane not in PLANES:
         raise ValueError(f"plane must be one of {', '.join(PLANES)}, got '{plane}'")
     pick = list(PLANES[plane])
+    lines = lines or {}
     for index, (name, points) in enumerate(edges.items()):
         color = color_of(name, index)
         ax.plot(*points[:, pick].T, ".", color=color, label=name)
-        if lines and name in lines:
+        if name in lines:
             point, direction = lines[name]
             along = (points - point) @ direction
             ends = point + np.outer([along.min(), along.max()], direction)
@@ -174,28 +257,49 @@ def projection(ax, edges, plane, lines=None):
     ax.legend()
 
 
-def picture(ax, image):
-    """An image (h, w, 3) or (h, w), blue first, without axes; a dark one brightened."""
+def picture(ax: Axes, image: np.ndarray) -> None:
+    """An image without axes, a dark one brightened.
+
+    Parameters
+    ----------
+    ax
+    image
+        Shape (h, w, 3), blue first, or (h, w).
+    """
     brightest = max(np.quantile(image[::4, ::4], 0.99), 1.0)
     gain = np.clip(BRIGHT / brightest, 1.0, GAIN)
-    looks = {"interpolation": "antialiased", "vmin": 0, "vmax": 255}
+    shown = gain * image
     if image.ndim == 3:
-        color = np.clip(gain * image[..., ::-1], 0, 255)
-        ax.imshow(color.astype(np.uint8), **looks)
-    else:
-        ax.imshow(gain * image, cmap="gray", **looks)
+        shown = np.clip(shown[..., ::-1], 0, 255).astype(np.uint8)
+    ax.imshow(shown, cmap="gray", interpolation="antialiased", vmin=0, vmax=255)
     if gain > 1:
-        box = {"facecolor": "#333333", "edgecolor": "none", "pad": 2}
-        looks = {"color": "white", "va": "bottom", "bbox": box, "transform": ax.transAxes}
-        ax.text(0.01, 0.015, f"brightened {gain:.1f} times", **looks)
+        ax.text(
+            0.01,
+            0.015,
+            f"brightened {gain:.1f} times",
+            color="white",
+            va="bottom",
+            bbox=DARK | {"pad": 2},
+            transform=ax.transAxes,
+        )
     ax.set_axis_off()
 
 
-def board_view(ax, image, view, model, margin=60):
-    """An image with what a BoardView found in it, cut to `margin` pixels around the board.
+def board_view(ax: Axes, image: np.ndarray, view, model: CameraModel, margin: float = 60) -> None:
+    """An image with what was found of the board in it, cut to the board.
 
-    The title names edges that were not used. `model` puts edges, which are kept in undistorted
-    pixels, back through the lens.
+    The title names edges that were not used.
+
+    Parameters
+    ----------
+    ax
+    image
+        Shape (h, w, 3), blue first.
+    view : BoardView
+    model
+        Puts edges, which are kept in undistorted pixels, back through the lens.
+    margin
+        Pixels around the board.
     """
     picture(ax, image)
     color = color_of(view.camera)
@@ -204,55 +308,79 @@ def board_view(ax, image, view, model, margin=60):
         ax.plot(*view.pixels.T, "+", color=COLORS["filtered"], markersize=4, markeredgewidth=0.8)
         drawn.append(view.pixels)
     box = {"facecolor": color, "edgecolor": "none", "boxstyle": "round,pad=0.2", "alpha": 0.85}
-    looks = {"color": "white", "fontsize": 8, "ha": "center", "va": "center"}
     for edge in view.edges:
         stretch = stretch_in_image(edge, model)
+        middle = stretch.mean(axis=0)
         ax.plot(*stretch.T, "-", color=color, linewidth=1.6)
-        ax.text(*stretch.mean(axis=0), edge.name, bbox=box, clip_on=True, **looks)
+        ax.text(
+            middle[0],
+            middle[1],
+            edge.name,
+            color="white",
+            fontsize=8,
+            bbox=box,
+            clip_on=True,
+            **CENTRED,
+        )
         drawn.append(stretch)
     title = f"{view.camera}, placement {view.placement}"
     if view.rejected:
-        lost = ", ".join(name for name, _ in view.rejected)
-        title = f"{title}; not used: {lost}"
+        unused = ", ".join(name for name, _ in view.rejected)
+        title = f"{title}; not used: {unused}"
     ax.set_title(title)
     _cut(ax, drawn, image, margin)
 
 
-def seen_points(ax, view, image, model, points, margin=60, styles=("o", "x", "s", "+", "d", "^")):
+def seen_points(
+    ax: Axes,
+    view,
+    image: np.ndarray,
+    model: CameraModel,
+    points: dict[str, np.ndarray],
+    margin: float = 60,
+    styles: Sequence[str] = ("o", "x", "s", "+", "d", "^"),
+) -> None:
     """LRF points by method beside the edges of the board in the image of a view, figure 7.
 
     Parameters
     ----------
-    ax : Axes
+    ax
     view : BoardView
-    image : ndarray of uint8, shape (h, w, 3)
-        In which the view was found, see :meth:`lrfcal_lib.preprocess.prepared.Prepared.seen`.
-    model : CameraModel
-    points : dict of str to ndarray, shape (n, 2)
-        Recorded pixels by method; NaN rows are left out.
-    margin : float
+    image
+        Shape (h, w, 3), in which the view was found, see
+        :meth:`lrfcal_lib.preprocess.prepared.Prepared.seen`.
+    model
+    points
+        Recorded pixels (n, 2) by method; NaN rows are left out.
+    margin
         Pixels around all that is drawn.
-    styles : sequence of str
+    styles
         Markers or line styles, one a method.
     """
     picture(ax, image)
-    lines = [stretch_in_image(edge, model) for edge in view.edges]
-    for index, stretch in enumerate(lines):
-        label = None if index else "edge in the image"
+    edges = [stretch_in_image(edge, model) for edge in view.edges]
+    label: str | None = "edge in the image"
+    for stretch in edges:
         ax.plot(*stretch.T, "-", color="white", linewidth=1.0, label=label)
+        label = None  # once
     for index, (method, uv) in enumerate(points.items()):
-        color = SERIES[(index + 1) % len(SERIES)]
-        looks = {"color": color, "markersize": 4.5, "markerfacecolor": "none"}
-        ax.plot(*uv.T, styles[index % len(styles)], label=method, **looks)
-    dark = {"facecolor": "#333333", "labelcolor": "white", "edgecolor": "none"}
-    ax.legend(frameon=True, framealpha=0.8, **dark)
-    _cut(ax, [*points.values(), *lines], image, margin)
+        ax.plot(
+            *uv.T,
+            styles[index % len(styles)],
+            color=series(index + 1),
+            markersize=4.5,
+            markerfacecolor="none",
+            label=method,
+        )
+    ax.legend(frameon=True, framealpha=0.8, labelcolor="white", **DARK)
+    _cut(ax, [*points.values(), *edges], image, margin)
     ax.set_title(f"{view.camera}, placement {view.placement}")
 
 
-def stretch_in_image(edge, model, count=61):
-    """An image edge as recorded: its stretch of pixels seen through the lens, shape (count, 2)."""
-    uv = np.linspace(*edge.ends, count)
+def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
+    """Recorded pixels (STRETCH, 2) of an ImageEdge, which is a straight line without the lens."""
+    first, last = edge.ends
+    uv = np.linspace(first, last, STRETCH)
     focal = np.array([model.fx, model.fy])
     centre = np.array([model.cx, model.cy])
     return distort((uv - centre) / focal, model.distortion) * focal + centre
@@ -261,60 +389,74 @@ def stretch_in_image(edge, model, count=61):
 def _cut(ax, drawn, image, margin):
     """Limit the axes to what is drawn in them, and to the image."""
     points = np.concatenate([*drawn, np.zeros((0, 2))])
-    size = np.array(image.shape[1::-1])
     points = points[np.isfinite(points).all(axis=1)]
     first = np.array([-0.5, -0.5])
-    last = size - 0.5
+    last = np.array(image.shape[1::-1]) - 0.5
     if len(points):
-        first = np.maximum(points.min(axis=0) - margin, first)
-        last = np.minimum(points.max(axis=0) + margin, last)
-    left, top = np.minimum(first, size - 0.5)
-    right, bottom = np.maximum(last, -0.5)
+        left, top = np.clip(points.min(axis=0) - margin, first, last)
+        right, bottom = np.clip(points.max(axis=0) + margin, first, last)
+    else:
+        left, top = first
+        right, bottom = last
     ax.set(xlim=(left, right), ylim=(bottom, top))
 
 
-def board_plan(ax, board):
-    """A Board with its sizes, corners A, B, ... and printed squares, in its own frame."""
+def board_plan(ax: Axes, board: Board) -> None:
+    """A board with its sizes, corners A, B, ... and printed squares, in its own frame.
+
+    Parameters
+    ----------
+    ax
+    board
+        With known corners.
+    """
     corners = board.known_corners()
-    turn = outline_lines(board.known_corners())[:, :2]
+    around = closed(corners)
+    outwards = outline_lines(corners)[:, :2]
     ax.fill(*corners.T, color="#333333", linewidth=0)
     if board.pattern is not None:
         size = board.pattern.square
-        start = np.subtract(board.pattern.origin, board.pattern.square)
+        start = np.subtract(board.pattern.origin, size)
         for row, column in np.ndindex(board.pattern.rows + 1, board.pattern.columns + 1):
             if (row + column) % 2:
-                corner = start + size * np.array([column, row])
-                ax.add_patch(Rectangle(corner, size, size, color="white", linewidth=0))
+                x, y = start + size * np.array([column, row])
+                ax.add_patch(Rectangle((x, y), size, size, color="white", linewidth=0))
     for index, (name, length) in enumerate(board.lengths().items()):
-        ends = corners[[index, (index + 1) % len(corners)]]
-        at = ends.mean(axis=0) + 0.03 * turn[index]
+        ends = around[index : index + 2]
+        at = ends.mean(axis=0) + 0.03 * outwards[index]
         x, y = ends[1] - ends[0]
         upright = (np.degrees(np.arctan2(y, x)) + 90) % 180 - 90
-        turned = {"rotation": upright, "rotation_mode": "anchor"}
         text = f"{name.upper()} {1000 * length:.1f} mm"
-        ax.text(*at, text, ha="center", va="center", **turned)
+        ax.text(at[0], at[1], text, rotation=upright, rotation_mode="anchor", **CENTRED)
     ax.update_datalim(np.vstack([corners - 0.06, corners + 0.06]))
     to_scale(ax, "x [m]", "y [m]")
 
 
-def outline(ax, measured, exaggerate=20):
-    """The measured Outline of the board, the spread of each edge `exaggerate` times larger."""
-    corners = measured.board.known_corners()
-    closed = np.vstack([corners, corners[:1]])
-    ax.plot(*closed.T, "-", color=COLORS["truth"])
-    for index, (name, length) in enumerate(measured.board.lengths().items()):
-        ends = closed[index : index + 2]
+def outline(ax: Axes, measured, exaggerate: float = 20) -> None:
+    """The measured outline of the board.
+
+    Parameters
+    ----------
+    ax
+    measured : Outline
+    exaggerate
+        By which the spread of each edge is drawn larger.
+    """
+    board = measured.board
+    around = closed(board.known_corners())
+    ax.plot(*around.T, "-", color=COLORS["truth"])
+    for index, (name, length) in enumerate(board.lengths().items()):
+        ends = around[index : index + 2]
         normal = measured.lines[index, :2]
         if np.isfinite(measured.line_sd[index]):
             away = exaggerate * measured.line_sd[index] * normal
             band = np.vstack([ends - away, ends[::-1] + away])
             ax.fill(*band.T, color=COLORS["fit"], alpha=0.25, linewidth=0)
-        text = f"{name}\n{1000 * length:.1f} mm"
         at = ends.mean(axis=0) - 0.09 * normal
-        ax.text(*at, text, ha="center", va="center", fontsize=8)
-    if measured.board.pattern is not None:
-        corners = measured.board.pattern.points()[:, :2]
-        ax.plot(*corners.T, "+", color=COLORS["raw"], markersize=4)
+        ax.text(at[0], at[1], f"{name}\n{1000 * length:.1f} mm", fontsize=8, **CENTRED)
+    if board.pattern is not None:
+        points = board.pattern.points()[:, :2]
+        ax.plot(*points.T, "+", color=COLORS["raw"], markersize=4)
     ax.invert_yaxis()
     to_scale(ax, "x [m]", "y [m]")
     ax.set_title(f"bands: spread over the images, {exaggerate:g} times")

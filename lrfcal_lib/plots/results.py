@@ -1,98 +1,174 @@
-"""Figures of results: bars, strips, maps, uncertainty."""
+"""Figures of results: bars, strips and points."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from numpy.typing import ArrayLike
 
-from lrfcal_lib.plots.recording import COLORS, SERIES, color_of
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.plots.recording import COLORS, SERIES, color_of, series
 
-BINS = 8
-SPREAD = {"capsize": 2, "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]}}  # of bars
+BINS = 8  # of distances, with as many residuals each
+SPREAD: dict[str, Any] = {
+    "capsize": 2,
+    "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]},
+}  # of bars
+WORST = 4.0  # times the median: a placement that fits so badly is an outlier
 
 
-def by_placement(ax, names, label):
+def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
     """Ticks and labels of an axis of placements; the zero of what is drawn over them."""
     ax.set(xlabel="placement", ylabel=label, xticks=np.arange(len(names)), xticklabels=names)
     ax.grid(False, axis="x")
-    ax.axhline(0, color=COLORS["truth"], linewidth=0.8)
+    _zero(ax.axhline)
 
 
-def residual_strips(ax, residuals, placement, label, color):
-    """Residuals (n,) by placement (n,), with their root mean square as a bar.
+def rows_of(ax: Axes, names: Sequence | Mapping) -> None:
+    """Ticks of rows from above to below."""
+    count = len(names)
+    ax.set(yticks=np.arange(count), yticklabels=list(names), ylim=(count - 0.5, -0.5))
 
-    `label` is the quantity with its unit.
+
+def _zero(line):
+    """Draw the zero by one of the methods axhline and axvline."""
+    line(0, color=COLORS["truth"], linewidth=0.8)
+
+
+def _side_by_side(count):
+    """Places of so many dots in a strip from -0.5 to 0.5."""
+    return (np.arange(count) + 0.5) / np.maximum(count, 1) - 0.5
+
+
+def residual_strips(
+    ax: Axes, residuals: np.ndarray, placement: np.ndarray, label: str, color: str
+) -> None:
+    """Residuals by placement, with their root mean square as a bar.
+
+    Parameters
+    ----------
+    ax
+    residuals, placement
+        Shape (n,).
+    label
+        The quantity with its unit.
+    color
     """
-    names, column, count = np.unique(placement, return_inverse=True, return_counts=True)
-    rank = np.argsort(np.argsort(column, kind="stable"))
-    first = np.cumsum(count) - count
-    within = rank - first[column]
-    spread = (within + 0.5) / count[column] - 0.5
-    rms = np.sqrt(np.bincount(column, np.square(residuals)) / count)
-    looks = {"width": 0.8, "color": color, "alpha": 0.2, "linewidth": 0}
-    ax.bar(np.arange(len(names)), 2 * rms, bottom=-rms, label="rms", **looks)
-    ax.plot(column + 0.6 * spread, residuals, ".", color=color, markersize=2.5)
-    by_placement(ax, names, label)
+    names = np.unique(placement)
+    for column, name in enumerate(names):
+        values = residuals[placement == name]
+        rms = np.sqrt(np.mean(values**2))
+        ax.bar(column, 2 * rms, 0.8, -rms, color=color, alpha=0.2, linewidth=0)
+        at = column + 0.6 * _side_by_side(len(values))
+        ax.plot(at, values, ".", color=color, markersize=2.5)
+    by_placement(ax, names.tolist(), label)
     limit = 1.08 * max(np.abs(residuals).max(), 1e-12)
     ax.set_ylim(-limit, limit)
 
 
-def pitch_offsets(ax, placement, offset, sigma, direction):
-    """Pitch offset of each sweep and its sigma (radians), coloured by direction: +1 (up), -1, 0."""
+def pitch_offsets(
+    ax: Axes, placement: Sequence[int], offset: ArrayLike, sigma: ArrayLike, direction: ArrayLike
+) -> None:
+    """Pitch offset of each sweep, coloured by direction.
+
+    Parameters
+    ----------
+    ax
+    placement
+        Numbers of the sweeps, n of them.
+    offset, sigma
+        And its standard deviation, radians, shape (n,).
+    direction
+        +1 (up), -1 or 0, shape (n,).
+    """
     offset = np.degrees(offset)
     sigma = np.degrees(sigma)
     kinds = {1: (SERIES[0], "upwards"), -1: (SERIES[1], "downwards"), 0: (COLORS["raw"], "unknown")}
     for sign, (color, label) in kinds.items():
         rows = np.flatnonzero(np.equal(direction, sign))
         if rows.size:
-            looks = {"color": color, "width": 0.75} | SPREAD
-            ax.bar(rows, offset[rows], yerr=sigma[rows], label=label, **looks)
-            ax.axhline(np.median(offset[rows]), color=color, linestyle=":", linewidth=1)
+            values = offset[rows]
+            ax.bar(rows, values, 0.75, yerr=sigma[rows], color=color, label=label, **SPREAD)
+            ax.axhline(np.median(values), color=color, linestyle=":", linewidth=1)
     by_placement(ax, placement, "pitch offset [deg]")
-    above = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
-    ax.legend(title="head moved", ncols=3, **above)
+    ax.legend(
+        title="head moved",
+        ncols=3,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.2,
+    )
 
 
-def parameter_comparison(ax, values, sigmas, label):
-    """One parameter by method, values and sigmas, with one-sigma bars (none for NaN)."""
+def parameter_comparison(
+    ax: Axes, values: Mapping[str, float], sigmas: Mapping[str, float], label: str
+) -> None:
+    """One parameter by method.
+
+    Parameters
+    ----------
+    ax
+    values, sigmas
+        By method, and their standard deviations (NaN: no bar), both in the unit of the label.
+    label
+    """
     for row, (method, value) in enumerate(values.items()):
         sigma = sigmas[method] if np.isfinite(sigmas[method]) else None
-        looks = {"fmt": "o", "color": SERIES[row % len(SERIES)], "capsize": 2.5, "markersize": 4.5}
-        ax.errorbar(value, row, xerr=sigma, **looks)
+        color = series(row)
+        ax.errorbar(value, row, xerr=sigma, fmt="o", color=color, capsize=2.5, markersize=4.5)
     rows_of(ax, values)
     ax.set_xlabel(label)
 
 
-def rows_of(ax, names):
-    """Ticks of rows from above to below."""
-    count = len(names)
-    ax.set(yticks=np.arange(count), yticklabels=list(names), ylim=(count - 0.5, -0.5))
+def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
+    """Errors of edge lengths: a dot an edge, the mean a bar.
 
-
-def edge_errors(ax, errors):
-    """Errors of edge lengths (measured minus true, mm) by rule: a dot an edge, the mean a bar."""
+    Parameters
+    ----------
+    ax
+    errors
+        Measured minus true, mm, by rule.
+    """
     for row, values in enumerate(errors.values()):
-        spread = (np.arange(len(values)) + 0.5) / max(len(values), 1) - 0.5
-        color = SERIES[row % len(SERIES)]
-        ax.plot(values, row + 0.5 * spread, "o", color=color, markersize=3.5, alpha=0.8)
-        ax.plot([np.mean(values)] * 2, [row - 0.36, row + 0.36], color=color, linewidth=2.5)
-    ax.axvline(0, color=COLORS["truth"], linewidth=0.8)
+        color = series(row)
+        height = row + 0.5 * _side_by_side(len(values))
+        ax.plot(values, height, "o", color=color, markersize=3.5, alpha=0.8)
+        mean = np.mean(values)
+        ax.plot([mean, mean], [row - 0.36, row + 0.36], color=color, linewidth=2.5)
+    _zero(ax.axvline)
     ax.grid(False, axis="y")
     rows_of(ax, errors)
     ax.set_xlabel("measured - true length [mm]")
 
 
-def method_bars(ax, table, column, label):
-    """One column of a ``method_comparison``, a bar for each method and camera."""
-    methods = list(dict.fromkeys(table.method))
-    cameras = list(dict.fromkeys(table.camera))
-    height = 0.8 / len(cameras)
+def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
+    """One column of a ``method_comparison``, a bar for each method and camera.
+
+    Parameters
+    ----------
+    ax
+    table
+        With the columns method and camera.
+    column
+        Another one of it.
+    label
+        Of its values, with their unit.
+    """
+    values = table.pivot(index="method", columns="camera", values=column)
+    methods = table.method.unique()
+    cameras = table.camera.unique()
     rows = np.arange(len(methods))
+    height = 0.8 / len(cameras)
     for i, camera in enumerate(cameras):
-        part = table[table.camera == camera].set_index("method")[column].reindex(methods)
-        looks = {"height": 0.95 * height, "color": color_of(camera, i)}
-        ax.barh(rows + i * height, part, label=camera, **looks)
+        part = values.loc[methods, camera]
+        ax.barh(rows + i * height, part, 0.95 * height, label=camera, color=color_of(camera, i))
     middle = height * (len(cameras) - 1) / 2
     ax.set(yticks=rows + middle, yticklabels=methods, xlabel=label)
     ax.set_ylim(len(methods) - 0.5 * height, -height)
-    mean = table.groupby("method", sort=False)[column].mean()
+    mean = values.loc[methods].mean(axis=1)
     title = "no method could be judged"
     if mean.notna().any():
         title = f"least: {mean.idxmin()}"
@@ -100,44 +176,56 @@ def method_bars(ax, table, column, label):
     ax.legend()
 
 
-def misfit_bars(ax, misfit, limit=4.0):
+def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     """Normalised mean squared residuals by placement; 1 is what the noise explains.
 
-    Placements above `limit` times the median are drawn as outliers.
+    Parameters
+    ----------
+    ax
+    misfit
+        By placement; those above `WORST` times the median are drawn as outliers.
     """
     values = np.array(list(misfit.values()))
-    every = 1 if len(misfit) < 16 else 2
-    bad = values > limit * max(np.median(values), 1.0)
-    color = np.where(bad, COLORS["outlier"], COLORS["lrf"])
-    ax.bar(np.arange(len(values)), values, color=color, width=0.75)
+    rows = np.arange(len(values))
+    bad = values > WORST * max(np.median(values), 1.0)
+    ax.bar(rows, values, 0.75, color=np.where(bad, COLORS["outlier"], COLORS["lrf"]))
     ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
     by_placement(ax, list(misfit), "chi-square per degree of freedom")
-    ax.set_xticks(np.arange(len(values))[::every], list(misfit)[::every])
+    if len(misfit) > 15:
+        ax.set_xticks(rows[::2], [str(name) for name in list(misfit)[::2]])
     title = f"all placements fit alike, the worst {values.max():.1f}"
     if bad.any():
         title = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
     ax.set(ylim=(0, 1.1 * max(values.max(), 1.2)), title=title)
 
 
-def residuals_by_range(ax, distance, residual):
-    """Range residuals over distance (metres, shapes (n,)), with means and their errors in bins.
+def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> None:
+    """Range residuals over distance, with means and their standard errors in bins.
 
     Noise scatters, a model error bends; see ``joint_tables.range_residuals``.
+
+    Parameters
+    ----------
+    ax
+    distance, residual
+        Metres, shape (n,).
     """
     residual = 1000 * np.asarray(residual)
     ax.plot(distance, residual, ",", color=COLORS["raw"], zorder=0)
-    limits = np.unique(np.quantile(distance, np.linspace(0, 1, BINS + 1)))
-    number = np.searchsorted(limits, distance, side="right") - 1
-    number = np.clip(number, 0, max(len(limits) - 2, 0))
-    means = []
-    for i in np.unique(number):
-        here = residual[number == i]
-        error = here.std() / np.sqrt(len(here))
-        means.append((distance[number == i].mean(), here.mean(), error))
-    x, y, error = np.transpose(means)
-    looks = {"fmt": "o-", "color": COLORS["lrf"], "capsize": 2.5}
-    ax.errorbar(x, y, yerr=error, label="mean and its standard error", **looks)
-    ax.axhline(0, color=COLORS["truth"], linewidth=0.8)
+    bins = pd.qcut(distance, BINS, labels=False, duplicates="drop")
+    parts = pd.DataFrame({"distance": distance, "residual": residual}).groupby(bins)
+    means = parts.mean()
+    error = parts.residual.std(ddof=0) / np.sqrt(parts.size())
+    ax.errorbar(
+        means.distance,
+        means.residual,
+        error,
+        fmt="o-",
+        color=COLORS["lrf"],
+        capsize=2.5,
+        label="mean and its standard error",
+    )
+    _zero(ax.axhline)
     limit = 1.05 * max(np.quantile(np.abs(residual), 0.995), 1e-9)
     rms = np.sqrt(np.mean(residual**2))
     ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit))
@@ -145,18 +233,36 @@ def residuals_by_range(ax, distance, residual):
     ax.legend()
 
 
-def residuals_by_region(ax, uv, shift, model, name):
+def residuals_by_region(
+    ax: Axes, uv: np.ndarray, shift: np.ndarray, model: CameraModel, name: str
+) -> None:
     """Residuals of the boards' middles over an image, as arrows.
 
-    The longest is an eighth of the image's width. `uv` and `shift` (n, 2), pixels: see
-    ``joint_tables.view_residuals``. The camera's name is its colour.
+    The longest is an eighth of the image's width; see ``joint_tables.view_residuals``.
+
+    Parameters
+    ----------
+    ax
+    uv, shift
+        Pixels, shape (n, 2).
+    model
+        Of the camera.
+    name
+        Of the camera, which tells the colour.
     """
     length = np.linalg.norm(shift, axis=1)
     title = f"{name}: no board in any image"
     if len(uv):
         longest = max(length.max(), 1e-9)
-        looks = {"angles": "xy", "scale_units": "xy", "width": 0.005, "color": color_of(name)}
-        drawn = ax.quiver(*uv.T, *shift.T, scale=longest / (model.width / 8), **looks)
+        drawn = ax.quiver(
+            *uv.T,
+            *shift.T,
+            angles="xy",
+            scale_units="xy",
+            scale=longest / (model.width / 8),
+            width=0.005,
+            color=color_of(name),
+        )
         unit = float(f"{longest / 2:.1g}")
         ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S", coordinates="axes")
         title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
@@ -164,19 +270,27 @@ def residuals_by_region(ax, uv, shift, model, name):
     ax.set(xlabel="u [px]", ylabel="v [px]", title=title)
 
 
-def over_view(ax, cloud, values, limit):
-    """Values of a Cloud's points over bearing (to the left as in the scene) and pitch, degrees.
+def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollection:
+    """Values of points over bearing (to the left as in the scene) and pitch, degrees.
 
-    Colours end at `limit`, and at its negative where there are negative values. Returns what was
-    drawn.
+    Parameters
+    ----------
+    ax
+    cloud : Cloud
+        Of n points.
+    values
+        Shape (n,).
+    limit
+        Where colours end, and at its negative where there are negative values.
     """
-    shades = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
+    shades: dict[str, Any] = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
     if np.nanmin(values, initial=0.0) < 0:
         shades = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     bearing = np.degrees(cloud.bearing)
     pitch = np.degrees(cloud.pitch)
-    looks = {"s": 2.5, "marker": "s", "linewidths": 0, "rasterized": True}
-    drawn = ax.scatter(bearing, pitch, c=values, **looks, **shades)
+    drawn = ax.scatter(
+        bearing, pitch, 2.5, values, marker="s", linewidths=0, rasterized=True, **shades
+    )
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
     ax.set(xlim=(bearing.max(), bearing.min()), ylim=(pitch.min(), pitch.max()))
     return drawn

@@ -1,175 +1,308 @@
 """Drawings in space, and coloured clouds as a camera sees them."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.axes3d import Axes3D
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.plots.recording import AXES_RGB, COLORS, color_of
+from lrfcal_lib.plots.recording import AXES_RGB, CENTRED, COLORS, closed, color_of
 
-SURFACE = {
-    "color": COLORS["left"],
-    "alpha": 0.15,
-    "linewidth": 0,
-    "antialiased": True,
-    "shade": True,
-}
+SURFACE = {"color": COLORS["left"], "alpha": 0.15, "linewidth": 0}
+NEAREST = 1e-6  # metres: what is nearer, or behind a camera, is not seen
+PARALLEL = 1e-9  # sine of an angle below which two directions are one
+Vector = Sequence[float] | np.ndarray
+SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
-def frames(ax, transforms, length=0.1):
+def frames(ax: Axes3D, transforms: Mapping[str, RigidTransform], length: float = 0.1) -> None:
     """Coordinate frames in space: x red, y green, z blue.
 
-    `transforms` lead from each frame, by name, to the one drawn in; `length` of the arrows in
-    metres.
+    Parameters
+    ----------
+    ax
+    transforms
+        From each frame, by name, to the one drawn in.
+    length
+        Of the arrows, metres.
     """
     for name, transform in transforms.items():
         for axis, color in zip(np.eye(3), AXES_RGB, strict=True):
-            ax.plot(*transform.apply(np.outer([0, length], axis)).T, color=color, linewidth=1.8)
-        ax.text(
-            *transform.apply([-0.35 * length] * 3),
-            name,
-            fontsize=8,
-            color=color_of(name, 7),
-            weight="bold",
-        )
+            arrow = transform.apply([0 * axis, length * axis])
+            ax.plot(*arrow.T, color=color, linewidth=1.8)
+        beside = transform.apply([-0.35 * length] * 3)
+        ax.text(*beside, name, fontsize=8, color=color_of(name, 7), weight="bold")
 
 
-def polygon(ax, corners, color=COLORS["truth"]):
-    """A flat polygon in space, for instance a board; corners (n, 3) in metres."""
+def polygon(ax: Axes3D, corners: np.ndarray, color: str = COLORS["truth"]) -> None:
+    """A flat polygon in space, for instance a board.
+
+    Parameters
+    ----------
+    ax
+    corners
+        Shape (n, 3), metres.
+    color
+    """
     ax.add_collection3d(Poly3DCollection([corners], facecolors=color, edgecolors=color, alpha=0.15))
-    ax.plot(*np.vstack([corners, corners[:1]]).T, color=color, linewidth=1.2)
+    ax.plot(*closed(corners).T, color=color, linewidth=1.2)
 
 
-def rays(ax, origin, points):
-    """Beams in space, from an origin (3,) or (n, 3) to the points (n, 3) that they hit, metres."""
-    beams = np.stack([np.broadcast_to(origin, np.shape(points)), points], axis=1)
+def rays(ax: Axes3D, origin: ArrayLike, points: np.ndarray) -> None:
+    """Beams in space.
+
+    Parameters
+    ----------
+    ax
+    origin
+        Shape (3,), or (n, 3), metres.
+    points
+        That they hit, shape (n, 3), metres.
+    """
+    beams = np.stack([np.broadcast_to(origin, points.shape), points], axis=1)
     color = COLORS["lrf"]
     ax.add_collection3d(Line3DCollection(beams, colors=color, linewidths=0.4, alpha=0.35))
-    ax.plot(*np.asarray(points).T, ".", color=color, markersize=2.5)
+    ax.plot(*points.T, ".", color=color, markersize=2.5)
 
 
-def lines(ax, drawn):
-    """Lines in space by name: a colour and points (n, 3), with NaN rows where a line breaks."""
+def lines(ax: Axes3D, drawn: Mapping[str, tuple[str, np.ndarray]]) -> None:
+    """Lines in space.
+
+    Parameters
+    ----------
+    ax
+    drawn
+        By name a colour and points (n, 3), metres, with NaN rows where a line breaks.
+    """
     for name, (color, points) in drawn.items():
-        ax.plot(*np.transpose(points), color=color, linewidth=1.6, label=name)
+        ax.plot(*points.T, color=color, linewidth=1.6, label=name)
 
 
-def space(ax, points, elev=22.0, azim=-60.0, zoom=1.0, labels=True):
-    """Equal scales and a view for axes in space, limits from the points (n, 3) to show, metres.
+def space(
+    ax: Axes3D,
+    points: np.ndarray,
+    elev: float = 22.0,
+    azim: float = -60.0,
+    zoom: float = 1.0,
+    labels: bool = True,
+) -> None:
+    """Equal scales and a view for axes in space.
 
-    One looks from `elev` and `azim` (degrees); `zoom`: Matplotlib leaves wide margins around flat
-    scenes. Without `labels` the axes are not drawn at all.
+    Parameters
+    ----------
+    ax
+    points
+        Those to show, shape (n, 3), metres.
+    elev, azim
+        From where one looks, degrees.
+    zoom
+        Matplotlib leaves wide margins around flat scenes.
+    labels
+        Otherwise the axes are not drawn at all.
     """
     low = np.min(points, axis=0)
     high = np.max(points, axis=0)
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    limits = np.stack([low, high], axis=1)
+    for axis, (first, last) in zip("xyz", limits, strict=True):
+        ax.set(**{f"{axis}lim": (first, last), f"{axis}label": f"{axis} [m]"})
     ax.set_box_aspect(np.maximum(high - low, 1e-6), zoom=zoom)
     ax.view_init(elev=elev, azim=azim)
-    ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     if not labels:
         ax.set_axis_off()
 
 
-def sphere(ax, centre, radius):
-    """The set a point allows, figure 3 (a): the surface of a sphere, metres."""
-    u, v = np.mgrid[0 : 2 * np.pi : 36j, 0 : np.pi : 19j]
-    ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
-    ax.plot_surface(*(np.reshape(centre, (3, 1, 1)) + radius * ball), **SURFACE)
+def sphere(ax: Axes3D, centre: np.ndarray, radius: float) -> None:
+    """The set a point allows, figure 3 (a): the surface of a sphere.
 
-
-def cylinder(ax, point, direction, radius, half_length):
-    """The set a line allows, figure 3 (b): a cylinder around it, metres.
-
-    `direction` is a unit vector.
+    Parameters
+    ----------
+    ax
+    centre, radius
+        Shape (3,) and a number, metres.
     """
-    across = np.linalg.svd(np.asarray(direction, float)[None])[2][1:]
-    u, s = np.mgrid[0 : 2 * np.pi : 36j, -half_length:half_length:9j]
-    ring = radius * (np.cos(u)[..., None] * across[0] + np.sin(u)[..., None] * across[1])
-    ax.plot_surface(
-        *np.moveaxis(point + ring + s[..., None] * np.asarray(direction), -1, 0), **SURFACE
-    )
-    ax.plot(*(point + np.outer([-half_length, half_length], direction)).T, color=COLORS["truth"])
+    u, v = np.mgrid[0 : 2 * np.pi : 36j, 0 : np.pi : 19j]
+    ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+    _surface(ax, np.asarray(centre) + radius * ball)
 
 
-def slab(ax, point, normal, thickness, half_width):
-    """The set a plane allows, figure 3 (c): from it to its parallel near the sensor, metres."""
-    across = np.linalg.svd(np.asarray(normal, float)[None])[2][1:]
-    square = half_width * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ across + point
+def cylinder(
+    ax: Axes3D, point: np.ndarray, direction: np.ndarray, radius: float, half_length: float
+) -> None:
+    """The set a line allows, figure 3 (b): a cylinder around it.
+
+    Parameters
+    ----------
+    ax
+    point, direction
+        Of the line, shape (3,): metres, a unit vector.
+    radius, half_length
+        Metres.
+    """
+    first, second = across(direction)
+    u, s = np.mgrid[0 : 2 * np.pi : 36j, -half_length:half_length:9j][..., None]
+    ring = radius * (np.cos(u) * first + np.sin(u) * second)
+    _surface(ax, point + ring + s * direction)
+    line = point + np.outer([-half_length, half_length], direction)
+    ax.plot(*line.T, color=COLORS["truth"])
+
+
+def slab(
+    ax: Axes3D, point: np.ndarray, normal: np.ndarray, thickness: float, half_width: float
+) -> None:
+    """The set a plane allows, figure 3 (c): from it to its parallel near the sensor.
+
+    Parameters
+    ----------
+    ax
+    point, normal
+        Of the plane, shape (3,): metres, a unit vector.
+    thickness, half_width
+        Metres.
+    """
+    square = half_width * SQUARE @ across(normal) + point
     polygon(ax, square)
     polygon(ax, square + thickness * np.asarray(normal), COLORS["left"])
 
 
-def render(points, colors, T_view, size, focal=None, splat=1):
+def across(direction: ArrayLike) -> np.ndarray:
+    """Two unit vectors (2, 3) at right angles to a direction and to each other."""
+    return np.linalg.svd(np.atleast_2d(direction))[2][1:]
+
+
+def _surface(ax, points):
+    """A grid of points (n, m, 3) as a surface that one sees through."""
+    ax.plot_surface(*np.moveaxis(points, -1, 0), antialiased=True, shade=True, **SURFACE)
+
+
+def render(
+    points: np.ndarray,
+    colors: np.ndarray,
+    T_view: RigidTransform,
+    size: tuple[int, int],
+    focal: float | None = None,
+    splat: int = 1,
+) -> np.ndarray:
     """A coloured cloud as a pinhole camera sees it: the nearest point of each pixel, or white.
 
     Parameters
     ----------
-    points : ndarray, shape (n, 3)
-        Metres; NaN rows and points behind the camera are left out.
-    colors : ndarray of uint8, shape (n, 3)
-        In the order wanted in the picture.
-    T_view : RigidTransform
+    points
+        Shape (n, 3), metres; NaN rows and points behind the camera are left out.
+    colors
+        Of uint8, shape (n, 3), in the order wanted in the picture.
+    T_view
         From the frame of the points to the view (x right, y down, z ahead).
-    size : (int, int)
+    size
         Height and width, pixels.
-    focal : float, optional
+    focal
         Pixels; the width (53 deg across) unless given.
-    splat : int
+    splat
         Each point covers (2 splat + 1)^2 pixels.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width, 3)
+    """
+    seen = T_view.apply(points)
+    ahead = np.isfinite(seen).all(axis=1) & (seen[:, 2] > NEAREST)
+    far_to_near = np.argsort(-seen[:, 2], kind="stable")
+    order = far_to_near[ahead[far_to_near]]
+    uv = np.rint(pixels(seen[order], size, focal)).astype(int)
+    winner = np.full(size, -1)
+    for dv, du in np.ndindex(2 * splat + 1, 2 * splat + 1):
+        v, u = (uv + [du - splat, dv - splat]).T[::-1]
+        inside = np.flatnonzero((u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0]))
+        layer = np.full(size, -1)
+        layer[v[inside], u[inside]] = inside  # of equal pixels the last one, the nearest, stays
+        winner = np.maximum(winner, layer)
+    white = np.full((1, 3), 255, np.uint8)
+    return np.vstack([colors[order], white])[winner]  # the last row where no point is
+
+
+def pixels(seen: np.ndarray, size: tuple[int, int], focal: float | None = None) -> np.ndarray:
+    """Where points stand in a picture of :func:`render`.
+
+    Parameters
+    ----------
+    seen
+        Points of the view, shape (n, 3), metres.
+    size, focal
+        As there.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
     """
     height, width = size
-    seen = T_view.apply(np.asarray(points, float))
-    keep = np.flatnonzero(np.isfinite(seen).all(axis=1) & (seen[:, 2] > 1e-6))
-    # far to near: of equal pixels the last one written stays
-    keep = keep[np.argsort(-seen[keep, 2], kind="stable")]
-    seen = seen[keep]
-    colors = np.asarray(colors, np.uint8)[keep]
-    uv = np.rint(pixels(seen, (height, width), focal)).astype(int)
-    winner = np.full((height, width), -1)
-    for dv, du in np.ndindex(2 * splat + 1, 2 * splat + 1):
-        u = uv[:, 0] + du - splat
-        v = uv[:, 1] + dv - splat
-        inside = np.flatnonzero((u >= 0) & (u < width) & (v >= 0) & (v < height))
-        layer = np.full((height, width), -1)
-        layer[v[inside], u[inside]] = inside
-        winner = np.maximum(winner, layer)  # a larger index is nearer
-    # the last row where no point is
-    return np.vstack([colors, np.full((1, 3), 255, np.uint8)])[winner]
+    centre = np.array([width - 1, height - 1]) / 2
+    return (focal or width) * seen[:, :2] / seen[:, 2:] + centre
 
 
-def pixels(seen, size, focal=None):
-    """Where points of the view (n, 3) stand in a picture of :func:`render`, shape (n, 2)."""
-    return (focal or size[1]) * seen[:, :2] / seen[:, 2:] + [(size[1] - 1) / 2, (size[0] - 1) / 2]
+def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidTransform:
+    """The view from one point to another for :func:`render`.
 
+    Parameters
+    ----------
+    eye, target
+        Shape (3,), metres.
+    up
+        Shown upwards.
 
-def look_at(eye, target, up=(0.0, 0.0, 1.0)):
-    """The view from one point to another (metres) for :func:`render`, a transform of points.
+    Returns
+    -------
+    RigidTransform
+        Of points.
 
-    `up` is shown upwards. A ValueError if eye and target coincide, or `up` is the line of sight.
+    Raises
+    ------
+    ValueError
+        If eye and target coincide, or `up` is the line of sight.
     """
-    eye, ahead = np.asarray(eye, float), np.subtract(target, eye)
+    eye = np.asarray(eye, float)
+    target = np.asarray(target, float)
+    ahead = target - eye
     right = np.cross(ahead, up)
-    if np.linalg.norm(right) < 1e-9 * max(np.linalg.norm(ahead), 1e-300) or not ahead.any():
+    distance = np.linalg.norm(ahead)
+    if np.linalg.norm(right) <= PARALLEL * distance:
         raise ValueError(
             f"no view from {eye} to {target} with {up} upwards: choose another eye or another up"
         )
     right = right / np.linalg.norm(right)
-    ahead = ahead / np.linalg.norm(ahead)
+    ahead = ahead / distance
     rotation = Rotation.from_matrix(np.stack([right, np.cross(ahead, right), ahead]))
     return RigidTransform.from_components(-rotation.apply(eye), rotation)
 
 
-def measured_edges(ax, measured, known, T_view, size, focal=None):
-    """Edges of a MeasuredBoard over a picture of :func:`render`, with lengths and `known` ones."""
+def measured_edges(
+    ax,
+    measured,
+    known: dict[str, float],
+    T_view: RigidTransform,
+    size: tuple[int, int],
+    focal: float | None = None,
+) -> None:
+    """Edges of a measured board over a picture of :func:`render`, with their lengths.
+
+    Parameters
+    ----------
+    ax : Axes
+    measured : MeasuredBoard
+    known
+        True lengths by edge, metres, in the order of the outline.
+    T_view, size, focal
+        Of the picture.
+    """
     names = list(known)
-    middle = pixels(T_view.apply(measured.T_platform_plane[None, :3, 3]), size, focal)[0]
+    after = dict(zip(names, names[1:] + names[:1], strict=True))
+    centre = measured.T_platform_plane[None, :3, 3]
+    middle = pixels(T_view.apply(centre), size, focal)[0]
     for name, length in measured.lengths.items():
-        ends = [
-            measured.corner_point(n) for n in (name, names[(names.index(name) + 1) % len(names)])
-        ]
-        uv = pixels(T_view.apply(np.array(ends)), size, focal)
+        ends = [measured.corner_point(name), measured.corner_point(after[name])]
+        uv = pixels(T_view.apply(ends), size, focal)
         ax.plot(*uv.T, "o-", color=COLORS["fit"])
         away = uv.mean(axis=0) - middle
-        words = f"{1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
         at = uv.mean(axis=0) + 0.07 * size[1] * away / np.linalg.norm(away)
-        looks = {"ha": "center", "va": "center"}
-        ax.text(*at, f"{name.upper()} {words}", color=COLORS["fit"], **looks)
+        words = f"{1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
+        ax.text(*at, f"{name.upper()} {words}", color=COLORS["fit"], **CENTRED)

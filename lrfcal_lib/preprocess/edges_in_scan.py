@@ -68,7 +68,7 @@ class ScanSide:
         between = other.ends.mean(axis=0) - self.ends.mean(axis=0)
         apart = np.linalg.norm(np.cross(between, self.direction))
         cosine = abs(self.direction @ other.direction)
-        return cosine > np.cos(LEAST_TURN) and apart < SAME_SIDE
+        return bool(cosine > np.cos(LEAST_TURN) and apart < SAME_SIDE)
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,9 @@ from lrfcal_lib.preprocess.pattern_in_image import (
     square_px,
 )
 from lrfcal_lib.preprocess.turns import alike, decide, turned_boards
-from lrfcal_lib.session.cache import spread
 from lrfcal_lib.session.read import ImageRecord, Session
 from lrfcal_lib.session.stated import short
+from lrfcal_lib.session.workers import spread
 
 LEAST_VIEWS_FOR_RELIEF = 8
 # of a camera with images taken for the intrinsics; more cost time and tell little
@@ -518,8 +518,7 @@ def _by_outline(shots, orders, read, board, models):
     def score(number):
         shot = shots[number]
         model = models[shot.record.camera]
-        corners = orders.corners[number]
-        return order_scores(shot.image(read), board, model, corners, orders.poses[number])
+        return order_scores(shot.image(read), board, model, orders.poses[number])
 
     return decide(np.array(spread(score, range(len(shots)))), orders.leader)
 

@@ -1,4 +1,4 @@
-"""Stages that several notebooks begin with, worked out once; loops that several processes share.
+"""Stages that several notebooks begin with, worked out once.
 
 Where the environment variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is
 kept there for whoever asks for the same again. A report and a test run use a fresh folder each,
@@ -10,13 +10,9 @@ in the place of; so is a file in it, and a link.
 
 import fcntl
 import hashlib
-import multiprocessing
 import os
 import pickle
 import stat
-import sys
-import threading
-from contextlib import contextmanager, suppress
 from functools import lru_cache, wraps
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -30,7 +26,6 @@ from lrfcal_lib.session.stated import opened
 VARIABLE = "LRFCAL_CACHE"
 REMEDY = "and what lies there is run; chmod go-w, or name a folder of your own"
 LARGEST_RESULT = 4_000_000_000  # bytes that are read; the largest are clouds of some 100 MB
-_processes = 1  # that share a loop
 
 
 def cached(stage):
@@ -106,82 +101,3 @@ def library():
     for file in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(file.read_bytes())
     return digest.digest()
-
-
-@contextmanager
-def all_processors():
-    """Let :func:`spread` use every processor; a process with threads, as that of a notebook, stays
-    alone.
-    """
-    global _processes
-    alone = not hasattr(os, "sched_getaffinity") or threading.active_count() > 1
-    before = _processes
-    if alone:
-        _processes = 1
-    else:
-        _processes = len(os.sched_getaffinity(0))
-    try:
-        yield
-    finally:
-        _processes = before
-
-
-def spread(work, items):
-    """``[work(item) for item in items]``, shared with forked processes within
-    :func:`all_processors`.
-
-    Whoever is free takes the next item; what another process could not do (it died, or `work`
-    raised) is done here. Every result is a copy, as a pickle makes it: sums over arrays of another
-    layout in memory differ in the last digit. Pickles are read from the pipes of our own children
-    only. No executor does this: one whose parent is killed leaves processes behind that wait for
-    ever, and here they end with the items.
-    """
-    global _processes
-    items = list(items)
-    count = min(_processes, len(items))
-    if count < 2:
-        return [pickle.loads(pickle.dumps(work(item))) for item in items]
-    before = _processes
-    _processes = 1  # of loops within
-    queue, end = os.pipe()  # of the numbers of items
-    os.write(end, np.arange(len(items), dtype=np.uint16).tobytes())
-    os.close(end)
-
-    def take(send):
-        """Work on what nobody works on, and send pickles of the results by number."""
-        done = {}
-        with suppress(Exception):
-            while number := os.read(queue, 2):
-                number = int.from_bytes(number, sys.byteorder)
-                done[number] = pickle.dumps(work(items[number]))
-        send(done)
-
-    def quietly(send):
-        """The same in a process of its own, which tells nobody that it was interrupted."""
-        with suppress(BaseException):
-            take(send)
-
-    results = {}
-    others = []  # processes, and the pipes that their results come from
-    fork = multiprocessing.get_context("fork")
-    try:
-        for _ in range(count - 1):
-            receiver, sender = fork.Pipe(duplex=False)
-            process = fork.Process(target=quietly, args=(sender.send,), daemon=True)
-            process.start()
-            sender.close()
-            others.append((process, receiver))
-        take(results.update)
-        for _, receiver in others:
-            with suppress(EOFError):
-                results |= receiver.recv()
-    finally:
-        _processes = before
-        os.close(queue)
-        for process, _ in others:
-            process.kill()
-            process.join()
-    for number, item in enumerate(items):
-        if number not in results:
-            results[number] = pickle.dumps(work(item))
-    return [pickle.loads(results[number]) for number in range(len(items))]

@@ -1,7 +1,8 @@
 """Other people's recordings as sessions."""
 
-import math
 import re
+from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -39,30 +40,92 @@ STEP_DEG = 0.1
 FIRST = 550
 LAST = 1250
 COUNT = 0.001  # metres, one count of the LMS400
-LASERSETERO = (
+LRF = LrfInfo(
+    model="SICK LMS400",
+    field_of_view=tuple(np.radians([FIRST * STEP_DEG, LAST * STEP_DEG])),
+    bearing_step=np.radians(STEP_DEG),
+    sigma_range=0.005,
+    range_resolution=COUNT,
+    max_range=3.0,
+)
+BOARD = Board(
+    "chessboard 9 x 7",
+    edges=("top", "right", "bottom", "left"),
+    corners=None,
+    pattern=Chessboard(columns=8, rows=6, square=0.0775),
+    features=("left", "top"),
+)
+# the authors' result is printed with four digits, so made orthonormal again
+T_LEFT_CLOUD = RigidTransform.from_components(
+    [0.1169, -0.0500, -0.2737],
+    Rotation.from_matrix(
+        [[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]]
+    ),
+)
+SOURCE = (
     "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
+)
+NOTE = (
+    "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, their bearing b "
+    "is 90 deg - ours. "
+    "T_left_platform is the authors' optimum (6.7 mm rms over the boards' planes)."
 )
 # radians of pitch between points of two scan lines; rounding to a micrometre makes less than 1e-5
 LINE_JUMP = 1e-4
 LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from what was recovered
+KEYS = {"fc": 2, "cc": 2, "kc": 5, "fc_error": 2, "cc_error": 2, "kc_error": 5, "nx": 1, "ny": 1}
 
 
-def import_lasersetero(src, dst, *, intrinsics="own"):
-    """Make a session `dst` of the public LMS400 + ZED recording.
+@dataclass(frozen=True)
+class Recovered:
+    """What the published points of a cloud were made of.
+
+    Attributes
+    ----------
+    ranges : ndarray, shape (L, B)
+        Metres on the sensor's grid of 1 mm, NaN outside the published part.
+    bearings : ndarray, shape (B,)
+        Ours, radians, in steps of 0.1 deg.
+    pitch : ndarray, shape (L,)
+        Radians.
+    miss : float
+        Largest distance between published and rebuilt points, metres.
+    """
+
+    ranges: np.ndarray
+    bearings: np.ndarray
+    pitch: np.ndarray
+    miss: float
+
+
+@dataclass(frozen=True)
+class BouguetCamera:
+    """A camera by Bouguet's toolbox; `reference`: intrinsics and board poses as JSON has them."""
+
+    model: CameraModel
+    reference: dict
+
+
+def import_lasersetero(
+    src: str | PathLike, dst: str | PathLike, *, intrinsics: str = "own"
+) -> float:
+    """Make a session of the public LMS400 + ZED recording.
 
     Parameters
     ----------
-    src : path-like
+    src
         Folder with ``plane_NN.pcd``, ``left_NN.png``, ``right_NN.png`` and
         ``Calib_Results_{left,right}.m``.
-    intrinsics : {'own', 'published'}
+    dst
+        The session's.
+    intrinsics
         'own' leaves the intrinsics open, so that they are estimated from the session's images;
         'published' takes them from the Bouguet results. Either way the published ones are kept in
         the session's reference.
 
     Returns
     -------
-    largest_miss : float
+    float
         Metres between the published points and those rebuilt from range, bearing and pitch, at
         most.
 
@@ -83,54 +146,43 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
         images[name] = numbered(src, f"{name}_*.png")
         first = next(iter(images[name].values()))
         width, height = image_size(first, read_bytes(first))
-        model = None
-        if intrinsics == "published":
-            model = published[name]["model"]
-        cameras.append(CameraInfo(name, "platform", width, height, model))
-    pattern = Chessboard(columns=8, rows=6, square=0.0775)
-    edges = ("top", "right", "bottom", "left")
-    features = ("left", "top")
-    board = Board("chessboard 9 x 7", edges, corners=None, pattern=pattern, features=features)
-    lrf = LrfInfo(
-        model="SICK LMS400",
-        field_of_view=tuple(np.radians([FIRST * STEP_DEG, LAST * STEP_DEG])),
-        bearing_step=np.radians(STEP_DEG),
-        sigma_range=0.005,
-        range_resolution=COUNT,
-        max_range=3.0,
-    )
-    # the authors' result is printed with four digits, so made orthonormal again
-    turn = Rotation.from_matrix(
-        [[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]]
-    )
-    T_left_cloud = RigidTransform.from_components([0.1169, -0.0500, -0.2737], turn)
+        model = published[name].model if intrinsics == "published" else None
+        cameras.append(CameraInfo(name, "platform", width, height, model))  # type: ignore[arg-type]
     reference = {
-        "note": "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, "
-        "their bearing b is 90 deg - ours. T_left_platform is the authors' optimum (6.7 mm rms "
-        "over the boards' planes).",
+        "note": NOTE,
         "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
-        "T_left_platform": transform_to_json(T_left_cloud * LASERSETERO_CLOUD),
-        "cameras": {name: result["reference"] for name, result in published.items()},
+        "T_left_platform": transform_to_json(T_LEFT_CLOUD * LASERSETERO_CLOUD),
+        "cameras": {name: camera.reference for name, camera in published.items()},
     }
-    about = {
-        "licence": "none stated by the authors",
-        "source": LASERSETERO,
-        "reference": reference,
-        "platform_sigma": LASERSETERO_PLATFORM_SIGMA,
-    }
-    with SessionWriter(dst, board, lrf, cameras, LASERSETERO_HEAD, **about) as writer:
-        misses = []
-        values = 0
-        for placement, file in clouds.items():
-            ranges, bearings, pitch, miss = recover_polar(read_pcd(file), file)
-            values += ranges.size
-            with naming(file):
-                check_amount(values)
-            writer.add_sweep(placement, ranges, bearings, pitch)
-            misses.append(miss)
+    with SessionWriter(
+        dst,
+        BOARD,
+        LRF,
+        cameras,
+        LASERSETERO_HEAD,
+        licence="none stated by the authors",
+        source=SOURCE,
+        reference=reference,
+        platform_sigma=LASERSETERO_PLATFORM_SIGMA,
+    ) as writer:
+        miss = _add_sweeps(writer, clouds)
         for name, files in images.items():
             for placement, file in files.items():
                 writer.add_image(name, file, placement, purpose="board")
+    return miss
+
+
+def _add_sweeps(writer, clouds):
+    """Write the scan lines of clouds (files by placement); the largest miss, metres."""
+    misses = []
+    values = 0
+    for placement, file in clouds.items():
+        sweep = recover_polar(read_pcd(file), file)
+        values += sweep.ranges.size
+        with naming(file):
+            check_amount(values)
+        writer.add_sweep(placement, sweep.ranges, sweep.bearings, sweep.pitch)
+        misses.append(sweep.miss)
     return max(misses)
 
 
@@ -148,24 +200,20 @@ def numbered(folder, pattern):
     return files
 
 
-def recover_polar(points, name="points"):
+def recover_polar(points: np.ndarray, name: str | PathLike = "points") -> Recovered:
     """Range, bearing and pitch that the published points of a LaserSetero cloud were made of.
 
     Parameters
     ----------
-    points : ndarray, shape (n, 3)
-        Authors' cloud frame, metres, in the order of acquisition.
-    name : str
+    points
+        Authors' cloud frame, metres, in the order of acquisition, shape (n, 3).
+    name
         For messages.
 
-    Returns
-    -------
-    ranges, bearings, pitch : ndarray, shapes (L, B), (B,) and (L,)
-        Metres on the sensor's grid of 1 mm, NaN outside the published part; ours, radians, in steps
-        of 0.1 deg.
-    miss : float
-        Largest distance between published and rebuilt points, metres; SessionError for more than
-        0.01 mm.
+    Raises
+    ------
+    SessionError
+        If the rebuilt points miss by more than 0.01 mm, or lie where the LMS400 does not see.
 
     Notes
     -----
@@ -189,22 +237,21 @@ def recover_polar(points, name="points"):
     jumps = np.abs(np.diff(pitch)) > LINE_JUMP
     line = np.cumsum(np.r_[True, restarts | jumps]) - 1
     pitch = np.bincount(line, pitch) / np.bincount(line)
+
     rebuilt = lrf_to_platform(polar_to_points(ranges, bearing), pitch[line], LASERSETERO_HEAD)
     miss = float(np.linalg.norm(rebuilt - p_platform, axis=1).max())
     if not miss <= LARGEST_MISS:
         limit = f"more than {1000 * LARGEST_MISS:g} mm; not points of this rig?"
         raise SessionError(f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, {limit}")
-    low = steps.min()
-    high = steps.max()
-    if low < FIRST or high > LAST:
-        reach = f"{STEP_DEG * low:.1f} .. {STEP_DEG * high:.1f} deg"
+    if steps.min() < FIRST or steps.max() > LAST:
+        reach = f"{STEP_DEG * steps.min():.1f} .. {STEP_DEG * steps.max():.1f} deg"
         raise SessionError(f"{name}: bearings reach {reach}, the LMS400 sees 55 .. 125 deg")
-    shape = (line[-1] + 1, LAST - FIRST + 1)
+    grid = np.arange(FIRST, LAST + 1)
     with naming(name):
-        check_amount(math.prod(shape))  # scan lines of few points are long as well
-    grid = np.full(shape, np.nan)
-    grid[line, steps.astype(int) - FIRST] = ranges
-    return grid, np.radians(np.arange(FIRST, LAST + 1) * STEP_DEG), pitch, miss
+        check_amount(len(pitch) * len(grid))  # scan lines of few points are long as well
+    on_grid = np.full((len(pitch), len(grid)), np.nan)
+    on_grid[line, steps.astype(int) - FIRST] = ranges
+    return Recovered(on_grid, np.radians(grid * STEP_DEG), pitch, miss)
 
 
 def source_text(file):
@@ -212,17 +259,15 @@ def source_text(file):
     return read_bytes(file, most=LARGEST_TEXT).decode(errors="replace")
 
 
-def read_pcd(file):
-    """Points of an ASCII PCD file with the fields x y z, shape (n, 3).
+def read_pcd(file: str | PathLike) -> np.ndarray:
+    """Points (n, 3) of an ASCII PCD file with the fields x y z.
 
     SessionError for a missing file, other fields, binary data, or fewer points than the header
     states.
     """
     head, _, body = source_text(file).partition("DATA ascii")
-    fields, count = (
-        re.search(rf"^{key} (.*)$", head, re.MULTILINE) for key in ("FIELDS", "POINTS")
-    )
-    if not body or not fields or not count or fields[1].split() != ["x", "y", "z"]:
+    count = re.search(r"^POINTS (.*)$", head, re.MULTILINE)
+    if not body or not count or not re.search(r"^FIELDS\s+x\s+y\s+z\s*$", head, re.MULTILINE):
         raise SessionError(f"{file}: expected an ASCII PCD file with the fields x y z")
     with reading(file, "{}; damaged?"):
         points = np.array(body.split(), dtype=float)
@@ -235,49 +280,46 @@ def read_pcd(file):
     return points.reshape(-1, 3)
 
 
-def read_bouguet(file):
-    """Intrinsics and board poses of a ``Calib_Results.m`` of Bouguet's toolbox; SessionError if
-    something is missing.
+def read_bouguet(file: str | PathLike) -> BouguetCamera:
+    """A camera of a ``Calib_Results.m`` of Bouguet's toolbox; SessionError if something is missing.
 
-    A dict: ``model``, a CameraModel (the toolbox prints three standard deviations, which its
-    covariance holds squared), and ``reference``, the same as plain numbers, with ``T_camera_board``
-    by image number (millimetres became metres).
+    The toolbox prints three standard deviations, which the model's covariance holds squared.
+    ``T_camera_board`` by image number is in metres, not millimetres.
     """
-    found = re.findall(
+    assigned = re.findall(
         r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE
     )
     with naming(file):
         values = {}
-        for key, many, one in found:
+        for key, many, one in assigned:
             values[key] = np.array((many or one).replace(";", " ").split(), float)
         return _from_bouguet(values)
 
 
 def _from_bouguet(values):
-    """What :func:`read_bouguet` returns, of arrays by name; ValueError for a wrong one."""
-    lengths = {"fc": 2, "cc": 2, "kc": 5, "fc_error": 2, "cc_error": 2, "kc_error": 5}
-    lengths |= {"nx": 1, "ny": 1}
-    if lacking := [key for key, length in lengths.items() if len(values.get(key, ())) != length]:
+    """A BouguetCamera of arrays by name; ValueError for a wrong one."""
+    lacking = [key for key, length in KEYS.items() if len(values.get(key, ())) != length]
+    if lacking:
         raise ValueError(f"no value of {', '.join(lacking)}; is this a Calib_Results.m?")
-    if endless := [key for key, array in values.items() if not np.isfinite(array).all()]:
+    endless = [key for key, array in values.items() if not np.isfinite(array).all()]
+    if endless:
         raise ValueError(f"values of {short(endless)} are not finite; damaged?")
-    intrinsics = np.concatenate([values[key] for key in ("fc", "cc", "kc")])
-    sigma = np.concatenate([values[f"{key}_error"] for key in ("fc", "cc", "kc")])
-    fx, fy, cx, cy, *distortion = intrinsics.tolist()
-    width = int(values["nx"][0])
-    height = int(values["ny"][0])
-    model = CameraModel(width, height, fx, fy, cx, cy, np.array(distortion))
+    intrinsics = np.concatenate([values["fc"], values["cc"], values["kc"]])
+    errors = np.concatenate([values["fc_error"], values["cc_error"], values["kc_error"]])
+    sigma = errors / 3
+    model = CameraModel(
+        int(values["nx"][0]), int(values["ny"][0]), *intrinsics[:4].tolist(), intrinsics[4:]
+    ).with_parameters(intrinsics, np.diag(sigma**2))
     poses = {}
     for key in values:
-        number = re.fullmatch(r"omc_(\d+)", key)
-        if number and f"Tc_{number[1]}" in values:
-            rotation = Rotation.from_rotvec(values[key])
-            shift = values[f"Tc_{number[1]}"] / 1000
-            poses[number[1]] = transform_to_json(RigidTransform.from_components(shift, rotation))
-    both = {"intrinsics": intrinsics, "intrinsics_sigma": sigma / 3}
-    reference = {k: dict(zip(INTRINSIC_NAMES, v.tolist(), strict=True)) for k, v in both.items()}
-    reference["T_camera_board"] = poses
-    return {
-        "model": model.with_parameters(intrinsics, np.diag((sigma / 3) ** 2)),
-        "reference": reference,
+        number = key.removeprefix("omc_")
+        if number.isdecimal() and f"Tc_{number}" in values:
+            turn = Rotation.from_rotvec(values[key])
+            shift = values[f"Tc_{number}"] / 1000
+            poses[number] = transform_to_json(RigidTransform.from_components(shift, turn))
+    reference = {
+        "intrinsics": dict(zip(INTRINSIC_NAMES, intrinsics.tolist(), strict=True)),
+        "intrinsics_sigma": dict(zip(INTRINSIC_NAMES, sigma.tolist(), strict=True)),
+        "T_camera_board": poses,
     }
+    return BouguetCamera(model, reference)

@@ -1,18 +1,22 @@
 """A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes."""
 
 import math
-from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field, NonNegativeFloat, NonNegativeInt
+from pydantic.dataclasses import dataclass
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.session.lms2xx_codec import MODES, REASONS, encode_values
 from lrfcal_lib.session.stated import LrfInfo
-from lrfcal_lib.simulate.scene import need
+from lrfcal_lib.simulate.scene import World, need
 
 NOT_VALID, DAZZLED, WEAK = (REASONS.index(words) for words in ("not valid", "dazzled", "noise"))
 # deg, 1/100 deg: of telegram 0x3B
 VARIANTS = ((100, 25), (100, 50), (100, 100), (180, 50), (180, 100))
+UNITS = {0.001: "mm", 0.01: "cm"}  # by metres a count
 RAYS_AT_ONCE = 1 << 19
 
 
@@ -28,9 +32,11 @@ class Beam:
     angles: tuple[int, ...] = (100, 180)
     # diameter of the spot at the window, metres, and its growth with distance, radians (technical
     # description)
-    spot_exit: float = 0.016
-    divergence: float = 0.0119
-    sigma_range: float = 0.010  # statistical error, 1 sigma, metres (technical description)
+    spot_exit: NonNegativeFloat = 0.016
+    divergence: NonNegativeFloat = 0.0119
+    sigma_range: NonNegativeFloat = (
+        0.010  # statistical error, 1 sigma, metres (technical description)
+    )
     systematic: float = 0.0  # constant error of this one device, metres
     # largest systematic error that the maker admits, by unit, metres
     systematic_bound: tuple[tuple[float, float], ...] = ((0.001, 0.035), (0.01, 0.05))
@@ -40,15 +46,15 @@ class Beam:
     unit: float = 0.001  # metres a count: 0.001 or 0.01
     # surfaces nearer together than this along the beam give one reading (telegram listing, 10.2:
     # about 1 m)
-    pulse: float = 1.0
+    pulse: NonNegativeFloat = 1.0
     # weakest echo that is a range: the 10 % reflectivity that the maker states the greatest range
     # for, there
-    least_energy: float = 0.1 / 30.0**2
+    least_energy: NonNegativeFloat = 0.1 / 30.0**2
     # an echo is taken when it has this share of the strongest one. Assumed: the receiver's gain
     # follows the strongest
     # echo; the maker states nothing. It widens what stands before a brighter background.
-    least_share: float = 0.25
-    rings: int = 4  # of sub-rays over the spot, 1 + 3 rings (rings + 1) of them
+    least_share: Annotated[float, Field(ge=0, le=1)] = 0.25
+    rings: NonNegativeInt = 4  # of sub-rays over the spot, 1 + 3 rings (rings + 1) of them
 
     def __post_init__(self):
         known = [variant for variant in VARIANTS if variant[0] in self.angles]
@@ -56,47 +62,46 @@ class Beam:
         listed = ", ".join(f"{angle}/{step / 100:g}" for angle, step in known)
         words = f"no whole scans of {variant}; it can be set to {listed}"
         need((self.field_of_view, self.resolution) in known, f"{self.name} has {words}")
-        for name in ("spot_exit", "divergence", "sigma_range", "pulse", "least_energy"):
-            value = getattr(self, name)
-            need(
-                0 <= value < math.inf,
-                f"{self.name}: {name} is {value}, it must be zero or positive",
-            )
         bound = dict(self.systematic_bound).get(self.unit)
         need(bound, f"{self.name}: the unit is 0.001 or 0.01 m, got {self.unit}")
         offset = f"{self.name}: a systematic error of {self.systematic} m"
         need(abs(self.systematic) <= bound, f"{offset} is beyond the maker's {bound} m")
-        share = f"least_share is {self.least_share}, a share lies between 0 and 1"
-        need(0 <= self.least_share <= 1, f"{self.name}: {share}")
-        rings = f"{self.rings} rings of rays cannot fill the spot, take 0 (one ray) or more"
-        need(self.rings >= 0, f"{self.name}: {rings}")
 
     @property
-    def rays(self):
+    def rays(self) -> int:
         """Sub-rays of one spot."""
         return 1 + 3 * self.rings * (self.rings + 1)
 
     @property
-    def turns(self):
+    def turns(self) -> int:
         """Mirror turns of one whole scan."""
         return 100 // self.resolution
 
-    def bearings(self):
-        """Bearings of a whole scan, shape (B,), radians.
+    def bearings(self) -> np.ndarray:
+        """Bearings of a whole scan, radians.
 
-        0 right, pi/2 ahead (40 to 140 deg for 100 deg variants).
+        Returns
+        -------
+        ndarray, shape (B,)
+            0 right, pi/2 ahead (40 to 140 deg for 100 deg variants).
         """
         count = self.field_of_view * 100 // self.resolution + 1
         first = 90 - self.field_of_view / 2
         return np.radians(first + np.arange(count) * self.resolution / 100)
 
     @property
-    def unit_name(self):
+    def unit_name(self) -> str:
         """'mm' or 'cm'."""
-        return "mm" if self.unit < 0.005 else "cm"
+        return UNITS[self.unit]
 
-    def info(self, made):
-        """What a session states of it, an LrfInfo; `made` is how ('simulated')."""
+    def info(self, made: str) -> LrfInfo:
+        """What a session states of it.
+
+        Parameters
+        ----------
+        made
+            How: 'simulated'.
+        """
         return LrfInfo(
             f"{self.name} ({made})",
             tuple(self.bearings()[[0, -1]].tolist()),
@@ -112,11 +117,19 @@ class Beam:
 LMS221 = Beam()
 
 
-def spot_pattern(rings):
-    """Points (K, 2) that stand for equal parts of the unit disc: one in the middle, 6 k on ring k.
+def spot_pattern(rings: int) -> np.ndarray:
+    """Points that stand for equal parts of the unit disc: one in the middle, 6 k on ring k.
 
     Turning the pattern by 60 deg changes nothing: its centre and its moments of inertia are those
     of the disc.
+
+    Parameters
+    ----------
+    rings
+
+    Returns
+    -------
+    ndarray, shape (K, 2)
     """
     count = np.r_[1, 6 * np.arange(1, rings + 1)]
     inside = np.cumsum(count)
@@ -127,47 +140,78 @@ def spot_pattern(rings):
     return np.repeat(radius, count)[:, None] * unit
 
 
-def echo(beam, distance, energy):
-    """Readings (n,), NaN without an echo, and whole energies (n,) out of sub-rays (n, K) of spots.
+def echo(beam: Beam, distance: np.ndarray, energy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Readings out of sub-rays.
 
     Surfaces within one pulse length of the nearest one blend into its reading, weighted by energy
     (a mixed pixel); what is farther makes an echo of its own. The first echo above both thresholds
     is the reading.
+
+    Parameters
+    ----------
+    beam
+    distance
+        Of the sub-rays of spots, metres, inf where they end nowhere, shape (n, K).
+    energy
+        That they bring back, shape (n, K).
+
+    Returns
+    -------
+    reading, total : ndarray, shape (n,)
+        Metres, NaN without an echo; the whole energy.
     """
     left = np.where(np.isfinite(distance), distance, np.inf)
-    best = np.zeros(len(distance))
-    echoes = []
+    places = []
+    strengths = []
     while np.isfinite(left).any():
         near = left.min(axis=1)
-        within = left <= near[:, None] + beam.pulse
-        group = np.isfinite(left) & within
+        group = np.isfinite(left) & (left <= near[:, None] + beam.pulse)
         part = np.where(group, energy, 0.0)
         strength = part.sum(axis=1)
         mean = np.sum(part * np.where(group, distance, 0.0), axis=1)
         place = np.full(len(near), np.nan)
         np.divide(mean, strength, out=place, where=strength > 0)
-        echoes.append((place, strength))
-        best = np.maximum(best, strength)
+        places.append(place)
+        strengths.append(strength)
         left = np.where(group, np.inf, left)
-    reading = np.full(len(distance), np.nan)
+    best = np.max(strengths, axis=0, initial=0.0)
     threshold = np.maximum(beam.least_energy, beam.least_share * best)
-    total = np.zeros(len(distance))
-    for _, strength in echoes:
-        total = total + strength
-    for place, strength in reversed(echoes):  # the first one that is good comes last
+    reading = np.full(len(distance), np.nan)
+    for place, strength in zip(reversed(places), reversed(strengths), strict=True):
         good = (strength >= threshold) & np.isfinite(place)
-        reading = np.where(good, place, reading)
-    return reading, total
+        reading = np.where(good, place, reading)  # the first one that is good comes last
+    return reading, sum(strengths, np.zeros(len(distance)))
 
 
-def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
-    """Readings without noise, offset and rounding, of beams at bearings and pitch (n,), radians.
+class Readings(NamedTuple):
+    """Of beams, without noise, offset and rounding: metres (NaN without an echo), energy, light."""
+
+    reading: np.ndarray
+    total: np.ndarray
+    dazzled: np.ndarray
+
+
+def ideal_readings(
+    beam: Beam,
+    world: World,
+    bearings: np.ndarray,
+    pitch: np.ndarray,
+    T_head_lrf: RigidTransform,
+) -> Readings:
+    """Readings without noise, offset and rounding.
+
+    Parameters
+    ----------
+    beam
+    world
+    bearings, pitch
+        Of the beams, radians, shape (n,).
+    T_head_lrf
 
     Returns
     -------
-    reading, total : ndarray, shape (n,)
-        Metres, NaN without an echo; returned energy.
-    dazzled : ndarray of bool, shape (n,)
+    Readings
+        Of shape (n,).
 
     Notes
     -----
@@ -175,6 +219,27 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
     cosine of incidence over squared distance (a Lambertian surface). The nearer part of a spot on a
     slanted plane is therefore brighter: at 45 deg the reading is 0.09 mm short.
     """
+    origins, directions = _sub_rays(beam, bearings)
+    rotation = T_head_lrf.rotation.as_matrix().T
+    origins = tilt(origins @ rotation + T_head_lrf.translation, pitch[:, None]).reshape(-1, 3)
+    directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
+    hits = world.cast(origins, directions)
+    seen = hits.face >= 0
+    distance = hits.distance[seen]
+    points = origins[seen] + distance[:, None] * directions[seen]
+    normals = world.normals[hits.face[seen]]
+    cosine = np.abs(np.sum(normals * directions[seen], axis=1))
+    albedo = world.infrared(points, hits.thing[seen])
+    energy = np.zeros(len(seen))
+    energy[seen] = albedo * cosine / distance**2 / beam.rays
+    shape = len(bearings), beam.rays
+    reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
+    dazzled = world.dazzling[hits.thing].reshape(shape).any(axis=1)
+    return Readings(reading, total, dazzled)
+
+
+def _sub_rays(beam, bearings):
+    """Origins and unit directions of the sub-rays of spots in the LRF frame, shape (n, K, 3)."""
     c = np.cos(bearings)
     s = np.sin(bearings)
     zero = np.zeros_like(c)
@@ -185,38 +250,56 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
     middle = np.stack([c, s, zero], axis=-1)
     directions = middle[:, None] + beam.divergence / 2 * shift
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    rotation = T_head_lrf.rotation.as_matrix().T
-    origins = beam.spot_exit / 2 * shift @ rotation + T_head_lrf.translation
-    origins = tilt(origins, pitch[:, None]).reshape(-1, 3)
-    directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
-    hits = world.cast(origins, directions)
-    seen = hits.face >= 0
-    energy = np.zeros(len(seen))
-    distance = hits.distance[seen]
-    points = origins[seen] + distance[:, None] * directions[seen]
-    normals = world.normals[hits.face[seen]]
-    cosine = np.abs(np.sum(normals * directions[seen], axis=1))
-    albedo = world.infrared(points, hits.thing[seen])
-    energy[seen] = albedo * cosine / distance**2 / beam.rays
-    shape = len(bearings), beam.rays
-    reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
-    dazzled = world.dazzling[hits.thing].reshape(shape).any(axis=1)
-    return reading, total, dazzled
+    return beam.spot_exit / 2 * shift, directions
 
 
-def measured(beam, reading, total, dazzled, rng):
-    """Noisy ranges, metres, out of ideal readings, and why there is none (index into REASONS)."""
-    noise = beam.sigma_range * rng.standard_normal(reading.shape)
-    ranges = reading + beam.systematic + noise
-    without = np.where(total > 0, WEAK, NOT_VALID)
-    reasons = np.where(np.isfinite(reading), 0, without)
-    return np.clip(ranges, 0, None), np.where(dazzled, DAZZLED, reasons)
+def measured(
+    beam: Beam, ideal: Readings, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy ranges out of ideal readings.
+
+    Parameters
+    ----------
+    beam
+    ideal
+        Of shape (n,), or any other.
+    rng
+
+    Returns
+    -------
+    ranges, reasons : ndarray
+        Metres, and why there is none: index into REASONS.
+    """
+    noise = beam.sigma_range * rng.standard_normal(ideal.reading.shape)
+    ranges = ideal.reading + beam.systematic + noise
+    reasons = np.where(ideal.total > 0, WEAK, NOT_VALID)
+    reasons[np.isfinite(ideal.reading)] = 0
+    reasons[ideal.dazzled] = DAZZLED
+    return np.clip(ranges, 0, None), reasons
 
 
-def scan(beam, world, pitch, T_head_lrf, rng):
-    """Record scan lines, words (L, B) of 13 bits.
+def scan(
+    beam: Beam,
+    world: World,
+    pitch: np.ndarray,
+    T_head_lrf: RigidTransform,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Record scan lines.
 
-    `pitch` is the true one of the head, radians, in each line (L, 1) or beam (L, B).
+    Parameters
+    ----------
+    beam
+    world
+    pitch
+        The true one of the head, radians, in each line (L, 1) or beam (L, B).
+    T_head_lrf
+    rng
+
+    Returns
+    -------
+    ndarray of uint16, shape (L, B)
+        Words of 13 bits.
     """
     bearings, pitch = np.broadcast_arrays(beam.bearings(), pitch)
     shape = bearings.shape
@@ -227,6 +310,6 @@ def scan(beam, world, pitch, T_head_lrf, rng):
     for start in range(0, len(bearings), step):
         rows = slice(start, start + step)
         parts.append(ideal_readings(beam, world, bearings[rows], pitch[rows], T_head_lrf))
-    ideal = [np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True)]
-    ranges, reasons = measured(beam, *ideal, rng)
+    ideal = Readings(*(np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True)))
+    ranges, reasons = measured(beam, ideal, rng)
     return encode_values(ranges, unit=beam.unit_name, reasons=reasons)

@@ -4,8 +4,12 @@ import json
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import pydantic
+from numpy.typing import ArrayLike
+from pydantic import Field, InstanceOf, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -24,7 +28,7 @@ CLOSE = (0.22, 0.45)  # metres from the camera to a board that is held close
 PLACES = 3  # stream of random numbers
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class Platform:
     """A pitching platform that lies a little about its pitch.
 
@@ -32,31 +36,40 @@ class Platform:
     """
 
     # play of the gear, radians: the head hangs back by half of it against the direction of motion
-    backlash: float = 0.0
-    stretch: float = 0.0  # the head turns 1 + stretch times as far as the platform says
-    latency: float = 0.0  # seconds by which the measured pitch is older than its time stamp
+    backlash: NonNegativeFloat = 0.0
+    stretch: Annotated[float, Field(gt=-0.5, lt=0.5)] = (
+        0.0  # the head turns 1 + stretch times as far as the platform says
+    )
+    latency: NonNegativeFloat = (
+        0.0  # seconds by which the measured pitch is older than its time stamp
+    )
     # standard deviation of where the head comes to rest about where it should, radians
-    noise: float = 0.0
-    encoder_step: float = 0.0  # of the measured pitch, radians; 0 for none
-    speed: float = math.radians(5.0)  # of continuous motion, radians a second
-    settle: float = 0.4  # seconds from a command to rest in stop-and-go
+    noise: NonNegativeFloat = 0.0
+    encoder_step: NonNegativeFloat = 0.0  # of the measured pitch, radians; 0 for none
+    speed: PositiveFloat = math.radians(5.0)  # of continuous motion, radians a second
+    settle: NonNegativeFloat = 0.4  # seconds from a command to rest in stop-and-go
     # least and greatest pitch, radians
     limits: tuple[float, float] = (-math.radians(60), math.radians(60))
 
-    def __post_init__(self):
-        for name in ("backlash", "latency", "noise", "encoder_step", "settle"):
-            value = getattr(self, name)
-            need(0 <= value < math.inf, f"platform: {name} is {value}, it must be zero or positive")
-        need(
-            0 < self.speed < math.inf, f"platform: speed is {self.speed} rad/s, it must be positive"
-        )
-        share = f"stretch is {self.stretch}, a share of the angle (0.01 is one per cent)"
-        need(abs(self.stretch) < 0.5, f"platform: {share}")
-
-    def stop(self, commanded, direction, rng):
-        """True and measured pitch (n,) at rest at commanded angles, from below (+1) or above.
+    def stop(
+        self, commanded: ArrayLike, direction: float, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where the head comes to rest.
 
         The encoder sits on the motor: it sees neither backlash nor stretch.
+
+        Parameters
+        ----------
+        commanded
+            Pitch, radians, shape (n,).
+        direction
+            From below (+1) or from above (-1).
+        rng
+
+        Returns
+        -------
+        true, measured : ndarray, shape (n,)
+            Pitch, radians.
         """
         commanded = np.asarray(commanded, float)
         step = self.encoder_step
@@ -68,8 +81,18 @@ class Platform:
             return head, np.rint(motor / step) * step
         return head, motor
 
-    def check(self, pitch):
-        """Refuse angles beyond the limits."""
+    def check(self, pitch: ArrayLike) -> None:
+        """Refuse angles beyond the limits.
+
+        Parameters
+        ----------
+        pitch
+            Radians, shape (n,).
+
+        Raises
+        ------
+        ValueError
+        """
         low = min(pitch, default=0.0)
         high = max(pitch, default=0.0)
         first, last = np.round(np.degrees([low, high]), 2)
@@ -106,22 +129,29 @@ class Rig:
     # how well the stated transform is said to be known: direction (radians) and offset (metres)
     stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
-    def camera_pose(self, camera, pitch):
-        """``T_camera_platform`` of a RigCamera at a true pitch of the head, or at many, radians."""
+    def camera_pose(self, camera: RigCamera, pitch: ArrayLike) -> RigidTransform:
+        """``T_camera_platform`` of a camera.
+
+        Parameters
+        ----------
+        camera
+        pitch
+            True one of the head, or many, radians.
+        """
         back = RigidTransform.from_rotation(
             Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0]))
         )
         return camera.mounting * self.T_head_lrf.inv() * back
 
-    def camera_infos(self):
-        """What a session states of the cameras, a list of CameraInfo."""
+    def camera_infos(self) -> list[CameraInfo]:
+        """What a session states of the cameras."""
         return [
             CameraInfo(c.name, "head", c.model.width, c.model.height, None, c.guess)
             for c in self.cameras
         ]
 
-    def truth(self):
-        """Mountings, intrinsics and board as only the simulator knows them, as JSON."""
+    def truth(self) -> dict:
+        """Mountings, intrinsics and board as only the simulator knows them, as JSON has them."""
         cameras = {
             c.name: {
                 "T_camera_lrf": transform_to_json(c.mounting),
@@ -171,35 +201,24 @@ class Rig:
         return np.all(ahead & inside.all(axis=-1), axis=-1)
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class Setup:
     """A recording to simulate; everything follows from it."""
 
     name: str
     seed: int
-    rig: Rig
+    rig: InstanceOf[Rig]
     pairs: int  # pairs of board placements
     distances: tuple[float, float]  # of the board, metres
-    step: float = math.radians(0.25)  # between the stops of a sweep, radians
-    intrinsics_views: int = 20  # images of the board held close, a camera
+    step: PositiveFloat = math.radians(0.25)  # between the stops of a sweep, radians
+    intrinsics_views: NonNegativeInt = 20  # images of the board held close, a camera
     # first pitch, last pitch and step of the sweep of the room, radians; empty for none
-    room_sweep: tuple[float, ...] = ()
+    room_sweep: tuple[float, float, float] | tuple[()] = ()
     room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
-    quality: int = 95  # of JPEG, 1 to 100
-
-    def __post_init__(self):
-        name = f"setup '{self.name}'"
-        views = self.intrinsics_views
-        sweep = self.room_sweep
-        need(self.step > 0, f"{name}: the pitch step is {self.step} rad, it must be positive")
-        need(1 <= self.quality <= 100, f"{name}: JPEG quality is 1 to 100, got {self.quality}")
-        need(views >= 0, f"{name}: {views} intrinsics views; 0 or more are possible")
-        need(
-            len(sweep) in (0, 3), f"{name}: room_sweep is (first, last, step) or empty, got {sweep}"
-        )
+    quality: Annotated[int, Field(ge=1, le=100)] = 95  # of JPEG
 
 
-def printed_triangle():
+def printed_triangle() -> Board:
     """The paper's triangle (315 and 380 mm, a right angle) with 4 x 5 inner corners beside it."""
     return triangle_board(
         name="triangle_315_380", pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))
@@ -209,10 +228,17 @@ def printed_triangle():
 SETUPS = json.loads(Path(__file__).with_name("setups.json").read_text())
 
 
-def load_setup(name):
-    """A Setup of ``setups.json``; what it does not say is taken from the one that it is like.
+def load_setup(name: str) -> Setup:
+    """A set-up of ``setups.json``; what it does not say is taken from the one that it is like.
 
-    ValueError for a name that is not there.
+    Parameters
+    ----------
+    name
+
+    Raises
+    ------
+    ValueError
+        For a name that is not there.
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
     row = _radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
@@ -282,13 +308,18 @@ class Placement:
         return 1 if self.sweep[1] >= self.sweep[0] else -1
 
 
-def random(setup, *key):
+def random(setup: Setup, *key: int) -> np.random.Generator:
     """Random numbers that depend on a setup's seed and a key, whatever else is simulated."""
     return np.random.default_rng([setup.seed, *key])
 
 
-def placements_of(setup):
-    """The placements of a setup, a list: those of the board, then a sweep of the room if any."""
+def placements_of(setup: Setup) -> list[Placement]:
+    """The placements of a setup: those of the board, then a sweep of the room if there is any.
+
+    Parameters
+    ----------
+    setup
+    """
     out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
     if setup.room_sweep:
         number = 2 * setup.pairs + 1
@@ -312,14 +343,33 @@ def check_size(rig, nearest):
         need(angle <= 0.9 * view, f"{large}, but {seen}")
 
 
-def pairs(rig, count, distances, rng, margin=OUTSIDE):
+def pairs(
+    rig: Rig,
+    count: int,
+    distances: tuple[float, float],
+    rng: np.random.Generator,
+    margin: float = OUTSIDE,
+) -> list[Placement]:
     """Placements in pairs: at one place, turned by about a right angle and tilted otherwise.
 
-    Boards stand at `distances` (least and greatest, metres) from the platform; a sweep begins and
-    ends `margin` (radians) outside of them. Placements are numbered from 1. The first of each pair
-    has images at three pitch angles, the second at one. Sweeps go upwards at odd placements and
-    downwards at even ones. ValueError if the board does not fit into a view, or no place is found
-    that everything sees.
+    Placements are numbered from 1. The first of each pair has images at three pitch angles, the
+    second at one. Sweeps go upwards at odd placements and downwards at even ones.
+
+    Parameters
+    ----------
+    rig
+    count
+        Of pairs.
+    distances
+        Least and greatest of the boards from the platform, metres.
+    rng
+    margin
+        By which a sweep begins and ends outside of the board, radians.
+
+    Raises
+    ------
+    ValueError
+        If the board does not fit into a view, or no place is found that everything sees.
     """
     asked = f"{count} pairs at {distances} m"
     need(
@@ -391,11 +441,28 @@ def _spans(rig, pose, margin):
     return sweep, (seen[0], seen[-1])
 
 
-def held_close(rig, camera, count, rng):
-    """Poses ``T_camera_board`` of the board held in front of a RigCamera, tilted every way, a list.
+def held_close(
+    rig: Rig, camera: RigCamera, count: int, rng: np.random.Generator
+) -> list[RigidTransform]:
+    """Poses of the board held in front of a camera, tilted every way.
 
-    The whole pattern is inside the image, spread over all of it by the poses together; ValueError
-    if it does not fit.
+    Parameters
+    ----------
+    rig
+    camera
+    count
+    rng
+
+    Returns
+    -------
+    list of RigidTransform
+        ``T_camera_board``: the whole pattern is inside the image, spread over all of it by the
+        poses together.
+
+    Raises
+    ------
+    ValueError
+        If it does not fit, or the board has no pattern.
     """
     m = camera.model
     pattern = rig.board.pattern

@@ -299,11 +299,11 @@ class JointSolution:
         rows[np.argsort(placement, kind="stable")] = padded[getattr(self.data, group)["used"]]
         return rows
 
-    def with_levels(self, **levels) -> "JointSolution":
+    def with_levels(self, **changed) -> "JointSolution":
         """The same estimate at other noise levels, fields of
         :class:`lrfcal_lib.solvers.joint_model.Levels` by name.
         """
-        levels = replace(self.data.levels, **levels)
+        levels = replace(self.data.levels, **changed)
         return replace(self, data=replace(self.data, levels=levels))
 
     def information(self) -> np.ndarray:

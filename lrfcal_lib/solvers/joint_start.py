@@ -18,9 +18,9 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
 )
 from lrfcal_lib.model.kinematics import TILT_AXIS
-from lrfcal_lib.model.observations import CameraObservations, JointObservations
+from lrfcal_lib.model.observations import CameraObservations, JointObservations, thin
 from lrfcal_lib.solvers.joint_model import JointState
-from lrfcal_lib.solvers.planes import start_from_planes
+from lrfcal_lib.solvers.plane_start import start_from_planes
 
 START_SOFTNESS = 0.2  # spot radii
 LEAST_TURN = np.radians(1.0)  # between two images of a camera for the axis
@@ -64,8 +64,8 @@ def start_states(
         possible = True
         yield states
     if not possible:
-        reasons = "; ".join(dict.fromkeys(reasons))
-        raise DegenerateGeometry(f"no start value for the joint estimate: {reasons}")
+        every = "; ".join(dict.fromkeys(reasons))
+        raise DegenerateGeometry(f"no start value for the joint estimate: {every}")
 
 
 def _states(obs, head, known):
@@ -81,13 +81,6 @@ def _states(obs, head, known):
         for pose in poses[1:]:
             states.append(state_of(obs, head, [*best[:camera], pose, *best[camera + 1 :]]))
     return states
-
-
-def thin(rows: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of some rows, evenly spread."""
-    if len(rows) <= count:
-        return rows
-    return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
 
 
 def _camera(obs, camera, head=None):

@@ -1,14 +1,12 @@
-"""What is wrong with a recording, in words: a lens that is not its model's, a pitch that is off."""
+"""Does the model of a lens fit what its images show?"""
 
 import numpy as np
 
-from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind
+from lrfcal_lib.judge.findings import Finding, Kind, no_if
 from lrfcal_lib.model.camera import CameraModel, fold, lens_terms, project
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
-from lrfcal_lib.solvers.pitch import PitchErrors
 
-SIGNIFICANT = 3.0  # standard deviations of an offset by sweep direction
 LENS_PARTS = np.array([6, 4])  # columns and rows that an image is cut into
 LENS_CORNERS = 20  # corners of the chessboard in a part, at least
 LENS_MISS = 0.15  # pixels that corners of a part may miss by alike
@@ -57,12 +55,14 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
                 "intrinsics of another image size"
             )
         if faults:
-            wide = 2 * np.arctan2(model.width / 2, model.fx) > WIDE
+            remedy = REMEDY
+            if 2 * np.arctan2(model.width / 2, model.fx) > WIDE:
+                remedy = REMEDY_WIDE
             words = (
                 f"the lens of camera '{camera}' is not that of its model ({'; '.join(faults)}): "
-                f"{REMEDY_WIDE if wide else REMEDY}"
+                f"{remedy}"
             )
-            findings.append(Finding(NO if other_size else CARE, Kind.LENS, words))
+            findings.append(Finding(no_if(other_size), Kind.LENS, words))
     return findings
 
 
@@ -81,7 +81,9 @@ def common_miss(views, points, model):
         if len(of_part) >= LENS_CORNERS:
             noise = of_part.var(axis=0).sum() / len(of_part)
             squares.append(np.sum(of_part.mean(axis=0) ** 2) - noise)
-    return np.sqrt(max(np.mean(squares), 0.0)) if squares else 0.0
+    if not squares:
+        return 0.0
+    return np.sqrt(max(np.mean(squares), 0.0))
 
 
 def reach_of_fold(model: CameraModel) -> float:
@@ -98,36 +100,3 @@ def reach_of_fold(model: CameraModel) -> float:
     corner = np.linalg.norm(far / [model.fx, model.fy])
     k1, k2, _, _, k5 = model.distortion
     return float(r * (1 + lens_terms(r, 0.0, k1, k2, 0.0, 0.0, k5)[0]) / corner)
-
-
-def pitch_words(errors: PitchErrors | None) -> list[str]:
-    """What data say about errors of the recorded pitch, a sentence each.
-
-    Parameters
-    ----------
-    errors
-        None where nothing can be said.
-    """
-    if errors is None or errors.wanted == "none":
-        return []
-    wanted = errors.models[errors.wanted]
-    sentences = []
-    offset, sigma = np.rad2deg([errors.direction_offset, errors.direction_sigma])
-    if np.isfinite(offset) and abs(offset) > SIGNIFICANT * sigma:
-        sentences.append(
-            "the pitch depends on the direction of the sweep: upward and downward sweeps differ "
-            f"by {2 * abs(offset):.2f} +- {2 * sigma:.2f} deg"
-        )
-    if errors.wanted in ("sweep", "sweep_stretch"):
-        offsets = np.rad2deg(np.std(wanted.offset))
-        sentences.append(
-            f"every sweep has a pitch offset of its own: {offsets:.2f} deg (standard deviation)"
-        )
-    if errors.wanted == "sweep_stretch":
-        low = 100 * wanted.stretch.min()
-        high = 100 * wanted.stretch.max()
-        sentences.append(
-            f"every sweep is stretched by an amount of its own: {low:+.1f} to {high:+.1f} % of "
-            "the pitch"
-        )
-    return sentences

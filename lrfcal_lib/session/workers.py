@@ -1,0 +1,146 @@
+"""Loops that several workers share: an executor that the caller names, or forked processes."""
+
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from functools import partial
+
+_executor: ContextVar[Executor | None] = ContextVar("executor", default=None)
+_cores: ContextVar[int] = ContextVar("cores", default=1)  # for processes of our own
+_loop: tuple = ()  # of a forked process, which finds it in its memory
+
+
+@contextmanager
+def side_by_side(executor: Executor | None = None) -> Iterator[None]:
+    """Let :func:`spread` share its loops while this lasts.
+
+    Parameters
+    ----------
+    executor
+        Whose workers take part; it is not shut down. By default processes of this machine's
+        cores: forked for every loop, so that they have what was read before it, or kept for all
+        loops where this process has threads, which must not be forked.
+    """
+    if executor is not None:
+        with _setting(_executor, executor):
+            yield
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    if cores > 1 and threading.active_count() > 1:
+        context = multiprocessing.get_context("forkserver")
+        with _pool(cores, context) as pool, _setting(_executor, pool):
+            yield
+        return
+    with _setting(_cores, cores):
+        yield
+
+
+def spread(work: Callable, items: Iterable) -> list:
+    """``[work(item) for item in items]``, shared by workers within :func:`side_by_side`.
+
+    Parameters
+    ----------
+    work
+        Can be pickled, as the items, unless the processes are forked: a function of a module, or
+        ``functools.partial`` of one.
+    items
+        What is done with one does not depend on the others.
+
+    Returns
+    -------
+    list
+        Every result is a copy, as a pickle makes it: sums over arrays of another layout in memory
+        differ in the last digit. What a worker could not do is done here.
+    """
+    items = list(items)
+    executor = _executor.get()
+    cores = min(_cores.get(), len(items))
+    results = {}
+    if executor is not None and len(items) > 1:
+        with suppress(BrokenExecutor):
+            for number, result in enumerate(executor.map(partial(_packed, work), items)):
+                results[number] = result
+    elif cores > 1:
+        results = _forked(work, items, cores)
+    for number, item in enumerate(items):
+        if number not in results:
+            results[number] = _packed(work, item)
+    return [pickle.loads(results[number]) for number in range(len(items))]
+
+
+def _packed(work, item):
+    return pickle.dumps(work(item))
+
+
+def _forked(work, items, cores):
+    """Results by number, of forked processes and of this one, which keeps what it has read."""
+    fork = multiprocessing.get_context("fork")
+    loop = (work, items, fork.Value("i"))
+    with _pool(cores - 1, fork, loop) as pool, _setting(_cores, 1):
+        others = [pool.submit(_take_part) for _ in range(cores - 1)]
+        results = _rounds(*loop)
+        for other in others:
+            with suppress(BrokenExecutor):
+                results |= other.result()
+    return results
+
+
+def _rounds(work, items, begun):
+    """Whoever is free takes the next item, until none is left or one fails: results by number."""
+    results = {}
+    with suppress(Exception):
+        while True:
+            with begun.get_lock():
+                number = begun.value
+                begun.value += 1
+            results[number] = _packed(work, items[number])
+    return results
+
+
+@contextmanager
+def _setting(variable, value):
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
+@contextmanager
+def _pool(count, context, loop=()):
+    """Processes that end with this one, however it ends, and at once where anything is raised."""
+    ours, theirs = context.Pipe()
+    with ours, theirs, ProcessPoolExecutor(count, context, _begin, (ours, theirs, loop)) as pool:
+        try:
+            yield pool
+        except BaseException:
+            ours.close()
+            raise
+
+
+def _begin(ours, theirs, loop):
+    """In a worker: it shares no loop itself, and its end is not the user's."""
+    global _loop
+    ours.close()  # here; that of the other process tells that it is there
+    _executor.set(None)
+    _cores.set(1)
+    _loop = loop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(theirs,), daemon=True).start()
+
+
+def _end_with(pipe):
+    """End this process as soon as the other end of a pipe is closed, or its process is dead."""
+    pipe.poll(None)
+    os._exit(1)
+
+
+def _take_part():
+    """In a forked worker."""
+    return _rounds(*_loop)
