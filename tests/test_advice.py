@@ -140,10 +140,8 @@ def test_a_motion_that_nothing_determines(good):
     assert any("right" in words for words in solution.unobservable), solution.unobservable
 
 
-def test_misfit_model_error_and_noise_are_named(good, monkeypatch):
+def test_misfit_model_error_and_noise_are_named(good):
     solution = good[2]
-    warnings = ("the data ask for the scale of the pitch",)
-    monkeypatch.setattr(type(solution), "warnings", property(lambda self: warnings))
     inner = replace(solution.solution, covariance_placements=25 * solution.solution.covariance, converged=False)
     left_out = Problem(Stage.JOINT, ProblemKind.CONTRADICTS, "left out", 9)
     bad = replace(
