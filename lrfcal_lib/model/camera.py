@@ -138,14 +138,14 @@ def lens_terms(x, y, k1, k2, k3, k4, k5):
     return growth, shift_x, shift_y
 
 
-def distort(normalized: ArrayLike, distortion: ArrayLike) -> np.ndarray:
+def distort(normalized: ArrayLike, distortion: np.ndarray) -> np.ndarray:
     """Lens distortion, equation (18).
 
     Parameters
     ----------
     normalized : array_like, shape (..., 2)
         ``(x / z, y / z)``.
-    distortion : array_like, shape (5,)
+    distortion : ndarray, shape (5,)
         (k1, k2, k3, k4, k5).
 
     Returns

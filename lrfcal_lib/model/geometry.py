@@ -318,12 +318,12 @@ def _principal(points):
     return centre, variances, axes
 
 
-def fit_plane(points: ArrayLike) -> tuple[np.ndarray, float, float]:
+def fit_plane(points: np.ndarray) -> tuple[np.ndarray, float, float]:
     """Total least squares plane ``normal . p = distance``.
 
     Parameters
     ----------
-    points : array_like, shape (n, 3)
+    points : ndarray, shape (n, 3)
         Metres; rows with NaN are ignored.
 
     Returns
@@ -355,12 +355,12 @@ def fit_plane(points: ArrayLike) -> tuple[np.ndarray, float, float]:
     return normal, float(normal @ centre), float(np.sqrt(max(values[0], 0.0)))
 
 
-def fit_line(points: ArrayLike) -> tuple[np.ndarray, np.ndarray, float]:
+def fit_line(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Total least squares line of points.
 
     Parameters
     ----------
-    points : array_like, shape (n, 2) or (n, 3)
+    points : ndarray, shape (n, 2) or (n, 3)
 
     Returns
     -------
@@ -610,12 +610,12 @@ def axis_words(direction):
     return "({:.2f}, {:.2f}, {:.2f})".format(*(direction + 0.0))
 
 
-def motion_words(delta: ArrayLike, frame: str) -> str:
+def motion_words(delta: np.ndarray, frame: str) -> str:
     """Name a small motion by its direction, e.g. ``translation along x of the left frame``.
 
     Parameters
     ----------
-    delta : array_like, shape (6,)
+    delta : ndarray, shape (6,)
         ``[w, v]``.
     frame : str
     """
@@ -653,7 +653,11 @@ def point_set(
 
 
 def line_set(
-    positions: ArrayLike, point: ArrayLike, direction: ArrayLike, distance: float, tolerance: float
+    positions: ArrayLike,
+    point: np.ndarray,
+    direction: np.ndarray,
+    distance: float,
+    tolerance: float,
 ) -> np.ndarray:
     """Which positions a line with one hit point at a measured distance allows: a cylinder, figure
     3 (b).
@@ -661,7 +665,7 @@ def line_set(
     Parameters
     ----------
     positions : array_like, shape (..., 3)
-    point, direction : array_like, shape (3,)
+    point, direction : ndarray, shape (3,)
         A point of the line and its unit direction; which point was hit is not known.
     distance, tolerance : float
         Metres.
