@@ -653,11 +653,7 @@ def point_set(
 
 
 def line_set(
-    positions: ArrayLike,
-    point: np.ndarray,
-    direction: np.ndarray,
-    distance: float,
-    tolerance: float,
+    positions: ArrayLike, point: ArrayLike, direction: np.ndarray, distance: float, tolerance: float
 ) -> np.ndarray:
     """Which positions a line with one hit point at a measured distance allows: a cylinder, figure
     3 (b).
