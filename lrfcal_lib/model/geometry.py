@@ -323,7 +323,7 @@ def fit_plane(points: np.ndarray) -> tuple[np.ndarray, float, float]:
 
     Parameters
     ----------
-    points : array_like, shape (n, 3)
+    points : ndarray, shape (n, 3)
         Metres; rows with NaN are ignored.
 
     Returns
@@ -355,12 +355,12 @@ def fit_plane(points: np.ndarray) -> tuple[np.ndarray, float, float]:
     return normal, float(normal @ centre), float(np.sqrt(max(values[0], 0.0)))
 
 
-def fit_line(points: ArrayLike) -> tuple[np.ndarray, np.ndarray, float]:
+def fit_line(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Total least squares line of points.
 
     Parameters
     ----------
-    points : array_like, shape (n, 2) or (n, 3)
+    points : ndarray, shape (n, 2) or (n, 3)
 
     Returns
     -------
@@ -615,7 +615,7 @@ def motion_words(delta: np.ndarray, frame: str) -> str:
 
     Parameters
     ----------
-    delta : array_like, shape (6,)
+    delta : ndarray, shape (6,)
         ``[w, v]``.
     frame : str
     """
@@ -661,7 +661,7 @@ def line_set(
     Parameters
     ----------
     positions : array_like, shape (..., 3)
-    point, direction : array_like, shape (3,)
+    point, direction : ndarray, shape (3,)
         A point of the line and its unit direction; which point was hit is not known.
     distance, tolerance : float
         Metres.
