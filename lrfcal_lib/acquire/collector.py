@@ -237,6 +237,12 @@ class Collector(Closed):
         return self.rig is not None and self.rig.stated.devices.control is not None
 
     @property
+    def limits_deg(self) -> Any:
+        """Lowest and highest pitch of the head."""
+        rig, _ = self._needed()
+        return rig.stated.devices.head.pitch_limits_deg
+
+    @property
     def finished(self) -> tuple[int, ...]:
         """Numbers of the placements that are recorded and safe."""
         if self.recording is None:

@@ -37,7 +37,6 @@ IMAGES = 3  # of each camera on the head, spread over the pitch angles at which 
 MARGIN = 0.04  # of the image, that a board keeps from its border, distortion included
 STEEPEST = np.radians(60.0)  # incidence of beams and of lines of sight
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
-USUAL_SPOT = 0.01  # metres, radius where no beam was recorded
 
 
 @dataclass(frozen=True)
@@ -152,17 +151,11 @@ def total_sigma(information, solution):
 
 
 def scales_of(solution: JointSolution) -> np.ndarray:
-    """How much of each shared unknown, (c,), shifts what lies 2 m away by a metre."""
+    """How much of each pose, (c,), shifts what lies 2 m away by a metre; 1 of other unknowns."""
     turns = [*AXIS_NAMES[:2], "pitch_scale", "pitch_by_direction"]
     for camera in solution.transforms:
         turns += [f"{camera}_{name}" for name in POSE_NAMES[:3]]
-    names = np.array(solution.solution.names)
-    scales = np.where(np.isin(names, turns), 1 / RADIUS, 1.0)
-    radii = solution.observations.beam_radius
-    spot = USUAL_SPOT
-    if len(radii):
-        spot = np.median(radii)
-    return np.where(names == "edge_log_odds", 2 / spot, scales)
+    return np.where(np.isin(solution.solution.names, turns), 1 / RADIUS, 1.0)
 
 
 def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np.ndarray]:
@@ -188,7 +181,12 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
 
 
 def outline(solution: JointSolution) -> np.ndarray:
-    """Corners of the board, shape (e, 3), metres."""
+    """Corners of the board, shape (e, 3), metres.
+
+    Parameters
+    ----------
+    solution
+    """
     corners = solution.observations.corners
     return np.column_stack([corners, np.zeros(len(corners))])
 
@@ -231,10 +229,7 @@ def pitches_of_images(boards, solution, models, field_of_view):
 
     first = LATTICE[np.argmax(visible, axis=0)]
     last = LATTICE[len(LATTICE) - 1 - np.argmax(visible[::-1], axis=0)]
-    share = np.array([0.5])
-    if "head" in solution.observations.mounts:
-        share = np.linspace(0, 1, IMAGES)
-    pitches = first[:, None] + (last - first)[:, None] * share
+    pitches = np.linspace(first, last, IMAGES, axis=1)
     return np.where(visible.any(axis=0)[:, None], pitches, np.nan)
 
 

@@ -16,7 +16,12 @@ from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.judge.alternatives import guesses_of
 from lrfcal_lib.judge.camera_changes import LEVER, camera_changes, explains, large_changes
 from lrfcal_lib.judge.findings import by_sign
-from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    lrf_to_platform,
+    lrf_to_source,
+    transform_difference,
+)
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -433,19 +438,18 @@ def _same_board(calibration, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
     prepared = calibration.prepared
     solution = calibration.joint.solution
-    board = prepared.board
-    corners = board.pattern.points() if board.corners is None else board.corners
+    corners = prepared.board.corners
+    if corners is None:
+        corners = prepared.board.pattern.points()
     middle = corners.mean(axis=0)[:2]
     p_lrf, pitch, _ = face_points(scan, POINTS)
+    p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
     agree = []
-    for camera, transform in solution.transforms.items():
+    for camera in solution.transforms:
         view = prepared.views[camera].get(placement)
-        if view is None or view.T_camera_board is None:
-            continue
-        mount = prepared.session.cameras[camera].mount
-        image_pitch = view.pitch if mount == "head" else 0.0
-        points = lrf_to_source(p_lrf, pitch, solution.T_head_lrf, mount, image_pitch)
-        on_board = view.T_camera_board.inv().apply(transform.apply(points))
-        beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
-        agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
+        if view is not None and view.T_camera_board is not None:
+            T_camera_platform = solution.camera_at(camera, view.pitch)
+            on_board = (view.T_camera_board.inv() * T_camera_platform).apply(p_platform)
+            beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
+            agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
     return bool(agree) and all(agree)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import null_space
 from lrfcal_lib.fit.least_squares import reduced_hessian
@@ -220,7 +221,12 @@ def root_mean_square(sigma: np.ndarray) -> float:
 
 
 def range_noise(solution: JointSolution) -> float:
-    """Standard deviation of one range as the solution found or took it, metres."""
+    """Standard deviation of one range as the solution found or took it, metres.
+
+    Parameters
+    ----------
+    solution
+    """
     if not len(solution.observations.face_sigma):
         return 0.0
     return float(np.median(solution.observations.face_sigma) * solution.noise["face_scale"])
@@ -284,10 +290,19 @@ def carried(
     return points, by_link, by_pitch @ A.T
 
 
-def spread(chain, jacobian):
-    """Root mean square error of quantities with a Jacobian (..., m, 13).
+def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
+    """Root mean square error of quantities that the links of a chain move.
 
-    Inf where an undetermined motion matters.
+    Parameters
+    ----------
+    chain
+    jacobian : ndarray, shape (..., m, 13)
+        Of m quantities by `COLUMNS`.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Of all m together, in their unit; inf where an undetermined motion matters.
     """
     variance = 0.0
     for C in chain.covariances:
@@ -300,10 +315,21 @@ def spread(chain, jacobian):
     return np.where(np.any(matters, axis=-1), np.inf, np.sqrt(variance))
 
 
-def beams_to(points, T_head_lrf):
-    """Bearing, pitch (radians) and range (metres) at which scans reach points (platform frame).
+def beams_to(
+    points: ArrayLike, T_head_lrf: RigidTransform
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bearing, pitch (radians) and range (metres) at which scans reach points.
 
-    Shapes (...) for points (..., 3); NaN where the scan plane never gets there.
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Platform frame, metres.
+    T_head_lrf
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Each of the three; NaN where the scan plane never gets there.
     """
     points = np.asarray(points, float)
     R = T_head_lrf.rotation.as_matrix()
