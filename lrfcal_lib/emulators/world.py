@@ -76,7 +76,7 @@ class EmulatedWorld:
         self._rng = np.random.default_rng([seed, 3])
         # what a head at rest saw last, and without noise
         self._still_key: tuple | None = None
-        self._still: tuple = ()
+        self._still: lrf.Readings | None = None
         self.put(None)
 
     @property

@@ -81,7 +81,7 @@ class Platform:
             return head, np.rint(motor / step) * step
         return head, motor
 
-    def check(self, pitch: ArrayLike) -> None:
+    def check(self, pitch: np.ndarray) -> None:
         """Refuse angles beyond the limits.
 
         Parameters
@@ -213,7 +213,7 @@ class Setup:
     step: PositiveFloat = math.radians(0.25)  # between the stops of a sweep, radians
     intrinsics_views: NonNegativeInt = 20  # images of the board held close, a camera
     # first pitch, last pitch and step of the sweep of the room, radians; empty for none
-    room_sweep: tuple[float, float, float] | tuple[()] = ()
+    room_sweep: tuple[float, ...] = ()
     room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
     quality: Annotated[int, Field(ge=1, le=100)] = 95  # of JPEG
 
@@ -261,13 +261,13 @@ def load_setup(name: str) -> Setup:
         guess = RigidTransform.from_components(
             mounting.translation + np.array(c["guess"]["shift"]), off
         )
-        size = (round(v * scale) for v in c["size"])
-        pinhole = (v * scale for v in c["pinhole"])
-        model = CameraModel(*size, *pinhole, np.array(c["distortion"]))
+        width, height = (round(v * scale) for v in c["size"])
+        fx, fy, cx, cy = (v * scale for v in c["pinhole"])
+        model = CameraModel(width, height, fx, fy, cx, cy, np.array(c["distortion"]))
         cameras.append(
             RigCamera(camera, model, mounting, guess, exposure=Exposure(**c["exposure"]))
         )
-    heads = (
+    head, head_stated = (
         RigidTransform.from_components(
             row[k]["shift"], Rotation.from_rotvec(row[k]["turn"], degrees=True)
         )
@@ -275,7 +275,7 @@ def load_setup(name: str) -> Setup:
     )
     beam = replace(LMS221, **row["beam"])
     platform = Platform(**_radians(row["platform"]))
-    rig = Rig(beam, platform, *heads, tuple(cameras), printed_triangle())
+    rig = Rig(beam, platform, head, head_stated, tuple(cameras), printed_triangle())
     return Setup(name, rig=rig, **{k: row[k] for k in names})
 
 
@@ -323,7 +323,8 @@ def placements_of(setup: Setup) -> list[Placement]:
     out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
     if setup.room_sweep:
         number = 2 * setup.pairs + 1
-        out.append(Placement(number, None, setup.room_sweep[:2], setup.room_images))
+        first, last, _ = setup.room_sweep
+        out.append(Placement(number, None, (first, last), setup.room_images))
     return out
 
 

@@ -481,7 +481,7 @@ def furnished_room(*more: Thing) -> World:
         "standing lamp",
         "small things",
     )
-    lights = Lights(*map(np.array, ROOM["lights"].values()))
+    lights = Lights(**{name: np.array(value) for name, value in ROOM["lights"].items()})
     return World([*furnished(*parts), *more], lights)
 
 
