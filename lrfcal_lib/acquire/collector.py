@@ -249,7 +249,7 @@ class Collector(Closed):
             return ()
         return self.recording.finished
 
-    def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> None:
+    def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> Rig:
         """Open a rig and a session; one that was recorded with the same rig goes on.
 
         Parameters
@@ -278,6 +278,7 @@ class Collector(Closed):
             self.view = View()
             self.lights = {}
             self._advice = ""
+        return opened
 
     def close(self) -> None:
         """Stop the head, finish the session, close all devices; a second call does nothing.

@@ -14,7 +14,7 @@ LEAST_STEP = 0.15
 LEAST_SHARE = 1e-12  # of a spot, so that odds stay finite
 
 
-def disc_share(x: ArrayLike) -> np.ndarray:
+def disc_share(x: np.ndarray) -> np.ndarray:
     """Share of a unit disc inside a straight edge.
 
     Parameters
@@ -72,7 +72,7 @@ def _slope(x):
 
 
 def edge_shift(
-    log_odds: ArrayLike, radius: ArrayLike, background: ArrayLike = 0.0
+    log_odds: ArrayLike, radius: np.ndarray, background: ArrayLike = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """By how far a spot's centre may lie outside an edge and still read the board.
 

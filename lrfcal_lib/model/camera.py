@@ -138,7 +138,7 @@ def lens_terms(x, y, k1, k2, k3, k4, k5):
     return growth, shift_x, shift_y
 
 
-def distort(normalized: ArrayLike, distortion: ArrayLike) -> np.ndarray:
+def distort(normalized: ArrayLike, distortion: np.ndarray) -> np.ndarray:
     """Lens distortion, equation (18).
 
     Parameters

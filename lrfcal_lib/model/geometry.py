@@ -318,7 +318,7 @@ def _principal(points):
     return centre, variances, axes
 
 
-def fit_plane(points: ArrayLike) -> tuple[np.ndarray, float, float]:
+def fit_plane(points: np.ndarray) -> tuple[np.ndarray, float, float]:
     """Total least squares plane ``normal . p = distance``.
 
     Parameters
@@ -610,7 +610,7 @@ def axis_words(direction):
     return "({:.2f}, {:.2f}, {:.2f})".format(*(direction + 0.0))
 
 
-def motion_words(delta: ArrayLike, frame: str) -> str:
+def motion_words(delta: np.ndarray, frame: str) -> str:
     """Name a small motion by its direction, e.g. ``translation along x of the left frame``.
 
     Parameters
@@ -653,7 +653,7 @@ def point_set(
 
 
 def line_set(
-    positions: ArrayLike, point: ArrayLike, direction: ArrayLike, distance: float, tolerance: float
+    positions: ArrayLike, point: ArrayLike, direction: np.ndarray, distance: float, tolerance: float
 ) -> np.ndarray:
     """Which positions a line with one hit point at a measured distance allows: a cylinder, figure
     3 (b).

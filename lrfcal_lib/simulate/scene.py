@@ -481,7 +481,8 @@ def furnished_room(*more: Thing) -> World:
         "standing lamp",
         "small things",
     )
-    lights = Lights(**{name: np.array(value) for name, value in ROOM["lights"].items()})
+    lamps = {name: np.array(value) for name, value in ROOM["lights"].items()}
+    lights = Lights(lamps["positions"], lamps["strengths"], float(lamps["ambient"]))
     return World([*furnished(*parts), *more], lights)
 
 
