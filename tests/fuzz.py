@@ -39,8 +39,9 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess.survey import views_of
 from lrfcal_lib.session.importers import import_lasersetero
 from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
-from lrfcal_lib.session.write import SessionRecorder, SessionWriter, finish
+from lrfcal_lib.session.write import SessionWriter, finish
 
 SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])

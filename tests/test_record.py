@@ -18,8 +18,8 @@ from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.port import DeviceError
 from lrfcal_lib.session import progress
 from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.stated import SessionError
-from lrfcal_lib.session.write import SessionRecorder
 
 
 def write(rig, path, count=None, **options):

@@ -37,7 +37,7 @@ from lrfcal_lib.session.stated import (
     transform_to_json,
 )
 from lrfcal_lib.session.write import SessionWriter
-from lrfcal_lib.simulate.beam import LMS221, echo, measured, spot_pattern
+from lrfcal_lib.simulate.beam import LMS221, Readings, echo, measured, spot_pattern
 from lrfcal_lib.simulate.draw import AHEAD
 from lrfcal_lib.simulate.rig import Platform, Rig, RigCamera, held_close, pairs
 from lrfcal_lib.simulate.scene import Imager
@@ -237,7 +237,7 @@ def _scan(v, rig, scene, pitch, rng):
     hit = np.isfinite(distance)
     energy = np.where(hit, value * cosine / np.where(hit, distance, 1.0) ** 2, 0.0).reshape(-1, len(disc))
     reading, total = echo(beam, distance.reshape(-1, len(disc)), energy * weight / weight.sum())
-    ranges, reasons = measured(beam, reading, total, np.zeros(len(reading), bool), rng)
+    ranges, reasons = measured(beam, Readings(reading, total, np.zeros(len(reading), bool)), rng)
     ranges = np.where(reasons == 0, np.round(ranges / beam.unit) * beam.unit, np.nan)
     return ranges.reshape(len(pitch), len(bearings))
 

@@ -3,13 +3,13 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.edges_in_scan import crossings
@@ -188,9 +188,7 @@ def _check_sides(scan):
     return Light("edges", "warn", f"{text}; turn the board to show another side")
 
 
-def check_image(
-    image: np.ndarray, board: Board, model: CameraModel | None = None, name: str = "image"
-) -> Light:
+def check_image(image: np.ndarray, board: Board, model: Any = None, name: str = "image") -> Light:
     """The Light of an image of the board.
 
     Parameters
@@ -199,7 +197,7 @@ def check_image(
         (height, width, 3), BGR.
     board
         That it should show.
-    model
+    model : CameraModel or None
         Of the camera; a board without a pattern cannot be checked without.
     name
         Of the Light.
@@ -216,9 +214,9 @@ def check_image(
         return Light(name, "bad", text)
     scale = math.ceil(LEAST_SQUARE_PX / np.linalg.norm(corners[1] - corners[0]))
     large = cv2.resize(grey(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
-    there = (scale * corners + (scale - 1) / 2).astype(np.float32)
+    enlarged = (scale * corners + (scale - 1) / 2).astype(np.float32)
     size = (pattern.columns, pattern.rows)
-    (rise, dark, white, _), _ = cv2.estimateChessboardSharpness(large, size, there)
+    (rise, dark, white, _), _ = cv2.estimateChessboardSharpness(large, size, enlarged)
     rise /= scale
     faults = []
     if rise > BLURRED_PX:

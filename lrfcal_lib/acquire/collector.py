@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lrfcal_lib.acquire.checks import Light
-from lrfcal_lib.acquire.record import Recording, RecordingError
+from lrfcal_lib.acquire.record import Recording, RecordingError, Sweeping
 from lrfcal_lib.calibrate.pipeline import (
     Calibration,
     calibrate,
@@ -237,13 +237,19 @@ class Collector(Closed):
         return self.rig is not None and self.rig.stated.devices.control is not None
 
     @property
+    def limits_deg(self) -> Any:
+        """Lowest and highest pitch of the head."""
+        rig, _ = self._needed()
+        return rig.stated.devices.head.pitch_limits_deg
+
+    @property
     def finished(self) -> tuple[int, ...]:
         """Numbers of the placements that are recorded and safe."""
         if self.recording is None:
             return ()
         return self.recording.finished
 
-    def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> Rig:
+    def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> None:
         """Open a rig and a session; one that was recorded with the same rig goes on.
 
         Parameters
@@ -263,7 +269,7 @@ class Collector(Closed):
             If the session states another rig, or cannot be written.
         """
         self.close()
-        with self._own(), contextlib.ExitStack() as stack:
+        with self._exclusively(), contextlib.ExitStack() as stack:
             opened = stack.enter_context(Rig.open(_stated(rig, stack)))
             recording = stack.enter_context(Recording(opened, Path(session), resume=True))
             self.rig = opened
@@ -272,7 +278,6 @@ class Collector(Closed):
             self.view = View()
             self.lights = {}
             self._advice = ""
-        return opened
 
     def close(self) -> None:
         """Stop the head, finish the session, close all devices; a second call does nothing.
@@ -287,7 +292,7 @@ class Collector(Closed):
         if rig is None or recording is None:
             return
         self.stop()
-        with self._own():
+        with self._exclusively():
             self.rig = None
             self.recording = None
             with self._closing:
@@ -296,7 +301,7 @@ class Collector(Closed):
                     recording.finish()
 
     @contextlib.contextmanager
-    def _own(self):
+    def _exclusively(self):
         """The devices for oneself."""
         if not self._devices.acquire(timeout=WAIT_S):
             raise Busy("the rig is busy: wait until it is done, or press stop")
@@ -332,7 +337,7 @@ class Collector(Closed):
             If something else is under way.
         """
         rig, _ = self._needed()
-        with self._own():
+        with self._exclusively():
             self.stopped.clear()
             self.view.pitch = rig.head.move_to(pitch)
             self.view.measured = rig.head.has_feedback
@@ -411,7 +416,7 @@ class Collector(Closed):
         if task is None:
             remedy = "calibrate, or connect with another session"
             raise RecordingError(f"the plan of this rig is done: {remedy}")
-        with self._own():
+        with self._exclusively():
             self.stopped.clear()
             placement = task.placement
             if placement is None:
@@ -432,10 +437,13 @@ class Collector(Closed):
 
     def _record(self, placement, progress):
         """Record a placement; Interrupted if the user stops it."""
+        sweeping = Sweeping()
         with contextlib.closing(self.recording.run(placement)) as events:
             try:
                 for event in events:
-                    self._note(event, progress)
+                    self._note(event)
+                    sweeping.note(event)
+                    progress(sweeping.share, f"{sweeping.stop}{sweeping.counts()}")
                     if self.stopped.is_set():
                         raise DeviceError("stopped")
             except DeviceError as error:
@@ -444,21 +452,18 @@ class Collector(Closed):
                 words = f"placement {placement.number} does not count, record it again"
                 raise Interrupted(f"stopped: {words}") from error
 
-    def _note(self, event, progress):
+    def _note(self, event):
         """Put an event into the view."""
         view = self.view
         if isinstance(event, Moved):
             view.pitch = event.pitch
             view.measured = event.measured
-            progress((event.number - 1) / event.of, f"stop {event.number} of {event.of}")
         elif isinstance(event, Scanned):
             for reading, pitch in zip(event.readings, event.pitch.tolist(), strict=True):
                 view.rows[pitch] = reading.ranges
             view.ranges = reading.ranges
             view.bearings = reading.bearings
             view.pitch = pitch
-            if np.isfinite(event.share):
-                progress(event.share, f"{100 * event.share:.0f} % of the sweep")
         elif isinstance(event, Photographed):
             view.frames[event.camera] = event.frame
 
@@ -478,7 +483,7 @@ class Collector(Closed):
         if not self.finished:
             remedy = "press capture to record one"
             raise RecordingError(f"there is no placement to record again: {remedy}")
-        with self._own():
+        with self._exclusively():
             number = next(reversed(self.lights), self.finished[-1])
             recording.drop(number)
             self.lights.pop(number, None)

@@ -124,7 +124,7 @@ class Parts:
         lights = card(self.lights, grow=2, basis="420px")
         result = card(w.HTML(HTML.title("Result")), row(self.calibrate), self.result, basis="auto")
         below = [self.views, row(head, task, lights), result, self.notes]
-        parts = [w.HTML(STYLE), self.top, fields, self.places, self.error, *below]
+        parts = [w.HTML(STYLE), self.top, fields, self.places, self.error, self.trouble, *below]
         self.root = named("panel", w.VBox(parts, layout=w.Layout(grid_gap="10px")))
 
     def _make_fields(self, rig, session):
@@ -194,6 +194,7 @@ class Parts:
         self.state = text("state", HTML.state("off"))
         self.places = text("places")
         self.error = text("error")
+        self.trouble = text("trouble")
         self.notes = text("notes")
         self.pitch = text("pitch")
         self.task = text("task")
@@ -281,7 +282,6 @@ class Panel(Closed):
         self._live: threading.Thread | None = None  # keeps looking
         self._quit = threading.Event()
         self._sweep = None  # field of view, ends of the pitch and its step, radians
-        self._view_failed = False  # the error shown is one of the view
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         for name in ("rig", "session"):
@@ -302,9 +302,7 @@ class Panel(Closed):
         """Display the panel."""
         from IPython.display import display
 
-        bundle = self.parts.root._repr_mimebundle_()
-        data = bundle[0] if isinstance(bundle, tuple) else bundle
-        display({**data, "text/plain": PLAIN}, raw=True)
+        display({**self.parts.root._repr_mimebundle_(), "text/plain": PLAIN}, raw=True)
 
     # --------------------------------------------------------------------- the buttons
 
@@ -391,7 +389,6 @@ class Panel(Closed):
         """Something is under way: nothing else can be pressed, and what goes wrong is said."""
         parts = self.parts
         heading = ""
-        self._view_failed = False
         parts.error.value = ""
         parts.state.value = HTML.state("busy", text)
         self._show_progress(0.0, text)
@@ -399,15 +396,14 @@ class Panel(Closed):
         try:
             yield
         except Exception as error:
-            said = str(error)
+            words = str(error)
             heading = f"{text} failed"
             if isinstance(error, Interrupted):
                 heading = "stopped"
             elif not isinstance(error, EXPECTED):
-                said = f"{type(error).__name__}: {error}"
+                words = f"{type(error).__name__}: {error}"
                 LOG.exception("the panel failed while %s", text)
-            self._view_failed = False
-            parts.error.value = HTML.error(heading, said)
+            parts.error.value = HTML.error(heading, words)
             raise
         finally:
             self._show_progress(0.0, heading)
@@ -469,13 +465,11 @@ class Panel(Closed):
         if sweep is not None:
             rows = dict(view.rows)  # a copy: the recording goes on
             picture = sweep_picture(rows, view.bearings, *sweep)
-            said = f"{len(rows)} scan lines; near is bright, white is no range"
-            pictures["sweep"].show(png(picture), said)
+            words = f"{len(rows)} scan lines; near is bright, white is no range"
+            pictures["sweep"].show(png(picture), words)
         for name, frame in dict(view.frames).items():
             height, width = frame.image.shape[:2]
             picture = jpeg(frame.image, WIDTH)
             pictures[name].show(picture, f"{width} x {height} pixels")
 
-        if view.trouble or self._view_failed:  # what was said goes when it is over
-            self.parts.error.value = HTML.error("view", view.trouble)
-            self._view_failed = bool(view.trouble)
+        self.parts.trouble.value = HTML.error("view", view.trouble)

@@ -18,8 +18,9 @@ from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned, Tra
 from lrfcal_lib.drivers.rig_file import Placement, read_rig_file
 from lrfcal_lib.session.progress import Progress, duration
 from lrfcal_lib.session.read import Session, open_session
+from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.stated import SessionError
-from lrfcal_lib.session.write import SessionRecorder, not_written
+from lrfcal_lib.session.write import not_written
 
 FAILED = 2
 INTERRUPTED = 130  # exit codes
@@ -228,8 +229,8 @@ class Recording(Closed):
         resume
             Say how to go on, too.
         """
-        there = self._readable()
-        if there is None or set(self.finished) - there:
+        readable = self._readable()
+        if readable is None or set(self.finished) - readable:
             lost = "the session was removed or damaged while it was recorded"
             return f"{lost}: record again, to another folder"
         safe = "no placement was finished"

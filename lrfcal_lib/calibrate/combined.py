@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.calibrate.observe_joint import observe_joint
+from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.outline import (
     LEAST_STRETCH,
     MeasuredBoard,

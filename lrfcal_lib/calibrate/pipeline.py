@@ -10,8 +10,6 @@ from functools import partial
 import numpy as np
 
 from lrfcal_lib.calibrate.cameras import (
-    CalibratedCamera,
-    CalibratedRig,
     KnownAxis,
     PlatformCalibration,
     calibrate_cameras,
@@ -19,8 +17,13 @@ from lrfcal_lib.calibrate.cameras import (
     stated_covariance,
 )
 from lrfcal_lib.calibrate.naming import name_sides
-from lrfcal_lib.calibrate.observe import observe, observe_all, platform_observations
-from lrfcal_lib.calibrate.observe_joint import observe_joint
+from lrfcal_lib.calibrate.observe import (
+    observe,
+    observe_all,
+    observe_joint,
+    platform_observations,
+)
+from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig
 from lrfcal_lib.fit.result import PlatformPrior, Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.kinematics import AS_RECORDED

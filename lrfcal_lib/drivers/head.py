@@ -68,10 +68,10 @@ class PanTilt(port.Closed):
         """Stop the head, ask whether it tells its tilt, and see who answers."""
         settings = self.settings
         line.stop()
-        told = None
+        reading = None
         if settings.feedback is not False:
-            told = self.motion.read(settings.retries)
-        self.has_feedback = self.motion.feedback = told is not None
+            reading = self.motion.read(settings.retries)
+        self.has_feedback = self.motion.feedback = reading is not None
         if not self.has_feedback and line.skipped > FRAME * line.frames:
             raise WrongDevice(
                 f"{line.path} sends {line.skipped} bytes that are no Pelco-D at "
@@ -162,14 +162,14 @@ class PanTilt(port.Closed):
         if not self.has_feedback:
             return self.motion.estimate(), False
         if self.moving():
-            told = self.motion.read()
+            reading = self.motion.read()
         else:
-            told = self.motion.read(self.settings.retries)
-            if told is None:
+            reading = self.motion.read(self.settings.retries)
+            if reading is None:
                 raise NoReply(self._silence(line))
-        if told is None:
+        if reading is None:
             return self.motion.estimate(), False
-        return told.pitch, True
+        return reading.pitch, True
 
     def set_pitch(self, pitch: float) -> None:
         """Say where a head without feedback stands.
@@ -206,10 +206,10 @@ class PanTilt(port.Closed):
         """Begin a motion to a pitch, one at a time."""
         self._open_line()
         low, high = self.settings.pitch_limits_deg
-        asked = math.degrees(pitch)
-        if not low - ROUNDING_DEG <= asked <= high + ROUNDING_DEG:
+        degrees = math.degrees(pitch)
+        if not low - ROUNDING_DEG <= degrees <= high + ROUNDING_DEG:
             raise OutOfRange(
-                f"pitch {asked:.2f} deg is beyond the head's limits of {low:g} to {high:g} deg: "
+                f"pitch {degrees:.2f} deg is beyond the head's limits of {low:g} to {high:g} deg: "
                 "ask for less, or widen pitch_limits_deg if the head can do it"
             )
         if not self._lock.acquire(blocking=False):

@@ -471,13 +471,6 @@ class LMS2xx(Closed):
         self._thread = self._host.thread(self._run, "LMS2xx reader")
         self._thread.start()
 
-    @property
-    def interval_s(self) -> float:
-        """Seconds between two scans of the stream."""
-        if self._interlaced:
-            return 4 * self._assembler.interval_s
-        return self._assembler.interval_s
-
     def _stream(self):
         self._prepare(self._interlaced)
         data = STREAM
@@ -515,7 +508,7 @@ class LMS2xx(Closed):
         """
         host = self._host
         last = host.now()
-        quiet_s = max(LEAST_QUIET_S, 2.2 * self.interval_s + 0.15)
+        quiet_s = max(LEAST_QUIET_S, 2.2 * self._assembler.interval_s + 0.15)
         while not self._interrupted.is_set():
             arrivals = self._opened().receive()
             fresh = []
@@ -561,7 +554,7 @@ class LMS2xx(Closed):
             raise DeviceError(f"{self.port}: the device does not stream; call start() first")
         host = self._host
         if timeout is None:
-            timeout = 2 + 2 * (count + 2) * self.interval_s
+            timeout = 2 + 2 * (count + 2) * self._assembler.interval_s
         if after is None:
             after = host.time()
         end = host.now() + timeout

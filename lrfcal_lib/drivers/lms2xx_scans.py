@@ -154,7 +154,7 @@ class Assembler:
     turns : int
         Of the mirror, of which one begins a telegram.
     duration_s, interval_s : float
-        From the beginning of a telegram to its last byte, and between two of a stream.
+        From the beginning of a telegram to its last byte, and between two readings of a stream.
     """
 
     def __init__(
@@ -183,6 +183,8 @@ class Assembler:
         scan_s = self.turns * MIRROR_TURN
         self.duration_s = scan_s + transfer_s(size, baudrate)
         self.interval_s = interval_s(size, baudrate, scan_s)
+        if interlaced:
+            self.interval_s *= 4
 
     def feed(self, raw: bytes, arrival_s: float) -> Reading | None:
         """The Reading that a telegram completes.

@@ -35,7 +35,7 @@ class Stopped(DeviceError):
     """The motion was ended by a stop."""
 
 
-class Told(NamedTuple):
+class PitchReading(NamedTuple):
     """What the head told of its pitch."""
 
     instant: float  # of the host
@@ -139,7 +139,7 @@ class Motion:
         return self._pitch + way * self.speed(way, step) * seconds
 
     def read(self, retries=0):
-        """What the head tells, as Told; None without a reply.
+        """What the head tells, as PitchReading; None without a reply.
 
         A reading far from dead reckoning is asked for twice more, and the one in the middle counts.
         """
@@ -156,23 +156,23 @@ class Motion:
         if self._pitch is not None:
             reckoned = self.estimate(instant)
         self.know(pitch, instant)
-        return Told(instant, pitch, reckoned)
+        return PitchReading(instant, pitch, reckoned)
 
     def note(self, retries=0):
         """Append where the head is now to the rows."""
-        told = None
+        reading = None
         if self.feedback and self._misses < MISSES:
-            told = self.read(retries)
+            reading = self.read(retries)
             self._misses += 1
         now = self._now()
         date = self.line.host.time()
-        if told is None:
+        if reading is None:
             here = self.estimate(now)
             self.rows.append(TrackPoint(date, here, False, here))
         else:
             self._misses = 0
             self.rows.append(
-                TrackPoint(date - (now - told.instant), told.pitch, True, told.reckoned)
+                TrackPoint(date - (now - reading.instant), reading.pitch, True, reading.reckoned)
             )
 
     # ------------------------------------------------------------------------------------------
@@ -251,10 +251,10 @@ class Motion:
 
         def left():
             """Seconds; after a reading the stop has to be on its way in time."""
-            there = (goal - self.estimate()) * way / self.speed(way, step)
+            rest_s = (goal - self.estimate()) * way / self.speed(way, step)
             if self._known_at > begun:
-                there -= line.wire_s()
-            return min(there, begun + longest_s - self._now())
+                rest_s -= line.wire_s()
+            return min(rest_s, begun + longest_s - self._now())
 
         try:
             self._frame = encode_frame(settings.address, command2=bit, data2=step)
@@ -298,21 +298,21 @@ class Motion:
         resting = None  # pitch since an instant
         since = 0.0
         while True:
-            told = self.read()
+            reading = self.read()
             now = self._now()
-            if told is None:
+            if reading is None:
                 resting = None
-            elif resting is None or abs(told.pitch - resting) > self._tolerance:
+            elif resting is None or abs(reading.pitch - resting) > self._tolerance:
                 if resting is not None and target is None:
                     self.stop()  # the one before was lost
-                resting = told.pitch
+                resting = reading.pitch
                 since = now
             else:
                 enough_s = self.settings.settle_s
                 if target is not None and abs(resting - target) > ARRIVAL:
                     enough_s *= STALLED
                 if now - since >= enough_s:
-                    return told.pitch
+                    return reading.pitch
             if now >= deadline:
                 break
             self.pause(self.settings.poll_s)
@@ -442,11 +442,11 @@ class Motion:
                     "the head is silent while it moves and its speed is unknown: state "
                     "degrees_per_second"
                 )
-            told = [row for row in self.rows[1:] if row.measured]
-            if told:
-                swept = abs(told[-1].pitch - told[0].pitch)
+            measured = [row for row in self.rows[1:] if row.measured]
+            if measured:
+                swept = abs(measured[-1].pitch - measured[0].pitch)
                 if swept >= 10 * self._tolerance:
-                    self.learn(way, step, swept / (told[-1].time_s - told[0].time_s))
+                    self.learn(way, step, swept / (measured[-1].time_s - measured[0].time_s))
 
         try:
             self.run(goal, step, look=look)
@@ -480,8 +480,8 @@ def drawn_to_readings(rows: Sequence[TrackPoint]) -> list[tuple[float, float, bo
         Date of the host, s, pitch, rad, and whether it was measured.
     """
     pitches = [row.pitch for row in rows]
-    told = [i for i, row in enumerate(rows) if row.measured]
-    for first, last in itertools.pairwise(told):
+    measured = [i for i, row in enumerate(rows) if row.measured]
+    for first, last in itertools.pairwise(measured):
         start = rows[first].pitch
         reckoned = rows[last].reckoned - start
         if reckoned:

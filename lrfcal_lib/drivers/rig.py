@@ -147,14 +147,14 @@ class Rig(Closed):
         skipped = {"port", "interlaced"}
         if devices.lrf.interlaced:  # it chooses its own
             skipped.add("variant")
-        asked = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
-        camera = camera or partial(_camera, stated)
+        settings = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
+        open_camera: Callable = camera or partial(_camera, stated)
         openers: dict[str, Callable] = {
             "head": partial(PanTilt, devices.head.port, devices.head, host=host),
-            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **asked),
+            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **settings),
         }
         for name in stated.cameras:
-            openers[f"camera '{name}'"] = partial(camera, name)
+            openers[f"camera '{name}'"] = partial(open_camera, name)
         with contextlib.ExitStack() as stack:
             opened = []
             for name, opener in openers.items():
@@ -504,16 +504,16 @@ def unchanged(scans: Iterable[np.ndarray]) -> bool:
 
 def _camera(stated, name):
     """A camera that gives images of the size stated."""
-    asked = stated.devices.cameras[name]
+    device = stated.devices.cameras[name]
     info = stated.cameras[name]
     size = (info.width, info.height)
-    options = asked.model_dump(exclude_none=True, exclude={"source", "size"})
-    camera = Camera(asked.source, name=name, size=size, **options)
+    options = device.model_dump(exclude_none=True, exclude={"source", "size"})
+    camera = Camera(device.source, name=name, size=size, **options)
     if camera.size not in (None, size):
         camera.close()
         given = "{} x {} pixels".format(*camera.size)
-        wanted = "{} x {}".format(*size)
+        expected = "{} x {}".format(*size)
         raise ValueError(
-            f"it gives {given}, rig.cameras.{name} states {wanted}: state a size that it can do"
+            f"it gives {given}, rig.cameras.{name} states {expected}: state a size that it can do"
         )
     return camera

@@ -335,18 +335,18 @@ class Plan(Stated):
         """
         listed = self.placements or [ListedPlacement()] * (count or self.count)
         placements = []
-        for i, one in enumerate(listed[:count], 1):
+        for i, entry in enumerate(listed[:count], 1):
             number = i
-            if one.number is not None:
-                number = one.number
-            stops = stops_of(one.pitch_deg or self.pitch_deg)
+            if entry.number is not None:
+                number = entry.number
+            stops = stops_of(entry.pitch_deg or self.pitch_deg)
             if not self.placements and i % 2 == 0:
                 stops = stops[::-1]
             images = self.image_pitch_deg
-            if one.image_pitch_deg is not None:
-                images = one.image_pitch_deg
+            if entry.image_pitch_deg is not None:
+                images = entry.image_pitch_deg
             purpose = "scene"
-            if one.board:
+            if entry.board:
                 purpose = "board"
             placements.append(Placement(number, stops, tuple(map(math.radians, images)), purpose))
         return placements
@@ -373,11 +373,11 @@ class RigFile:
     def __post_init__(self):
         low, high = self.devices.head.pitch_limits_deg
         for placement in self.plan.to_do():
-            asked = np.degrees([*placement.pitch, *placement.image_pitch])
-            if asked.min() < low - ROUNDING_DEG or asked.max() > high + ROUNDING_DEG:
+            angles = np.degrees([*placement.pitch, *placement.image_pitch])
+            if angles.min() < low - ROUNDING_DEG or angles.max() > high + ROUNDING_DEG:
                 raise RigFileError(
                     f"{self.path}: plan: placement {placement.number} asks for a pitch of "
-                    f"{asked.min():g} to {asked.max():g} deg, devices.head.pitch_limits_deg are "
+                    f"{angles.min():g} to {angles.max():g} deg, devices.head.pitch_limits_deg are "
                     f"{low:g} to {high:g}: ask for less"
                 )
         if self.plan.mode == "continuous" and self.devices.lrf.interlaced:

@@ -50,7 +50,7 @@ class Frame:
 
 
 class Camera(Closed):
-    """A camera, set to what is asked for; what could not be set is logged. A context manager.
+    """A camera, set to what is asked for; a context manager.
 
     A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and
     that looks for the source again when it is lost. A recorded one (video file, images) gives its
@@ -64,9 +64,9 @@ class Camera(Closed):
     name
         For messages.
     size
-        Width and height, pixels; by default as it is.
+        Width and height, pixels; by default as it is. The attribute tells whether it was obeyed.
     exposure
-        Seconds; by default the camera's automatic exposure is left alone.
+        Seconds; by default the camera's automatic exposure is left alone. Another one is logged.
     silence_s
         A stream that sends nothing for so long is taken for lost and opened again.
 
@@ -106,7 +106,7 @@ class Camera(Closed):
         self._quit = threading.Event()
         self._wanted = self._properties(size, exposure)
         self._open()
-        self._compare(size, exposure)
+        self._read_back(exposure)
         self._thread = None
         if self._remedy:
             self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
@@ -182,26 +182,22 @@ class Camera(Closed):
         self._before = REAL.time()
         self._taken = {key for key, value in self._wanted.items() if self._capture.set(key, value)}
 
-    def _compare(self, size, exposure):
-        """Read back what was asked for, and say what is different."""
+    def _read_back(self, exposure):
+        """The size that it gives; an exposure that is not as asked for is logged."""
         capture = self._capture
         given = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
         self.size = None
         if all(given):
             self.size = given
-        if size is not None and self.size is None:
-            LOG.warning("camera %s: size cannot be set, asked %s", self.name, tuple(size))
-        elif size is not None and self.size != tuple(size):
-            LOG.warning("camera %s: size is %s, asked %s", self.name, self.size, tuple(size))
         if exposure is None:
             return
-        got = 0.0
+        given_s = 0.0
         if cv2.CAP_PROP_EXPOSURE in self._taken:
-            got = capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
-        if got <= 0:
+            given_s = capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
+        if given_s <= 0:
             LOG.warning("camera %s: exposure cannot be set, asked %s", self.name, exposure)
-        elif abs(got - exposure) > SAME_EXPOSURE * exposure:
-            LOG.warning("camera %s: exposure is %s, asked %s", self.name, got, exposure)
+        elif abs(given_s - exposure) > SAME_EXPOSURE * exposure:
+            LOG.warning("camera %s: exposure is %s, asked %s", self.name, given_s, exposure)
 
     # ---------------------------------------------------------------------------------------------
     # grabbing
@@ -234,12 +230,10 @@ class Camera(Closed):
         self._release()
 
     def _keep(self, instant):
-        """Decode what was grabbed, three channels of it; whether that was an image."""
+        """Decode what was grabbed; whether that was an image."""
         done, image = self._capture.retrieve()
         if not done:
             return False
-        if image.ndim == 2 or image.shape[2] == 1:
-            image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
         with self._new:
             self._frame = Frame(image, instant, self._count)
             self._count += 1
@@ -304,11 +298,11 @@ def open_source(path: str, silence_s: float):
         return _open_stream(path, silence_s)
     if path.startswith("/dev/"):
         return _open_device(path)
-    there = os.path.exists(path)
-    pattern = glob.has_magic(path) and not there
+    exists = os.path.exists(path)
+    pattern = glob.has_magic(path) and not exists
     if os.path.isdir(path) or pattern or Path(path).suffix.lower() in IMAGES:
         return Files(path)
-    if not there:
+    if not exists:
         remedy = "name a file, a device, a folder of images or a URL"
         raise PortError(f"there is no video {path}: {remedy}")
     return _opened(f"{path} is no video that OpenCV can read", path)

@@ -26,13 +26,14 @@ from lrfcal_lib.emulators.lms2xx_memory import (
     REQUEST,
     STREAMED,
     Memory,
-    Told,
-    told_of,
+    Selection,
+    selection_of,
     words_of,
 )
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, encode_telegram
+from lrfcal_lib.session.lms2xx_frame import Telegram
 
 LOG = logging.getLogger(__name__)
 ACK = b"\x06"
@@ -126,7 +127,7 @@ class EmulatedLms(SerialDevice):
         self._effect: Callable | None = None  # of the command whose reply is on its way
         self._zero = host.now() - POWERED_S  # when turns of the mirror are counted from
         self._number = 0  # of the next scan
-        self._told = Told()
+        self._selection = Selection()
         # of the next scan of the stream
         self._turn = 0
         self._partial = 0
@@ -192,7 +193,7 @@ class EmulatedLms(SerialDevice):
         self.requests.append((self.host.time(), raw))
         self.obey(codec.parse_telegram(raw), at)
 
-    def obey(self, telegram: codec.Telegram, at: float) -> None:
+    def obey(self, telegram: Telegram, at: float) -> None:
         """Do what a telegram says, and answer it.
 
         Parameters
@@ -208,7 +209,7 @@ class EmulatedLms(SerialDevice):
                 self.answer(at, 0x91, effect=self._begin_restart, delay=ACK_S + 0.001)
             case 0x20, data:
                 self.set_mode(data, at)
-            case 0x30, b"\x01" if not self._told.head:
+            case 0x30, b"\x01" if not self._selection.head:
                 # the scan that is being measured when the request is whole
                 begun = at + ACK_S + 2 * self.byte_s
                 turn = self._turn_of(begun, memory.turns, math.floor)
@@ -248,14 +249,14 @@ class EmulatedLms(SerialDevice):
             self._set_rate(BAUD_COMMAND[mode], at)
         elif mode == INSTALLATION and len(parameters) == 8 and parameters != memory.password:
             self.answer(at, 0xA0, WRONG)
-        elif (told := told_of(mode, parameters)) is None:
+        elif (selection := selection_of(mode, parameters)) is None:
             self.answer(at, 0x92)
         else:
             delay = REPLY_S + self._rng.uniform(0, 0.02)
             if self.streaming:
                 delay += self._rng.uniform(0, STOP_S)
             memory.mode = mode
-            self._told = told
+            self._selection = selection
             self.answer(at, 0xA0, DONE, delay=delay)
 
     def _set_rate(self, rate, at):
@@ -345,7 +346,7 @@ class EmulatedLms(SerialDevice):
         self.abort()
         self._booting = True
         self._effect = None
-        self._told = Told()
+        self._selection = Selection()
         memory.mode = REQUEST
         memory.baudrate = 9600
         memory.variant = (memory.widest, 50)
@@ -369,7 +370,7 @@ class EmulatedLms(SerialDevice):
         """Turns of the mirror for a telegram of the stream."""
         if self.memory.mode == INTERLACED:
             return 1
-        return self._told.scans * self.memory.turns
+        return self._selection.scans * self.memory.turns
 
     def _measure(self, turn, partial, send, tag):
         """Send the scan that begins at a turn at its end.
@@ -383,7 +384,7 @@ class EmulatedLms(SerialDevice):
         if partial >= 0:
             turns = 1
             values = PARTIAL - (partial > 0)
-        scans = self._told.scans
+        scans = self._selection.scans
         end = self._zero + (turn + turns * scans) * MIRROR_TURN
 
         def ahead(_):
@@ -436,7 +437,7 @@ class EmulatedLms(SerialDevice):
         """What the mode tells of a scan."""
         memory = self.memory
         configuration = memory.configuration
-        words = scan.words[self._told.first - 1 : self._told.last]
+        words = scan.words[self._selection.first - 1 : self._selection.last]
         if memory.mode == REFLECTIVITY:  # behind every range
             answered = words <= MODES[ENCODED[configuration.measuring_mode]].largest
             words = np.stack([words, WHITE * answered], axis=1)
@@ -450,7 +451,7 @@ class EmulatedLms(SerialDevice):
             indices=indices,
             address=0x80 | memory.address,
             code=STREAMED.get(memory.mode, SCAN),
-            head=self._told.head,
+            head=self._selection.head,
         )
 
     def _plan(self):

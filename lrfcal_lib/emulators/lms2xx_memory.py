@@ -1,4 +1,4 @@
-"""What an LMS2xx remembers: its settings, and what its operating mode tells of the scans."""
+"""What an LMS2xx remembers: its settings, and what its operating mode sends of the scans."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -40,13 +40,13 @@ ENCODED = dict(zip(MODES, MODES, strict=True)) | {13: 0, 14: 0}
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a mode tells of the scans; by default all."""
+class Selection:
+    """Part of the scans that a mode sends; by default all."""
 
     head: bytes = b""  # of its telegrams: the parameters of the mode
-    first: int = 1  # value that is told, counted from 1
+    first: int = 1  # value that is sent, counted from 1
     last: int = LAST
-    scans: int = 1  # whose mean is told
+    scans: int = 1  # whose mean is sent
 
 
 @dataclass
@@ -139,8 +139,8 @@ def words_of(numbers: Sequence[int]) -> bytes:
     return np.array(numbers, "<u2").tobytes()
 
 
-def told_of(mode: int, parameters: bytes) -> Told | None:
-    """What a mode tells of the scans.
+def selection_of(mode: int, parameters: bytes) -> Selection | None:
+    """What a mode sends of the scans.
 
     Parameters
     ----------
@@ -151,15 +151,15 @@ def told_of(mode: int, parameters: bytes) -> Told | None:
 
     Returns
     -------
-    Told or None
+    Selection or None
         None for a mode that there is not, and for parameters that it does not have.
     """
     if len(parameters) != PARAMETERS.get(mode):
         return None
     if mode == MEAN:
         scans = parameters[0]
-        return Told(parameters, scans=scans) if scans in SCANS else None
+        return Selection(parameters, scans=scans) if scans in SCANS else None
     if mode in (PART, REFLECTIVITY):
         first, last = np.frombuffer(parameters, "<u2")[-2:].tolist()
-        return Told(parameters, first, last) if 1 <= first <= last <= LAST else None
-    return Told()
+        return Selection(parameters, first, last) if 1 <= first <= last <= LAST else None
+    return Selection()

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import math
 import os
 import signal
 import tempfile
@@ -102,39 +101,24 @@ class EmulatedRig:
         return self.lrf.error or self.pan_tilt.error
 
     def plan(self) -> dict:
-        """What a recording of this rig can do: the sweep that holds all placements, and each of
-        them.
-        """
+        """What a recording of this rig can do: its placements, each with its sweep."""
         setup = self.setup
         placements = []
-        ends = []
-        images = []
         for placement in self.world.placements.values():
             board = placement.T_platform_board is not None
             step = setup.step
             if not board and setup.room_sweep:
                 step = setup.room_sweep[2]
-            sweep = np.degrees([*placement.sweep, step]).round(4).tolist()
-            at = np.degrees(placement.image_pitch).round(4).tolist()
-            if board:
-                ends += sweep[:2]
-                images += at
+            sweep = (*placement.sweep, step)
             placements.append(
                 {
                     "number": placement.number,
                     "board": board,
-                    "pitch_deg": sweep,
-                    "image_pitch_deg": at,
+                    "pitch_deg": np.degrees(sweep).round(4).tolist(),
+                    "image_pitch_deg": np.degrees(placement.image_pitch).round(4).tolist(),
                 }
             )
-        return {
-            "mode": "stop-and-go",
-            "scans_per_stop": 1,
-            "intrinsics_images": setup.intrinsics_views,
-            "pitch_deg": [math.floor(min(ends)), math.ceil(max(ends)), math.degrees(setup.step)],
-            "image_pitch_deg": np.unique(np.round(images)).tolist(),
-            "placements": placements,
-        }
+        return {"intrinsics_images": setup.intrinsics_views, "placements": placements}
 
     def rig_file(self) -> dict:
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices,
@@ -342,7 +326,7 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
     try:
         with stream:
             stream.write(text)
-        ours = file.stat()
+        written = file.stat()
     except OSError as error:
         file.unlink()
         raise ValueError(
@@ -352,7 +336,7 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
         yield
     finally:
         with contextlib.suppress(OSError):  # somebody removed it
-            if os.path.samestat(file.lstat(), ours) and file.read_bytes() == text.encode():
+            if os.path.samestat(file.lstat(), written) and file.read_bytes() == text.encode():
                 file.unlink()
             else:
                 print(f"{file}: was changed, so it stays; its devices are gone", flush=True)

@@ -76,7 +76,7 @@ class EmulatedWorld:
         self._rng = np.random.default_rng([seed, 3])
         # what a head at rest saw last, and without noise
         self._still_key: tuple | None = None
-        self._still: tuple = ()
+        self._still: lrf.Readings | None = None
         self.put(None)
 
     @property
@@ -163,8 +163,7 @@ class EmulatedWorld:
             self._still_key = key
             bearings = np.radians(quarters / 4)
             self._still = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
-        ideal, energy, dazzled = self._still
-        return lrf.measured(rig.beam, ideal, energy, dazzled, self._rng)
+        return lrf.measured(rig.beam, self._still, self._rng)
 
 
 def scaled(rig: Rig, width: int) -> Rig:

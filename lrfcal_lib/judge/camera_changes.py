@@ -11,7 +11,8 @@ from scipy.special import chdtrc, fdtrc
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
-from lrfcal_lib.preprocess.intrinsics import adjust_robust, raised_points
+from lrfcal_lib.preprocess.bundle import adjust_robust
+from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_solution import JointSolution

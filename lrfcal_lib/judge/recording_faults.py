@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtri
 
-from lrfcal_lib.calibrate.observe_joint import observe_joint
+from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
 from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
@@ -221,7 +221,8 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     if 0 < len(mirrored) < len(stated):
         return mirrored
 
-    for group in (SENSES, IMAGES, UNITS):
+    groups: tuple[tuple[Reading, ...], ...] = (SENSES, IMAGES, UNITS)
+    for group in groups:
         misses = {reading: board_misses(prepared, reading) for reading in group}
         fitting = {reading: miss for reading, miss in misses.items() if _fits(miss, stated)}
         if fitting:

@@ -1,6 +1,7 @@
 """Figures of what was recorded: scans, range images, pictures, edges; a colour for each sensor."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,7 +31,7 @@ ABOUT = 6.0  # degrees shown on either side of a board
 BRIGHT = 150  # grey level: a picture whose brightest hundredth is darker is brightened
 GAIN = 5.0  # by this factor at most
 STRETCH = 61  # points of an edge as the lens bends it
-CENTRED = {"ha": "center", "va": "center"}  # text about its place
+CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}  # text about its place
 DARK = {"facecolor": "#333333", "edgecolor": "none"}  # behind white text in a picture
 
 
@@ -311,7 +312,16 @@ def board_view(ax: Axes, image: np.ndarray, view, model: CameraModel, margin: fl
         stretch = stretch_in_image(edge, model)
         middle = stretch.mean(axis=0)
         ax.plot(*stretch.T, "-", color=color, linewidth=1.6)
-        ax.text(*middle, edge.name, color="white", fontsize=8, bbox=box, clip_on=True, **CENTRED)
+        ax.text(
+            middle[0],
+            middle[1],
+            edge.name,
+            color="white",
+            fontsize=8,
+            bbox=box,
+            clip_on=True,
+            **CENTRED,
+        )
         drawn.append(stretch)
     title = f"{view.camera}, placement {view.placement}"
     if view.rejected:
@@ -349,7 +359,7 @@ def seen_points(
     """
     picture(ax, image)
     edges = [stretch_in_image(edge, model) for edge in view.edges]
-    label = "edge in the image"
+    label: str | None = "edge in the image"
     for stretch in edges:
         ax.plot(*stretch.T, "-", color="white", linewidth=1.0, label=label)
         label = None  # once
@@ -369,7 +379,8 @@ def seen_points(
 
 def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
     """Recorded pixels (STRETCH, 2) of an ImageEdge, which is a straight line without the lens."""
-    uv = np.linspace(*edge.ends, STRETCH)
+    first, last = edge.ends
+    uv = np.linspace(first, last, STRETCH)
     focal = np.array([model.fx, model.fy])
     centre = np.array([model.cx, model.cy])
     return distort((uv - centre) / focal, model.distortion) * focal + centre
@@ -408,15 +419,15 @@ def board_plan(ax: Axes, board: Board) -> None:
         start = np.subtract(board.pattern.origin, size)
         for row, column in np.ndindex(board.pattern.rows + 1, board.pattern.columns + 1):
             if (row + column) % 2:
-                corner = start + size * np.array([column, row])
-                ax.add_patch(Rectangle(corner, size, size, color="white", linewidth=0))
+                x, y = start + size * np.array([column, row])
+                ax.add_patch(Rectangle((x, y), size, size, color="white", linewidth=0))
     for index, (name, length) in enumerate(board.lengths().items()):
         ends = around[index : index + 2]
         at = ends.mean(axis=0) + 0.03 * outwards[index]
         x, y = ends[1] - ends[0]
         upright = (np.degrees(np.arctan2(y, x)) + 90) % 180 - 90
         text = f"{name.upper()} {1000 * length:.1f} mm"
-        ax.text(*at, text, rotation=upright, rotation_mode="anchor", **CENTRED)
+        ax.text(at[0], at[1], text, rotation=upright, rotation_mode="anchor", **CENTRED)
     ax.update_datalim(np.vstack([corners - 0.06, corners + 0.06]))
     to_scale(ax, "x [m]", "y [m]")
 
@@ -442,7 +453,7 @@ def outline(ax: Axes, measured, exaggerate: float = 20) -> None:
             band = np.vstack([ends - away, ends[::-1] + away])
             ax.fill(*band.T, color=COLORS["fit"], alpha=0.25, linewidth=0)
         at = ends.mean(axis=0) - 0.09 * normal
-        ax.text(*at, f"{name}\n{1000 * length:.1f} mm", fontsize=8, **CENTRED)
+        ax.text(at[0], at[1], f"{name}\n{1000 * length:.1f} mm", fontsize=8, **CENTRED)
     if board.pattern is not None:
         points = board.pattern.points()[:, :2]
         ax.plot(*points.T, "+", color=COLORS["raw"], markersize=4)

@@ -1,6 +1,7 @@
 """Figures of results: bars, strips and points."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,11 +13,14 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots.recording import COLORS, SERIES, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
-SPREAD = {"capsize": 2, "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]}}  # of bars
+SPREAD: dict[str, Any] = {
+    "capsize": 2,
+    "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]},
+}  # of bars
 WORST = 4.0  # times the median: a placement that fits so badly is an outlier
 
 
-def by_placement(ax: Axes, names: Sequence, label: str) -> None:
+def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
     """Ticks and labels of an axis of placements; the zero of what is drawn over them."""
     ax.set(xlabel="placement", ylabel=label, xticks=np.arange(len(names)), xticklabels=names)
     ax.grid(False, axis="x")
@@ -60,7 +64,7 @@ def residual_strips(
         ax.bar(column, 2 * rms, 0.8, -rms, color=color, alpha=0.2, linewidth=0)
         at = column + 0.6 * _side_by_side(len(values))
         ax.plot(at, values, ".", color=color, markersize=2.5)
-    by_placement(ax, names, label)
+    by_placement(ax, names.tolist(), label)
     limit = 1.08 * max(np.abs(residuals).max(), 1e-12)
     ax.set_ylim(-limit, limit)
 
@@ -119,7 +123,7 @@ def parameter_comparison(
     ax.set_xlabel(label)
 
 
-def edge_errors(ax: Axes, errors: Mapping[str, ArrayLike]) -> None:
+def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
     """Errors of edge lengths: a dot an edge, the mean a bar.
 
     Parameters
@@ -188,7 +192,7 @@ def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
     by_placement(ax, list(misfit), "chi-square per degree of freedom")
     if len(misfit) > 15:
-        ax.set_xticks(rows[::2], list(misfit)[::2])
+        ax.set_xticks(rows[::2], [str(name) for name in list(misfit)[::2]])
     title = f"all placements fit alike, the worst {values.max():.1f}"
     if bad.any():
         title = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
@@ -279,12 +283,14 @@ def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollecti
     limit
         Where colours end, and at its negative where there are negative values.
     """
-    shades = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
+    shades: dict[str, Any] = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
     if np.nanmin(values, initial=0.0) < 0:
         shades = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     bearing = np.degrees(cloud.bearing)
     pitch = np.degrees(cloud.pitch)
-    drawn = ax.scatter(bearing, pitch, 2.5, values, "s", linewidths=0, rasterized=True, **shades)
+    drawn = ax.scatter(
+        bearing, pitch, 2.5, values, marker="s", linewidths=0, rasterized=True, **shades
+    )
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
     ax.set(xlim=(bearing.max(), bearing.min()), ylim=(pitch.min(), pitch.max()))
     return drawn

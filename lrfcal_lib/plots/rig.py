@@ -1,6 +1,6 @@
 """Drawings in space, and coloured clouds as a camera sees them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
@@ -13,6 +13,7 @@ from lrfcal_lib.plots.recording import AXES_RGB, CENTRED, COLORS, closed, color_
 SURFACE = {"color": COLORS["left"], "alpha": 0.15, "linewidth": 0}
 NEAREST = 1e-6  # metres: what is nearer, or behind a camera, is not seen
 PARALLEL = 1e-9  # sine of an angle below which two directions are one
+Vector = Sequence[float] | np.ndarray
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
@@ -112,7 +113,7 @@ def space(
         ax.set_axis_off()
 
 
-def sphere(ax: Axes3D, centre: ArrayLike, radius: float) -> None:
+def sphere(ax: Axes3D, centre: np.ndarray, radius: float) -> None:
     """The set a point allows, figure 3 (a): the surface of a sphere.
 
     Parameters
@@ -123,7 +124,7 @@ def sphere(ax: Axes3D, centre: ArrayLike, radius: float) -> None:
     """
     u, v = np.mgrid[0 : 2 * np.pi : 36j, 0 : np.pi : 19j]
     ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
-    _surface(ax, centre + radius * ball)
+    _surface(ax, np.asarray(centre) + radius * ball)
 
 
 def cylinder(
@@ -239,7 +240,7 @@ def pixels(seen: np.ndarray, size: tuple[int, int], focal: float | None = None) 
     return (focal or width) * seen[:, :2] / seen[:, 2:] + centre
 
 
-def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> RigidTransform:
+def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidTransform:
     """The view from one point to another for :func:`render`.
 
     Parameters
@@ -260,7 +261,8 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
         If eye and target coincide, or `up` is the line of sight.
     """
     eye = np.asarray(eye, float)
-    ahead = np.subtract(target, eye)
+    target = np.asarray(target, float)
+    ahead = target - eye
     right = np.cross(ahead, up)
     distance = np.linalg.norm(ahead)
     if np.linalg.norm(right) <= PARALLEL * distance:

@@ -40,7 +40,7 @@ OTHER_LABELS = {  # of what is no row of METHODS
     "projected_last_beam": "projected lines, last beam",
     "projected_printed": "projected lines as the paper prints them",
 }
-_found = {"figures": [], "tables": [], "findings": [], "verdicts": []}
+_found: dict[str, list] = {"figures": [], "tables": [], "findings": [], "verdicts": []}
 
 
 def set_up():

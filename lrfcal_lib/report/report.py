@@ -69,7 +69,7 @@ USUAL_SECONDS = {  # by number, two at a time on two busy cores; only their rati
     "08": 129.0,
     "09": 144.0,
 }
-_CLIENTS = set()  # of the notebooks that are being executed
+_CLIENTS: set[NotebookClient] = set()  # of the notebooks that are being executed
 MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way first
 
 

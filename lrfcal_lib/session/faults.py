@@ -126,7 +126,7 @@ def repeated_scans(session) -> list[Fault]:
     return found
 
 
-def ranges_beyond(session):
+def ranges_beyond(session) -> list[Fault]:
     """Ranges that the range finder cannot have measured, as session.json states it."""
     ranges = session.scans["ranges"]
     known = ranges[np.isfinite(ranges)]
@@ -143,7 +143,7 @@ def ranges_beyond(session):
     return [Fault("beyond range", words)]
 
 
-def bearings_beyond(session):
+def bearings_beyond(session) -> list[Fault]:
     """Bearings, or steps between them, that are not those which session.json states."""
     lrf = session.lrf
     bearings = session.scans["bearings"]
@@ -170,7 +170,7 @@ def bearings_beyond(session):
     return [Fault("field of view", words)]
 
 
-def other_clocks(session):
+def other_clocks(session) -> list[Fault]:
     """Cameras whose times put most images beside the scans of other placements."""
     ends = {}
     for number in session.placements:
@@ -205,18 +205,35 @@ def other_clocks(session):
     return found
 
 
-def brightness(image):
-    """Grey level of the brightest surface in an image (h, w, 3), of every fourth pixel."""
+def brightness(image: np.ndarray) -> int:
+    """Grey level of the brightest surface in an image, of every fourth pixel.
+
+    Parameters
+    ----------
+    image
+        Of uint8, shape (h, w, 3).
+    """
     return int(np.quantile(image[::4, ::4].max(axis=2), WHITE))
 
 
 def dark_image(image: np.ndarray) -> bool:
-    """Whether the brightest surface of an image (h, w, 3) is darker than a white square may be."""
+    """Whether the brightest surface of an image is darker than a white square may be.
+
+    Parameters
+    ----------
+    image
+        Of uint8, shape (h, w, 3).
+    """
     return brightness(image) < DARK
 
 
 def dark_images(session) -> list[Fault]:
-    """Cameras whose images of the board are too dark; SHOWN of each are looked at."""
+    """Cameras whose images of the board are too dark; SHOWN of each are looked at.
+
+    Parameters
+    ----------
+    session : Session
+    """
     found = []
     for camera in session.cameras:
         records = session.images(camera, purpose="board")

@@ -1,8 +1,9 @@
 """Sizes of PNG and JPEG images by their headers, without decoding what may be made to take long."""
 
 import struct
+from os import PathLike
 
-from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.session.stated import CameraInfo, SessionError
 
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
@@ -15,11 +16,21 @@ MOST_SCANS = 100  # of a JPEG, each up to 30 ms at 30 megapixels; programs write
 MOST_SEGMENTS = 10_000
 
 
-def image_size(file, data):
-    """Width and height of a PNG or JPEG image from its header.
+def image_size(file: str | PathLike, data: bytes) -> tuple[int, int]:
+    """Width and height of a PNG or JPEG image from its header, pixels.
 
-    SessionError if it is cut off, or neither; also for a JPEG that would take long to decode, or
-    much memory, by its number of scans or of segments with remarks.
+    Parameters
+    ----------
+    file
+        For messages.
+    data
+        Its content.
+
+    Raises
+    ------
+    SessionError
+        If it is cut off, or neither; also for a JPEG that would take long to decode, or much
+        memory, by its number of scans or of segments with remarks.
     """
     size = None
     if data.startswith(PNG):
@@ -61,8 +72,25 @@ def _jpeg_size(data):
     return None
 
 
-def check_image_size(file, data, camera, size=None):
-    """Refuse an image of another size than its camera's; `size` is that of the decoded image."""
+def check_image_size(
+    file: str | PathLike, data: bytes, camera: CameraInfo, size: tuple[int, int] | None = None
+) -> None:
+    """Refuse an image of another size than its camera's.
+
+    Parameters
+    ----------
+    file
+        For messages.
+    data
+        Its content.
+    camera
+    size
+        That of the decoded image, pixels; by default that of its header.
+
+    Raises
+    ------
+    SessionError
+    """
     width, height = size or image_size(file, data)
     if (width, height) != (camera.width, camera.height):
         found = (

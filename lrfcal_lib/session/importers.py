@@ -147,7 +147,7 @@ def import_lasersetero(
         first = next(iter(images[name].values()))
         width, height = image_size(first, read_bytes(first))
         model = published[name].model if intrinsics == "published" else None
-        cameras.append(CameraInfo(name, "platform", width, height, model))
+        cameras.append(CameraInfo(name, "platform", width, height, model))  # type: ignore[arg-type]
     reference = {
         "note": NOTE,
         "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),

@@ -3,6 +3,7 @@
 import fcntl
 import os
 import socket
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -13,9 +14,18 @@ LOCK = "writer.lock"
 
 
 @contextmanager
-def alone(path):
-    """Keep other writers out of a session as long as this lasts; a process that is killed lets go
-    of it as well.
+def alone(path: str | os.PathLike) -> Iterator[None]:
+    """Keep other writers out of a session; a process that is killed lets go of it as well.
+
+    Parameters
+    ----------
+    path
+        The session's folder.
+
+    Raises
+    ------
+    SessionError
+        Where another process writes it.
     """
     file = Path(path) / LOCK
     with ExitStack() as stack:

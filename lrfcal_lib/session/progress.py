@@ -21,19 +21,23 @@ class Progress:
         self._said = clock()
 
     @property
-    def seconds(self):
+    def seconds(self) -> float:
         """Since it began."""
         return self._clock() - self._begun
 
-    def left(self, share):
-        """How long it will still take where this share is done, as text; '' where none
-        is, or all.
+    def left(self, share: float) -> str:
+        """How long it will still take, in words; '' where nothing is done yet, or all.
+
+        Parameters
+        ----------
+        share
+            That is done, 0 to 1.
         """
         if not 0 < share < 1:
             return ""
         return f"about {duration(self.seconds * (1 - share) / share)} left"
 
-    def due(self):
+    def due(self) -> bool:
         """Whether it is time for another line; then it counts as written."""
         now = self._clock()
         if now - self._said < LINE_S:
@@ -42,6 +46,11 @@ class Progress:
         return True
 
 
-def duration(seconds):
-    """Seconds as text, in minutes from 100 s on."""
+def duration(seconds: float) -> str:
+    """A time as text, in minutes from 100 s on.
+
+    Parameters
+    ----------
+    seconds
+    """
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

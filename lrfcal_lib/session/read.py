@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import cv2
@@ -151,19 +152,35 @@ def _read_arrays(file, archive):
     return scans
 
 
-def check_scans(scans):
+def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Scan lines with consistent shapes and credible units.
 
-    Takes a dict of ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,),
-    time_s (N,), and intensities (N, B) where there are any; gives the same as floats (placement:
-    integers), zero or infinite ranges NaN. KeyError or ValueError for a missing array, wrong shapes
-    or units, bearings that do not ascend, no range at all.
+    Parameters
+    ----------
+    scans
+        By name: ranges (N, B), metres; bearings (B,) and pitch (N,), radians; placement (N,);
+        time_s (N,); intensities (N, B) where there are any.
+
+    Returns
+    -------
+    dict of ndarray
+        The same as floats (placement: integers), zero or infinite ranges NaN.
+
+    Raises
+    ------
+    KeyError, ValueError
+        For a missing array, wrong shapes or units, bearings that do not ascend, no range at all.
     """
     ranges = np.asarray(scans["ranges"], float)
     if ranges.ndim != 2:
         raise ValueError(f"ranges must be scan lines x beams, got shape {ranges.shape}")
     lines, beams = ranges.shape
-    shapes = {"bearings": (beams,), "placement": (lines,), "pitch": (lines,), "time_s": (lines,)}
+    shapes: dict[str, tuple[int, ...]] = {
+        "bearings": (beams,),
+        "placement": (lines,),
+        "pitch": (lines,),
+        "time_s": (lines,),
+    }
     shapes |= {"intensities": (lines, beams)} if "intensities" in scans else {}
     for key, shape in shapes.items():
         if scans[key].shape != shape:
@@ -396,9 +413,17 @@ class Session:
     telegrams: TelegramLog | None = field(default=None, repr=False)
     continuous: bool = False
 
-    def sweep(self, placement):
-        """The Sweep of a placement; SessionError if it is not in the session, or has no scan line
-        with a range.
+    def sweep(self, placement: int) -> Sweep:
+        """The scan lines of a placement.
+
+        Parameters
+        ----------
+        placement
+
+        Raises
+        ------
+        SessionError
+            If it is not in the session, or has no scan line with a range.
         """
         if placement not in self.placements:
             raise SessionError(
@@ -423,8 +448,21 @@ class Session:
             intensities=intensities,
         )
 
-    def images(self, camera=None, placement=None, purpose=None):
-        """The records of images that match all that is given, in the order of images.csv."""
+    def images(
+        self,
+        camera: str | None = None,
+        placement: int | None = None,
+        purpose: str | None = None,
+    ) -> tuple[ImageRecord, ...]:
+        """The records of images that match all that is given, in the order of images.csv.
+
+        Parameters
+        ----------
+        camera, placement
+            -1 are the images of no placement.
+        purpose
+            'board', 'intrinsics' or 'scene'.
+        """
         records = []
         for record in self.image_records:
             if camera not in (None, record.camera) or placement not in (None, record.placement):
@@ -433,11 +471,22 @@ class Session:
                 records.append(record)
         return tuple(records)
 
-    def read_image(self, record):
-        """The pixels of an ImageRecord: blue, green, red, ndarray of uint8, shape (height, width,
-        3).
+    def read_image(self, record: ImageRecord) -> np.ndarray:
+        """The pixels of an image.
 
-        SessionError if the file cannot be decoded or has another size than the camera.
+        Parameters
+        ----------
+        record
+
+        Returns
+        -------
+        ndarray of uint8, shape (height, width, 3)
+            Blue, green, red.
+
+        Raises
+        ------
+        SessionError
+            If the file cannot be decoded or has another size than the camera.
         """
         camera = self.cameras[record.camera]
         data = stated.read_bytes(record.file, self.path)
@@ -445,27 +494,33 @@ class Session:
         with reading(
             record.file, "cannot be decoded; remove its row from images.csv or restore the file"
         ):
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-            shape = image.shape  # there is none of an image that is None
-        check_image_size(record.file, data, camera, shape[1::-1])
+            image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+            height, width = image.shape[:2]  # there is none of an image that is None
+        check_image_size(record.file, data, camera, (width, height))
         return image
 
     @property
-    def scene_placements(self):
-        """Placements that show a scene to be rebuilt, not the board: their images have the purpose
-        'scene'.
-        """
+    def scene_placements(self) -> tuple[int, ...]:
+        """Placements that show a scene to be rebuilt, by the purpose of their images."""
         return tuple(p for p in self.placements if self.images(placement=p, purpose="scene"))
 
     @property
-    def board_placements(self):
+    def board_placements(self) -> tuple[int, ...]:
         """All other placements."""
         scenes = self.scene_placements
         return tuple(p for p in self.placements if p not in scenes)
 
-    def sweep_direction(self, placement):
-        """Sign of the pitch motion over a sweep: +1 upwards, -1 downwards, 0 for scans at one
-        pitch.
+    def sweep_direction(self, placement: int) -> int:
+        """Sign of the pitch motion over a sweep.
+
+        Parameters
+        ----------
+        placement
+
+        Returns
+        -------
+        int
+            +1 upwards, -1 downwards, 0 for scans at one pitch.
         """
         pitch = self.sweep(placement).pitch
         quarter = len(pitch) // 4 + 1
@@ -475,12 +530,13 @@ class Session:
         return int(np.sign(moved))
 
 
-def open_session(path):
-    """Open a session (its folder) and check all of it.
+def open_session(path: str | os.PathLike) -> Session:
+    """Open a session and check all of it.
 
-    Returns
-    -------
-    Session
+    Parameters
+    ----------
+    path
+        Its folder.
 
     Raises
     ------
@@ -512,10 +568,18 @@ def open_session(path):
     return Session(path=path, **found, **facts)
 
 
-def validate(path):
+def validate(path: str | os.PathLike) -> list[str]:
     """Everything that is wrong with a session, as sentences; none for a sound one.
 
-    The first is what keeps the session from being opened, if anything does.
+    Parameters
+    ----------
+    path
+        Its folder.
+
+    Returns
+    -------
+    list of str
+        The first is what keeps the session from being opened, if anything does.
     """
     try:
         session = open_session(path)

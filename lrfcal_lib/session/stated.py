@@ -1,27 +1,50 @@
-"""session.json, and how files of a session are opened: within its folder, and bounded."""
+"""What session.json states, as records and as JSON."""
 
 import json
 import math
-import os
 import re
-import stat
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import pydantic
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFloat, PlainSerializer
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.session.shown import printable
+from lrfcal_lib.session.files import (
+    LARGEST_FILE,
+    LARGEST_TEXT,
+    SPLIT,
+    SessionError,
+    check_amount,
+    checked,
+    naming,
+    opened,
+    read_bytes,
+    read_json,
+    reading,
+    short,
+)
 
-LARGEST_FILE = 64_000_000  # bytes of any file of a session
-SPLIT = "split the recording into several sessions"
+__all__ = [  # how files are opened, beside all that is below
+    "LARGEST_FILE",
+    "LARGEST_TEXT",
+    "SPLIT",
+    "SessionError",
+    "check_amount",
+    "checked",
+    "naming",
+    "opened",
+    "read_bytes",
+    "read_json",
+    "reading",
+    "short",
+]
+
 FILES = (  # of any session, besides its images
     "session.json",
     "lrf/scans.npz",
@@ -32,180 +55,6 @@ FILES = (  # of any session, besides its images
     "platform.csv",
     "truth.json",
 )
-KINDS = {
-    "l": "a link",
-    "d": "a folder",
-    "p": "a named pipe",
-    "s": "a socket",
-    "b": "a device",
-    "c": "a device",
-}
-
-
-class SessionError(ValueError):
-    """A session on disk that cannot be used: the message names the file, the value and what to do
-    about it.
-    """
-
-    def __init__(self, text):
-        text = printable(text)
-        super().__init__(text if len(text) < 2000 else f"{text[:1000]} [...] {text[-500:]}")
-
-
-def checked(file, within, make=False):
-    """A file of a session; SessionError where a folder on the way to it is none, such as a link."""
-    where = Path(within)
-    for part in Path(file).relative_to(within).parts[:-1]:
-        where /= part
-        if make:
-            where.mkdir(exist_ok=True)
-        _refuse_other(where, where.lstat(), "d", "a folder")
-    return Path(file)
-
-
-def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
-    """Binary stream of a file in a session.
-
-    Parameters
-    ----------
-    file : path-like
-    within : path-like, optional
-        The session's folder; without, the file is somebody else's, who may have links to it.
-    flags : int
-        Of ``os.open``; any but O_RDONLY writes.
-    most : int
-        Bytes that are read.
-
-    Raises
-    ------
-    SessionError
-        If the file, or a folder between it and the session's, is a link, or the file is none (a
-        pipe, a device), too large to be read, or to be written and known by another name as well
-        (a hard link, maybe outside).
-    OSError
-        If it cannot be opened.
-    """
-    file = Path(file)
-    writes = flags != os.O_RDONLY
-    if within is not None:
-        checked(file, within)
-        flags |= os.O_NOFOLLOW
-    with suppress(FileNotFoundError):  # a device is not even opened
-        found = os.stat(file, follow_symlinks=within is None)
-        _refuse_other(file, found, "-", "a file")
-        if not writes and found.st_size > most:
-            raise SessionError(
-                f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}"
-            )
-    inner = os.open(file, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
-    mode = "rb"
-    if writes:
-        mode = "r+b" if flags & os.O_RDWR else "wb"
-    stream = os.fdopen(inner, mode)
-    if writes and os.fstat(inner).st_nlink > 1:
-        stream.close()
-        remedy = "copy the session's folder and write to the copy"
-        raise SessionError(f"{file}: has another name elsewhere (a hard link); {remedy}")
-    return stream
-
-
-def _refuse_other(file, status, kind, wanted):
-    """Refuse what is no plain file (or folder), such as a link."""
-    if (found := stat.filemode(status.st_mode)[0]) != kind:
-        what = KINDS.get(found, "a file")
-        raise SessionError(
-            f"{file}: is {what}, not {wanted}: a session holds plain files; put {wanted} in its "
-            "place"
-        )
-
-
-MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
-LARGEST_TEXT = 8_000_000  # bytes of a JSON or CSV file
-DEEPEST_JSON = 30  # levels
-
-
-@contextmanager
-def reading(file, remedy):
-    """Turn whatever other people's code says about the content of a file into a SessionError.
-
-    Any exception is meant, so nothing but calls of other people's code belongs inside: ours has to
-    show its mistakes.
-    """
-    try:
-        yield
-    except SessionError:
-        raise
-    except Exception as error:
-        raise SessionError(
-            f"{file}: {remedy.format(str(error) or type(error).__name__)}"
-        ) from error
-
-
-@contextmanager
-def naming(file):
-    """Turn whatever goes wrong with values of a file into a SessionError that begins with the
-    file's name.
-    """
-    try:
-        yield
-    except SessionError:
-        raise
-    except KeyError as error:
-        raise SessionError(f"{file}: key {error} is missing") from error
-    except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise SessionError(f"{file}: {error}") from error
-
-
-def read_bytes(file, within=None, most=LARGEST_FILE):
-    """Content of a file of a session (see :func:`opened`); a SessionError where it cannot
-    be read.
-    """
-    try:
-        with opened(file, within, most=most) as stream:
-            data = stream.read(most + 1)
-    except OSError as error:
-        raise SessionError(f"{file}: {error.strerror}; the session needs this file") from error
-    if len(data) > most:  # files of the system do not tell their size
-        raise SessionError(f"{file}: more than {most / 1e6:.0f} MB; {SPLIT}")
-    return data
-
-
-def read_json(file, within):
-    """The object in a JSON file."""
-    text = read_bytes(file, within, LARGEST_TEXT)
-    with reading(file, "not JSON ({}); truncated, or edited by hand?"):
-        data = json.loads(text.decode())
-    if not isinstance(data, dict):
-        raise SessionError(
-            f"{file}: holds a {type(data).__name__}, expected an object with the key 'schema'"
-        )
-    inner = [data]
-    for _ in range(DEEPEST_JSON):
-        inner = [
-            v
-            for x in inner
-            if isinstance(x, dict | list)
-            for v in (x.values() if isinstance(x, dict) else x)
-        ]
-    if inner:
-        raise SessionError(
-            f"{file}: nested deeper than {DEEPEST_JSON} levels; was this written by a program?"
-        )
-    return data
-
-
-def check_amount(values):
-    """Refuse more ranges and other values of scan lines than reading has memory for."""
-    if values > MOST_VALUES:
-        raise ValueError(f"{values} values of scan lines, more than {MOST_VALUES}; {SPLIT}")
-
-
-def short(values):
-    """Values as text for a message, the middle of long lists left out."""
-    values = [str(v) for v in values]
-    return ", ".join(values if len(values) < 13 else [*values[:6], "...", *values[-3:]]) or "none"
-
-
 SCHEMA = "lrfcal-session/1"
 LARGEST_IMAGE = 30_000_000  # pixels
 MOST_CORNERS = 1000  # of a pattern, or of a board's outline
@@ -254,8 +103,21 @@ def in_words(error):
 adapter = lru_cache(pydantic.TypeAdapter)
 
 
-def from_json(kind, data):
-    """What is stated in JSON as one of the types below; ValueError in words for anything else."""
+def from_json(kind: Any, data: Any) -> Any:
+    """What is stated in JSON as one of the types below.
+
+    Parameters
+    ----------
+    kind
+        The type.
+    data
+        As JSON has it.
+
+    Raises
+    ------
+    ValueError
+        In words for anything else.
+    """
     try:
         return adapter(kind).validate_python(data)
     except pydantic.ValidationError as error:
@@ -304,8 +166,13 @@ class TransformStated(BaseModel):
         )
 
 
-def transform_to_json(transform):
-    """A RigidTransform (or None) as rotation vector and translation."""
+def transform_to_json(transform: RigidTransform | None) -> dict | None:
+    """A transform as rotation vector and translation, as it stands in files.
+
+    Parameters
+    ----------
+    transform
+    """
     if transform is None:
         return None
     turn = transform.rotation.as_rotvec().tolist()
@@ -341,9 +208,16 @@ class LensStated(BaseModel):
         )
 
 
-def model_to_json(model):
-    """Intrinsics (or None) as they stand in session.json."""
-    return model and plain({name: getattr(model, name) for name in LensStated.model_fields})
+def model_to_json(model: CameraModel | None) -> dict | None:
+    """Intrinsics as they stand in session.json.
+
+    Parameters
+    ----------
+    model
+    """
+    if model is None:
+        return None
+    return plain({name: getattr(model, name) for name in LensStated.model_fields})
 
 
 class PatternStated(BaseModel):
@@ -396,21 +270,45 @@ class BoardStated(BaseModel):
         return Board(self.name, self.edges, corners, self.pattern, self.features)
 
 
-def board_to_json(board):
-    """A board as it stands in session.json."""
-    p = board.pattern
-    grid = p and {"kind": "chessboard", "columns": p.columns, "rows": p.rows}
-    named = {
-        "name": board.name,
-        "edges": board.edges,
-        "features": board.features,
-        "corners_m": board.corners,
-    }
-    return plain(named | {"pattern": p and grid | {"square_m": p.square, "origin_m": p.origin}})
+def board_to_json(board: Board) -> dict:
+    """A board as it stands in session.json.
+
+    Parameters
+    ----------
+    board
+    """
+    pattern = None
+    if board.pattern is not None:
+        pattern = {
+            "kind": "chessboard",
+            "columns": board.pattern.columns,
+            "rows": board.pattern.rows,
+            "square_m": board.pattern.square,
+            "origin_m": board.pattern.origin,
+        }
+    return plain(
+        {
+            "name": board.name,
+            "edges": board.edges,
+            "features": board.features,
+            "corners_m": board.corners,
+            "pattern": pattern,
+        }
+    )
 
 
-def board_from_json(data):
-    """Inverse of :func:`board_to_json`; ValueError for a wrong one."""
+def board_from_json(data: dict) -> Board:
+    """Inverse of :func:`board_to_json`.
+
+    Parameters
+    ----------
+    data
+
+    Raises
+    ------
+    ValueError
+        For a wrong one.
+    """
     return from_json(BoardStated, data).made()
 
 
@@ -471,26 +369,33 @@ class LrfInfo:
     ] = None
 
     @property
-    def admitted_offset(self):
-        """The largest range offset that the maker admits, metres: stated, or known of the model, or
-        assumed.
-        """
+    def admitted_offset(self) -> float:
+        """The largest range offset that the maker admits, metres: stated, or known, or assumed."""
         known = [value for name, value in SYSTEMATIC_ERROR.items() if name in self.model]
         if not known or self.range_resolution > 0.005:
             known = [ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)]
         return self.systematic_error or known[0]
 
-    def spot_radius(self, distance):
-        """Radius of the spot at a distance, metres; 5 mm everywhere where the spot is not
-        stated.
+    def spot_radius(self, distance: ArrayLike) -> np.ndarray:
+        """Radius of the spot, metres; ASSUMED_SPOT_RADIUS everywhere where the spot is not stated.
+
+        Parameters
+        ----------
+        distance
+            From the window, metres.
         """
         if self.spot_exit is None:
             return np.full(np.shape(distance), ASSUMED_SPOT_RADIUS)
         return (self.spot_exit + (self.spot_divergence or 0.0) * np.asarray(distance, float)) / 2
 
 
-def lrf_to_json(lrf):
-    """An LrfInfo as it stands in session.json (degrees there)."""
+def lrf_to_json(lrf: LrfInfo) -> dict:
+    """A range finder as it stands in session.json (degrees there).
+
+    Parameters
+    ----------
+    lrf
+    """
     return adapter(LrfInfo).dump_python(lrf, by_alias=True, exclude_none=True)
 
 
@@ -502,6 +407,17 @@ def _few_pixels(height, info):
 
 def _lens(lens, info):
     return lens and lens.made(info.data.get("width"), info.data.get("height"))
+
+
+if TYPE_CHECKING:
+    Lens = CameraModel | None
+else:  # stated without the size of the image, which stands beside it
+    Lens = Annotated[
+        LensStated | None,
+        AfterValidator(_lens),
+        PlainSerializer(model_to_json),
+        Field(alias="intrinsics"),
+    ]
 
 
 @dataclass(frozen=True)
@@ -526,18 +442,38 @@ class CameraInfo:
     mount: Literal["head", "platform"]
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1), AfterValidator(_few_pixels)]
-    model: Annotated[
-        LensStated | None,
-        AfterValidator(_lens),
-        PlainSerializer(model_to_json),
-        Field(alias="intrinsics"),
-    ] = None
+    model: Lens = None
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
 
-def camera_to_json(camera):
-    """A CameraInfo as it stands in session.json."""
+def camera_to_json(camera: CameraInfo) -> dict:
+    """A camera as it stands in session.json.
+
+    Parameters
+    ----------
+    camera
+    """
     return adapter(CameraInfo).dump_python(camera, by_alias=True)
+
+
+def platform_to_json(
+    T_head_lrf: RigidTransform | None, sigma: tuple[float, float] | None, continuous: bool
+) -> dict:
+    """A platform as it stands in session.json.
+
+    Parameters
+    ----------
+    T_head_lrf, sigma, continuous
+        Fields of a Session; sigma is `platform_sigma`, radians and metres.
+    """
+    platform: dict[str, Any] = {"T_head_lrf": transform_to_json(T_head_lrf)}
+    if sigma is not None:
+        direction, offset = sigma
+        platform["sigma_direction_deg"] = round(math.degrees(direction), 9)
+        platform["sigma_offset_m"] = offset
+    if continuous:
+        platform["continuous"] = True
+    return platform
 
 
 def _with_names(cameras):
@@ -582,9 +518,20 @@ class SessionStated(BaseModel):
     unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None
 
 
-def parse_session(data, kind=SessionStated):
-    """The statements of session.json (or more of its `kind`) as fields of a Session; ValueError for
-    a wrong one.
+def parse_session(data: dict, kind: type = SessionStated) -> dict:
+    """The statements of session.json as fields of a Session.
+
+    Parameters
+    ----------
+    data
+        As JSON has it.
+    kind
+        SessionStated, or what states more.
+
+    Raises
+    ------
+    ValueError
+        For a wrong one.
     """
     found = dict(from_json(kind, data))
     rig = dict(found.pop("rig"))

@@ -1,18 +1,33 @@
 """Tables of a session: CSV files with given columns."""
 
 import csv
+from os import PathLike
+from pathlib import Path
 
 from lrfcal_lib.session.stated import LARGEST_TEXT, SPLIT, SessionError, read_bytes, reading
 
 MOST_ROWS = 200_000
-WHOLE_COLUMNS = ("placement", "offset", "length")  # of tables, which hold whole numbers
+WHOLE_COLUMNS = {"placement", "offset", "length"}  # of tables, which hold whole numbers
 
 
-def read_table(file, columns, within, torn=False):
-    """Rows of a CSV file as dicts, and whether one was left out; the columns must be exactly
-    `columns`.
+def read_table(
+    file: Path, columns: tuple[str, ...], within: str | PathLike, torn: bool = False
+) -> tuple[list[dict[str, str]], bool]:
+    """Rows of a CSV file with exactly these columns, and whether one was left out.
 
-    With `torn`, a last row without its line end (cut off by a crash) is left out.
+    Parameters
+    ----------
+    file
+    columns
+    within
+        The session's folder.
+    torn
+        A last row without its line end (cut off by a crash) is left out.
+
+    Raises
+    ------
+    SessionError
+        For other columns, rows of other lengths, or too many.
     """
     data = read_bytes(file, within, LARGEST_TEXT)
     with reading(file, "not a CSV file in UTF-8 ({})"):
@@ -35,14 +50,12 @@ def read_table(file, columns, within, torn=False):
             raise SessionError(
                 f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?"
             )
-    whole = [key in WHOLE_COLUMNS for key in columns]
-    rows = [map(_without_point, row, whole) for row in rows[1:]]
-    return [dict(zip(columns, row, strict=True)) for row in rows], cut
-
-
-def _without_point(cell, whole):
-    """A cell of a table: 1.0, as programs write whole numbers beside empty cells, is 1."""
-    return cell.removesuffix(".0") if whole else cell
+    table = [dict(zip(columns, row, strict=True)) for row in rows[1:]]
+    for cells in table:
+        for key in WHOLE_COLUMNS & cells.keys():
+            # programs write whole numbers beside empty cells as 1.0
+            cells[key] = cells[key].removesuffix(".0")
+    return table, cut
 
 
 def whole_number(text, name):

@@ -6,27 +6,40 @@ import json
 import math
 import os
 import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.model.board import Board
 from lrfcal_lib.session import read, stated
 from lrfcal_lib.session.images import JPEG, check_image_size
 from lrfcal_lib.session.lock import LOCK, alone
-from lrfcal_lib.session.stated import SessionError, naming, short
-from lrfcal_lib.session.tables import read_table
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, naming, short
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
 RECORDINGS = "LRFCAL_RECORDINGS"  # environment variable: where new recordings go
 
 
-def new_session_path():
-    """Where a recording goes whose place nobody names: a folder by date in
-    ``~/lrfcal_sessions``.
-    """
+def new_session_path() -> Path:
+    """Where a recording goes whose place nobody names: by date in ``~/lrfcal_sessions``."""
     folder = os.environ.get(RECORDINGS) or Path.home() / "lrfcal_sessions"
     return Path(folder, time.strftime("%Y-%m-%d_%H%M%S")).absolute()
+
+
+@dataclass(frozen=True)
+class About:
+    """What a session says besides its rig, see :class:`lrfcal_lib.session.read.Session`."""
+
+    name: str | None = None  # that of its folder by default
+    licence: str = ""
+    source: str = ""
+    simulated: bool = False
+    reference: dict = field(default_factory=dict)
 
 
 class SessionWriter:
@@ -39,11 +52,12 @@ class SessionWriter:
 
     Parameters
     ----------
-    path : path-like
-        Must not exist or be an empty folder; its name is the session's `name` by default.
-    board, lrf, cameras, T_head_lrf, platform_sigma, licence, source, simulated, reference,
-    continuous
+    path
+        Must not exist or be an empty folder.
+    board, lrf, cameras, T_head_lrf, platform_sigma, continuous
         See :class:`lrfcal_lib.session.read.Session`.
+    **about
+        Fields of :class:`About`.
 
     Raises
     ------
@@ -58,65 +72,53 @@ class SessionWriter:
 
     def __init__(
         self,
-        path,
-        board,
-        lrf,
-        cameras=(),
-        T_head_lrf=None,
+        path: str | os.PathLike,
+        board: Board,
+        lrf: LrfInfo,
+        cameras: Iterable[CameraInfo] = (),
+        T_head_lrf: RigidTransform | None = None,
         *,
-        name=None,
-        licence="",
-        source="",
-        simulated=False,
-        platform_sigma=None,
-        reference=None,
-        continuous=False,
+        platform_sigma: tuple[float, float] | None = None,
+        continuous: bool = False,
+        **about,
     ):
         self.path = Path(path)
         self.cameras = {camera.name: camera for camera in cameras}
-        self.bearings = None  # of the sweeps so far
+        self.bearings: np.ndarray | None = None  # of the sweeps so far
         self.parts = 0  # files of sweeps so far
         self.shots = dict.fromkeys(self.cameras, 0)  # images so far, by camera
         self.telegrams = self.path / "lrf" / "telegrams.bin"
-        platform = {"T_head_lrf": stated.transform_to_json(T_head_lrf)}
-        if platform_sigma is not None:
-            platform["sigma_direction_deg"] = round(math.degrees(platform_sigma[0]), 9)
-            platform["sigma_offset_m"] = platform_sigma[1]
-        if continuous:
-            platform["continuous"] = True
-        rig = {
-            "lrf": stated.lrf_to_json(lrf),
-            "platform": platform,
-            "cameras": {name: stated.camera_to_json(info) for name, info in self.cameras.items()},
-        }
+        words = asdict(About(**about))
+        reference = words.pop("reference") or {}
         self.data = {
             "schema": stated.SCHEMA,
-            "name": name or self.path.resolve().name,
-            "licence": licence,
-            "source": source,
-            "simulated": simulated,
+            **words,
+            "name": words["name"] or self.path.resolve().name,
             "board": stated.board_to_json(board),
-            "rig": rig,
+            "rig": {
+                "lrf": stated.lrf_to_json(lrf),
+                "platform": stated.platform_to_json(T_head_lrf, platform_sigma, continuous),
+                "cameras": {n: stated.camera_to_json(info) for n, info in self.cameras.items()},
+            },
             "placements": [],
-            "reference": reference or {},
+            "reference": reference,
         }
         with naming(self.path):
             stated.parse_session(json.loads(json.dumps(self.data)))
         if self.path.exists() and not self.path.is_dir():
-            raise SessionError(
-                f"{self.path}: exists already; choose another name or remove it first"
-            )
+            self._refuse("choose another name or remove it first")
         self.path.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
             stack.enter_context(alone(self.path))
             self._create()
             self._held = stack.pop_all()
 
+    def _refuse(self, remedy):
+        raise SessionError(f"{self.path}: exists already; {remedy}")
+
     def _create(self):
         if set(os.listdir(self.path)) - {LOCK}:
-            raise SessionError(
-                f"{self.path}: exists already; choose another name or remove it first"
-            )
+            self._refuse("choose another name or remove it first")
         self._make_folders()
         self._state()
 
@@ -158,19 +160,35 @@ class SessionWriter:
         if placement >= 0 and placement not in self.data["placements"]:
             self._state(placements=sorted([*self.data["placements"], int(placement)]))
 
-    def add_sweep(self, placement, ranges, bearings, pitch, time_s=None, intensities=None):
-        """Append the scan lines of a placement; SessionError for wrong shapes or units, or other
-        bearings than before.
+    def add_sweep(
+        self,
+        placement: int,
+        ranges: ArrayLike,
+        bearings: ArrayLike,
+        pitch: ArrayLike,
+        time_s: ArrayLike = math.nan,
+        intensities: ArrayLike | None = None,
+    ) -> None:
+        """Append the scan lines of a placement.
 
         Parameters
         ----------
-        ranges : array_like, shape (L, B)
-            Metres, NaN where nothing came back.
-        bearings : array_like, shape (B,)
-            Radians, ascending; the same in all sweeps of a session.
-        pitch : array_like, shape (L,)
-            Radians.
-        time_s, intensities : array_like, shapes (L,) and (L, B), optional
+        placement
+        ranges
+            Metres, NaN where nothing came back, shape (L, B).
+        bearings
+            Radians, ascending, shape (B,); the same in all sweeps of a session.
+        pitch
+            Radians, shape (L,).
+        time_s
+            Seconds, shape (L,).
+        intensities
+            Shape (L, B).
+
+        Raises
+        ------
+        SessionError
+            For wrong shapes or units, or other bearings than before.
         """
         if self.telegrams.exists():
             raise SessionError(
@@ -179,15 +197,19 @@ class SessionWriter:
             )
         ranges = np.array(ranges, float, ndmin=2)
         bearings = np.asarray(bearings, float)
-        if time_s is None:
-            time_s = np.full(len(ranges), np.nan)
-        scans = {"ranges": ranges, "bearings": bearings}
-        scans["pitch"] = np.asarray(pitch, float)
-        scans["time_s"] = np.asarray(time_s, float)
+        scans = {
+            "ranges": ranges,
+            "bearings": bearings,
+            "pitch": np.asarray(pitch, float),
+            "time_s": np.asarray(time_s, float),
+            "placement": np.full(len(ranges), placement),
+        }
+        if np.ndim(time_s) == 0:
+            scans["time_s"] = np.full(len(ranges), time_s)
         if intensities is not None:
             scans["intensities"] = np.asarray(intensities, float)
         with naming(f"{self.path}: placement {placement}"):
-            scans = read.check_scans(scans | {"placement": np.full(len(ranges), placement)})
+            scans = read.check_scans(scans)
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError(
                     "the bearings differ from those of the sweeps before: one grid a session"
@@ -197,17 +219,23 @@ class SessionWriter:
         self._write(f"lrf/part_{self.parts:06d}.npz", scans)
         self._note_placement(placement)
 
-    def add_telegrams(self, placement, telegrams, pitch=math.nan, time_s=math.nan):
+    def add_telegrams(
+        self,
+        placement: int,
+        telegrams: Sequence[bytes],
+        pitch: ArrayLike = math.nan,
+        time_s: ArrayLike = math.nan,
+    ) -> None:
         """Append telegrams as the device sent them.
 
         Parameters
         ----------
-        placement : int
+        placement
             -1 for none: replies that are no scans, scans between the sweeps.
-        telegrams : sequence of bytes
+        telegrams
             Whole telegrams in the order they came, also damaged ones.
-        pitch, time_s : float or array_like, shape (len(telegrams),)
-            Radians, seconds.
+        pitch, time_s
+            Radians and seconds; of all, or of each, shape (len(telegrams),).
 
         Raises
         ------
@@ -237,19 +265,40 @@ class SessionWriter:
         self._append_rows("lrf/index.csv", rows)
 
     def add_image(
-        self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"
-    ):
-        """Append an image: a PNG or JPEG file or its bytes, kept as they are, or blue-green-red
-        pixels (h, w, 3).
+        self,
+        camera: str,
+        image: str | os.PathLike | bytes | np.ndarray,
+        placement: int = -1,
+        *,
+        pitch: float = math.nan,
+        time_s: float = math.nan,
+        purpose: str = "board",
+    ) -> None:
+        """Append an image.
 
-        The placement is -1 for none, pitch in radians, purpose one of 'board', 'intrinsics',
-        'scene'. SessionError for an unknown camera or purpose, or an image of another size than the
-        camera's.
+        Parameters
+        ----------
+        camera
+        image
+            A PNG or JPEG file or its bytes, kept as they are, or blue-green-red pixels (h, w, 3).
+        placement
+            -1 for none.
+        pitch
+            Of the platform, radians.
+        time_s
+            Seconds.
+        purpose
+            'board', 'intrinsics' or 'scene'.
+
+        Raises
+        ------
+        SessionError
+            For an unknown camera or purpose, or an image of another size than the camera's.
         """
         if camera not in self.cameras or purpose not in read.PURPOSES:
             known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
             raise SessionError(f"{self.path}: camera '{camera}', purpose '{purpose}': {known}")
-        what = f"camera '{camera}'"
+        what: str | os.PathLike = f"camera '{camera}'"
         if isinstance(image, np.ndarray):
             content = cv2.imencode(".png", image)[1].tobytes()
         elif isinstance(image, bytes):
@@ -268,11 +317,19 @@ class SessionWriter:
         self._append_rows("images.csv", [row])
 
 
-def finish(path):
-    """Complete a session whose recording was interrupted: one scans.npz out of its sweeps, whole
-    rows in its tables.
+def finish(path: str | os.PathLike) -> None:
+    """Complete a session whose recording was interrupted.
 
-    SessionError if there is no sweep, or one of them is damaged, or somebody records this session.
+    One scans.npz out of its sweeps, whole rows in its tables.
+
+    Parameters
+    ----------
+    path
+
+    Raises
+    ------
+    SessionError
+        If there is no sweep, or one of them is damaged, or somebody records this session.
     """
     try:
         with alone(path):
@@ -330,9 +387,16 @@ def number_cell(placement):
     return "" if placement < 0 else str(placement)
 
 
-def write_file(file, content, within):
-    """Write a file of a session (text or arrays, say) under another name, fsync, rename: it is
-    whole or not there.
+def write_file(file: Path, content: str | bytes | dict, within: str | os.PathLike) -> None:
+    """Write a file of a session under another name, fsync, rename: it is whole or not there.
+
+    Parameters
+    ----------
+    file
+    content
+        Text, bytes, or arrays by name.
+    within
+        The session's folder.
     """
     draft = stated.checked(file, within).with_name(file.name + ".draft")
     draft.unlink(missing_ok=True)
@@ -352,12 +416,12 @@ def write_file(file, content, within):
 
 
 @contextlib.contextmanager
-def whole(path):
+def whole(path: str | os.PathLike) -> Iterator[Path]:
     """Let a file that is no session's be written whole, or not at all.
 
     Parameters
     ----------
-    path : path-like
+    path
         Its folder is made where there is none.
 
     Yields
@@ -385,7 +449,7 @@ def whole(path):
         raise ValueError(f"{path}: {not_written(error)}, or name another folder") from error
 
 
-def not_written(error):
+def not_written(error: OSError) -> str:
     """Why an OSError kept something from being written, and what to do; half a sentence."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     remedy = "free some space" if full else "check the disk and its permissions"
@@ -409,158 +473,3 @@ def append_file(file, content, within):
                 os.ftruncate(handle, begin)  # half a row would spoil the next one
             raise
     return begin
-
-
-class SessionRecorder(SessionWriter):
-    """A :class:`SessionWriter` for recordings that may be interrupted and go on later (`resume`).
-
-    While a session is recorded, session.json has the key ``unfinished``: the placement that was
-    begun. The placement joins ``placements`` when it is finished, in one renaming of session.json;
-    until then every reader leaves it out. Going on, or dropping a placement, marks what was
-    recorded of it: its rows of index.csv lose their placement, its images get the purpose
-    'dropped'. No telegram and no image is deleted. SessionError if there is a session already, or
-    one that states another board or rig, where it goes on.
-    """
-
-    @property
-    def finished(self):
-        """Numbers of the finished placements."""
-        return tuple(self.data["placements"])
-
-    def __init__(self, *rig, resume=False, **about):
-        self._resume = resume
-        super().__init__(*rig, **about)
-
-    def _create(self):
-        if self._resume and os.path.lexists(self.path / "session.json"):
-            self._go_on()
-        elif set(os.listdir(self.path)) - {"session.json.draft", LOCK}:
-            hint = (
-                "choose another name"
-                if self._resume
-                else "record with --resume to go on with it, or choose another"
-            )
-            raise SessionError(f"{self.path}: exists already; {hint}")
-        else:  # session.json comes first, so that a recording killed at once can go on
-            self._state(unfinished=[])
-        self._make_folders()
-        self._begin_table("platform.csv", read.PLATFORM_COLUMNS)
-
-    def _go_on(self):
-        """Take over what an earlier recording wrote, without the placement that it did
-        not finish.
-        """
-        mine = json.loads(json.dumps(self.data))
-        data = stated.read_json(self.path / "session.json", self.path)
-        with naming(self.path / "session.json"):
-            known = stated.parse_session(data)
-            for key in ("board", "rig"):
-                if data[key] != mine[key]:
-                    where = _first_difference(data[key], mine[key], key)
-                    remedy = "go on with the same rig file, or begin another one"
-                    raise ValueError(f"{where}, unlike the rig now: {remedy}")
-        self.data = dict(data)
-        self.data["placements"] = list(known["placements"])
-        self.data["unfinished"] = list(known["unfinished"] or ())
-        self._make_folders()
-        mend_tables(self.path)
-        for placement in self.data["unfinished"]:
-            self._mark_dropped(placement)
-        self._state(unfinished=[])
-        for camera in self.cameras:
-            numbers = [0]
-            for file in (self.path / "images" / camera).iterdir():
-                if file.suffix != ".draft" and file.stem.isdecimal():
-                    numbers.append(int(file.stem))
-            self.shots[camera] = max(numbers)
-
-    def begin_placement(self, placement):
-        """State that a placement is being recorded from now on; one that was broken off is dropped.
-
-        SessionError if it was recorded already.
-        """
-        for other in self.data["unfinished"]:
-            self.drop_placement(other)
-        if placement in self.finished or placement < 0:
-            raise SessionError(
-                f"{self.path}: placement {placement} cannot be begun; recorded: "
-                f"{short(self.finished)}"
-            )
-        self._state(unfinished=[int(placement)])
-
-    def finish_placement(self):
-        """State that the placement begun last is complete; from now on it is part of the
-        session.
-        """
-        self._state(placements=sorted([*self.finished, *self.data["unfinished"]]), unfinished=[])
-
-    def drop_placement(self, placement):
-        """Take a placement, finished or not, out of the session; its number can be recorded again.
-
-        SessionError if there is no such placement.
-        """
-        if placement not in {*self.finished, *self.data["unfinished"]}:
-            raise SessionError(
-                f"{self.path}: no placement {placement} to drop; recorded: {short(self.finished)}"
-            )
-        self._state(placements=[p for p in self.finished if p != placement], unfinished=[placement])
-        self._mark_dropped(placement)
-        self._state(unfinished=[])
-
-    def add_platform(self, rows):
-        """Append to the log of the platform: host time (s), commanded and measured pitch (rad), NaN
-        where unknown.
-        """
-        cells = []
-        for time_s, commanded, measured in rows:
-            angles = [cell(math.degrees(angle)) for angle in (commanded, measured)]
-            cells.append([cell(time_s), *angles])
-        self._append_rows("platform.csv", cells)
-
-    def finish(self):
-        """Close the recording: nothing can be half done in it any more."""
-        for placement in self.data["unfinished"]:
-            self.drop_placement(placement)
-        del self.data["unfinished"]
-        self._state()
-        self.close()
-
-    def __exit__(self, kind, error, trace):
-        """A recording ends by :meth:`finish`; after anything else it may go on."""
-        self.close()
-
-    def shots_of(self, purpose):
-        """Numbers of images of a purpose, a dict by camera."""
-        counts = dict.fromkeys(self.cameras, 0)
-        if not counts:
-            return counts
-        for row in read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0]:
-            if row["camera"] in counts and row["purpose"] == purpose:
-                counts[row["camera"]] += 1
-        return counts
-
-    def _note_placement(self, placement):
-        if placement not in (-1, *self.data["unfinished"]):
-            raise SessionError(f"{self.path}: placement {placement} was not begun")
-
-    def _mark_dropped(self, placement):
-        self._mark_rows("lrf/index.csv", INDEX_COLUMNS, placement, {"placement": ""})
-        self._mark_rows("images.csv", read.IMAGE_COLUMNS, placement, {"purpose": read.DROPPED})
-
-    def _mark_rows(self, name, columns, placement, mark):
-        """Write other values into the rows of a placement in a table, if there is one."""
-        if not os.path.lexists(self.path / name):
-            return
-        rows = read_table(self.path / name, columns, self.path)[0]
-        for row in rows:
-            if row["placement"] == str(placement):
-                row.update(mark)
-        self._write(name, as_lines([columns, *(row.values() for row in rows)]))
-
-
-def _first_difference(old, new, where):
-    """Which value of session.json differs, as text."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        key = next(k for k in [*old, *new] if old.get(k, ...) != new.get(k, ...))
-        return _first_difference(old.get(key), new.get(key), f"{where}.{key}")
-    return f"{where} is {old!r}, not {new!r}"

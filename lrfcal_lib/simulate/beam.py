@@ -1,16 +1,17 @@
 """A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes."""
 
 import math
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt
 from pydantic.dataclasses import dataclass
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.session.lms2xx_codec import MODES, REASONS, encode_values
 from lrfcal_lib.session.stated import LrfInfo
-from lrfcal_lib.simulate.scene import need
+from lrfcal_lib.simulate.scene import World, need
 
 NOT_VALID, DAZZLED, WEAK = (REASONS.index(words) for words in ("not valid", "dazzled", "noise"))
 # deg, 1/100 deg: of telegram 0x3B
@@ -67,31 +68,40 @@ class Beam:
         need(abs(self.systematic) <= bound, f"{offset} is beyond the maker's {bound} m")
 
     @property
-    def rays(self):
+    def rays(self) -> int:
         """Sub-rays of one spot."""
         return 1 + 3 * self.rings * (self.rings + 1)
 
     @property
-    def turns(self):
+    def turns(self) -> int:
         """Mirror turns of one whole scan."""
         return 100 // self.resolution
 
-    def bearings(self):
-        """Bearings of a whole scan, shape (B,), radians.
+    def bearings(self) -> np.ndarray:
+        """Bearings of a whole scan, radians.
 
-        0 right, pi/2 ahead (40 to 140 deg for 100 deg variants).
+        Returns
+        -------
+        ndarray, shape (B,)
+            0 right, pi/2 ahead (40 to 140 deg for 100 deg variants).
         """
         count = self.field_of_view * 100 // self.resolution + 1
         first = 90 - self.field_of_view / 2
         return np.radians(first + np.arange(count) * self.resolution / 100)
 
     @property
-    def unit_name(self):
+    def unit_name(self) -> str:
         """'mm' or 'cm'."""
         return UNITS[self.unit]
 
-    def info(self, made):
-        """What a session states of it, an LrfInfo; `made` is how ('simulated')."""
+    def info(self, made: str) -> LrfInfo:
+        """What a session states of it.
+
+        Parameters
+        ----------
+        made
+            How: 'simulated'.
+        """
         return LrfInfo(
             f"{self.name} ({made})",
             tuple(self.bearings()[[0, -1]].tolist()),
@@ -107,11 +117,19 @@ class Beam:
 LMS221 = Beam()
 
 
-def spot_pattern(rings):
-    """Points (K, 2) that stand for equal parts of the unit disc: one in the middle, 6 k on ring k.
+def spot_pattern(rings: int) -> np.ndarray:
+    """Points that stand for equal parts of the unit disc: one in the middle, 6 k on ring k.
 
     Turning the pattern by 60 deg changes nothing: its centre and its moments of inertia are those
     of the disc.
+
+    Parameters
+    ----------
+    rings
+
+    Returns
+    -------
+    ndarray, shape (K, 2)
     """
     count = np.r_[1, 6 * np.arange(1, rings + 1)]
     inside = np.cumsum(count)
@@ -122,47 +140,78 @@ def spot_pattern(rings):
     return np.repeat(radius, count)[:, None] * unit
 
 
-def echo(beam, distance, energy):
-    """Readings (n,), NaN without an echo, and whole energies (n,) out of sub-rays (n, K) of spots.
+def echo(beam: Beam, distance: np.ndarray, energy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Readings out of sub-rays.
 
     Surfaces within one pulse length of the nearest one blend into its reading, weighted by energy
     (a mixed pixel); what is farther makes an echo of its own. The first echo above both thresholds
     is the reading.
+
+    Parameters
+    ----------
+    beam
+    distance
+        Of the sub-rays of spots, metres, inf where they end nowhere, shape (n, K).
+    energy
+        That they bring back, shape (n, K).
+
+    Returns
+    -------
+    reading, total : ndarray, shape (n,)
+        Metres, NaN without an echo; the whole energy.
     """
     left = np.where(np.isfinite(distance), distance, np.inf)
-    best = np.zeros(len(distance))
-    echoes = []
+    places = []
+    strengths = []
     while np.isfinite(left).any():
         near = left.min(axis=1)
-        within = left <= near[:, None] + beam.pulse
-        group = np.isfinite(left) & within
+        group = np.isfinite(left) & (left <= near[:, None] + beam.pulse)
         part = np.where(group, energy, 0.0)
         strength = part.sum(axis=1)
         mean = np.sum(part * np.where(group, distance, 0.0), axis=1)
         place = np.full(len(near), np.nan)
         np.divide(mean, strength, out=place, where=strength > 0)
-        echoes.append((place, strength))
-        best = np.maximum(best, strength)
+        places.append(place)
+        strengths.append(strength)
         left = np.where(group, np.inf, left)
-    reading = np.full(len(distance), np.nan)
+    best = np.max(strengths, axis=0, initial=0.0)
     threshold = np.maximum(beam.least_energy, beam.least_share * best)
-    total = np.zeros(len(distance))
-    for _, strength in echoes:
-        total = total + strength
-    for place, strength in reversed(echoes):  # the first one that is good comes last
+    reading = np.full(len(distance), np.nan)
+    for place, strength in zip(reversed(places), reversed(strengths), strict=True):
         good = (strength >= threshold) & np.isfinite(place)
-        reading = np.where(good, place, reading)
-    return reading, total
+        reading = np.where(good, place, reading)  # the first one that is good comes last
+    return reading, sum(strengths, np.zeros(len(distance)))
 
 
-def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
-    """Readings without noise, offset and rounding, of beams at bearings and pitch (n,), radians.
+class Readings(NamedTuple):
+    """Of beams, without noise, offset and rounding: metres (NaN without an echo), energy, light."""
+
+    reading: np.ndarray
+    total: np.ndarray
+    dazzled: np.ndarray
+
+
+def ideal_readings(
+    beam: Beam,
+    world: World,
+    bearings: np.ndarray,
+    pitch: np.ndarray,
+    T_head_lrf: RigidTransform,
+) -> Readings:
+    """Readings without noise, offset and rounding.
+
+    Parameters
+    ----------
+    beam
+    world
+    bearings, pitch
+        Of the beams, radians, shape (n,).
+    T_head_lrf
 
     Returns
     -------
-    reading, total : ndarray, shape (n,)
-        Metres, NaN without an echo; returned energy.
-    dazzled : ndarray of bool, shape (n,)
+    Readings
+        Of shape (n,).
 
     Notes
     -----
@@ -170,6 +219,27 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
     cosine of incidence over squared distance (a Lambertian surface). The nearer part of a spot on a
     slanted plane is therefore brighter: at 45 deg the reading is 0.09 mm short.
     """
+    origins, directions = _sub_rays(beam, bearings)
+    rotation = T_head_lrf.rotation.as_matrix().T
+    origins = tilt(origins @ rotation + T_head_lrf.translation, pitch[:, None]).reshape(-1, 3)
+    directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
+    hits = world.cast(origins, directions)
+    seen = hits.face >= 0
+    distance = hits.distance[seen]
+    points = origins[seen] + distance[:, None] * directions[seen]
+    normals = world.normals[hits.face[seen]]
+    cosine = np.abs(np.sum(normals * directions[seen], axis=1))
+    albedo = world.infrared(points, hits.thing[seen])
+    energy = np.zeros(len(seen))
+    energy[seen] = albedo * cosine / distance**2 / beam.rays
+    shape = len(bearings), beam.rays
+    reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
+    dazzled = world.dazzling[hits.thing].reshape(shape).any(axis=1)
+    return Readings(reading, total, dazzled)
+
+
+def _sub_rays(beam, bearings):
+    """Origins and unit directions of the sub-rays of spots in the LRF frame, shape (n, K, 3)."""
     c = np.cos(bearings)
     s = np.sin(bearings)
     zero = np.zeros_like(c)
@@ -180,38 +250,56 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
     middle = np.stack([c, s, zero], axis=-1)
     directions = middle[:, None] + beam.divergence / 2 * shift
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    rotation = T_head_lrf.rotation.as_matrix().T
-    origins = beam.spot_exit / 2 * shift @ rotation + T_head_lrf.translation
-    origins = tilt(origins, pitch[:, None]).reshape(-1, 3)
-    directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
-    hits = world.cast(origins, directions)
-    seen = hits.face >= 0
-    energy = np.zeros(len(seen))
-    distance = hits.distance[seen]
-    points = origins[seen] + distance[:, None] * directions[seen]
-    normals = world.normals[hits.face[seen]]
-    cosine = np.abs(np.sum(normals * directions[seen], axis=1))
-    albedo = world.infrared(points, hits.thing[seen])
-    energy[seen] = albedo * cosine / distance**2 / beam.rays
-    shape = len(bearings), beam.rays
-    reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
-    dazzled = world.dazzling[hits.thing].reshape(shape).any(axis=1)
-    return reading, total, dazzled
+    return beam.spot_exit / 2 * shift, directions
 
 
-def measured(beam, reading, total, dazzled, rng):
-    """Noisy ranges, metres, out of ideal readings, and why there is none (index into REASONS)."""
-    noise = beam.sigma_range * rng.standard_normal(reading.shape)
-    ranges = reading + beam.systematic + noise
-    without = np.where(total > 0, WEAK, NOT_VALID)
-    reasons = np.where(np.isfinite(reading), 0, without)
-    return np.clip(ranges, 0, None), np.where(dazzled, DAZZLED, reasons)
+def measured(
+    beam: Beam, ideal: Readings, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy ranges out of ideal readings.
+
+    Parameters
+    ----------
+    beam
+    ideal
+        Of shape (n,), or any other.
+    rng
+
+    Returns
+    -------
+    ranges, reasons : ndarray
+        Metres, and why there is none: index into REASONS.
+    """
+    noise = beam.sigma_range * rng.standard_normal(ideal.reading.shape)
+    ranges = ideal.reading + beam.systematic + noise
+    reasons = np.where(ideal.total > 0, WEAK, NOT_VALID)
+    reasons[np.isfinite(ideal.reading)] = 0
+    reasons[ideal.dazzled] = DAZZLED
+    return np.clip(ranges, 0, None), reasons
 
 
-def scan(beam, world, pitch, T_head_lrf, rng):
-    """Record scan lines, words (L, B) of 13 bits.
+def scan(
+    beam: Beam,
+    world: World,
+    pitch: np.ndarray,
+    T_head_lrf: RigidTransform,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Record scan lines.
 
-    `pitch` is the true one of the head, radians, in each line (L, 1) or beam (L, B).
+    Parameters
+    ----------
+    beam
+    world
+    pitch
+        The true one of the head, radians, in each line (L, 1) or beam (L, B).
+    T_head_lrf
+    rng
+
+    Returns
+    -------
+    ndarray of uint16, shape (L, B)
+        Words of 13 bits.
     """
     bearings, pitch = np.broadcast_arrays(beam.bearings(), pitch)
     shape = bearings.shape
@@ -222,6 +310,6 @@ def scan(beam, world, pitch, T_head_lrf, rng):
     for start in range(0, len(bearings), step):
         rows = slice(start, start + step)
         parts.append(ideal_readings(beam, world, bearings[rows], pitch[rows], T_head_lrf))
-    ideal = [np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True)]
-    ranges, reasons = measured(beam, *ideal, rng)
+    ideal = Readings(*(np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True)))
+    ranges, reasons = measured(beam, ideal, rng)
     return encode_values(ranges, unit=beam.unit_name, reasons=reasons)

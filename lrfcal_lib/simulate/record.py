@@ -21,8 +21,15 @@ from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.session.write import SessionWriter, write_file
 from lrfcal_lib.simulate.beam import scan
-from lrfcal_lib.simulate.rig import held_close, placements_of, random
-from lrfcal_lib.simulate.scene import Imager, board_on_stand, furnished, furnished_room, need
+from lrfcal_lib.simulate.rig import Placement, Setup, held_close, placements_of, random
+from lrfcal_lib.simulate.scene import (
+    Imager,
+    World,
+    board_on_stand,
+    furnished,
+    furnished_room,
+    need,
+)
 
 LICENCE = "CC-BY-4.0"
 RECORDING = (
@@ -57,10 +64,16 @@ class Shots(NamedTuple):
     key: tuple
 
 
-def world_of(setup, T_platform_board, stand=True):
-    """The room with the board on its stand (or held by nothing).
+def world_of(setup: Setup, T_platform_board: RigidTransform | None, stand: bool = True) -> World:
+    """The room with the board in it.
 
-    With a laid table where the pose is None.
+    Parameters
+    ----------
+    setup
+    T_platform_board
+        None for a laid table instead of the board.
+    stand
+        Whether the board is on its stand, or held by nothing.
     """
     if T_platform_board is None:
         return furnished_room(*furnished("still life"))
@@ -76,16 +89,23 @@ def step_angles(first, last, step):
     return angles if last >= first else angles[::-1]
 
 
-def stops_of(setup, placement):
-    """Where the head stands for the images and for the scan lines of a placement, two Stops."""
+def stops_of(setup: Setup, placement: Placement) -> tuple[Stops, Stops]:
+    """Where the head stands for the images and for the scan lines of a placement.
+
+    Parameters
+    ----------
+    setup
+    placement
+    """
     step = setup.step if placement.T_platform_board is not None else setup.room_sweep[2]
     rng = random(setup, STOPS, placement.number)
-    stops = []
-    for commanded in (np.asarray(placement.image_pitch), step_angles(*placement.sweep, step)):
-        stops.append(
-            Stops(commanded, *setup.rig.platform.stop(commanded, placement.direction, rng))
-        )
-    return tuple(stops)
+    images = np.asarray(placement.image_pitch)
+    lines = step_angles(*placement.sweep, step)
+    stop = setup.rig.platform.stop
+    return (
+        Stops(images, *stop(images, placement.direction, rng)),
+        Stops(lines, *stop(lines, placement.direction, rng)),
+    )
 
 
 def sweep_of(setup, placement):
@@ -101,8 +121,15 @@ def sweep_of(setup, placement):
     )
 
 
-def close_views(setup, number):
-    """Poses ``T_platform_board`` of the board held close to a camera while the head is at 0."""
+def close_views(setup: Setup, number: int) -> list[RigidTransform]:
+    """Poses ``T_platform_board`` of the board held close to a camera while the head is at 0.
+
+    Parameters
+    ----------
+    setup
+    number
+        Of the camera in the rig.
+    """
     rig = setup.rig
     camera = setup.rig.cameras[number]
     still = rig.camera_pose(camera, 0.0).inv()
@@ -151,8 +178,15 @@ def photograph(setup, shots):
     ]
 
 
-def simulate(path, setup, workers=1):
-    """Simulate a recording and write its session into a new folder; `workers` render images.
+def simulate(path: str | os.PathLike, setup: Setup, workers: int = 1) -> None:
+    """Simulate a recording and write its session into a new folder.
+
+    Parameters
+    ----------
+    path
+    setup
+    workers
+        Processes that render images.
 
     Raises
     ------

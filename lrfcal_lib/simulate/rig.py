@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 import pydantic
+from numpy.typing import ArrayLike
 from pydantic import Field, InstanceOf, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -50,10 +51,25 @@ class Platform:
     # least and greatest pitch, radians
     limits: tuple[float, float] = (-math.radians(60), math.radians(60))
 
-    def stop(self, commanded, direction, rng):
-        """True and measured pitch (n,) at rest at commanded angles, from below (+1) or above.
+    def stop(
+        self, commanded: ArrayLike, direction: float, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where the head comes to rest.
 
         The encoder sits on the motor: it sees neither backlash nor stretch.
+
+        Parameters
+        ----------
+        commanded
+            Pitch, radians, shape (n,).
+        direction
+            From below (+1) or from above (-1).
+        rng
+
+        Returns
+        -------
+        true, measured : ndarray, shape (n,)
+            Pitch, radians.
         """
         commanded = np.asarray(commanded, float)
         step = self.encoder_step
@@ -65,8 +81,18 @@ class Platform:
             return head, np.rint(motor / step) * step
         return head, motor
 
-    def check(self, pitch):
-        """Refuse angles beyond the limits."""
+    def check(self, pitch: np.ndarray) -> None:
+        """Refuse angles beyond the limits.
+
+        Parameters
+        ----------
+        pitch
+            Radians, shape (n,).
+
+        Raises
+        ------
+        ValueError
+        """
         low = min(pitch, default=0.0)
         high = max(pitch, default=0.0)
         first, last = np.round(np.degrees([low, high]), 2)
@@ -103,22 +129,29 @@ class Rig:
     # how well the stated transform is said to be known: direction (radians) and offset (metres)
     stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
-    def camera_pose(self, camera, pitch):
-        """``T_camera_platform`` of a RigCamera at a true pitch of the head, or at many, radians."""
+    def camera_pose(self, camera: RigCamera, pitch: ArrayLike) -> RigidTransform:
+        """``T_camera_platform`` of a camera.
+
+        Parameters
+        ----------
+        camera
+        pitch
+            True one of the head, or many, radians.
+        """
         back = RigidTransform.from_rotation(
             Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0]))
         )
         return camera.mounting * self.T_head_lrf.inv() * back
 
-    def camera_infos(self):
-        """What a session states of the cameras, a list of CameraInfo."""
+    def camera_infos(self) -> list[CameraInfo]:
+        """What a session states of the cameras."""
         return [
             CameraInfo(c.name, "head", c.model.width, c.model.height, None, c.guess)
             for c in self.cameras
         ]
 
-    def truth(self):
-        """Mountings, intrinsics and board as only the simulator knows them, as JSON."""
+    def truth(self) -> dict:
+        """Mountings, intrinsics and board as only the simulator knows them, as JSON has them."""
         cameras = {
             c.name: {
                 "T_camera_lrf": transform_to_json(c.mounting),
@@ -180,12 +213,12 @@ class Setup:
     step: PositiveFloat = math.radians(0.25)  # between the stops of a sweep, radians
     intrinsics_views: NonNegativeInt = 20  # images of the board held close, a camera
     # first pitch, last pitch and step of the sweep of the room, radians; empty for none
-    room_sweep: tuple[float, float, float] | tuple[()] = ()
+    room_sweep: tuple[float, ...] = ()
     room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
     quality: Annotated[int, Field(ge=1, le=100)] = 95  # of JPEG
 
 
-def printed_triangle():
+def printed_triangle() -> Board:
     """The paper's triangle (315 and 380 mm, a right angle) with 4 x 5 inner corners beside it."""
     return triangle_board(
         name="triangle_315_380", pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))
@@ -195,10 +228,17 @@ def printed_triangle():
 SETUPS = json.loads(Path(__file__).with_name("setups.json").read_text())
 
 
-def load_setup(name):
-    """A Setup of ``setups.json``; what it does not say is taken from the one that it is like.
+def load_setup(name: str) -> Setup:
+    """A set-up of ``setups.json``; what it does not say is taken from the one that it is like.
 
-    ValueError for a name that is not there.
+    Parameters
+    ----------
+    name
+
+    Raises
+    ------
+    ValueError
+        For a name that is not there.
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
     row = _radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
@@ -221,13 +261,13 @@ def load_setup(name):
         guess = RigidTransform.from_components(
             mounting.translation + np.array(c["guess"]["shift"]), off
         )
-        size = (round(v * scale) for v in c["size"])
-        pinhole = (v * scale for v in c["pinhole"])
-        model = CameraModel(*size, *pinhole, np.array(c["distortion"]))
+        width, height = (round(v * scale) for v in c["size"])
+        fx, fy, cx, cy = (v * scale for v in c["pinhole"])
+        model = CameraModel(width, height, fx, fy, cx, cy, np.array(c["distortion"]))
         cameras.append(
             RigCamera(camera, model, mounting, guess, exposure=Exposure(**c["exposure"]))
         )
-    heads = (
+    head, head_stated = (
         RigidTransform.from_components(
             row[k]["shift"], Rotation.from_rotvec(row[k]["turn"], degrees=True)
         )
@@ -235,7 +275,7 @@ def load_setup(name):
     )
     beam = replace(LMS221, **row["beam"])
     platform = Platform(**_radians(row["platform"]))
-    rig = Rig(beam, platform, *heads, tuple(cameras), printed_triangle())
+    rig = Rig(beam, platform, head, head_stated, tuple(cameras), printed_triangle())
     return Setup(name, rig=rig, **{k: row[k] for k in names})
 
 
@@ -268,17 +308,23 @@ class Placement:
         return 1 if self.sweep[1] >= self.sweep[0] else -1
 
 
-def random(setup, *key):
+def random(setup: Setup, *key: int) -> np.random.Generator:
     """Random numbers that depend on a setup's seed and a key, whatever else is simulated."""
     return np.random.default_rng([setup.seed, *key])
 
 
-def placements_of(setup):
-    """The placements of a setup, a list: those of the board, then a sweep of the room if any."""
+def placements_of(setup: Setup) -> list[Placement]:
+    """The placements of a setup: those of the board, then a sweep of the room if there is any.
+
+    Parameters
+    ----------
+    setup
+    """
     out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
     if setup.room_sweep:
         number = 2 * setup.pairs + 1
-        out.append(Placement(number, None, setup.room_sweep[:2], setup.room_images))
+        first, last, _ = setup.room_sweep
+        out.append(Placement(number, None, (first, last), setup.room_images))
     return out
 
 
@@ -298,14 +344,33 @@ def check_size(rig, nearest):
         need(angle <= 0.9 * view, f"{large}, but {seen}")
 
 
-def pairs(rig, count, distances, rng, margin=OUTSIDE):
+def pairs(
+    rig: Rig,
+    count: int,
+    distances: tuple[float, float],
+    rng: np.random.Generator,
+    margin: float = OUTSIDE,
+) -> list[Placement]:
     """Placements in pairs: at one place, turned by about a right angle and tilted otherwise.
 
-    Boards stand at `distances` (least and greatest, metres) from the platform; a sweep begins and
-    ends `margin` (radians) outside of them. Placements are numbered from 1. The first of each pair
-    has images at three pitch angles, the second at one. Sweeps go upwards at odd placements and
-    downwards at even ones. ValueError if the board does not fit into a view, or no place is found
-    that everything sees.
+    Placements are numbered from 1. The first of each pair has images at three pitch angles, the
+    second at one. Sweeps go upwards at odd placements and downwards at even ones.
+
+    Parameters
+    ----------
+    rig
+    count
+        Of pairs.
+    distances
+        Least and greatest of the boards from the platform, metres.
+    rng
+    margin
+        By which a sweep begins and ends outside of the board, radians.
+
+    Raises
+    ------
+    ValueError
+        If the board does not fit into a view, or no place is found that everything sees.
     """
     asked = f"{count} pairs at {distances} m"
     need(
@@ -377,11 +442,28 @@ def _spans(rig, pose, margin):
     return sweep, (seen[0], seen[-1])
 
 
-def held_close(rig, camera, count, rng):
-    """Poses ``T_camera_board`` of the board held in front of a RigCamera, tilted every way, a list.
+def held_close(
+    rig: Rig, camera: RigCamera, count: int, rng: np.random.Generator
+) -> list[RigidTransform]:
+    """Poses of the board held in front of a camera, tilted every way.
 
-    The whole pattern is inside the image, spread over all of it by the poses together; ValueError
-    if it does not fit.
+    Parameters
+    ----------
+    rig
+    camera
+    count
+    rng
+
+    Returns
+    -------
+    list of RigidTransform
+        ``T_camera_board``: the whole pattern is inside the image, spread over all of it by the
+        poses together.
+
+    Raises
+    ------
+    ValueError
+        If it does not fit, or the board has no pattern.
     """
     m = camera.model
     pattern = rig.board.pattern

@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 import open3d as o3d
 import pydantic
+from numpy.typing import ArrayLike
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -26,28 +27,47 @@ FLOOR = -1.1  # metres, below the platform
 SKY = (0.95, 0.98, 1.0)  # light from where there is nothing
 FLAT = 0.03  # difference of light over a block of pixels below which its four corners tell the rest
 BLOCK = 2  # pixels
+Mesh = tuple[np.ndarray, np.ndarray]  # vertices (n, 3), metres, and faces (m, 3)
 BATCH = 1 << 19  # rays that are cast at once
 # random values that textures are made of
 LATTICE = np.random.default_rng(20091001).random((64,) * 3)
 ROOM = json.loads(Path(__file__).with_name("room.json").read_text())
 
 
-def need(good, words):
-    """A ValueError in these words, unless a setting is good."""
+def need(good: object, words: str) -> None:
+    """A ValueError in these words, unless a setting is good.
+
+    Parameters
+    ----------
+    good
+    words
+    """
     if not good:
         raise ValueError(words)
 
 
-def polygon(corners):
-    """A flat convex sheet of no thickness in the plane z = 0."""
+def polygon(corners: ArrayLike) -> Mesh:
+    """A flat convex sheet of no thickness in the plane z = 0.
+
+    Parameters
+    ----------
+    corners
+        Shape (n, 2), metres.
+    """
     corners = np.asarray(corners, float)
     fan = np.arange(1, len(corners) - 1)
     faces = np.stack([0 * fan, fan, fan + 1], axis=1)
     return np.column_stack([corners, np.zeros(len(corners))]), faces
 
 
-def rectangle(width, height):
-    """A sheet about the origin in the plane z = 0."""
+def rectangle(width: float, height: float) -> Mesh:
+    """A sheet about the origin in the plane z = 0.
+
+    Parameters
+    ----------
+    width, height
+        Along x and y, metres.
+    """
     w = width / 2
     h = height / 2
     return polygon([[-w, -h], [w, -h], [w, h], [-w, h]])
@@ -145,8 +165,26 @@ def value_noise(points, cell):
     return out
 
 
-def plain(points, color, rough=0.0, cell=0.15):
-    """One colour, with a soft variation of the share `rough`."""
+def plain(
+    points: np.ndarray, color: ArrayLike, rough: float = 0.0, cell: float = 0.15
+) -> np.ndarray:
+    """One colour, with a soft variation.
+
+    Parameters
+    ----------
+    points
+        Shape (n, 3), metres.
+    color
+        Albedo, shape (3,).
+    rough
+        Share of the variation.
+    cell
+        Its size, metres.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+    """
     if not rough:
         return np.broadcast_to(np.asarray(color, float), points.shape)
     return np.asarray(color, float) * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
@@ -196,7 +234,12 @@ def printed_page(points, width, height, heading=0.1, line=0.0055):
     grey = np.where(ink, 0.12, 0.86)
     picture = between(x, 0.52, 0.88) & between(y, 0.55, 0.8)
     grey = np.where(picture, 0.25 + 0.5 * value_noise(points, 0.02), grey)
-    return np.repeat(grey[:, None], 3, axis=1)
+    return _grey(grey)
+
+
+def _grey(levels):
+    """Levels (n,) as colours (n, 3)."""
+    return np.repeat(levels[:, None], 3, axis=1)
 
 
 def between(values, low, high):
@@ -249,7 +292,7 @@ def chessboard(points, board, dark, light, ring=0.5):
         inside = np.all((at > -ring) & (at < last + ring), axis=1)
         even = np.floor(at).astype(int).sum(axis=1) % 2 == 0
         grey[inside & even] = light
-    return np.repeat(grey[:, None], 3, axis=1)
+    return _grey(grey)
 
 
 TEXTURES = {
@@ -261,7 +304,7 @@ TEXTURES = {
 class Thing:
     """A mesh with what its surface does with light."""
 
-    mesh: tuple  # vertices (n, 3) in the thing's own frame, metres, and faces (m, 3)
+    mesh: Mesh  # in the thing's own frame
     # function of points (n, 3) in the thing's frame and settings to albedo (n, 3), then the
     # settings
     texture: tuple
@@ -323,8 +366,14 @@ class World:
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(vertices.astype(np.float32), faces[whole].astype(np.uint32))
 
-    def cast(self, origins, directions):
-        """Follow rays (n, 3), unit directions in the platform frame, to the first surface."""
+    def cast(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
+        """Follow rays to the first surface.
+
+        Parameters
+        ----------
+        origins, directions
+            Metres and unit vectors in the platform frame, shape (n, 3).
+        """
         origins = np.asarray(origins, float)
         directions = np.asarray(directions, float)
         origins, directions = np.broadcast_arrays(origins, directions)
@@ -338,8 +387,8 @@ class World:
         distance[seen] = height / np.einsum("ni,ni->n", normal, directions[seen])
         return Hits(distance, face, np.where(seen, self.thing_of[face], -1))
 
-    def albedo(self, points, thing):
-        """Albedo of points on things of these numbers, shape (n, 3)."""
+    def albedo(self, points: np.ndarray, thing: np.ndarray) -> np.ndarray:
+        """Albedo (n, 3) of points (n, 3) on things of these numbers (n,)."""
         out = np.zeros((len(points), 3))
         order = np.argsort(thing, kind="stable")
         numbers, starts = np.unique(thing[order], return_index=True)
@@ -349,19 +398,42 @@ class World:
             out[rows] = texture(item.pose.inv().apply(points[rows]), *settings)
         return out
 
-    def infrared(self, points, thing):
-        """Reflectivity of surface points for the LRF, shape (n,)."""
+    def infrared(self, points: np.ndarray, thing: np.ndarray) -> np.ndarray:
+        """Reflectivity of surface points for the LRF.
+
+        Parameters
+        ----------
+        points
+            In the platform frame, metres, shape (n, 3).
+        thing
+            Numbers of the things that they are on, shape (n,).
+
+        Returns
+        -------
+        ndarray, shape (n,)
+        """
         stated = np.array([t.infrared for t in self.things], float)  # NaN for None
         out = stated[thing]
         ask = np.isnan(out)
         out[ask] = self.albedo(points[ask], thing[ask])[:, 0]
         return out
 
-    def radiance(self, origins, directions, hits):
-        """Light that comes back along rays, linear, shape (n, 3).
+    def radiance(self, origins: np.ndarray, directions: np.ndarray, hits: Hits) -> np.ndarray:
+        """Light that comes back along rays, linear.
 
         Lambert's law for every point light, each casting hard shadows, over an even background
         light. What is seen through an opening of the room is bright sky.
+
+        Parameters
+        ----------
+        origins, directions
+            Metres and unit vectors in the platform frame, shape (n, 3).
+        hits
+            Of these rays.
+
+        Returns
+        -------
+        ndarray, shape (n, 3)
         """
         seen = hits.face >= 0
         points = origins[seen] + hits.distance[seen, None] * directions[seen]
@@ -384,7 +456,7 @@ class World:
         return out
 
 
-def furnished(*parts):
+def furnished(*parts: str) -> list[Thing]:
     """Things of parts of ``room.json``."""
     things = []
     for row in (dict(row) for part in parts for row in ROOM[part]):
@@ -397,8 +469,8 @@ def furnished(*parts):
     return things
 
 
-def furnished_room(*more):
-    """The room around the rig with further things in it, under two lamps: a World."""
+def furnished_room(*more: Thing) -> World:
+    """The room around the rig with further things in it, under two lamps."""
     parts = (
         "shell",
         "fittings",
@@ -409,7 +481,7 @@ def furnished_room(*more):
         "standing lamp",
         "small things",
     )
-    lights = Lights(*map(np.array, ROOM["lights"].values()))
+    lights = Lights(**{name: np.array(value) for name, value in ROOM["lights"].items()})
     return World([*furnished(*parts), *more], lights)
 
 
@@ -472,10 +544,23 @@ class Imager:
         lens = f"lens {model.distortion} folds the image (off by {miss:.3g} px)"
         need(miss < 1e-3, f"{lens}: weaken the distortion")
 
-    def render(self, world, T_camera_platform, rng):
-        """Take a picture of a World with lights: blue, green, red, uint8, (height, width, 3).
+    def render(
+        self, world: World, T_camera_platform: RigidTransform, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Take a picture.
 
-        `rng` places the rays in the pixels and makes the noise.
+        Parameters
+        ----------
+        world
+            With lights.
+        T_camera_platform
+        rng
+            Places the rays in the pixels and makes the noise.
+
+        Returns
+        -------
+        ndarray of uint8, shape (height, width, 3)
+            Blue, green, red.
         """
         e = self.exposure
         m = self.model

@@ -64,8 +64,8 @@ def start_states(
         possible = True
         yield states
     if not possible:
-        reasons = "; ".join(dict.fromkeys(reasons))
-        raise DegenerateGeometry(f"no start value for the joint estimate: {reasons}")
+        every = "; ".join(dict.fromkeys(reasons))
+        raise DegenerateGeometry(f"no start value for the joint estimate: {every}")
 
 
 def _states(obs, head, known):

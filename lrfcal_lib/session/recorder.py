@@ -1,0 +1,190 @@
+"""Sessions whose recording may be interrupted and go on later."""
+
+import json
+import math
+import os
+from collections.abc import Iterable
+
+from lrfcal_lib.session import read, stated
+from lrfcal_lib.session.lock import LOCK
+from lrfcal_lib.session.stated import SessionError, naming, short
+from lrfcal_lib.session.tables import read_table
+from lrfcal_lib.session.telegrams import INDEX_COLUMNS
+from lrfcal_lib.session.write import SessionWriter, as_lines, cell, mend_tables
+
+
+class SessionRecorder(SessionWriter):
+    """A :class:`SessionWriter` for recordings that may be interrupted and go on later (`resume`).
+
+    While a session is recorded, session.json has the key ``unfinished``: the placement that was
+    begun. The placement joins ``placements`` when it is finished, in one renaming of session.json;
+    until then every reader leaves it out. Going on, or dropping a placement, marks what was
+    recorded of it: its rows of index.csv lose their placement, its images get the purpose
+    'dropped'. No telegram and no image is deleted. SessionError if there is a session already, or
+    one that states another board or rig, where it goes on.
+    """
+
+    @property
+    def finished(self) -> tuple[int, ...]:
+        """Numbers of the finished placements."""
+        return tuple(self.data["placements"])
+
+    def __init__(self, *rig, resume=False, **about):
+        self._resume = resume
+        super().__init__(*rig, **about)
+
+    def _create(self):
+        if self._resume and os.path.lexists(self.path / "session.json"):
+            self._go_on()
+        elif set(os.listdir(self.path)) - {"session.json.draft", LOCK}:
+            remedy = "record with --resume to go on with it, or choose another"
+            if self._resume:
+                remedy = "choose another name"
+            self._refuse(remedy)
+        else:  # session.json comes first, so that a recording killed at once can go on
+            self._state(unfinished=[])
+        self._make_folders()
+        self._begin_table("platform.csv", read.PLATFORM_COLUMNS)
+
+    def _go_on(self):
+        """Take over what an earlier recording wrote, without the placement that it did
+        not finish.
+        """
+        mine = json.loads(json.dumps(self.data))
+        data = stated.read_json(self.path / "session.json", self.path)
+        with naming(self.path / "session.json"):
+            known = stated.parse_session(data)
+            for key in ("board", "rig"):
+                if data[key] != mine[key]:
+                    where = _first_difference(data[key], mine[key], key)
+                    remedy = "go on with the same rig file, or begin another one"
+                    raise ValueError(f"{where}, unlike the rig now: {remedy}")
+        self.data = dict(data)
+        self.data["placements"] = list(known["placements"])
+        self.data["unfinished"] = list(known["unfinished"] or ())
+        self._make_folders()
+        mend_tables(self.path)
+        for placement in self.data["unfinished"]:
+            self._mark_dropped(placement)
+        self._state(unfinished=[])
+        for camera in self.cameras:
+            numbers = [0]
+            for file in (self.path / "images" / camera).iterdir():
+                if file.suffix != ".draft" and file.stem.isdecimal():
+                    numbers.append(int(file.stem))
+            self.shots[camera] = max(numbers)
+
+    def begin_placement(self, placement: int) -> None:
+        """State that a placement is being recorded from now on; one that was broken off is dropped.
+
+        Parameters
+        ----------
+        placement
+
+        Raises
+        ------
+        SessionError
+            If it was recorded already.
+        """
+        for other in self.data["unfinished"]:
+            self.drop_placement(other)
+        if placement in self.finished or placement < 0:
+            raise SessionError(
+                f"{self.path}: placement {placement} cannot be begun; recorded: "
+                f"{short(self.finished)}"
+            )
+        self._state(unfinished=[int(placement)])
+
+    def finish_placement(self) -> None:
+        """State that the placement begun last is complete; from now on it is part of the
+        session.
+        """
+        self._state(placements=sorted([*self.finished, *self.data["unfinished"]]), unfinished=[])
+
+    def drop_placement(self, placement: int) -> None:
+        """Take a placement, finished or not, out of the session; its number can be recorded again.
+
+        Parameters
+        ----------
+        placement
+
+        Raises
+        ------
+        SessionError
+            If there is no such placement.
+        """
+        if placement not in {*self.finished, *self.data["unfinished"]}:
+            raise SessionError(
+                f"{self.path}: no placement {placement} to drop; recorded: {short(self.finished)}"
+            )
+        self._state(placements=[p for p in self.finished if p != placement], unfinished=[placement])
+        self._mark_dropped(placement)
+        self._state(unfinished=[])
+
+    def add_platform(self, rows: Iterable[tuple[float, float, float]]) -> None:
+        """Append to the log of the platform.
+
+        Parameters
+        ----------
+        rows
+            Time of this computer (s), commanded and measured pitch (rad), NaN where unknown.
+        """
+        cells = []
+        for time_s, commanded, measured in rows:
+            angles = [cell(math.degrees(angle)) for angle in (commanded, measured)]
+            cells.append([cell(time_s), *angles])
+        self._append_rows("platform.csv", cells)
+
+    def finish(self) -> None:
+        """Close the recording: nothing can be half done in it any more."""
+        for placement in self.data["unfinished"]:
+            self.drop_placement(placement)
+        del self.data["unfinished"]
+        self._state()
+        self.close()
+
+    def __exit__(self, kind, error, trace):
+        """A recording ends by :meth:`finish`; after anything else it may go on."""
+        self.close()
+
+    def shots_of(self, purpose: str) -> dict[str, int]:
+        """Numbers of images by camera.
+
+        Parameters
+        ----------
+        purpose
+            Of the images.
+        """
+        counts = dict.fromkeys(self.cameras, 0)
+        if not counts:
+            return counts
+        for row in read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0]:
+            if row["camera"] in counts and row["purpose"] == purpose:
+                counts[row["camera"]] += 1
+        return counts
+
+    def _note_placement(self, placement):
+        if placement not in (-1, *self.data["unfinished"]):
+            raise SessionError(f"{self.path}: placement {placement} was not begun")
+
+    def _mark_dropped(self, placement):
+        self._mark_rows("lrf/index.csv", INDEX_COLUMNS, placement, {"placement": ""})
+        self._mark_rows("images.csv", read.IMAGE_COLUMNS, placement, {"purpose": read.DROPPED})
+
+    def _mark_rows(self, name, columns, placement, mark):
+        """Write other values into the rows of a placement in a table, if there is one."""
+        if not os.path.lexists(self.path / name):
+            return
+        rows = read_table(self.path / name, columns, self.path)[0]
+        for row in rows:
+            if row["placement"] == str(placement):
+                row.update(mark)
+        self._write(name, as_lines([columns, *(row.values() for row in rows)]))
+
+
+def _first_difference(old, new, where):
+    """Which value of session.json differs, as text."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        key = next(k for k in [*old, *new] if old.get(k, ...) != new.get(k, ...))
+        return _first_difference(old.get(key), new.get(key), f"{where}.{key}")
+    return f"{where} is {old!r}, not {new!r}"
