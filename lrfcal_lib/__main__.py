@@ -15,7 +15,7 @@ def run(args):
         case "check":
             return check(args)
         case "calibrate":
-            from lrfcal_lib.evaluate.export import calibrate_session
+            from lrfcal_lib.report.calibrate import calibrate_session
             from lrfcal_lib.session.workers import side_by_side
 
             with side_by_side():

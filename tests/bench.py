@@ -28,8 +28,8 @@ from synthetic import camera_observations, random_board_poses, random_rig
 from telegrams import encode_scan
 
 from lrfcal_lib.calibrate.painting import Painter, View
-from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
+from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
 from lrfcal_lib.preprocess.survey import survey, views_of
 from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, split_stream
@@ -38,7 +38,7 @@ from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Unknowns, gather, move_state
 from lrfcal_lib.solvers.joint_residuals import minimum, named_blocks
-from lrfcal_lib.solvers.joint_start import start_states, thin
+from lrfcal_lib.solvers.joint_start import start_states
 
 ROOT = Path(__file__).resolve().parent.parent
 FULL = {
@@ -140,7 +140,7 @@ def with_gtsam(count):
     def error(p, values, jacobians):
         at, piece = pieces[p]
         moved = move_state(at, (values.atVector(0), values.atVector(p + 1)[None]), unknowns)
-        parts = [whiten(block) for block in named_blocks(moved, piece, unknowns).values()]
+        parts = [(b.white, b.white_jacobian) for b in named_blocks(moved, piece, unknowns).values()]
         r, J = (np.concatenate(rows, axis=1)[0] for rows in zip(*parts, strict=True))
         if jacobians is not None:
             jacobians[0], jacobians[1] = np.asfortranarray(J[:, :c]), np.asfortranarray(J[:, c:])

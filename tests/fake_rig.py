@@ -2,11 +2,12 @@
 
 import json
 import math
+from functools import reduce
 from types import SimpleNamespace
 
 import numpy as np
 
-from lrfcal_lib.drivers.lms2xx_link import Reading
+from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import rig_of
@@ -121,7 +122,7 @@ class Lrf:
             self.head.note()
         times = instant + (np.arange(BEAMS) / 360) * 0.0133
         ranges = np.full(BEAMS, 2.0 + pitch)
-        self.readings.append(Reading((telegram(pitch),), ranges, None, BEARINGS, instant, times, None, None))
+        self.readings.append(Reading((telegram(pitch),), ranges, None, BEARINGS, instant, times, -1, -1))
         return self.readings[-1]
 
     def request(self):
@@ -186,6 +187,17 @@ def rig_data(cameras=("left",), **plan):
         },
         "plan": {"pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "count": 3, **plan},
     }
+
+
+def changed(path, value, **plan):
+    """A rig file with one key changed (or removed, where the value is None)."""
+    data = rig_data(**plan)
+    *way, last = path.split(".")
+    at = reduce(dict.__getitem__, way, data)
+    at[last] = value
+    if value is None:
+        del at[last]
+    return data
 
 
 def make_rig(data=None, *, feedback=True, silent_moving=False):

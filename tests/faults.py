@@ -3,13 +3,15 @@
 from collections import Counter
 from contextlib import suppress
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import SYNC, encode_extended
-from lrfcal_lib.emulators.head import EmulatedHead
-from lrfcal_lib.emulators.lms2xx import ACK, BAUD_WORD, RESET_S, EmulatedLms
+from lrfcal_lib.emulators.head import ANSWERS, TURN_AROUND_S, EmulatedHead
+from lrfcal_lib.emulators.lms2xx import ACK, RESET_S, EmulatedLms
+from lrfcal_lib.emulators.lms2xx_memory import BAUD_WORD
 from lrfcal_lib.session import lms2xx_codec as codec
 
 DELAY_S, AWAY_S, SLIP_S, JUMP = 0.7, 0.5, 0.3, 1000  # JUMP in hundredths of a degree
@@ -138,11 +140,42 @@ class FaultyLms(FaultyLine, EmulatedLms):
 
 
 class FaultyHead(FaultyLine, EmulatedHead):
-    """A head with faults."""
+    """A head with faults, and with habits of other heads.
+
+    It confirms commands by 4 bytes, its two-wire line hands back what the host sends, it stops when no frame came for
+    `watchdog_s`, or its 'up' and positive elevation lower the view.
+    """
 
     known = HEAD
 
+    def __init__(self, *args, confirms=False, echo=False, watchdog_s=None, invert=False, **options):
+        super().__init__(*args, **options)
+        self.confirms, self.echo, self.watchdog_s, self.inverted = confirms, echo, watchdog_s, invert
+
+    def receive(self, data, at):
+        if self.echo:
+            self.write(data, at)
+        super().receive(data, at)
+
+    def turned(self, frame):
+        """A frame as a head that hangs upside down understands it."""
+        ways = frame.command2 & (pelco_d.UP | pelco_d.DOWN)
+        if frame.command2 == pelco_d.SET_TILT:
+            return replace(frame, **dict(zip(("data1", "data2"), divmod(-frame.value % pelco_d.TURN, 256), strict=True)))
+        if frame.command2 & 1 or not ways:
+            return frame
+        return replace(frame, command2=frame.command2 ^ (pelco_d.UP | pelco_d.DOWN))
+
     def obey(self, frame, at):
+        self.cancel("watchdog")
+        if self.watchdog_s:
+            self.at(at + self.watchdog_s, self.stop, "watchdog")
+        self.moved(self.turned(frame) if self.inverted else frame, at)
+        if self.confirms and frame.command2 not in ANSWERS:
+            checksum = sum(vars(frame).values()) % 256
+            self.reply(bytes([SYNC, self.habits.address, 0, checksum]), at + TURN_AROUND_S)
+
+    def moved(self, frame, at):
         moves = frame.command2 & (pelco_d.UP | pelco_d.DOWN) and not frame.command2 & 1
         head, until = self.head, self.absolute_until
         stalls = (moves or frame.command2 == pelco_d.SET_TILT) and self.hit("stall")
@@ -159,9 +192,11 @@ class FaultyHead(FaultyLine, EmulatedHead):
 
     def prepare(self, raw):
         """A reply with the faults that keep its checksum sound."""
+        if len(raw) == pelco_d.FRAME and raw[3] == pelco_d.TILT and self.inverted:
+            raw = encode_extended(raw[1], raw[3], -int.from_bytes(raw[4:6], "big") % pelco_d.TURN)
         if len(raw) == pelco_d.FRAME and raw[3] == pelco_d.TILT and self.hit("jump"):
             raw = encode_extended(raw[1], raw[3], (int.from_bytes(raw[4:6], "big") + JUMP) % pelco_d.TURN)
         if len(raw) >= pelco_d.GENERAL and raw[0] == SYNC and self.hit("address"):
             other = raw[1] % 255 + 1
             raw = bytes([SYNC, other]) + raw[2:-1] + bytes([(raw[-1] + other - raw[1]) % 256])
-        return encode_extended(self.address, 0x5D, 0x1234) + raw if self.hit("foreign") else raw
+        return encode_extended(self.habits.address, 0x5D, 0x1234) + raw if self.hit("foreign") else raw

@@ -101,7 +101,7 @@ def make_sessions(folder):
     (folder / "rig").mkdir()
     rig = rig_data(placements=[{"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}])
     rig["devices"]["head"] |= HeadSettings(degrees_per_second=4.0, repeat_s=0.5).model_dump(mode="json")
-    rig["devices"]["cameras"]["left"] |= {"exposure": 0.01, "fps": 10, "silence_s": 10}
+    rig["devices"]["cameras"]["left"] |= {"exposure": 0.01, "silence_s": 10}
     (folder / "rig" / "rig.json").write_text(json.dumps(rig))
     write_source(folder / "import", np.random.default_rng(0))
     (folder / "outside").mkdir()

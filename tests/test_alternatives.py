@@ -16,6 +16,7 @@ from lrfcal_lib.judge.alternatives import (
     alternatives_of,
     doubtful,
     not_an_offset,
+    step_not_told,
     weigh,
 )
 from lrfcal_lib.judge.diagnosis import lens_words
@@ -95,6 +96,14 @@ def test_an_angular_step_that_is_off_is_no_range_offset(value, mount):
 def test_a_range_offset_is_no_angular_step(offset, mount):
     solution = solved(7, lambda obs: replace(obs, face_range=obs.face_range + offset), mount=mount)
     assert not_an_offset(solution, ADMITTED) is None
+
+
+@pytest.mark.parametrize(("mount", "told"), [("head", False), ("platform", True)])
+def test_a_step_that_the_data_cannot_tell_is_said_where_the_result_hangs_on_it(mount, told):
+    """Cameras on the head: 1 % is off by six standard deviations, and explained as well by an offset of 11 mm."""
+    words = step_not_told(solved(1, mount=mount), ADMITTED)
+    assert (words == "") is told
+    assert told or "taken as stated: these data tell it to " in words
 
 
 def test_what_bearings_explain_alone_must_not_be_contradicted_where_both_are_free(monkeypatch):

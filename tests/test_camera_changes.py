@@ -10,7 +10,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
 from lrfcal_lib.fit.result import PlatformPrior
-from lrfcal_lib.judge.camera_changes import camera_changes, large_changes, likeliest_step
+from lrfcal_lib.judge.camera_changes import (
+    LEAST_SIZE,
+    Step,
+    camera_changes,
+    large_changes,
+    largest_motion,
+    likeliest_step,
+)
 from lrfcal_lib.judge.recording_faults import faults_of_changes
 from lrfcal_lib.solvers.joint import solve_joint
 
@@ -145,3 +152,14 @@ def test_steady_cameras_are_not_accused(seed, order):
 def test_too_few_placements_say_nothing():
     obs, settings, _ = drawn(7, 3)
     assert likeliest_step(solve_joint(obs, required=False, **settings)) is None
+
+
+def test_a_step_that_moves_no_board_in_the_images_needs_no_other_estimate(monkeypatch):
+    """Errors of the intrinsics look like one of a third of a pixel, as in data/sim_lms221."""
+    obs, settings, prepared = drawn(7)
+    solution = solve_joint(changed(obs, turn_deg=(0.02, 0.0, 0.0)), required=False, **settings)
+    step = Step(camera=0, row=FIRST, p_value=0.0, change=np.array([0.0, 3e-4, 0.0, 0.0, 0.0, 0.0]))
+    assert 0.1 < largest_motion(solution, step, prepared.models["left"]) < LEAST_SIZE
+    monkeypatch.setattr("lrfcal_lib.judge.camera_changes.likeliest_step", lambda _: step)
+    monkeypatch.setattr("lrfcal_lib.judge.camera_changes.solve_joint", None)
+    assert camera_changes(solution, prepared, settings) == []

@@ -9,7 +9,6 @@ import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case, camera_observations
 
-from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
 from lrfcal_lib.model import observations
 from lrfcal_lib.model.geometry import (
@@ -147,7 +146,8 @@ def test_errors_agree_with_the_covariance(name):
 
 @pytest.mark.parametrize(
     ("name", "weighted"),
-    [("line", True), ("line", False), ("wasielewski_strauss", True), ("wasielewski_strauss", False), ("planes", False)],
+    [("line", True), ("line", False), ("wasielewski_strauss", True), ("wasielewski_strauss", False), ("planes", False),
+     ("bauermann", True), ("bauermann", False)],
 )
 
 
@@ -160,13 +160,69 @@ def test_scipy_agrees(name, weighted):
         if name == "planes":
             return plane_residuals_m(obs, pose_transform(pose))
         block = RESIDUALS[name](pose, obs)
-        return whiten(block)[0] if weighted else block.residuals
+        return block.white if weighted else block.residuals
 
     theirs = scipy.optimize.least_squares(residuals, np.zeros(6), **options)
     ours = solve_camera(obs, "zhang_pless" if name == "planes" else name, rig.T_camera_lrf, weighted=weighted)
     np.testing.assert_allclose(pose_array(ours.transform), move_pose(start, theirs.x), atol=2e-6)
     assert not weighted or ours.chi2 / 2 == pytest.approx(theirs.cost, rel=1e-9)
-    assert ours.n_observations == len(obs.plane_points if name == "planes" else obs.crossing_points)
+    counts = {"planes": len(obs.plane_points), "bauermann": 2 * len(obs.scene_points)}
+    assert ours.n_observations == counts.get(name, len(obs.crossing_points))
+
+
+BATCHED = {  # methods that solve many trials at once, and the points that differ between trials
+    "line": "crossing", "line_printed": "crossing", "wasielewski_strauss": "crossing", "bauermann": "scene",
+    "zhang_pless": "plane", "zhang_pless_printed": "plane",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BATCHED)
+def test_many_trials_at_once_are_the_trials_one_by_one(name):
+    rig, obs = camera_case(11, noise=1.0)
+    rng, field = np.random.default_rng(12), f"{BATCHED[name]}_points"
+    points = getattr(obs, field) + rng.normal(0, 0.002, (4, *getattr(obs, field).shape))
+    boards, covariance = (np.stack([x] * 4) for x in (obs.board_poses, obs.board_covariance))
+    more = {"board_poses": boards, "board_covariance": covariance} if BATCHED[name] == "plane" else {}
+    if BATCHED[name] == "plane":
+        more["plane_covariance"] = np.stack([obs.plane_covariance] * 4)
+    many = solve_camera(replace(obs, **{field: points}, **more), name, rig.T_camera_lrf)
+    assert many.converged.shape == (4,) and many.converged.all()
+    for i, one in enumerate(points):
+        alone = solve_camera(replace(obs, **{field: one}), name, rig.T_camera_lrf, search=False)
+        np.testing.assert_allclose(pose_array(many.transform[i]), pose_array(alone.transform), atol=1e-9)
+        np.testing.assert_allclose(many.covariance[i], alone.covariance, rtol=1e-6, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_frame_of_the_source_does_not_matter(name):
+    """Scanner coordinates turned and shifted by T: the pose is the old one times the inverse of T."""
+    rig, obs = camera_case(13, noise=1.0)
+    T = RigidTransform.from_components([0.3, -0.2, 0.1], Rotation.from_rotvec([0.2, -0.4, 0.3]))
+    R, moved = T.rotation.as_matrix(), {}
+    for group in ("crossing", "plane", "scene"):
+        moved[f"{group}_points"] = T.apply(getattr(obs, f"{group}_points"))
+        moved[f"{group}_covariance"] = R @ getattr(obs, f"{group}_covariance") @ R.T
+    start = rig.T_camera_lrf * OFF
+    before = solve_camera(obs, name, start, search=False)
+    after = solve_camera(replace(obs, **moved), name, start * T.inv(), search=False)
+    np.testing.assert_allclose(pose_array(after.transform), pose_array(before.transform * T.inv()), atol=2e-8)
+    assert np.sum(after.chi2) == pytest.approx(np.sum(before.chi2), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_order_of_the_rows_does_not_matter(name):
+    rig, obs = camera_case(14, noise=1.0)
+    rng, shuffled = np.random.default_rng(15), obs
+    for prefix in ("crossing_", "plane_", "scene_"):
+        order = rng.permutation(len(getattr(obs, f"{prefix}placement")))
+        shuffled = rows_of(shuffled, prefix, order)
+    order = rng.permutation(len(obs.placements))
+    of_boards = ("placements", "board_poses", "board_covariance", "pattern_pixels")
+    shuffled = replace(shuffled, **{field: getattr(obs, field)[order] for field in of_boards})
+    start = rig.T_camera_lrf * OFF
+    one, other = (solve_camera(each, name, start, search=False) for each in (obs, shuffled))
+    np.testing.assert_allclose(pose_array(other.transform), pose_array(one.transform), atol=1e-8)
+    np.testing.assert_allclose(other.covariance_placements, one.covariance_placements, rtol=1e-4, atol=1e-14)
 
 
 def test_robust_loss_resists_wrong_edges():

@@ -13,7 +13,6 @@ from test_uncertainty import CAMERA, moved_points, random_chain
 
 from lrfcal_lib.fit import edge_likelihood, residuals
 from lrfcal_lib.fit.axis_chart import move_head, prior_terms
-from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.judge.uncertainty import carried
 from lrfcal_lib.model import camera
@@ -44,8 +43,9 @@ def camera_methods():
             return residual(move_pose(pose, s), obs)
 
         yield block(np.zeros(6)).jacobian, lambda s: block(s).residuals, 6
-        r, J = whiten(block(np.zeros(6)))  # with what the weights change
-        yield J.T @ r, lambda s: 0.5 * np.sum(whiten(block(s))[0] ** 2), 6
+        here = block(np.zeros(6))
+        r, J = here.white, here.white_jacobian  # with what the weights change
+        yield J.T @ r, lambda s: 0.5 * np.sum(block(s).white ** 2), 6
 
 
 def board_planes():
@@ -65,8 +65,9 @@ def tilt_axis():
             return platform.projected_block(move_head(head, s), obs, pairs(obs, range(1, 21)), printed=printed)
 
         yield block(np.zeros(4)).jacobian, lambda s: block(s).residuals, 4
-    *data, boards, _ = platform.prepare_boards(make(8, count=4, noise=1.0), ROUGH)
-    state = head, np.array(list(boards.values())), np.full((4, 2), 0.02)
+    boards = platform.prepare_boards(make(8, count=4, noise=1.0), ROUGH)
+    data = boards.edge, boards.face
+    state = head, boards.poses, np.full((4, 2), 0.02)
 
     def blocks(s):
         return platform.platform_blocks(platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1)))), *data, 1e-3)
@@ -124,15 +125,15 @@ def joint_estimate():
 
             def costs(s):
                 found = block(s)
-                return np.sum(found.cost if found.cost is not None else 0.5 * whiten(found, False)[0] ** 2, axis=1)
+                return np.sum(found.cost if found.cost is not None else 0.5 * found.white ** 2, axis=1)
 
             count = EVERY.shared + EVERY.own
             for name in ("beam",) if lapse else ("face", "beam", "view", "sweep", "side"):
                 here = block(np.zeros(count))
-                r, J = whiten(here)
+                r, J = here.white, here.white_jacobian
                 yield np.sum(r[..., None] * J, axis=1), costs, count
                 if here.cost is None:
-                    yield J, lambda s: whiten(block(s), False)[0], count
+                    yield J, lambda s: block(s).white, count
 
 
 def chain_of_a_rig():

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
-from lrfcal_lib.calibrate import observe
+from lrfcal_lib.calibrate import naming
 from lrfcal_lib.evaluate.stereo import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
@@ -32,7 +32,8 @@ from lrfcal_lib.preprocess.intrinsics import (
     estimate_relief,
     first_pose,
 )
-from lrfcal_lib.preprocess.kept_images import KeptImages
+from lrfcal_lib.preprocess.kept_images import part_around
+from lrfcal_lib.preprocess.outline_in_images import measure_outline
 from lrfcal_lib.preprocess.pattern_in_image import (
     PatternFinder,
     PatternNotFound,
@@ -236,10 +237,10 @@ def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
 def test_where_all_cameras_contradict_a_scan_small_squares_are_a_cause(monkeypatch, side, named):
     views = {c: {4: BoardView(c, placement=4, pixels=pixels_of_squares(side))} for c in ("left", "right")}
     data = SimpleNamespace(placements=np.array([4]), select=lambda inliers: None)
-    monkeypatch.setattr(observe, "observe", lambda prepared, camera: data)
-    monkeypatch.setattr(observe, "find_outlying_placements", lambda obs: ([], {4: 0.02}))
-    monkeypatch.setattr(observe, "solve_camera", lambda obs, method: SimpleNamespace(transform=None))
-    (problem,) = observe.rough_poses(SimpleNamespace(views=views, board=SHEET))[1]
+    monkeypatch.setattr(naming, "observe", lambda prepared, camera: data)
+    monkeypatch.setattr(naming, "find_outlying_placements", lambda obs: ([], {4: 0.02}))
+    monkeypatch.setattr(naming, "solve_camera", lambda obs, method: SimpleNamespace(transform=None))
+    (problem,) = naming.rough_poses(SimpleNamespace(views=views, board=SHEET))[1]
     assert problem.placement == 4 and "another surface" in problem.words
     assert ("or the images: squares below 9 px" in problem.words) == named
 
@@ -270,19 +271,18 @@ def test_large_images_are_searched_small_and_refined_as_they_are(monkeypatch):
 def test_an_image_is_decoded_once_and_kept_where_the_board_is():
     pose = pose_of(at=(0.0, 0.0, 2.5))
     picture = render(pose)
+    part = part_around(picture, on_board(pose, PATTERN.points()[:, :2], project), SHEET)
     reads = []
-    kept = KeptImages(lambda r: reads.append(r) or picture, SHEET)
-    one, other = record("left", "a.png", 3), record("left", "b.png", 4)
-    kept.make_room([one, other], picture)
-    kept.keep(one, picture, on_board(pose, PATTERN.points()[:, :2], project))
-    image = kept.around_board(one)
+    shot = survey.Shot(record("left", "a.png", 3), BoardView(), part)
+    image = shot.image(reads.append)
     assert reads == []
     low = np.floor(on_board(pose, CORNERS, project).min(axis=0)).astype(int) - 40
     high = np.ceil(on_board(pose, CORNERS, project).max(axis=0)).astype(int) + 40
     board = np.s_[max(low[1], 0) : high[1], max(low[0], 0) : high[0]]
     np.testing.assert_array_equal(image[board], picture[board])
     assert np.any(image != picture)  # the rest is not kept
-    assert kept.around_board(other) is picture and reads == [other]
+    other = survey.Shot(record("left", "b.png", 4), BoardView())
+    assert other.image(lambda r: reads.append(r) or picture) is picture and reads == [other.record]
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image():
@@ -472,7 +472,7 @@ def test_the_order_of_corners_follows_the_outline():
         for start in pattern_orders(PATTERN):
             orders = exact[start][pattern_orders(PATTERN)]
             poses = RigidTransform.concatenate([first_pose(PATTERN.points(), pixels, MODEL) for pixels in orders])
-            np.testing.assert_array_equal(orders[np.argmax(order_scores(picture, SHEET, MODEL, orders, poses))], exact)
+            np.testing.assert_array_equal(orders[np.argmax(order_scores(picture, SHEET, MODEL, poses))], exact)
 
 
 def test_line_covariance_tells_the_error_over_noise():
@@ -554,7 +554,7 @@ def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed
     assert np.all(outline.line_sd < 0.002)
     for name, length in outline.board.lengths().items():
         assert length == pytest.approx(expected[name], abs=0.001) and outline.length_sd[name] < 0.003
-    alone = survey.measure_outline(surveyed.views["left"][:1], UNKNOWN, surveyed.models)
+    alone = measure_outline(surveyed.views["left"][:1], UNKNOWN, surveyed.models)
     assert np.isnan([*alone.line_sd, *alone.length_sd.values()]).all()
 
 
@@ -571,7 +571,7 @@ def test_surveys_that_cannot_work(session, surveyed):
             survey.survey(records[:count], see, board, models)
     views = [replace(v, edges=v.edges[:1]) for group in surveyed.views.values() for v in group]
     with pytest.raises(ValueError, match="edge '.*' of board 'sheet' was found in none of 14 images"):
-        survey.measure_outline(views, UNKNOWN, surveyed.models)
+        measure_outline(views, UNKNOWN, surveyed.models)
 
 
 def stereo(first, second, pattern=PATTERN, models=(MODEL, MODEL)):

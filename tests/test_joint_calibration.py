@@ -7,12 +7,13 @@ import pytest
 from shared import QUICK, campaign
 
 from lrfcal_lib.calibrate import clouds, combined, pipeline
-from lrfcal_lib.calibrate.observe import all_views, observe_joint
+from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.evaluate import edge_tables, joint_tables, scenes
 from lrfcal_lib.evaluate.export import calibration_record
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
+from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.session.read import open_session
 
 

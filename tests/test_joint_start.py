@@ -10,7 +10,7 @@ from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.model.geometry import transform_difference
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.planes import sizes_of_minima
+from lrfcal_lib.solvers.plane_start import sizes_of_minima
 
 LEAN = 0.35  # radians
 

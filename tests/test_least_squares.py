@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from lrfcal_lib.fit.covariance import placement_covariance, pseudo_inverse
 from lrfcal_lib.fit.least_squares import (
     Block,
     minimise,
-    placement_covariance,
-    pseudo_inverse,
     solve,
 )
 from lrfcal_lib.model.geometry import DegenerateGeometry, motion_words

@@ -3,7 +3,9 @@
 Those of the C++ toolbox (sicktoolbox, ``c++/examples/lms2xx``) pass over what comes before a reply,
 and give up a telegram whose bytes are more than 35 ms apart; here they ask once, not up to three
 times. CARMEN (``laser-new/sick_laser.c``) wants an ACK as the next byte, waits 250 ms for any byte,
-and forgets nothing that came before.
+and forgets nothing that came before. The Python client of AtlasBuggy (``lms200/sicklms``) wants an ACK
+within 250 ms and the reply within 1.5 s; its bytes are those of a recording. Player
+(``laser/sicklms200.cc``) looks for replies only, at 38400 and 9600 Bd.
 """
 
 import struct
@@ -193,7 +195,7 @@ def test_a_mean_is_that_of_its_scans_and_one_without_a_range_leaves_none():
     assert parse_telegram(raw).code == 0xB6 and parse_telegram(raw).data[0] == 5
     turn = device.scans[0].turn
     quarters = 2 * np.arange(361)
-    ranges, reasons, _ = zip(
+    ranges, reasons = zip(
         *(Source().scan(turn + 2 * k, quarters, None) for k in range(5)), strict=True
     )
     ranged = np.all(np.array(reasons) == 0, axis=0)
@@ -276,7 +278,7 @@ STREAMS = {  # start, unit, measuring mode, variant, values of the scans
 }
 
 
-@pytest.mark.parametrize("rate", [9600, 19200, 38400])
+@pytest.mark.parametrize("rate", BAUD)
 @pytest.mark.parametrize("name", STREAMS)
 def test_carmen_connects_configures_and_reads_scans(name, rate):
     start, unit, mode, variant, counts = STREAMS[name]
@@ -298,3 +300,103 @@ def test_carmen_connects_configures_and_reads_scans(name, rate):
     while not client.send(STOP):
         pass
     assert not device.streaming and device.memory.flash_writes == 1
+
+
+# ------------------------------------------------------------------------------------ AtlasBuggy
+
+# Recorded with an LMS200 (S18063, V02.19) at 38400 Bd: what was sent, and how its reply begins.
+RECORDED = [
+    ("02 00 02 00 20 25 35 08", "A0 00"),
+    ("02 00 02 00 20 40 50 08", "A0 00"),
+    ("02 00 01 00 3A 1E 12", "BA 4C 4D 53 32 30 30 3B 53 31 38 30 36 33"),
+    ("02 00 01 00 31 15 12", "B1 56 30 32 2E 31 39 20"),
+    ("02 00 01 00 74 50 12", "F4"),
+    ("02 00 0A 00 20 00 53 49 43 4B 5F 4C 4D 53 BE C5", "A0 00"),
+    (
+        f"02 00 23 00 77 00 00 70 00 00 04 01 00 00 02 02 {'00 ' * 21} 02 00 94 8A",
+        "F7 01 00 00 70 00 00 04 01",
+    ),
+    ("02 00 02 00 20 25 35 08", "A0 00"),
+    ("02 00 02 00 20 24 34 08", "A0 00"),
+]
+
+
+def test_the_recorded_bytes_of_a_python_client_are_acknowledged_and_answered_in_time():
+    device = lms(model="LMS200;S18063;V02.19 ", baudrate=9600)
+    client = Client(device, gap_s=0.25)
+    for sent, begin in RECORDED:
+        client.port.write(bytes.fromhex(sent))
+        asked = client.host.now()
+        assert client.read(1) == b"\x06" and client.host.now() < asked + 0.25
+        reply = client.rest_of(client.read(2))
+        assert reply[4:].startswith(bytes.fromhex(begin)) and client.host.now() < asked + 1.5
+        if sent.startswith("02 00 02 00 20 40"):
+            client.port.baudrate = 38400
+    heads = [client.rest_of(client.read(2))[4:7] for _ in range(20)]
+    assert set(heads) == {bytes.fromhex("B0 69 41")}  # 361 values, millimetres, as in 892 real scans
+    assert device.memory.flash_writes == 1 and device.memory.configuration.measuring_mode == 4
+    every = np.diff([record.time_s for record in list(device.scans)[:20]])
+    np.testing.assert_allclose(every, 8 * 2 / 75.08, atol=1e-6)  # 213 ms, as recorded
+
+
+# ------------------------------------------------------------------------------------------ Player
+
+
+class Player(Client):
+    """Player's driver: what is no telegram with the wanted code is passed over."""
+
+    def __init__(self, device):
+        super().__init__(device, gap_s=0.1)
+
+    def ask(self, payload, limit_s=1.0):
+        """The data of the reply, None where none comes in time."""
+        self.port.reset_input_buffer()
+        self.port.write(telegram_of(payload))
+        end = self.host.now() + limit_s
+        window = b""
+        while self.host.now() < end:
+            window = (window + self.port.read(1))[-2:]
+            if window == b"\x02\x80" and (raw := self.rest_of(window)) is not None:
+                if raw[4] == int(payload[:2], 16) | 0x80:
+                    return raw[5:-3]
+                window = b""
+        return None
+
+    def find(self):
+        """Stop whatever streams, at the rates of RS-232 that it knows."""
+        for rate in (38400, 9600):
+            self.port.baudrate = rate
+            if self.ask(STOP) is not None:
+                return rate
+        raise AssertionError("no rate")
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+@pytest.mark.parametrize("rate", [9600, 38400])
+def test_player_finds_sets_up_and_streams(rate, streaming):
+    device = lms(baudrate=rate)
+    client = Player(device)
+    if streaming:  # left by a program that crashed
+        client.port.baudrate = rate
+        client.ask("20 24")
+        assert device.streaming
+    assert client.find() == rate and not device.streaming
+    if rate != 38400:
+        assert client.ask(BAUD[38400]) == b"\0"
+        client.port.baudrate = 38400
+    assert client.ask("3A").startswith(b"LMS221")
+    assert client.ask(PASSWORD, 3.0) == b"\0"
+    block = client.ask("74")
+    taken = client.ask("77" + MILLIMETRES.block.hex(), 3.0)
+    assert len(block) == 34 and taken[:1] == b"\1"
+    assert client.ask("3B 64 00 32 00")[:1] == b"\1" and client.ask("20 24", 3.0) == b"\0"
+    window = b""
+    scans = []
+    while len(scans) < 5:
+        window = (window + client.read(1))[-2:]
+        if window == b"\x02\x80":
+            scans.append(values_of(client.rest_of(window))[1])
+            window = b""
+    sent = [record.words for record in list(device.scans)[-len(scans) - 1 :]]
+    assert all(any(np.array_equal(scan, words) for words in sent) for scan in scans)
+    assert {len(scan) for scan in scans} == {201}

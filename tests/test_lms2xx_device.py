@@ -1,32 +1,18 @@
 """The LMS2xx on a port: finding it, setting it up, scans and their instants; against the emulated device."""
 
-import errno
-import os
-import termios
-import tty
-from contextlib import suppress
-
 import numpy as np
 import pytest
-import serial
-from telegrams import encode_scan
-from virtual import INDEXED, Bench, Source, VirtualHost
+from virtual import INDEXED, Bench, Source
 from virtual import lms as lms_on
 
-from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import TURN_S, Assembler, Link, ScanClock, transfer_s
 from lrfcal_lib.drivers.port import (
     DeviceError,
     LineLost,
     NoReply,
-    PortError,
     Refused,
     WrongDevice,
-    open_port,
-    set_rate,
 )
-from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.session.lms2xx_codec import Configuration, encode_telegram
 
@@ -41,17 +27,6 @@ def opened(device, **options):
     return LMS2xx(device.path, host=device.host, **options)
 
 
-@pytest.fixture
-def wire():
-    """A pseudo-terminal: descriptor of the far end, path of the near one."""
-    far, near = os.openpty()
-    tty.setraw(near)
-    yield far, os.ttyname(near)
-    for end in (far, near):
-        with suppress(OSError):  # a test closed it
-            os.close(end)
-
-
 def commands(device):
     """Codes of the requests that an emulated device understood."""
     return [raw[4] for _, raw in device.requests]
@@ -61,90 +36,6 @@ def record_of(device, reading):
     """The emulated device's own records of the telegrams of a reading."""
     by_telegram = {one.telegram: one for one in device.scans}
     return [by_telegram[raw] for raw in reading.telegrams]
-
-
-# ------------------------------------------------------------------------------------------------------- ports
-
-
-def test_ports_that_cannot_be_opened_say_what_to_do(wire, tmp_path, monkeypatch):
-    with pytest.raises(PortError, match=r"there is no port .*nowhere: check cable and power; present are "):
-        open_port(tmp_path / "nowhere", 9600, timeout=0)
-    with pytest.raises(PortError, match="/dev/null is no serial line"):
-        open_port("/dev/null", 9600, timeout=0)
-    held = open_port(wire[1], 9600, timeout=0)
-    with pytest.raises(PortError, match=rf"busy, held by .*process {os.getpid()}\): close that program"):
-        open_port(wire[1], 9600, timeout=0)
-    held.close()
-
-    def forbidden(*_, **__):
-        raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
-
-    monkeypatch.setattr(port.serial, "Serial", forbidden)
-    with pytest.raises(PortError, match="no permission for /dev/ttyUSB0: run 'sudo usermod -aG dialout"):
-        open_port("/dev/ttyUSB0", 9600, timeout=0)
-
-
-def test_a_rate_that_the_line_does_not_take_is_refused_and_the_old_one_stays(wire, monkeypatch):
-    with open_port(wire[1], 19200, timeout=0) as port:
-        for rate in (9600, 38400, 500000, 19200):
-            set_rate(port, rate)
-        with pytest.raises(PortError, match="does not take 12345 Bd"):
-            set_rate(port, 12345)
-        with pytest.raises(PortError, match="cannot do -1 Bd"):
-            set_rate(port, -1)
-        real = termios.tcgetattr
-        monkeypatch.setattr(termios, "tcgetattr", lambda fd: [*real(fd)[:4], 13, 13, real(fd)[6]])
-        with pytest.raises(PortError, match="does not take 500000 Bd.*RS-422 interface"):
-            set_rate(port, 500000)
-        assert port.baudrate == 19200
-
-
-def test_a_port_that_vanishes_is_a_lost_line(wire):
-    link = Link(wire[1], 38400)
-    os.close(wire[0])
-    for action in (link.receive, lambda: link.send(0x31), lambda: link.set_rate(9600)):
-        with pytest.raises(LineLost, match="is lost.*check plug and power"):
-            action()
-    link.close()
-
-
-# -------------------------------------------------------------------------------------------------------- link
-
-
-class Far(SerialDevice):
-    """A device that hears, and says what a test lets it say."""
-
-    def __init__(self, baudrate=38400):
-        super().__init__("far", VirtualHost())
-        self.heard, self.baudrate = [], baudrate
-        self.start()
-
-    def receive(self, data, at):
-        self.heard.append((at, data))
-
-
-@pytest.mark.parametrize(("rate", "writes"), [(38400, 1), (500000, 8)])
-def test_bytes_are_paced_at_500000_baud_only(rate, writes):
-    far = Far(rate)
-    Link(far.path, rate, host=far.host).send(0x20, b"\x25")
-    times, pieces = zip(*far.heard, strict=True)
-    assert b"".join(pieces) == encode_telegram(0x20, b"\x25") and len(pieces) == writes
-    assert np.all(np.diff(times) >= 75e-6 - 1e-9)
-
-
-def test_nobody_there_and_somebody_else_are_told_apart():
-    far = Far()
-    with pytest.raises(NoReply, match="19200, 500000 Bd, address 5: check power.*address, .*crossed.*RS-422"):
-        opened(far, find_s=1.2, address=5)
-    assert far.host.now() < 2.5
-
-    def talk(instant):
-        far.write(b"$GPGGA,12,,*4A\r\n", instant)
-        far.at(instant + 0.05, talk)
-
-    talk(far.host.now())
-    with pytest.raises(WrongDevice, match=r"bytes arrive, but no telegram of an LMS2xx at .* Bd, address 0 \(any\)"):
-        opened(far, find_s=1.2)
 
 
 LMS211 = {"model": "LMS211;302063;X01.27 ", "variant": (100, 50), "baudrates": (9600, 19200, 38400)}
@@ -207,7 +98,7 @@ def test_the_device_is_found_at_any_rate_whatever_it_was_doing(past, rate):
     assert device.streaming == (past in ("stream", "interlaced"))
     bench.port.close()
     with opened(device) as lms:
-        assert (lms.type, lms.firmware, lms.variant) == ("LMS221-302063", "X01.27", (180, 0.5))
+        assert (lms.type, lms.status.firmware, lms.variant) == ("LMS221-302063", "X01.27", (180, 0.5))
         assert (lms.baudrate, device.streaming, device.memory.mode) == (rate, False, 0x25)
 
 
@@ -257,49 +148,6 @@ def test_a_rate_that_does_not_come_through_is_given_up():
         opened(device, baudrate=500000)
     with opened(device) as lms:
         assert lms.baudrate == 38400 and len(lms.request().ranges) == 361
-
-
-# ------------------------------------------------------------------------------------------------- times of scans
-
-
-def test_late_arrivals_do_not_shift_scans():
-    rng, clock = np.random.default_rng(1), ScanClock()
-    turns = np.cumsum(rng.integers(1, 40, 400))  # over many rounds of the index
-    late = np.where(rng.random(400) < 0.2, rng.exponential(0.05, 400), 0)
-    late[0] = 0
-    instants, steps = zip(*map(clock.place, (turns % 256).tolist(), 100.0 + turns * TURN_S + late), strict=True)
-    off = np.array(instants) - 100.0 - turns * TURN_S
-    assert np.median(off) == pytest.approx(0, abs=1e-9) and np.abs(off).max() < 0.01 < late.max()
-    assert list(steps[1:]) == np.diff(turns).tolist()
-
-
-def interlaced(partials, indexed, skipped=()):
-    """Readings that telegrams of interlaced scans complete; ranges tell where they belong."""
-    configuration, counts = INDEXED.changed(realtime_indices=indexed), {"dropped": 0, "stale": 0}
-    one, made = Assembler((100, 0.25), configuration, 500000, True, counts, None), {}
-    for k, partial in enumerate(partials):
-        ranges = 1 + (4 * np.arange(181 - (partial > 0)) + partial) / 1000
-        raw = encode_scan(ranges, partial=partial, indices=(k % 256, k % 256) if indexed else None)
-        reading = None if k in skipped else one.feed(raw, 9 + k * TURN_S + transfer_s(len(raw), 500000))
-        made |= {k: reading} if reading else {}
-    return made
-
-
-FOUR = [2, 3, 4, 5, 8, 9, 10, 11]  # 0 and 1 of one set and 2 and 3 of the next are left
-
-
-@pytest.mark.parametrize(("indexed", "missing", "made"), [
-    *((indexed, [part], [3, 11]) for indexed in (True, False) for part in (4, 5, 6, 7)),
-    (True, FOUR, []), (False, FOUR, [7]),
-])  # fmt: skip
-
-
-def test_sets_with_a_missing_part_are_no_scan(indexed, missing, made):
-    """Without indices four that are missing in a row are not seen."""
-    found = interlaced([0, 1, 2, 3] * 3, indexed, missing)
-    assert list(found) == made
-    for reading in found.values():
-        np.testing.assert_allclose(reading.ranges, 1 + np.arange(721) / 1000, atol=1e-9)
 
 
 # ------------------------------------------------------------------------------------------------ scans of a device

@@ -10,8 +10,8 @@ from shared import campaign
 from tiny_sessions import record, rectangle
 
 from lrfcal_lib.calibrate.pipeline import calibrate
-from lrfcal_lib.evaluate.export import calibrate_session
 from lrfcal_lib.judge import verdict
+from lrfcal_lib.report.calibrate import calibrate_session
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
 

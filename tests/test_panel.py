@@ -207,12 +207,12 @@ def test_a_lost_camera_is_said_until_it_is_back(panel):
     panel.connect()
     camera, parts = panel.collector.rig.cameras["left"], panel.parts
     newest, camera.newest = camera.newest, raising(LineLost("camera left is lost: its plug"))
-    until(lambda: "camera left is lost: its plug" in parts.error.value)
+    until(lambda: "camera left is lost: its plug" in parts.trouble.value)
     assert "left" not in panel.collector.view.frames
     with pytest.raises(LineLost, match="its plug"):
         panel.collector.capture()
     camera.newest = newest
-    until(lambda: parts.error.value == "" and "left" in panel.collector.view.frames)
+    until(lambda: parts.trouble.value.strip() == "" and "left" in panel.collector.view.frames)
 
 
 def test_what_nobody_expects_and_what_drivers_report_is_said_too(panel, monkeypatch, caplog):

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lrfcal_lib.calibrate import pipeline
-from lrfcal_lib.calibrate.observe import nearest_edges
+from lrfcal_lib.calibrate.naming import nearest_edges
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.prepared import Prepared

@@ -4,16 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.optimize
 import synthetic
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import CORNERS, TRIANGLE, edge_sweeps, sweep_boards
 
+from lrfcal_lib.fit.axis_chart import move_head
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     axis_difference,
     head_from_axis,
     lrf_to_platform,
+    pose_array,
+    pose_transform,
 )
 from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.solvers import platform
@@ -55,7 +59,7 @@ def chart_error(T):
 def test_exact_data_are_recovered(solve, faces, T0):
     obs = make(2)
     found = solve(obs if faces else without_faces(obs), T0)
-    assert found.converged and (miss(found) < 1e-9).all()
+    assert found.solution.converged and (miss(found) < 1e-9).all()
     assert np.abs(found.skew).max() < 1e-9 and np.abs(found.gap).max() < 1e-9
     assert found.solution.unobservable == () and (found.skipped == {} or solve is solve_projected)
 
@@ -72,6 +76,21 @@ def test_level_edges_are_reported_not_divided_by_zero():
     assert "parallel to the x" in found.skipped[9] and miss(found)[1] < 1e-9
     with pytest.raises(DegenerateGeometry, match="projected fits: no placement can be used.*parallel to the x"):
         solve_projected(swept(rng, boards[-1:]), TRUTH)
+
+
+@pytest.mark.parametrize("printed", [False, True])
+def test_scipy_agrees_with_the_projected_fits(printed):
+    obs = make(21, noise=1.0)
+    found = solve_projected(obs, TRUTH, printed=printed)
+    start = pose_array(head_from_axis(found.axis))  # the terms hang on the frame
+    groups = pairs(obs, found.placements)
+
+    def residuals(step):
+        return platform.projected_block(move_head(start, step), obs, groups, printed=printed).residuals
+
+    theirs = scipy.optimize.least_squares(residuals, np.zeros(4), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    axis = geometry.axis_of(pose_transform(move_head(start, theirs.x)))
+    assert max(axis_difference(found.axis, axis)) < 1e-6
 
 
 def test_error_agrees_with_the_predicted_covariance(monkeypatch):

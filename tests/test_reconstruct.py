@@ -17,9 +17,9 @@ from lrfcal_lib.calibrate.reconstruct import GREY, reconstruct
 from lrfcal_lib.evaluate.export import write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.camera import CameraModel, fold, project
-from lrfcal_lib.model.kinematics import AS_RECORDED
+from lrfcal_lib.model.kinematics import AS_RECORDED, MIRROR_TURN
 from lrfcal_lib.session.read import Sweep, open_session
-from lrfcal_lib.session.stated import MIRROR_TURN, LrfInfo
+from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate import beam
 from lrfcal_lib.simulate.record import placements_of, stops_of, world_of
 from lrfcal_lib.simulate.rig import load_setup
@@ -269,9 +269,9 @@ def test_files_hold_everything_and_say_frame_and_units(tmp_path):
         np.testing.assert_allclose(back.point.positions.numpy(), cloud.points, atol=1e-6)
         np.testing.assert_allclose(back.point.normals.numpy(), cloud.normals, atol=1e-6)
         assert (back.point.colors.numpy() == cloud.colors).all()
-    back = o3d.t.io.read_point_cloud(str(tmp_path / "deep" / "c.ply")).point
-    for name in ("seen", "placement", "image", "pitch", "bearing", "range", "sigma"):
-        np.testing.assert_allclose(back[name].numpy().ravel(), getattr(cloud, name), rtol=1e-6, err_msg=name)
+        for name in ("seen", "placement", "image", "pitch", "bearing", "range", "intensity", "sigma"):
+            values = back.point[name].numpy().ravel()
+            np.testing.assert_allclose(values, getattr(cloud, name), rtol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("number", range(3))

@@ -1,6 +1,6 @@
 """`python -m lrfcal_lib record` in a process of its own, against emulated devices: what goes wrong ends with one line
 that says what to do, an exit code, a head that stands still and a session that can be gone on with. What else can be
-wrong with rig and rig file is in test_rig, test_record and test_video.
+wrong with rig and rig file is in test_rig, test_rig_file, test_record and test_video.
 """
 
 import json

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 from shared import QUICK, ROOT
 
 from lrfcal_lib.calibrate.observe import platform_observations
@@ -27,9 +28,18 @@ def test_damaged_truth_is_named(tmp_path):
 def test_the_true_calibration_has_no_error():
     truth = read_truth(open_session(QUICK))
     for camera, transform in truth.cameras.items():
-        errors = camera_errors(SimpleNamespace(transform=transform), truth, camera)
+        errors = camera_errors(SimpleNamespace(transform=transform, trusted=np.eye(6)), truth, camera)
         assert max(errors.values()) < 1e-6
     assert max(axis_errors(truth.T_head_lrf, truth)) < 1e-6
+
+
+def test_a_pull_is_the_error_over_its_standard_deviation():
+    truth = read_truth(open_session(QUICK))
+    (camera, transform), *_ = truth.cameras.items()
+    off = RigidTransform.from_translation([0.006, 0.0, 0.0]) * transform
+    covariance = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 4e-6, 4e-6])
+    errors = camera_errors(SimpleNamespace(transform=off, trusted=covariance), truth, camera)
+    assert errors["translation_pull"] == pytest.approx(6 / 3) and errors["rotation_pull"] < 1e-6
 
 
 def test_only_evaluate_reads_the_truth():

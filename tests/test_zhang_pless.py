@@ -14,7 +14,7 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
     transform_difference,
 )
-from lrfcal_lib.solvers import planes, solve_camera
+from lrfcal_lib.solvers import plane_start, solve_camera
 from lrfcal_lib.solvers.planes import (
     board_whitener,
     compress,
@@ -111,7 +111,7 @@ def test_any_start_value_reaches_the_best_minimum(method, source):
 def test_three_single_lines_have_the_truth_among_eight_poses(seed):
     rig, obs = camera_case(seed)
     sets = plane_sets(obs.select(obs.placements[:3]))
-    found = planes.three_planes(compress(sets, 1.0), sets.boards)
+    found = plane_start.three_planes(compress(sets, 1.0), sets.boards)
     assert found.shape == (8, 3, 4)
     assert min(max(transform_difference(pose_transform(pose), rig.T_camera_lrf)) for pose in found) < 1e-7
 
@@ -122,5 +122,5 @@ def test_a_second_minimum_is_handed_back_beside_the_best():
     few = solve_camera(obs.select(obs.placements[:3]), "zhang_pless")
     poses = [few.transform, few.rival]
     assert min(transform_difference(pose, rig.T_camera_lrf)[0] for pose in poses) < 0.1
-    assert transform_difference(*poses)[0] > planes.SAME_TURN
+    assert transform_difference(*poses)[0] > plane_start.SAME_TURN
     assert solve_camera(obs, "zhang_pless").rival is None

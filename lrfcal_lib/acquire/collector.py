@@ -1,24 +1,40 @@
 """What the panel does, without any widget: one rig, one recording, one thing at a time."""
 
 import contextlib
+import os
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from lrfcal_lib.acquire.record import Recording, RecordingError
-from lrfcal_lib.calibrate.pipeline import calibrate, calibrate_jointly, handed_over, prepare
+from lrfcal_lib.acquire.checks import Light
+from lrfcal_lib.acquire.record import Recording, RecordingError, Sweeping
+from lrfcal_lib.calibrate.pipeline import (
+    Calibration,
+    calibrate,
+    calibrate_jointly,
+    handed_over,
+    prepare,
+)
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
-from lrfcal_lib.drivers.rig_file import RigFileError, read_rig_file, rig_of
+from lrfcal_lib.drivers.rig_file import Placement, RigFileError, read_rig_file, rig_of
+from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.judge.verdict import YES, judge, sight_of, verdict
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.solvers import CANDIDATES
 
+PRACTICE_RIGS = ("practice", "sim_quick", "sim_lms221")
+ADVICE_FROM = 3  # placements, below which every other one helps
+WAIT_S = 3.0  # for a look at the rig to end
+AGAIN_S = 0.1  # between stops, until whoever moves the head has noticed
+RECONNECT_S = 2.0
 GUIDE = (
     "about 1.5 m ahead, turned in its plane so that no edge is upright or level",
     "about 1.2 m ahead, a little to the left, turned by a third of a turn, "
@@ -37,18 +53,24 @@ class Task:
 
     title: str
     guidance: str  # where to put the board
-    placement: object = None
-    close: tuple | None = None  # of the board held close to a camera: its name, number of the view
+    placement: Placement | None = None
+    close: tuple[str, int] = ("", 0)  # without a placement: camera of a close view, its number
 
 
-def next_task(recording, advice=""):
-    """What to record next, a Task; None where the plan is done.
+def next_task(recording: Recording, advice: str = "") -> Task | None:
+    """What to record next.
 
     Parameters
     ----------
-    recording : Recording
-    advice : str
+    recording
+        Open.
+    advice
         Where to put the board, instead of the guide.
+
+    Returns
+    -------
+    Task or None
+        None where the plan is done.
     """
     plan = recording.rig.stated.plan
     for camera, view in recording.close_views_to_do():
@@ -57,14 +79,14 @@ def next_task(recording, advice=""):
         guidance = f"hold the board close, {how}"
         return Task(title, guidance, close=(camera, view))
 
-    finished = recording.finished
     left = recording.to_do()
     if not left and not plan.placements:  # nothing is listed: one more can always be had
-        left = [p for p in plan.to_do(max(finished) + 1) if p.number not in finished]
+        more = plan.to_do(max(recording.finished) + 1)
+        left = [placement for placement in more if placement.number not in recording.finished]
     if not left:
         return None
     placement = left[0]
-    done = sum(p.number in finished for p in recording.plan)
+    done = len(recording.plan) - len(recording.to_do())
     guidance = advice or f"put the board {GUIDE[done % len(GUIDE)]}"
     if placement.purpose == "scene":
         guidance = "take the board away: this sweep shows the room"
@@ -82,40 +104,27 @@ class Pose:
     shift_sigma: np.ndarray
 
 
-def pose_of(solution):
-    """The Pose of a camera's Solution."""
-    sigma = solution.trusted_sigma
-    return Pose(
-        turn=np.degrees(solution.transform.rotation.as_rotvec()),
-        shift=1000 * solution.transform.translation,
-        turn_sigma=np.degrees(sigma[:3]),
-        shift_sigma=1000 * sigma[3:6],
-    )
-
-
 @dataclass(frozen=True)
 class Result:
     """A calibration."""
 
     answer: str  # whether to trust it: yes, with care, no
-    sentences: tuple
+    sentences: tuple[str, ...]
     method: str  # whose poses are handed over; '' where none is
-    poses: dict  # Pose by camera
+    poses: dict[str, Pose]  # by camera
     file: Path | None  # calibration.json
-    calibration: object
+    calibration: Calibration
 
 
-def calibrate_recording(path):
+def calibrate_recording(path: Path) -> Result:
     """Calibrate a session that may still be growing.
+
+    ``<session>_calibration/calibration.json`` is written beside it.
 
     Parameters
     ----------
-    path : Path
-        Of the session; ``<session>_calibration/calibration.json`` is written beside it.
-
-    Returns
-    -------
-    Result
+    path
+        Of the session.
 
     Raises
     ------
@@ -124,20 +133,40 @@ def calibrate_recording(path):
     """
     calibration = calibrate(open_session(path), CANDIDATES)
     judged = judge(calibration)
+    sentences = tuple(judged.sentences())
     if not judged.errors:
-        sentences = (*judged.sentences(), "Nothing is written.")
+        sentences += ("Nothing is written.",)
         return Result(judged.answer, sentences, "", {}, None, calibration)
-    method = handed_over(calibration)
-    solutions = calibration.solutions
-    poses = {c: pose_of(solutions[c, name]) for c, name in solutions if name == method}
+    method = handed_over(calibration) or ""
+    poses = {}
+    for (camera, name), solution in calibration.solutions.items():
+        if name == method:
+            sigma = solution.trusted_sigma
+            pose: Any = solution.transform
+            poses[camera] = Pose(
+                turn=np.degrees(pose.rotation.as_rotvec()),
+                shift=1000 * pose.translation,
+                turn_sigma=np.degrees(sigma[:3]),
+                shift_sigma=1000 * sigma[3:6],
+            )
     file = path.with_name(f"{path.name}_calibration") / "calibration.json"
     write_calibration(file, calibration_record(calibration, method, judged))
-    sentences = tuple(judged.sentences())
     return Result(judged.answer, sentences, method, poses, file, calibration)
 
 
-def advise(session):
-    """What the next placement should add, in a sentence; '' where all is known well enough."""
+def advise(session: Session) -> str:
+    """What the next placement should add, in a sentence.
+
+    Parameters
+    ----------
+    session
+        With what was recorded so far.
+
+    Returns
+    -------
+    str
+        '' where all is known well enough.
+    """
     prepared = prepare(session)
     try:
         solution = calibrate_jointly(prepared).solution
@@ -146,14 +175,9 @@ def advise(session):
     judged = verdict(solution, prepared.models, **sight_of(prepared))
     if judged.answer == YES:
         return ""
-    return f"put the {judged.suggestion.words()}" if judged.suggestion else judged.no_suggestion
-
-
-PRACTICE_RIGS = ("practice", "sim_quick", "sim_lms221")
-ADVICE_FROM = 3  # placements, below which every other one helps
-WAIT_S = 3.0  # for a look at the rig to end
-AGAIN_S = 0.1  # between stops, until whoever moves the head has noticed
-RECONNECT_S = 2.0
+    if judged.suggestion:
+        return f"put the {judged.suggestion.words()}"
+    return judged.no_suggestion
 
 
 class Busy(RuntimeError):
@@ -172,8 +196,9 @@ class View:
     bearings: np.ndarray | None = None  # (B,), radians
     pitch: float = 0.0  # of the head, radians
     measured: bool = False  # the head tells its pitch
-    frames: dict = field(default_factory=dict)  # newest Frame by camera
-    rows: dict = field(default_factory=dict)  # ranges by pitch, of the placement recorded last
+    frames: dict[str, Frame] = field(default_factory=dict)  # the newest by camera
+    # ranges by pitch, of the placement recorded last
+    rows: dict[float, np.ndarray] = field(default_factory=dict)
     trouble: str = ""  # what cannot be seen, and why
 
 
@@ -192,43 +217,40 @@ class Collector(Closed):
     """
 
     def __init__(self):
-        self.rig = None
-        self.recording = None
+        self.rig: Rig | None = None
+        self.recording: Recording | None = None
         self.view = View()
-        self.lights = {}
+        self.lights: dict[int, list[Light]] = {}
         self.stopped = threading.Event()
         self._advice = ""
         self._devices = threading.Lock()
         self._closing = contextlib.ExitStack()
 
     @property
-    def connected(self):
+    def connected(self) -> bool:
         """Whether a rig is open."""
         return self.rig is not None
 
     @property
-    def emulated(self):
+    def emulated(self) -> bool:
         """Whether the board moves by itself."""
-        return self.connected and self.rig.stated.devices.control is not None
+        return self.rig is not None and self.rig.stated.devices.control is not None
 
     @property
-    def limits_deg(self):
-        """Lowest and highest pitch of the head."""
-        return self._needed().stated.devices.head.pitch_limits_deg
-
-    @property
-    def finished(self):
+    def finished(self) -> tuple[int, ...]:
         """Numbers of the placements that are recorded and safe."""
-        return () if self.recording is None else self.recording.finished
+        if self.recording is None:
+            return ()
+        return self.recording.finished
 
-    def connect(self, rig, session):
+    def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> Rig:
         """Open a rig and a session; one that was recorded with the same rig goes on.
 
         Parameters
         ----------
-        rig : path-like or str
+        rig
             A rig file, or the name of an emulated rig.
-        session : path-like
+        session
             Its folder.
 
         Raises
@@ -241,7 +263,7 @@ class Collector(Closed):
             If the session states another rig, or cannot be written.
         """
         self.close()
-        with self._own(), contextlib.ExitStack() as stack:
+        with self._exclusively(), contextlib.ExitStack() as stack:
             opened = stack.enter_context(Rig.open(_stated(rig, stack)))
             recording = stack.enter_context(Recording(opened, Path(session), resume=True))
             self.rig = opened
@@ -250,18 +272,22 @@ class Collector(Closed):
             self.view = View()
             self.lights = {}
             self._advice = ""
+        return opened
 
-    def close(self):
+    def close(self) -> None:
         """Stop the head, finish the session, close all devices; a second call does nothing.
 
-        RecordingError if the session cannot be finished; the devices are closed all the same.
+        Raises
+        ------
+        RecordingError
+            If the session cannot be finished; the devices are closed all the same.
         """
-        if self.rig is None:
+        rig = self.rig
+        recording = self.recording
+        if rig is None or recording is None:
             return
         self.stop()
-        with self._own():
-            rig = self.rig
-            recording = self.recording
+        with self._exclusively():
             self.rig = None
             self.recording = None
             with self._closing:
@@ -270,7 +296,7 @@ class Collector(Closed):
                     recording.finish()
 
     @contextlib.contextmanager
-    def _own(self):
+    def _exclusively(self):
         """The devices for oneself."""
         if not self._devices.acquire(timeout=WAIT_S):
             raise Busy("the rig is busy: wait until it is done, or press stop")
@@ -283,18 +309,36 @@ class Collector(Closed):
         if self.rig is None:
             remedy = "name a rig file or an emulated rig, and press connect"
             raise DeviceError(f"no rig is connected: {remedy}")
-        return self.rig
+        return self.rig, self.recording
 
-    def move_to(self, pitch):
-        """Move the head to a pitch, radians; where it settled. OutOfRange beyond its limits."""
-        rig = self._needed()
-        with self._own():
+    def move_to(self, pitch: float) -> float:
+        """Move the head.
+
+        Parameters
+        ----------
+        pitch
+            Radians, up positive.
+
+        Returns
+        -------
+        float
+            Where it settled, radians.
+
+        Raises
+        ------
+        OutOfRange
+            Beyond its limits.
+        Busy
+            If something else is under way.
+        """
+        rig, _ = self._needed()
+        with self._exclusively():
             self.stopped.clear()
             self.view.pitch = rig.head.move_to(pitch)
             self.view.measured = rig.head.has_feedback
         return self.view.pitch
 
-    def stop(self):
+    def stop(self) -> None:
         """Stop the head at once, and whatever was under way; returns when it has ended."""
         rig = self.rig
         end = time.monotonic() + WAIT_S
@@ -305,7 +349,7 @@ class Collector(Closed):
                 self._devices.release()
                 return
 
-    def look(self):
+    def look(self) -> View:
         """The View of the rig, unless it is busy: then what it records is in `view` already.
 
         What could not be read is said in `trouble`; nothing is raised for it.
@@ -336,16 +380,20 @@ class Collector(Closed):
         view.trouble = "; ".join(troubles)
         return view
 
-    def task(self):
-        """What to record next, a Task; None where the plan is done."""
-        return None if self.recording is None else next_task(self.recording, self._advice)
+    def task(self) -> Task | None:
+        """What to record next; None where the plan is done."""
+        if self.recording is None:
+            return None
+        return next_task(self.recording, self._advice)
 
-    def capture(self, progress=lambda share, text: None):
+    def capture(
+        self, progress: Callable[[float, str], object] = lambda share, text: None
+    ) -> list[Light]:
         """Record the next task, the board being where it should; an emulated rig puts it there.
 
         Parameters
         ----------
-        progress : callable
+        progress
             ``progress(share, text)`` is called after every event.
 
         Returns
@@ -358,30 +406,39 @@ class Collector(Closed):
         DeviceError, RecordingError, Interrupted
             Or if it was stopped: the placement does not count.
         """
-        self._needed()
+        rig, recording = self._needed()
         task = self.task()
         if task is None:
             remedy = "calibrate, or connect with another session"
             raise RecordingError(f"the plan of this rig is done: {remedy}")
-        with self._own():
+        with self._exclusively():
             self.stopped.clear()
-            if task.close:
-                self.rig.hold_close(*task.close)
-                return [self.recording.run_close(task.close[0])]
-            number = task.placement.number
+            placement = task.placement
+            if placement is None:
+                camera, view = task.close
+                rig.hold_close(camera, view)
+                return [recording.run_close(camera)]
+            number = placement.number
             self.view.rows = {}
-            self.rig.move_board(number)
-            self._record(task.placement, progress)
+            rig.move_board(number)
+            self._record(placement, progress)
         progress(1.0, "checking what was recorded")
-        self.lights[number] = self.recording.check(number, self._adviser())
+        scenes = {placement.number for placement in recording.plan if placement.purpose == "scene"}
+        adviser = None  # while every other placement helps
+        if len({*self.finished} - scenes) >= ADVICE_FROM:
+            adviser = self._advise
+        self.lights[number] = recording.check(number, adviser)
         return self.lights[number]
 
     def _record(self, placement, progress):
         """Record a placement; Interrupted if the user stops it."""
+        sweeping = Sweeping()
         with contextlib.closing(self.recording.run(placement)) as events:
             try:
                 for event in events:
-                    self._note(event, progress)
+                    self._note(event)
+                    sweeping.note(event)
+                    progress(sweeping.share, f"{sweeping.stop}{sweeping.counts()}")
                     if self.stopped.is_set():
                         raise DeviceError("stopped")
             except DeviceError as error:
@@ -390,27 +447,18 @@ class Collector(Closed):
                 words = f"placement {placement.number} does not count, record it again"
                 raise Interrupted(f"stopped: {words}") from error
 
-    def _adviser(self):
-        """What says where the next board helps most; None while every other one does."""
-        scenes = {p.number for p in self.recording.plan if p.purpose == "scene"}
-        enough = len({*self.finished} - scenes) >= ADVICE_FROM
-        return self._advise if enough else None
-
-    def _note(self, event, progress):
+    def _note(self, event):
         """Put an event into the view."""
         view = self.view
         if isinstance(event, Moved):
             view.pitch = event.pitch
             view.measured = event.measured
-            progress((event.number - 1) / event.of, f"stop {event.number} of {event.of}")
         elif isinstance(event, Scanned):
             for reading, pitch in zip(event.readings, event.pitch.tolist(), strict=True):
                 view.rows[pitch] = reading.ranges
-                view.ranges = reading.ranges
-                view.bearings = reading.bearings
-                view.pitch = pitch
-            if np.isfinite(event.share):
-                progress(event.share, f"{100 * event.share:.0f} % of the sweep")
+            view.ranges = reading.ranges
+            view.bearings = reading.bearings
+            view.pitch = pitch
         elif isinstance(event, Photographed):
             view.frames[event.camera] = event.frame
 
@@ -418,31 +466,39 @@ class Collector(Closed):
         self._advice = advise(session)
         return self._advice
 
-    def again(self):
+    def again(self) -> int:
         """Take the placement recorded last out of the session, to record it again; its number.
 
-        RecordingError if there is none.
+        Raises
+        ------
+        RecordingError
+            If there is none.
         """
-        self._needed()
+        _, recording = self._needed()
         if not self.finished:
             remedy = "press capture to record one"
             raise RecordingError(f"there is no placement to record again: {remedy}")
-        with self._own():
+        with self._exclusively():
             number = next(reversed(self.lights), self.finished[-1])
-            self.recording.drop(number)
+            recording.drop(number)
             self.lights.pop(number, None)
         return number
 
-    def calibrate(self):
-        """The Result of what was recorded so far; the recording can go on afterwards.
+    def calibrate(self) -> Result:
+        """Calibrate what was recorded so far; the recording can go on afterwards.
 
-        RecordingError if nothing was recorded yet, ValueError if it determines no calibration.
+        Raises
+        ------
+        RecordingError
+            If nothing was recorded yet.
+        ValueError
+            If it determines no calibration.
         """
-        self._needed()
+        _, recording = self._needed()
         if not self.finished:
             remedy = "capture at least three placements of the board"
             raise RecordingError(f"nothing was recorded yet: {remedy}")
-        return calibrate_recording(self.recording.path)
+        return calibrate_recording(recording.path)
 
 
 def _stated(rig, stack):

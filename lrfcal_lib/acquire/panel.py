@@ -2,24 +2,36 @@
 
 import contextlib
 import logging
+import os
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import ipywidgets as w
 import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
-from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted
-from lrfcal_lib.acquire.pictures import PICTURE, jpeg, png, scan_picture, sweep_picture
+from lrfcal_lib.acquire.checks import Light
+from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted, Result
+from lrfcal_lib.acquire.pictures import WIDTH, jpeg, png, scan_picture, sweep_picture
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.session.shown import escape
 from lrfcal_lib.session.write import new_session_path
 
+LOG = logging.getLogger(__name__)
+DRIVERS = logging.getLogger("lrfcal_lib")
+# errors whose messages say what to do
+EXPECTED = (DeviceError, RecordingError, Busy, Interrupted, ValueError, OSError)
+LOOK_S = 0.3  # between looks at the rig
+NOTES = 4  # lines of what drivers report
+FOLLOWS = "three placements and more; the recording can go on afterwards"
+PLAIN = "The data collection panel: it appears here while this notebook runs in JupyterLab."
+BUTTONS = ("connect", "close", "stop", "go", "capture", "again", "calibrate")  # methods of Panel
 HERE = Path(__file__).parent
 STYLE = f"<style>\n{HERE.joinpath('panel.css').read_text()}</style>"
 
@@ -31,7 +43,7 @@ def _as_text(value):
     return Markup(escape(value))
 
 
-HTML = (  # macros that make parts of the panel
+HTML: Any = (  # macros that make parts of the panel
     Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -78,7 +90,7 @@ class Picture:
     """A picture with a heading and a remark under it."""
 
     def __init__(self, name, heading, kind="png"):
-        layout = w.Layout(width="100%", max_width=f"{PICTURE[0]}px")
+        layout = w.Layout(width="100%", max_width=f"{WIDTH}px")
         self.image = w.Image(format=kind, layout=layout)
         self.image.add_class(f"lrfcal-picture-{name}")
         self.remark = w.HTML()
@@ -88,10 +100,6 @@ class Picture:
         """Show the bytes of an image; what did not change is not sent again."""
         self.image.value = data
         self.remark.value = HTML.soft(remark)
-
-
-FOLLOWS = "three placements and more; the recording can go on afterwards"
-BUTTONS = ("connect", "close", "stop", "go", "capture", "again", "calibrate")  # methods of Panel
 
 
 class Parts:
@@ -116,7 +124,7 @@ class Parts:
         lights = card(self.lights, grow=2, basis="420px")
         result = card(w.HTML(HTML.title("Result")), row(self.calibrate), self.result, basis="auto")
         below = [self.views, row(head, task, lights), result, self.notes]
-        parts = [w.HTML(STYLE), self.top, fields, self.places, self.error, *below]
+        parts = [w.HTML(STYLE), self.top, fields, self.places, self.error, self.trouble, *below]
         self.root = named("panel", w.VBox(parts, layout=w.Layout(grid_gap="10px")))
 
     def _make_fields(self, rig, session):
@@ -186,6 +194,7 @@ class Parts:
         self.state = text("state", HTML.state("off"))
         self.places = text("places")
         self.error = text("error")
+        self.trouble = text("trouble")
         self.notes = text("notes")
         self.pitch = text("pitch")
         self.task = text("task")
@@ -211,15 +220,6 @@ class Parts:
             part.disabled = busy or not connected
         for part in (self.again, self.calibrate):
             part.disabled = busy or not (connected and recorded)
-
-
-LOG = logging.getLogger(__name__)
-DRIVERS = logging.getLogger("lrfcal_lib")
-# errors whose messages say what to do
-EXPECTED = (DeviceError, RecordingError, Busy, Interrupted, ValueError, OSError)
-LOOK_S = 0.3
-NOTES = 4
-PLAIN = "The data collection panel: it appears here while this notebook runs in JupyterLab."
 
 
 class Notes(logging.Handler):
@@ -258,9 +258,9 @@ class Panel(Closed):
 
     Parameters
     ----------
-    rig : path-like or str
+    rig
         Rig file, or an emulated rig: 'practice' (seconds a placement), 'sim_quick', 'sim_lms221'.
-    session : path-like, optional
+    session
         Folder of the session, which stays; by default a new one in the folder that the environment
         variable ``LRFCAL_RECORDINGS`` names, else in ``~/lrfcal_sessions``. The panel shows where.
 
@@ -270,17 +270,18 @@ class Panel(Closed):
     >>> panel.show()  # doctest: +SKIP
     """
 
-    def __init__(self, rig="practice", session=None):
+    def __init__(
+        self, rig: str | os.PathLike = "practice", session: str | os.PathLike | None = None
+    ):
         session = session or new_session_path()
         self.collector = Collector()
         self.parts = Parts(str(rig), str(session))
         self.notes = Notes(self.parts.notes)
-        self.job = None  # what a button began
+        self.job: Future | None = None  # what a button began
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="panel")
-        self._live = None  # the thread that keeps looking
+        self._live: threading.Thread | None = None  # keeps looking
         self._quit = threading.Event()
         self._sweep = None  # field of view, ends of the pitch and its step, radians
-        self._view_failed = False  # the error shown is one of the view
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         for name in ("rig", "session"):
@@ -289,7 +290,7 @@ class Panel(Closed):
         self._refresh()
 
     @property
-    def session(self):
+    def session(self) -> Path:
         """Folder of the session that the field names, an absolute Path."""
         return absolute(self.parts.session.value)
 
@@ -297,17 +298,15 @@ class Panel(Closed):
         """Show what the fields name: relative paths are taken from where this notebook lies."""
         self.parts.places.value = HTML.places(rig_named(self.parts.rig.value), self.session)
 
-    def show(self):
+    def show(self) -> None:
         """Display the panel."""
         from IPython.display import display
 
-        bundle = self.parts.root._repr_mimebundle_()
-        data = bundle[0] if isinstance(bundle, tuple) else bundle
-        display({**data, "text/plain": PLAIN}, raw=True)
+        display({**self.parts.root._repr_mimebundle_(), "text/plain": PLAIN}, raw=True)
 
     # --------------------------------------------------------------------- the buttons
 
-    def connect(self):
+    def connect(self) -> None:
         """Open the rig and the session that the fields name; see :meth:`Collector.connect`."""
         with self._doing("connecting"):
             DRIVERS.addHandler(self.notes)
@@ -315,18 +314,17 @@ class Panel(Closed):
             collector = self.collector
             parts.rig.value = str(rig_named(parts.rig.value))
             parts.session.value = str(self.session)
-            collector.connect(parts.rig.value, self.session)
-            low, high = collector.limits_deg
+            rig = collector.connect(parts.rig.value, self.session)
+            limits: Any = rig.stated.devices.head.pitch_limits_deg
             with parts.slider.hold_trait_notifications():
-                parts.slider.min = low
-                parts.slider.max = high
-            parts.show_pictures(collector.rig.cameras)
+                parts.slider.min, parts.slider.max = limits
+            parts.show_pictures(rig.cameras)
             self._begin_sweep(collector.task())
             self._quit.clear()
             self._live = threading.Thread(target=self._keep_looking, name="panel view", daemon=True)
             self._live.start()
 
-    def close(self):
+    def close(self) -> None:
         """Stop the head, finish the session, close the devices."""
         with self._doing("closing"):
             self._quit.set()
@@ -337,35 +335,36 @@ class Panel(Closed):
             finally:
                 DRIVERS.removeHandler(self.notes)
 
-    def go(self):
+    def go(self) -> float:
         """Move the head to the target of the slider; returns where it settled, radians."""
         with self._doing("moving the head"):
             return self.collector.move_to(np.radians(self.parts.slider.value))
 
-    def capture(self):
+    def capture(self) -> list[Light]:
         """Record the next placement; returns its lights."""
         task = self.collector.task()
         with self._doing("recording"):
             self._begin_sweep(task)
             lights = self.collector.capture(self._show_progress)
-            self.parts.lights.value = HTML.lights(f"Quality of {task.title.lower()}", lights)
+            title = task.title.lower() if task else ""
+            self.parts.lights.value = HTML.lights(f"Quality of {title}", lights)
         return lights
 
-    def again(self):
+    def again(self) -> int:
         """Take the placement recorded last back; returns its number."""
         with self._doing("taking it back"):
             number = self.collector.again()
             self.parts.lights.value = HTML.lights("Quality", ())
         return number
 
-    def calibrate(self):
+    def calibrate(self) -> Result:
         """Calibrate what was recorded so far; returns the Result."""
         with self._doing("calibrating"):
             result = self.collector.calibrate()
             self.parts.result.value = HTML.result(result)
         return result
 
-    def stop(self):
+    def stop(self) -> None:
         """Stop the head at once, and what is under way."""
         self.collector.stop()
         self._show_progress(0.0, "stopped")
@@ -390,7 +389,6 @@ class Panel(Closed):
         """Something is under way: nothing else can be pressed, and what goes wrong is said."""
         parts = self.parts
         heading = ""
-        self._view_failed = False
         parts.error.value = ""
         parts.state.value = HTML.state("busy", text)
         self._show_progress(0.0, text)
@@ -398,15 +396,14 @@ class Panel(Closed):
         try:
             yield
         except Exception as error:
-            said = str(error)
+            words = str(error)
             heading = f"{text} failed"
             if isinstance(error, Interrupted):
                 heading = "stopped"
             elif not isinstance(error, EXPECTED):
-                said = f"{type(error).__name__}: {error}"
+                words = f"{type(error).__name__}: {error}"
                 LOG.exception("the panel failed while %s", text)
-            self._view_failed = False
-            parts.error.value = HTML.error(heading, said)
+            parts.error.value = HTML.error(heading, words)
             raise
         finally:
             self._show_progress(0.0, heading)
@@ -468,13 +465,11 @@ class Panel(Closed):
         if sweep is not None:
             rows = dict(view.rows)  # a copy: the recording goes on
             picture = sweep_picture(rows, view.bearings, *sweep)
-            said = f"{len(rows)} scan lines; near is bright, white is no range"
-            pictures["sweep"].show(png(picture), said)
+            words = f"{len(rows)} scan lines; near is bright, white is no range"
+            pictures["sweep"].show(png(picture), words)
         for name, frame in dict(view.frames).items():
             height, width = frame.image.shape[:2]
-            picture = jpeg(frame.image, PICTURE[0])
+            picture = jpeg(frame.image, WIDTH)
             pictures[name].show(picture, f"{width} x {height} pixels")
 
-        if view.trouble or self._view_failed:  # what was said goes when it is over
-            self.parts.error.value = HTML.error("view", view.trouble)
-            self._view_failed = bool(view.trouble)
+        self.parts.trouble.value = HTML.error("view", view.trouble)

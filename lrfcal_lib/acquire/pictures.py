@@ -2,14 +2,15 @@
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.recording import COLORS
 
-PICTURE = (400, 300)  # width and height of a picture, pixels
-REACHES = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 20.0, 30.0, 50.0, 82.0)  # of the top view, metres
-# metres between rings, up to a reach
-RING_STEPS = ((6.0, 1.0), (12.0, 2.0), (30.0, 5.0), (82.0, 20.0))
+WIDTH = 400  # of a picture, pixels
+HEIGHT = 300
+REACHES = (2.0, 4.0, 8.0, 12.0, 20.0, 40.0, 80.0, 120.0)  # of the top view, metres
+RINGS = 4  # of the top view
 SHIFT = 4  # binary digits of a pixel's fraction, as OpenCV counts them
 MARGIN = 1.1  # a picture is so many times larger than what it shows
 # of a sweep in its picture, pixels
@@ -24,26 +25,21 @@ CIRCLE = (217, 217, 217)
 GREY = (138, 138, 138)
 DARK = (51, 51, 51)
 EMPTY = (238, 238, 238)  # where there is no range
-DOT = tuple(int(COLORS["lrf"][i : i + 2], 16) for i in (5, 3, 1))
+DOT = tuple(reversed(bytes.fromhex(COLORS["lrf"][1:])))
 
 
-def write(image, text, u, v):
-    """Small grey text about a pixel."""
-    font = cv2.FONT_HERSHEY_SIMPLEX
-    scale = 0.36
-    (width, height), _ = cv2.getTextSize(text, font, scale, 1)
-    corner = round(u - width / 2), round(v + height / 2)
-    cv2.putText(image, text, corner, font, scale, GREY, 1, cv2.LINE_AA)
-
-
-def scan_picture(ranges, bearings, field_of_view):
+def scan_picture(
+    ranges: ArrayLike, bearings: ArrayLike, field_of_view: tuple[float, float]
+) -> np.ndarray:
     """A scan from above, the laser range finder below.
 
     Parameters
     ----------
-    ranges, bearings : array_like, shape (B,)
-        Metres, NaN for none; radians.
-    field_of_view : tuple of float
+    ranges
+        (B,), metres, NaN for none.
+    bearings
+        (B,), radians.
+    field_of_view
         First and last bearing, radians.
 
     Returns
@@ -53,29 +49,30 @@ def scan_picture(ranges, bearings, field_of_view):
     """
     points = polar_to_points(np.asarray(ranges, float), bearings)[:, :2]
     points = points[np.isfinite(points).all(axis=1)]
-    reach = _reach(points)
-    angle = np.linspace(*field_of_view, 91)
-    border = reach * np.column_stack([np.cos(angle), np.sin(angle)])
+    far = 0.0  # of nine of ten points
+    if len(points):
+        far = np.percentile(np.linalg.norm(points, axis=1), 90)
+    reach = next((reach for reach in REACHES if reach >= far), REACHES[-1])
+    border = polar_to_points(np.full(91, reach), np.linspace(*field_of_view, 91))[:, :2]
 
     low = min(0.0, border[:, 1].min())
     high = border[:, 1].max()
-    wide = PICTURE[0] / 2 / np.abs(border[:, 0]).max()
-    scale = min(PICTURE[1] / (high - low), wide) / MARGIN  # pixels a metre
-    origin = np.array(PICTURE) / 2 - 0.5 + [0, scale * (low + high) / 2]
+    across = 2 * np.abs(border[:, 0]).max()
+    scale = min(HEIGHT / (high - low), WIDTH / across) / MARGIN  # pixels a metre
+    origin = np.array([WIDTH, HEIGHT + scale * (low + high)]) / 2 - 0.5
 
     def pixels(points):
         """Fixed-point pixels of points in metres."""
-        return np.rint((origin + [scale, -scale] * np.asarray(points)) * 2**SHIFT).astype(int)
+        return np.rint((origin + [scale, -scale] * points) * 2**SHIFT).astype(int)
 
-    image = np.full((PICTURE[1], PICTURE[0], 3), 255, np.uint8)
-    cv2.fillPoly(image, [pixels([(0, 0), *border])], SECTOR, cv2.LINE_AA, SHIFT)
-    step = next(step for most, step in RING_STEPS if reach <= most)
-    for radius in np.arange(step, reach + 1e-6, step):
-        ring = pixels(border * radius / reach)
+    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    cv2.fillPoly(image, [pixels(np.vstack([np.zeros(2), border]))], SECTOR, cv2.LINE_AA, SHIFT)
+    for share in np.linspace(0, 1, RINGS + 1)[1:]:
+        ring = pixels(share * border)
         cv2.polylines(image, [ring], False, CIRCLE, 1, cv2.LINE_AA, SHIFT)
-        if radius < reach:
+        if share < 1:
             u, v = ring[0] / 2**SHIFT
-            write(image, f"{radius:g} m", u + 14, v + 8)
+            write(image, f"{share * reach:g} m", u + 14, v + 8)
     arrow = pixels(np.array([(-6, -5), (6, -5), (0, 7)]) / scale)
     cv2.fillPoly(image, [arrow], DARK, cv2.LINE_AA, SHIFT)
     for pixel in pixels(points).tolist():
@@ -83,28 +80,26 @@ def scan_picture(ranges, bearings, field_of_view):
     return image
 
 
-def _reach(points):
-    """How far a top view reaches: nine of ten points (n, 2) are nearer; metres."""
-    far = 0.0
-    if len(points):
-        far = np.percentile(np.linalg.norm(points, axis=1), 90)
-    return next((reach for reach in REACHES if reach >= far), REACHES[-1])
-
-
-def sweep_picture(rows, bearings, field_of_view, pitch, step):
+def sweep_picture(
+    rows: dict[float, np.ndarray],
+    bearings: np.ndarray,
+    field_of_view: tuple[float, float],
+    pitch: tuple[float, float],
+    step: float,
+) -> np.ndarray:
     """A sweep as it grows: ranges as colours, near is bright, grey where there is none.
 
     Bearing grows to the left as in the scene, pitch upwards.
 
     Parameters
     ----------
-    rows : dict of float to ndarray, shape (B,)
-        Ranges (metres) by pitch (radians).
-    bearings : ndarray, shape (B,)
-        Radians.
-    field_of_view, pitch : tuple of float
+    rows
+        Ranges (B,), metres, by pitch, radians.
+    bearings
+        (B,), radians; not used without rows.
+    field_of_view, pitch
         Their ends, radians.
-    step : float
+    step
         Radians between scan lines, of a continuous sweep the most between two.
 
     Returns
@@ -113,35 +108,54 @@ def sweep_picture(rows, bearings, field_of_view, pitch, step):
         Blue, green, red.
     """
     half = np.degrees(step) / 2
-    across = np.degrees([max(field_of_view), min(field_of_view)])
-    down = np.array([np.degrees(max(pitch)) + half, np.degrees(min(pitch)) - half])
+    right, left = np.sort(np.degrees(field_of_view))
+    low, high = np.sort(np.degrees(pitch)) + [-half, half]
+    across = (left, right)
+    down = (high, low)
     image = _axes(across, down)
     if not rows:
         return image
 
     shades = _shades(np.array(list(rows.values())))
-    width = RIGHT - LEFT
-    height = BOTTOM - TOP
-    u = (np.arange(width) + 0.5) / width
-    v = (np.arange(height) + 0.5) / height
-    bearing = np.interp(u, (0, 1), across)
+    bearing = np.linspace(*across, RIGHT - LEFT)
     beam = np.rint(np.interp(bearing, np.degrees(bearings), np.arange(len(bearings)))).astype(int)
-    away = np.abs(np.interp(v, (0, 1), down)[:, None] - np.degrees(list(rows)))
-    covered = away.min(axis=1) <= half + np.ptp(down) / height
+    at = np.linspace(*down, BOTTOM - TOP)
+    away = np.abs(at[:, None] - np.degrees(list(rows)))
+    covered = away.min(axis=1) <= half + (high - low) / len(at)
     nearest = away.argmin(axis=1)[covered]
     image[TOP:BOTTOM, LEFT:RIGHT][covered] = shades[nearest][:, beam]
     return image
 
 
+def write(image: np.ndarray, text: str, u: float, v: float) -> None:
+    """Write small and grey.
+
+    Parameters
+    ----------
+    image
+        To be written to.
+    text
+        In plain letters.
+    u, v
+        Middle of the text, pixels.
+    """
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    scale = 0.36
+    (width, height), _ = cv2.getTextSize(text, font, scale, 1)
+    corner = round(u - width / 2), round(v + height / 2)
+    cv2.putText(image, text, corner, font, scale, GREY, 1, cv2.LINE_AA)
+
+
 def _axes(across, down):
     """The empty picture of a sweep, with the bearings and pitches (degrees) of its ends."""
-    image = np.full((PICTURE[1], PICTURE[0], 3), 255, np.uint8)
+    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     image[TOP:BOTTOM, LEFT:RIGHT] = EMPTY
-    for share in (0, 0.5, 1):
-        bearing = np.interp(share, (0, 1), across)
-        pitch = np.interp(share, (0, 1), down)
-        write(image, f"{bearing:.0f}", LEFT + share * (RIGHT - LEFT), BOTTOM + 12)
-        write(image, f"{pitch:.0f}", LEFT - 18, TOP + share * (BOTTOM - TOP))
+    bearings = np.linspace(*across, 3)
+    for bearing, u in zip(bearings, np.linspace(LEFT, RIGHT, 3), strict=True):
+        write(image, f"{bearing:.0f}", u, BOTTOM + 12)
+    pitches = np.linspace(*down, 3)
+    for pitch, v in zip(pitches, np.linspace(TOP, BOTTOM, 3), strict=True):
+        write(image, f"{pitch:.0f}", LEFT - 18, v)
     write(image, "bearing [deg]", (LEFT + RIGHT) / 2, BOTTOM + 30)
     write(image, "pitch [deg]", 32, BOTTOM + 30)
     return image
@@ -160,13 +174,27 @@ def _shades(ranges):
     return np.where(known[..., None], colours, np.uint8(EMPTY))
 
 
-def png(image):
-    """Bytes of a PNG file."""
+def png(image: np.ndarray) -> bytes:
+    """Content of a PNG file.
+
+    Parameters
+    ----------
+    image
+        (height, width, 3), BGR.
+    """
     return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
 
 
-def jpeg(image, width):
-    """Bytes of a JPEG file of an image (BGR), not wider than so many pixels."""
+def jpeg(image: np.ndarray, width: int) -> bytes:
+    """Content of a JPEG file.
+
+    Parameters
+    ----------
+    image
+        (height, width, 3), BGR.
+    width
+        Of the file at most, pixels.
+    """
     scale = width / image.shape[1]
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -3,19 +3,21 @@
 import contextlib
 import logging
 import math
+import os
 import signal
 import sys
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm import tqdm
 
-from lrfcal_lib.acquire.checks import check_image, check_placement
+from lrfcal_lib.acquire.checks import Light, check_image, check_placement
 from lrfcal_lib.drivers.port import Closed, DeviceError
-from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked
-from lrfcal_lib.drivers.rig_file import read_rig_file
+from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned, Tracked
+from lrfcal_lib.drivers.rig_file import Placement, read_rig_file
 from lrfcal_lib.session.progress import Progress, duration
-from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import not_written
@@ -42,13 +44,13 @@ class Recording(Closed):
 
     Parameters
     ----------
-    rig : Rig
+    rig
         Open.
-    path : path-like
+    path
         Folder of the session.
-    resume : bool
+    resume
         Go on with the recording in `path` if there is one: its finished placements stay.
-    count : int, optional
+    count
         Record only so many placements of the plan.
 
     Raises
@@ -70,7 +72,14 @@ class Recording(Closed):
     ...     recording.finish()
     """
 
-    def __init__(self, rig, path, *, resume=False, count=None):
+    def __init__(
+        self,
+        rig: Rig,
+        path: str | os.PathLike,
+        *,
+        resume: bool = False,
+        count: int | None = None,
+    ):
         self.rig = rig
         self.path = Path(path)
         self.plan = rig.stated.plan.to_do(count)
@@ -109,30 +118,41 @@ class Recording(Closed):
         )
 
     @property
-    def finished(self):
+    def finished(self) -> tuple[int, ...]:
         """Numbers of the placements that are complete and safe."""
         return self.writer.finished
 
-    def close(self):
+    def close(self) -> None:
         """Record nothing any more: the session is free for others, who may go on with it."""
         self.writer.close()
 
-    def to_do(self):
+    def to_do(self) -> list[Placement]:
         """The placements of the plan that are not finished, in order."""
         return [placement for placement in self.plan if placement.number not in self.finished]
 
-    def close_views_to_do(self):
+    def close_views_to_do(self) -> list[tuple[str, int]]:
         """Images of the board held close still to be taken: camera, number of the view from 0."""
         wanted = self.rig.stated.plan.intrinsics_images
         taken = self.writer.shots_of("intrinsics")
         return [(camera, view) for camera in taken for view in range(taken[camera], wanted)]
 
-    def run(self, placement):
-        """Record a placement of :meth:`to_do`, and yield every event once it is on the disk.
+    def run(self, placement: Placement) -> Generator[Event, None, None]:
+        """Record a placement, and yield every event once it is on the disk.
 
-        When the generator ends the placement is finished. When it is closed or raises (DeviceError,
-        or RecordingError if the disk is full or gone), the head is stopped and the placement is not
-        part of the session.
+        When the generator ends the placement is finished. When it is closed or raises, the head is
+        stopped and the placement is not part of the session.
+
+        Parameters
+        ----------
+        placement
+            Of :meth:`to_do`.
+
+        Raises
+        ------
+        DeviceError
+            If the rig fails.
+        RecordingError
+            If the disk is full or gone.
         """
         with self._safely():
             self.writer.begin_placement(placement.number)
@@ -143,64 +163,112 @@ class Recording(Closed):
         with self._safely():
             self.writer.finish_placement()
 
-    def run_close(self, camera):
-        """Take an image of the board held close to a camera: its Light.
+    def run_close(self, camera: str) -> Light:
+        """Take an image of the board held close to a camera.
 
-        It is 'bad' where the image shows no pattern and was not kept.
+        Parameters
+        ----------
+        camera
+            Its name.
+
+        Returns
+        -------
+        Light
+            'bad' where the image shows no pattern and was not kept.
         """
         with contextlib.closing(self.rig.acquire_close(camera)) as events:
-            *_, event = events
-        model = self.rig.stated.cameras[camera].model
-        light = check_image(event.frame.image, self.rig.stated.board, model, f"camera {camera}")
+            (photo,) = (event for event in events if isinstance(event, Photographed))
+        stated = self.rig.stated
+        model = stated.cameras[camera].model
+        light = check_image(photo.frame.image, stated.board, model, f"camera {camera}")
         if light.state != "bad":
-            self.write(event)
+            self.write(photo)
         return light
 
-    def check(self, number, advice=None):
-        """Lights of a finished placement, see
-        :func:`~lrfcal_lib.acquire.checks.check_placement`.
+    def check(self, number: int, advice: Callable[[Session], str] | None = None) -> list[Light]:
+        """Lights of a finished placement.
+
+        Parameters
+        ----------
+        number
+            Of the placement.
+        advice
+            As of :func:`~lrfcal_lib.acquire.checks.check_placement`.
         """
         return check_placement(open_session(self.path), number, advice)
 
-    def drop(self, number):
-        """Take a placement out of the session, to record it again; its bytes stay on the disk."""
+    def drop(self, number: int) -> None:
+        """Take a placement out of the session, to record it again; its bytes stay on the disk.
+
+        Parameters
+        ----------
+        number
+            Of the placement.
+        """
         with self._safely():
             self.writer.drop_placement(number)
 
-    def finish(self):
+    def finish(self) -> None:
         """Close the session; without this it can still be opened, and the recording can go on.
 
-        RecordingError if the session on the disk does not hold what was finished.
+        Raises
+        ------
+        RecordingError
+            If the session on the disk does not hold what was finished.
         """
         with self._safely():
             self.writer.finish()
         if self._readable() != set(self.finished):
             raise RecordingError(f"{self.path}: {self.safe()}")
 
-    def safe(self, resume=False):
-        """What is safe on the disk and, if asked for, how to go on; half a sentence."""
-        there = self._readable()
-        if there is None or set(self.finished) - there:
+    def safe(self, resume: bool = False) -> str:
+        """What is safe on the disk, half a sentence.
+
+        Parameters
+        ----------
+        resume
+            Say how to go on, too.
+        """
+        readable = self._readable()
+        if readable is None or set(self.finished) - readable:
             lost = "the session was removed or damaged while it was recorded"
             return f"{lost}: record again, to another folder"
-        numbers = ", ".join(map(str, self.finished))
-        safe = f"placements {numbers} are safe" if numbers else "no placement was finished"
-        return f"{safe}; --resume goes on from there" if resume else safe
+        safe = "no placement was finished"
+        if self.finished:
+            safe = f"placements {', '.join(map(str, self.finished))} are safe"
+        if resume:
+            safe = f"{safe}; --resume goes on from there"
+        return safe
 
     def _readable(self):
         """Finished placements that a reader finds with their scans; None without a session."""
         try:
-            found = set(open_session(self.path).scans["placement"].tolist())
+            recorded = open_session(self.path).scans["placement"].tolist()
         except (SessionError, OSError):
-            return None if self.finished or not self.path.exists() else set()
-        return found & set(self.finished)
+            if self.finished or not self.path.exists():
+                return None
+            return set()
+        return set(recorded) & set(self.finished)
 
-    def write(self, event):
-        """Put an event on the disk; the parts of an interlaced scan share its pitch."""
+    def write(self, event: Event) -> None:
+        """Put an event on the disk; the parts of an interlaced scan share its pitch.
+
+        Parameters
+        ----------
+        event
+            Of the rig.
+
+        Raises
+        ------
+        RecordingError
+            If the disk is full or gone.
+        """
         writer = self.writer
         with self._safely():
             if isinstance(event, Moved):
-                measured = event.pitch if event.measured else math.nan
+                measured = math.nan
+                if event.measured:
+                    measured = event.pitch
                 writer.add_platform([(event.time_s, event.commanded, measured)])
             elif isinstance(event, Scanned):
                 self._write_scans(event)
@@ -214,8 +282,10 @@ class Recording(Closed):
                     purpose=event.purpose,
                 )
             elif isinstance(event, Tracked):
-                known = [(t, pitch) for t, pitch, measured in event.track if measured]
-                writer.add_platform([(t, event.commanded, pitch) for t, pitch in known])
+                track = [
+                    (t, event.commanded, pitch) for t, pitch, measured in event.track if measured
+                ]
+                writer.add_platform(track)
 
     def _write_scans(self, event):
         """Put the telegrams of readings on the disk."""
@@ -235,12 +305,25 @@ class Recording(Closed):
         try:
             yield
         except OSError as error:
-            safe = self.safe(resume=True) if hasattr(self, "writer") else "then record again"
+            safe = "then record again"
+            if hasattr(self, "writer"):
+                safe = self.safe(resume=True)
             raise RecordingError(f"{self.path}: {not_written(error)}; {safe}") from error
 
 
-def ask(text):
-    """What the user at the terminal answers; RecordingError if nobody can."""
+def ask(text: str) -> str:
+    """Ask the user at the terminal.
+
+    Parameters
+    ----------
+    text
+        The question.
+
+    Raises
+    ------
+    RecordingError
+        If nobody answers.
+    """
     try:
         return input(text).strip().lower()
     except EOFError:
@@ -258,8 +341,14 @@ class Sweeping:
     stop: str = ""
     share: float = 0.0  # of the sweep
 
-    def note(self, event):
-        """Take an event into account."""
+    def note(self, event: Event) -> None:
+        """Take an event into account.
+
+        Parameters
+        ----------
+        event
+            Of the placement.
+        """
         if isinstance(event, Moved):
             self.stop = f"stop {event.number} of {event.of}, "
             self.pitch = event.pitch
@@ -277,10 +366,19 @@ class Sweeping:
         return f"{self.scans} scans, {self.images} images"
 
 
-def follow(placement, number, of, events):
+def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) -> None:
     """Show the recording of a placement while it runs, and how long it will still take.
 
     On a terminal one line is written over and over; a file gets a line now and then.
+
+    Parameters
+    ----------
+    placement
+        That is recorded.
+    number, of
+        It is the so-manieth of so many.
+    events
+        Of its recording.
     """
     first, last = (math.degrees(pitch) for pitch in placement.pitch[[0, -1]])
     title = f"placement {placement.number} ({number} of {of}): {placement.purpose}"
@@ -299,12 +397,22 @@ def follow(placement, number, of, events):
     print(f"  {sweeping.counts()} in {progress.seconds:.0f} s", flush=True)
 
 
-def show(light, name=None):
-    """What a check found."""
-    print(f"{MARKS[light.state]}  {name or light.name}: {light.text}", flush=True)
+def show(light: Light, name: str) -> None:
+    """Print what a check found.
+
+    Parameters
+    ----------
+    light
+        Of the check.
+    name
+        What was checked.
+    """
+    print(f"{MARKS[light.state]}  {name}: {light.text}", flush=True)
 
 
-def record_session(rig, path, *, resume=False, count=None):
+def record_session(
+    rig: Rig, path: str | os.PathLike, *, resume: bool = False, count: int | None = None
+) -> Recording:
     """Record a session with an open rig, from the first placement that is missing to the last.
 
     Parameters
@@ -371,7 +479,7 @@ def _placements(recording):
         recorded.append(progress.seconds)
         before = placement.number
         for light in recording.check(before):
-            show(light)
+            show(light, light.name)
         if left := len(todo) - 1:
             expected = duration(left * sum(recorded) / len(recorded))
             print(f"  {left} of {of} placements left: about {expected} of recording", flush=True)
@@ -393,15 +501,23 @@ def _ask_for_board(placement, before):
     return answer
 
 
-def main(rig_file, path, *, resume=False, count=None, mode=None):
+def main(
+    rig_file: str | os.PathLike,
+    path: str | os.PathLike,
+    *,
+    resume: bool = False,
+    count: int | None = None,
+    mode: str | None = None,
+) -> int:
     """Record from the command line.
 
     Parameters
     ----------
-    rig_file, path : path-like
-    resume, count
+    rig_file
+        Its path.
+    path, resume, count
         As of :func:`record_session`.
-    mode : str, optional
+    mode
         Instead of the plan's.
 
     Returns
@@ -422,7 +538,7 @@ def main(rig_file, path, *, resume=False, count=None, mode=None):
         if isinstance(error, KeyboardInterrupt):
             text = "\nstopped by Ctrl-C"
             code = INTERRUPTED
-        elif isinstance(error, SystemExit):
+        elif isinstance(error, SystemExit) and isinstance(error.code, int):
             text = f"\nstopped by {signal.Signals(error.code - 128).name}"
             code = error.code
         with contextlib.suppress(OSError):  # after SIGHUP the terminal may be gone
@@ -432,8 +548,14 @@ def main(rig_file, path, *, resume=False, count=None, mode=None):
     return 0
 
 
-def next_step(recording):
-    """What can be done with a recording that has ended, half a sentence."""
+def next_step(recording: Recording) -> str:
+    """What can be done with a recording that has ended, half a sentence.
+
+    Parameters
+    ----------
+    recording
+        Finished.
+    """
     boards = {placement.number for placement in recording.plan if placement.purpose == "board"}
     if boards & set(recording.finished):
         return f"'python -m lrfcal_lib calibrate {recording.path}' calibrates the rig"

@@ -1,6 +1,6 @@
 """The tilt axis and the cameras, each by itself, from observations alone: no session is needed."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,9 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
-from lrfcal_lib.model.kinematics import Corrections, camera_at
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.solvers import METHODS, row_of, solve_camera
@@ -51,52 +49,6 @@ class KnownAxis:
     def sigma(self) -> np.ndarray:
         """Standard deviations of `parameters`, shape (4,)."""
         return np.sqrt(np.diag(self.covariance))
-
-
-@dataclass(frozen=True)
-class CalibratedCamera:
-    """A camera as it is fixed to a rig.
-
-    Attributes
-    ----------
-    T_camera : RigidTransform
-        ``T_camera_lrf`` on the head, ``T_camera_platform`` on the base.
-    mount : {'head', 'platform'}
-    model : CameraModel
-    """
-
-    T_camera: RigidTransform
-    mount: str
-    model: CameraModel
-
-
-@dataclass(frozen=True)
-class CalibratedRig:
-    """What a method says about a rig: all that turns its sweeps and images into a coloured cloud.
-
-    Attributes
-    ----------
-    method : str
-    axis : KnownAxis
-    corrections : Corrections
-        Of ranges and pitch.
-    cameras : dict of str to CalibratedCamera
-    """
-
-    method: str
-    axis: KnownAxis
-    corrections: Corrections
-    cameras: dict[str, CalibratedCamera]
-
-    @property
-    def T_head_lrf(self) -> RigidTransform:
-        """Of its axis."""
-        return self.axis.T_head_lrf
-
-    def camera_at(self, name: str, pitch: float) -> RigidTransform:
-        """``T_camera_platform`` of a camera at a true pitch (radians)."""
-        camera = self.cameras[name]
-        return camera_at(camera.T_camera, camera.mount, self.T_head_lrf, pitch)
 
 
 @dataclass(frozen=True)
@@ -166,7 +118,7 @@ def calibrate_platform(
         Where the platform is neither stated nor determined, 'combined' is an assumption, and so
         named in `problems`.
     """
-    ways = {
+    ways: dict[str, tuple[str, Callable[..., PlatformSolution]]] = {
         "projected_printed": ("last_beam", partial(solve_projected, printed=True)),
         "projected_last_beam": ("last_beam", solve_projected),
         "line_3d": ("half_step", partial(solve_platform, sigma_pitch=sigma_pitch)),

@@ -97,6 +97,11 @@ def join(clouds: Iterable[Cloud]) -> Cloud:
     return Cloud(**columns, removed=sum(cloud.removed for cloud in clouds))
 
 
+def point_type(columns: dict[str, tuple[str, str]]) -> np.dtype:
+    """How a file with columns such as :data:`COLUMNS` holds one point."""
+    return np.dtype([(key, kind, (len(names.split()),)) for key, (kind, names) in columns.items()])
+
+
 def write_ply(
     path: str | Path, clouds: Cloud | Iterable[Cloud], comments: Iterable[str] = ()
 ) -> int:
@@ -122,10 +127,8 @@ def write_ply(
     """
     if isinstance(clouds, Cloud):
         clouds = [clouds]
-    layout = []
     properties = []
-    for attribute, (kind, names) in COLUMNS.items():
-        layout.append((attribute, kind, (len(names.split()),)))
+    for kind, names in COLUMNS.values():
         properties += [f"property {KINDS[kind]} {name}" for name in names.split()]
     head = ["ply", "format binary_little_endian 1.0"]
     head += [f"comment {words}" for words in (*ABOUT, *comments)]
@@ -139,8 +142,8 @@ def write_ply(
     with whole(path) as draft, open(draft, "wb") as file:
         file.write(header(0))
         for cloud in clouds:
-            rows = np.empty(len(cloud.points), np.dtype(layout))
-            for attribute, *_ in layout:
+            rows = np.empty(len(cloud.points), point_type(COLUMNS))
+            for attribute in COLUMNS:
                 rows[attribute] = getattr(cloud, attribute).reshape(len(rows), -1)
             file.write(rows.tobytes())
             count += len(rows)

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from lrfcal_lib.calibrate.cameras import CalibratedRig
 from lrfcal_lib.calibrate.cloud import Cloud, join
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.reconstruct import reconstruct
+from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.session.read import Session
 
 MARGIN = 20  # scan lines and beams about a board that are worked on with it

@@ -4,44 +4,96 @@ what it is worth.
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.calibrate import outline
 from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.fit.least_squares import Block, linearise, minimise, whiten
+from lrfcal_lib.calibrate.outline import (
+    LEAST_STRETCH,
+    MeasuredBoard,
+    measure_board,
+    moved_lines,
+    plane_frame,
+    sized,
+)
+from lrfcal_lib.calibrate.pipeline import JointCalibration
+from lrfcal_lib.calibrate.recorded import in_platform, named_sides
+from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
+from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.preprocess.board_in_image import line_misses
+from lrfcal_lib.preprocess.board_in_scan import face_points
+from lrfcal_lib.preprocess.edges_in_image import ImageEdge
+from lrfcal_lib.preprocess.pose_from_lines import line_misses
 from lrfcal_lib.solvers import joint_model, joint_residuals
 
+FEWEST_CELLS = 8  # beams about a side that no image shows
+# information roots of a side of which nothing is known: ten metres and a radian are far
+FAR = (10.0, 1.0)
 STILL = 1e5  # information roots of what moves board and sides together, which changes no length
+ALONG = np.linspace(0.0, 1.0, 9)  # places along the stretch of an image edge
 SCALE_ROUNDS = 4  # of weighing image edges by how well they fit
 LEAST_SCALE = 0.1
 UNKNOWN = 1e6  # variance of what nothing determines
+KNOWN = 1e-18  # variance of what is held
 WIDEST = 0.1  # share of its length by which an edge may be uncertain and still count as measured
+ITERATIONS = 30
+TOLERANCE = 0.02  # sigma
+
+
+class ImageSide(NamedTuple):
+    """A side of the board in an image: the row of the image's view, the number of the side, the
+    edge and its lens, and where along the side (metres) it begins and ends.
+    """
+
+    row: int
+    number: int
+    edge: ImageEdge
+    model: CameraModel
+    reach: np.ndarray
+
+
+class State(NamedTuple):
+    """What moves: the joint state, the lines (E, 3) of all sides, the change of the
+    calibration (c,).
+    """
+
+    joint: joint_model.JointState
+    lines: np.ndarray
+    change: np.ndarray
 
 
 @dataclass(frozen=True)
 class Case:
-    """What one placement says: padded observations, image edges as pairs (row of the view, edge,
-    model), and a start.
+    """What one placement says, and a start.
 
-    `whitener` (c, c) is of the calibration that has not seen the placement; `middle` (E, 2) are
-    points of the sides about which they turn, `reach` (m, 2) where along its side each image edge
-    begins and ends, metres.
+    Attributes
+    ----------
+    data, unknowns : JointData, Unknowns
+        Of this placement alone.
+    whitener : ndarray, shape (c, c)
+        Of the calibration that has not seen the placement.
+    images : list of ImageSide
+    middle : ndarray, shape (E, 2)
+        Points of the sides about which they turn, metres.
+    edges : tuple of str
+        All of the board.
+    start : State
     """
 
     data: joint_model.JointData
     unknowns: joint_model.Unknowns
     whitener: np.ndarray
-    images: list
-    reach: np.ndarray
+    images: list[ImageSide]
     middle: np.ndarray
-    start: tuple
+    edges: tuple[str, ...]
+    start: State
 
 
-def combined_outlines(joint):
+def combined_outlines(
+    joint: JointCalibration,
+) -> dict[int, tuple[MeasuredBoard, frozenset[str]]]:
     """Measure the boards of all placements by face, beams about the edges and image edges, none
     knowing their size.
 
@@ -61,58 +113,69 @@ def combined_outlines(joint):
         By placement, with standard deviations, and the sides that no image shows; placements that
         span no plane or show no edge are missing.
     """
-    views = {camera: list(found.values()) for camera, found in joint.prepared.views.items()}
-    observations = observe_joint(joint.prepared, views)
+    prepared = joint.prepared
+    views = {camera: list(of_camera.values()) for camera, of_camera in prepared.views.items()}
+    observations = observe_joint(prepared, views)
+    states = {}
     cases = {}
-    scale = 1.0
     for placement in observations.placements.tolist():
         try:
-            cases[placement] = case_of(joint, observations, placement)
+            case = case_of(joint, observations, placement)
         except DegenerateGeometry:
             continue
-    found = {placement: case.start for placement, case in cases.items()}
-    measured = {}
-    for last in [False] * SCALE_ROUNDS + [True]:
-        total = np.zeros(2)
-        for placement, case in list(cases.items()):
-            try:
-                found[placement], covariance = fitted(case, found[placement], scale)
-                if last:
-                    measured[placement] = _measured(
-                        case, found[placement], covariance, joint.prepared.board.edges
-                    )
+        cases[placement] = case
+        states[placement] = case.start
+    measured: dict = {}
+    scale = 1.0
+    for _ in range(SCALE_ROUNDS + 1):
+        measured = {}
+        square = 0.0
+        freedom = 0.0
+        for placement, case in cases.items():
             # what is left open, as by single scans, has no answer
+            try:
+                state, covariance = fitted(case, states[placement], scale)
+                measured[placement] = _measured(case, state, covariance)
             except (DegenerateGeometry, np.linalg.LinAlgError):
-                del cases[placement]
                 continue
+            states[placement] = state
             if case.images:
-                r, J = whiten(sight_block(found[placement], case, scale))
-                total += np.sum(r**2), np.sum(1 - np.sum((J @ covariance) * J, axis=-1))
-        scale = max(scale * np.sqrt(total[0] / total[1]) if total[1] > 0 else 1.0, LEAST_SCALE)
+                block = sight_block(state, case, scale)
+                r = block.white
+                J = block.white_jacobian
+                square += np.sum(r**2)
+                freedom += np.sum(1 - np.vecdot(J @ covariance, J))
+        cases = {placement: cases[placement] for placement in measured}
+        if freedom > 0:
+            scale = max(scale * np.sqrt(square / freedom), LEAST_SCALE)
     return as_scattered(measured)
 
 
-def as_scattered(measured):
+def as_scattered(
+    measured: dict[int, tuple[MeasuredBoard, frozenset[str]]],
+) -> dict[int, tuple[MeasuredBoard, frozenset[str]]]:
     """Boards (see :func:`combined_outlines`), as well known as their lengths agree over placements.
 
     Errors that all images of a side share (paint, a rim, a pattern close by), or all beams about
     it, show in no residual of its placement. But it is one board everywhere, whatever its size.
     """
+    lengths: dict = {}  # pairs of length and sigma, by edge
+    for board, _ in measured.values():
+        for name, length in board.lengths.items():
+            lengths.setdefault(name, []).append((length, board.sigma[name]))
     square = 0.0
     freedom = 0
-    for name in {name for board, _ in measured.values() for name in board.lengths}:
-        showing = [board for board, _ in measured.values() if name in board.lengths]
-        length = np.array([board.lengths[name] for board in showing])
-        sigma = np.array([board.sigma[name] for board in showing])
+    for pairs in lengths.values():
+        length, sigma = np.transpose(pairs)
         mean = np.average(length, weights=sigma**-2)
         square += np.sum(((length - mean) / sigma) ** 2)
-        freedom += len(showing) - 1
-    grow = np.sqrt(max(square / freedom, 1.0)) if freedom > 0 else 1.0
-    out = {}
+        freedom += len(pairs) - 1
+    grow = float(np.sqrt(max(square / max(freedom, 1), 1.0)))
+    grown = {}
     for placement, (board, scanned) in measured.items():
-        sigma = {name: float(grow * value) for name, value in board.sigma.items()}
-        out[placement] = replace(board, sigma=sigma), scanned
-    return out
+        sigma = {name: grow * value for name, value in board.sigma.items()}
+        grown[placement] = (replace(board, sigma=sigma), scanned)
+    return grown
 
 
 def case_of(joint, observations, placement):
@@ -120,121 +183,154 @@ def case_of(joint, observations, placement):
 
     DegenerateGeometry if its face spans no plane or nothing shows a side of it.
     """
-    solution = joint.without.get(placement, joint.solution)
     prepared = joint.prepared
-    obs = observations.with_cameras(solution.observations.cameras).select([placement])
-    edges = prepared.board.edges
-    face, sides = outline.edges_in_cloud(solution, prepared, placement)
-    shown = set(sides)
-    told = [edges.index(name) for name in sides]
-    for side in outline.named_sides(prepared, placement, stretch=outline.LEAST_STRETCH):
+    solution = joint.without.get(placement, joint.solution)
+    edges = tuple(prepared.board.edges)
+    source = in_platform(placement, solution.T_head_lrf, solution.corrections)
+    p_lrf, pitch, _ = face_points(prepared.scans[placement])
+    face = source.points(p_lrf, pitch)
+    sides = edges_in_cloud(solution, prepared, placement, face)
+    for side in named_sides(prepared, placement, stretch=LEAST_STRETCH):
         # where a sweep begins and ends may be where a cloud was cut
-        if side.name not in shown and not side.across:
-            told.append(edges.index(side.name))
-            points = solution.corrections.points(side.edges.points[side.rows])
-            pitch = solution.corrections.pitch(placement, side.edges.pitch[side.rows])
-            sides[side.name] = geometry.lrf_to_platform(points, pitch, solution.T_head_lrf)
-    rough = outline.measure_board(face, sides, edges)
+        if side.name not in sides and not side.across:
+            sides[side.name] = source.points(side.points, side.pitch)
+    rough = measure_board(face, sides, edges)
+    board = rough.T_platform_plane
     lines = np.array([rough.lines.get(name, [1.0, 0.0, -1.0]) for name in edges])
     lines *= -np.where(lines[:, 2:] > 0, 1.0, -1.0)  # outwards: the face is in the middle
-    obs = obs.keep(beam=np.isin(obs.beam_edge, told))
-    data = joint_model.gather(obs, replace(solution.data.levels, prior=None))
-    own = {
-        "boards": rough.T_platform_plane[None, :3],
-        "sweeps": np.zeros((1, 2)),
-        "sides": np.zeros((1, len(edges))),
-    }
-    state = replace(solution.state, **own)
+    obs = observations.with_cameras(solution.observations.cameras).select([placement])
     images = []
-    seen = (prepared.views[c].get(placement) for c in obs.cameras)
-    for row, view in enumerate(
-        view for view in seen if view is not None and view.T_camera_board is not None
-    ):
-        model = prepared.models[view.camera]
-        images += [(row, edges.index(edge.name), edge, model) for edge in view.edges]
-    along = np.stack([-lines[:, 1], lines[:, 0]], axis=1)
-    middle = -lines[:, 2:] * lines[:, :2]
-    reach = np.zeros((len(images), 2))
-    at = {
-        name: (points - state.boards[0, :, 3]) @ state.boards[0, :, :2]
-        for name, points in sides.items()
-    }
-    for k, (_, number, edge, _) in enumerate(images):
-        reach[k] = np.quantile(at[edge.name] @ along[number], [0.0, 1.0])
-    covariance = solution.solution.trusted
-    known = np.isfinite(covariance)
-    covariance = np.where(known, covariance, 0.0) + np.diag(
-        np.where(np.diag(known), 1e-18, UNKNOWN)
+    views = [prepared.views[camera].get(placement) for camera in obs.cameras]
+    posed = [view for view in views if view is not None and view.T_camera_board is not None]
+    for row, view in enumerate(posed):
+        for edge in view.edges:
+            number = edges.index(edge.name)
+            flat = (sides[edge.name] - board[:3, 3]) @ board[:3, :2]
+            places = flat @ along(lines[number])
+            reach = np.array([places.min(), places.max()])
+            images.append(ImageSide(row, number, edge, prepared.models[view.camera], reach))
+    obs = obs.keep(beam=np.isin(obs.beam_edge, [edges.index(name) for name in sides]))
+    state = replace(
+        solution.state,
+        boards=board[None, :3],
+        sweeps=np.zeros((1, 2)),
+        sides=np.zeros((1, len(edges))),
     )
-    variances, axes = np.linalg.eigh(covariance)
-    whitener = axes.T / np.sqrt(np.maximum(variances, 1e-18))[:, None]
+    whitener = whitener_of(solution.solution.trusted)
     return Case(
-        data,
-        solution.unknowns,
-        whitener,
-        images,
-        reach,
-        middle,
-        (state, lines, np.zeros(len(covariance))),
+        data=joint_model.gather(obs, replace(solution.data.levels, prior=None)),
+        unknowns=solution.unknowns,
+        whitener=whitener,
+        images=images,
+        middle=-lines[:, 2:] * lines[:, :2],
+        edges=edges,
+        start=State(state, lines, np.zeros(len(whitener))),
     )
+
+
+def edges_in_cloud(solution, prepared, placement, face):
+    """Where lines of sight of image edges meet the plane of a face (n, 3), under a JointSolution:
+    points (k, 3) by edge, platform frame, metres.
+    """
+    plane = plane_frame(face)
+    normal = plane[:3, 2]
+    sides: dict = {}
+    for camera, views in prepared.views.items():
+        view = views.get(placement)
+        if view is None or camera not in solution.transforms:
+            continue
+        pitch = solution.corrections.pitch(placement, view.pitch)
+        T_platform_camera = solution.camera_at(camera, pitch).inv()
+        lens = prepared.models[camera]
+        centre = T_platform_camera.translation
+        height = (plane[:3, 3] - centre) @ normal
+        for edge in view.edges:
+            a = edge.line[:2]
+            first, last = edge.ends - np.outer(edge.ends @ a + edge.line[2], a)
+            uv = first + ALONG[:, None] * (last - first)
+            x, y = ((uv - [lens.cx, lens.cy]) / [lens.fx, lens.fy]).T
+            sight = T_platform_camera.rotation.apply(np.column_stack([x, y, np.ones(len(x))]))
+            points = centre + (height / (sight @ normal))[:, None] * sight
+            sides.setdefault(edge.name, []).append(points)
+    return {name: np.concatenate(points) for name, points in sides.items()}
+
+
+def along(line):
+    """Direction (2,) of a line."""
+    return np.array([-line[1], line[0]])
+
+
+def whitener_of(covariance):
+    """Whitener (c, c) of what has this covariance; NaN where nothing determines it."""
+    known = np.isfinite(covariance)
+    spread = np.where(np.diag(known), KNOWN, UNKNOWN)
+    variances, axes = np.linalg.eigh(np.where(known, covariance, 0.0) + np.diag(spread))
+    return axes.T / np.sqrt(np.maximum(variances, KNOWN))[:, None]
 
 
 def moved(case, state, step):
     """Everything a step on; the last two numbers of each side are its own."""
-    (found, lines, change) = state
     own = case.unknowns.own
-    found = joint_model.move_state(found, (step[0], step[1][:, :own]), case.unknowns)
-    return (
-        found,
-        outline.moved_lines(lines, case.middle, step[1][0, own:].reshape(-1, 2)),
-        change + step[0],
+    shared, each = step
+    return State(
+        joint_model.move_state(state.joint, (shared, each[:, :own]), case.unknowns),
+        moved_lines(state.lines, case.middle, each[0, own:].reshape(-1, 2)),
+        state.change + shared,
     )
 
 
 def fitted(case, start, scale):
-    """The most likely state (joint state, lines, change of the calibration) and the covariance
-    of all unknowns.
-    """
-
-    def evaluate(state):
-        return blocks_of(state, case, scale)
-
-    shared = case.unknowns.shared
-    retract = partial(moved, case)
-    state = minimise(evaluate, start, retract, shared=shared, max_iterations=30, tolerance=0.02)[0]
-    return state, np.linalg.inv(linearise(evaluate(state), None, 1.0, (-2, -1))[0][0])
+    """The most likely State and the covariance of all unknowns."""
+    evaluate = partial(blocks_of, case=case, scale=scale)
+    state = minimise(
+        evaluate,
+        start,
+        partial(moved, case),
+        shared=case.unknowns.shared,
+        max_iterations=ITERATIONS,
+        tolerance=TOLERANCE,
+    )[0]
+    hessian = linearise(evaluate(state), None, 1.0, (-2, -1))[0]
+    return state, np.linalg.inv(hessian[0])
 
 
 def blocks_of(state, case, scale):
     """All that is known of a placement, a list of Block (1, n, width)."""
-    (found, lines, change) = state
     unknowns = case.unknowns
-    count = len(case.middle)
-    data = replace(case.data, lines=lines)
-    width = unknowns.shared + unknowns.own + 2 * count
-    blocks = [joint_residuals.face_block(found, data, unknowns)]
-    if data.beam["used"].any():
-        beams = joint_residuals.beam_block(found, data, unknowns)
-        own = side_columns(beams.jacobian, data.beam["edge"], state, case)
-        blocks.append(replace(beams, jacobian=np.concatenate([beams.jacobian, own], axis=-1)))
+    of_joint = (state.joint, replace(case.data, lines=state.lines), unknowns)
+    blocks = [joint_residuals.face_block(*of_joint)]
+    if case.data.beam["used"].any():
+        beams = joint_residuals.beam_block(*of_joint)
+        by_sides = side_columns(beams.jacobian, case.data.beam["edge"], state, case)
+        jacobian = np.concatenate([beams.jacobian, by_sides], axis=-1)
+        blocks.append(replace(beams, jacobian=jacobian))
     if joint_model.SWEEPS[unknowns.sweep]:
-        blocks.append(joint_residuals.sweep_block(found, data, unknowns))
+        blocks.append(joint_residuals.sweep_block(*of_joint))
     if unknowns.sides:
-        blocks.append(joint_residuals.side_block(found, data, unknowns))
+        blocks.append(joint_residuals.side_block(*of_joint))
     if case.images:
         blocks.append(sight_block(state, case, scale))
-    # board and sides together; sides of which nothing is known
-    fixed = np.zeros((3 + 2 * count, width))
-    board = found.boards[0]
+    blocks.append(_rows(case.whitener @ state.change, case.whitener))
+    count = 2 * len(case.middle)
+    width = unknowns.shared + unknowns.own + count
     start = unknowns.columns["board"].start
-    fixed[0, start : start + 3] = STILL * board[:, 2]
-    fixed[1:3, start + 3 : start + 6] = STILL * board[:, :2].T
-    fixed[3:, -2 * count :] = np.kron(np.eye(count), np.sqrt(outline.FAR))
-    known = np.pad(case.whitener, [(0, 0), (0, width - len(change))])
-    rows = ((case.whitener @ change, known), (np.zeros(len(fixed)), fixed))
-    blocks += [Block(r[None], J[None], np.ones((1, len(r)))) for r, J in rows]
-    full = (np.pad(b.jacobian, [(0, 0), (0, 0), (0, width - b.jacobian.shape[-1])]) for b in blocks)
-    return [replace(block, jacobian=J) for block, J in zip(blocks, full, strict=True)]
+    board = state.joint.boards[0]
+    held = np.zeros((3 + count, width))
+    held[0, start : start + 3] = STILL * board[:, 2]  # turn of board and sides together
+    held[1:3, start + 3 : start + 6] = STILL * board[:, :2].T  # their shift
+    held[3:, -count:] = np.diag(np.tile(FAR, len(case.middle)))
+    blocks.append(_rows(np.zeros(len(held)), held))
+    wide = []
+    for block in blocks:
+        missing = width - block.jacobian.shape[-1]
+        jacobian = np.pad(block.jacobian, [(0, 0), (0, 0), (0, missing)])
+        wide.append(replace(block, jacobian=jacobian))
+    return wide
+
+
+def _rows(residuals, jacobian):
+    """White residuals (n,) and their Jacobian (n, c), a Block of one placement."""
+    return Block(residuals[None], jacobian[None], np.ones((1, len(residuals))))
 
 
 def side_columns(J, edge, state, case):
@@ -243,72 +339,68 @@ def side_columns(J, edge, state, case):
 
     `J` (..., k) are rows about the side numbers `edge` (...).
     """
-    board = state[0].boards[0]
+    R = state.joint.boards[0, :, :3]
     start = case.unknowns.columns["board"].start
     turn = J[..., start : start + 3]
     shift = J[..., start + 3 : start + 6]
-    z = board[:, 2]
-    outward, arm = (flat @ board[:, :2].T for flat in (state[1][:, :2], case.middle))
-    spin = np.sum(turn * z - shift * geometry.cross(z, arm)[edge], axis=-1)
-    both = np.stack([np.sum(shift * outward[edge], axis=-1), spin], axis=-1)
+    outward = state.lines[:, :2] @ R[:, :2].T
+    arm = case.middle @ R[:, :2].T
+    by_shift = np.vecdot(shift, outward[edge])
+    by_turn = np.vecdot(turn, R[:, 2]) - np.vecdot(shift, np.cross(R[:, 2], arm)[edge])
+    columns = np.zeros((*edge.shape, len(arm), 2))
     mine = edge[..., None] == np.arange(len(arm))
-    return (mine[..., None] * both[..., None, :]).reshape(*edge.shape, -1)
+    columns[mine] = np.stack([by_shift, by_turn], axis=-1).reshape(-1, 2)
+    return columns.reshape(*edge.shape, -1)
 
 
 def sight_block(state, case, scale):
     """Distances (undistorted pixels) of two points of a side from the line in which an image
     shows it, whitened.
     """
-    found, lines, _ = state
     view = case.data.view
-    unknowns = case.unknowns
-    off = joint_residuals.view_block(found, case.data, unknowns).residuals.reshape(1, -1, 6)
-    here = np.concatenate(
-        [geometry.move_pose(view["pose"][..., :3, :], off), view["pose"][..., 3:, :]], axis=-2
-    )
-    by_all = joint_residuals.view_block(
-        found, replace(case.data, view=view | {"pose": here}), unknowns
-    ).jacobian
-    # of [w, v] of every T_camera_board
-    by_all = by_all.reshape(-1, 6, by_all.shape[-1])
-    out = []
-    for (row, number, edge, model), reach in zip(case.images, case.reach, strict=True):
-        line = lines[number]
-        flat = -line[2] * line[:2] + reach[:, None] * np.array([-line[1], line[0]])
-        off, by_pose = line_misses(
-            [edge], np.pad(flat, ((0, 0), (0, 1)))[None], model, here[0, row, :3]
-        )
-        J = by_pose[0] @ by_all[row]
-        out.append(
-            (
-                off[0] / scale,
-                np.hstack([J, side_columns(J, np.full(2, number), state, case)]) / scale,
-            )
-        )
-    r, J = (np.concatenate(part)[None] for part in zip(*out, strict=True))
-    return Block(r, J, np.ones(r.shape))
+    off = joint_residuals.view_block(state.joint, case.data, case.unknowns).residuals
+    poses = geometry.move_pose(view["pose"][..., :3, :], off.reshape(1, -1, 6))
+    # with the poses as they are predicted: derivatives of [w, v] of every T_camera_board
+    as_predicted = view | {"pose": np.concatenate([poses, view["pose"][..., 3:, :]], axis=-2)}
+    data = replace(case.data, view=as_predicted)
+    J = joint_residuals.view_block(state.joint, data, case.unknowns).jacobian
+    by_all = J.reshape(-1, 6, J.shape[-1])
+    residuals = []
+    jacobians = []
+    for image in case.images:
+        line = state.lines[image.number]
+        ends = np.zeros((1, 2, 3))
+        ends[0, :, :2] = -line[2] * line[:2] + np.outer(image.reach, along(line))
+        misses, by_pose = line_misses([image.edge], ends, image.model, poses[0, image.row])
+        J = by_pose[0] @ by_all[image.row]
+        by_sides = side_columns(J, np.full(2, image.number), state, case)
+        residuals.append(misses[0] / scale)
+        jacobians.append(np.hstack([J, by_sides]) / scale)
+    return _rows(np.concatenate(residuals), np.concatenate(jacobians))
 
 
-def _measured(case, state, covariance, edges):
+def _measured(case, state, covariance):
     """A state in words of :func:`combined_outlines`: sides with image edges or beams enough,
     lengths known somehow.
     """
-    found, lines, _ = state
-    beams = np.bincount(case.data.beam["edge"][case.data.beam["used"]], minlength=len(edges))
-    shown = [number for _, number, _, _ in case.images]
-    good = np.union1d(np.flatnonzero(beams >= outline.FEWEST_CELLS), shown).astype(int)
+    edges = case.edges
+    beam = case.data.beam
+    beams = np.bincount(beam["edge"][beam["used"]], minlength=len(edges))
+    shown = [image.number for image in case.images]
+    good = np.union1d(np.flatnonzero(beams >= FEWEST_CELLS), shown).astype(int)
     if not len(good):
         raise DegenerateGeometry("nothing shows a side")
-    index = (len(covariance) - 2 * len(edges) + 2 * good[:, None] + [0, 1]).ravel()
-    names = [edges[i] for i in good]
-    shape, sigma = outline.sized(
-        lines[good], case.middle[good], covariance[np.ix_(index, index)], names, edges
+    columns = np.arange(len(covariance))[-2 * len(edges) :].reshape(-1, 2)[good].ravel()
+    lines = {edges[number]: state.lines[number] for number in good}
+    corners, lengths, sigma = sized(
+        lines, case.middle[good], covariance[np.ix_(columns, columns)], edges
     )
-    known = {name for name, size in shape[2].items() if sigma[name] < WIDEST * size}
-    lengths, sigma = (
-        {name: v for name, v in part.items() if name in known} for part in (shape[2], sigma)
+    lengths = {name: size for name, size in lengths.items() if sigma[name] < WIDEST * size}
+    board = MeasuredBoard(
+        T_platform_plane=np.vstack([state.joint.boards[0], [0, 0, 0, 1]]),
+        lines=lines,
+        corners=corners,
+        lengths=lengths,
+        sigma={name: sigma[name] for name in lengths},
     )
-    board = outline.MeasuredBoard(
-        np.vstack([found.boards[0], [0, 0, 0, 1]]), *shape[:2], lengths, sigma=sigma
-    )
-    return board, frozenset(edges[i] for i in np.setdiff1d(good, shown))
+    return board, frozenset(edges[number] for number in np.setdiff1d(good, shown))

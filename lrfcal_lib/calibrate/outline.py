@@ -1,22 +1,19 @@
-"""Edge lengths of boards in the cloud by least squares; image edges on the plane of the cloud."""
+"""Edge lengths of boards in the cloud by least squares."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.calibrate.recorded import in_platform, named_sides, platform_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.geometry import fit_line, lrf_to_platform
+from lrfcal_lib.model.geometry import fit_line
 from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edge_cells import edge_cells
-from lrfcal_lib.preprocess.edges_in_scan import ScanEdges
+from lrfcal_lib.preprocess.prepared import Prepared
 
 LEAST_STRETCH = 0.4  # share of an edge that must be seen before its line decides a corner
-FEWEST_CELLS = 8
-# information of a side that no beam tells anything about: a metre and a radian are far
-FAR = np.diag([1e2, 1.0])
-ALONG = np.linspace(0.0, 1.0, 9)  # places along the stretch of an image edge
+STEP = 1e-6  # of shifts and turns of lines, metres and radians: for derivatives of lengths
 
 
 @dataclass(frozen=True)
@@ -36,213 +33,171 @@ class MeasuredBoard:
     """
 
     T_platform_plane: np.ndarray
-    lines: dict
-    corners: dict
-    lengths: dict
-    scatter: dict = field(default_factory=dict)
-    sigma: dict = field(default_factory=dict)
+    lines: dict[str, np.ndarray]
+    corners: dict[str, np.ndarray]
+    lengths: dict[str, float]
+    scatter: dict[str, float] = field(default_factory=dict)
+    sigma: dict[str, float] = field(default_factory=dict)
 
-    def corner_point(self, name):
+    def corner_point(self, name: str) -> np.ndarray:
         """The corner where an edge starts, shape (3,), in the frame of the cloud."""
         return self.T_platform_plane[:3, 3] + self.T_platform_plane[:3, :2] @ self.corners[name]
 
 
-def plane_frame(points):
+def outline_of(
+    prepared: Prepared,
+    placement: int,
+    variant: str = "half_step",
+    T_head_lrf: RigidTransform | None = None,
+) -> tuple[MeasuredBoard, frozenset[str]]:
+    """Measure the board's outline in the cloud of a placement by least squares.
+
+    Sides of which less than 40 % is seen are missing: a stub does not carry a line to its corners.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    placement : int
+    variant : {'half_step', 'last_beam'}
+    T_head_lrf : RigidTransform, optional
+        The session's own platform when left out.
+
+    Returns
+    -------
+    board : MeasuredBoard
+    across : frozenset of str
+        The edges found across the scan lines (where the sweep enters or leaves the board): their
+        place hangs on the pitch.
+
+    Raises
+    ------
+    DegenerateGeometry
+        If the sweep does not cross enough scan lines to span a plane.
+    """
+    source = in_platform(placement, platform_of(prepared, T_head_lrf))
+    p_lrf, pitch, _ = face_points(prepared.scans[placement])
+    sides = {}
+    across = set()
+    for side in named_sides(prepared, placement, variant, LEAST_STRETCH):
+        sides[side.name] = source.points(side.points, side.pitch)
+        if side.across:
+            across.add(side.name)
+    board = measure_board(source.points(p_lrf, pitch), sides, prepared.board.edges)
+    return board, frozenset(across)
+
+
+def measure_board(
+    face: np.ndarray, sides: dict[str, np.ndarray], edges: tuple[str, ...]
+) -> MeasuredBoard:
+    """Measure a board's outline in a cloud: plane of the face, lines through sides, corners.
+
+    Parameters
+    ----------
+    face : ndarray, shape (n, 3)
+        Metres.
+    sides : dict of str to ndarray, shape (k, 3)
+        Points of edges by name, metres.
+    edges : tuple of str
+        All of them in order around the board.
+
+    Returns
+    -------
+    MeasuredBoard
+        Standard deviations are those of the points about the lines alone.
+    """
+    pose = plane_frame(face)
+    if not sides:
+        return MeasuredBoard(pose, {}, {}, {})
+    lines = {}
+    middles = []
+    variances = []  # of shift and turn
+    for name, points in sides.items():
+        flat = (points - pose[:3, 3]) @ pose[:3, :2]
+        middle, direction, rms = fit_line(flat)
+        x, y = direction
+        lines[name] = np.array([y, -x, x * middle[1] - y * middle[0]])
+        middles.append(middle)
+        shift = rms**2 / max(len(flat) - 1, 1)
+        spread = np.mean(((flat - middle) @ direction) ** 2)
+        variances += [shift, shift / max(spread, 1e-12)]
+    corners, lengths, sigma = sized(lines, np.array(middles), np.diag(variances), edges)
+    scatter = {name: fit_line(points)[2] for name, points in sides.items()}
+    return MeasuredBoard(pose, lines, corners, lengths, scatter, sigma)
+
+
+def plane_frame(points: np.ndarray) -> np.ndarray:
     """A frame (4, 4) in the plane of points: origin in their middle, z towards their origin."""
-    normal, distance, _ = geometry.fit_plane(points)
-    if distance > 0:
-        normal = -normal
-        distance = -distance
+    away, distance, _ = geometry.fit_plane(points)
+    normal = -away
     across = np.linalg.svd(geometry.hat(normal))[2][0]
+    centre = np.nanmean(points, axis=0)
     pose = np.eye(4)
     pose[:3, 0] = across
     pose[:3, 1] = np.cross(normal, across)
     pose[:3, 2] = normal
-    centre = np.nanmean(points, axis=0)
-    pose[:3, 3] = centre - normal * (normal @ centre - distance)
+    pose[:3, 3] = centre - normal * (normal @ centre + distance)
     return pose
 
 
-def measure_board(face, sides, edges):
-    """Measure a board's outline in a cloud: plane of the face, lines through sides, corners.
+def sized(
+    lines: dict[str, np.ndarray], middle: np.ndarray, covariance: np.ndarray, edges: tuple[str, ...]
+) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, float]]:
+    """Corners and lengths of an outline, and how well the lengths are known.
 
-    `face` are points (n, 3), `sides` edge points (k, 3) by edge name, metres; `edges` all edges in
-    order around the board. Standard deviations are those of the points about the lines alone.
-    """
-    pose = plane_frame(face)
-    lines = []
-    middles = []
-    variances = []  # of shift and turn
-    if not sides:
-        return MeasuredBoard(pose, {}, {}, {})
-    for points in sides.values():
-        flat = (points - pose[:3, 3]) @ pose[:3, :2]
-        line, middle = _flat_line(flat)
-        along = (flat - middle) @ [-line[1], line[0]]
-        square = np.nan
-        if len(flat) > 1:
-            square = np.sum((flat @ line[:2] + line[2]) ** 2) / (len(flat) - 1)
-        shift = square / len(flat)
-        lines.append(line)
-        middles.append(middle)
-        variances += [shift, shift * (1 / max(np.mean(along**2), 1e-12))]
-    covariance = np.diag(variances)
-    outline, sigma = sized(np.array(lines), np.array(middles), covariance, list(sides), edges)
-    scatter = {name: fit_line(points)[2] for name, points in sides.items()}
-    return MeasuredBoard(pose, *outline, scatter, sigma)
-
-
-def sized(lines, middle, covariance, names, edges):
-    """Sides by name, corners and lengths, and the standard deviations of these by edge.
-
-    `covariance` (2 s, 2 s) is of shifts and turns of the lines (s, 3) about their `middle` (s, 2).
-    """
-
-    def outline(lines):
-        """Sides, corners (..., 2) of two known neighbours, lengths (...) between these, by edge."""
-        sides = dict(zip(names, np.moveaxis(lines, -2, 0), strict=True))
-        pairs = list(zip(edges, edges[1:] + edges[:1], strict=True))
-        corners = {}
-        for edge, after in pairs:
-            if edge in sides and after in sides:
-                two = np.stack([sides[edge], sides[after]], axis=-2)
-                corners[after] = corners_of_lines(two)[..., 1, :]
-        lengths = {}
-        for edge, after in pairs:
-            if edge in corners and after in corners:
-                lengths[edge] = np.linalg.norm(corners[after] - corners[edge], axis=-1)
-        return sides, corners, lengths
-
-    sides, corners, size = outline(lines)
-    steps = 1e-6 * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
-    after = outline(moved_lines(lines, middle, steps))[2]
-    lengths = {name: float(value) for name, value in size.items()}
-    sigma = {}
-    for name, value in lengths.items():
-        J = (after[name] - value) / 1e-6
-        sigma[name] = float(np.sqrt(np.sum(J * (covariance @ J))))
-    return (sides, corners, lengths), sigma
-
-
-def _flat_line(points):
-    """The line ``a x + b y + c = 0`` (3,) through points (n, 2) of a plane, and their middle."""
-    middle, (x, y), _ = fit_line(points)
-    return np.array([y, -x, x * middle[1] - y * middle[0]]), middle
-
-
-@dataclass(frozen=True)
-class NamedSide:
-    """A side of the scan that has the name of an edge.
-
-    Attributes
+    Parameters
     ----------
-    name : str
-        Of the board's edge.
-    edges : ScanEdges
-        That hold its points.
-    rows : ndarray of int
-        Which of them.
-    across : bool
-        Whether it was found across the scan lines.
+    lines : dict of str to ndarray, shape (3,)
+        Sides by name.
+    middle : ndarray, shape (s, 2)
+        Points of the sides, about which they turn, metres.
+    covariance : ndarray, shape (2 s, 2 s)
+        Of shift and turn of every side, metres and radians.
+    edges : tuple of str
+        All of the board in order around it.
+
+    Returns
+    -------
+    corners : dict of str to ndarray, shape (2,)
+        Where an edge meets the one before it, of two known neighbours.
+    lengths, sigma : dict of str to float
+        Of edges between two corners, and their standard deviations.
     """
+    names = list(lines)
+    straight = np.array(list(lines.values()))
+    corners, lengths = _corners(straight, names, edges)
+    steps = STEP * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
+    _, after = _corners(moved_lines(straight, middle, steps), names, edges)
+    sigma = {}
+    for name, length in lengths.items():
+        J = (after[name] - length) / STEP
+        sigma[name] = float(np.sqrt(J @ covariance @ J))
+    return corners, {name: float(length) for name, length in lengths.items()}, sigma
 
-    name: str
-    edges: ScanEdges
-    rows: np.ndarray
-    across: bool
 
-
-def named_sides(prepared, placement, variant="half_step", stretch=0.0):
-    """NamedSide one by one, of a placement; those of which the sweep shows a share at least."""
-    along = prepared.edges[variant][placement]
-    swept = prepared.swept[variant].get(placement)
-    numbers = np.unique(along.side)
+def _corners(lines, names, edges):
+    """Corners (..., 2) of lines (..., s, 3) and lengths (...) between these, by edge."""
+    row = {name: number for number, name in enumerate(names)}
+    after = dict(zip(edges, [*edges[1:], edges[0]], strict=True))
+    corners = {}
+    for edge, following in after.items():
+        if edge in row and following in row:
+            both = lines[..., [row[edge], row[following]], :]
+            corners[following] = corners_of_lines(both)[..., 1, :]
     lengths = {}
-    if stretch > 0:
-        lengths = prepared.board.lengths()
-    for number, name in prepared.names.get(placement, {}).items():
-        edges = along if number in numbers else swept
-        length = next((s.length for s in edges.sides if s.side == number), 0.0)
-        if length >= stretch * lengths.get(name, 0.0):
-            rows = np.flatnonzero(edges.side == number)
-            yield NamedSide(name, edges, rows, across=edges is not along)
+    for edge, following in after.items():
+        if edge in corners and following in corners:
+            lengths[edge] = np.linalg.norm(corners[following] - corners[edge], axis=-1)
+    return corners, lengths
 
 
-def outline_of(prepared, placement, variant="half_step", T_head_lrf=None):
-    """Measure the board's outline in the cloud of a placement by least squares: a MeasuredBoard.
-
-    And the edges whose place hangs on the pitch. The platform is the session's own when left out.
-    Sides of which less than 40 % is seen are missing: a stub does not carry a line to its corners.
-    The second result are the edges found across the scan lines (where the sweep enters or leaves
-    the board), a frozenset. DegenerateGeometry if the sweep does not cross enough scan lines to
-    span a plane.
-    """
-    T_head_lrf = platform_of(prepared, T_head_lrf)
-    points, pitch, _ = face_points(prepared.scans[placement])
-    sides = {}
-    across = set()
-    for side in named_sides(prepared, placement, variant, LEAST_STRETCH):
-        p_lrf = side.edges.points[side.rows]
-        sides[side.name] = lrf_to_platform(p_lrf, side.edges.pitch[side.rows], T_head_lrf)
-        if side.across:
-            across.add(side.name)
-    face = lrf_to_platform(points, pitch, T_head_lrf)
-    return measure_board(face, sides, prepared.board.edges), frozenset(across)
-
-
-def platform_of(prepared, T_head_lrf=None):
-    """The platform to use: the one given, else the session's, else a tilt axis along x."""
-    if T_head_lrf is not None:
-        return T_head_lrf
-    if prepared.session.T_head_lrf is not None:
-        return prepared.session.T_head_lrf
-    return RigidTransform.identity()
-
-
-def cells_of(prepared, placement):
-    """Beams about the edges in the sweep of a placement, see :func:`edge_cells`."""
-    along = prepared.edges["half_step"][placement]
-    swept = prepared.swept["half_step"].get(placement)
-    return edge_cells(prepared.scans[placement], along, swept, prepared.session.lrf)
-
-
-def moved_lines(lines, middle, step):
-    """Lines shifted outwards and turned about the middle of their cells."""
-    c = np.cos(step[..., 1])
-    s = np.sin(step[..., 1])
-    at = np.sum(lines[:, :2] * middle, axis=1) + lines[:, 2] - step[..., 0]
-    x = c * lines[:, 0] - s * lines[:, 1]
-    y = s * lines[:, 0] + c * lines[:, 1]
-    return np.stack([x, y, at - (x * middle[:, 0] + y * middle[:, 1])], axis=-1)
-
-
-def edges_in_cloud(solution, prepared, placement):
-    """Face points (n, 3) under a JointSolution, and points of image edges in their plane by
-    edge.
-    """
-    recorded, recorded_pitch, _ = face_points(prepared.scans[placement])
-    points = solution.corrections.points(recorded)
-    pitch = solution.corrections.pitch(placement, recorded_pitch)
-    face = lrf_to_platform(points, pitch, solution.T_head_lrf)
-    pose = plane_frame(face)
-    sides = {}
-    for camera, views in prepared.views.items():
-        view = views.get(placement)
-        if view is None or camera not in solution.transforms:
-            continue
-        pitch = solution.corrections.pitch(placement, view.pitch)
-        T_platform_camera = solution.camera_at(camera, pitch).inv()
-        lens = prepared.models[camera]
-        centre = T_platform_camera.translation
-        height = (pose[:3, 3] - centre) @ pose[:3, 2]
-        for edge in view.edges:  # where lines of sight of a few of its points meet the plane
-            normal = edge.line[:2]
-            off = edge.ends @ normal + edge.line[2]
-            first, last = edge.ends - off[:, None] * normal
-            uv = first + ALONG[:, None] * (last - first)
-            xy = (uv - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
-            rays = np.column_stack([xy, np.ones(len(uv))])
-            sight = T_platform_camera.rotation.apply(rays)
-            points = centre + (height / (sight @ pose[:3, 2]))[:, None] * sight
-            sides.setdefault(edge.name, []).append(points)
-    return face, {name: np.concatenate(points) for name, points in sides.items()}
+def moved_lines(lines: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Lines (s, 3) shifted outwards and turned about points (s, 2) of them by steps (..., s, 2)."""
+    shift = step[..., 0]
+    cos = np.cos(step[..., 1])
+    sin = np.sin(step[..., 1])
+    a, b, c = lines.T
+    x, y = middle.T
+    turned_a = cos * a - sin * b
+    turned_b = sin * a + cos * b
+    at = a * x + b * y + c - shift
+    return np.stack([turned_a, turned_b, at - (turned_a * x + turned_b * y)], axis=-1)

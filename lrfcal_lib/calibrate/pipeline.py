@@ -10,21 +10,20 @@ from functools import partial
 import numpy as np
 
 from lrfcal_lib.calibrate.cameras import (
-    CalibratedCamera,
-    CalibratedRig,
     KnownAxis,
     PlatformCalibration,
     calibrate_cameras,
     calibrate_platform,
     stated_covariance,
 )
+from lrfcal_lib.calibrate.naming import name_sides
 from lrfcal_lib.calibrate.observe import (
-    name_sides,
     observe,
     observe_all,
     observe_joint,
     platform_observations,
 )
+from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig
 from lrfcal_lib.fit.result import PlatformPrior, Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.kinematics import AS_RECORDED
@@ -144,7 +143,7 @@ class Calibration:
         CalibratedRig
         """
         corrections = AS_RECORDED
-        if method == "joint":
+        if self.joint is not None and method == "joint":
             corrections = self.joint.solution.corrections
         cameras = {}
         for (camera, name), solution in self.solutions.items():
@@ -217,8 +216,8 @@ def prepare(session: Session) -> Prepared:
     """
     ready = prepare_images(prepare_scans(session))
     names, dropped, problems = name_sides(ready)
-    problems = (*ready.problems, *problems)
-    ready = without(replace(ready, names=names, dropped=dropped, problems=problems))
+    every = (*ready.problems, *problems)
+    ready = without(replace(ready, names=names, dropped=dropped, problems=every))
     return replace(ready, pitch_noise=pitch_noise(find_pitch_errors(ready)))
 
 
@@ -385,7 +384,7 @@ def with_joint(calibration: Calibration, joint: JointCalibration | Problem) -> C
     platform = calibration.platform
     observations = dict(calibration.observations)
     solutions = dict(calibration.solutions)
-    outlines = {}
+    outlines: dict = {}
     for camera in joint.observations.cameras:
         observations[camera, "joint"] = joint.seen_by(camera, outlines=outlines)
         solutions[camera, "joint"] = joint.solution.camera(camera)
@@ -418,7 +417,7 @@ def leave_out(joint: JointCalibration, groups: int = 8) -> JointCalibration:
         With `without` filled; placements whose absence leaves something open are missing there.
     """
     numbers = np.array(list(joint.solution.boards))
-    estimates = {}
+    estimates: dict = {}
     for group in range(min(groups, len(numbers))):
         out = numbers[group::groups]
         rest = joint.observations.select(np.setdiff1d(numbers, out))

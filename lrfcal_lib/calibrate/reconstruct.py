@@ -2,7 +2,7 @@
 in bounded memory.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +13,9 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.mixed import mixed
 from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.model.kinematics import Corrections
+from lrfcal_lib.model.kinematics import MIRROR_TURN, Corrections
 from lrfcal_lib.session.read import Sweep
-from lrfcal_lib.session.stated import MIRROR_TURN, LrfInfo
+from lrfcal_lib.session.stated import LrfInfo
 
 GREY = 128  # colour of points that no camera sees
 BLOCK = 1 << 18  # points worked on at once
@@ -23,6 +23,7 @@ KEPT = 4 * BLOCK  # points of a sweep whose blocks are made once: they are gone 
 WINDOW = 4  # beams and scan lines on either side of a point that make its normal
 MARGIN = 4 * WINDOW  # scan lines about a block that its normals and mixed pixels need
 GAIN_POINTS = 30_000  # that compare the exposures of images
+SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # places of a matrix in its upper half
 BEHIND = 5.0  # sigma: between the farthest and the nearest of a few points of a wall
 
 
@@ -69,7 +70,7 @@ def reconstruct(
         mask = np.isfinite(sweep.ranges)
     steps = (_pitch_step(sweep), lrf.bearing_step)
     painter = Painter(views, max(steps), BEHIND * lrf.sigma_range)
-    blocks = _Blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous)
+    blocks: Iterable[_Block] = _Blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous)
     if sweep.ranges.size <= KEPT:
         blocks = list(blocks)
     points = []
@@ -257,8 +258,8 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     mean = uniform_filter(p, size, mode="constant") / whole
     i, j = np.triu_indices(3)
     square = uniform_filter(p[..., i] * p[..., j], size, mode="constant") / whole
-    covariance = square - mean[..., i] * mean[..., j]
-    least, middle, across = flattest(*np.moveaxis(covariance, -1, 0))
+    upper = np.moveaxis(square - mean[..., i] * mean[..., j], -1, 0)
+    least, middle, across = flattest(upper[SYMMETRIC])
     known = (share[..., 0] > 1 / 3) & (middle > 0)
     rough = np.where(known, np.maximum(least, 0.0), np.inf)
     # the middles of the nine windows, (2, 9, l, b)
@@ -268,39 +269,41 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     flat = np.where(valid, rough[tuple(places)], np.inf)
     chosen = np.argmin(flat, axis=0)[None]
     best = np.take_along_axis(flat, chosen, axis=0)[0]
-    normals = across[tuple(np.take_along_axis(places, chosen[None], axis=1)[:, 0])]
+    line, beam = np.take_along_axis(places, chosen[None], axis=1)[:, 0]
+    normals = np.moveaxis(across, 0, -1)[line, beam]
     sign = np.where(np.isfinite(best), 1.0, np.nan)
     sign[np.sum(normals * (points - origins), axis=-1) > 0] = -1.0
     scatter = np.sqrt(np.where(np.isfinite(best), best, np.nan))
     return sign[..., None] * normals, scatter
 
 
-def flattest(xx, xy, xz, yy, yz, zz):
-    """The least and the middle eigenvalue (...) of covariances of points, and the direction (...,
-    3) of the least.
+def flattest(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The least and the middle eigenvalue (...) of covariances of points (3, 3, ...), and the
+    direction (3, ...) of the least.
 
     In closed form, many times as fast as LAPACK on as many small matrices (Smith 1961).
     """
-    mean = (xx + yy + zz) / 3
-    a = xx - mean
-    b = yy - mean
-    c = zz - mean
-    p = np.maximum(np.sqrt((a * a + b * b + c * c) / 6 + (xy * xy + xz * xz + yz * yz) / 3), 1e-100)
-    half = (a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)) / (2 * p**3)
+    eye = np.eye(3)[..., None, None]
+    mean = np.trace(covariance) / 3
+    D = covariance - mean * eye
+    size = np.maximum(np.sqrt(np.sum(D**2, axis=(0, 1)) / 6), 1e-100)
+    half = np.sum(D[0] * _cross(D[1], D[2]), axis=0) / (2 * size**3)
     turn = np.arccos(np.clip(half, -1, 1)) / 3
-    most, least = (2 * p * np.cos(turn + shift) for shift in (0.0, 2 * np.pi / 3))
-    a = a - least
-    b = b - least
-    c = c - least
+    most = 2 * size * np.cos(turn)
+    least = 2 * size * np.cos(turn + 2 * np.pi / 3)
     # columns of the adjugate of the matrix without it all point across; the longest is the most
     # precise
-    u = xy * yz - xz * b
-    v = xz * xy - a * yz
-    w = xz * yz - xy * c
-    columns = np.stack([[b * c - yz * yz, w, u], [w, a * c - xz * xz, v], [u, v, a * b - xy * xy]])
-    longest = np.argmax(columns[[0, 1, 2], [0, 1, 2]], axis=0)[None, None]
-    across = np.take_along_axis(columns, longest, axis=0)[0]
-    x, y, z = across / np.maximum(np.sqrt(np.sum(across**2, axis=0)), 1e-300)
-    # to all digits
-    least = x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + zz * z * z
-    return least, 2 * mean - most - least, np.stack([x, y, z], axis=-1)
+    A = D - least * eye
+    columns = np.stack([_cross(A[1], A[2]), _cross(A[2], A[0]), _cross(A[0], A[1])])
+    longest = np.argmax(np.sum(columns**2, axis=1), axis=0)
+    across = np.take_along_axis(columns, longest[None, None], axis=0)[0]
+    across /= np.maximum(np.sqrt(np.sum(across**2, axis=0)), 1e-300)
+    to_all_digits = np.einsum("i...,ij...,j...->...", across, covariance, across)
+    return to_all_digits, mean - most - least, across
+
+
+def _cross(a, b):
+    """Cross products of vectors (3, ...)."""
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )

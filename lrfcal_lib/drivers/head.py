@@ -2,17 +2,16 @@
 
 import logging
 import math
+import os
 import threading
 
-from lrfcal_lib.drivers import pelco_d, port
+from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.motion import ASSUMED, Motion, Stopped, drawn_to_readings
-from lrfcal_lib.drivers.pelco_d import (
-    FASTEST,
-    HeadLine,
-)
+from lrfcal_lib.drivers.pelco_d import FASTEST, FRAME, HeadLine
 from lrfcal_lib.drivers.port import (
     REAL,
     DeviceError,
+    Host,
     LineLost,
     NoReply,
     OutOfRange,
@@ -20,17 +19,20 @@ from lrfcal_lib.drivers.port import (
 )
 
 LOG = logging.getLogger(__name__)
+ROUNDING_DEG = 1e-6  # by which a pitch may exceed the limits
+EXTRA_S = 10  # that a move may take beside twice the time of its way
 
 
 class PanTilt(port.Closed):
-    """A head on a serial line; a context manager. It is stopped on every way out, Ctrl-C and
-    SIGTERM included.
+    """A head on a serial line, stopped on every way out, Ctrl-C and SIGTERM included.
 
     Parameters
     ----------
-    path : str or Path
+    path
         Of the port.
     settings : rig_file.HeadSettings
+    host
+        Machine that the driver runs on.
 
     Attributes
     ----------
@@ -47,69 +49,71 @@ class PanTilt(port.Closed):
         If something else answers.
     """
 
-    def __init__(self, path, settings, *, host=REAL):
+    def __init__(self, path: str | os.PathLike, settings, *, host: Host = REAL):
         self.settings = settings
         self._lock = threading.Lock()
-        self._line = HeadLine(path, settings, host)
-        self._thread = None
-        self._error = None
+        self._line: HeadLine | None = HeadLine(path, settings, host)
+        self._host = host
+        self._thread: threading.Thread | None = None
+        self._error: DeviceError | None = None
         self.motion = Motion(self._line, settings)
         try:
-            self._probe()
+            self._probe(self._line)
         except BaseException:
             self._line.close()
             raise
         port.guard(self)
 
-    def _probe(self):
+    def _probe(self, line):
         """Stop the head, ask whether it tells its tilt, and see who answers."""
         settings = self.settings
-        line = self._line
-        start = math.radians(self.settings.start_pitch_deg)
         line.stop()
-        reading = self.motion.read(settings.retries) if settings.feedback is not False else None
-        if reading is None and line.counts["skipped"] > pelco_d.FRAME * line.counts["frames"]:
+        reading = None
+        if settings.feedback is not False:
+            reading = self.motion.read(settings.retries)
+        self.has_feedback = self.motion.feedback = reading is not None
+        if not self.has_feedback and line.skipped > FRAME * line.frames:
             raise WrongDevice(
-                f"{line.path} sends {line.counts['skipped']} bytes that are no Pelco-D at "
+                f"{line.path} sends {line.skipped} bytes that are no Pelco-D at "
                 f"{settings.baudrate} Bd: another device, another rate, or Pelco-P"
             )
-        if settings.echo is True and not line.counts["echoed"]:
-            raise NoReply(
-                f"{line.path} does not echo what is sent: check the adapter and its power"
-            )
-        if settings.echo is False and line.counts["echoed"]:
-            LOG.warning(
-                "%s echoes what is sent, which was not expected: echoes are removed", line.path
-            )
-        if reading is None and settings.feedback is True:
-            raise NoReply(self._silence())
-        self.has_feedback = self.motion.feedback = reading is not None
-        if not self.has_feedback:
-            self.motion.know(start)
-            how = "stated" if self.motion.calibrated else "assumed, state degrees_per_second"
-            LOG.warning(
-                "the head does not tell its tilt: timed moves at %g/%g deg/s (%s), from %.2f deg; "
-                "its pitch is not measured",
-                *(settings.degrees_per_second or ASSUMED),
-                how,
-                settings.start_pitch_deg,
-            )
-
-    def _silence(self):
-        echo = (
-            "what was sent came back, so the adapter works: " if self._line.counts["echoed"] else ""
+        if settings.echo is True and not line.echoed:
+            remedy = "check the adapter and its power"
+            raise NoReply(f"{line.path} does not echo what is sent: {remedy}")
+        if settings.echo is False and line.echoed:
+            LOG.warning("%s echoes what is sent, against what is stated: it is removed", line.path)
+        if self.has_feedback:
+            return
+        if settings.feedback is True:
+            raise NoReply(self._silence(line))
+        self.set_pitch(math.radians(settings.start_pitch_deg))
+        how = "assumed, state degrees_per_second"
+        if self.motion.calibrated:
+            how = "stated"
+        LOG.warning(
+            "the head does not tell its tilt: timed moves at %g/%g deg/s (%s), from %.2f deg; its "
+            "pitch is not measured",
+            *(settings.degrees_per_second or ASSUMED),
+            how,
+            settings.start_pitch_deg,
         )
+
+    def _silence(self, line):
+        settings = self.settings
+        echo = ""
+        if line.echoed:
+            echo = "what was sent came back, so the adapter works: "
         return (
-            f"the head at {self._line.path} does not tell its tilt: {echo}check its power, the "
-            f"wires A and B, address {self.settings.address} and {self.settings.baudrate} Bd; "
-            "state a longer reply_s than "
-            f'{self.settings.reply_s:g} s if it answers late, or feedback "auto" to go on '
-            "without its tilt"
+            f"the head at {line.path} does not tell its tilt: {echo}check its power, the wires A "
+            f"and B, address {settings.address} and {settings.baudrate} Bd; state a longer reply_s "
+            f'than {settings.reply_s:g} s if it answers late, or feedback "auto" to go on without '
+            "its tilt"
         )
 
-    def close(self):
+    def close(self) -> None:
         """Stop the head and close the port; a second call does nothing."""
-        if self._line is None:
+        line = self._line
+        if line is None:
             return
         try:
             self.stop()
@@ -117,57 +121,82 @@ class PanTilt(port.Closed):
             LOG.error("the head could not be stopped (%s): cut its power if it moves", error)
         finally:
             port.release(self)
-            line = self._line
             self._line = None
             line.close()
 
-    def emergency_stop(self):
+    def emergency_stop(self) -> None:
         """Stop at once, from a signal or at exit; errors are logged."""
         self.motion.abort.set()
         if self._line is not None:
             self._line.blurt_stop()
 
-    def _need_open(self):
+    def _open_line(self):
         if self._line is None:
             raise DeviceError("the head is closed: open it again")
+        return self._line
 
     # ---------------------------------------------------------------------------------------------
     # pitch
 
-    def pitch(self):
-        """Where the head points now, rad, up positive, and whether it was measured (else it is dead
-        reckoning).
+    def pitch(self) -> tuple[float, bool]:
+        """Where the head points now.
 
-        NoReply if it rests and does not answer, LineLost if the port did not come back, DeviceError
-        if the head was closed, or the pitch of one without feedback is unknown after its line was
-        lost.
+        Returns
+        -------
+        pitch : float
+            Radians, up positive.
+        measured : bool
+            The head told it; else it is dead reckoning.
+
+        Raises
+        ------
+        NoReply
+            If a head with feedback rests and does not answer.
+        LineLost
+            If the port did not come back.
+        DeviceError
+            If the head was closed, or the pitch of one without feedback is unknown after its line
+            was lost.
         """
-        self._need_open()
-        if self.has_feedback:
-            moving = self.moving()
-            reading = self.motion.read(0 if moving else self.settings.retries)
-            if reading is not None:
-                return reading[1], True
-            if not moving:
-                raise NoReply(self._silence())
-        return self.motion.estimate(), False
+        line = self._open_line()
+        if not self.has_feedback:
+            return self.motion.estimate(), False
+        if self.moving():
+            reading = self.motion.read()
+        else:
+            reading = self.motion.read(self.settings.retries)
+            if reading is None:
+                raise NoReply(self._silence(line))
+        if reading is None:
+            return self.motion.estimate(), False
+        return reading.pitch, True
 
-    def set_pitch(self, pitch):
-        """Say where a head without feedback stands, rad."""
-        self.motion.know(pitch)
+    def set_pitch(self, pitch: float) -> None:
+        """Say where a head without feedback stands.
 
-    def moving(self):
+        Parameters
+        ----------
+        pitch
+            Radians, up positive.
+        """
+        self.motion.know(pitch, self._host.now())
+
+    def moving(self) -> bool:
         """Whether a move or sweep of this object is under way."""
         return self._lock.locked()
 
     # ---------------------------------------------------------------------------------------------
     # moves
 
-    def stop(self):
-        """End every motion; the move that another thread waits for raises. LineLost if the port
-        stays away.
+    def stop(self) -> None:
+        """End every motion; the move that another thread waits for raises.
+
+        Raises
+        ------
+        LineLost
+            If the port stays away.
         """
-        self._need_open()
+        self._open_line()
         self.motion.abort.set()
         self.motion.stop()
         if self._thread is not None:
@@ -175,21 +204,27 @@ class PanTilt(port.Closed):
 
     def _begin(self, pitch):
         """Begin a motion to a pitch, one at a time."""
-        self._need_open()
+        self._open_line()
         low, high = self.settings.pitch_limits_deg
-        if not low - 1e-6 <= math.degrees(pitch) <= high + 1e-6:
+        degrees = math.degrees(pitch)
+        if not low - ROUNDING_DEG <= degrees <= high + ROUNDING_DEG:
             raise OutOfRange(
-                f"pitch {math.degrees(pitch):.2f} deg is beyond the head's limits of {low:g} to "
-                f"{high:g} deg: ask for less, or widen pitch_limits_deg if the head can do it"
+                f"pitch {degrees:.2f} deg is beyond the head's limits of {low:g} to {high:g} deg: "
+                "ask for less, or widen pitch_limits_deg if the head can do it"
             )
         if not self._lock.acquire(blocking=False):
             raise DeviceError("the head is moving already: stop it, or wait for it")
         self.motion.abort.clear()
 
-    def move_to(self, pitch):
+    def move_to(self, pitch: float) -> float:
         """Move and wait until the head rests.
 
         It may take twice the time that the way takes, and 10 s; a lost line adds `reconnect_s`.
+
+        Parameters
+        ----------
+        pitch
+            Radians, up positive.
 
         Returns
         -------
@@ -210,35 +245,48 @@ class PanTilt(port.Closed):
             If it was stopped meanwhile.
         """
         self._begin(pitch)
+        line = self._open_line()
         motion = self.motion
-        now = self._line.host.now
         try:
             if self.has_feedback and motion.read(self.settings.retries) is None:
-                raise NoReply(self._silence())
+                raise NoReply(self._silence(line))
             way = pitch - motion.estimate()
             seconds = abs(way) / motion.speed(way, self.settings.tilt_speed)
-            deadline = now() + 2 * seconds + 10
-            while self.has_feedback:
+            if not self.has_feedback:
+                return motion.timed(pitch, seconds)
+            deadline = self._host.now() + 2 * seconds + EXTRA_S
+            while True:
                 try:
                     return motion.move(pitch, deadline)
                 except LineLost:
-                    if now() >= deadline:
+                    if self._host.now() >= deadline:
                         raise
-                    self._line.opened()
-            return motion.timed(pitch, seconds)
+                    line.opened()
         except BaseException:
             self.emergency_stop()
             raise
         finally:
             self._lock.release()
 
-    def start_sweep(self, stop_at, speed=None):
-        """Start a thread that moves the head to a pitch, rad, notes where it is, and stops it
-        there.
+    def start_sweep(self, stop_at: float, speed: int | None = None) -> None:
+        """Start a thread that moves the head, notes where it is, and stops it.
 
-        The speed byte is 0 (very slow) to 0x3F, by default ``settings.tilt_speed``; one that was
-        not calibrated is taken to be in proportion. Raises OutOfRange beyond the limits, ValueError
-        for a speed that does not exist; what goes wrong later is raised by :meth:`finish_sweep`.
+        What goes wrong later is raised by :meth:`finish_sweep`.
+
+        Parameters
+        ----------
+        stop_at
+            Pitch, rad.
+        speed
+            Byte from 0 (very slow) to 0x3F, by default ``settings.tilt_speed``; one that was not
+            calibrated is taken to be in proportion.
+
+        Raises
+        ------
+        OutOfRange
+            Beyond the limits; nothing moves.
+        ValueError
+            For a speed that does not exist.
         """
         step = self.settings.tilt_speed if speed is None else speed
         if step not in range(FASTEST + 1):
@@ -258,10 +306,10 @@ class PanTilt(port.Closed):
 
         self.motion.rows = []
         self._error = None
-        self._thread = self._line.host.thread(run, "sweep")
+        self._thread = self._host.thread(run, "sweep")
         self._thread.start()
 
-    def finish_sweep(self):
+    def finish_sweep(self) -> list[tuple[float, float, bool]]:
         """Wait for the end of the sweep; its :attr:`track`. DeviceError if it ended too early."""
         if self._thread is None:
             raise DeviceError("there was no sweep: start one")
@@ -271,9 +319,9 @@ class PanTilt(port.Closed):
         return self.track
 
     @property
-    def track(self):
-        """List of host time, pitch in rad and whether it was measured, of the sweep that runs or
-        ran last.
+    def track(self) -> list[tuple[float, float, bool]]:
+        """Host time (s), pitch (rad) and whether it was measured, of the sweep that runs or ran
+        last.
 
         Between readings the pitch is dead reckoning, which is drawn to the readings.
         """

@@ -2,13 +2,17 @@
 
 import logging
 import math
+import os
+from threading import Thread
 
 from lrfcal_lib.drivers import lms2xx_link as wire
-from lrfcal_lib.drivers.lms2xx_link import POINTS, POWER_ON, RATES, Assembler, Link, ScanClock
+from lrfcal_lib.drivers.lms2xx_link import POWER_ON, RATES, Arrival, Link
+from lrfcal_lib.drivers.lms2xx_scans import VARIANTS, Assembler, Reading, ScanClock
 from lrfcal_lib.drivers.port import (
     REAL,
     Closed,
     DeviceError,
+    Host,
     LineLost,
     NoReply,
     PortError,
@@ -24,12 +28,15 @@ INSTALLATION = b"\x00"
 STREAM = b"\x24"
 INTERLACED = b"\x2a"
 ALL_VALUES = b"\x01"  # data of VALUES
+FINE = (100, 0.25)  # variant that interlaced scans need, deg
+USUAL_RATE = 38400  # Bd; where a device is looked for first
 AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
 KEPT = 256  # scans that can be asked for by their instant
 LEAST_QUIET_S = 0.6  # of a stream, before it is taken for silent
 RECOVERY_S = 8.0  # one attempt to find a lost device; there are more until the stream is stopped
 REPLY_S = 0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
+LOOK_S = 0.2  # between looks whether the reader thread lives
 COUNTS = ("dropped", "stale", "reconnects")
 
 
@@ -41,30 +48,35 @@ class LMS2xx(Closed):
 
     Parameters
     ----------
-    port : str or Path
-    baudrate : int, optional
+    port
+        Its path.
+    baudrate
         To switch to afterwards; the one found stays by default.
-    address : int
+    address
         Of the device; 0 reaches any.
-    password : bytes
+    password
         Eight characters, of the installation mode; the factory's by default.
-    variant : tuple of float, optional
+    variant
         To be set, see :meth:`set_variant`.
-    find_s : float
+    find_s
         Longest time to find the rate.
-    host : Host
+    host
         Machine that the driver runs on; tests have one of their own.
     **configuration
         Of :meth:`configure`.
 
     Attributes
     ----------
-    type, firmware : str
-        Model and order number; version.
+    type : str
+        Model and order number.
     status : DeviceStatus
         As read last.
     configuration : Configuration
         As read last.
+    counts : dict of str to int
+        'dropped': scans that the mirror made between two that came (needs real-time indices), most
+        of them because the line is slow; 'stale': scans that were not newer than the one before;
+        'reconnects'.
 
     Raises
     ------
@@ -78,48 +90,50 @@ class LMS2xx(Closed):
 
     def __init__(
         self,
-        port,
+        port: str | os.PathLike,
         *,
-        baudrate=None,
-        address=0,
-        password=b"SICK_LMS",
-        variant=None,
-        find_s=FIND_S,
-        host=REAL,
+        baudrate: int | None = None,
+        address: int = 0,
+        password: bytes = b"SICK_LMS",
+        variant: tuple[float, float] | None = None,
+        find_s: float = FIND_S,
+        host: Host = REAL,
         **configuration,
     ):
         if baudrate not in (None, *RATES):
-            raise ValueError(
-                f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {baudrate}"
-            )
-        if not 0 <= address < 0x80 or len(password) != 8:
-            raise ValueError(
-                f"an address is 0 to 127, got {address}; a password has 8 bytes, got "
-                f"{len(password)}"
-            )
+            known = ", ".join(map(str, sorted(RATES)))
+            raise ValueError(f"an LMS2xx has {known} Bd, got {baudrate}")
+        if not 0 <= address < 0x80:
+            raise ValueError(f"an address is 0 to 127, got {address}")
+        if len(password) != 8:
+            raise ValueError(f"a password has 8 bytes, got {len(password)}")
         self.port = str(port)
+        self.counts = dict.fromkeys(COUNTS, 0)
         self._password = bytes(password)
         self._host = host
-        self._counts = dict.fromkeys(COUNTS, 0)
+        self._address = address
         self._interrupted = host.event()
-        self._options = {"address": address, "interrupted": self._interrupted, "host": host}
-        self._link = self._assembler = self._settled = self._scan_clock = self._thread = None
+        self._link = None
+        self._thread: Thread | None = None
         self._interlaced = False
-        self._readings = []
-        self._trouble = None
+        self._readings: list[Reading] = []
+        self._trouble = ""  # why no reading came
         self._news = host.event()
         try:
-            self._connect(baudrate or 38400, host.now() + find_s)
+            self._connect(baudrate or USUAL_RATE, host.now() + find_s)
             if baudrate is not None and baudrate != self.baudrate:
                 self._set_rate(baudrate)
-            self.configure(**configuration) if configuration else self._prepare()
+            if configuration:
+                self.configure(**configuration)
+            else:
+                self._prepare()
             if variant is not None:
                 self.set_variant(*variant)
         except BaseException:
             self._release()
             raise
 
-    def close(self):
+    def close(self) -> None:
         """Stop streaming, close the port; never raises for a device that is gone."""
         try:
             self.stop()
@@ -135,100 +149,109 @@ class LMS2xx(Closed):
             self._link = None
 
     @property
-    def baudrate(self):
+    def baudrate(self) -> int:
         """Of both ends of the line."""
         return self._opened().baudrate
-
-    @property
-    def counts(self):
-        """How often what happened since the device was opened, a dict.
-
-        'dropped': scans that the mirror made between two that came (needs real-time indices), most
-        of them because the line is slow; 'stale': scans that were not newer than the one before;
-        'reconnects'.
-        """
-        return dict(self._counts)
 
     # ---------------------------------------------------------------------------------------------
     # connecting
 
     def _connect(self, first, end, deadline=math.inf):
-        """Open the port and leave the device quiet, with everything about it read; the rate is
-        found by `end`.
+        """Open the port and leave the device quiet, with everything about it read.
+
+        The rate is found by `end`, and no request lasts beyond the deadline.
         """
-        self._link = Link(self.port, first, **self._options)
-        self._scan_clock = ScanClock()
+        host = self._host
+        self._link = Link(
+            self.port, first, address=self._address, interrupted=self._interrupted, host=host
+        )
+        self._clock = ScanClock()
         self._link.deadline = deadline
-        self._link.find([first, *(rate for rate in RATES if rate != first)], end - self._host.now())
+        self._link.find([first, *RATES], end - host.now())
         self._link.hush()
-        self.status = self._told(wire.STATUS, codec.parse_status)
+        self._read_status()
         self._link.senders = {0x80, 0x80 | self.status.address}
-        model, *rest = self._told(wire.TYPE, codec.parse_type)
+        model, *rest = self._read(wire.TYPE, codec.parse_type)
         if not model.startswith("LMS2"):
-            raise WrongDevice(
-                f"{self.port}: '{model}' answers, not an LMS2xx: name the port of the LMS2xx"
-            )
+            remedy = "name the port of the LMS2xx"
+            raise WrongDevice(f"{self.port}: '{model}' answers, not an LMS2xx: {remedy}")
         self.type = "-".join([model, *rest[:1]])
-        self.firmware = self.status.firmware
         self._read_configuration()
-        told = (self.port, self.type, self.firmware, self.baudrate, *self.variant)
-        LOG.info("%s: %s %s at %d Bd, %g deg in steps of %g deg", *told)
 
     def _prepare(self, interlaced=False):
         """Expect scans as the device is set now; these settings are those to come back to."""
-        if self.variant not in POINTS:
+        if self.variant not in VARIANTS:
             raise WrongDevice(
                 f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does"
             )
-        if (mode := self.configuration.measuring_mode) not in MODES:
-            text = (
-                f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are "
-                "no ranges"
-            )
+        mode = self.configuration.measuring_mode
+        if mode not in MODES:
             raise WrongDevice(
-                f"{text} that can be told from errors: state measuring_mode, 0 to 6, to have it set"
+                f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are "
+                "no ranges that can be told from errors: state measuring_mode, 0 to 6, to have it "
+                "set"
             )
         self._settled = self.variant, self.configuration, self.baudrate
-        self._assembler = Assembler(*self._settled, interlaced, self._counts, self._scan_clock)
+        self._assembler = Assembler(*self._settled, interlaced, self.counts, self._clock)
 
     def _opened(self):
         if self._link is None:
             raise LineLost(f"{self.port} is closed: open it, or call reconnect()")
         return self._link
 
-    def _told(self, code, parse):
+    def _read(self, code, parse):
         """What a reply says."""
         raw = self._opened().ask(code).raw
         try:
             return parse(raw)
         except codec.TelegramError as error:
-            text = f"{self.port}: the reply to command {code:02X} is not that of an LMS2xx: {error}"
-            raise WrongDevice(text) from error
+            what = f"the reply to command {code:02X} is not that of an LMS2xx"
+            raise WrongDevice(f"{self.port}: {what}: {error}") from error
 
-    def _idle(self):
+    def _read_status(self):
+        self.status = self._read(wire.STATUS, codec.parse_status)
+
+    def _read_configuration(self):
+        def parse(raw):
+            configuration = codec.parse_configuration(raw)
+            _ = configuration.unit  # raises for one that no manual lists
+            return configuration
+
+        self.configuration = self._read(wire.CONFIGURATION, parse)
+
+    def _need_quiet(self):
         if self._thread is not None:
             raise DeviceError(f"{self.port}: the device streams; call stop() first")
 
-    def reconnect(self, deadline=10.0):
-        """Find the device again after the line was lost or it restarted, within seconds, and set it
-        as it was.
+    def reconnect(self, deadline: float = 10.0) -> None:
+        """Find the device again after the line was lost or it restarted, and set it as it was.
 
-        LineLost if the port did not come back; NoReply, WrongDevice or Refused if it did, but the
-        device does not work as before.
+        Parameters
+        ----------
+        deadline
+            Seconds that it may take.
+
+        Raises
+        ------
+        LineLost
+            If the port did not come back.
+        NoReply, WrongDevice, Refused
+            If it did, but the device does not work as before.
         """
-        self._idle()
+        self._need_quiet()
         self._mend(deadline)
 
     def _mend(self, deadline):
-        end = self._host.now() + deadline
+        host = self._host
+        end = host.now() + deadline
         variant, configuration, rate = self._settled
         self._release()
         while self._link is None:
             try:
-                self._connect(rate, min(end, self._host.now() + FIND_S), end)
+                self._connect(rate, min(end, host.now() + FIND_S), end)
             except (PortError, LineLost) as error:
                 self._release()
-                if self._interrupted.wait(AGAIN_S) or self._host.now() > end - AGAIN_S:
+                if self._interrupted.wait(AGAIN_S) or host.now() > end - AGAIN_S:
                     raise LineLost(f"the line did not come back: {error}") from error
         if self.variant != variant:
             self._set_variant(variant)
@@ -238,62 +261,72 @@ class LMS2xx(Closed):
             self._set_rate(rate)
         self._prepare()
         self._link.deadline = math.inf
-        self._counts["reconnects"] += 1
+        self.counts["reconnects"] += 1
         LOG.warning("%s: the device is back at %d Bd", self.port, rate)
 
     # ---------------------------------------------------------------------------------------------
     # settings
 
     @property
-    def variant(self):
+    def variant(self) -> tuple[float, float]:
         """Field of view and resolution, degrees."""
         return self.status.scan_angle_deg, self.status.resolution_deg
 
-    def _read_configuration(self):
-        def parse(raw):
-            found = codec.parse_configuration(raw)
-            return found.unit and found  # a unit that no manual lists is seen here
-
-        self.configuration = self._told(wire.CONFIGURATION, parse)
-
     def _set_rate(self, rate):
-        """Change the rate of both ends; flash is not written. Where it does not come through the
-        old one holds.
+        """Change the rate of both ends; flash is not written.
+
+        Where it does not come through the old one holds.
         """
-        old = self.baudrate
-        self._link.set_rate(rate)  # before the device is told: raises where this end cannot
-        self._link.set_rate(old)
+        link = self._opened()
+        before = self.baudrate
+        link.set_rate(rate)  # before the device is told: raises where this end cannot
+        link.set_rate(before)
         self._mode(bytes([RATES[rate]]), f"{rate} Bd")
-        self._link.set_rate(rate)
+        link.set_rate(rate)
         try:
-            self._link.ask(wire.TYPE)
+            link.ask(wire.TYPE)
         except (NoReply, Refused) as error:
-            self._link.find([old, *(r for r in RATES if r not in (old, rate)), rate], FIND_S)
+            link.find([before, *RATES], FIND_S)
             need = "a shorter cable"
-            if rate == 500000:
+            if rate == wire.FASTEST:
                 need = "RS-422 (a jumper in the plug of the device)"
-            text = (
+            raise NoReply(
                 f"{self.port}: nothing comes through at {rate} Bd, which needs {need}; "
                 f"{self.baudrate} Bd now"
-            )
-            raise NoReply(text) from error
+            ) from error
 
-    def _mode(self, data, what, sign=None):
+    def _mode(self, data, what):
         """Change the operating mode; replies A0 other than 00 are refusals."""
-        reply = self._opened().ask(wire.MODE, data, sign=sign)
-        if reply.code != sign and reply.raw[5]:
-            raise Refused(f"{self.port}: the device declines {what} (A0 {reply.raw[5]:02X})")
+        result = self._opened().ask(wire.MODE, data).raw[5]
+        if result:
+            raise Refused(f"{self.port}: the device declines {what} (A0 {result:02X})")
 
-    def set_variant(self, fov_deg, resolution_deg):
-        """Set field of view and resolution, 180 with 1 or 0.5 or 100 with 1, 0.5 or 0.25 deg;
-        whether they differed.
+    def set_variant(self, fov_deg: float, resolution_deg: float) -> bool:
+        """Set field of view and resolution.
+
+        Parameters
+        ----------
+        fov_deg, resolution_deg
+            180 with 1 or 0.5, or 100 with 1, 0.5 or 0.25 deg.
+
+        Returns
+        -------
+        bool
+            Whether they differed.
+
+        Raises
+        ------
+        ValueError
+            For a variant that no LMS2xx has.
+        Refused
+            If this one does not have it.
         """
-        self._idle()
+        self._need_quiet()
         wanted = (float(fov_deg), float(resolution_deg))
-        if wanted not in POINTS:
-            known = ", ".join(f"{fov:g}/{step:g}" for fov, step in POINTS)
+        if wanted not in VARIANTS:
+            known = ", ".join(f"{fov:g}/{step:g}" for fov, step in VARIANTS)
             raise ValueError(f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}")
-        self.status = self._told(wire.STATUS, codec.parse_status)
+        self._read_status()
         differs = self.variant != wanted
         if differs:
             self._set_variant(wanted)
@@ -301,40 +334,57 @@ class LMS2xx(Closed):
         return differs
 
     def _set_variant(self, wanted):
-        words = b"".join(round(v).to_bytes(2, "little") for v in (wanted[0], 100 * wanted[1]))
+        view, step = wanted
+        data = round(view).to_bytes(2, "little") + round(100 * step).to_bytes(2, "little")
         try:
-            self._opened().ask(wire.VARIANT, words)
+            self._opened().ask(wire.VARIANT, data)
         except NoReply as error:  # the reply may be lost and the variant set
             LOG.warning("%s; reading the variant", error)
-        self.status = self._told(wire.STATUS, codec.parse_status)
+        self._read_status()
         if self.variant != wanted:
-            have = "{:g} deg in steps of {:g} deg".format(*self.variant)
-            raise Refused(
-                f"{self.port}: the {self.type} has no variant {wanted[0]:g}/{wanted[1]:g}; it "
-                f"keeps {have}"
-            )
+            kept = "{:g} deg in steps of {:g} deg".format(*self.variant)
+            lacks = f"the {self.type} has no variant {view:g}/{step:g}"
+            raise Refused(f"{self.port}: {lacks}; it keeps {kept}")
 
-    def configure(self, *, unit=None, measuring_mode=None, realtime_indices=None):
-        """Change settings that are kept in flash (some thousand writes), only if they differ;
-        whether they did.
+    def configure(
+        self,
+        *,
+        unit: str | None = None,
+        measuring_mode: int | None = None,
+        realtime_indices: bool | None = None,
+    ) -> bool:
+        """Change settings that are kept in flash (some thousand writes), only if they differ.
 
-        The unit is 'cm' or 'mm', the measuring mode a key of `lms2xx_codec.MODES` (it tells the
-        largest range, too). Without real-time indices dropped and repeated scans cannot be seen.
-        Refused for a wrong password, or values that the device declines; ValueError for those that
-        no LMS2xx has.
+        Parameters
+        ----------
+        unit
+            Of a reading, 'cm' or 'mm'.
+        measuring_mode
+            Key of `lms2xx_codec.MODES`; it tells the largest range, too.
+        realtime_indices
+            Without them dropped and repeated scans cannot be seen.
+
+        Returns
+        -------
+        bool
+            Whether they differed.
+
+        Raises
+        ------
+        ValueError
+            For values that no LMS2xx has.
+        Refused
+            For a wrong password, or values that the device declines.
         """
-        self._idle()
+        self._need_quiet()
         if unit not in (None, *UNITS) or measuring_mode not in (None, *MODES):
             raise ValueError(
                 f"unit is one of {UNITS}, measuring mode 0 to 6; got {unit!r}, {measuring_mode!r}"
             )
         self._read_configuration()
-        options = {
-            "unit": unit,
-            "measuring_mode": measuring_mode,
-            "realtime_indices": realtime_indices,
-        }
-        wanted = self.configuration.changed(**options)
+        wanted = self.configuration.changed(
+            unit=unit, measuring_mode=measuring_mode, realtime_indices=realtime_indices
+        )
         differs = wanted.block != self.configuration.block
         if differs:
             self._write(wanted)
@@ -345,7 +395,7 @@ class LMS2xx(Closed):
         """Write a configuration in installation mode, and read it back."""
         try:
             self._mode(INSTALLATION + self._password, "the password of the installation mode")
-            self._link.ask(wire.CONFIGURE, wanted.block)
+            self._opened().ask(wire.CONFIGURE, wanted.block)
         except NoReply as error:
             # the reply may be lost and the flash written: read it, do not write again
             LOG.warning("%s; reading the configuration", error)
@@ -353,24 +403,38 @@ class LMS2xx(Closed):
             self._mode(wire.ON_REQUEST, "to leave the installation mode")
         self._read_configuration()
         if self.configuration.block != wanted.block:
-            raise Refused(
-                f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}"
-            )
+            block = wanted.block.hex(" ")
+            raise Refused(f"{self.port}: the device does not take the configuration {block}")
 
     # ---------------------------------------------------------------------------------------------
     # scans
 
-    def request(self, timeout=None):
-        """One scan, a Reading, within so many seconds; by default what three tries need."""
-        self._idle()
-        patience = wire.TRIES * (0.5 + 2 * self._assembler.interval_s)
-        end = self._host.now() + (patience if timeout is None else timeout)
+    def request(self, timeout: float | None = None) -> Reading:
+        """One scan.
+
+        Parameters
+        ----------
+        timeout
+            Seconds; by default what three tries need.
+
+        Raises
+        ------
+        NoReply
+            If none comes in time.
+        LineLost
+            If the port vanished.
+        """
+        self._need_quiet()
+        host = self._host
+        if timeout is None:
+            timeout = wire.TRIES * (0.5 + 2 * self._assembler.interval_s)
+        end = host.now() + timeout
         for _ in range(wire.TRIES):
-            left = max(0.0, end - self._host.now())
-            arrival = self._opened().ask(wire.VALUES, ALL_VALUES, limit_s=left)
-            late = arrival.time_s - self._link.asked_s > REPLY_S + self._assembler.duration_s
-            # nobody knows the instant of a scan that came late
-            reading = None if late else self._scan(arrival)
+            link = self._opened()
+            arrival = link.ask(wire.VALUES, ALL_VALUES, limit_s=max(0.0, end - host.now()))
+            if arrival.time_s - link.asked_s > REPLY_S + self._assembler.duration_s:
+                continue  # nobody knows the instant of a scan that came late
+            reading = self._reading(arrival)
             if reading is not None:
                 return reading
         raise NoReply(
@@ -378,33 +442,41 @@ class LMS2xx(Closed):
             f"{self.variant}"
         )
 
-    def _scan(self, arrival):
-        return self._assembler.feed(arrival.raw, arrival.time_s) if arrival.code == SCAN else None
+    def _reading(self, arrival: Arrival):
+        if arrival.code != SCAN:
+            return None
+        return self._assembler.feed(arrival.raw, arrival.time_s)
 
-    def start(self, interlaced=False):
+    def start(self, interlaced: bool = False) -> None:
         """Stream: a thread reads every scan from now on.
 
-        With `interlaced` partial scans are merged to 180 deg in steps of 0.25 deg; the variant
-        becomes 100/0.25, which such scans need.
+        Parameters
+        ----------
+        interlaced
+            Partial scans are merged to 180 deg in steps of 0.25 deg; the variant becomes 100/0.25,
+            which such scans need.
+
+        Raises
+        ------
+        Refused, NoReply, LineLost
+            If the device does not stream.
         """
-        self._idle()
+        self._need_quiet()
         self._interlaced = interlaced
         if interlaced:
-            self.set_variant(100, 0.25)
+            self.set_variant(*FINE)
         self._stream()
         self._readings = []
-        self._trouble = None
+        self._trouble = ""
         self._thread = self._host.thread(self._run, "LMS2xx reader")
         self._thread.start()
 
-    @property
-    def interval_s(self):
-        """Seconds between two scans of the stream."""
-        return (4 if self._interlaced else 1) * self._assembler.interval_s
-
     def _stream(self):
         self._prepare(self._interlaced)
-        self._mode(INTERLACED if self._interlaced else STREAM, "to stream", sign=SCAN)
+        data = STREAM
+        if self._interlaced:
+            data = INTERLACED
+        self._mode(data, "to stream")
 
     def _run(self):
         """Read until the stream is to stop; whatever goes wrong with the line, find the device
@@ -417,7 +489,7 @@ class LMS2xx(Closed):
                     self._mend(RECOVERY_S)
                     self._stream()
                     lost = False
-                self._read()
+                self._post()
             except DeviceError as error:
                 if lost:
                     self._interrupted.wait(AGAIN_S)
@@ -429,51 +501,88 @@ class LMS2xx(Closed):
                 LOG.exception("LMS2xx reader thread")
                 raise
 
-    def _read(self):
-        """Post readings until the stream falls silent, or until the end; the list is replaced,
-        never changed.
+    def _post(self):
+        """Post readings until the stream falls silent, or until the end.
+
+        The list is replaced, never changed.
         """
-        last = self._host.now()
+        host = self._host
+        last = host.now()
+        quiet_s = max(LEAST_QUIET_S, 2.2 * self._assembler.interval_s + 0.15)
         while not self._interrupted.is_set():
-            found = self._opened().receive()
-            if any(one.code == POWER_ON for one in found):
-                raise NoReply("the device started anew")
-            if fresh := [reading for one in found if (reading := self._scan(one)) is not None]:
+            arrivals = self._opened().receive()
+            fresh = []
+            for arrival in arrivals:
+                if arrival.code == POWER_ON:
+                    raise NoReply("the device started anew")
+                reading = self._reading(arrival)
+                if reading is not None:
+                    fresh.append(reading)
+            if fresh:
                 self._readings = [*self._readings, *fresh][-KEPT:]
-                self._trouble = None
+                self._trouble = ""
                 self._news.set()
-                last = self._host.now()
-            if self._host.now() - last > max(LEAST_QUIET_S, 2.2 * self.interval_s + 0.15):
+                last = host.now()
+            if host.now() - last > quiet_s:
                 raise NoReply("the stream fell silent")
 
-    def take(self, count, after=None, timeout=None):
-        """Consecutive scans of the stream, a list of Reading, later than an instant, by default
-        that of the call.
+    def take(
+        self, count: int, after: float | None = None, timeout: float | None = None
+    ) -> list[Reading]:
+        """Consecutive scans of the stream.
 
         The last 256 scans are kept, so that with the instant of the last scan of one call the next
-        call goes on without a gap. By default it lasts as long as the line needs and 2 s.
+        call goes on without a gap.
+
+        Parameters
+        ----------
+        count
+            Of the scans.
+        after
+            Date of the host, s, later than which they are; by default that of the call.
+        timeout
+            Seconds; by default as long as the line needs and 2 s.
+
+        Raises
+        ------
+        NoReply
+            If they do not come in time.
+        DeviceError
+            If the device does not stream.
         """
         if self._thread is None:
             raise DeviceError(f"{self.port}: the device does not stream; call start() first")
-        limit = 2 + 2 * (count + 2) * self.interval_s if timeout is None else timeout
-        found = []
-        last_s = self._host.time() if after is None else after
-        end = self._host.now() + limit
+        host = self._host
+        if timeout is None:
+            timeout = 2 + 2 * (count + 2) * self._assembler.interval_s
+        if after is None:
+            after = host.time()
+        end = host.now() + timeout
+        readings: list[Reading] = []
         while True:
             self._news.clear()
             alive = self._thread.is_alive()
-            found += [one for one in self._readings if one.time_s > last_s]
-            if len(found) >= count:
-                return found[:count]
-            last_s = found[-1].time_s if found else last_s
-            left = end - self._host.now()
+            readings += [reading for reading in self._readings if reading.time_s > after]
+            if len(readings) >= count:
+                return readings[:count]
+            if readings:
+                after = readings[-1].time_s
+            left = end - host.now()
             if left <= 0 or not alive:
-                state = "the stream is silent" if alive else "the reader thread ended"
-                raise NoReply(f"no new scan within {limit:g} s: {self._trouble or state}")
-            self._news.wait(min(left, 0.2))
+                trouble = self._trouble or "the stream is silent"
+                raise NoReply(f"no new scan within {timeout:g} s: {trouble}")
+            self._news.wait(min(left, LOOK_S))
 
-    def stop(self):
-        """Stop streaming; nothing happens where the device does not."""
+    def stop(self) -> None:
+        """Stop streaming; nothing happens where the device does not.
+
+        Raises
+        ------
+        LineLost
+            If the line is lost.
+        NoReply, Refused
+            If the device does not stop.
+        """
         if self._thread is None:
             return
         self._interrupted.set()

@@ -3,34 +3,28 @@
 import itertools
 import logging
 import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.pelco_d import (
-    DOWN,
-    SET_TILT,
-    UP,
-    encode_extended,
-    encode_frame,
-)
-from lrfcal_lib.drivers.port import (
-    DeviceError,
-    LineLost,
-    NoReply,
-    Refused,
-)
+from lrfcal_lib.drivers.pelco_d import DOWN, SET_TILT, UP, HeadLine, encode_extended, encode_frame
+from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, Refused
 
 LOG = logging.getLogger(__name__)
-ASSUMED = 4.0, 4.0  # deg/s
+ASSUMED = 4.0, 4.0  # deg/s up and down, as of heads of constant speed
+ARRIVAL = math.radians(0.5)  # a move that ends this near has arrived; its settled pitch counts
+STALLED = 5  # settle times at rest elsewhere: the head does not get to where it was sent
 BURSTS = 25  # of up and down, to reach one pitch
 FIRST_BURST_S = 0.1  # of a head whose speed is unknown
 GROWTH = 4  # of bursts while the speed is being learnt
+SHORT_OF = 0.9  # part of the way that a burst is to make, so that the last come from one side
 SURPRISE = math.radians(3)  # from dead reckoning: then a reading is not believed at once
-# part of the way that a burst is meant to make, so that the last ones come from one side
-SHORT_OF = 0.9
 LEAST_S = 1e-4  # of a wait worth its while
 MISSES = 3  # queries without a reply, after which a head that is swept is not asked any more
+WRONG_WAY = math.radians(2)  # that a sweep may seem to go
 OTHER_WAY = "the head moves the other way: set invert to the contrary"
 STOPPED = "the head was stopped before it arrived"
+UNKNOWN = "where the head stands is unknown since its line was lost: look, and call set_pitch"
 INTERRUPTED = (
     "the head's line was lost, and the head stopped when it came back: move or sweep again; where "
     "it tells nothing look where it stands, and call set_pitch"
@@ -41,37 +35,71 @@ class Stopped(DeviceError):
     """The motion was ended by a stop."""
 
 
-class Motion:
-    """Motions of one axis, its speeds, and where it must be by now; rad, rad/s, instants of the
-    host.
+class PitchReading(NamedTuple):
+    """What the head told of its pitch."""
 
-    While the event `abort` is set nothing moves the head. `feedback`: it tells its tilt, if maybe
-    not while it moves; `calibrated`: its speed was stated or measured, not assumed; `rows` are of a
-    sweep: host time, pitch, whether it was measured, and dead reckoning before that was known.
+    instant: float  # of the host
+    pitch: float  # radians
+    reckoned: float  # dead reckoning before that was known, radians
+
+
+class TrackPoint(NamedTuple):
+    """Where the head was in a sweep."""
+
+    time_s: float  # date of the host
+    pitch: float  # radians
+    measured: bool  # the head told it
+    reckoned: float  # dead reckoning before that was known, radians
+
+
+class Motion:
+    """Motions of one axis, its speeds, and where it must be by now.
+
+    Angles are in rad, speeds in rad/s, instants those of the host. While the event `abort` is set
+    nothing moves the head.
+
+    Parameters
+    ----------
+    line
+        To the head.
+    settings : rig_file.HeadSettings
+
+    Attributes
+    ----------
+    feedback : bool
+        The head tells its tilt, if maybe not while it moves.
+    calibrated : bool
+        Its speed was stated or measured, not assumed.
+    rows : list of TrackPoint
+        Of the sweep that runs or ran last.
     """
 
-    def __init__(self, line, settings):
+    def __init__(self, line: HeadLine, settings):
         self.line = line
         self.settings = settings
-        self._now = line.host.now
         self.abort = line.host.event()
         self.feedback = False
-        self.rows = []
-        self._misses = 0
+        self.rows: list[TrackPoint] = []
         self.calibrated = settings.degrees_per_second is not None
+        self._now = line.host.now
         up, down = map(math.radians, settings.degrees_per_second or ASSUMED)
-        self._speeds = {settings.tilt_speed: {1: up, -1: down}}
-        self._longest = math.inf if self.calibrated else FIRST_BURST_S / GROWTH
-        # set-tilt; None until it was tried
-        self._obeys = False if settings.absolute is False else None
-        self._dead = set()
-        self._going = None
+        self._speeds = {(settings.tilt_speed, 1): up, (settings.tilt_speed, -1): down}
+        self._longest = FIRST_BURST_S / GROWTH
+        if self.calibrated:
+            self._longest = math.inf
+        self._obeys = None  # whether set-tilt moves the head; None until it was tried
+        if settings.absolute is False:
+            self._obeys = False
+        self._dead: set[int] = set()  # speed bytes at which the head does not move
+        self._going: tuple | None = (
+            None  # way (1 up, -1 down), speed byte and instant of the motion
+        )
         self._frame = b""
         self._repeated = 0.0
-        self._pitch = None
-        self._seen = 0.0
+        self._pitch: float | None = None
+        self._known_at = 0.0
+        self._misses = 0
         self._tolerance = math.radians(settings.tolerance_deg)
-        self._arrival = math.radians(settings.arrival_deg)
         self._shortest_s = 2 * line.wire_s() + settings.gap_s  # of a motion and its stop
 
     # -------------------------------------------------------------------------------------------
@@ -81,62 +109,71 @@ class Motion:
         """Speed upwards (`way` > 0) or downwards; of other speed bytes in proportion, until they
         were used.
         """
-        nearest = min(self._speeds, key=lambda other: abs(other - step))
-        return self._speeds[nearest][1 if way > 0 else -1] * max(step, 1) / max(nearest, 1)
+        way = math.copysign(1, way)
+        known = [other for other, direction in self._speeds if direction == way]
+        nearest = min(known, key=lambda other: abs(other - step))
+        return self._speeds[nearest, way] * max(step, 1) / max(nearest, 1)
 
     def learn(self, way, step, speed):
         """Remember a speed that was measured."""
-        self._speeds.setdefault(step, {1: speed, -1: speed})[1 if way > 0 else -1] = speed
+        way = math.copysign(1, way)
+        self._speeds[step, way] = speed
+        self._speeds.setdefault((step, -way), speed)
         self.calibrated = True
 
-    def know(self, pitch, instant=None):
-        """The head was at a pitch (None: nobody knows where it is) at an instant, by
-        default now.
-        """
-        self._pitch, self._seen = pitch, self._now() if instant is None else instant
+    def know(self, pitch, instant):
+        """The head was at a pitch at an instant."""
+        self._pitch = pitch
+        self._known_at = instant
 
     def estimate(self, instant=None):
         """Dead reckoning at an instant, by default now; DeviceError if nothing is known."""
         if self._pitch is None:
-            raise DeviceError(
-                "where the head stands is unknown since its line was lost: look, and call set_pitch"
-            )
+            raise DeviceError(UNKNOWN)
         if self._going is None:
             return self._pitch
+        if instant is None:
+            instant = self._now()
         way, step, begun = self._going
-        seconds = (self._now() if instant is None else instant) - max(
-            self._seen, begun + self.settings.start_delay_s
-        )
-        return self._pitch + way * self.speed(way, step) * max(0.0, seconds)
+        seconds = max(0.0, instant - max(self._known_at, begun))
+        return self._pitch + way * self.speed(way, step) * seconds
 
     def read(self, retries=0):
-        """Instant, pitch that the head tells, and dead reckoning for it; None without a reply.
+        """What the head tells, as PitchReading; None without a reply.
 
         A reading far from dead reckoning is asked for twice more, and the one in the middle counts.
         """
-        told = self.line.pitch(retries)
-        if told is None:
+        answer = self.line.pitch(retries)
+        if answer is None:
             return None
-        if self._pitch is not None and abs(told[1] - self.estimate(told[0])) > SURPRISE:
-            told = [told, self.line.pitch(retries), self.line.pitch(retries)]
-            if None in told:
+        instant, pitch = answer
+        if self._pitch is not None and abs(pitch - self.estimate(instant)) > SURPRISE:
+            answers = [answer, self.line.pitch(retries), self.line.pitch(retries)]
+            if None in answers:
                 return None
-            told = sorted(told, key=lambda one: one[1])[1]
-        reckoned = told[1] if self._pitch is None else self.estimate(told[0])
-        self.know(told[1], told[0])
-        return *told, reckoned
+            instant, pitch = sorted(answers, key=lambda answer: answer[1])[1]
+        reckoned = pitch
+        if self._pitch is not None:
+            reckoned = self.estimate(instant)
+        self.know(pitch, instant)
+        return PitchReading(instant, pitch, reckoned)
 
-    def note(self, brief=False):
+    def note(self, retries=0):
         """Append where the head is now to the rows."""
         reading = None
-        if self.feedback and not (brief and self._misses >= MISSES):
-            reading = self.read(0 if brief else self.settings.retries)
-            self._misses = 0 if reading else self._misses + 1
+        if self.feedback and self._misses < MISSES:
+            reading = self.read(retries)
+            self._misses += 1
         now = self._now()
-        instant, pitch, reckoned = reading or (now, self.estimate(now), self.estimate(now))
-        self.rows.append(
-            (self.line.host.time() - (now - instant), pitch, reading is not None, reckoned)
-        )
+        date = self.line.host.time()
+        if reading is None:
+            here = self.estimate(now)
+            self.rows.append(TrackPoint(date, here, False, here))
+        else:
+            self._misses = 0
+            self.rows.append(
+                TrackPoint(date - (now - reading.instant), reading.pitch, True, reading.reckoned)
+            )
 
     # ------------------------------------------------------------------------------------------
     # start and stop
@@ -157,13 +194,15 @@ class Motion:
         return ended
 
     def pause(self, seconds):
-        """Wait, repeating the motion for heads that want it; raises Stopped if it was ended
-        meanwhile.
+        """Wait, repeating the motion for heads that want it.
+
+        Raises Stopped if it was ended meanwhile.
         """
         end = self._now() + seconds
-        every = self.settings.repeat_s
         while True:
-            due = math.inf if every is None or self._going is None else self._repeated + every
+            due = math.inf
+            if self.settings.repeat_s is not None and self._going is not None:
+                due = self._repeated + self.settings.repeat_s
             if self._now() >= due:
                 self._repeated = self._send(self._frame)
             elif self.abort.wait(max(0.0, min(end, due) - self._now())):
@@ -171,114 +210,161 @@ class Motion:
             elif self._now() >= end:
                 return
 
-    def run(self, goal, step, longest_s=math.inf, look=None):
-        """Move towards a pitch until the head must be there, at most for so long; the seconds it
-        took.
+    def run(
+        self,
+        goal: float,
+        step: int,
+        longest_s: float = math.inf,
+        look: Callable[[], None] | None = None,
+    ) -> float:
+        """Move towards a pitch until the head must be there.
 
-        ``look()`` is called again and again; by default the head is asked where it is if there is
-        time for that.
+        Parameters
+        ----------
+        goal
+            Pitch, rad.
+        step
+            Speed byte.
+        longest_s
+            Of the motion, seconds.
+        look
+            Is called again and again; by default the head is asked where it is if there is time.
+
+        Returns
+        -------
+        float
+            The seconds that it took.
+
+        Raises
+        ------
+        LineLost
+            If the port vanished; the head was stopped if it came back.
         """
-        way = 1 if goal > self.estimate() else -1
-        reconnects = self.line.counts["reconnects"]
-        bit = UP if (way > 0) != self.settings.invert else DOWN
-        self._frame = encode_frame(self.settings.address, command2=bit, data2=step)
+        line = self.line
+        settings = self.settings
+        reconnects = line.reconnects
+        way = math.copysign(1, goal - self.estimate())
+        bit = DOWN
+        if (way > 0) != settings.invert:
+            bit = UP
+        asking_s = self._shortest_s + settings.reply_s + pelco_d.READ_S
 
         def left():
             """Seconds; after a reading the stop has to be on its way in time."""
-            late = self.line.wire_s() if self._seen > begun else 0.0
-            there = (goal - self.estimate()) * way / self.speed(way, step) - late
-            return min(there, begun + longest_s - self._now())
+            rest_s = (goal - self.estimate()) * way / self.speed(way, step)
+            if self._known_at > begun:
+                rest_s -= line.wire_s()
+            return min(rest_s, begun + longest_s - self._now())
 
         try:
+            self._frame = encode_frame(settings.address, command2=bit, data2=step)
             begun = self._repeated = self._send(self._frame)
-            self._going = (way, step, begun)
+            self._going = way, step, begun
             try:
-                while left() > LEAST_S and self.line.counts["reconnects"] == reconnects:
+                while left() > LEAST_S and line.reconnects == reconnects:
                     if look is not None:
                         look()
-                    elif (
-                        self.feedback
-                        and left() > self._shortest_s + self.settings.reply_s + pelco_d.READ_S
-                    ):
+                    elif self.feedback and left() > asking_s:
                         self.read()
-                    self.pause(min(left(), self.settings.poll_s))
+                    self.pause(min(left(), settings.poll_s))
             finally:
                 ended = self.stop()
-            if self.line.counts["reconnects"] != reconnects:
+            if line.reconnects != reconnects:
                 raise LineLost(INTERRUPTED)
         except LineLost:
-            self._pitch = self._pitch if self.feedback else None
+            if not self.feedback:
+                self._pitch = None
             raise
         return ended - begun
 
-    def settle(self, deadline, target=None):
+    def settle(self, deadline: float, target: float | None = None) -> float:
         """Wait until the head rests; its pitch.
 
-        Rest elsewhere than at the target of a set-tilt counts after `stall_s` only, because it may
-        not have begun. Raises NoReply if it stays silent, Refused if it does not come to rest.
+        Parameters
+        ----------
+        deadline
+            Instant of the host.
+        target
+            Of a set-tilt, rad. Rest elsewhere counts after a while only, as the motion may not have
+            begun.
+
+        Raises
+        ------
+        NoReply
+            If the head stays silent.
+        Refused
+            If it does not come to rest.
         """
-        first = None
+        resting = None  # pitch since an instant
         since = 0.0
         while True:
             reading = self.read()
             now = self._now()
             if reading is None:
-                first = None
-            elif first is None or abs(reading[1] - first) > self._tolerance:
-                if first is not None and target is None:
+                resting = None
+            elif resting is None or abs(reading.pitch - resting) > self._tolerance:
+                if resting is not None and target is None:
                     self.stop()  # the one before was lost
-                first = reading[1]
+                resting = reading.pitch
                 since = now
             else:
-                on_the_way = target is not None and abs(first - target) > self._arrival
-                if now - since >= max(self.settings.settle_s, self.settings.stall_s * on_the_way):
-                    return reading[1]
+                enough_s = self.settings.settle_s
+                if target is not None and abs(resting - target) > ARRIVAL:
+                    enough_s *= STALLED
+                if now - since >= enough_s:
+                    return reading.pitch
             if now >= deadline:
                 break
             self.pause(self.settings.poll_s)
-        if first is None:
-            raise NoReply(
-                f"the head at {self.line.path} stopped telling its tilt: check its power and the "
-                "wires"
-            )
+        if resting is None:
+            remedy = "check its power and the wires"
+            raise NoReply(f"the head at {self.line.path} stopped telling its tilt: {remedy}")
         raise Refused(
-            f"the head does not come to rest, {math.degrees(first):.2f} deg by now: give it more "
+            f"the head does not come to rest, {math.degrees(resting):.2f} deg by now: give it more "
             "time, a higher tolerance_deg, or look whether it can get there"
         )
 
     # ---------------------------------------------------------------------------------------------
     # moves
 
-    def move(self, target, deadline):
+    def move(self, target: float, deadline: float) -> float:
         """Reach a pitch by set-tilt where the head obeys, else by up and down.
 
-        Raises Refused if it obeys, but does not get there.
+        Parameters
+        ----------
+        target
+            Pitch, rad.
+        deadline
+            Instant of the host.
+
+        Returns
+        -------
+        float
+            Settled pitch, rad.
+
+        Raises
+        ------
+        Refused
+            If the head does not get there, or does not obey where that is stated.
         """
-        value = pelco_d.encode_tilt(self.settings.elevation(target))
-        # the first may be lost, or come while it was still busy
-        for _ in range(2 if self._obeys is not False else 0):
-            self._send(encode_extended(self.settings.address, SET_TILT, value))
+        if self._obeys is False:
+            return self.steer(target, deadline)
+        settings = self.settings
+        value = pelco_d.encode_tilt(settings.elevation(target))
+        for _ in range(2):  # the first may be lost, or come while the head was still busy
+            self._send(encode_extended(settings.address, SET_TILT, value))
             pitch = self.settle(deadline, target)
-            if abs(pitch - target) <= self._arrival:
+            if abs(pitch - target) <= ARRIVAL:
                 self._obeys = True
                 return pitch
         if self._obeys:
-            raise self._short_of(pitch, target)
-        if self._obeys is None:
-            self._obeys = False
-            if self.settings.absolute is True:
-                raise Refused(
-                    "the head does not obey set-tilt (4D): state absolute false to use up and down"
-                )
-            LOG.warning("the head does not obey set-tilt (4D): it is moved by up and down")
+            raise _short_of(pitch, target)
+        words = "the head does not obey set-tilt (4D)"
+        if settings.absolute is True:
+            raise Refused(f"{words}: state absolute false to use up and down")
+        self._obeys = False
+        LOG.warning("%s: it is moved by up and down", words)
         return self.steer(target, deadline)
-
-    @staticmethod
-    def _short_of(pitch, target):
-        return Refused(
-            f"the head stays at {math.degrees(pitch):.2f} deg on its way to "
-            f"{math.degrees(target):.2f}: look for an end stop, or narrow pitch_limits_deg"
-        )
 
     def steer(self, target, deadline):
         """Reach a pitch by up and down, each time as long as the way that is left takes.
@@ -290,11 +376,11 @@ class Motion:
         for _ in range(BURSTS):
             error = target - pitch
             steps = sorted({full, full // 4, full // 16} - self._dead, reverse=True)
-            # of the shortest bursts
-            ways = {step: self._shortest_s * self.speed(error, step) for step in steps}
-            if abs(error) <= max(self._arrival, ways[steps[-1]]):
+            shortest = {step: self._shortest_s * self.speed(error, step) for step in steps}
+            slowest = steps[-1]
+            if abs(error) <= max(ARRIVAL, shortest[slowest]):
                 return pitch
-            step = next((step for step in steps if abs(error) >= 2 * ways[step]), steps[-1])
+            step = next((step for step in steps if abs(error) >= 2 * shortest[step]), slowest)
             took = self.run(pitch + SHORT_OF * error, step, GROWTH * self._longest)
             before = pitch
             pitch = self.settle(deadline)
@@ -304,22 +390,31 @@ class Motion:
             if moved > 2 * self._tolerance:
                 self.learn(error, step, moved / took)
             elif self._longest >= FIRST_BURST_S:
-                self._dead.add(step)
                 if step == full:
                     self._dead.clear()
                     raise Refused(
                         "the head does not move: look for an end stop, its power, and whether "
                         "tilt_speed suffices"
                     )
+                self._dead.add(step)
                 continue
             self._longest = max(self._longest, took)
-        raise self._short_of(pitch, target)
+        raise _short_of(pitch, target)
 
-    def timed(self, target, seconds):
-        """Move by time, unless the shortest motion would lead further away; the pitch that results
-        is dead reckoning.
+    def timed(self, target: float, seconds: float) -> float:
+        """Move by time, unless the shortest motion would lead further away.
 
-        Raises LineLost if the port vanished: the pitch is unknown then.
+        Parameters
+        ----------
+        target
+            Pitch, rad.
+        seconds
+            That the way takes.
+
+        Returns
+        -------
+        float
+            The pitch that results by dead reckoning, rad.
         """
         if seconds >= self._shortest_s / 2:
             self.run(target, self.settings.tilt_speed)
@@ -327,53 +422,70 @@ class Motion:
         return self.estimate()
 
     def sweep(self, goal, step):
-        """Move to a pitch at a speed byte and note where the head is on the way, and where it
-        rests.
-        """
+        """Move to a pitch at a speed byte; note where the head is on the way and where it rests."""
         self._misses = 0
-        self.note()
+        self.note(self.settings.retries)
         first = self.estimate()
         way = math.copysign(1, goal - first)
         deadline = self._now() + 3 * abs(goal - first) / self.speed(way, step) + 10
 
         def look():
             """Note where the head is; what goes wrong in a sweep ends it."""
-            self.note(brief=True)
+            self.note()
             if self._now() > deadline:
-                raise Refused(
-                    "the sweep does not get to its end: look for an end stop, or state "
-                    "degrees_per_second"
-                )
-            if (self.rows[-1][1] - first) * way < -math.radians(2):
+                remedy = "look for an end stop, or state degrees_per_second"
+                raise Refused(f"the sweep does not get to its end: {remedy}")
+            if (self.rows[-1].pitch - first) * way < -WRONG_WAY:
                 raise Refused(OTHER_WAY)
             if self.feedback and self._misses >= MISSES and not self.calibrated:
                 raise NoReply(
                     "the head is silent while it moves and its speed is unknown: state "
                     "degrees_per_second"
                 )
-            told = [row for row in self.rows[1:] if row[2]]
-            if told and abs(told[-1][1] - told[0][1]) >= 10 * self._tolerance:
-                self.learn(way, step, abs(told[-1][1] - told[0][1]) / (told[-1][0] - told[0][0]))
+            measured = [row for row in self.rows[1:] if row.measured]
+            if measured:
+                swept = abs(measured[-1].pitch - measured[0].pitch)
+                if swept >= 10 * self._tolerance:
+                    self.learn(way, step, swept / (measured[-1].time_s - measured[0].time_s))
 
         try:
             self.run(goal, step, look=look)
         finally:
+            self._misses = 0
             if self._pitch is not None:
-                self.note()
-        self.settle(self._now() + 5) if self.feedback else self.pause(0)
-        self.note()
+                self.note(self.settings.retries)
+        if self.feedback:
+            self.settle(self._now() + 5)
+        self.note(self.settings.retries)
 
 
-def drawn_to_readings(rows):
-    """Track of a sweep out of its rows: what lies between two readings is stretched to both, what
-    is outside is not.
+def _short_of(pitch, target):
+    return Refused(
+        f"the head stays at {math.degrees(pitch):.2f} deg on its way to "
+        f"{math.degrees(target):.2f}: look for an end stop, or narrow pitch_limits_deg"
+    )
+
+
+def drawn_to_readings(rows: Sequence[TrackPoint]) -> list[tuple[float, float, bool]]:
+    """Track of a sweep: what lies between two readings is stretched to both.
+
+    Parameters
+    ----------
+    rows
+        Of the sweep.
+
+    Returns
+    -------
+    list of tuple
+        Date of the host, s, pitch, rad, and whether it was measured.
     """
-    track = [row[:3] for row in rows]
-    told = [i for i, row in enumerate(rows) if row[2]]
-    for first, last in itertools.pairwise(told):
-        start = rows[first][1]
-        way = rows[last][3] - rows[first][1]
-        stretch = (rows[last][1] - start) / way if way else 1.0
-        for i in range(first + 1, last):
-            track[i] = (rows[i][0], start + stretch * (rows[i][1] - start), False)
-    return track
+    pitches = [row.pitch for row in rows]
+    measured = [i for i, row in enumerate(rows) if row.measured]
+    for first, last in itertools.pairwise(measured):
+        start = rows[first].pitch
+        reckoned = rows[last].reckoned - start
+        if reckoned:
+            stretch = (rows[last].pitch - start) / reckoned
+            for i in range(first + 1, last):
+                pitches[i] = start + stretch * (rows[i].pitch - start)
+    return [(row.time_s, pitch, row.measured) for row, pitch in zip(rows, pitches, strict=True)]

@@ -3,16 +3,16 @@
 import contextlib
 import logging
 import math
+import os
 from dataclasses import dataclass
 
-from lrfcal_lib.drivers.port import REAL, LineLost, PortError, line_lost
+from lrfcal_lib.drivers.port import REAL, Host, LineLost, PortError, line_lost
 
 LOG = logging.getLogger(__name__)
 SYNC = 0xFF
-# bytes
-FRAME = 7
-SHORT = 5  # a short reply
-GENERAL = 4  # a confirmation
+FRAME = 7  # bytes
+SHORT = 5  # bytes of a reply without sync and address
+GENERAL = 4  # bytes of a confirmation
 # bits of command 2; without them, and those of the pan, it is a stop
 UP = 0x08
 DOWN = 0x10
@@ -21,6 +21,9 @@ SET_TILT = 0x4D
 QUERY_TILT = 0x53
 TILT = 0x5B  # its reply
 TURN = 36000  # hundredths of a degree
+READ_S = 0.02  # longest wait for single bytes, so that no read overshoots a deadline by more
+MOST = 512  # bytes looked at after a frame: a head sends up to 18, the rest is another device
+AGAIN_S = 0.05  # between looks for a port that vanished
 
 
 @dataclass(frozen=True)
@@ -37,37 +40,66 @@ class Frame:
     data2: int = 0
 
     @property
-    def value(self):
+    def value(self) -> int:
         """Number of both data bytes."""
         return self.data1 << 8 | self.data2
 
 
-@dataclass(frozen=True)
+@dataclass
 class Received:
     """What came back after a frame was sent."""
 
-    tilts: tuple = ()  # numbers of the replies that tell the tilt
+    tilts: tuple[int, ...] = ()  # numbers of the replies that tell the tilt
     acknowledged: bool = False
     echoed: int = 0  # bytes of the own frame that a two-wire adapter handed back
     skipped: int = 0  # bytes that belong to nothing
 
 
-def encode_frame(address, command1=0, command2=0, data1=0, data2=0):
-    """The 7 bytes of a frame, all 0 that of a stop; ValueError for numbers that are no bytes.
+def encode_frame(
+    address: int, command1: int = 0, command2: int = 0, data1: int = 0, data2: int = 0
+) -> bytes:
+    """The 7 bytes of a frame.
 
     A motion is obeyed until the next one, a stop, or the head's limit.
+
+    Parameters
+    ----------
+    address
+        Of the head.
+    command1, command2, data1, data2
+        Bytes; all 0 are those of a stop.
+
+    Raises
+    ------
+    ValueError
+        For numbers that are no bytes.
     """
     body = bytes([address, command1, command2, data1, data2])
     return bytes([SYNC, *body, sum(body) & 0xFF])
 
 
-def encode_extended(address, opcode, value=0):
-    """Bytes of an extended command, whose opcode is odd: a preset, a position, a query."""
+def encode_extended(address: int, opcode: int, value: int = 0) -> bytes:
+    """Bytes of an extended command: a preset, a position, a query.
+
+    Parameters
+    ----------
+    address
+        Of the head.
+    opcode
+        Odd.
+    value
+        Number of both data bytes.
+    """
     return encode_frame(address, 0, opcode, *value.to_bytes(2, "big"))
 
 
-def split_frames(data):
-    """The Frames in a stream of commands, of overlapping ones the first.
+def split_frames(data: bytes) -> tuple[tuple[Frame, ...], int]:
+    """The frames in a stream of commands, of overlapping ones the first.
+
+    Parameters
+    ----------
+    data
+        Of the stream.
 
     Returns
     -------
@@ -75,50 +107,113 @@ def split_frames(data):
     pending : int
         From where on bytes must be kept: a frame may begin there whose end has not come yet.
     """
-    data = bytes(data)
-    frames = []
+    frames: list[Frame] = []
     at = 0
-    while (at := data.find(SYNC, at)) >= 0 and at + FRAME <= len(data):
-        body = data[at + 1 : at + 6]
-        if data[at + 6] == sum(body) & 0xFF:
-            frames.append(Frame(*body))
+    while (at := data.find(SYNC, at)) >= 0:
+        raw = data[at : at + FRAME]
+        if len(raw) < FRAME:
+            return tuple(frames), at
+        if encode_frame(*raw[1:6]) == raw:
+            frames.append(Frame(*raw[1:6]))
             at += FRAME
         else:
             at += 1
-    return tuple(frames), at if at >= 0 else len(data)
+    return tuple(frames), len(data)
 
 
-def encode_tilt(elevation):
-    """Number of the set-tilt command for finite radians, up positive.
+def encode_tilt(elevation: float) -> int:
+    """Number of the set-tilt command.
 
-    Hundredths of a degree, 0 to 35999: 0 level, 9000 straight down, 33000 30 deg up.
+    Parameters
+    ----------
+    elevation
+        Radians, up positive, finite.
+
+    Returns
+    -------
+    int
+        Hundredths of a degree, 0 to 35999: 0 level, 9000 straight down, 33000 30 deg up.
     """
     return round(-math.degrees(elevation) * 100) % TURN
 
 
-def decode_tilt(value):
-    """Elevation of a head's tilt reply, radians in [-pi, pi): inverse of :func:`encode_tilt`."""
-    return -math.radians((value if value <= TURN // 2 else value - TURN) / 100)
+def decode_tilt(value: int) -> float:
+    """Elevation that a head tells, the inverse of :func:`encode_tilt`.
 
+    Parameters
+    ----------
+    value
+        Hundredths of a degree, 0 to 35999.
 
-def tilt_in(raw, address):
-    """Numbers of the frames with which the head of an address tells its tilt, a tuple.
-
-    Angles end at 359.99 deg.
+    Returns
+    -------
+    float
+        Radians in [-pi, pi), up positive.
     """
-    frames, _ = split_frames(raw)
-    wanted = (address, 0, TILT)
-    return tuple(
-        frame.value
-        for frame in frames
-        if (frame.address, frame.command1, frame.command2) == wanted and frame.value < TURN
-    )
+    if value > TURN // 2:
+        value -= TURN
+    return -math.radians(value / 100)
 
 
-def confirms(data, sent):
-    """Whether bytes begin with the confirmation of a command that was sent.
+# ---------------------------------------------------------------------------------------- replies
 
-    What may as well be the beginning of an echo is none; a query is not confirmed.
+
+def split_replies(data: bytes, sent: bytes) -> Received:
+    """What a head, and an adapter that echoes, sent back after one frame.
+
+    7 bytes answer a query, so do 5 bytes, the same without sync and address; 4 bytes confirm a
+    command. Every place is tried, and one that fits nothing is skipped; so are frames of other
+    senders, and the single byte 01 of some heads. What looks like a confirmation may as well be the
+    beginning of an echo, and is none then; of echoes the beginning may be lost.
+
+    Parameters
+    ----------
+    data
+        All that came back.
+    sent
+        The frame.
+    """
+    received = Received()
+    if not data.startswith(sent):
+        received.echoed = _end_of_echo(data, sent)
+        data = data[received.echoed :]
+    while data:
+        tilt, size = _tilt_reply(data, sent[1])
+        if data.startswith(sent):
+            size = FRAME
+            received.echoed += size
+        elif size:
+            received.tilts += (tilt,)
+        elif _confirms(data, sent):
+            size = GENERAL
+            received.acknowledged = True
+        else:
+            size = 1
+            received.skipped += size
+        data = data[size:]
+    return received
+
+
+def _end_of_echo(data, sent):
+    """How many bytes in front are the end of the frame that was sent; 0 where they are a reply."""
+    if _tilt_reply(data, sent[1])[1] or _confirms(data, sent):
+        return 0
+    return next((n for n in range(FRAME - 1, 0, -1) if data.startswith(sent[-n:])), 0)
+
+
+def _tilt_reply(data, address):
+    """Number of the tilt reply that bytes begin with, and its size; size 0 if it is none."""
+    for sender, missing in ((address, 0), (0, 2)):  # whole, or without sync and address
+        value = int.from_bytes(data[4 - missing : 6 - missing], "big")
+        reply = encode_extended(sender, TILT, value)[missing:]
+        if value < TURN and data.startswith(reply):
+            return value, len(reply)
+    return 0, 0
+
+
+def _confirms(data, sent):
+    """Whether bytes begin with the confirmation of a command: a byte of alarm bits, and a checksum
+    that continues that of the command. A query is not confirmed.
     """
     general = data[:GENERAL]
     if len(general) < GENERAL or sent[3] == QUERY_TILT or sent.startswith(general):
@@ -126,73 +221,44 @@ def confirms(data, sent):
     return general[0] == SYNC and general[3] == (sent[6] + general[2]) & 0xFF
 
 
-def echo_in(data, sent):
-    """How many bytes in front are the end of the frame that was sent; 0 for none."""
-    return next((n for n in range(FRAME - 1, 0, -1) if data.startswith(sent[-n:])), 0)
-
-
-def split_replies(data, sent):
-    """What a head, and an adapter that echoes, sent back after one frame, as Received.
-
-    7 bytes answer a query, so do 5 bytes, the same without sync and address; 4 bytes confirm a
-    command: a byte of alarm bits, and a checksum that continues that of the command. Every place is
-    tried, and one that fits nothing is skipped; so are frames of other senders, and the single byte
-    01 of some heads. What looks like a confirmation may as well be the beginning of an echo, and is
-    none then; of echoes the beginning may be lost.
-    """
-    tilts = []
-    acknowledged = False
-    echoed = 0
-    skipped = 0
-    first = True
-    while data:
-        size = 1
-        if data.startswith(sent):
-            size = FRAME
-            echoed += size
-        elif tilt := tilt_in(data[:FRAME], sent[1]) or tilt_in(bytes([SYNC, 0]) + data[:SHORT], 0):
-            size = FRAME if data[0] else SHORT
-            tilts += tilt
-        elif confirms(data, sent):
-            size = GENERAL
-            acknowledged = True
-        elif first and (size_of_end := echo_in(data, sent)):
-            size = size_of_end
-            echoed += size
-        else:
-            skipped += 1
-        first = False
-        data = data[size:]
-    return Received(tuple(tilts), acknowledged, echoed, skipped)
-
-
-READ_S = 0.02  # longest wait for single bytes, so that no read overshoots a deadline by more
-MOST = 512  # bytes looked at after a frame: a head sends up to 18, the rest is another device
+# ------------------------------------------------------------------------------------------- line
 
 
 class HeadLine:
     """Line to one head; a lock keeps threads apart.
 
-    Calls raise LineLost if the port vanished and did not come back. `counts` has frames sent, bytes
-    echoed and skipped, and reconnects.
+    Calls raise LineLost if the port vanished and did not come back.
+
+    Parameters
+    ----------
+    path
+        Of the port.
+    settings : rig_file.HeadSettings
+    host
+        Machine that the driver runs on.
+
+    Attributes
+    ----------
+    frames, echoed, skipped, reconnects : int
+        Frames sent, bytes that came back as an echo or belong to nothing, and how often the port
+        came back.
     """
 
-    def __init__(self, path, settings, host=REAL):
+    def __init__(self, path: str | os.PathLike, settings, host: Host = REAL):
         self.path = path
         self.settings = settings
         self.host = host
-        self.counts = dict.fromkeys(("frames", "echoed", "skipped", "reconnects"), 0)
+        self.frames = 0
+        self.echoed = 0
+        self.skipped = 0
+        self.reconnects = 0
         self.lock = host.lock()
         self._stop = encode_frame(settings.address)
-        self._port = None
         self._free = 0.0  # when the next frame may be sent
         self._sent = 0.0  # when the last one was
         self._late = False  # the reply to the last query did not come in time
         self._acknowledges = False
-        self._open()
-
-    def _open(self):
-        self._port = self.host.port(self.path, self.settings.baudrate, timeout=READ_S)
+        self._port = host.port(path, settings.baudrate, timeout=READ_S)
 
     def wire_s(self, count=FRAME):
         """Seconds that bytes take on the line."""
@@ -203,16 +269,16 @@ class HeadLine:
     def pitch(self, retries):
         """Instant of the host and pitch that the head tells, rad; None if no reply came.
 
-        After a time-out the next reply may be the late one, so it is thrown away and the head asked
-        again. The head looks at its encoder about half-way between the beginning of the query and
-        the end of the reply.
+        After a time-out the next reply may be the late one, so it is thrown away and the head is
+        asked again. The head looks at its encoder about half-way between the beginning of the query
+        and the end of the reply.
         """
-        frame = encode_extended(self.settings.address, QUERY_TILT)
+        query = encode_extended(self.settings.address, QUERY_TILT)
         for _ in range(1 + retries + self._late):
             with self.lock:
                 suspect = self._late
                 begun = self.host.now()
-                tilts = self._exchange(frame, self.settings.reply_s, again=True).tilts
+                tilts = self._exchange(query, self.settings.reply_s, again=True).tilts
                 self._late = not tilts
             if tilts and not suspect:
                 halfway = (begun + self.host.now()) / 2
@@ -225,23 +291,24 @@ class HeadLine:
         If the port vanished it is not sent again, because its time has passed.
         """
         with self.lock:
-            self._exchange(frame * self.settings.sends)
+            self._exchange(frame)
             return self._sent
 
     def stop(self):
-        """Send the stop until it is acknowledged; its instant.
+        """Send the stop until it is acknowledged; the instant of the first one.
 
         To heads that acknowledge nothing it is sent at least twice.
         """
-        instants = []
+        first = None
         for _ in range(2 + self.settings.retries * self._acknowledges):
             with self.lock:
                 acknowledged = self._exchange(self._stop, again=True).acknowledged
-                instants.append(self._sent)
+                if first is None:
+                    first = self._sent
             if acknowledged:
                 self._acknowledges = True
                 break
-        return instants[0]
+        return first
 
     def blurt_stop(self):
         """Send the stop at once, whatever another thread does on the line; errors are logged."""
@@ -260,42 +327,44 @@ class HeadLine:
     def _exchange(self, frame, wait_s=None, *, again=False):
         """Send a frame, and collect what is Received until a reply.
 
-        With `again` also where the port was lost and came back. The wait (by default that of an
-        acknowledgement) counts from the end of the transmission of frame and reply.
+        With `again` it is sent again where the port was lost and came back. The wait (by default
+        that of an acknowledgement) counts from the end of the transmission of frame and reply.
         """
+        wait_s = wait_s or self.settings.gap_s
         with self.lock:
-            self.host.sleep(max(0.0, self._free - self.host.now()))
-            data = b""
-            received = Received()
+            self.host.sleep(self._free - self.host.now())
             try:
                 with line_lost(self.path):
                     port = self.opened()
                     port.reset_input_buffer()
                     port.write(frame)
                     self._sent = self.host.now()
-                    end = (
-                        self._sent
-                        + self.wire_s(len(frame) + FRAME)
-                        + (wait_s or self.settings.gap_s)
+                    received = self._collect(
+                        port, frame, self._sent + self.wire_s(2 * FRAME) + wait_s
                     )
-                    while not (received.tilts or received.acknowledged):
-                        if self.host.now() >= end or len(data) >= MOST:
-                            break
-                        data += port.read(max(1, min(port.in_waiting, MOST)))
-                        received = split_replies(data, frame[:FRAME])
             except LineLost:
                 LOG.warning("the line %s to the head is lost", self.path)
-                there = self._port is not None  # else it did not come back
+                vanished = self._port is not None  # else it did not come back
                 self.close()
-                if not (again and there):
+                if not (again and vanished):
                     raise
                 return self._exchange(frame, wait_s)
-            out = self._sent + self.wire_s(len(frame))
-            self._free = max(self.host.now(), out) + self.settings.gap_s
-            self.counts["frames"] += 1
-            self.counts["echoed"] += received.echoed
-            self.counts["skipped"] += received.skipped
+            self._free = max(self.host.now(), self._sent + self.wire_s()) + self.settings.gap_s
+            self.frames += 1
+            self.echoed += received.echoed
+            self.skipped += received.skipped
             return received
+
+    def _collect(self, port, frame, end):
+        """What is Received until a reply, or an instant."""
+        data = b""
+        received = Received()
+        while not (received.tilts or received.acknowledged):
+            if self.host.now() >= end or len(data) >= MOST:
+                break
+            data += port.read(max(1, min(port.in_waiting, MOST)))
+            received = split_replies(data, frame)
+        return received
 
     # --------------------------------------------------------------------------------------- port
 
@@ -308,13 +377,13 @@ class HeadLine:
             deadline = self.host.now() + self.settings.reconnect_s
             while self._port is None:
                 try:
-                    self._open()
+                    self._port = self.host.port(self.path, self.settings.baudrate, timeout=READ_S)
                 except PortError as error:
                     if self.host.now() >= deadline:
                         raise LineLost(f"the head's line is lost: {error}") from error
-                    self.host.sleep(0.05)
+                    self.host.sleep(AGAIN_S)
                     continue
-                self.counts["reconnects"] += 1
+                self.reconnects += 1
                 LOG.warning("the line %s to the head is back", self.path)
                 self._port.write(self._stop * 2)
                 self.host.sleep(self.wire_s(2 * FRAME) + self.settings.gap_s)

@@ -1,6 +1,4 @@
-"""Ports that open with errors that say what to do, what can go wrong, and heads that stop on every
-exit.
-"""
+"""Serial ports whose errors say what to do, and heads that stop on every exit."""
 
 import atexit
 import errno
@@ -10,11 +8,15 @@ import termios
 import threading
 import time
 import weakref
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import serial
 from serial.tools.list_ports import comports
+
+WRITE_S = 1.0  # longest time that a write may block
+MOMENT_S = 1e-3  # shorter waits are spent awake
 
 
 class DeviceError(RuntimeError):
@@ -22,9 +24,7 @@ class DeviceError(RuntimeError):
 
 
 class PortError(DeviceError):
-    """The port cannot be opened or set: missing, no permission, busy, no serial line, rate not
-    possible.
-    """
+    """The port cannot be opened or set: missing, forbidden, busy, no serial line, wrong rate."""
 
 
 class NoReply(DeviceError):
@@ -32,7 +32,7 @@ class NoReply(DeviceError):
 
 
 class WrongDevice(DeviceError):
-    """Something answers, but not the device that was expected."""
+    """Something answers, but it is not the device that was expected."""
 
 
 class Refused(DeviceError):
@@ -54,13 +54,177 @@ class Closed(AbstractContextManager):
         self.close()
 
 
-_moving_things = weakref.WeakSet()
-_before = {}
+# ------------------------------------------------------------------------------------------ ports
 
 
-def guard(device):
-    """Call ``device.emergency_stop()`` at exit, and in the main thread on SIGTERM and SIGHUP, until
-    `release`.
+def open_port(path: str | os.PathLike, baudrate: int, *, timeout: float) -> serial.Serial:
+    """Open a serial port for this process alone: 8 data bits, no parity, 1 stop bit.
+
+    Parameters
+    ----------
+    path
+        Of the port.
+    baudrate
+        Bits a second.
+    timeout
+        Longest time that a read waits, seconds.
+
+    Returns
+    -------
+    serial.Serial
+
+    Raises
+    ------
+    PortError
+        If the port is missing, forbidden, busy, no serial line, or cannot do this rate.
+    """
+    path = os.fspath(path)
+    try:
+        port = serial.Serial(path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True)
+    except (OSError, ValueError, termios.error) as error:
+        number = getattr(error, "errno", None)
+        reason = f"{path} is no serial line ({error}): name the port of the device"
+        if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+            present = ", ".join(sorted(port.device for port in comports())) or "none"
+            reason = f"there is no port {path}: check cable and power; present are {present}"
+        elif number in (errno.EACCES, errno.EPERM):
+            remedy = "run 'sudo usermod -aG dialout $USER', then log in again"
+            reason = f"no permission for {path}: {remedy}"
+        elif number in (errno.EBUSY, errno.EAGAIN):
+            reason = f"the port {path} is busy, held by {_holders(path)}: close that program"
+        raise PortError(reason) from error
+    try:
+        set_rate(port, baudrate)
+    except BaseException:
+        port.close()
+        raise
+    return port
+
+
+def _holders(path):
+    """The processes that have a port open, as far as this user may see."""
+    holders = set()
+    real = os.path.realpath(path)
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        try:
+            if os.readlink(link) == real:
+                name = (link.parents[1] / "comm").read_text().strip()
+                holders.add(f"{name} (process {link.parts[2]})")
+        except OSError:  # that process ended, or belongs to somebody else
+            continue
+    return ", ".join(sorted(holders)) or "another program"
+
+
+def set_rate(port: serial.Serial, baudrate: int) -> None:
+    """Change the rate of an open port, and read it back.
+
+    Parameters
+    ----------
+    port
+        Open.
+    baudrate
+        Bits a second.
+
+    Raises
+    ------
+    PortError
+        If the port cannot do this rate; the old one holds.
+    LineLost
+        If the port vanished.
+    """
+    before = port.baudrate
+    try:
+        with line_lost(port.port):
+            port.baudrate = baudrate
+            rates = set(termios.tcgetattr(port.fd)[4:6])  # of input and output
+        if rates == {getattr(termios, f"B{baudrate}", None)}:
+            return
+        reason = (
+            f"does not take {baudrate} Bd: its driver set another rate; 500000 Bd needs an RS-422 "
+            "interface whose clock divides to it, else use 38400"
+        )
+    except ValueError as error:
+        reason = f"cannot do {baudrate} Bd: {error}"
+    port.baudrate = before
+    raise PortError(f"{port.port} {reason}")
+
+
+@contextmanager
+def line_lost(path: str | os.PathLike) -> Iterator[None]:
+    """Turn what pyserial raises when a port vanishes into LineLost.
+
+    Parameters
+    ----------
+    path
+        Of the port, for the message.
+    """
+    try:
+        yield
+    except (OSError, termios.error) as error:
+        raise LineLost(f"the line {path} is lost ({error}): check plug and power") from error
+
+
+class Host:
+    """What drivers have of this machine, named as in `time` and `threading`; tests have another."""
+
+    now = staticmethod(time.monotonic)
+    event = threading.Event
+    lock = staticmethod(threading.RLock)
+    port = staticmethod(open_port)
+    set_rate = staticmethod(set_rate)
+    _zero = time.time() - time.monotonic()
+
+    def time(self) -> float:
+        """A date, s, that nobody sets while this program runs.
+
+        A step would tear scans and pitch apart.
+        """
+        return self._zero + time.monotonic()
+
+    @staticmethod
+    def sleep(seconds: float) -> None:
+        """Wait; a busy machine gives the processor back late to those who sleep for a moment.
+
+        Parameters
+        ----------
+        seconds
+            How long; none or less does not wait.
+        """
+        end = time.monotonic() + seconds
+        if seconds > MOMENT_S:
+            time.sleep(seconds)
+        while time.monotonic() < end:
+            pass
+
+    @staticmethod
+    def thread(target: Callable[[], None], name: str) -> threading.Thread:
+        """A daemon thread that is not started yet.
+
+        Parameters
+        ----------
+        target
+            What it does.
+        name
+            Of the thread.
+        """
+        return threading.Thread(target=target, name=name, daemon=True)
+
+
+REAL = Host()
+
+# ----------------------------------------------------------------------------- stop on every exit
+
+_moving_things: weakref.WeakSet = weakref.WeakSet()
+_before: dict = {}  # handlers of signals that were there before ours
+
+
+def guard(device) -> None:
+    """Let a device be stopped at exit, and in the main thread on SIGTERM and SIGHUP.
+
+    Parameters
+    ----------
+    device
+        Its ``emergency_stop()`` is called until `release`.
     """
     _moving_things.add(device)
     if threading.current_thread() is threading.main_thread():
@@ -70,8 +234,14 @@ def guard(device):
                 _before[number] = signal.signal(number, _on_signal)
 
 
-def release(device):
-    """Forget a device that was closed."""
+def release(device) -> None:
+    """Forget a device that was closed.
+
+    Parameters
+    ----------
+    device
+        As given to `guard`.
+    """
     _moving_things.discard(device)
     if not _moving_things and threading.current_thread() is threading.main_thread():
         while _before:
@@ -86,9 +256,7 @@ def _stop_all():
 
 
 def _on_signal(number, frame):
-    """Stop, then do what would have been done; what would kill becomes an exit that
-    closes files.
-    """
+    """Stop, then do what the signal did before; what would kill becomes an exit."""
     _stop_all()
     before = _before.get(number)
     if callable(before):
@@ -99,123 +267,3 @@ def _on_signal(number, frame):
 
 atexit.register(_stop_all)
 os.register_at_fork(after_in_child=_moving_things.clear)
-WRITE_S = 1.0  # longest time a write may block
-
-
-def open_port(path, baudrate, *, timeout):
-    """Open a serial port for this process alone: 8 data bits, no parity, 1 stop bit; reads wait
-    `timeout` seconds.
-
-    Raises
-    ------
-    PortError
-        If the port is missing, forbidden, busy, no serial line, or cannot do this rate.
-    """
-    path = os.fspath(path)
-    try:
-        port = serial.Serial(path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True)
-    except (OSError, ValueError, termios.error) as error:
-        number = getattr(error, "errno", None)
-        if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-            present = ", ".join(sorted(one.device for one in comports())) or "none"
-            reason = f"there is no port {path}: check cable and power; present are {present}"
-        elif number in (errno.EACCES, errno.EPERM):
-            reason = (
-                f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then log in again"
-            )
-        elif number in (errno.EBUSY, errno.EAGAIN):
-            reason = f"the port {path} is busy, held by {_holder(path)}: close that program"
-        else:
-            reason = f"{path} is no serial line ({error}): name the port of the device"
-        raise PortError(reason) from error
-    try:
-        set_rate(port, baudrate)
-    except BaseException:
-        port.close()
-        raise
-    return port
-
-
-def _holder(path):
-    """The processes that have a port open, as far as this user may see."""
-    found = set()
-    real = os.path.realpath(path)
-    for link in Path("/proc").glob("[0-9]*/fd/*"):
-        try:
-            if os.readlink(link) == real:
-                found.add(
-                    f"{(link.parents[1] / 'comm').read_text().strip()} (process {link.parts[2]})"
-                )
-        except OSError:  # that process ended, or belongs to somebody else
-            continue
-    return ", ".join(sorted(found)) or "another program"
-
-
-def set_rate(port, baudrate):
-    """Change the rate of an open port and read it back; PortError if it cannot (the old one holds),
-    or LineLost.
-    """
-    old = port.baudrate
-    try:
-        with line_lost(port.port):
-            port.baudrate = baudrate
-            if set(termios.tcgetattr(port.fd)[4:6]) == {getattr(termios, f"B{baudrate}", None)}:
-                return
-        reason = (
-            f"does not take {baudrate} Bd: its driver set another rate; 500000 Bd needs an RS-422 "
-            "interface whose clock divides to it, else use 38400"
-        )
-    except ValueError as error:
-        reason = f"cannot do {baudrate} Bd: {error}"
-    port.baudrate = old
-    raise PortError(f"{port.port} {reason}")
-
-
-@contextmanager
-def line_lost(path):
-    """Turn what pyserial raises when a port vanishes into LineLost."""
-    try:
-        yield
-    except (OSError, termios.error) as error:
-        raise LineLost(f"the line {path} is lost ({error}): check plug and power") from error
-
-
-MOMENT_S = 1e-3
-
-
-class Host:
-    """What drivers have of this machine, named as in `time` and `threading`; tests have another
-    one.
-    """
-
-    now = staticmethod(time.monotonic)
-    _zero = time.time() - time.monotonic()
-    event = threading.Event
-    lock = staticmethod(threading.RLock)
-    port = staticmethod(open_port)
-    set_rate = staticmethod(set_rate)
-
-    def time(self):
-        """A date, s, that nobody sets while this program runs: a step would tear scans and pitch
-        apart.
-        """
-        return self._zero + time.monotonic()
-
-    @staticmethod
-    def sleep(seconds):
-        """Wait; moments are spent awake, since a busy machine gives the processor back late to
-        those who sleep.
-        """
-        end = time.monotonic() + seconds
-        if seconds > MOMENT_S:
-            time.sleep(seconds)
-        while time.monotonic() < end:
-            pass
-
-    @staticmethod
-    def thread(target, name):
-        """A daemon thread that is not started yet."""
-        return threading.Thread(target=target, name=name, daemon=True)
-
-
-REAL = Host()

@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import math
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
@@ -12,88 +13,104 @@ import urllib3
 
 from lrfcal_lib.drivers.head import PanTilt
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply
-from lrfcal_lib.drivers.rig_file import RigFileError
-from lrfcal_lib.drivers.video import Camera
+from lrfcal_lib.drivers.lms2xx_scans import Reading
+from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, Host, LineLost, NoReply
+from lrfcal_lib.drivers.rig_file import Placement, RigFile, RigFileError
+from lrfcal_lib.drivers.video import Camera, Frame
 from lrfcal_lib.session.lms2xx_codec import METRES, MODES, encode_configuration
-
-
-@dataclass(frozen=True)
-class Moved:
-    """The head rests at a stop, number so many of so many; what is recorded at it is later than its
-    host time.
-
-    Pitch in radians, as commanded and as it is: measured, or dead reckoning where the head does not
-    tell it.
-    """
-
-    placement: int
-    time_s: float
-    commanded: float
-    pitch: float
-    measured: bool
-    number: int
-    of: int
-
-
-@dataclass(frozen=True, eq=False)
-class Scanned:
-    """Readings, each with its pitch in radians; `share` is what is done of a continuous sweep, NaN
-    at a stop.
-    """
-
-    placement: int
-    readings: tuple
-    pitch: np.ndarray
-    share: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class Photographed:
-    """An image of a placement, -1 for the board held close; purpose 'board', 'scene' or
-    'intrinsics'.
-    """
-
-    placement: int
-    camera: str
-    frame: object
-    pitch: float
-    purpose: str
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """The pitch over a continuous sweep to a commanded one, a tuple of host time, radians, whether
-    it was measured.
-    """
-
-    placement: int
-    commanded: float
-    track: tuple
-
+from lrfcal_lib.session.stated import LrfInfo
 
 LOG = logging.getLogger(__name__)
 SCAN_S = 5.0  # wait for one fresh scan: at 9600 Bd one takes 0.9 s, an interlaced one 1.6 s
 IMAGE_S = 30.0  # wait for one fresh image, a camera that comes back included
 BATCH_S = 0.25  # of a continuous sweep; its scans are handed out this often
+GAP_S = 4.0  # without a scan, after which a continuous sweep is given up
+CONTROL_S = 10.0  # wait for the answer of a control
 OBEYED = 204  # answer of a control; a redirection or a page moved nothing
 LONGEST_REASON = 200  # characters of another answer that are told
-GAP_S = 4.0  # without a scan, after which a continuous sweep is given up
 SAME_STOP = 1e-3  # radians; an image and a scan this near share a stop
 # of which can be told whether the view changed, even of a bare wall
 FEWEST_SCANS = 8
 LEAST_SWEEP = math.radians(10)
 STILL = 1.9  # mean ratio of von Neumann; 2 of scans that differ by noise alone
+CLOSE = -1  # placement of images of the board held close
+
+
+@dataclass(frozen=True)
+class Moved:
+    """The head rests at a stop; what is recorded at it is later than its host time."""
+
+    placement: int
+    time_s: float
+    commanded: float  # pitch, radians
+    pitch: float  # as it is, radians
+    measured: bool  # the head told it; else it is dead reckoning
+    number: int  # of the stop
+    of: int  # so many
+
+
+@dataclass(frozen=True, eq=False)
+class Scanned:
+    """Readings, each with its pitch."""
+
+    placement: int
+    readings: tuple[Reading, ...]
+    pitch: np.ndarray  # radians
+    share: float = math.nan  # what is done of a continuous sweep; NaN at a stop
+
+
+@dataclass(frozen=True, eq=False)
+class Photographed:
+    """An image of a placement, -1 for the board held close."""
+
+    placement: int
+    camera: str
+    frame: Frame
+    pitch: float  # radians
+    purpose: str  # 'board', 'scene' or 'intrinsics'
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """The pitch over a continuous sweep."""
+
+    placement: int
+    commanded: float  # where it ends, radians
+    track: tuple  # of host time (s), pitch (radians) and whether it was measured
+
+
+Event = Moved | Scanned | Photographed | Tracked
 
 
 class Rig(Closed):
-    """The devices of a RigFile, all with the same host clock, s; a context manager that stops the
-    head and closes them.
+    """The devices of a rig file, all with the same host clock; :meth:`open` opens them.
 
-    :meth:`open` opens them.
+    A context manager that stops the head and closes them.
+
+    Parameters
+    ----------
+    stated
+        The rig file.
+    lrf, head, cameras
+        Open devices; the cameras by their names.
+    host
+        Machine that the drivers run on.
+
+    Attributes
+    ----------
+    clock : callable
+        The date of the host, s.
     """
 
-    def __init__(self, stated, lrf, head, cameras, *, host=REAL):
+    def __init__(
+        self,
+        stated: RigFile,
+        lrf: LMS2xx,
+        head: PanTilt,
+        cameras: dict[str, Camera],
+        *,
+        host: Host = REAL,
+    ):
         self.stated = stated
         self.lrf = lrf
         self.head = head
@@ -103,25 +120,41 @@ class Rig(Closed):
         self._now = host.now
 
     @classmethod
-    def open(cls, stated, *, host=REAL, camera=None):
-        """Open all devices and set the laser range finder as the rig file asks; what is set already
-        is left alone.
+    def open(
+        cls, stated: RigFile, *, host: Host = REAL, camera: Callable[[str], Camera] | None = None
+    ) -> "Rig":
+        """Open all devices and set the laser range finder as the rig file asks.
 
-        The host is the machine that the drivers run on; ``camera(name)`` opens cameras whose images
-        come from elsewhere than the source stated. DeviceError, with the device in the message:
-        those opened before are closed again.
+        What is set already is left alone.
+
+        Parameters
+        ----------
+        stated
+            The rig file.
+        host
+            Machine that the drivers run on.
+        camera
+            ``camera(name)`` opens cameras whose images come from elsewhere than stated.
+
+        Raises
+        ------
+        DeviceError
+            With the device in the message; those opened before are closed again.
+        RigFileError
+            If a device cannot be what is stated.
         """
         devices = stated.devices
         skipped = {"port", "interlaced"}
         if devices.lrf.interlaced:  # it chooses its own
             skipped.add("variant")
-        asked = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
-        openers = {
+        settings = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
+        open_camera: Callable = camera or partial(_camera, stated)
+        openers: dict[str, Callable] = {
             "head": partial(PanTilt, devices.head.port, devices.head, host=host),
-            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **asked),
+            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **settings),
         }
-        camera = camera or partial(_camera, stated)
-        openers |= {f"camera '{name}'": partial(camera, name) for name in stated.cameras}
+        for name in stated.cameras:
+            openers[f"camera '{name}'"] = partial(open_camera, name)
         with contextlib.ExitStack() as stack:
             opened = []
             for name, opener in openers.items():
@@ -133,35 +166,38 @@ class Rig(Closed):
                 except ValueError as error:
                     raise RigFileError(f"{stated.path}: {name}: {error}") from error
                 stack.callback(opened[-1].close)
-            head, lrf, *cameras = opened
-            cameras = dict(zip(stated.cameras, cameras, strict=True))
+            head, lrf, *rest = opened
+            cameras = dict(zip(stated.cameras, rest, strict=True))
             rig = cls(stated, lrf, head, cameras, host=host)
             rig._closing = stack.pop_all()
         return rig
 
-    def close(self):
+    def close(self) -> None:
         """Stop the head and close all devices; a second call does nothing."""
         self._closing.close()
 
     @property
-    def lrf_info(self):
-        """The stated LrfInfo with the field of view, step, unit and largest range that the device
-        has now.
+    def lrf_info(self) -> LrfInfo:
+        """What is stated of the laser range finder, with the field of view, step, unit and largest
+        range that the device has now.
         """
         stated = self.stated.lrf
-        lrf = self.lrf
-        view, step = (180, 0.25) if self.stated.devices.lrf.interlaced else lrf.variant
-        unit = METRES[lrf.configuration.unit]
-        largest = MODES[lrf.configuration.measuring_mode].largest
-        seen = {
-            "field_of_view": tuple(np.radians([90 - view / 2, 90 + view / 2]).tolist()),
-            "bearing_step": math.radians(step),
-            "range_resolution": unit,
-            "max_range": largest * unit,
-        }
-        return replace(stated, model=stated.model or lrf.type, **seen)
+        configuration = self.lrf.configuration
+        view, step = self.lrf.variant
+        if self.stated.devices.lrf.interlaced:
+            view = 180.0
+            step = 0.25
+        unit = METRES[configuration.unit]
+        return replace(
+            stated,
+            model=stated.model or self.lrf.type,
+            field_of_view=(math.radians(90 - view / 2), math.radians(90 + view / 2)),
+            bearing_step=math.radians(step),
+            range_resolution=unit,
+            max_range=MODES[configuration.measuring_mode].largest * unit,
+        )
 
-    def begin_telegrams(self):
+    def begin_telegrams(self) -> list[bytes]:
         """Telegrams with which a recording begins: the configuration, which states the measuring
         mode.
         """
@@ -170,31 +206,64 @@ class Rig(Closed):
     # --------------------------------------------------------------------------------------------
     # the board
 
-    def move_board(self, placement):
-        """Put the board of an emulated rig at a placement; False where nobody but the user can: a
-        real rig.
+    def move_board(self, placement: int | str) -> bool:
+        """Put the board of an emulated rig at a placement.
+
+        Parameters
+        ----------
+        placement
+            Its number.
+
+        Returns
+        -------
+        bool
+            False where nobody but the user can: a real rig.
+
+        Raises
+        ------
+        DeviceError
+            If the emulated rig does not obey.
         """
         return self._control(f"place/{placement}")
 
-    def hold_close(self, camera, view):
-        """Hold the board of an emulated rig close to a camera; as :meth:`move_board`."""
+    def hold_close(self, camera: str, view: int) -> bool:
+        """Hold the board of an emulated rig close to a camera.
+
+        Parameters
+        ----------
+        camera
+            Its name.
+        view
+            Number of the view, from 0.
+
+        Returns
+        -------
+        bool
+            As :meth:`move_board`.
+
+        Raises
+        ------
+        DeviceError
+            If the emulated rig does not obey.
+        """
         return self._control(f"close/{camera}/{view}")
 
     def _control(self, command):
-        if (control := self.stated.devices.control) is None:
+        control = self.stated.devices.control
+        if control is None:
             return False
+        url = f"{control}/{command}"
         try:
             # what it sends is not read: an answer without end fills no memory
             answer = urllib3.request(
-                "POST", f"{control}/{command}", timeout=10, retries=False, preload_content=False
+                "POST", url, timeout=CONTROL_S, retries=False, preload_content=False
             )
             answer.close()
-        except urllib3.exceptions.HTTPError as error:
-            wrong = error
-        else:
             if answer.status == OBEYED:
                 return True
             wrong = f"it answers {answer.status} {str(answer.reason)[:LONGEST_REASON]!r}"
+        except urllib3.exceptions.HTTPError as error:
+            wrong = str(error)
         raise DeviceError(
             f"control {control}: {wrong}; is 'python -m lrfcal_lib emulate' still running? "
             "Remove devices.control from the rig file to move a real board by hand"
@@ -203,58 +272,75 @@ class Rig(Closed):
     # ----------------------------------------------------------------------------------------------
     # recording
 
-    def acquire(self, placement):
-        """Record a Placement of the plan: a generator of Moved, Scanned, Photographed and Tracked,
-        as they happen.
+    def acquire(self, placement: Placement) -> Generator[Event, None, None]:
+        """Record a placement of the plan; its events, as they happen.
 
         Scans and images of a stop are later than the instant at which the head came to rest there.
         In a continuous sweep every scan has the pitch at the instant of its middle beam,
         interpolated between the head's readings (dead reckoning without them), and is handed out as
         soon as that is known. Whatever happens, also when the generator is closed, the head is
-        stopped, and the scans are. DeviceError, too, after a sweep with a head that tells nothing
-        if the scans are all alike: it did not move.
+        stopped, and the scans are.
+
+        Parameters
+        ----------
+        placement
+            Of the plan.
+
+        Raises
+        ------
+        DeviceError
+            Also after a sweep with a head that tells nothing if the scans are all alike: it did not
+            move.
         """
-        sweep = self._continuous if self.stated.plan.mode == "continuous" else self._stop_and_go
-        seen = []
+        sweep = self._stop_and_go
+        if self.stated.plan.mode == "continuous":
+            sweep = self._continuous
+        scans = []  # of a head that tells nothing
         try:
             for event in sweep(placement):
                 if isinstance(event, Scanned) and not self.head.has_feedback:
-                    seen += [one.ranges for one in event.readings]
+                    scans += [reading.ranges for reading in event.readings]
                 yield event
-            if (
-                len(seen) >= FEWEST_SCANS
-                and np.ptp(placement.pitch) >= LEAST_SWEEP
-                and unchanged(seen)
-            ):
+            wide = np.ptp(placement.pitch) >= LEAST_SWEEP
+            if wide and len(scans) >= FEWEST_SCANS and unchanged(scans):
                 head = self.stated.devices.head
                 raise NoReply(
-                    f"the head did not move: all {len(seen)} scans of the sweep show the same; "
-                    "check its power, the "
-                    f"wires A and B, address {head.address} and {head.baudrate} Bd at {head.port}"
+                    f"the head did not move: all {len(scans)} scans of the sweep show the same; "
+                    "check its power, the wires A and B, "
+                    f"address {head.address} and {head.baudrate} Bd at {head.port}"
                 )
         except BaseException:
             self.halt()
             raise
 
-    def acquire_close(self, camera):
-        """Take one image of the board held close to a camera, the head at pitch 0; events as
-        :meth:`acquire`.
+    def acquire_close(self, camera: str) -> Generator[Photographed, None, None]:
+        """Take one image of the board held close to a camera, the head at pitch 0.
+
+        Parameters
+        ----------
+        camera
+            Its name.
+
+        Raises
+        ------
+        DeviceError
+            As :meth:`acquire`.
         """
         try:
-            yield from self._photograph([camera], -1, self._move(-1, 0.0, 1, 1), "intrinsics")
+            rest = self._move(CLOSE, 0.0, 1, 1)
+            yield from self._photograph([camera], rest, "intrinsics")
         except BaseException:
             self.halt()
             raise
 
-    def halt(self):
+    def halt(self) -> None:
         """Stop the head and the scans; what cannot be stopped is logged, with what to do."""
         for name, device in (("head", self.head), ("laser range finder", self.lrf)):
             try:
                 device.stop()
             except DeviceError as error:
-                LOG.error(
-                    "the %s could not be stopped (%s): cut its power if it moves", name, error
-                )
+                remedy = "cut its power if it moves"
+                LOG.error("the %s could not be stopped (%s): %s", name, error, remedy)
 
     def _stop_and_go(self, placement):
         interlaced = self.stated.devices.lrf.interlaced
@@ -268,27 +354,24 @@ class Rig(Closed):
             moved = self._move(placement.number, pitch, number, len(stops))
             yield moved
             if pitch not in alone:
-                readings = self._scans(moved.time_s, interlaced)
-                yield Scanned(
-                    placement.number, tuple(readings), np.full(len(readings), moved.pitch)
-                )
+                readings = tuple(self._scans(moved.time_s, interlaced))
+                yield Scanned(placement.number, readings, np.full(len(readings), moved.pitch))
             if any(abs(pitch - image) < SAME_STOP for image in images):
-                yield from self._photograph(
-                    self.cameras, placement.number, moved, placement.purpose
-                )
+                yield from self._photograph(self.cameras, moved, placement.purpose)
         self.lrf.stop()
 
     def _scans(self, after, interlaced):
-        """Scans of a stream, or one by one, later than an instant; a line that was lost has one
-        chance to come back.
+        """Scans of a stream, or one by one, later than an instant.
+
+        A line that was lost has one chance to come back.
         """
         count = self.stated.plan.scans_per_stop
         if interlaced:
             return self.lrf.take(count, after=after, timeout=SCAN_S * count)
-        found = []
+        readings = []
         mended = False
         end = self._now() + SCAN_S
-        while len(found) < count:
+        while len(readings) < count:
             try:
                 reading = self.lrf.request()
             except (LineLost, NoReply) as error:
@@ -299,36 +382,34 @@ class Rig(Closed):
                 mended = True
                 continue
             if reading.time_s > after:
-                found = [*found, reading]
+                readings.append(reading)
                 after = reading.time_s
                 end = self._now() + SCAN_S
             elif self._now() > end:
-                raise NoReply(
-                    f"the laser range finder gives no scan later than the stop in {SCAN_S:g} s"
-                )
-        return found
+                late = f"no scan later than the stop in {SCAN_S:g} s"
+                raise NoReply(f"the laser range finder gives {late}")
+        return readings
 
     def _move(self, placement, pitch, number, of):
         reached = self.head.move_to(pitch)
         return Moved(placement, self.clock(), pitch, reached, self.head.has_feedback, number, of)
 
-    def _photograph(self, cameras, placement, moved, purpose):
+    def _photograph(self, cameras, moved, purpose):
         for name in cameras:
             frame = self.cameras[name].newest(after=moved.time_s, timeout=IMAGE_S)
-            yield Photographed(placement, name, frame, moved.pitch, purpose)
+            yield Photographed(moved.placement, name, frame, moved.pitch, purpose)
 
     def _continuous(self, placement):
         first, last = placement.pitch[[0, -1]].tolist()
         images = sorted(placement.image_pitch, reverse=placement.direction < 0)
-        for number, pitch in enumerate([*images, first], 1):
-            moved = self._move(placement.number, float(pitch), number, len(images) + 1)
+        stops = [*images, first]
+        for number, pitch in enumerate(stops, 1):
+            moved = self._move(placement.number, float(pitch), number, len(stops))
             yield moved
-            if number <= len(images):
-                yield from self._photograph(
-                    self.cameras, placement.number, moved, placement.purpose
-                )
+            if number < len(stops):
+                yield from self._photograph(self.cameras, moved, placement.purpose)
         self.lrf.start()
-        held = self.lrf.take(1, timeout=SCAN_S)
+        held = self.lrf.take(1, timeout=SCAN_S)  # readings whose pitch is not known yet
         heard = self._now()
         newest = held[-1].time_s
         self.head.start_sweep(last, self.stated.plan.sweep_speed)
@@ -338,74 +419,101 @@ class Rig(Closed):
                 heard = self._now()
                 newest = fresh[-1].time_s
             elif self._now() - heard > GAP_S:
-                raise NoReply(
-                    f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range "
-                    "finder"
-                )
-            sure = [point for point in self.head.track if point[2] or not self.head.has_feedback]
+                remedy = "check the line of the laser range finder"
+                raise NoReply(f"no scan for {GAP_S:g} s of the sweep: {remedy}")
             # what is not measured may change until the next reading
-            known, held = _placed(held + fresh, sure)
-            if known:
-                share = float(np.clip((known[1][-1] - first) / (last - first), 0, 1))
-                yield Scanned(placement.number, *known, share)
+            sure = [point for point in self.head.track if point[2] or not self.head.has_feedback]
+            readings, pitch, held = placed(held + fresh, sure)
+            if readings:
+                share = np.clip((pitch[-1] - first) / (last - first), 0, 1)
+                yield Scanned(placement.number, readings, pitch, float(share))
         track = self.head.finish_sweep()
-        known, _ = _placed(held + self._since(newest), track)
+        readings, pitch, _ = placed(held + self._since(newest), track)
         self.lrf.stop()
-        if known:
-            yield Scanned(placement.number, *known, 1.0)
+        if readings:
+            yield Scanned(placement.number, readings, pitch, 1.0)
         yield Tracked(placement.number, last, tuple(track))
 
     def _since(self, instant):
         """All scans after an instant that come within the time of a batch."""
         end = self._now() + BATCH_S
-        found = []
+        readings = []
         with contextlib.suppress(NoReply):
             while self._now() < end:
-                found += self.lrf.take(1, after=instant, timeout=BATCH_S)
-                instant = found[-1].time_s
-        return found
+                readings += self.lrf.take(1, after=instant, timeout=BATCH_S)
+                instant = readings[-1].time_s
+        return readings
 
 
-def _placed(readings, track):
-    """Scans within a track with their pitch (None without any), and those that are later."""
+def placed(
+    readings: Sequence[Reading], track: Sequence[tuple[float, float, bool]]
+) -> tuple[tuple[Reading, ...], np.ndarray, list[Reading]]:
+    """Give scans of a sweep their pitch.
+
+    Parameters
+    ----------
+    readings
+        Of the sweep, in order.
+    track
+        Host time (s), pitch (rad) and whether it was measured.
+
+    Returns
+    -------
+    known : tuple of Reading
+        Those within the track, by the instants of their middle beams.
+    pitch : ndarray, shape (n,)
+        Of each, radians.
+    later : list of Reading
+        Those after the track.
+    """
     if len(track) < 2:
-        return None, readings
-    times, pitch = np.array([point[:2] for point in track], float).T
-    middle = np.array([np.mean(one.beam_times_s[[0, -1]]) for one in readings])
+        return (), np.empty(0), list(readings)
+    times, pitch = np.array([point[:2] for point in track]).T
+    middle = np.array([np.mean(reading.beam_times_s[[0, -1]]) for reading in readings])
     inside = (middle >= times[0]) & (middle <= times[-1])
     later = list(compress(readings, middle > times[-1]))
-    known = tuple(compress(readings, inside)), np.interp(middle[inside], times, pitch)
-    return known if inside.any() else None, later
+    return tuple(compress(readings, inside)), np.interp(middle[inside], times, pitch), later
 
 
-def unchanged(scans):
+def unchanged(scans: Iterable[np.ndarray]) -> bool:
     """Whether scans differ by noise alone, as those of a head at rest do.
 
     By the ratio of von Neumann: squared steps from scan to scan over the squared spread, 2 for
     noise, less where something changes slowly or once. The mean over the beams counts, since beams
     along the tilt axis see the same wall at any pitch: a head that moves is never accused, one that
-    does not is believed where much else moves. Beams without a range in one of the scans, (B,)
-    each, do not count; False where all lack one.
+    does not is believed where much else moves.
+
+    Parameters
+    ----------
+    scans
+        Ranges (B,) each, metres. Beams without a range in one of the scans do not count.
+
+    Returns
+    -------
+    bool
+        False where all lack one.
     """
     ranges = np.array(scans)
     ranges = ranges[:, np.isfinite(ranges).all(axis=0)]
     steps = (np.diff(ranges, axis=0) ** 2).sum(axis=0)
     spread = ((ranges - ranges.mean(axis=0)) ** 2).sum(axis=0)
-    ratio = np.divide(steps, spread, out=np.full(len(steps), 2.0), where=steps > 0)
+    noise = np.full(len(steps), 2.0)
+    ratio = np.divide(steps, spread, out=noise, where=steps > 0)
     return ratio.size > 0 and bool(ratio.mean() > STILL)
 
 
 def _camera(stated, name):
     """A camera that gives images of the size stated."""
-    asked = stated.devices.cameras[name]
+    device = stated.devices.cameras[name]
     info = stated.cameras[name]
     size = (info.width, info.height)
-    options = asked.model_dump(exclude_none=True, exclude={"source", "size"})
-    camera = Camera(asked.source, name=name, size=size, **options)
-    if (got := camera.size) not in (None, size):
+    options = device.model_dump(exclude_none=True, exclude={"source", "size"})
+    camera = Camera(device.source, name=name, size=size, **options)
+    if camera.size not in (None, size):
         camera.close()
+        given = "{} x {} pixels".format(*camera.size)
+        expected = "{} x {}".format(*size)
         raise ValueError(
-            f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{name} states {size[0]} x "
-            f"{size[1]}: state a size that it can do"
+            f"it gives {given}, rig.cameras.{name} states {expected}: state a size that it can do"
         )
     return camera

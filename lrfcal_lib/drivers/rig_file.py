@@ -1,9 +1,8 @@
-"""The rig file: what is stated about a rig, where its devices are, and what is to be recorded
-(JSON).
-"""
+"""The rig file (JSON): what is stated about a rig, where its devices are, what to record."""
 
 import json
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,6 +28,12 @@ MOST_STOPS = 5000
 FINEST_DEG = 1e-3
 MOST_BYTES = 10_000_000
 MOST_PLACEMENTS = 1000
+ROUNDING_DEG = 1e-6  # by which a pitch may exceed the limits of the head
+OTHER_RATE = (
+    "one of 9600, 19200, 38400, 500000 is needed, the rates of a SICK LMS2xx: no other range "
+    "finder is driven here; record it by a program of your own that writes a session "
+    "(lrfcal_lib.session.write.SessionWriter)"
+)
 STOPS = f"first, last, and a step of {FINEST_DEG:g} or more for 2 to {MOST_STOPS} stops are needed"
 
 
@@ -38,27 +43,17 @@ class RigFileError(ValueError):
     """
 
 
-class Stated(BaseModel, frozen=True):
-    """An object of a rig file: null is as good as left out, and keys that it does not have are
-    refused.
-    """
-
-    @model_validator(mode="before")
-    @classmethod
-    def known(cls, data):
-        """The values that are stated."""
-        for key in data if isinstance(data, dict) else ():
-            if key not in cls.model_fields:
-                raise ValueError(f"{key} is not known; known are {', '.join(cls.model_fields)}")
-        return {k: v for k, v in data.items() if v is not None} if isinstance(data, dict) else data
+# ------------------------------------------------------------------------------ kinds of values
 
 
 def number(least, most, unit="", kinds=(int, float), what="a number"):
     """A number within limits; NaN is in none, and true is no number."""
     words = f"{what} from {least} to {most} {unit}".rstrip() + " is needed"
-    return Annotated[
-        Any, refused(lambda value: type(value) not in kinds or not least <= value <= most, words)
-    ]
+
+    def wrong(value):
+        return type(value) not in kinds or not least <= value <= most
+
+    return Annotated[Any, refused(wrong, words)]
 
 
 def whole(least, most):
@@ -68,43 +63,94 @@ def whole(least, most):
 
 def several(kind, count):
     """So many values of a kind."""
-    return Annotated[
-        tuple[kind, ...],
-        refused(lambda values: len(values) != count, f"a list of {count} is needed"),
-    ]
+    wrong = refused(lambda values: len(values) != count, f"a list of {count} is needed")
+    return Annotated[tuple[kind, ...], wrong]
 
 
-Text = Annotated[
-    StrictStr, refused(lambda text: not text.isprintable() or not text, "a text is needed")
+def no_text(value):
+    """Whether nothing is said, or something that cannot be printed."""
+    return type(value) is not str or not value or not value.isprintable()
+
+
+def no_source(value):
+    """Whether a value names no camera."""
+    return no_text(value) and not (type(value) is int and 0 <= value <= 255)
+
+
+def stops_of(sweep: tuple[float, float, float]) -> np.ndarray:
+    """Pitch angles of a sweep: its ends are met, its step is not exceeded.
+
+    Parameters
+    ----------
+    sweep
+        First, last, step, degrees.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Radians; none where the step is too small.
+    """
+    first, last, step = sweep
+    if step < FINEST_DEG:
+        return np.empty(0)
+    count = math.ceil(round(abs(last - first) / step, 6)) + 1
+    if count > MOST_STOPS:
+        return np.empty(0)
+    return np.radians(np.linspace(first, last, count))
+
+
+Text = Annotated[StrictStr, refused(no_text, "a text is needed")]
+Source = Annotated[Any, refused(no_source, "a text, or a whole number from 0 to 255 is needed")]
+Rate = Annotated[Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)]
+Password = Annotated[
+    Text,
+    AfterValidator(str.encode),
+    refused(lambda raw: len(raw) != 8, "8 ASCII characters are needed"),
 ]
-Angle = number(-180, 180, "deg")
 Perhaps = Literal["auto", True, False]
-Near = number(1e-4, 45, "deg")
+Angle = number(-180, 180, "deg")
 Seconds = number(0, 60, "s")
-Speed = number(0.01, 360, "deg/s")
-ORDER = "the lower one comes first"
+Limits = Annotated[
+    several(Angle, 2),
+    refused(lambda ends: ends[0] >= ends[1], "the lower one comes first"),
+]
+Sweep = Annotated[several(Angle, 3), refused(lambda sweep: len(stops_of(sweep)) < 2, STOPS)]
 
 
-OTHER_RATE = (
-    "one of 9600, 19200, 38400, 500000 is needed, the rates of a SICK LMS2xx: no other range "
-    "finder is driven here; record it by a program of your own that writes a session "
-    "(lrfcal_lib.session.write.SessionWriter)"
-)
+def both_ways(value):
+    """A speed upwards and downwards, of one number or two."""
+    if isinstance(value, tuple | list):
+        return value
+    return value, value
+
+
+Speeds = Annotated[several(number(0.01, 360, "deg/s"), 2), BeforeValidator(both_ways)]
+
+# ------------------------------------------------------------------------------------- devices
+
+
+class Stated(BaseModel, frozen=True):
+    """An object of a rig file: null is as good as left out, and other keys are refused."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def known(cls, data):
+        """The values that are stated."""
+        if not isinstance(data, dict):
+            return data
+        for key in data:
+            if key not in cls.model_fields:
+                raise ValueError(f"{key} is not known; known are {', '.join(cls.model_fields)}")
+        return {key: value for key, value in data.items() if value is not None}
 
 
 class LrfDevice(Stated):
     """Where the laser range finder is, and how it is to be set."""
 
     port: Text
-    baudrate: Annotated[
-        Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)
-    ] = None
+    baudrate: Rate = None
     address: whole(0, 127) = None
-    password: Annotated[
-        Text,
-        AfterValidator(str.encode),
-        refused(lambda raw: len(raw) != 8, "8 ASCII characters are needed"),
-    ] = None
+    password: Password = None
     variant: several(number(0.25, 180, "deg"), 2) = None
     unit: Literal["mm", "cm"] = None
     measuring_mode: whole(0, 6) = None
@@ -131,68 +177,75 @@ class HeadSettings(Stated):
     # true makes a missing one an error (the adapter is dead), false makes one a warning.
     echo: Perhaps = "auto"
     # Asking for more is an error. The protocol knows no limits; typical heads tilt by -90 to 90.
-    pitch_limits_deg: Annotated[
-        several(Angle, 2), refused(lambda ends: ends[0] >= ends[1], ORDER)
-    ] = (-60.0, 60.0)
+    pitch_limits_deg: Limits = (-60.0, 60.0)
     position_zero_deg: number(-360, 360, "deg") = 0.0  # elevation that the head tells at pitch 0
-    invert: StrictBool = (
-        False  # it hangs upside down or counts the other way: its "up" lowers the view
-    )
+    # It hangs upside down or counts the other way: its "up" lowers the view.
+    invert: StrictBool = False
     tilt_speed: whole(0, FASTEST) = 0x20  # speed byte, 0 is very slow
     # At `tilt_speed`, both ways or (up, down). Not stated: 4 is assumed, as of constant-speed
     # heads, until it was learnt, and the log says so.
-    degrees_per_second: Annotated[
-        several(Speed, 2), BeforeValidator(lambda v: v if isinstance(v, tuple | list) else (v, v))
-    ] = None
-    # From the motion frame to the movement, less what it runs on after the stop.
-    start_delay_s: number(-10, 10, "s") = 0.0
+    degrees_per_second: Speeds = None
     start_pitch_deg: Angle = 0.0  # where a head without feedback stands at first: levelled by hand
-    tolerance_deg: Near = 0.1  # readings that differ by less are the same: cheap encoders jitter
-    arrival_deg: Near = 0.5  # a move that ends this near has arrived; its settled pitch counts
+    # Readings that differ by less are the same: cheap encoders jitter.
+    tolerance_deg: number(1e-4, 45, "deg") = 0.1
     settle_s: Seconds = 0.3  # the head rests when its readings stay the same for this long
-    stall_s: Seconds = 1.5  # rest elsewhere for this long: it does not get to where it was sent
     poll_s: Seconds = 0.1  # between queries while it moves
     reply_s: number(1e-3, 10, "s") = 0.35  # until a reply begins; 1 is needed by slow heads
     gap_s: number(0, 10, "s") = 0.05  # silence between frames, and time for an acknowledgement
     retries: whole(0, 20) = 3  # queries repeated when no reply came
-    # motion frames in a row: 2 on weak lines; stops are sent twice in any case
-    sends: whole(1, 20) = 1
     repeat_s: number(1e-3, 60, "s") = None  # below 1 for heads that stop by themselves without
-    # a call waits this long for a vanished port to come back
-    reconnect_s: number(0, 3600, "s") = 3.0
+    reconnect_s: number(0, 3600, "s") = 3.0  # that a call waits for a vanished port
 
-    def elevation(self, pitch):
-        """What the head calls a pitch, rad."""
-        return math.radians(self.position_zero_deg) + (-pitch if self.invert else pitch)
+    def elevation(self, pitch: float) -> float:
+        """What the head calls a pitch.
 
-    def pitch(self, elevation):
-        """The pitch of an elevation that the head tells, rad, in [-pi, pi)."""
-        turn = (elevation - math.radians(self.position_zero_deg) + math.pi) % math.tau - math.pi
-        return -turn if self.invert else turn
+        Parameters
+        ----------
+        pitch
+            Radians, up positive.
+
+        Returns
+        -------
+        float
+            Radians.
+        """
+        if self.invert:
+            pitch = -pitch
+        return math.radians(self.position_zero_deg) + pitch
+
+    def pitch(self, elevation: float) -> float:
+        """The pitch of an elevation that the head tells.
+
+        Parameters
+        ----------
+        elevation
+            Radians.
+
+        Returns
+        -------
+        float
+            Radians in [-pi, pi), up positive.
+        """
+        turn = elevation - math.radians(self.position_zero_deg)
+        turn = (turn + math.pi) % math.tau - math.pi
+        if self.invert:
+            return -turn
+        return turn
 
 
 class HeadDevice(HeadSettings):
     """Where the head is, and its settings."""
 
     port: Text
-    feedback: Literal["auto", True, False] = True
+    feedback: Perhaps = True
 
 
 class CameraDevice(Stated):
     """Where a camera is, and how it is to be set."""
 
-    source: Annotated[
-        Any,
-        refused(
-            lambda v: (
-                not (type(v) is int and 0 <= v <= 255 or type(v) is str and v and v.isprintable())
-            ),
-            "a text, or a whole number from 0 to 255 is needed",
-        ),
-    ]
+    source: Source
     size: several(whole(1, 100_000), 2) = None
     exposure: number(1e-6, 60, "s") = None
-    fps: number(0.01, 10_000, "Hz") = None
     silence_s: number(0.1, 3600, "s") = None
 
 
@@ -214,16 +267,7 @@ class Devices(Stated):
         return self
 
 
-def stops_of(sweep):
-    """Pitch angles of a sweep (first, last, step; deg), radians: its ends are met, its step is not
-    exceeded.
-    """
-    first, last, step = sweep
-    count = math.ceil(round(abs(last - first) / step, 6)) + 1 if step >= FINEST_DEG else 0
-    return np.radians(np.linspace(first, last, count if count <= MOST_STOPS else 0))
-
-
-Sweep = Annotated[several(Angle, 3), refused(lambda sweep: len(stops_of(sweep)) < 2, STOPS)]
+# ---------------------------------------------------------------------------------------- plan
 
 
 class ListedPlacement(Stated):
@@ -248,7 +292,7 @@ class Placement:
     purpose: str = "board"  # of the images, or "scene"
 
     @property
-    def direction(self):
+    def direction(self) -> int:
         """+1 for a sweep upwards, -1 downwards."""
         return 1 if self.pitch[-1] >= self.pitch[0] else -1
 
@@ -276,25 +320,39 @@ class Plan(Stated):
     @model_validator(mode="after")
     def numbered(self):
         """Placements have different numbers."""
-        numbers = [one.number for one in self.to_do()]
+        numbers = [placement.number for placement in self.to_do()]
         if len(set(numbers)) < len(numbers):
             raise ValueError(f"placements: numbers must differ, got {numbers}")
         return self
 
-    def to_do(self, count=None):
-        """The placements to record, in order, a list of Placement; only so many of them if that is
-        given.
+    def to_do(self, count: int | None = None) -> list[Placement]:
+        """The placements to record, in order.
+
+        Parameters
+        ----------
+        count
+            Only so many of them; where none are listed also more than the plan has.
         """
         listed = self.placements or [ListedPlacement()] * (count or self.count)
-        found = []
-        for i, one in enumerate(listed[:count], 1):
-            stops = stops_of(one.pitch_deg or self.pitch_deg)
-            images = self.image_pitch_deg if one.image_pitch_deg is None else one.image_pitch_deg
-            stops = stops if self.placements or i % 2 else stops[::-1]
-            number = i if one.number is None else one.number
-            purpose = "board" if one.board else "scene"
-            found.append(Placement(number, stops, tuple(map(math.radians, images)), purpose))
-        return found
+        placements = []
+        for i, entry in enumerate(listed[:count], 1):
+            number = i
+            if entry.number is not None:
+                number = entry.number
+            stops = stops_of(entry.pitch_deg or self.pitch_deg)
+            if not self.placements and i % 2 == 0:
+                stops = stops[::-1]
+            images = self.image_pitch_deg
+            if entry.image_pitch_deg is not None:
+                images = entry.image_pitch_deg
+            purpose = "scene"
+            if entry.board:
+                purpose = "board"
+            placements.append(Placement(number, stops, tuple(map(math.radians, images)), purpose))
+        return placements
+
+
+# ------------------------------------------------------------------------------------ rig file
 
 
 @dataclass(frozen=True)
@@ -315,11 +373,11 @@ class RigFile:
     def __post_init__(self):
         low, high = self.devices.head.pitch_limits_deg
         for placement in self.plan.to_do():
-            asked = np.degrees([*placement.pitch, *placement.image_pitch])
-            if asked.min() < low - 1e-6 or asked.max() > high + 1e-6:
+            angles = np.degrees([*placement.pitch, *placement.image_pitch])
+            if angles.min() < low - ROUNDING_DEG or angles.max() > high + ROUNDING_DEG:
                 raise RigFileError(
                     f"{self.path}: plan: placement {placement.number} asks for a pitch of "
-                    f"{asked.min():g} to {asked.max():g} deg, devices.head.pitch_limits_deg are "
+                    f"{angles.min():g} to {angles.max():g} deg, devices.head.pitch_limits_deg are "
                     f"{low:g} to {high:g}: ask for less"
                 )
         if self.plan.mode == "continuous" and self.devices.lrf.interlaced:
@@ -328,40 +386,22 @@ class RigFile:
                 "head at rest, use the mode stop-and-go, or a variant of 0.5 or 1 deg"
             )
 
-    def with_mode(self, mode):
-        """The same with another mode of the plan (None: its own)."""
-        return (
-            self
-            if mode is None
-            else replace(self, plan=self.plan.model_copy(update={"mode": mode}))
-        )
+    def with_mode(self, mode: str | None) -> "RigFile":
+        """The same with another mode of the plan.
 
+        Parameters
+        ----------
+        mode
+            'stop-and-go' or 'continuous'; None: its own.
 
-def read_rig_file(path):
-    """Read and check a rig file.
-
-    Returns
-    -------
-    RigFile
-
-    Raises
-    ------
-    RigFileError
-        With the file, the key and the value, for anything that cannot be used.
-    """
-    path = Path(path)
-    try:
-        if path.stat().st_size > MOST_BYTES or not path.is_file():
-            raise RigFileError(
-                f"{path}: no file, or one of more than {MOST_BYTES} bytes: name a rig file"
-            )
-        data = json.loads(path.read_bytes())
-    except OSError as error:
-        hint = "'python -m lrfcal_lib emulate --rig-file' writes an example"
-        raise RigFileError(f"{path}: {error.strerror}; {hint}") from error
-    except (ValueError, RecursionError) as error:
-        raise RigFileError(f"{path}: not JSON ({error})") from error
-    return rig_of(data, path)
+        Raises
+        ------
+        RigFileError
+            If its laser range finder cannot do that.
+        """
+        if mode is None:
+            return self
+        return replace(self, plan=self.plan.model_copy(update={"mode": mode}))
 
 
 class RigFileStated(SessionStated):
@@ -371,32 +411,77 @@ class RigFileStated(SessionStated):
     plan: Plan = Plan()
 
 
-def rig_of(data, path=Path("rig.json")):
-    """A RigFile of parsed JSON, with a path for messages; RigFileError for a wrong one."""
+def read_rig_file(path: str | os.PathLike) -> RigFile:
+    """Read and check a rig file.
+
+    Parameters
+    ----------
+    path
+        Of the file.
+
+    Raises
+    ------
+    RigFileError
+        With the file, the key and the value, for anything that cannot be used.
+    """
+    path = Path(path)
+    try:
+        usable = path.stat().st_size <= MOST_BYTES and path.is_file()
+        content = path.read_bytes() if usable else b""
+    except OSError as error:
+        hint = "'python -m lrfcal_lib emulate --rig-file' writes an example"
+        raise RigFileError(f"{path}: {error.strerror}; {hint}") from error
+    if not usable:
+        remedy = "name a rig file"
+        raise RigFileError(f"{path}: no file, or one of more than {MOST_BYTES} bytes: {remedy}")
+    try:
+        data = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise RigFileError(f"{path}: not JSON ({error})") from error
+    return rig_of(data, path)
+
+
+def rig_of(data: Any, path: Path = Path("rig.json")) -> RigFile:
+    """The rig file that parsed JSON makes.
+
+    Parameters
+    ----------
+    data
+        As of ``json.loads``.
+    path
+        For messages.
+
+    Raises
+    ------
+    RigFileError
+        With the path, the key and the value, for anything that cannot be used.
+    """
     try:
         if not isinstance(data, dict):
             raise ValueError(f"the file is {ascii(data)[:80]}: an object is needed")
-        given = (
-            {"name": "rig", "licence": "", "source": "", "simulated": False}
-            | data
-            | {"placements": ()}
-        )
-        stated = parse_session({k: v for k, v in given.items() if v is not None}, RigFileStated)
-        devices = stated["devices"].cameras
-        cameras = stated["cameras"]
-        if set(devices) != set(cameras):
-            raise ValueError(
-                f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras "
-                f"{', '.join(cameras) or 'none'}: every camera stands in both"
-            )
-        for name, info in cameras.items():
-            if devices[name].size not in (None, (info.width, info.height)):
-                raise ValueError(
-                    f"devices.cameras.{name}.size is {list(devices[name].size)}, "
-                    f"rig.cameras.{name} states {[info.width, info.height]}: leave it out"
-                )
+        present = {key: value for key, value in data.items() if value is not None}
+        unsaid = {"name": "rig", "licence": "", "source": "", "simulated": False}
+        stated = parse_session(unsaid | present | {"placements": ()}, RigFileStated)
+        _check_cameras(stated["devices"].cameras, stated["cameras"])
     except (ValueError, RecursionError) as error:
         raise RigFileError(f"{path}: {error}") from error
     about = {key: stated[key] for key in ("licence", "source", "simulated")}
     rest = ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras", "devices", "plan")
     return RigFile(Path(path), about, **{key: stated[key] for key in rest})
+
+
+def _check_cameras(devices, cameras):
+    """Refuse cameras of the devices that are not those of the rig."""
+    if set(devices) != set(cameras):
+        raise ValueError(
+            f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras "
+            f"{', '.join(cameras) or 'none'}: every camera stands in both"
+        )
+    for name, info in cameras.items():
+        size = devices[name].size
+        if size not in (None, (info.width, info.height)):
+            stated = [info.width, info.height]
+            raise ValueError(
+                f"devices.cameras.{name}.size is {list(size)}, rig.cameras.{name} states {stated}: "
+                "leave it out"
+            )

@@ -1,6 +1,4 @@
-"""Colour cameras: devices, streams and files; the newest frame with the time at which it was
-grabbed.
-"""
+"""Colour cameras: devices, streams and files; the newest frame with the time of its grab."""
 
 import contextlib
 import glob
@@ -9,8 +7,10 @@ import os
 import re
 import select
 import threading
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,134 +24,288 @@ LOG = logging.getLogger(__name__)
 BEGIN = b"\xff\xd8"
 END = b"\xff\xd9"
 LENGTH = re.compile(rb"content-length:\s*(\d+)", re.IGNORECASE)
-CHUNK = 1 << 16
-LONGEST = 1 << 26
+CHUNK = 1 << 16  # bytes that are read at once
+LONGEST = 1 << 26  # bytes of an image of a stream
 EXPOSURE_UNIT_S = 1e-4  # of V4L2
 MANUAL = 1  # exposure mode of V4L2
+SAME_EXPOSURE = 0.05  # share by which that of a camera may differ from what was asked for
 WIDTH = cv2.CAP_PROP_FRAME_WIDTH
 HEIGHT = cv2.CAP_PROP_FRAME_HEIGHT
-FPS = cv2.CAP_PROP_FPS
 IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm"}
 AGAIN_S = 0.25  # between attempts to find a lost device
 CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
-# A camera that is lost is told once, by us: FFmpeg and OpenCV would say so at every attempt to find
-# it.
+# We say once that a camera is lost: FFmpeg and OpenCV would at every attempt to find it.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet
 if "OPENCV_LOG_LEVEL" not in os.environ:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
-class Images:
-    """Encoded images that are read like cv2.VideoCapture; ``take()`` gives the next one, None at
-    the end.
+@dataclass(frozen=True)
+class Frame:
+    """One image."""
+
+    image: np.ndarray  # (height, width, 3) of uint8, BGR
+    time_s: float  # host time at which it was grabbed; the exposure was before it
+    index: int  # frames grabbed before it; gaps are frames that nobody asked for in time
+
+
+class Camera(Closed):
+    """A camera, set to what is asked for; a context manager.
+
+    A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and
+    that looks for the source again when it is lost. A recorded one (video file, images) gives its
+    next image each time it is asked.
+
+    Parameters
+    ----------
+    source
+        V4L2 index or path (/dev/video0), URL, video file, image, folder of images, or pattern such
+        as ``"images/*.png"``.
+    name
+        For messages.
+    size
+        Width and height, pixels; by default as it is. The attribute tells whether it was obeyed.
+    exposure
+        Seconds; by default the camera's automatic exposure is left alone. Another one is logged.
+    silence_s
+        A stream that sends nothing for so long is taken for lost and opened again.
+
+    Attributes
+    ----------
+    size : tuple of int or None
+        Width and height that it gives, pixels; None where that is unknown.
+    lost : bool
+        A live source gave no frame when it should have, and was not found again yet; a recorded one
+        is at its end.
+
+    Raises
+    ------
+    PortError
+        If the source is missing, forbidden, busy, or no camera.
     """
 
-    def __init__(self):
-        self._image = b""
-        self._held = False
+    def __init__(
+        self,
+        source: int | str | os.PathLike,
+        *,
+        name: str,
+        size: tuple[int, int] | None = None,
+        exposure: float | None = None,
+        silence_s: float = 10.0,
+    ):
+        self.name = name
+        self.lost = False
+        self._path = str(source)
+        if self._path.isdigit():
+            self._path = f"/dev/video{self._path}"
+        self._silence_s = silence_s
+        self._remedy = remedy_of(self._path)
+        self._frame: Frame | None = None
+        self._count = 0
+        self._new = threading.Condition()
+        self._quit = threading.Event()
+        self._wanted = self._properties(size, exposure)
+        self._open()
+        self._read_back(exposure)
+        self._thread = None
+        if self._remedy:
+            self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
+            self._thread.start()
 
-    def grab(self):
-        """Take the next image, if there is one."""
-        if not self._held:
-            self._image = self.take()
-        self._held = False
-        return self._image is not None
+    def newest(self, after: float | None = None, timeout: float = 5.0) -> Frame:
+        """The newest frame; of a recorded source the next image.
 
-    def retrieve(self):
-        """Decode the image grabbed last: (True, image) or (False, None)."""
-        image = (
-            cv2.imdecode(np.frombuffer(self._image, np.uint8), cv2.IMREAD_COLOR)
-            if self._image
-            else None
-        )
-        return image is not None, image
+        Parameters
+        ----------
+        after
+            Date of the host, s, later than which it is grabbed.
+        timeout
+            Seconds to wait for it.
 
-    def get(self, key):
-        """Size of the image grabbed last, or of the first, which is kept for the next grab; 0 for
-        what is unknown.
+        Raises
+        ------
+        LineLost
+            If the source is lost and did not come back in time, or a recorded one is at its end.
+        NoReply
+            If no such frame came in time.
+        DeviceError
+            If the camera was closed.
         """
-        if self._image == b"":
-            self._held = self.grab()
-        done, image = self.retrieve()
-        height, width = image.shape[:2] if done else (0, 0)
-        return float({WIDTH: width, HEIGHT: height}.get(key, 0))
 
-
-class MjpegStream(Images):
-    """Images of an MJPEG stream; `timeout` in s, to connect and between any two bytes.
-
-    `multipart`: the answer is a stream of images; anything else is not read. `waited`: the frame
-    grabbed last was waited for; otherwise it came at some time since the one before. OSError if
-    nothing answers, or the URL names none.
-    """
-
-    def __init__(self, url, timeout):
-        super().__init__()
-        self._buffer = b""
-        self.waited = False
-        session = requests.Session()
-        session.trust_env = False  # no proxy: cameras are near
-        try:
-            self._answer = session.get(url, stream=True, timeout=timeout).raw
-        except ValueError as error:  # names that no host can have
-            raise OSError(f"no address of a stream: {error}") from error
-        kind = self._answer.headers.get("Content-Type", "")
-        self.multipart = self._answer.status == 200 and kind.lower().startswith("multipart/")
-        self.release = self._answer.close
-
-    def grab(self):
-        """Take the next image; False at the end of the stream, or after a silence."""
-        self.waited = False
-        return super().grab()
-
-    def take(self):
-        """The next whole image: as long as is stated before it (it may hold another one), else up
-        to its end.
-        """
-        while True:
-            begin = self._buffer.find(BEGIN)
-            stated = LENGTH.findall(self._buffer[: max(begin, 0)])
-            end = begin + int(stated[-1]) if stated else self._buffer.find(END, begin) + len(END)
-            if begin >= 0 and len(END) <= end <= len(self._buffer):
-                image = self._buffer[begin:end]
-                self._buffer = self._buffer[end:]
-                return image
-            if self._answer.closed or len(self._buffer) > LONGEST:  # at its end or after a silence
+        def fresh():
+            frame = self._frame
+            if frame is None or (after is not None and frame.time_s <= after):
                 return None
-            try:
-                self.waited |= not select.select([self._answer], [], [], 0)[0]
-                some = self._answer.read1(CHUNK)
-            except (OSError, ValueError, HTTPError):  # ValueError: the answer was closed
-                return None
-            if not some:
-                return None
-            self._buffer += some
+            return frame
 
+        with self._new:
+            if self._thread is not None:
+                self._new.wait_for(lambda: self._quit.is_set() or fresh(), timeout)
+            if self._quit.is_set():
+                raise DeviceError(f"camera {self.name} is closed: open it again")
+            if self._thread is None:
+                return self._next()
+            frame = fresh()
+            if frame is not None:
+                return frame
+        if self.lost:
+            raise LineLost(f"camera {self.name} is lost: {self._remedy}")
+        raise NoReply(f"camera {self.name} gave no new frame in {timeout:g} s: {self._remedy}")
 
-class Files(Images):
-    """Image files in the order of their names."""
+    def close(self) -> None:
+        """Close the source; a second call does nothing."""
+        self._quit.set()
+        with self._new:
+            self._new.notify_all()
+        if self._thread is not None:
+            self._thread.join(CLOSE_S)
+        else:
+            self._release()
 
-    def __init__(self, path):
-        super().__init__()
-        paths = Path(path).iterdir() if os.path.isdir(path) else map(Path, glob.glob(path))
-        self._left = sorted(one for one in paths if one.suffix.lower() in IMAGES)
-        if not self._left:
-            raise PortError(f"there are no images in {path}: name a folder or pattern with some")
+    # ---------------------------------------------------------------------------------------------
+    # settings
 
-    def take(self):
-        """Content of the next file."""
-        self._path, *self._left = self._left or [None]
-        return self._path and self._path.read_bytes()
+    def _properties(self, size, exposure):
+        """What a device is to be set to, by the keys of OpenCV."""
+        if not self._path.startswith("/dev/"):
+            return {}
+        wanted = {cv2.CAP_PROP_BUFFERSIZE: 1}
+        if size is not None:
+            wanted |= dict(zip((WIDTH, HEIGHT), size, strict=True))
+        if exposure is not None:
+            wanted[cv2.CAP_PROP_AUTO_EXPOSURE] = MANUAL
+            wanted[cv2.CAP_PROP_EXPOSURE] = round(exposure / EXPOSURE_UNIT_S)
+        return wanted
 
-    def retrieve(self):
-        """Decode it: (True, image)."""
-        done, image = super().retrieve()
+    def _open(self):
+        self._capture = open_source(self._path, self._silence_s)
+        self._before = REAL.time()
+        self._taken = {key for key, value in self._wanted.items() if self._capture.set(key, value)}
+
+    def _read_back(self, exposure):
+        """The size that it gives; an exposure that is not as asked for is logged."""
+        capture = self._capture
+        given = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
+        self.size = None
+        if all(given):
+            self.size = given
+        if exposure is None:
+            return
+        given_s = 0.0
+        if cv2.CAP_PROP_EXPOSURE in self._taken:
+            given_s = capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
+        if given_s <= 0:
+            LOG.warning("camera %s: exposure cannot be set, asked %s", self.name, exposure)
+        elif abs(given_s - exposure) > SAME_EXPOSURE * exposure:
+            LOG.warning("camera %s: exposure is %s, asked %s", self.name, given_s, exposure)
+
+    # ---------------------------------------------------------------------------------------------
+    # grabbing
+
+    def _release(self):
+        if self._capture is not None:
+            self._capture.release()
+        self._capture = None
+
+    def _next(self):
+        """The next image of a recorded source."""
+        self.lost = not self._capture.grab() or not self._keep(REAL.time())
+        if self.lost:
+            end = f"at the end of its {self._count} recorded images"
+            raise LineLost(f"camera {self.name} is {end}: open it again")
+        return self._frame
+
+    def _grab(self):
+        """Keep the newest frame; this thread alone touches the source."""
+        while not self._quit.is_set():
+            if self._capture is None or not self._capture.grab():
+                self._lose()
+                continue
+            now = REAL.time()
+            instant = now
+            if not getattr(self._capture, "waited", True):
+                instant = self._before  # it may have come at any time since the frame before
+            self._keep(instant)
+            self._before = now
+        self._release()
+
+    def _keep(self, instant):
+        """Decode what was grabbed; whether that was an image."""
+        done, image = self._capture.retrieve()
         if not done:
-            raise PortError(f"{self._path} is no image that OpenCV can read")
-        return done, image
+            return False
+        with self._new:
+            self._frame = Frame(image, instant, self._count)
+            self._count += 1
+            if self.lost:
+                LOG.warning("camera %s is back", self.name)
+            self.lost = False
+            self._new.notify_all()
+        return True
 
-    def release(self):
-        """Nothing is open."""
+    def _lose(self):
+        """Forget the last frame, and look for the source."""
+        with self._new:
+            if not self.lost:
+                LOG.warning("camera %s is lost: %s", self.name, self._remedy)
+            self.lost = True
+            self._frame = None
+        self._release()
+        if not self._quit.wait(AGAIN_S):
+            with contextlib.suppress(PortError):
+                self._open()
+
+
+# ---------------------------------------------------------------------------------------- sources
+
+
+def remedy_of(path: str) -> str:
+    """What to do about a live source that is lost; '' for files, which cannot be lost.
+
+    Parameters
+    ----------
+    path
+        Of the source.
+    """
+    if "://" in path:
+        return f"open {path} in a browser, and check network and power of the camera"
+    if path.startswith("/dev/"):
+        return f"check the plug of {path}, and what 'v4l2-ctl --list-devices' shows"
+    return ""
+
+
+def open_source(path: str, silence_s: float):
+    """Open what a path names.
+
+    Parameters
+    ----------
+    path
+        See :class:`Camera`.
+    silence_s
+        After which a stream is at its end.
+
+    Returns
+    -------
+    cv2.VideoCapture or Images
+        Either is read like the first.
+
+    Raises
+    ------
+    PortError
+        If the source is missing, forbidden, busy, or no camera.
+    """
+    if "://" in path:
+        return _open_stream(path, silence_s)
+    if path.startswith("/dev/"):
+        return _open_device(path)
+    exists = os.path.exists(path)
+    pattern = glob.has_magic(path) and not exists
+    if os.path.isdir(path) or pattern or Path(path).suffix.lower() in IMAGES:
+        return Files(path)
+    if not exists:
+        remedy = "name a file, a device, a folder of images or a URL"
+        raise PortError(f"there is no video {path}: {remedy}")
+    return _opened(f"{path} is no video that OpenCV can read", path)
 
 
 def _opened(message, *arguments):
@@ -165,12 +319,11 @@ def _opened(message, *arguments):
 
 def _open_device(path):
     if not os.path.exists(path):
-        there = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
-        raise PortError(f"there is no camera {path}: check its plug; present are {there}")
+        present = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
+        raise PortError(f"there is no camera {path}: check its plug; present are {present}")
     if not os.access(path, os.R_OK | os.W_OK):
-        raise PortError(
-            f"no permission for {path}: run 'sudo usermod -aG video $USER', then log in again"
-        )
+        remedy = "run 'sudo usermod -aG video $USER', then log in again"
+        raise PortError(f"no permission for {path}: {remedy}")
     busy = f"{path} gives no video: close other programs that use it, or name another device"
     return _opened(busy, path, cv2.CAP_V4L2)
 
@@ -188,240 +341,156 @@ def _open_stream(path, silence_s):
     return _opened(f"{path} gives no video: {remedy_of(path)}", path, cv2.CAP_FFMPEG, waits)
 
 
-def remedy_of(path):
-    """What to do about a live source that is lost; '' for files, which cannot be lost."""
-    if "://" in path:
-        return f"open {path} in a browser, and check network and power of the camera"
-    is_device = path.startswith("/dev/")
-    return (
-        f"check the plug of {path}, and what 'v4l2-ctl --list-devices' shows" if is_device else ""
-    )
+class Images(ABC):
+    """Encoded images that are read like cv2.VideoCapture."""
+
+    def __init__(self):
+        self._image = b""
+        self._held = False
+
+    @abstractmethod
+    def take(self) -> bytes | None:
+        """The next one; None at the end."""
+
+    def grab(self) -> bool:
+        """Take the next image, if there is one."""
+        if not self._held:
+            self._image = self.take()
+        self._held = False
+        return self._image is not None
+
+    def retrieve(self) -> tuple[bool, Any]:
+        """Decode the image grabbed last: whether it is one, and its pixels."""
+        image = None
+        if self._image:
+            image = cv2.imdecode(np.frombuffer(self._image, np.uint8), cv2.IMREAD_COLOR)
+        return image is not None, image
+
+    def get(self, key: int) -> float:
+        """Size of the image grabbed last, or of the first, which is kept for the next grab.
+
+        Parameters
+        ----------
+        key
+            ``cv2.CAP_PROP_FRAME_WIDTH`` or ``cv2.CAP_PROP_FRAME_HEIGHT``.
+
+        Returns
+        -------
+        float
+            Pixels; 0 for what is unknown.
+        """
+        if self._image == b"":
+            self._held = self.grab()
+        done, image = self.retrieve()
+        if not done:
+            return 0.0
+        return float(image.shape[(HEIGHT, WIDTH).index(key)])
 
 
-def open_source(path, silence_s):
-    """What a path names, see :class:`Camera`: it reads like cv2.VideoCapture."""
-    if "://" in path:
-        return _open_stream(path, silence_s)
-    if path.startswith("/dev/"):
-        return _open_device(path)
-    pattern = glob.has_magic(path) and not os.path.exists(path)
-    if os.path.isdir(path) or pattern or Path(path).suffix.lower() in IMAGES:
-        return Files(path)
-    if not os.path.exists(path):
-        raise PortError(
-            f"there is no video {path}: name a file, a device, a folder of images or a URL"
-        )
-    return _opened(f"{path} is no video that OpenCV can read", path)
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One image."""
-
-    image: np.ndarray  # (height, width, 3) of uint8, BGR
-    time_s: float  # host time at which it was grabbed; the exposure was before it
-    index: int  # frames grabbed before it; gaps are frames that nobody asked for in time
-
-
-class Camera(Closed):
-    """A camera, set to what is asked for; what could not be set is logged. A context manager.
-
-    A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and
-    that looks for the source again when it is lost. A recorded one (video file, images) gives its
-    next image each time it is asked.
+class MjpegStream(Images):
+    """Images of an MJPEG stream.
 
     Parameters
     ----------
-    source : int, str or Path
-        V4L2 index or path (/dev/video0), URL, video file, image, folder of images, or pattern such
-        as ``"images/*.png"``.
-    name : str
-    size : (int, int), optional
-        Width and height, pixels.
-    exposure : float, optional
-        s; by default the camera's automatic exposure is left alone.
-    fps : float, optional
-    silence_s : float
-        A stream that sends nothing for so long is taken for lost and opened again.
+    url
+        Of the stream.
+    timeout
+        To connect and between any two bytes, seconds.
 
     Attributes
     ----------
-    size : tuple of int or None
-        Width and height that it gives, pixels; None where that is unknown.
-    lost : bool
-        A live source gave no frame when it should have, and was not found again yet; a recorded one
-        is at its end.
+    multipart : bool
+        The answer is a stream of images; anything else is not read.
+    waited : bool
+        The frame grabbed last was waited for; otherwise it came at some time since the one before.
+
+    Raises
+    ------
+    OSError
+        If nothing answers, or the URL names none.
+    """
+
+    def __init__(self, url: str, timeout: float):
+        super().__init__()
+        self._buffer = b""
+        self.waited = False
+        session = requests.Session()
+        session.trust_env = False  # no proxy: cameras are near
+        try:
+            self._answer = session.get(url, stream=True, timeout=timeout).raw
+        except ValueError as error:  # names that no host can have
+            raise OSError(f"no address of a stream: {error}") from error
+        kind = self._answer.headers.get("Content-Type", "")
+        self.multipart = self._answer.status == 200 and kind.lower().startswith("multipart/")
+        self.release = self._answer.close
+
+    def grab(self) -> bool:
+        """Take the next image; False at the end of the stream, or after a silence."""
+        self.waited = False
+        return super().grab()
+
+    def take(self) -> bytes | None:
+        """The next whole image: as long as is stated before it (it may hold another one), else up
+        to its end.
+        """
+        while True:
+            begin = self._buffer.find(BEGIN)
+            end = self._buffer.find(END, begin) + len(END)
+            if stated := LENGTH.findall(self._buffer[: max(begin, 0)]):
+                end = begin + int(stated[-1])
+            if begin >= 0 and len(END) <= end <= len(self._buffer):
+                image = self._buffer[begin:end]
+                self._buffer = self._buffer[end:]
+                return image
+            if self._answer.closed or len(self._buffer) > LONGEST:  # at its end or after a silence
+                return None
+            try:
+                self.waited |= not select.select([self._answer], [], [], 0)[0]
+                more = self._answer.read1(CHUNK)
+            except (OSError, ValueError, HTTPError):  # ValueError: the answer was closed
+                return None
+            if not more:
+                return None
+            self._buffer += more
+
+
+class Files(Images):
+    """Image files in the order of their names.
+
+    Parameters
+    ----------
+    path
+        Of a folder, or a pattern.
 
     Raises
     ------
     PortError
-        If the source is missing, forbidden, busy, or no camera.
+        If there are none.
     """
 
-    def __init__(self, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0):
-        self._asked = {
-            "size": None if size is None else tuple(size),
-            "exposure": exposure,
-            "fps": fps,
-        }
-        self.name = name
-        self.lost = False
-        self._told = set()
-        path = os.fspath(source) if not isinstance(source, int) else str(source)
-        self._path = f"/dev/video{path}" if path.isdigit() else path
-        self._silence_s = silence_s
-        self._remedy = remedy_of(self._path)
-        self._frame = None
-        self._count = 0
-        self._new = threading.Condition()
-        self._quit = threading.Event()
-        self._capture = open_source(self._path, self._silence_s)
-        self._apply()
-        self._thread = None
-        if self._remedy:
-            self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
-            self._thread.start()
+    def __init__(self, path: str):
+        super().__init__()
+        names = glob.glob(path)
+        if os.path.isdir(path):
+            names = [os.path.join(path, name) for name in os.listdir(path)]
+        files = [Path(name) for name in sorted(names) if Path(name).suffix.lower() in IMAGES]
+        if not files:
+            raise PortError(f"there are no images in {path}: name a folder or pattern with some")
+        self._left = iter(files)
 
-    def newest(self, after=None, timeout=5.0):
-        """The newest frame within so many seconds, grabbed later than `after` by the host's clock
-        if that is given.
+    def take(self) -> bytes | None:
+        """Content of the next file."""
+        self._path = next(self._left, None)
+        if self._path is None:
+            return None
+        return self._path.read_bytes()
 
-        A recorded source gives its next image.
+    def retrieve(self) -> tuple[bool, Any]:
+        """Decode it: True and its pixels. PortError if it is no image."""
+        done, image = super().retrieve()
+        if not done:
+            raise PortError(f"{self._path} is no image that OpenCV can read")
+        return done, image
 
-        Returns
-        -------
-        Frame
-
-        Raises
-        ------
-        LineLost
-            If the source is lost and did not come back in time, or a recorded one is at its end.
-        NoReply
-            If no such frame came in time.
-        DeviceError
-            If the camera was closed.
-        """
-
-        def there():
-            return self._frame is not None and (after is None or self._frame.time_s > after)
-
-        with self._new:
-            if self._thread is not None:
-                self._new.wait_for(lambda: self._quit.is_set() or there(), timeout)
-            if self._quit.is_set():
-                raise DeviceError(f"camera {self.name} is closed: open it again")
-            if self._thread is None:
-                self.lost = not self._capture.grab() or not self._keep(REAL.time())
-                if self.lost:
-                    raise LineLost(
-                        f"camera {self.name} is at the end of its {self._count} recorded images: "
-                        "open it again"
-                    )
-                return self._frame
-            if there():
-                return self._frame
-        if self.lost:
-            raise LineLost(f"camera {self.name} is lost: {self._remedy}")
-        raise NoReply(f"camera {self.name} gave no new frame in {timeout:g} s: {self._remedy}")
-
-    def close(self):
-        """Close the source; a second call does nothing."""
-        self._quit.set()
-        with self._new:
-            self._new.notify_all()
-        if self._thread is not None:
-            self._thread.join(CLOSE_S)
-        else:
-            self._release()
-
-    # ---------------------------------------------------------------------------------------------
-    # grabbing
-
-    def _release(self):
-        if self._capture is not None:
-            self._capture.release()
-        self._capture = None
-
-    def _grab(self):
-        """Keep the newest frame; this thread alone touches the source."""
-        while not self._quit.is_set():
-            if self._capture is None or not self._capture.grab():
-                self._lose()
-                continue
-            now = REAL.time()
-            # what was there at once may have come at any time since the frame before
-            self._keep(now if getattr(self._capture, "waited", True) else self._before)
-            self._before = now
-        self._release()
-
-    def _keep(self, instant):
-        """Decode what was grabbed, three channels of it; whether that was an image."""
-        done, image = self._capture.retrieve()
-        if done:
-            grey = image.ndim == 2 or image.shape[2] == 1
-            with self._new:
-                self._frame = Frame(
-                    cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image, instant, self._count
-                )
-                self._count += 1
-                if self.lost:
-                    LOG.warning("camera %s is back", self.name)
-                self.lost = False
-                self._new.notify_all()
-        return done
-
-    def _lose(self):
-        """Forget the last frame, and look for the source."""
-        with self._new:
-            if not self.lost:
-                LOG.warning("camera %s is lost: %s", self.name, self._remedy)
-            self.lost = True
-            self._frame = None
-        self._release()
-        if not self._quit.wait(AGAIN_S):
-            with contextlib.suppress(PortError):
-                self._capture = open_source(self._path, self._silence_s)
-                self._apply()
-
-    def _apply(self):
-        """Set what was asked for, of devices, read it back, and say what is different."""
-        self._before = REAL.time()
-        capture = self._capture
-        asked = self._asked
-        ticks = 0
-        if self._path.startswith("/dev/"):
-            exposure = (
-                None if asked["exposure"] is None else round(asked["exposure"] / EXPOSURE_UNIT_S)
-            )
-            wanted = {
-                cv2.CAP_PROP_BUFFERSIZE: 1,
-                **dict(zip((WIDTH, HEIGHT), asked["size"] or (), strict=False)),
-                FPS: asked["fps"],
-                cv2.CAP_PROP_AUTO_EXPOSURE: exposure and MANUAL,
-                cv2.CAP_PROP_EXPOSURE: exposure,
-            }
-            done = {
-                key: capture.set(key, value) for key, value in wanted.items() if value is not None
-            }
-            ticks = capture.get(cv2.CAP_PROP_EXPOSURE) * done.get(cv2.CAP_PROP_EXPOSURE, True)
-        size = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
-        self.size = size if all(size) else None
-        found = {
-            "size": self.size,
-            "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
-            "fps": capture.get(FPS) or None,
-        }
-        for key, got in found.items():
-            if (
-                asked[key] is None
-                or got is not None
-                and np.allclose(asked[key], got, rtol=0.05, atol=0)
-            ):
-                continue
-            text = (
-                f"camera {self.name}: {key} {'cannot be set' if got is None else f'is {got}'}, "
-                f"asked {asked[key]}"
-            )
-            if text not in self._told:  # once, however often it is opened again
-                self._told.add(text)
-                LOG.warning(text)
+    def release(self) -> None:
+        """Nothing is open."""

@@ -1,20 +1,22 @@
 """A Pelco-D pan-tilt head, as good or as bad as heads are; how it moves is always known."""
 
 import math
+import os
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, QUERY_TILT, SYNC, TILT, UP, encode_extended
-from lrfcal_lib.drivers.port import REAL
+from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, QUERY_TILT, TILT, UP, encode_extended
+from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.simulate.rig import Platform
 
 REACT_S = 0.04  # from a command to the motor
 WOBBLE = 0.015  # amplitude after a stop, radians for each rad/s of speed
 WOBBLE_HZ = 4.0
-KEPT = 2000  # pieces of motion; ten times as many frames
+KEPT = 2000  # knots of the motion; ten times as many frames
 TURN_AROUND_S = 0.010  # from the end of a frame to a reply
 # to queries of pan, tilt, zoom, magnification
 ANSWERS = {0x51: 0x59, QUERY_TILT: TILT, 0x55: 0x5D, 0x61: 0x63}
@@ -24,103 +26,213 @@ FRAGMENT_S = 0.1  # a frame begun is forgotten after so long
 class Head:
     """Tilt of a head and the pitch that the sensors on it have.
 
-    Its motor runs at constant speed to where it is told, or until it is stopped. A Platform tells
-    how well it is made; the pitch at the start is in radians.
+    Its motor runs at constant speed to where it is told, or until it is stopped.
+
+    Parameters
+    ----------
+    platform
+        How well it is made.
+    seed
+        Of its noise.
+    pitch
+        At the start, radians.
     """
 
-    def __init__(self, platform=None, seed=0, pitch=0.0):
+    def __init__(self, platform: Platform | None = None, seed: int = 0, pitch: float = 0.0):
         self.platform = platform or Platform()
         self.limits = self.platform.limits
-        self.rng = np.random.default_rng([seed, 2])
-        # rows: instant from which it holds, motor from, to, rad/s, and where the head was within
-        # its play when the command came. One thread writes them, any may look: a look sees the
-        # table of before or of after.
-        dragged = (1 + self.platform.stretch) * pitch
-        self._pieces = np.array([(-np.inf, pitch, pitch, 0.0, dragged)])
+        self._rng = np.random.default_rng([seed, 2])
+        # rows: instant, motor, and where its play leaves the head. One thread writes them, any may
+        # look: a look sees the table of before or of after.
+        self._knots = np.array([(0.0, pitch, (1 + self.platform.stretch) * pitch)])
 
-    def move(self, instant, goal, speed):
-        """Tilt towards an angle, at most to a limit, at a speed, radians.
+    def move(self, instant: float, goal: float, speed: float) -> None:
+        """Tilt towards an angle, at most to a limit; the motor reacts a little later.
 
-        The motor reacts a little later.
+        Parameters
+        ----------
+        instant
+            Of the command, s.
+        goal
+            Radians.
+        speed
+            Radians a second.
         """
         self._run(instant + REACT_S, goal, speed)
 
     def _run(self, instant, goal, speed):
         now = float(self.motor(instant))
         goal = float(np.clip(goal, *self.limits))
-        velocity = abs(speed) * np.sign(goal - now)
-        piece = instant, now, goal, velocity, float(self._dragged(instant))
-        before = self._pieces[self._pieces[:, 0] <= instant]
-        self._pieces = np.vstack([before[-KEPT:], piece])
+        dragged = float(self._dragged(instant))
+        knots = [(instant, now, dragged)]
+        if speed and goal != now:
+            arrives = instant + abs((goal - now) / speed)
+            knots.append((arrives, goal, self._with_play(dragged, goal)))
+        before = self._knots[self._knots[:, 0] < instant]
+        self._knots = np.vstack([before[-KEPT:], *knots])
 
-    def go(self, instant, goal, speed):
-        """Tilt to an angle, missed by the noise of the platform."""
-        self.move(instant, goal + self.platform.noise * self.rng.standard_normal(), speed)
+    def go(self, instant: float, goal: float, speed: float) -> None:
+        """Tilt to an angle, missed by the noise of the platform.
 
-    def stop(self, instant):
-        """Stop tilting; what rests already goes on resting."""
+        Parameters
+        ----------
+        instant, goal, speed
+            As of :meth:`move`.
+        """
+        self.move(instant, goal + self.platform.noise * self._rng.standard_normal(), speed)
+
+    def stop(self, instant: float) -> None:
+        """Stop tilting; what rests already goes on resting.
+
+        Parameters
+        ----------
+        instant
+            Of the command, s.
+        """
         reacts = instant + REACT_S
         if self.moving(reacts):
             self._run(reacts, self.motor(reacts), 0.0)
 
-    def motor(self, instant):
-        """Angle of the motor at one instant or many."""
-        begun, first, last, speed, _ = self._held(instant)
-        elapsed = np.where(np.isfinite(begun), instant - begun, 0.0)
-        way = np.where(speed == 0, 0.0, speed * elapsed)
-        return np.clip(first + way, np.minimum(first, last), np.maximum(first, last))
+    def motor(self, instant: float | np.ndarray) -> np.ndarray:
+        """Angle of the motor.
 
-    def resting(self, instant):
-        """Seconds since the motor came to rest, negative while it runs; and the speed it had."""
-        begun, first, last, speed, _ = self._held(instant)
-        if speed != 0:
-            runs = abs((last - first) / speed)
-            return float(instant - begun - runs), float(speed)
-        speed_before = self._held(instant, back=1)[3]
-        return float(instant - begun), float(speed_before)
+        Parameters
+        ----------
+        instant
+            One or many, s.
 
-    def moving(self, instant):
-        """Whether the motor runs, or is about to."""
-        return self.resting(instant)[0] < 0 or self._pieces[-1, 0] > instant
+        Returns
+        -------
+        ndarray
+            Radians.
+        """
+        return np.interp(instant, self._knots[:, 0], self._knots[:, 1])
 
-    def settled(self, instant):
-        """Whether the head is at rest, its wobble included."""
-        return not self.moving(instant) and self.resting(instant)[0] >= self.platform.settle
+    def resting(self, instant: float) -> tuple[float, float]:
+        """Whether the motor rests.
 
-    def pitch(self, instant):
-        """True pitch at one instant or many, radians; after a stop it wobbles until it settled."""
+        Parameters
+        ----------
+        instant
+            Seconds.
+
+        Returns
+        -------
+        since : float
+            Seconds since the motor came to rest, negative while it runs.
+        speed : float
+            That it had, radians a second.
+        """
+        times, motor, _ = self._knots.T
+        row = max(0, int(np.searchsorted(times, instant, side="right")) - 1)
+        speeds = [0.0, *np.diff(motor) / np.diff(times), 0.0]
+        if speeds[row + 1]:
+            return instant - times[row + 1], speeds[row + 1]
+        return instant - times[row], speeds[row]
+
+    def moving(self, instant: float) -> bool:
+        """Whether the motor runs, or is about to.
+
+        Parameters
+        ----------
+        instant
+            Seconds.
+        """
+        return bool(instant < self._knots[-1, 0])
+
+    def settled(self, instant: float, rest_s: float = 0.0) -> bool:
+        """Whether the head is at rest, its wobble included.
+
+        Parameters
+        ----------
+        instant
+            Seconds.
+        rest_s
+            For so long, seconds.
+        """
+        since, _ = self.resting(instant)
+        return not self.moving(instant) and since >= self.platform.settle + rest_s
+
+    def pitch(self, instant: float | np.ndarray) -> np.ndarray:
+        """True pitch; after a stop it wobbles until it settled.
+
+        Parameters
+        ----------
+        instant
+            One or many, s.
+
+        Returns
+        -------
+        ndarray
+            Radians.
+        """
         instant = np.asarray(instant, float)
+        pitch = self._dragged(instant)
         settle = self.platform.settle
         latest = np.max(instant)
         since, speed = self.resting(float(latest))
         if not 0 < since < settle + np.ptp(instant) or not settle:
-            return self._dragged(instant) + 0.0
+            return pitch
         after = np.clip(since - (latest - instant), 0, None)
         amplitude = WOBBLE * speed * np.exp(-5 * after / settle)
         swing = amplitude * np.sin(2 * np.pi * WOBBLE_HZ * after)
-        return self._dragged(instant) + np.where(after < settle, swing, 0.0)
+        return pitch + np.where(after < settle, swing, 0.0)
 
-    def measured(self, instant):
-        """What the encoder says, radians; it sits on the motor and is late."""
-        angle = self.motor(instant - self.platform.latency)
+    def measured(self, instant: float) -> float:
+        """What the encoder says; it sits on the motor and is late.
+
+        Parameters
+        ----------
+        instant
+            Seconds.
+
+        Returns
+        -------
+        float
+            Radians.
+        """
+        angle = float(self.motor(instant - self.platform.latency))
         step = self.platform.encoder_step
-        return float(np.rint(angle / step) * step if step else angle)
-
-    def _held(self, instant, back=0):
-        """Columns of the pieces of motion that hold at instants, or of those before."""
-        pieces = self._pieces
-        row = np.searchsorted(pieces[:, 0], instant, side="right") - 1 - back
-        return np.moveaxis(pieces[np.maximum(row, 0)], -1, 0)
+        if not step:
+            return angle
+        return round(angle / step) * step
 
     def _dragged(self, instant):
         """Where the gear, which has some play, has dragged the head.
 
-        Within a piece of motion, which goes one way, the head stays where it was until the motor is
-        half the play ahead of it.
+        Between two knots the motor goes one way.
         """
+        row = np.searchsorted(self._knots[:, 0], instant, side="right") - 1
+        return self._with_play(self._knots[np.maximum(row, 0), 2], self.motor(instant))
+
+    def _with_play(self, dragged, motor):
+        """The head stays where it was until the motor is half the play ahead of it."""
         half = self.platform.backlash / 2
-        motor = (1 + self.platform.stretch) * self.motor(instant)
-        return np.clip(self._held(instant)[4], motor - half, motor + half)
+        driven = (1 + self.platform.stretch) * motor
+        return np.clip(dragged, driven - half, driven + half)
+
+
+@dataclass(frozen=True)
+class Habits:
+    """How a head behaves at its line.
+
+    Attributes
+    ----------
+    feedback : {'full', 'partial', 'none'}
+        'full': tells its position except during an absolute move, and makes absolute moves.
+        'partial': tells its position at rest only, and ignores absolute moves. 'none': neither;
+        nothing is ever answered.
+    speeds : tuple of float
+        Tilt speed at speed byte 0 and at 0x3F, between which it grows evenly; degrees a second.
+    go_speed : float
+        Of absolute moves, degrees a second.
+    """
+
+    baudrate: int = 2400
+    address: int = 1
+    feedback: str = "full"
+    speeds: tuple = (0.5, 12.0)
+    go_speed: float = 8.0
 
 
 class EmulatedHead(SerialDevice):
@@ -128,126 +240,134 @@ class EmulatedHead(SerialDevice):
 
     Parameters
     ----------
-    head : Head, optional
+    head
         Its motion; the pitch is the elevation, up positive.
-    path : path-like
+    path
         Of the port to appear.
-    baudrate, address : int
-    feedback : {'full', 'partial', 'none'}
-        'full': tells its position except during an absolute move, and makes absolute moves.
-        'partial': tells its position at rest only, and ignores absolute moves. 'none': neither;
-        nothing is ever answered.
-    confirms : bool
-        Answers commands by 4 bytes.
-    echo : bool
-        The two-wire line hands back what the host sends.
-    speeds, go_speed : tuple of float, float
-        Tilt speed at speed byte 0 and at 0x3F, between which it grows evenly; of absolute moves;
-        degrees a second.
-    watchdog_s : float, optional
-        Stops when no frame came for so long.
-    invert : bool
-        'Up' and positive elevation lower the view.
     seed, host
-        As for :class:`EmulatedLms`. `frames` holds host time and sound frames to this address.
+        As for :class:`EmulatedLms`.
+    **habits
+        Of :class:`Habits`.
+
+    Attributes
+    ----------
+    frames : deque of tuple
+        Host time, s, and sound frames to this address.
     """
 
     def __init__(
         self,
-        head=None,
+        head: Head | None = None,
         *,
-        path,
-        baudrate=2400,
-        address=1,
-        feedback="full",
-        confirms=False,
-        echo=False,
-        speeds=(0.5, 12.0),
-        go_speed=8.0,
-        watchdog_s=None,
-        invert=False,
-        seed=0,
-        host=REAL,
+        path: str | os.PathLike,
+        seed: int = 0,
+        host: Host = REAL,
+        **habits,
     ):
         super().__init__(path, host, seed)
         self.head = head or Head(seed=seed)
-        self.baudrate = baudrate
-        self.address = address
-        self.feedback = feedback
-        self.confirms = confirms and feedback != "none"
-        self.echo = echo
-        self.speeds = np.radians(speeds)
-        self.go_speed = math.radians(go_speed)
-        self.watchdog_s = watchdog_s
-        self.sign = -1 if invert else 1
-        self.frames = deque(maxlen=10 * KEPT)
+        self.habits = Habits(**habits)
+        self.frames: deque = deque(maxlen=10 * KEPT)
         self.absolute_until = -math.inf  # an absolute move is under way
         self._buffer = b""  # bytes of a frame that is not whole
 
-    def pitch(self, instant=None):
-        """True pitch now, or at instants, radians."""
-        return self.head.pitch(self.host.now() if instant is None else instant)
+    @property
+    def baudrate(self) -> int:
+        """Of its line."""
+        return self.habits.baudrate
 
-    def receive(self, data, at):
-        """Bytes of the host; the last of them arrived at an instant."""
-        if self.echo:
-            self.write(data, at)
+    def pitch(self) -> float:
+        """True pitch now, radians."""
+        return float(self.head.pitch(self.host.now()))
+
+    def receive(self, data: bytes, at: float) -> None:
+        """Bytes of the host.
+
+        Parameters
+        ----------
+        data
+            Of any number of frames, whole or not.
+        at
+            Instant of the last of them, s.
+        """
         self.cancel("fragment")
         data = self._buffer + data
         frames, pending = pelco_d.split_frames(data)
         self._buffer = data[pending:]
         for frame in frames:
-            if frame.address == self.address:
+            if frame.address == self.habits.address:
                 self.obey(frame, at)
         if self._buffer:
-            self.at(at + FRAGMENT_S, lambda _: setattr(self, "_buffer", b""), "fragment")
+            self.at(at + FRAGMENT_S, self._forget, "fragment")
 
-    def obey(self, frame, at):
-        """Do what a frame says, and confirm it."""
+    def _forget(self, _):
+        self._buffer = b""
+
+    def obey(self, frame: pelco_d.Frame, at: float) -> None:
+        """Do what a frame says.
+
+        Parameters
+        ----------
+        frame
+            To this address.
+        at
+            Instant of its last byte, s.
+        """
         self.frames.append((self.host.time(), frame))
-        self.cancel("watchdog")
-        if self.watchdog_s:
-            self.at(at + self.watchdog_s, self.stop, "watchdog")
         if frame.command2 in ANSWERS:
-            return self.tell(frame.command2, at)
-        if not frame.command2 & 1:
-            self._turn(frame, at)
+            self.tell(frame.command2, at)
         elif frame.command2 == pelco_d.SET_TILT:
             self._set_tilt(frame.value, at)
-        if self.confirms:
-            checksum = sum(vars(frame).values()) % 256
-            self.reply(bytes([SYNC, self.address, 0, checksum]), at + TURN_AROUND_S)
-        return None
+        elif not frame.command2 & 1:
+            self._turn(frame, at)
 
     def _turn(self, frame, at):
         """Move up or down; without a direction it is a stop, whatever the speeds say."""
-        way = {UP: self.sign, DOWN: -self.sign}.get(frame.command2 & (UP | DOWN))
-        if way is None:
-            return self.stop(at)
+        goal = {UP: math.tau, DOWN: -math.tau}.get(frame.command2 & (UP | DOWN))
+        if goal is None:
+            self.stop(at)
+            return
         self.absolute_until = -math.inf
-        share = min(frame.data2, FASTEST) / FASTEST
-        return self.head.move(at, way * math.tau, self.speeds[0] + np.ptp(self.speeds) * share)
+        speed = np.interp(frame.data2, (0, FASTEST), self.habits.speeds)
+        self.head.move(at, goal, math.radians(speed))
 
     def _set_tilt(self, value, at):
         """Move to an elevation; a second such move is lost while the first is under way."""
-        if self.feedback != "full" or value >= pelco_d.TURN or at < self.absolute_until:
+        if self.habits.feedback != "full" or value >= pelco_d.TURN or at < self.absolute_until:
             return
         head = self.head
-        goal = float(np.clip(self.sign * pelco_d.decode_tilt(value), *head.limits))
-        self.absolute_until = at + abs(goal - float(head.motor(at))) / self.go_speed
-        head.go(at, goal, self.go_speed)
+        speed = math.radians(self.habits.go_speed)
+        goal = float(np.clip(pelco_d.decode_tilt(value), *head.limits))
+        self.absolute_until = at + abs(goal - float(head.motor(at))) / speed
+        head.go(at, goal, speed)
 
-    def stop(self, at):
-        """Stop the motor."""
+    def stop(self, at: float) -> None:
+        """Stop the motor.
+
+        Parameters
+        ----------
+        at
+            Instant of the command, s.
+        """
         self.absolute_until = -math.inf
         self.head.stop(at)
 
-    def tell(self, opcode, at):
-        """Answer a query, unless the head is too busy or does not know how."""
-        busy = at < self.absolute_until or (self.feedback == "partial" and self.head.moving(at))
-        if self.feedback == "none" or busy:
+    def tell(self, opcode: int, at: float) -> None:
+        """Answer a query, unless the head is too busy or does not know how.
+
+        Parameters
+        ----------
+        opcode
+            Of the query.
+        at
+            Instant of its last byte, s.
+        """
+        feedback = self.habits.feedback
+        busy = at < self.absolute_until or (feedback == "partial" and self.head.moving(at))
+        if feedback == "none" or busy:
             return
         value = 0
         if opcode == QUERY_TILT:
-            value = pelco_d.encode_tilt(self.sign * self.head.measured(at))
-        self.reply(encode_extended(self.address, ANSWERS[opcode], value), at + TURN_AROUND_S)
+            value = pelco_d.encode_tilt(self.head.measured(at))
+        reply = encode_extended(self.habits.address, ANSWERS[opcode], value)
+        self.reply(reply, at + TURN_AROUND_S)

@@ -13,33 +13,38 @@ import select
 import termios
 import threading
 import tty
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from lrfcal_lib.drivers.port import REAL
+from lrfcal_lib.drivers.port import REAL, Host
 
-# code of a rate in termios -> baud
 NAMES = [name for name in dir(termios) if name[0] == "B" and name[1:].isdigit()]
-RATES = {getattr(termios, name): int(name[1:]) for name in NAMES}
+RATES = {getattr(termios, name): int(name[1:]) for name in NAMES}  # code in termios -> baud
 CHUNK_S = 0.005  # bytes that leave within this time are written at once
 LOOK_S = 0.02  # how often to see whether somebody opened the port
+END_S = 5  # longest wait for the end of the thread
 SOON = 1e-9  # s; so far ahead counts as now, whatever the rounding
+NONE = -1  # file of a terminal that is not plugged in
 SENDING = "sending"  # tag of what is planned for the bytes on their way out
 
 
-class SerialDevice:
+class SerialDevice(ABC):
     """What all devices on a line have in common; a context manager, or `start` and `close`.
 
-    A subclass has ``baudrate`` and ``receive(data, at)``. Instants are ``now()`` of the host that
-    it lives on.
+    Instants are ``now()`` of the host that it lives on, s.
 
     Parameters
     ----------
-    path : path-like
+    path
         Where the port appears, a symbolic link that stays the same when the port comes back.
-    host : Host
-    seed : int
+    host
+        Whose time the device lives in.
+    seed
+        Of noise on the line.
 
     Attributes
     ----------
@@ -47,51 +52,94 @@ class SerialDevice:
         What ended the device by itself.
     """
 
-    def __init__(self, path, host, seed=0):
+    def __init__(self, path: str | os.PathLike, host: Host, seed: int = 0):
         self.path = str(path)
         self.host = host
-        self.error = None
+        self.error: Exception | None = None
         self.port = getattr(host, "terminal", Terminal)(self)  # a test's is in memory
         self.busy_until = 0.0  # of the line to the host
         self._heard = 0.0  # the last byte from the host
         self._noise = np.random.default_rng([seed, 4])
-        self._agenda = []  # heap of instant, order, action, tag
+        self._agenda: list = []  # heap of instant, order, action, tag
         self._order = itertools.count()
 
     @property
-    def byte_s(self):
+    @abstractmethod
+    def baudrate(self) -> int:
+        """Of the device."""
+
+    @abstractmethod
+    def receive(self, data: bytes, at: float) -> None:
+        """Take bytes of the host.
+
+        Parameters
+        ----------
+        data
+            As they arrived.
+        at
+            Instant of the last of them, s.
+        """
+
+    @property
+    def byte_s(self) -> float:
         """Seconds a byte takes."""
         return 10 / self.baudrate
 
     def start(self):
-        """Let the port appear."""
+        """Let the port appear; the device."""
         self.port.plug()
         self.port.start()
         return self
 
-    def close(self, *_):
+    def close(self, *_) -> None:
         """Remove the port."""
         self.port.end()
 
     __enter__ = start
     __exit__ = close
 
-    def at(self, instant, action, tag=None):
-        """Call ``action(instant)`` when its time has come."""
+    def at(self, instant: float, action: Callable[[float], None], tag: str | None = None) -> None:
+        """Plan something.
+
+        Parameters
+        ----------
+        instant
+            When, s.
+        action
+            ``action(instant)`` is called then.
+        tag
+            To cancel it by.
+        """
         heapq.heappush(self._agenda, (instant, next(self._order), action, tag))
 
-    def cancel(self, *tags):
-        """Forget what was planned under tags."""
+    def cancel(self, *tags: str) -> None:
+        """Forget what was planned.
+
+        Parameters
+        ----------
+        *tags
+            Of the plans.
+        """
         self._agenda = [item for item in self._agenda if item[3] not in tags]
         heapq.heapify(self._agenda)
 
-    def abort(self):
+    def abort(self) -> None:
         """Stop sending at once, in the middle of a reply if need be."""
         self.cancel(SENDING)
         self.busy_until = 0.0
 
-    def write(self, data, at, then=None):
-        """Send bytes after those given before; ``then(instant)`` is called when the last is out."""
+    def write(self, data: bytes, at: float, then: Callable[[float], None] | None = None) -> None:
+        """Send bytes after those given before.
+
+        Parameters
+        ----------
+        data
+            To be sent.
+        at
+            Instant from which they may leave, s.
+        then
+            ``then(instant)`` is called when the last is out.
+        """
         byte_s = self.byte_s
         begin = max(at, self.busy_until)
         self.busy_until = begin + len(data) * byte_s
@@ -99,78 +147,94 @@ class SerialDevice:
         for first in range(0, len(data), at_once):
             chunk = data[first : first + at_once]
             out = begin + (first + len(chunk)) * byte_s
-            self.at(out, lambda _, chunk=chunk: self._put(chunk), SENDING)
+            self.at(out, partial(self._put, chunk), SENDING)
         if then is not None:
             self.at(self.busy_until, then, SENDING)
+
+    def _put(self, data, _):
+        if self.port.open:
+            self.port.put(self._through(data, self.baudrate, self.port.rate))
 
     reply = write
 
     # ------------------------------------------------------------------------------- for the port
 
-    def due(self):
-        """When something is to be done."""
-        return max(self.host.now(), self._agenda[0][0]) if self._agenda else math.inf
+    def due(self) -> float:
+        """When something is to be done, s."""
+        if not self._agenda:
+            return math.inf
+        return max(self.host.now(), self._agenda[0][0])
 
-    def advance(self):
+    def advance(self) -> None:
         """Do all that is due by now."""
         while self._agenda and self._agenda[0][0] <= self.host.now() + SOON:
             instant, _, action, _ = heapq.heappop(self._agenda)
             action(instant)
 
-    def hear(self, data):
-        """Bytes that the host sends."""
-        data = self.through(data, self.port.rate, self.baudrate)
+    def hear(self, data: bytes) -> None:
+        """Take bytes that the host sends.
+
+        Parameters
+        ----------
+        data
+            As they left it.
+        """
+        data = self._through(data, self.port.rate, self.baudrate)
         self._heard = max(self._heard, self.host.now()) + len(data) * self.byte_s
         if data:
             self.receive(data, self._heard)
 
-    def through(self, data, sent, read):
-        """Bytes after the line.
-
-        As much noise as fits into their time where its ends are set to different rates.
+    def _through(self, data, sent, read):
+        """Bytes at the other end of the line; where its ends are set to different rates as much
+        noise as fits into their time.
         """
         if sent == read:
             return data
-        return self._noise.bytes(math.ceil(len(data) * read / sent) if sent else 0)
-
-    def _put(self, data):
-        if self.port.open:
-            self.port.put(self.through(data, self.baudrate, self.port.rate))
+        if not sent:
+            return b""
+        return self._noise.bytes(math.ceil(len(data) * read / sent))
 
 
 class Terminal(threading.Thread):
     """A pseudo-terminal, and the thread that serves it.
 
     It sleeps until bytes come, something is due, or LOOK_S.
+
+    Parameters
+    ----------
+    device : SerialDevice
     """
 
-    def __init__(self, device):
+    def __init__(self, device: SerialDevice):
         super().__init__(name=f"emulated {Path(device.path).name}", daemon=True)
         self.open = False
         self._device = device
         self._quit = False
-        self._master = None
+        self._master = NONE
 
     @property
-    def there(self):
-        return self._master is not None
+    def there(self) -> bool:
+        """Whether the port is plugged in."""
+        return self._master != NONE
 
     @property
-    def rate(self):
+    def rate(self) -> int:
+        """Of the host's end, bits a second."""
         return RATES.get(termios.tcgetattr(self._master)[5], 0)
 
-    def end(self):
+    def end(self) -> None:
         """Take the port away and end the thread."""
         self._quit = True
         if self.is_alive():
-            self.join(5)
+            self.join(END_S)
 
-    def run(self):
+    def run(self) -> None:
         """Serve the port until it is closed."""
         try:
             while not self._quit:
-                wait = max(0.0, min(self._device.due() - REAL.now(), LOOK_S))
-                select.select([self._master] if self.open else [], [], [], wait)
+                wait = min(self._device.due() - REAL.now(), LOOK_S)
+                listened = [self._master] if self.open else []
+                select.select(listened, [], [], max(0.0, wait))
                 if self.there:
                     self._listen()
                 self._device.advance()
@@ -191,15 +255,20 @@ class Terminal(threading.Thread):
         # a port forgets what nobody read when it is closed
         if self.open and event & select.POLLHUP:
             with contextlib.suppress(OSError, termios.error):
-                slave = os.open(
-                    os.readlink(self._device.path), os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK
-                )
+                near = os.readlink(self._device.path)
+                slave = os.open(near, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
                 termios.tcflush(slave, termios.TCIFLUSH)
                 os.close(slave)
         self.open = not event & select.POLLHUP
 
-    def put(self, data):
-        """Send bytes; what the buffer cannot hold is lost."""
+    def put(self, data: bytes) -> None:
+        """Send bytes; what the buffer cannot hold is lost.
+
+        Parameters
+        ----------
+        data
+            For the host.
+        """
         try:
             os.write(self._master, data)
         except BlockingIOError:
@@ -207,7 +276,7 @@ class Terminal(threading.Thread):
         except OSError:  # closed at this moment
             self.open = False
 
-    def plug(self):
+    def plug(self) -> None:
         """Make the pseudo-terminal and let its path point to it."""
         self._master, slave = os.openpty()
         tty.setraw(slave)
@@ -220,10 +289,10 @@ class Terminal(threading.Thread):
         os.close(slave)
         self.open = False
 
-    def unplug(self):
+    def unplug(self) -> None:
         """Take the pseudo-terminal away; whoever holds it gets an error."""
         if self.there:
             Path(self._device.path).unlink(missing_ok=True)
             os.close(self._master)
-            self._master = None
+            self._master = NONE
             self.open = False

@@ -1,25 +1,24 @@
-"""A whole emulated rig: its devices in one world, rigs for practice, ``python -m lrfcal_lib
-emulate``.
-"""
+"""A whole emulated rig: its devices in one world, and ``python -m lrfcal_lib emulate``."""
 
 import contextlib
 import json
-import math
 import os
 import signal
 import tempfile
 import threading
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from lrfcal_lib.drivers.port import REAL
+from lrfcal_lib.drivers.lms2xx_link import FASTEST
+from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.head import EmulatedHead
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
 from lrfcal_lib.session import stated
-from lrfcal_lib.simulate.rig import PLACES, load_setup, pairs, random
+from lrfcal_lib.simulate.rig import PLACES, Placement, Setup, load_setup, pairs, random
 
 # that says nothing about an emulated camera: it sends no image while the head moves
 SILENCE_S = 600.0
@@ -30,21 +29,23 @@ MARGIN = np.radians(1.0)  # of a sweep beyond the board
 
 
 class EmulatedRig:
-    """The devices of a simulated setup, as files and addresses that any program can open; a context
-    manager.
+    """The devices of a simulated setup, as files and addresses that any program can open.
+
+    A context manager.
 
     Parameters
     ----------
-    setup : Setup
-    seed : int
+    setup
+        What to emulate.
+    seed
         Of noise; the world follows from the setup's own seed.
-    placements : sequence of Placement, optional
+    placements
         Where the board can be put, see :class:`EmulatedWorld`.
-    head_options : dict
+    head_options
         Of :class:`EmulatedHead`.
     rest_s
         Of :class:`CameraServer`.
-    host : Host
+    host
         Whose time the devices live in, and whose ``terminal(device)`` their ports are.
 
     Examples
@@ -55,13 +56,13 @@ class EmulatedRig:
 
     def __init__(
         self,
-        setup,
+        setup: Setup,
         *,
-        seed=0,
-        placements=None,
-        head_options=None,
-        rest_s=0.5,
-        host=REAL,
+        seed: int = 0,
+        placements: Sequence[Placement] | None = None,
+        head_options: dict | None = None,
+        rest_s: float = 0.5,
+        host: Host = REAL,
     ):
         self.setup = setup
         self.host = host
@@ -69,12 +70,11 @@ class EmulatedRig:
         folder = tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
         self.folder = Path(self._closing.enter_context(folder))
         self.world = EmulatedWorld(setup, host, seed, placements)
-        shared = {"host": host, "seed": seed}
-        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", **shared)
-        self.pan_tilt = EmulatedHead(
-            self.world.head, path=self.folder / "head", **shared, **(head_options or {})
-        )
-        self.scans = self.lrf.scans
+        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host, seed=seed)
+        head = self.world.head
+        options = head_options or {}
+        path = self.folder / "head"
+        self.pan_tilt = EmulatedHead(head, path=path, host=host, seed=seed, **options)
         self.camera_server = CameraServer(self.world, seed=seed, rest_s=rest_s)
         self.camera_urls = {
             name: f"{self.camera_server.url}/{name}.mjpg" for name in self.camera_server.cameras
@@ -84,65 +84,49 @@ class EmulatedRig:
             self._closing.callback(part.close)
 
     def start(self):
-        """Let all devices appear."""
+        """Let all devices appear; the rig."""
         for part in self._parts:
             part.start()
         return self
 
-    def close(self, *_):
+    def close(self, *_) -> None:
         """Remove all devices, and their folder."""
         self._closing.close()
 
     __enter__ = start
     __exit__ = close
 
-    def error(self):
+    def error(self) -> Exception | None:
         """What ended a device by itself, None while all live."""
         return self.lrf.error or self.pan_tilt.error
 
-    def plan(self):
-        """What a recording of this rig can do: the sweep that holds all placements, and each of
-        them.
-        """
+    def plan(self) -> dict:
+        """What a recording of this rig can do: its placements, each with its sweep."""
         setup = self.setup
-        each = []
-        for p in self.world.placements.values():
-            board = p.T_platform_board is not None
-            step = math.degrees(
-                setup.step if board or not setup.room_sweep else setup.room_sweep[2]
-            )
-            sweep, images = (
-                np.degrees(angles).round(4).tolist() for angles in (p.sweep, p.image_pitch)
-            )
-            each.append(
+        placements = []
+        for placement in self.world.placements.values():
+            board = placement.T_platform_board is not None
+            step = setup.step
+            if not board and setup.room_sweep:
+                step = setup.room_sweep[2]
+            sweep = (*placement.sweep, step)
+            placements.append(
                 {
-                    "number": p.number,
+                    "number": placement.number,
                     "board": board,
-                    "pitch_deg": [*sweep, step],
-                    "image_pitch_deg": images,
+                    "pitch_deg": np.degrees(sweep).round(4).tolist(),
+                    "image_pitch_deg": np.degrees(placement.image_pitch).round(4).tolist(),
                 }
             )
-        boards = [p for p in each if p["board"]] or each
-        ends = np.array([p["pitch_deg"][:2] for p in boards])
-        return {
-            "mode": "stop-and-go",
-            "scans_per_stop": 1,
-            "intrinsics_images": setup.intrinsics_views,
-            "pitch_deg": [math.floor(ends.min()), math.ceil(ends.max()), math.degrees(setup.step)],
-            "image_pitch_deg": np.unique(
-                np.round(np.concatenate([p["image_pitch_deg"] for p in boards]))
-            ).tolist(),
-            "placements": each,
-        }
+        return {"intrinsics_images": setup.intrinsics_views, "placements": placements}
 
-    def rig_file(self):
+    def rig_file(self) -> dict:
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices,
         plan.
         """
-        rig = self.setup.rig
         setup = self.setup
-        head = self.pan_tilt
-        cameras = {c.name: c for c in rig.camera_infos()}
+        rig = setup.rig
+        cameras = {camera.name: camera for camera in rig.camera_infos()}
         return {
             "schema": stated.SCHEMA,
             "name": f"{setup.name}_emulated",
@@ -155,43 +139,45 @@ class EmulatedRig:
                 "platform": {"T_head_lrf": stated.transform_to_json(rig.T_head_lrf_stated)},
                 "cameras": {name: stated.camera_to_json(c) for name, c in cameras.items()},
             },
-            "devices": {
-                "lrf": {
-                    "port": self.lrf.path,
-                    "baudrate": 500000,
-                    "interlaced": False,
-                    "unit": rig.beam.unit_name,
-                    "variant": [rig.beam.field_of_view, rig.beam.resolution / 100],
-                },
-                "head": {
-                    "port": head.path,
-                    "address": head.address,
-                    "baudrate": head.baudrate,
-                    "feedback": head.feedback != "none",
-                    "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist(),
-                },
-                "cameras": {
-                    name: {
-                        "source": self.camera_urls[name],
-                        "silence_s": SILENCE_S,
-                        "size": [c.width, c.height],
-                    }
-                    for name, c in cameras.items()
-                },
-                "control": self.camera_server.control,
-            },
+            "devices": self._devices(cameras),
             "plan": self.plan(),
         }
 
+    def _devices(self, cameras):
+        """Where the devices are, and how they are to be set."""
+        rig = self.setup.rig
+        head = self.pan_tilt
+        return {
+            "lrf": {
+                "port": self.lrf.path,
+                "baudrate": FASTEST,
+                "interlaced": False,
+                "unit": rig.beam.unit_name,
+                "variant": [rig.beam.field_of_view, rig.beam.resolution / 100],
+            },
+            "head": {
+                "port": head.path,
+                "address": head.habits.address,
+                "baudrate": head.baudrate,
+                "feedback": head.habits.feedback != "none",
+                "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist(),
+            },
+            "cameras": {
+                name: {
+                    "source": self.camera_urls[name],
+                    "silence_s": SILENCE_S,
+                    "size": [camera.width, camera.height],
+                }
+                for name, camera in cameras.items()
+            },
+            "control": self.camera_server.control,
+        }
 
-def practice_setup():
-    """A rig and placements that are recorded in a minute: coarse sweeps, small images, intrinsics
-    stated.
 
-    Returns
-    -------
-    setup : Setup
-    placements : list of Placement
+def practice_setup() -> tuple[Setup, list[Placement]]:
+    """A rig and placements that are recorded in a minute.
+
+    Its sweeps are coarse, its images small, its intrinsics stated.
     """
     quick = load_setup("sim_quick")
     rig = scaled(quick.rig, SMALL)
@@ -211,28 +197,49 @@ def practice_setup():
         room_sweep=(),
         room_images=(),
     )
-    found = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES), MARGIN)
-    return setup, [replace(p, image_pitch=(p.image_pitch[0], p.image_pitch[-1])) for p in found]
+    placements = []
+    for placement in pairs(rig, setup.pairs, setup.distances, random(setup, PLACES), MARGIN):
+        images = placement.image_pitch
+        placements.append(replace(placement, image_pitch=(images[0], images[-1])))
+    return setup, placements
 
 
-def emulated(name):
-    """An emulated rig ('practice', or a set-up), not started yet, and what makes its rig file
-    (parsed) once it is.
+def emulated(name: str) -> tuple[EmulatedRig, Callable[[], dict]]:
+    """An emulated rig, not started yet.
 
-    ValueError for another name.
+    Parameters
+    ----------
+    name
+        'practice', or a set-up.
+
+    Returns
+    -------
+    rig : EmulatedRig
+    rig_file : callable
+        Makes its rig file (parsed) once it is started.
+
+    Raises
+    ------
+    ValueError
+        For another name.
     """
     if name != PRACTICE:
         rig = EmulatedRig(load_setup(name))
         return rig, rig.rig_file
     setup, placements = practice_setup()
-    rig = EmulatedRig(
-        setup, placements=placements, head_options={"baudrate": 38400, "go_speed": 60.0}
-    )
+    quick = {"baudrate": 38400, "go_speed": 60.0}
+    rig = EmulatedRig(setup, placements=placements, head_options=quick)
     return rig, lambda: quick_file(rig)
 
 
-def quick_file(rig):
-    """The rig file of a rig whose head is quick and told to be, and whose cameras are known."""
+def quick_file(rig: EmulatedRig) -> dict:
+    """The rig file of a rig whose head is quick and told to be, and whose cameras are known.
+
+    Parameters
+    ----------
+    rig
+        Emulated.
+    """
     data = rig.rig_file()
     data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}
     for camera in rig.setup.rig.cameras:
@@ -240,38 +247,72 @@ def quick_file(rig):
     return data
 
 
-def main(name, rig_file=None, *, seed=0, feedback="full"):
-    """Emulate a set-up until Ctrl-C, SIGTERM or SIGHUP; 0, or 1 when a device ended by itself.
+def main(
+    name: str, rig_file: str | os.PathLike | None = None, *, seed: int = 0, feedback: str = "full"
+) -> int:
+    """Emulate a set-up until Ctrl-C, SIGTERM or SIGHUP.
 
-    Its rig file is written where it is asked for, see :func:`written_rig_file`. ValueError for a
-    set-up that there is not, and for a rig file that cannot be written.
+    Parameters
+    ----------
+    name
+        Of the set-up.
+    rig_file
+        Where its rig file is written, see :func:`written_rig_file`.
+    seed
+        Of noise.
+    feedback
+        Of the head, see :class:`Habits`.
+
+    Returns
+    -------
+    int
+        0, or 1 when a device ended by itself.
+
+    Raises
+    ------
+    ValueError
+        For a set-up that there is not, and for a rig file that cannot be written.
     """
     quit_ = threading.Event()
     with contextlib.ExitStack() as stack:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            # as nohup leaves it
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                stack.callback(signal.signal, number, signal.signal(number, lambda *_: quit_.set()))
-        rig = stack.enter_context(
-            EmulatedRig(load_setup(name), seed=seed, head_options={"feedback": feedback})
-        )
+            if number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN:
+                continue  # as nohup leaves it
+            before = signal.signal(number, lambda *_: quit_.set())
+            stack.callback(signal.signal, number, before)
+        rig = EmulatedRig(load_setup(name), seed=seed, head_options={"feedback": feedback})
+        stack.enter_context(rig)
         if rig_file is not None:
             stack.enter_context(written_rig_file(rig, Path(rig_file)))
         print(summary(rig, rig_file), flush=True)
         while not quit_.wait(LOOK_S) and rig.error() is None:
             pass
         error = rig.error()
-    print(f"a device ended: {error!r}" if error else "the emulated rig is gone", flush=True)
-    return 1 if error else 0
+    if error is not None:
+        print(f"a device ended: {error!r}", flush=True)
+        return 1
+    print("the emulated rig is gone", flush=True)
+    return 0
 
 
 @contextlib.contextmanager
-def written_rig_file(rig, file):
-    """The rig file of a running rig, for as long as the rig lives; a file that was there before is
-    never touched.
+def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
+    """The rig file of a running rig, for as long as the rig lives.
 
-    It is removed at the end, unless somebody changed or replaced it. ValueError where it cannot be
-    written.
+    It is removed at the end, unless somebody changed or replaced it. A file that was there before
+    is never touched.
+
+    Parameters
+    ----------
+    rig
+        Started.
+    file
+        To be written.
+
+    Raises
+    ------
+    ValueError
+        Where it cannot be written.
     """
     text = json.dumps(rig.rig_file(), indent=1) + "\n"
     try:
@@ -285,7 +326,7 @@ def written_rig_file(rig, file):
     try:
         with stream:
             stream.write(text)
-        ours = file.stat()
+        written = file.stat()
     except OSError as error:
         file.unlink()
         raise ValueError(
@@ -295,21 +336,29 @@ def written_rig_file(rig, file):
         yield
     finally:
         with contextlib.suppress(OSError):  # somebody removed it
-            if os.path.samestat(file.lstat(), ours) and file.read_bytes() == text.encode():
+            if os.path.samestat(file.lstat(), written) and file.read_bytes() == text.encode():
                 file.unlink()
             else:
                 print(f"{file}: was changed, so it stays; its devices are gone", flush=True)
 
 
-def summary(rig, file):
-    """What other programs need to know of an emulated rig, as text."""
+def summary(rig: EmulatedRig, file: str | os.PathLike | None) -> str:
+    """What other programs need to know of an emulated rig.
+
+    Parameters
+    ----------
+    rig
+        Started.
+    file
+        Its rig file.
+    """
     head = rig.pan_tilt
     control = rig.camera_server.control
     places = ", ".join(map(str, rig.world.placements))
     lines = [
         f"emulated rig '{rig.setup.name}' ({rig.setup.rig.beam.name}); Ctrl-C ends it",
         f"  lrf      {rig.lrf.path}   {rig.lrf.baudrate} Bd, SICK LMS2xx",
-        f"  head     {head.path}   {head.baudrate} Bd, Pelco-D, address {head.address}",
+        f"  head     {head.path}   {head.baudrate} Bd, Pelco-D, address {head.habits.address}",
         *(f"  {name:8s} {url}" for name, url in rig.camera_urls.items()),
         f"  board    curl -X POST {control}/place/NUMBER puts it at {places}, or none",
     ]

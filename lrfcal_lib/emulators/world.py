@@ -9,25 +9,26 @@ import itertools
 import secrets
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.drivers.port import REAL
+from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.head import Head
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import close_views, world_of
-from lrfcal_lib.simulate.rig import placements_of
+from lrfcal_lib.simulate.rig import Placement, Rig, Setup, placements_of
 from lrfcal_lib.simulate.scene import Imager
 
 STILL = 1e-7  # radians within which a scan at rest is cast once
 LOOK_S = 0.05
 QUALITY = 97  # of JPEG
 FPS = 8.0  # most images a second of a camera
+SERVE_S = 0.2  # between looks whether the server is to end
 
 
 @dataclass(frozen=True)
@@ -44,42 +45,82 @@ class Place:
 class EmulatedWorld:
     """The world of a simulated setup at the present; the source of scans of :class:`EmulatedLms`.
 
-    `placements` are where the board can be put; by default those of the setup.
+    Parameters
+    ----------
+    setup
+        What to emulate.
+    host
+        Whose time the world lives in.
+    seed
+        Of noise.
+    placements
+        Where the board can be put; by default those of the setup.
+
+    Attributes
+    ----------
+    current : tuple
+        Where the board is, a Place, and the world with it.
     """
 
-    @property
-    def place(self):
-        """Where the board is."""
-        return self._scene[0]
-
-    def __init__(self, setup, host=REAL, seed=0, placements=None):
+    def __init__(
+        self,
+        setup: Setup,
+        host: Host = REAL,
+        seed: int = 0,
+        placements: Sequence[Placement] | None = None,
+    ):
         self.setup = setup
         self.host = host
         self.head = Head(setup.rig.platform, seed)
         self.placements = {p.number: p for p in placements or placements_of(setup)}
         self._rng = np.random.default_rng([seed, 3])
         # what a head at rest saw last, and without noise
-        self._still_key = None
-        self._still = None
+        self._still_key: tuple | None = None
+        self._still: tuple = ()
         self.put(None)
 
-    def put(self, number):
-        """Put the board at a placement; None takes it away.
+    @property
+    def place(self) -> Place:
+        """Where the board is."""
+        return self.current[0]
 
-        ValueError for one that the setup does not have.
+    def put(self, number: int | None) -> None:
+        """Put the board at a placement.
+
+        Parameters
+        ----------
+        number
+            Of the placement; None takes the board away.
+
+        Raises
+        ------
+        ValueError
+            For a placement that the setup does not have.
         """
-        if number is not None and number not in self.placements:
-            known = ", ".join(map(str, self.placements))
-            raise ValueError(f"no placement {number}; there are {known}, and none")
-        pose = None if number is None else self.placements[number].T_platform_board
+        pose = None
+        if number is not None:
+            if number not in self.placements:
+                known = ", ".join(map(str, self.placements))
+                raise ValueError(f"no placement {number}; there are {known}, and none")
+            pose = self.placements[number].T_platform_board
         self._set(Place(("placement", number), pose))
 
-    def hold_close(self, camera, view):
-        """Hold the board close to a camera, in one of the views for its intrinsics, from 0.
+    def hold_close(self, camera: str, view: int) -> None:
+        """Hold the board close to a camera, in one of the views for its intrinsics.
 
-        ValueError for a camera or view that there is not.
+        Parameters
+        ----------
+        camera
+            Its name.
+        view
+            Number of the view, from 0.
+
+        Raises
+        ------
+        ValueError
+            For a camera or view that there is not.
         """
-        names = [c.name for c in self.setup.rig.cameras]
+        names = [camera.name for camera in self.setup.rig.cameras]
         count = self.setup.intrinsics_views
         if camera not in names or not 0 <= view < count:
             known = f"0 to {count - 1} of {', '.join(names)}"
@@ -89,19 +130,21 @@ class EmulatedWorld:
 
     def _set(self, place):
         # in one go, as a scan may be cast meanwhile
-        self._scene = place, world_of(self.setup, place.T_platform_board, stand=place.stand)
+        self.current = place, world_of(self.setup, place.T_platform_board, stand=place.stand)
 
-    def scan(self, turn, quarters, times):
+    def scan(
+        self, turn: int, quarters: np.ndarray, times: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Readings of a scan.
 
         Parameters
         ----------
-        turn : int
+        turn
             Of the mirror, the scan's first.
-        quarters : ndarray, shape (B,)
-            Bearings, quarters of a degree.
-        times : ndarray, shape (B,)
-            Instants of the beams, seconds of the devices.
+        quarters
+            Bearings (B,), quarters of a degree.
+        times
+            Instants (B,) of the beams, seconds of the devices.
 
         Returns
         -------
@@ -109,10 +152,8 @@ class EmulatedWorld:
             Metres.
         reasons : ndarray, shape (B,)
             Index into `REASONS`, 0 for a range.
-        pitch : ndarray, shape (2,)
-            Of the head at the first beam and the last, radians.
         """
-        place, world = self._scene
+        place, world = self.current
         rig = self.setup.rig
         pitch = np.broadcast_to(self.head.pitch(times), times.shape)
         key = None
@@ -122,12 +163,19 @@ class EmulatedWorld:
             self._still_key = key
             bearings = np.radians(quarters / 4)
             self._still = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
-        ranges, reasons = lrf.measured(rig.beam, self._still, self._rng)
-        return ranges, reasons, pitch[[np.argmin(times), np.argmax(times)]]
+        return lrf.measured(rig.beam, self._still, self._rng)
 
 
-def scaled(rig, width):
-    """The rig with images of another width, the same field of view."""
+def scaled(rig: Rig, width: int) -> Rig:
+    """The rig with smaller images of the same field of view.
+
+    Parameters
+    ----------
+    rig
+        Simulated.
+    width
+        Of the images, pixels.
+    """
     cameras = []
     for camera in rig.cameras:
         m = camera.model
@@ -153,22 +201,23 @@ class CameraServer:
 
     Parameters
     ----------
-    world : EmulatedWorld
-    seed : int
-    rest_s : float
+    world
+        That the cameras show.
+    seed
+        Of noise.
+    rest_s
         Seconds that the head must rest before an image is drawn. Nobody tells a camera whether its
         image is wanted; most stops of a sweep need none and are shorter.
     """
 
-    def __init__(self, world, *, seed=0, rest_s=0.5):
+    def __init__(self, world: EmulatedWorld, *, seed: int = 0, rest_s: float = 0.5):
         self.world = world
         self.seed = seed
         self.rest_s = rest_s
         self.quit = threading.Event()
         self.cameras = {camera.name: camera for camera in world.setup.rig.cameras}
-        self._imager = lru_cache(self._imager_of)
-        self._scene = lru_cache(2)(self._scene_of)
-        self._images = {}
+        self._imagers: dict[str, Imager] = {}
+        self._images: dict = {}  # what is shown, and a JPEG file, by camera
         self._count = itertools.count()
         self._lock = threading.Lock()
         handler = type("Handler", (_Handler,), {"server_of": self})
@@ -178,17 +227,10 @@ class CameraServer:
         self.token = secrets.token_urlsafe()
         self.control = f"{self.url}/{self.token}"
         serve = self._server.serve_forever
-        self._thread = threading.Thread(target=serve, args=(0.2,), daemon=True)
+        self._thread = threading.Thread(target=serve, args=(SERVE_S,), daemon=True)
         self.start = self._thread.start
 
-    def _imager_of(self, name):
-        camera = self.cameras[name]
-        return Imager(camera.model, camera.exposure)
-
-    def _scene_of(self, place):
-        return world_of(self.world.setup, place.T_platform_board, stand=place.stand)
-
-    def close(self):
+    def close(self) -> None:
         """End the server, started or not, and wait for the end of a drawing."""
         self.quit.set()
         if self._thread.is_alive():
@@ -197,45 +239,52 @@ class CameraServer:
         with self._lock:
             self._images.clear()
 
-    def image(self, name, timeout=1.0):
+    def image(self, name: str, timeout: float = 1.0) -> tuple[tuple, bytes] | tuple[None, None]:
         """The image of the rig as it stands now.
+
+        Parameters
+        ----------
+        name
+            Of the camera.
+        timeout
+            Seconds to wait for a head that rests long enough to draw it.
 
         Returns
         -------
         key : tuple or None
-            What it shows: see `_key`.
+            What it shows: the camera, the place, the pitch. None where the head does not rest.
         data : bytes or None
-            A JPEG file. None both where the head does not rest within the timeout, seconds, long
-            enough to draw it.
+            A JPEG file.
         """
         end = time.monotonic() + timeout
         while not self.quit.is_set() and time.monotonic() < end:
             with self._lock:
-                key = self._key(name)
+                place, scene = self.world.current
+                key = self._key(name, place)
                 if key is not None:
                     if self._images.get(name, (None,))[0] != key:
-                        self._images[name] = key, self._draw(*key, [self.seed, next(self._count)])
-                    if self._key(name) == key:
+                        self._images[name] = key, self._draw(name, scene, key[2])
+                    if self._key(name, self.world.place) == key:
                         return self._images[name]
             self.quit.wait(LOOK_S)
         return None, None
 
-    def _key(self, name):
-        """What the camera shows now: its name, the place, the pitch.
-
-        None while the head moves or hardly rests.
-        """
+    def _key(self, name, place):
+        """What the camera shows now; None while the head moves or hardly rests."""
         head = self.world.head
         now = self.world.host.now()
-        rests = head.settled(now) and head.resting(now)[0] >= self.rest_s + head.platform.settle
-        if not rests or self.quit.is_set():
+        if self.quit.is_set() or not head.settled(now, self.rest_s):
             return None
-        return name, self.world.place, round(float(head.pitch(now)), 7)
+        return name, place, round(float(head.pitch(now)), 7)
 
-    def _draw(self, name, place, pitch, seed):
+    def _draw(self, name, scene, pitch):
         """JPEG of what a camera sees."""
-        pose = self.world.setup.rig.camera_pose(self.cameras[name], pitch)
-        image = self._imager(name).render(self._scene(place), pose, np.random.default_rng(seed))
+        camera = self.cameras[name]
+        if name not in self._imagers:
+            self._imagers[name] = Imager(camera.model, camera.exposure)
+        rng = np.random.default_rng([self.seed, next(self._count)])
+        pose = self.world.setup.rig.camera_pose(camera, pitch)
+        image = self._imagers[name].render(scene, pose, rng)
         _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         return encoded.tobytes()
 

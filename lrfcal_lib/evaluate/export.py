@@ -2,23 +2,23 @@
 
 import hashlib
 import json
-import operator
 import os
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.cloud import write_ply
+from lrfcal_lib.calibrate.cloud import COLUMNS, point_type, write_ply
 from lrfcal_lib.calibrate.clouds import cloud_blocks
-from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
+from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
 from lrfcal_lib.fit.residuals import edge_residuals_px
-from lrfcal_lib.judge.verdict import NO, judge
-from lrfcal_lib.session.read import open_session
+from lrfcal_lib.judge.verdict import Verdict, judge
+from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import FILES, opened
 from lrfcal_lib.session.workers import spread
 from lrfcal_lib.session.write import whole
@@ -30,29 +30,47 @@ AXIS_PARAMETERS = [
     "offset_in_scan_plane_m",
     "offset_across_scan_plane_m",
 ]
-UNTRUSTED = 3  # exit status of a calibration whose verdict is 'no'
-SCENES_ONLY = (
-    "all placements show scenes, and a calibration needs the board: "
-    "record three or more placements of the board with the same rig"
-)
+LENS_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # as OpenCV calls them
+# of a PCD file, as its readers call them
+PCD_COLUMNS = COLUMNS | {
+    "normals": ("<f4", "normal_x normal_y normal_z"),
+    "colors": ("<u4", "rgb"),
+}
+RGB = np.array([[1 << 16], [1 << 8], [1]], "<u4")  # red, green and blue in one number
+POINTS_AT_ONCE = 1_000_000  # that are copied, 60 MB
 FRAMES = (
     "destination first: p_camera = T_camera_source p_source; metres, radians; "
     "covariances of [w, v]: R <- exp(w) R, t <- t + v"
 )
 
 
-def calibration_record(calibration, method, judged=None):
-    """Everything that a Calibration says about the results of a method, ready for JSON.
+def calibration_record(
+    calibration: Calibration, method: str, judged: Verdict | None = None
+) -> dict:
+    """Everything that a calibration says about the results of a method, ready for JSON.
 
     Schema, library version, verdict, session with the SHA-256 of its files, frames and units,
     platform, and for each camera its pose, intrinsics, covariance, and residual statistics. 'joint'
     brings its own platform, range offset and pitch terms, and what it says about the sensor.
-    `judged` is the Verdict on these results, where ``judge`` was asked already.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    method : str
+    judged : Verdict, optional
+        On these results, where ``judge`` was asked already.
+
+    Returns
+    -------
+    dict
     """
     session = calibration.prepared.session
-    platform = calibration.platform
-    axis = platform.axis_with(method)
-    every = calibration.solutions.items()
+    axis = calibration.rig(method).axis
+    judged = judged or judge(calibration, method, suggest=False)
+    cameras = {}
+    for (camera, name), solution in calibration.solutions.items():
+        if name == method:
+            cameras[camera] = _camera(calibration, camera, method, solution)
     record = {
         "schema": SCHEMA,
         "lrfcal": __version__,
@@ -60,33 +78,30 @@ def calibration_record(calibration, method, judged=None):
         "inputs_sha256": file_hashes(session),
         "conventions": FRAMES,
         "method": method,
-        "verdict": (judged or judge(calibration, method, suggest=False)).record(),
+        "verdict": judged.record(),
         "platform": {
-            **_transform(platform.transform(axis)),
+            **_transform(axis.T_head_lrf),
             "maps": "lrf to head",
-            "axis_covariance": platform.axes[axis].covariance.tolist(),
+            "axis_covariance": axis.covariance.tolist(),
             "axis_covariance_of": AXIS_PARAMETERS,
         },
-        "cameras": {
-            c: _camera(calibration, c, method, found)
-            for (c, name), found in every
-            if name == method
-        },
+        "cameras": cameras,
     }
-    # what it says about range finder and pitch, and what it left out in words
-    if method == "joint":
-        joint = calibration.joint.solution
-        sigma = calibration.joint.solution.sigma
-        sensor = {
-            name: {"value": joint.sensor[name], "sigma": sigma[name]}
-            for name in joint.sensor
-            if name in sigma
-        }
-        record["sensor"] = sensor | {
-            "noise": joint.noise,
-            "excluded": [str(problem) for problem in joint.excluded],
-        }
+    if calibration.joint is not None and method == "joint":
+        record["sensor"] = _sensor(calibration.joint.solution)
     return record
+
+
+def _sensor(solution):
+    """What a JointSolution says about range finder and pitch, and what it left out in words."""
+    sensor = {}
+    sigma = solution.sigma
+    for name, value in solution.sensor.items():
+        if name in sigma:
+            sensor[name] = {"value": value, "sigma": sigma[name]}
+    sensor["noise"] = solution.noise
+    sensor["excluded"] = [str(problem) for problem in solution.excluded]
+    return sensor
 
 
 def _camera(calibration, camera, method, solution):
@@ -94,23 +109,16 @@ def _camera(calibration, camera, method, solution):
 
     Of the joint estimate without the edge bias, from its own boards.
     """
-    obs = calibration.observations[camera, "joint" if method == "joint" else "half_step"]
+    variant = "joint" if method == "joint" else "half_step"
+    obs = calibration.observations[camera, variant]
     edge = edge_residuals_px(obs, solution.transform, solution.model)
-    model = calibration.prepared.models[camera]
-    misfit = {
-        "edge_rms_px": rms(edge),
-        "plane_rms_mm": 1000 * rms(plane_residuals_of(obs, solution)),
-    }
     if method == "joint":
         misfit = joint_fit(calibration.joint, [camera])
-    model = solution.model or model
-    lens = dict(
-        zip(
-            ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
-            model.parameters.tolist(),
-            strict=True,
-        )
-    )
+    else:
+        plane = plane_residuals_of(obs, solution)
+        misfit = {"edge_rms_px": rms(edge), "plane_rms_mm": 1000 * rms(plane)}
+    model = solution.model or calibration.prepared.models[camera]
+    lens = dict(zip(LENS_PARAMETERS, model.parameters.tolist(), strict=True))
     return {
         "maps": f"{obs.source} to {obs.camera}",
         **_transform(solution.transform),
@@ -126,29 +134,29 @@ def _camera(calibration, camera, method, solution):
 
 
 def _transform(transform):
-    pose = {
+    return {
+        "matrix": transform.as_matrix().tolist(),
         "rotvec_rad": transform.rotation.as_rotvec().tolist(),
         "translation_m": transform.translation.tolist(),
     }
-    return {"matrix": transform.as_matrix().tolist(), **pose}
 
 
-def file_hashes(session):
+def file_hashes(session: Session) -> dict[str, str]:
     """SHA-256 of every file that a session was read from, by its path within it.
 
     Of no other that lies there.
     """
-    files = {session.path / name for name in FILES if os.path.lexists(session.path / name)}
+    stated = {session.path / name for name in FILES if os.path.lexists(session.path / name)}
+    images = {record.file for record in session.image_records}
     hashes = {}
-    for file in sorted(files | {record.file for record in session.image_records}):
+    for file in sorted(stated | images):
         with opened(file, session.path) as stream:
-            hashes[file.relative_to(session.path).as_posix()] = hashlib.file_digest(
-                stream, "sha256"
-            ).hexdigest()
+            digest = hashlib.file_digest(stream, "sha256")
+        hashes[file.relative_to(session.path).as_posix()] = digest.hexdigest()
     return hashes
 
 
-def write_calibration(path, record):
+def write_calibration(path: str | Path, record: dict) -> None:
     """Write a :func:`calibration_record` as JSON, NaN as null.
 
     ValueError if it cannot be written.
@@ -158,7 +166,7 @@ def write_calibration(path, record):
         draft.write_text(json.dumps(plain, indent=1) + "\n")
 
 
-def write_clouds(folder, calibration, method):
+def write_clouds(folder: str | Path, calibration: Calibration, method: str) -> list[Path]:
     """Write ``cloud.ply`` (the boards) and, where there are scenes, ``scene.ply`` and
     ``scene.pcd``.
 
@@ -183,23 +191,26 @@ def write_clouds(folder, calibration, method):
         For a session that the calibration cannot colour, or a file that cannot be written. Every
         file is whole, or as it was before.
     """
-    write = partial(_write_cloud, Path(folder), calibration, method)
-    written = spread(write, _kinds_of_clouds(calibration.prepared))
+    written = spread(lambda task: task(), cloud_tasks(folder, calibration, method))
     return [file for files in reversed(written) for file in files]
 
 
-def _kinds_of_clouds(prepared):
-    """The clouds that can be had, the longest work first: True of the scenes, False of the
-    boards.
+def cloud_tasks(
+    folder: str | Path, calibration: Calibration, method: str
+) -> list[Callable[[], list[Path]]]:
+    """The clouds that can be had, see :func:`write_clouds`: calls that write one each and return
+    its files, the longest work first.
     """
-    kinds = []
+    prepared = calibration.prepared
     session = prepared.session
+    write = partial(_write_cloud, Path(folder), calibration, method)
+    tasks: list[Callable[[], list[Path]]] = []
     if session.scene_placements:
-        kinds.append(True)
+        tasks.append(partial(write, scene=True))
     of_another_session = not prepared.scans.keys() <= set(session.placements)
-    if prepared.scans and not (kinds and of_another_session):
-        kinds.append(False)
-    return kinds
+    if prepared.scans and not (tasks and of_another_session):
+        tasks.append(partial(write, scene=False))
+    return tasks
 
 
 def _write_cloud(folder, calibration, method, scene):
@@ -218,78 +229,41 @@ def _write_cloud(folder, calibration, method, scene):
 
 
 def write_pcd(path, ply):
-    """Write what a PLY of :func:`write_ply` holds as PCD.
+    """Write what a PLY of :func:`write_ply` holds as binary PCD.
 
     ValueError if the file cannot be written.
     """
-    import open3d as o3d
-
-    cloud = o3d.t.io.read_point_cloud(str(ply))
-    with whole(path) as draft:
-        if not o3d.t.io.write_point_cloud(str(draft), cloud):
-            raise OSError("is the disk full?")
-
-
-def calibrate_session(path, out=None):
-    """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and
-    clouds.
-
-    Parameters
-    ----------
-    path : path-like
-        Of the session.
-    out : path-like, optional
-        Folder of the files; ``reports/<name>`` under the current folder by default.
-
-    Returns
-    -------
-    int
-        0, or 3 where the verdict is 'no' (also when nothing could be calibrated, nor is written).
-
-    Raises
-    ------
-    ValueError
-        For a session that cannot be opened, or a file that cannot be written, which stays as it
-        was.
-    """
-    session = open_session(path)
-    if not session.board_placements:
-        print(f"{path}: {SCENES_ONLY}")
-        return UNTRUSTED
-    calibration = calibrate(session)
-    _print_poses(calibration)
-    method = handed_over(calibration)
-    if method is None:
-        judged = judge(calibration)
-        print(*judged.sentences(), sep="\n")
-        return UNTRUSTED
-    folder = Path(out or Path("reports") / Path(path).resolve().name)
-    kinds = _kinds_of_clouds(calibration.prepared)
-    clouds = [partial(_write_cloud, folder, calibration, method, kind) for kind in kinds]
-    tasks = [*clouds, partial(_judged, calibration, method)]
-    *written, (judged, record) = spread(operator.call, tasks)
-    file = folder / "calibration.json"
-    write_calibration(file, record)  # last: where it stands, the clouds do
-    print(*judged.sentences(), sep="\n")
-    names = [str(name) for files in reversed(written) for name in files]
-    print("written:", ", ".join([*names, str(file)]))
-    return UNTRUSTED if judged.answer == NO else 0
+    stored = point_type(COLUMNS)
+    with open(ply, "rb") as source, whole(path) as draft, open(draft, "wb") as file:
+        while source.readline() != b"end_header\n":
+            pass
+        count = (os.path.getsize(ply) - source.tell()) // stored.itemsize
+        file.write(_pcd_header(count).encode())
+        for start in range(0, count, POINTS_AT_ONCE):
+            points = np.fromfile(source, stored, min(POINTS_AT_ONCE, count - start))
+            packed = np.empty(len(points), point_type(PCD_COLUMNS))
+            for field in COLUMNS:
+                packed[field] = points[field] @ RGB if field == "colors" else points[field]
+            file.write(packed.tobytes())
 
 
-def _judged(calibration, method):
-    """The Verdict on a calibration, and its record."""
-    judged = judge(calibration, method)
-    return judged, calibration_record(calibration, method, judged)
-
-
-def _print_poses(calibration):
-    """Print the pose of every camera by every method, and what could not be used."""
-    scale = np.repeat([np.rad2deg(1.0), 1000.0], 3)
-    for (camera, method), solution in calibration.solutions.items():
-        values = (scale * solution.parameters[:6]).round(2)
-        sigma = (scale * solution.trusted_sigma[:6]).round(2)
-        turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
-        shift = f"translation {values[3:]} +- {sigma[3:]} mm"
-        print(f"{camera:>8} {method:<20} {turn}, {shift}")
-    for problem in (*calibration.prepared.problems, *calibration.problems):
-        print(problem)
+def _pcd_header(count):
+    """The lines before the points of a PCD file."""
+    names = []
+    types = []
+    for kind, columns in PCD_COLUMNS.values():
+        names += columns.split()
+        types += [np.dtype(kind)] * len(columns.split())
+    lines = (
+        "VERSION 0.7",
+        f"FIELDS {' '.join(names)}",
+        f"SIZE {' '.join(str(kind.itemsize) for kind in types)}",
+        f"TYPE {' '.join(kind.kind.upper() for kind in types)}",
+        f"COUNT {' '.join('1' for _ in types)}",
+        f"WIDTH {count}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {count}",
+        "DATA binary\n",
+    )
+    return "\n".join(lines)

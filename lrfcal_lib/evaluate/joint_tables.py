@@ -1,17 +1,21 @@
 """Tables that judge the joint estimate."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import pandas as pd
 
+from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.tables import rms, unit_of
-from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
+from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors, sigmas
 from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_again
+from lrfcal_lib.solvers.joint_solution import JointSolution
 
 ALL = 10**9  # crossings
 NOISE_WORDS = {
@@ -32,15 +36,42 @@ HALVES_COLUMNS = (
 )
 
 
-def range_residuals(solution):
-    """Ranges (n,) on the boards' faces as measured, and predicted minus measured, metres."""
+def range_residuals(solution: JointSolution) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges on the boards' faces.
+
+    Parameters
+    ----------
+    solution : JointSolution
+
+    Returns
+    -------
+    measured, residuals : ndarray, shape (n,)
+        Metres; predicted minus measured.
+    """
     return solution.observations.face_range, solution.residuals("face")[:, 0]
 
 
-def view_residuals(solution, camera, model):
-    """Where the boards' middles were seen in a camera's images, and predicted minus seen.
+def view_residuals(
+    solution: JointSolution, camera: str, model: CameraModel
+) -> tuple[np.ndarray, np.ndarray]:
+    """The boards' middles in a camera's images.
 
-    Pixels, shapes (n, 2). A ValueError if there is no such camera.
+    Parameters
+    ----------
+    solution : JointSolution
+    camera : str
+    model : CameraModel
+        Of it.
+
+    Returns
+    -------
+    measured, residuals : ndarray, shape (n, 2)
+        Pixels; predicted minus measured.
+
+    Raises
+    ------
+    ValueError
+        If there is no such camera.
     """
     if camera not in solution.transforms:
         cameras = ", ".join(solution.transforms) or "none"
@@ -55,11 +86,19 @@ def view_residuals(solution, camera, model):
     return seen, project(moved + at + shift, model) - seen
 
 
-def joint_table(joint):
-    """Every shared unknown of the joint estimate (JointCalibration).
+def joint_table(joint: JointCalibration) -> pd.DataFrame:
+    """Every shared unknown of the joint estimate.
 
-    Columns parameter, unit, value, sigma_noise (propagated), sigma_placements (scatter over the
-    placements, model errors included; NaN where unknown), sigma (of both, see `Solution.trusted`).
+    Parameters
+    ----------
+    joint : JointCalibration
+
+    Returns
+    -------
+    DataFrame
+        Columns parameter, unit, value, sigma_noise (propagated), sigma_placements (scatter over the
+        placements, model errors included; NaN where unknown), sigma (of both, see
+        `Solution.trusted`).
     """
     solution = joint.solution.solution
     units, factors = zip(*map(unit_of, solution.names), strict=True)
@@ -75,8 +114,18 @@ def joint_table(joint):
     )
 
 
-def noise_table(joint):
-    """Noise levels that the estimate took from the data, in words."""
+def noise_table(joint: JointCalibration) -> pd.DataFrame:
+    """Noise levels that the estimate took from the data.
+
+    Parameters
+    ----------
+    joint : JointCalibration
+
+    Returns
+    -------
+    DataFrame
+        Columns what, value.
+    """
     rows = []
     for name, value in joint.solution.noise.items():
         if name == "sigma_pitch":
@@ -85,10 +134,17 @@ def noise_table(joint):
     return pd.DataFrame(rows, columns=["what", "value"])
 
 
-def edge_bias_mm(joint):
+def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
     """By how much boards look larger at each side: mean over the beams of every edge, millimetres.
 
-    Columns placement, edge, distance_m, bias_mm (positive outwards), bias_radii.
+    Parameters
+    ----------
+    joint : JointCalibration
+
+    Returns
+    -------
+    DataFrame
+        Columns placement, edge, distance_m, bias_mm (positive outwards), bias_radii.
     """
     solution = joint.solution
     obs = joint.observations
@@ -107,11 +163,20 @@ def edge_bias_mm(joint):
     return sides.mean().reset_index()
 
 
-def joint_fit(joint, cameras=None):
-    """How well ranges and edges fit the joint estimate: ``plane_rms_mm`` and ``edge_rms_px``.
+def joint_fit(joint: JointCalibration, cameras: Iterable[str] = ()) -> dict[str, float]:
+    """How well ranges and edges fit the joint estimate.
 
-    Of face points from their boards, and of all half-step crossings of scan lines from the image
-    edges, the estimated edge bias taken off, over all cameras or those named.
+    Parameters
+    ----------
+    joint : JointCalibration
+    cameras : iterable of str
+        Whose edges; all by default.
+
+    Returns
+    -------
+    dict of str to float
+        ``plane_rms_mm`` of face points from their boards, ``edge_rms_px`` of all half-step
+        crossings of scan lines from the image edges, the estimated edge bias taken off.
     """
     solution = joint.solution
     height = solution.face_points()[:, 2]
@@ -120,7 +185,7 @@ def joint_fit(joint, cameras=None):
     return {"plane_rms_mm": 1000 * rms(height), "edge_rms_px": rms(edges)}
 
 
-def edge_misses_px(joint, camera):
+def edge_misses_px(joint: JointCalibration, camera: str) -> np.ndarray:
     """Distances (n,) of crossings of scan lines from one camera's edges without the edge bias.
 
     Undistorted pixels.
@@ -140,13 +205,22 @@ def edge_misses_px(joint, camera):
     return edge_residuals_px(obs, pose) - shift * obs.model.fx / depth
 
 
-def random_halves(joint, pairs=8):
+def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
     """How far estimates from two random halves of the placements differ, beside their sigmas.
 
-    Columns pair, camera, rotation_deg, translation_mm (differences), predicted_rotation_deg,
-    predicted_translation_mm (root mean square difference that the sigma of the whole estimate,
-    model error included, predicts: twice that sigma, without the part of the intrinsics, which the
-    halves share). Splits of which a half leaves something open are missing.
+    Parameters
+    ----------
+    joint : JointCalibration
+    pairs : int
+        How often they are split.
+
+    Returns
+    -------
+    DataFrame
+        Columns pair, camera, rotation_deg, translation_mm (differences), predicted_rotation_deg,
+        predicted_translation_mm (root mean square difference that the sigma of the whole estimate,
+        model error included, predicts: twice that sigma, without the part of the intrinsics, which
+        the halves share). Splits of which a half leaves something open are missing.
     """
     rng = np.random.default_rng(0)
     numbers = np.array(list(joint.solution.boards))
@@ -189,11 +263,19 @@ def _predicted(solution, camera):
     }
 
 
-def joint_errors(joint, truth):
-    """Errors of axis and cameras against the Truth, beside their predicted sigmas.
+def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:
+    """Errors of axis and cameras against the truth, beside their predicted sigmas.
 
-    Columns what, rotation_error_deg, rotation_sigma_deg, translation_error_mm,
-    translation_sigma_mm; no axis where it was not estimated.
+    Parameters
+    ----------
+    joint : JointCalibration
+    truth : Truth
+
+    Returns
+    -------
+    DataFrame
+        Columns what, rotation_error_deg, rotation_sigma_deg, rotation_pull (error over sigma), and
+        the same of the translation in millimetres; no axis where it was not estimated.
     """
     solution = joint.solution
     rows = []
@@ -201,7 +283,9 @@ def joint_errors(joint, truth):
         turn, shift = axis_errors(solution.T_head_lrf, truth)
         rows.append(_error_row("tilt axis", turn, shift, solution.covariance("axis_", "offset_")))
     for camera in solution.transforms:
-        turn, shift = camera_errors(solution.camera(camera), truth, camera).values()
+        errors = camera_errors(solution.camera(camera), truth, camera)
+        turn = errors["rotation_error_deg"]
+        shift = errors["translation_error_mm"]
         covariance = solution.covariance(f"{camera}_")
         rows.append(_error_row(f"camera {camera}", turn, shift, covariance))
     return pd.DataFrame(rows)
@@ -209,11 +293,13 @@ def joint_errors(joint, truth):
 
 def _error_row(what, turn_deg, shift_mm, covariance):
     """Errors of a pose, or of an axis, beside the sigma of both from its covariance (2 k, 2 k)."""
-    turn_variance, shift_variance = np.diag(covariance).reshape(2, -1).sum(axis=1)
+    turn_sigma, shift_sigma = sigmas(covariance) * [np.rad2deg(1.0), 1000.0]
     return {
         "what": what,
         "rotation_error_deg": turn_deg,
-        "rotation_sigma_deg": np.rad2deg(np.sqrt(turn_variance)),
+        "rotation_sigma_deg": turn_sigma,
+        "rotation_pull": turn_deg / turn_sigma,
         "translation_error_mm": shift_mm,
-        "translation_sigma_mm": 1000 * np.sqrt(shift_variance),
+        "translation_sigma_mm": shift_sigma,
+        "translation_pull": shift_mm / shift_sigma,
     }

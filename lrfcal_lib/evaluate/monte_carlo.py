@@ -11,7 +11,7 @@ from scipy.stats import binom, chi2
 
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.edge_likelihood import disc_share
-from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
+from lrfcal_lib.fit.least_squares import reduced_hessian
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     polar_to_points,
@@ -19,8 +19,9 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
 )
 from lrfcal_lib.model.observations import CameraObservations
-from lrfcal_lib.preprocess.board_in_scan import fit_lines, row_ends
+from lrfcal_lib.preprocess.board_in_scan import fit_lines
 from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
+from lrfcal_lib.preprocess.surfaces import row_ends
 from lrfcal_lib.simulate.draw import ShotSetup
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import in_stated_gauge
@@ -127,8 +128,8 @@ def monte_carlo(draw, solve, seeds):
         obs, truth = draw(np.random.default_rng(seed))
         try:
             found = solve(obs)
-        except DegenerateGeometry as error:
-            failed[int(seed)] = str(error)
+        except DegenerateGeometry as reason:
+            failed[int(seed)] = str(reason)
             continue
         if names is None:
             names = found.solution.names
@@ -178,10 +179,10 @@ def bound(obs, truth, unknowns):
     missed = named_blocks(truth, none_read, unknowns)
     hessian = 0.0
     for name, block in read.items():
-        J = whiten(block)[1]
+        J = block.white_jacobian
         if name == "beam":  # expected: over both readings, weighted by how likely each is
             chance = np.exp(-block.cost)[..., None]
-            other = whiten(missed[name])[1]
+            other = missed[name].white_jacobian
             hessian = hessian + np.swapaxes(other, -1, -2) @ ((1 - chance) * other)
             J = np.sqrt(chance) * J
         hessian = hessian + np.swapaxes(J, -1, -2) @ J

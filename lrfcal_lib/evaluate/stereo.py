@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import transform_difference
 from lrfcal_lib.preprocess.intrinsics import adjust_robust, board_pose, waves
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -87,9 +86,9 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
     basis = None
     if np.any(prepared.relief):
         basis = waves(pattern.points())
-    fixed = ()
+    fixed = []
     if all(model.distortion[4] == 0 for model in models):
-        fixed = (K3,)
+        fixed.append(K3)
     adjusted = adjust_robust(
         pixels,
         pattern.points(),
@@ -97,14 +96,12 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
         poses[0],
         RigidTransform.concatenate([RigidTransform.identity(), rough]),
         basis=basis,
-        fixed=fixed,
+        fixed=tuple(fixed),
     )
     return StereoReference((first, second), adjusted.mounting[1], adjusted.mounting_covariance[0])
 
 
-def stereo_check(
-    solutions: dict[tuple[str, str], Solution], reference: StereoReference
-) -> pd.DataFrame:
+def stereo_check(solutions: dict, reference: StereoReference) -> pd.DataFrame:
     """What two cameras, calibrated apart, say about each other, against the chessboard in both.
 
     Parameters

@@ -1,18 +1,26 @@
 """Tables of what was recorded and calibrated, and the comparison of methods."""
 
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
+from lrfcal_lib.calibrate.cameras import PlatformCalibration
+from lrfcal_lib.calibrate.pipeline import JointCalibration
+from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors, sigmas
 from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
-from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.fit.result import AXIS_NAMES, Solution
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import INTRINSIC_NAMES
+from lrfcal_lib.model.camera import INTRINSIC_NAMES, CameraModel
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.preprocess.outline_in_images import Outline
+from lrfcal_lib.preprocess.prepared import Prepared
+from lrfcal_lib.session.read import Session
 from lrfcal_lib.solvers import METHODS, left_out
+from lrfcal_lib.solvers.pitch import PitchErrors
 
 UNITS = {  # of parameters, and the factor from radians and metres
     r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
@@ -30,15 +38,15 @@ SCAN_COLUMNS = (
 )
 
 
-def unit_of(parameter):
-    """Unit and factor in which a parameter is shown."""
+def unit_of(parameter: str) -> tuple[str, float]:
+    """Unit in which a parameter is shown, and the factor from radians and metres."""
     for names, unit in UNITS.items():
         if re.fullmatch(names, parameter):
             return unit
     return "1", 1.0
 
 
-def rms(values):
+def rms(values: np.ndarray) -> float:
     """Root mean square of the finite values; NaN where there are none."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
@@ -47,7 +55,7 @@ def rms(values):
     return float(np.sqrt(np.mean(values**2)))
 
 
-def poses_under(obs, model):
+def poses_under(obs: CameraObservations, model: CameraModel | None) -> np.ndarray:
     """The board poses (p, 4, 4) that a camera sees under other intrinsics.
 
     As they are where no pattern was seen.
@@ -73,13 +81,29 @@ def poses_under(obs, model):
     return moved
 
 
-def plane_residuals_of(obs, solution):
-    """Distances (metres) of face points from the board planes, under the solution's intrinsics."""
+def plane_residuals_of(obs: CameraObservations, solution: Solution) -> np.ndarray:
+    """Distances of face points from the board planes, under the solution's intrinsics.
+
+    Parameters
+    ----------
+    obs : CameraObservations
+        With n face points.
+    solution : Solution
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Metres.
+    """
     return plane_residuals_m(obs, solution.transform, poses_under(obs, solution.model))
 
 
-def jointly_left_out(joint, camera):
-    """The same of the joint estimate (JointCalibration), judged with its own platform and range."""
+def jointly_left_out(
+    joint: JointCalibration, camera: str
+) -> Iterator[tuple[CameraObservations, Solution]]:
+    """What every placement shows, made with the platform and range of the joint estimate without
+    it, and that estimate's camera.
+    """
     ready = joint.prepared
     for placement, solution in joint.without.items():
         scan = {placement: ready.scans[placement]}
@@ -88,11 +112,20 @@ def jointly_left_out(joint, camera):
         yield judge, solution.camera(camera)
 
 
-def left_out_residuals(pairs):
+def left_out_residuals(
+    pairs: Iterable[tuple[CameraObservations, Solution]],
+) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of every placement under a calibration from all the others.
 
-    Of crossings (pixels) and of face points (metres). `pairs` are those of :func:`left_out` or
-    :func:`jointly_left_out`.
+    Parameters
+    ----------
+    pairs : iterable of (CameraObservations, Solution)
+        Of :func:`left_out` or :func:`jointly_left_out`.
+
+    Returns
+    -------
+    edges, planes : ndarray, shapes (n,), (m,)
+        Of crossings, pixels, and of face points, metres.
     """
     edges = [np.zeros(0)]
     planes = [np.zeros(0)]
@@ -102,7 +135,12 @@ def left_out_residuals(pairs):
     return np.concatenate(edges), np.concatenate(planes)
 
 
-def method_comparison(observations, solutions, truth=None, joint=None):
+def method_comparison(
+    observations: dict[tuple[str, str], CameraObservations],
+    solutions: dict[tuple[str, str], Solution],
+    truth: Truth | None = None,
+    joint: JointCalibration | None = None,
+) -> pd.DataFrame:
     """Every method judged on the same crossings and face points, and on placements it has not seen.
 
     Parameters
@@ -124,23 +162,26 @@ def method_comparison(observations, solutions, truth=None, joint=None):
     -------
     DataFrame
         camera, method, n_placements, edge_median_px, edge_rms_px, plane_rms_mm,
-        left_out_edge_rms_px, left_out_plane_rms_mm; with truth also rotation_error_deg,
-        translation_error_mm.
+        left_out_edge_rms_px, left_out_plane_rms_mm; with truth also the columns of
+        :func:`lrfcal_lib.evaluate.truth.camera_errors`.
     """
     rows = []
     for (camera, name), solution in solutions.items():
+        held: Iterable = ()
         if name == "joint":
-            own = observations[camera, "joint"]
-            judge = own.along()
-            used = own.placements
-            held = () if joint is None else jointly_left_out(joint, camera)
+            obs = observations[camera, "joint"]
+            judge = obs.along()
+            used = obs.placements
+            if joint is not None:
+                held = jointly_left_out(joint, camera)
         else:
-            own = observations[camera, METHODS[name].variant]
+            method = METHODS[name]
+            obs = observations[camera, method.variant]
             judge = observations[camera, "half_step"].along()
-            used = own.placements
-            if METHODS[name].uses != "plane":
-                used = getattr(own, f"{METHODS[name].uses}_placement")
-            held = left_out(own, judge, name, solution)
+            used = obs.placements
+            if method.uses != "plane":
+                used = getattr(obs, f"{method.uses}_placement")
+            held = left_out(obs, judge, name, solution)
         edge = edge_residuals_px(judge, solution.transform, solution.model)
         held_edge, held_plane = left_out_residuals(held)
         row = {
@@ -157,52 +198,84 @@ def method_comparison(observations, solutions, truth=None, joint=None):
     return pd.DataFrame(rows)
 
 
-def _parameter_table(keys, found):
-    """A row a parameter, in its unit; `found` has names, values and sigmas by a tuple of keys."""
+def _parameter_table(keys, parameters):
+    """A row a parameter, in its unit, of names, values and sigmas by a tuple of keys."""
     rows = []
-    for key, columns in found.items():
+    for key, columns in parameters.items():
         for name, value, sigma in zip(*columns, strict=True):
             unit, factor = unit_of(name)
             rows.append((*key, name, unit, factor * value, factor * sigma))
     return pd.DataFrame(rows, columns=[*keys, "parameter", "unit", "value", "sigma"])
 
 
-def camera_calibration_table(solutions):
-    """Parameters of every calibration (Solutions by camera and method) with their sigmas.
+def camera_calibration_table(solutions: dict[tuple[str, str], Solution]) -> pd.DataFrame:
+    """Parameters of every calibration with their sigmas.
 
-    Columns camera, method, parameter, unit, value, sigma (`Solution.trusted`).
+    Parameters
+    ----------
+    solutions : dict of (str, str) to Solution
+        By camera and method.
+
+    Returns
+    -------
+    DataFrame
+        Columns camera, method, parameter, unit, value, sigma (`Solution.trusted`).
     """
-    found = {key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()}
-    return _parameter_table(["camera", "method"], found)
+    parameters = {key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()}
+    return _parameter_table(["camera", "method"], parameters)
 
 
-def platform_calibration_table(platform, truth=None):
-    """The tilt axis by every method (PlatformCalibration) with sigmas, and in the paper's chart.
+def platform_calibration_table(
+    platform: PlatformCalibration, truth: Truth | None = None
+) -> pd.DataFrame:
+    """The tilt axis by every method with sigmas, and in the paper's chart.
 
-    Columns method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and
-    axis_offset_error_mm of the method. The four numbers of the axis are its angles out of and
-    within the scan plane and its offsets within and across it; phi and t_y are the same axis in the
-    paper's chart.
+    Parameters
+    ----------
+    platform : PlatformCalibration
+    truth : Truth, optional
+
+    Returns
+    -------
+    DataFrame
+        Columns method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and
+        axis_offset_error_mm of the method, and both over their standard deviations
+        (axis_direction_pull, axis_offset_pull). The four numbers of the axis are its angles out of
+        and within the scan plane and its offsets within and across it; phi and t_y are the same
+        axis in the paper's chart.
     """
     names = (*AXIS_NAMES, "phi_x", "phi_y", "phi_z", "t_y")
-    found = {}
+    parameters = {}
     for method, axis in platform.axes.items():
         phi, ty = geometry.paper_parameters(axis.T_head_lrf)
         sigma = np.append(axis.sigma, np.full(4, np.nan))
-        found[method,] = names, [*axis.parameters, *phi, ty], sigma
-    table = _parameter_table(["method"], found)
+        parameters[method,] = names, [*axis.parameters, *phi, ty], sigma
+    table = _parameter_table(["method"], parameters)
     if truth is not None:
-        errors = {method: axis_errors(platform.transform(method), truth) for (method,) in found}
+        errors = {}
+        for method, axis in platform.axes.items():
+            direction, offset = axis_errors(axis.T_head_lrf, truth)
+            direction_sigma, offset_sigma = sigmas(axis.covariance)
+            pulls = np.radians(direction) / direction_sigma, offset / (1000 * offset_sigma)
+            errors[method] = direction, offset, *pulls
         columns = ["axis_direction_error_deg", "axis_offset_error_mm"]
+        columns += ["axis_direction_pull", "axis_offset_pull"]
         table[columns] = [errors[method] for method in table.method]
     return table
 
 
-def sweeps_table(session):
+def sweeps_table(session: Session) -> pd.DataFrame:
     """What a session recorded at every placement.
 
-    Columns placement, n_scan_lines, n_returns, invalid_percent, pitch_from_deg, pitch_to_deg,
-    pitch_step_deg (median), direction (+1 up, -1 down, 0 neither), n_images.
+    Parameters
+    ----------
+    session : Session
+
+    Returns
+    -------
+    DataFrame
+        Columns placement, n_scan_lines, n_returns, invalid_percent, pitch_from_deg, pitch_to_deg,
+        pitch_step_deg (median), direction (+1 up, -1 down, 0 neither), n_images.
     """
     rows = []
     for placement in session.placements:
@@ -227,11 +300,18 @@ def sweeps_table(session):
     return pd.DataFrame(rows)
 
 
-def scans_table(prepared):
-    """The board in every sweep (Prepared): noise, rejected points, and the sides that scans cross.
+def scans_table(prepared: Prepared) -> pd.DataFrame:
+    """The board in every sweep: noise, rejected points, and the sides that scans cross.
 
-    Columns placement, n_points, sigma_range_mm, jump_points, sides_along (crossed by scan lines),
-    sides_across (where the sweep enters or leaves the board).
+    Parameters
+    ----------
+    prepared : Prepared
+
+    Returns
+    -------
+    DataFrame
+        Columns placement, n_points, sigma_range_mm, jump_points, sides_along (crossed by scan
+        lines), sides_across (where the sweep enters or leaves the board).
     """
     rows = []
     for placement, board in prepared.scans.items():
@@ -250,25 +330,40 @@ def scans_table(prepared):
     return pd.DataFrame(rows, columns=SCAN_COLUMNS)
 
 
-def intrinsics_table(models):
-    """Intrinsics of every camera (CameraModels by name) with their standard deviations.
+def intrinsics_table(models: dict[str, CameraModel]) -> pd.DataFrame:
+    """Intrinsics of every camera with their standard deviations.
 
-    Columns camera, parameter, unit, value, sigma (NaN where the session states the intrinsics).
+    Parameters
+    ----------
+    models : dict of str to CameraModel
+
+    Returns
+    -------
+    DataFrame
+        Columns camera, parameter, unit, value, sigma (NaN where the session states the
+        intrinsics).
     """
-    found = {}
+    parameters = {}
     for camera, model in models.items():
         sigma = np.full(9, np.nan)
         if model.covariance is not None:
             sigma = np.sqrt(np.diag(model.covariance))
-        found[camera,] = INTRINSIC_NAMES, model.parameters, sigma
-    return _parameter_table(["camera"], found)
+        parameters[camera,] = INTRINSIC_NAMES, model.parameters, sigma
+    return _parameter_table(["camera"], parameters)
 
 
-def outline_table(outline):
-    """Edge lengths of a board (:class:`lrfcal_lib.preprocess.survey.Outline`) in the images.
+def outline_table(outline: Outline) -> pd.DataFrame:
+    """Edge lengths of a board in the images.
 
-    Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours),
-    n_images.
+    Parameters
+    ----------
+    outline : Outline
+
+    Returns
+    -------
+    DataFrame
+        Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours),
+        n_images.
     """
     rows = []
     for name, length in outline.board.lengths().items():
@@ -277,10 +372,17 @@ def outline_table(outline):
     return pd.DataFrame(rows, columns=["edge", "length_mm", "sd_mm", "n_images"])
 
 
-def pitch_models_table(errors):
-    """Which errors of the recorded pitch (PitchErrors) the data ask for.
+def pitch_models_table(errors: PitchErrors) -> pd.DataFrame:
+    """Which errors of the recorded pitch the data ask for.
 
-    Columns model, n_parameters, plane_rms_mm, F, p_value (against the model before).
+    Parameters
+    ----------
+    errors : PitchErrors
+
+    Returns
+    -------
+    DataFrame
+        Columns model, n_parameters, plane_rms_mm, F, p_value (against the model before).
     """
     rows = []
     for model in errors.models.values():
@@ -289,10 +391,17 @@ def pitch_models_table(errors):
     return pd.DataFrame(rows, columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"])
 
 
-def pitch_errors_table(errors):
-    """Offset of the recorded pitch of every sweep (PitchErrors).
+def pitch_errors_table(errors: PitchErrors) -> pd.DataFrame:
+    """Offset of the recorded pitch of every sweep.
 
-    Columns placement, direction, offset_deg, sigma_deg.
+    Parameters
+    ----------
+    errors : PitchErrors
+
+    Returns
+    -------
+    DataFrame
+        Columns placement, direction, offset_deg, sigma_deg.
     """
     each = errors.models["sweep"]
     columns = {
@@ -304,10 +413,17 @@ def pitch_errors_table(errors):
     return pd.DataFrame(columns)
 
 
-def axis_knowledge_table(platform):
+def axis_knowledge_table(platform: PlatformCalibration) -> pd.DataFrame:
     """Who knows each number of the tilt axis better: data ('line_3d') or the rough measurement.
 
-    Columns parameter, unit, sigma_data, sigma_rough, better.
+    Parameters
+    ----------
+    platform : PlatformCalibration
+
+    Returns
+    -------
+    DataFrame
+        Columns parameter, unit, sigma_data, sigma_rough, better.
     """
     data = platform.axes["line_3d"].sigma
     rough = np.repeat(platform.stated_sigma, 2)

@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.observations import PlatformObservations
+from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import TransformStated, board_from_json, from_json, naming, read_json
 
 
@@ -16,22 +18,44 @@ from lrfcal_lib.session.stated import TransformStated, board_from_json, from_jso
 class Truth:
     """What a simulated session was made with.
 
-    `cameras` are ``T_camera_lrf`` of a camera on the head, ``T_camera_platform`` of one on the
-    base; `boards` ``T_platform_board`` by placement, `pitch` that of every scan line by placement,
-    radians.
+    Attributes
+    ----------
+    T_head_lrf : RigidTransform
+    cameras : dict of str to RigidTransform
+        ``T_camera_lrf`` of a camera on the head, ``T_camera_platform`` of one on the base.
+    board : Board
+    boards : dict of int to RigidTransform
+        ``T_platform_board`` by placement.
+    pitch : dict of int to ndarray
+        Of every scan line by placement, radians.
+    setup : str
+        Name of what it was simulated from, of :func:`lrfcal_lib.simulate.rig.load_setup`.
     """
 
     T_head_lrf: RigidTransform
-    cameras: dict
+    cameras: dict[str, RigidTransform]
     board: Board
-    boards: dict
-    pitch: dict
+    boards: dict[int, RigidTransform]
+    pitch: dict[int, np.ndarray]
+    setup: str
 
 
-def read_truth(session):
-    """The :class:`Truth` of a session, None for a recording.
+def read_truth(session: Session) -> Truth | None:
+    """What a session was made with.
 
-    A SessionError if ``truth.json`` is damaged.
+    Parameters
+    ----------
+    session : Session
+
+    Returns
+    -------
+    Truth or None
+        None for a recording.
+
+    Raises
+    ------
+    SessionError
+        If ``truth.json`` is damaged.
     """
     file = session.path / "truth.json"
     if not os.path.lexists(file):
@@ -47,8 +71,14 @@ def read_truth(session):
         pitch = {}
         for number, entry in data["sweeps"].items():
             pitch[int(number)] = np.asarray(entry["pitch_rad"], float)
-        head = _pose(data["T_head_lrf"])
-        return Truth(head, cameras, board_from_json(data["board"]), boards, pitch)
+        return Truth(
+            T_head_lrf=_pose(data["T_head_lrf"]),
+            cameras=cameras,
+            board=board_from_json(data["board"]),
+            boards=boards,
+            pitch=pitch,
+            setup=data.get("setup", ""),
+        )
 
 
 def _pose(stated):
@@ -56,18 +86,51 @@ def _pose(stated):
     return from_json(TransformStated, stated).made()
 
 
-def camera_errors(solution, truth, camera):
-    """Rotation (degrees) and translation error (millimetres) of a camera, by column.
+def camera_errors(solution: Solution, truth: Truth | None, camera: str) -> dict[str, float]:
+    """Errors of a camera's pose against the truth.
 
-    None without truth.
+    Parameters
+    ----------
+    solution : Solution
+        Of it.
+    truth : Truth or None
+    camera : str
+
+    Returns
+    -------
+    dict of str to float
+        By column: rotation_error_deg, translation_error_mm, and both over their standard
+        deviations: rotation_pull, translation_pull. A pull of 1 is what a standard deviation
+        promises. Nothing without truth.
     """
     if truth is None:
         return {}
     angle, distance = geometry.transform_difference(solution.transform, truth.cameras[camera])
-    return {"rotation_error_deg": np.rad2deg(angle), "translation_error_mm": 1000 * distance}
+    turn_sigma, shift_sigma = sigmas(solution.trusted[:6, :6])
+    return {
+        "rotation_error_deg": np.rad2deg(angle),
+        "translation_error_mm": 1000 * distance,
+        "rotation_pull": angle / turn_sigma,
+        "translation_pull": distance / shift_sigma,
+    }
 
 
-def axis_errors(T_head_lrf, truth):
+def sigmas(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations of the length of a turn (radians) and of a shift (metres).
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (2 k, 2 k)
+        Of turns, then shifts.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+    """
+    return np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
+
+
+def axis_errors(T_head_lrf: RigidTransform, truth: Truth) -> tuple[float, float]:
     """Direction (degrees) and offset error (millimetres) of a tilt axis."""
     true = geometry.axis_of(truth.T_head_lrf)
     angle, offset = geometry.axis_difference(geometry.axis_of(T_head_lrf), true)
@@ -79,6 +142,15 @@ def on_true_edges(observations: PlatformObservations, truth: Truth) -> PlatformO
 
     With these points the edges are straight about the true axis at the recorded pitch: what an
     estimate is off then is no error of edge points or pitch.
+
+    Parameters
+    ----------
+    observations : PlatformObservations
+    truth : Truth
+
+    Returns
+    -------
+    PlatformObservations
     """
     lines = truth.board.lines()
     points = observations.edge_points.copy()

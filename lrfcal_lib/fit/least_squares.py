@@ -21,18 +21,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from lrfcal_lib.fit.covariance import covariance_of, name_words, null_space, placement_covariance
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
 CAUCHY = 2.385  # 95 % efficiency for normal errors
-# eigenvalues of scaled normal equations below this share of the largest are rounding errors
-RANK = 1e-13
 OWN_RANK = 1e-13  # the same of what a placement owns
 FIRST_DAMPING = 1e-7  # of the normal equations' diagonal
 LEAST_DAMPING = 1e-12
 MOST_DAMPING = 1e14
 SMALL_DAMPING = 10.0  # a step with more is short because it is held, not because it has arrived
-PARTAKES = 0.05  # share of a direction's largest component from which an unknown takes part in it
 LARGE_CHI2 = 0.001  # chance alone exceeds chi-square so seldom where the stated noise is right
 
 
@@ -89,11 +87,6 @@ class Block:
     def white_jacobian(self):
         """Whitened Jacobian, the corrected one where there is one."""
         return self.whitened(self.jacobian if self.corrected is None else self.corrected)
-
-
-def whiten(block, jacobian=True):
-    """Whitened residuals and (corrected) Jacobian of a block."""
-    return block.white, (block.white_jacobian if jacobian else None)
 
 
 def medians(values, used):
@@ -174,7 +167,7 @@ def linearise(blocks: Iterable[Block], loss=None, scale=1.0, axes=(-2, -1)) -> L
     axes : int or tuple of int
         Over which the cost is summed: placements and residuals, or -1 for residuals of trials.
     """
-    hessian = gradient = cost = 0.0
+    hessian = gradient = cost = np.zeros(())
     roots = []
     for block in blocks:
         weights, value = _weigh(block, loss, scale, axes)
@@ -341,7 +334,7 @@ def minimise(
         np.divide(before - after, promised, out=gain, where=promised > 3e-15 * before)
         damping = _next_damping(damping, gain, accepted)
     if converged.ndim == 0:
-        converged = bool(converged)
+        converged = converged[()]
     return Minimum(state, converged, len(history) - 1, np.array(history))
 
 
@@ -429,7 +422,7 @@ class Question:
         """Motions that normal equations (k, k) of one problem leave open, in words."""
         if hessian.ndim > 2:
             return ()
-        directions = null_space(hessian, scales, self.limit)[0]
+        directions = null_space(hessian, scales, self.limit)
         words = self.words or (lambda direction: name_words(direction, self.names))
         motions = tuple(words(direction) for direction in directions)
         if self.required and motions:
@@ -482,7 +475,7 @@ def solve(
             f"{question.method}: residuals at the start value are not finite: check the "
             "observations and T0"
         )
-    options = {"shared": shared, "loss": loss, "scale": scale}
+    options: dict[str, Any] = {"shared": shared, "loss": loss, "scale": scale}
     minimum = minimise(once, start, retract, **options, **steps)
     costs = [costs[:-1] for costs in earlier]
     minimum = minimum._replace(
@@ -548,8 +541,7 @@ def _solution(question, minimum, blocks, weights, shared):
         **minimum._asdict(),
         residuals=r,
         jacobian=J,
-        weights=weights,
-        covariance=_covariance(hessian, scales, motions) * inflation[..., None, None],
+        covariance=covariance_of(hessian, scales, motions) * inflation[..., None, None],
         covariance_placements=covariance_placements,
         unobservable=motions,
         method=question.method,
@@ -558,101 +550,6 @@ def _solution(question, minimum, blocks, weights, shared):
         inflation=inflation,
         n_placements=hessians.shape[-3],
     )
-
-
-def null_space(hessian, scales, limit=1.0):
-    """Directions that normal equations (k, k) of whitened residuals do not determine.
-
-    `scales` (k,) are what counts as a change by one: 1 rad, 1 m, 1000 px; a direction is also
-    unobservable when its standard deviation exceeds `limit` scales. Returned are increments (m, k),
-    largest component 1, the worst first, and the singular values (k,) of the scaled, whitened
-    Jacobian, ascending: reciprocal standard deviations.
-    """
-    scales = np.asarray(scales, float)
-    values, vectors = np.linalg.eigh(hessian * scales[:, None] * scales)
-    basis = vectors[:, values < np.maximum(RANK * values[-1], limit**-2)].T
-    open_rows = list(range(len(basis)))
-    # reduced echelon form with pivots at the largest entries: the basis with most zeros
-    while open_rows:
-        row, column = np.unravel_index(
-            np.argmax(np.abs(basis[open_rows])), (len(open_rows), basis.shape[1])
-        )
-        pivot = open_rows.pop(row)
-        basis[pivot] /= basis[pivot, column]
-        others = np.arange(len(basis)) != pivot
-        basis[others] -= basis[others, column, None] * basis[pivot]
-    directions = np.where(np.abs(basis) < 1e-5, 0.0, basis) * scales
-    return directions / np.max(np.abs(directions), axis=1, keepdims=True), np.sqrt(
-        np.maximum(values, 0.0)
-    )
-
-
-def pseudo_inverse(hessian):
-    """Inverse of scaled normal equations on what they determine.
-
-    Eigenvalues below zero are rounding errors too.
-    """
-    values, vectors = np.linalg.eigh(hessian)
-    inverse = np.divide(
-        1.0, values, out=np.zeros_like(values), where=values > RANK * values[..., -1:]
-    )
-    return (vectors * inverse[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-
-
-def _covariance(hessian, scales, lost):
-    """Inverse of normal equations. Unknowns that take part in an undetermined direction have an
-    infinite variance.
-
-    A pseudo-inverse calls such unknowns perfectly known; their covariances with others are set to
-    zero.
-    """
-    unit = scales[:, None] * scales
-    covariance = pseudo_inverse(hessian * unit) * unit
-    if not lost:  # or many trials
-        return covariance
-    lost = np.any(np.abs(null_space(hessian, scales, np.inf)[0]) > 0.05, axis=0)
-    covariance = np.where(lost[:, None] | lost, 0.0, covariance)
-    return covariance + np.diag(np.where(lost, np.inf, 0.0))
-
-
-def name_words(direction, names, share=0.05):
-    """Names (or words) of the unknowns with the largest components of a direction."""
-    large = np.abs(direction) > share * np.max(np.abs(direction))
-    return " with ".join(np.asarray(names)[large])
-
-
-def placement_covariance(hessians, scores):
-    """First-order jackknife over g placements, from what each adds to the normal equations.
-
-    `scores` are ``J^T r`` of each placement at the solution. Returned are the covariance and the
-    changes (..., g, k) of the estimate when that placement is left out; None with fewer than three
-    placements, or where the others do not determine the estimate.
-
-    Notes
-    -----
-    The sum of squared changes (CR3) is too large in the mean where placements carry unequal weight:
-    noise alone gives ``(g - 1) / g sum_g (inv(H - H_g) - inv(H))`` instead of ``inv(H)``. That
-    factor is taken off every unknown, so that scatter and noise can be compared.
-    """
-    groups = hessians.shape[-3]
-    total = np.sum(hessians, axis=-3, keepdims=True)
-    diagonal = np.sqrt(np.maximum(np.diagonal(total, axis1=-2, axis2=-1), 1e-300))
-    outer = diagonal[..., :, None] * diagonal[..., None, :]
-    scaled = (total - hessians) / outer
-    try:  # squared pivots: what the others say about one unknown more
-        pivots = np.linalg.cholesky(scaled).diagonal(axis1=-2, axis2=-1)
-    except np.linalg.LinAlgError:
-        return None, None
-    if groups < 3 or pivots.min() < 1e-6:
-        return None, None
-    without = np.linalg.inv(scaled)
-    shifts = (without @ (scores / diagonal)[..., None])[..., 0] / diagonal
-    share = (groups - 1) / groups
-    squares = share * np.swapaxes(shifts, -1, -2) @ shifts
-    whole = np.diagonal(np.linalg.inv(total / outer), axis1=-2, axis2=-1)
-    gained = np.diagonal(without, axis1=-2, axis2=-1) - whole
-    factor = np.sqrt(whole[..., 0, :] / (share * gained.sum(axis=-2)))
-    return factor[..., :, None] * squares * factor[..., None, :], shifts
 
 
 def pad(group, count, width=1):

@@ -53,8 +53,6 @@ class Solution:
     residuals, jacobian : ndarray, shapes (..., n) and (..., n, k)
         Whitened at the solution, without the robust weights; Jacobian by the increments (``[w, v]``
         for a transform).
-    weights : ndarray, shape (..., n)
-        Robust weights, 1 without a loss.
     covariance : ndarray, shape (..., k, k)
         Of the increments, from the propagated noise. Where chi-square is above its 99.9 % limit the
         stated noise is too small, and the covariance is multiplied by `inflation`, chi-square per
@@ -89,7 +87,6 @@ class Solution:
     cost_history: np.ndarray
     residuals: np.ndarray
     jacobian: np.ndarray
-    weights: np.ndarray
     covariance: np.ndarray
     covariance_placements: np.ndarray | None
     n_placements: int

@@ -303,6 +303,26 @@ def _certain(doubt, stated):
     return doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
 
 
+def step_not_told(solution, admitted_offset, stated=ALTERNATIVES):
+    """In words, where the data cannot tell whether the angular step is stated rightly and what is
+    handed over hangs on it; else ''.
+
+    With cameras on the head, a step that is off and a range offset that the maker admits stretch
+    the cloud nearly alike.
+    """
+    told = weigh(solution, admitted_offset, {"bearings": stated["bearings"]})
+    for doubt in told:
+        moved = doubt.moved * doubt.sigma / abs(doubt.value)
+        if moved > MOVED:
+            return (
+                f"The angular step is taken as stated: these data tell it to "
+                f"{100 * doubt.sigma:.1f} % only, and were it off by that, axis or cameras would "
+                f"be off by {moved:.1f} of their standard deviations; boards at more different "
+                "distances tell more."
+            )
+    return ""
+
+
 def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):
     """The Doubt about bearings where they explain the data far better than the range offset found
     does, or None.

@@ -84,11 +84,15 @@ class CameraChange:
 
 @dataclass(frozen=True)
 class Step:
-    """The likeliest place of a step in a camera's pose (indices), and its probability by chance."""
+    """A step in a camera's pose at some place (indices), and its probability by chance.
+
+    `change` (6,) are the increments ``[w, v]`` of the pose, as a score test has them.
+    """
 
     camera: int
     row: int
     p_value: float
+    change: np.ndarray | None = None
 
 
 def camera_changes(
@@ -116,6 +120,9 @@ def camera_changes(
     while len(changes) < MOST_CHANGES and (step := likeliest_step(solution)):
         name = solution.observations.cameras[step.camera]
         camera = camera_of[name]
+        # errors of the intrinsics make small steps out of nothing, which no estimate confirms
+        if largest_motion(solution, step, prepared.models[camera]) < LEAST_SIZE:
+            return changes
         later = f"{camera} from placement {solution.observations.placements[step.row]}"
         parted = with_two_poses(solution.observations, step, later)
         try:
@@ -226,8 +233,8 @@ def likeliest_step(solution):
         columns = solution.columns(f"{name}_")
         for row in range(BESIDE, last + 1):
             if _seen_beside(solution.observations, camera, row):
-                p_value = _chance_of_step(score, columns, row)
-                tested.append(Step(camera, row, p_value))
+                p_value, change = _chance_of_step(score, columns, row)
+                tested.append(Step(camera, row, p_value, change))
     best = min(tested, key=lambda step: step.p_value, default=None)
     if best is None or best.p_value * len(tested) > LEVEL:
         return None
@@ -241,7 +248,8 @@ def _seen_beside(obs, camera, row):
 
 
 def _chance_of_step(score, columns, row):
-    """Probability that chance makes the pose in these columns seem another one from a row on.
+    """Probability that chance makes the pose in these columns seem another one from a row on, and
+    by how much (6,).
 
     `score` is what each placement says about the shared unknowns.
     """
@@ -261,7 +269,20 @@ def _chance_of_step(score, columns, row):
     # what each placement still pulls at the value found: its scatter is that of the placements
     pull = (gradient + whole @ step) @ covariance[:, -POSE:]
     scatter = np.einsum("pi,ij,pj->", pull, information, pull) / POSE * count / (count - 1)
-    return float(fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0)))
+    p_value = fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0))
+    return float(p_value), step[-POSE:]
+
+
+def largest_motion(solution, step, model):
+    """By how many pixels the change of a Step moves a corner of a board in an image, at most."""
+    obs = solution.observations
+    poses = obs.view_pose[obs.view_camera == step.camera]
+    corners = obs.corners @ np.swapaxes(poses[:, :3, :2], 1, 2) + poses[:, None, :3, 3]
+    corners = corners.reshape(-1, 3)
+    origin = solution.transforms[obs.cameras[step.camera]].translation
+    turned = Rotation.from_rotvec(step.change[:3]).apply(corners - origin)
+    motion = project(turned + origin + step.change[3:], model) - project(corners, model)
+    return float(np.max(np.linalg.norm(motion, axis=1)))
 
 
 def with_two_poses(obs, step, name):

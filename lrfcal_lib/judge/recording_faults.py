@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtri
 
 from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.calibrate.outline import platform_of
 from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
+from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.judge.camera_changes import LEVER, NOISY, camera_changes, large_changes
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
@@ -196,8 +196,8 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     """Units and senses that are not as stated: read otherwise, scans and images agree."""
     session = prepared.session
     if len(prepared.scans) <= len(session.board_placements) / 2:
-        readings = [reading for reading in UNITS if shows_boards(session, reading)]
-        return [Fault("unit", reading.words, severe=True) for reading in readings[:1]]
+        shown = [reading for reading in UNITS if shows_boards(session, reading)]
+        return [Fault("unit", reading.words, severe=True) for reading in shown[:1]]
 
     stated = board_misses(prepared, AS_STATED)
     if not stated or _worst(stated) < MISREAD:
@@ -212,7 +212,8 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
             _mirrored_camera(camera, stated[camera], found) for camera, found in mirrored.items()
         ]
 
-    for readings in (SENSES, IMAGES, UNITS):
+    every: tuple[tuple[Reading, ...], ...] = (SENSES, IMAGES, UNITS)
+    for readings in every:
         misses = {reading: board_misses(prepared, reading) for reading in readings}
         fitting = [reading for reading in readings if _fits(misses[reading], stated)]
         if fitting:

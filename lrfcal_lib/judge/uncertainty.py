@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lrfcal_lib.fit.least_squares import null_space, reduced_hessian
+from lrfcal_lib.fit.covariance import null_space
+from lrfcal_lib.fit.least_squares import reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.camera import project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
@@ -118,7 +119,7 @@ def chain_of(solution, camera=None):
     scales = np.array([SCALES.get(name, 1.0) for name in estimate.names])
     scaled = solution.information().sum(axis=0) * scales[:, None] * scales
     hessian = marginal(scaled, index[known])
-    motions = null_space(hessian, np.ones(len(hessian)), UNSEEN)[0] * scales[index[known]]
+    motions = null_space(hessian, np.ones(len(hessian)), UNSEEN) * scales[index[known]]
     unseen = np.zeros((len(motions), len(wanted)))
     unseen[:, known] = motions
     on_head = True

@@ -18,6 +18,7 @@ from lrfcal_lib.judge.alternatives import (
     far_from_stated,
     not_an_offset,
     places_of_cameras,
+    step_not_told,
 )
 from lrfcal_lib.judge.diagnosis import OTHER_SIZE, lens_words
 from lrfcal_lib.judge.next_placement import (
@@ -41,7 +42,7 @@ from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
 from lrfcal_lib.model.problem import LEAVES_OUT, ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.planes import rival_words
+from lrfcal_lib.solvers.plane_start import rival_words
 
 YES = "yes"
 CARE = "with care"
@@ -353,6 +354,9 @@ def judge(calibration, method=None, **options):
         *places,
         words,
     )
+    if method == "joint" and not sizes:
+        words = step_not_told(joint.solution, prepared.session.lrf.admitted_offset)
+        notes += (words,) if words else ()
     if method == "joint" and FEWEST <= (n := len(joint.solution.boards)) < MANY:
         known = 100 / np.sqrt(2 * (n - 1))
         within = stdtrit(n - 1, 0.95)

@@ -31,6 +31,12 @@ class Chessboard:
         y, x = np.mgrid[: self.rows, : self.columns] * self.square
         return np.stack([x + self.origin[0], y + self.origin[1], 0.0 * x], axis=-1).reshape(-1, 3)
 
+    def outline(self) -> np.ndarray:
+        """Corners of the printed squares together, shape (4, 2), metres."""
+        first = np.asarray(self.origin) - self.square
+        size = self.square * np.array([self.columns + 1, self.rows + 1])
+        return first + size * [[0, 0], [1, 0], [1, 1], [0, 1]]
+
 
 @dataclass(frozen=True)
 class Board:

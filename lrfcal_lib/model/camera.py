@@ -1,7 +1,9 @@
 """Pinhole camera with lens distortion: projection, undistortion, straight lines in pixels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,7 +54,7 @@ class CameraModel:
 
     def with_parameters(
         self,
-        values: ArrayLike,
+        values: Sequence[float] | np.ndarray,
         covariance: np.ndarray | None = None,
         rms_px: float | None = None,
     ) -> "CameraModel":
@@ -65,7 +67,7 @@ class CameraModel:
         covariance : ndarray, shape (9, 9), optional
         rms_px : float, optional
         """
-        matrix = dict(zip(INTRINSIC_NAMES[:4], map(float, values[:4]), strict=True))
+        matrix: dict[str, Any] = dict(zip(INTRINSIC_NAMES[:4], map(float, values[:4]), strict=True))
         distortion = np.asarray(values[4:9], float)
         return replace(self, **matrix, distortion=distortion, covariance=covariance, rms_px=rms_px)
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.geometry import lrf_to_source, tilt
 
 TILT_AXIS = np.array([1.0, 0.0, 0.0])  # of the head and of the platform
+MIRROR_TURN = 1 / 75.08  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real LMS200
 
 
 @dataclass(frozen=True)

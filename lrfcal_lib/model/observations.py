@@ -13,6 +13,13 @@ LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 ROUGH_NOISE = 1e-4 * np.eye(3)  # a centimetre every way, for points whose covariance is not told
 
 
+def thin(rows: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of some rows, evenly spread."""
+    if len(rows) <= count:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
+
+
 def check_finite(record, whose="", missing=()):
     """Refuse a record with a NaN or an infinity in an array; those named in `missing` may."""
     for name, value in vars(record).items():

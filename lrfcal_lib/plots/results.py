@@ -69,7 +69,7 @@ def residual_strips(
         ax.bar(column, 2 * rms, 0.8, -rms, color=color, alpha=0.2, linewidth=0)
         at = column + 0.6 * _side_by_side(len(values))
         ax.plot(at, values, ".", color=color, markersize=2.5)
-    by_placement(ax, names, label)
+    by_placement(ax, names.tolist(), label)
     limit = 1.08 * max(np.abs(residuals).max(), 1e-12)
     ax.set_ylim(-limit, limit)
 

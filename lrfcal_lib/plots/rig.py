@@ -113,7 +113,7 @@ def space(
         ax.set_axis_off()
 
 
-def sphere(ax: Axes3D, centre: ArrayLike, radius: float) -> None:
+def sphere(ax: Axes3D, centre: np.ndarray, radius: float) -> None:
     """The set a point allows, figure 3 (a): the surface of a sphere.
 
     Parameters
@@ -261,7 +261,8 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
         If eye and target coincide, or `up` is the line of sight.
     """
     eye = np.asarray(eye, float)
-    ahead = np.subtract(target, eye)
+    target = np.asarray(target, float)
+    ahead = target - eye
     right = np.cross(ahead, up)
     distance = np.linalg.norm(ahead)
     if np.linalg.norm(right) <= PARALLEL * distance:

@@ -4,7 +4,7 @@ import numpy as np
 from scipy import ndimage
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess.board_in_scan import DEPTH_NOISE, median_step, plane_axes
+from lrfcal_lib.preprocess.board_in_scan import median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
     BORDER,
     MIXING,
@@ -12,6 +12,7 @@ from lrfcal_lib.preprocess.edges_in_scan import (
     beyond,
     plane_range,
 )
+from lrfcal_lib.preprocess.surfaces import DEPTH_NOISE, plane_axes
 
 REACH = 2  # beams (or scan lines) on either side of a boundary
 CORNER = 1.0  # spot radii: a spot nearer than this to a second edge may reach over it

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.model.camera import fold, line_through, pinhole
@@ -24,13 +23,7 @@ SYSTEMATIC_PX = 0.1
 # grey levels: a step of this height counts half, cardboard and paint have weaker ones
 FULL_CONTRAST = 30.0
 PICK_SIGMA_PX = 1.0  # of a point clicked by hand
-STEP = 0.02  # of the wide search, in squares
-# squares outside the outermost inner corners
-NEAREST = 1.1
-FARTHEST = 6.0
 BEHIND = -1e6  # pixels; where points behind the camera are drawn
-SIDES = ("top", "right", "bottom", "left")
-SIDE_NORMALS = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
 
 
 @dataclass(frozen=True)
@@ -66,10 +59,6 @@ class ImageEdge:
 
 class EdgeNotSeen(ValueError):
     """An edge cannot be used in this image; the message is the reason."""
-
-
-class OutlineNotSeen(ValueError):
-    """The images do not show where a board ends: a sheet on a wall, a background as bright."""
 
 
 def loops():
@@ -290,35 +279,6 @@ def board_line(view, edge, model):
     return line / np.hypot(line[0], line[1])
 
 
-def wide_distances(pattern):
-    """Distances outside the outermost inner corners at which edges are looked for, metres."""
-    return np.arange(NEAREST, FARTHEST, STEP) * pattern.square
-
-
-def edge_votes(image, board, model, pose):
-    """Share (4, n) of the profiles that agree on an edge, by side and :func:`wide_distances`.
-
-    NaN where less than 30 % of the profiles lie inside the image.
-    """
-    pattern = board.pattern
-    distances = wide_distances(board.pattern)
-    size = np.array([pattern.columns - 1, pattern.rows - 1]) * pattern.square
-    slopes = np.linspace(-0.025, 0.025, 11) * 4  # the profiles stand four steps apart
-    out = []
-    for normal in SIDE_NORMALS:
-        along = np.abs(normal[::-1])
-        s = np.arange(-pattern.square, size @ along + pattern.square, 4 * STEP * pattern.square)
-        base = np.asarray(pattern.origin) + np.maximum(normal, 0) * size
-        xy = base + s[None, :, None] * along + distances[:, None, None] * normal
-        strip = sample(image, model, on_board(xy, pose, model))
-        height = step_contrast(strip, 1.5, along=3)
-        column, place, _ = peaks(height, 8.0)
-        votes = loops().vote(column, place, np.ones(len(column)), height.shape, slopes).max(axis=0)
-        seen = np.isfinite(strip[..., 0]).sum(axis=1)
-        out.append(np.where(seen > 0.3 * height.shape[1], votes / np.maximum(seen, 1), np.nan))
-    return np.stack(out)
-
-
 def on_board(xy, pose, model):
     """Undistorted pixels of points (..., 2) of the board.
 
@@ -326,62 +286,3 @@ def on_board(xy, pose, model):
     """
     points = np.column_stack([xy.reshape(-1, 2), np.zeros(xy.size // 2)])
     return np.nan_to_num(pinhole(pose.apply(points), model), nan=BEHIND).reshape(xy.shape)
-
-
-def common_lines(votes, board):
-    """Board lines (4, 3) that views with votes (v, 4, n), turned alike, agree on.
-
-    OutlineNotSeen names an edge.
-    """
-    # an edge moves by a few millimetres between placements
-    wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), 7, axis=-1)
-    wide[wide < 0] = np.nan
-    distances = wide_distances(board.pattern)
-    places = []
-    for name, own in zip(SIDES, np.moveaxis(wide, 1, 0), strict=True):
-        enough = np.isfinite(own).sum(axis=0) >= min(3, len(votes))
-        mean = np.zeros(len(distances))
-        mean[enough] = np.nanmean(own[:, enough], axis=0)
-        places.append(outer_peak(gaussian_filter1d(mean, 1.0)))
-        if places[-1] < 0:
-            raise OutlineNotSeen(
-                f"the images do not agree on the {name} edge of board '{board.name}': give the "
-                "corners of the board or pick edges by hand"
-            )
-    return side_lines(board.pattern, distances[places])
-
-
-def outer_peak(votes, least=0.5, quiet=0.2, width=6):
-    """Place of the board's edge in the votes (n,) of one side: the last line before the clutter
-    begins; -1 if none.
-
-    Two lines of a board (the border of the sheet, the edge) are `width` samples wide and `quiet` in
-    between.
-    """
-    best = -1
-    start = 0
-    for i in np.nonzero(votes >= least)[0]:
-        if votes[i] < votes[max(i - width, 0) : i + width + 1].max():
-            continue
-        gap = votes[start : max(i - 2 * width, start)]
-        if gap.size and gap.mean() > quiet:
-            break
-        best = int(i)
-        start = int(i) + 2 * width
-    return best
-
-
-def side_lines(pattern, distances):
-    """Board lines (4, 3) parallel to the sides of the pattern, at distances outside the outermost
-    inner corners.
-
-    Parameters
-    ----------
-    pattern : Chessboard
-    distances : sequence of 4 floats
-        Top, right, bottom, left; metres.
-    """
-    size = np.array([pattern.columns - 1, pattern.rows - 1]) * pattern.square
-    base = np.asarray(pattern.origin) + np.maximum(SIDE_NORMALS, 0) * size
-    offset = -np.sum(base * SIDE_NORMALS, axis=1) - np.asarray(distances, float)
-    return np.column_stack([SIDE_NORMALS, offset])

@@ -5,13 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, tilt
-from lrfcal_lib.preprocess.board_in_scan import (
-    depth_jump,
-    median_step,
-    plane_axes,
-    row_ends,
-    row_median,
-)
+from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step, row_median
+from lrfcal_lib.preprocess.straight_runs import LEAST_TURN, line_of, straight_runs
+from lrfcal_lib.preprocess.surfaces import SAME_PITCH, depth_jump, plane_axes, row_ends
 
 VARIANTS = ("last_beam", "half_step")
 # metres; an LMS2xx gives one reading for two surfaces nearer together along the beam (telegram
@@ -19,10 +15,6 @@ VARIANTS = ("last_beam", "half_step")
 MIXING = 1.0
 # beams or lines at the border of the view, where the board's end cannot be told from the view's end
 BORDER = 3
-# of a straight side; on one hand of a board
-FEWEST_POINTS = 5
-MOST_RUNS = 4
-LEAST_TURN = np.radians(8)  # between neighbouring sides that end scan lines on the same hand
 LEAST_ANGLE = np.radians(20)
 SHORTEST_SIDE = 0.1  # of the board's size
 UNIFORM = 1 / np.sqrt(12.0)  # standard deviation of a uniform distribution of width 1
@@ -31,98 +23,8 @@ EDGE_SCATTER = 0.006
 SAME_SIDE = 0.02  # metres; a side found by lines and by columns
 # at most, at either end of a scan line, that tell how far the board lies from the fitted line
 WARPED_BEAMS = 15
-
-
-def beyond(scan, line, beam, step, beams=3):
-    """Range behind ends of the board (a cell and the step to the next one): a median, or inf."""
-    ends = np.stack([line, beam], axis=1)
-    away = np.arange(1, beams + 1)[:, None]
-    cells = ends[:, None] + step[:, None] * away
-    cells = np.clip(cells, 0, np.array(scan.mask.shape) - 1)
-    ranges = scan.sweep.ranges[cells[..., 0], cells[..., 1]]
-    ordered = np.sort(np.nan_to_num(ranges, nan=np.inf), axis=1)
-    return ordered[:, beams // 2]
-
-
-def background_odds(here, behind):
-    """What the background adds to the log odds of the board's share at which readings flip.
-
-    ``2 ln(here / behind)``, the inverse square law; 0 with nothing behind, or so close that both
-    give one echo.
-    """
-    behind = np.asarray(behind, float)
-    apart = np.isfinite(behind) & (behind - here >= MIXING)
-    ratio = here / np.where(apart, behind, 1.0)
-    return 2 * np.log(np.where(apart, ratio, 1.0))
-
-
-def straight_runs(points, order, tolerance, shortest):
-    """Split a trace (n, 2) into straight runs: random sample consensus, the longest run first.
-
-    `order` (n,) is the place along the trace (scan line or beam number). Returns the indices of the
-    points of each run. Runs with fewer than five points, too short, or turned by less than 8 deg
-    against a longer one (the same side, bent or frayed) are not returned.
-    """
-    rng = np.random.default_rng(0)
-    left = np.arange(len(points))
-    runs = []
-    directions = []
-    for _ in range(2 * MOST_RUNS):
-        if len(left) < FEWEST_POINTS or len(runs) == MOST_RUNS:
-            break
-        found = left[_consensus(points[left], tolerance, shortest / 2, rng)]
-        if len(found) == 0:
-            break
-        # the largest part without a gap of more than a tenth of the run (five steps at least)
-        found = found[np.argsort(order[found], kind="stable")]
-        gaps = np.diff(order[found]) > max(5, 0.1 * len(found))
-        part = np.cumsum(np.r_[0, gaps])
-        largest = np.bincount(part).argmax()
-        found = np.sort(found[part == largest])
-        if len(found) < FEWEST_POINTS:
-            break
-        left = np.setdiff1d(left, found)
-        _, direction, along, _ = line_of(points[found])
-        turned = all(abs(direction @ other) < np.cos(LEAST_TURN) for other in directions)
-        if turned and np.ptp(along) >= shortest:
-            runs.append(found)
-            directions.append(direction)
-    return runs
-
-
-def line_of(points, among=slice(None)):
-    """Least squares line of some points (n, 2): centre, direction, places along and across it.
-
-    Total least squares; the places are of all points, metres.
-    """
-    centre = points[among].mean(axis=0)
-    offset = points - centre
-    spread = offset[among].T @ offset[among]
-    direction = np.linalg.eigh(spread)[1][:, 1]
-    across = offset[:, 1] * direction[0] - offset[:, 0] * direction[1]
-    return centre, direction, offset @ direction, across
-
-
-def _consensus(points, tolerance, apart, rng, trials=300):
-    """Which points lie near the line that most agree with, after two least-squares refinements."""
-    a = points[rng.integers(len(points), size=trials)]
-    b = points[rng.integers(len(points), size=trials)]
-    length = np.linalg.norm(b - a, axis=1)
-    far = length > apart
-    if not far.any():
-        return np.zeros(len(points), bool)
-    along = (b - a)[far] / length[far, None]
-    a = a[far]
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    distance = normal @ points.T - np.sum(normal * a, axis=1)[:, None]
-    # The sum of truncated squares ranks lines through the middle of a trace above those along its
-    # rim.
-    best = np.minimum((distance / tolerance) ** 2, 1).sum(axis=1).argmin()
-    on = np.abs(distance[best]) < tolerance
-    for _ in range(2):
-        if on.sum() >= 2:
-            on = np.abs(line_of(points, on)[3]) < tolerance
-    return on
+CELLS_BEHIND = 3  # cells beyond an end that tell the range behind it: a median
+MEDIAN_CHI2 = 0.455  # the median of a squared normal variable
 
 
 @dataclass(frozen=True)
@@ -156,17 +58,17 @@ class ScanSide:
     angle: float
     ends: np.ndarray
 
-    def is_same(self, other):
+    @property
+    def direction(self) -> np.ndarray:
+        """From one end to the other, shape (3,), of unit length."""
+        return (self.ends[1] - self.ends[0]) / self.length
+
+    def is_same(self, other: "ScanSide") -> bool:
         """Whether two sides are one: the same direction, and less than two centimetres apart."""
         between = other.ends.mean(axis=0) - self.ends.mean(axis=0)
         apart = np.linalg.norm(np.cross(between, self.direction))
         cosine = abs(self.direction @ other.direction)
-        return cosine > np.cos(LEAST_TURN) and apart < SAME_SIDE
-
-    @property
-    def direction(self):
-        """From one end to the other, shape (3,), of unit length."""
-        return (self.ends[1] - self.ends[0]) / self.length
+        return bool(cosine > np.cos(LEAST_TURN) and apart < SAME_SIDE)
 
 
 @dataclass(frozen=True)
@@ -208,11 +110,43 @@ class ScanEdges:
     background: np.ndarray
 
 
-def crossings(scan, across=False, known=()):
-    """Where scan lines cross the board's edges or, with `across`, columns of the range image (one
-    beam over the pitch).
+@dataclass(frozen=True)
+class _Ends:
+    """Ends of scan lines (or columns) on the board, arrays (n,), as in ScanEdges.
 
-    One rule, step (iii) of the paper's preprocessing, in which bearing and pitch change places.
+    `inner` and `outer` are the bearing (or the pitch) of the last cell on the board and of the
+    first one off it, radians.
+    """
+
+    line: np.ndarray
+    beam: np.ndarray
+    step: np.ndarray
+    end: np.ndarray
+    inner: np.ndarray
+    outer: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Crossings:
+    """Points (n, 3) of the board where lines (or columns) end, LRF frame at a `pitch` (n,).
+
+    `by_angle` (n, 3) is their derivative by bearing (or pitch), `range_sigma` (n,) the standard
+    deviation of the fitted range, metres.
+    """
+
+    points: np.ndarray
+    pitch: np.ndarray
+    by_angle: np.ndarray
+    range_sigma: np.ndarray
+
+
+def crossings(
+    scan: BoardScan, across: bool = False, known=()
+) -> tuple[dict[str, ScanEdges], tuple[ScanSide, ...]]:
+    """Where scan lines (with `across`, columns of the range image) cross the board's edges.
+
+    A column is one beam over the pitch. One rule, step (iii) of the paper's preprocessing, in which
+    bearing and pitch change places.
 
     Parameters
     ----------
@@ -237,61 +171,126 @@ def crossings(scan, across=False, known=()):
     sides : tuple of ScanSide
         All of them, with those left out.
     """
-    line, beam, step, end = _ends(scan, across)
-    pitch = scan.sweep.pitch[line]
-    if across:
-        angles = scan.sweep.pitch
-        cell = line
-    else:
-        angles = scan.sweep.bearings
-        cell = beam
-    inner = angles[cell]
-    outer = angles[cell + step.sum(axis=1)]
-    gap = outer - inner
-    middle = (inner + outer) / 2
-    if across:
-        order = beam
-        when = middle
-        shift = 0.0
-        warp_sigma = 0.0
-        if len(angles) > 1:  # the pitch is read in steps, it may seem to stand still
-            gap = np.copysign(np.maximum(np.abs(gap), median_step(angles)), gap)
-    else:
-        order = line
-        when = pitch
-        shift, warp_sigma = _warp(scan, line, beam, end)
-    points, by_angle, _ = _points_at(scan, line, beam, middle, shift, across)
-    here = scan.fitted[line, beam]
-    behind = beyond(scan, line, beam, step)
-    side, every = _group(scan, points, when, order, end, behind - here < MIXING, known)
+    ends = _ends(scan, across)
+    gap = ends.outer - ends.inner
+    shift = 0.0
+    warp_sigma = 0.0
+    if not across:
+        shift, warp_sigma = _warp(scan, ends)
+    elif len(scan.sweep.pitch) > 1:  # the pitch is read in steps, it may seem to stand still
+        gap = np.copysign(np.maximum(np.abs(gap), median_step(scan.sweep.pitch)), gap)
+
+    def at(angle):
+        if across:
+            return _down_columns(scan, ends, angle)
+        return _along_lines(scan, ends.line, angle, shift)
+
+    middle = at((ends.inner + ends.outer) / 2)
+    last = at(ends.inner)
+    here = scan.fitted[ends.line, ends.beam]
+    behind = beyond(scan, ends.line, ends.beam, ends.step)
+    order = ends.beam if across else ends.line
+    side, every = _group(scan, middle, order, ends.end, behind - here < MIXING, known)
     sigma = np.abs(gap) * UNIFORM
-    sigma = sigma * _inflation(_to_platform(scan, by_angle, when), sigma, side, every)
-    sides = every
+    by_angle = _to_platform(scan, middle.by_angle, middle.pitch)
+    sigma = sigma * _inflation(by_angle, sigma, side, every)
+    sides = tuple(s for s in every if _leans(s, across))
     if every:  # scans at one pitch have no sides, and keep all points
-        lean = [np.pi / 2 - s.angle if across else s.angle for s in every]
-        sides = tuple(s for s, angle in zip(every, lean, strict=True) if angle >= LEAST_ANGLE)
         side = np.where(np.isin(side, [s.side for s in sides]), side, -1)
-    about = line, beam, step, end, side, sides
-    odds = background_odds(here, behind)
-    found = {}
-    for variant, angle, there in (("last_beam", inner, pitch), ("half_step", middle, when)):
-        points, by_angle, range_sigma = _points_at(scan, line, beam, angle, shift, across)
-        rays = points / np.linalg.norm(points, axis=1, keepdims=True)
-        noise = _outer(rays * np.hypot(range_sigma, warp_sigma)[:, None])
-        spacing = _outer(by_angle * sigma[:, None])
-        found[variant] = ScanEdges(variant, points, spacing + noise, there, *about, odds)
-    return found, every
+    edges = {}
+    for variant, crossing in (("last_beam", last), ("half_step", middle)):
+        distance = np.linalg.norm(crossing.points, axis=1, keepdims=True)
+        rays = crossing.points / distance
+        noise = _outer(rays * np.hypot(crossing.range_sigma, warp_sigma)[:, None])
+        edges[variant] = ScanEdges(
+            variant=variant,
+            points=crossing.points,
+            covariance=noise + _outer(crossing.by_angle * sigma[:, None]),
+            pitch=crossing.pitch,
+            line=ends.line,
+            beam=ends.beam,
+            step=ends.step,
+            end=ends.end,
+            side=side,
+            sides=sides,
+            background=background_odds(here, behind),
+        )
+    return edges, every
+
+
+def beyond(scan, line, beam, step):
+    """Range behind ends of the board, metres: a median of three cells, or inf.
+
+    Parameters
+    ----------
+    scan : BoardScan
+    line, beam : ndarray of int, shape (n,)
+        The last cell on the board.
+    step : ndarray of int, shape (n, 2)
+        To the next one, in lines and beams.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    ends = np.stack([line, beam], axis=1)
+    away = np.arange(1, CELLS_BEHIND + 1)[:, None]
+    cells = ends[:, None] + step[:, None] * away
+    cells = np.clip(cells, 0, np.array(scan.mask.shape) - 1)
+    ranges = scan.sweep.ranges[cells[..., 0], cells[..., 1]]
+    ordered = np.sort(np.nan_to_num(ranges, nan=np.inf), axis=1)
+    return ordered[:, CELLS_BEHIND // 2]
+
+
+def background_odds(here, behind):
+    """What the background adds to the log odds of the board's share at which readings flip.
+
+    ``2 ln(here / behind)``, the inverse square law; 0 with nothing behind, or so close that both
+    give one echo.
+    """
+    behind = np.asarray(behind, float)
+    apart = np.isfinite(behind) & (behind - here >= MIXING)
+    ratio = here / np.where(apart, behind, 1.0)
+    return 2 * np.log(np.where(apart, ratio, 1.0))
+
+
+def plane_range(scan, rays, pitch) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays meet the board's plane.
+
+    Parameters
+    ----------
+    scan : BoardScan
+    rays : ndarray, shape (..., 3)
+        Unit vectors, LRF frame.
+    pitch : ndarray, shape (...)
+        Radians.
+
+    Returns
+    -------
+    range, cosine : ndarray
+        Metres, and the cosine of the incidence.
+    """
+    cosine = _to_platform(scan, rays, pitch) @ scan.normal
+    height = scan.distance - tilt(scan.T_head_lrf.translation, pitch) @ scan.normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return height / cosine, cosine
 
 
 def _outer(vectors):
     """Products (n, 3, 3) of vectors (n, 3) with themselves."""
-    return np.einsum("ni,nj->nij", vectors, vectors)
+    return vectors[:, :, None] * vectors[:, None, :]
+
+
+def _leans(side, across):
+    """Whether the place along a scan line (a column) tells more of a side than the pitch does."""
+    lean = np.pi / 2 - side.angle if across else side.angle
+    return lean >= LEAST_ANGLE
 
 
 def _ends(scan, across):
-    """Ends of lines (columns) that may be edges: line, beam, step off the board, -1 or +1."""
+    """Ends of lines (columns) that may be edges."""
     mask = scan.mask.T if across else scan.mask
-    pitch = scan.sweep.pitch
+    sweep = scan.sweep
     rows, first, last = row_ends(mask)
     row = np.r_[rows, rows]
     cell = np.r_[first, last]
@@ -303,57 +302,62 @@ def _ends(scan, across):
     beam = beam[keep]
     way = way[keep]
     step = np.zeros((len(way), 2), int)
-    if across:
-        step[:, 0] = way
-        turned = pitch[line + way] - pitch[line]
-    else:
-        step[:, 1] = way
-        turned = np.median(np.diff(scan.sweep.bearings))
+    step[:, 0 if across else 1] = way
+    angles = sweep.pitch if across else sweep.bearings
+    inner = angles[cell[keep]]
+    outer = angles[cell[keep] + way]
+    turned = outer - inner if across else np.median(np.diff(angles))
     here = scan.fitted[line, beam]
-    after = scan.sweep.ranges[line + step[:, 0], beam + step[:, 1]]
-    seen = ~(after < here - depth_jump(here, turned))
-    if across and len(pitch) > 1 and np.polyfit(np.arange(len(pitch)), pitch, 1)[0] <= 0:
-        way = -way  # a sweep downwards
-    return line[seen], beam[seen], step[seen], way[seen]
+    after = sweep.ranges[line + step[:, 0], beam + step[:, 1]]
+    end = way
+    if across and len(angles) > 1 and np.polyfit(np.arange(len(angles)), angles, 1)[0] <= 0:
+        end = -way  # a sweep downwards
+    visible = ~(after < here - depth_jump(here, turned))  # nothing nearer hides the board
+    ends = line, beam, step, end, inner, outer
+    return _Ends(*(part[visible] for part in ends))
 
 
-def _points_at(scan, line, beam, angle, shift, across):
-    """Points (LRF frame) of the board where lines end at bearings, or columns at pitch angles.
-
-    Returns them with their derivative by that angle and the standard deviation of the fitted range.
-    They lie on the fitted lines, moved by `shift` along the ray, and along a column by the change
-    that the board's plane predicts.
-    """
-    bearing = scan.sweep.bearings[beam] if across else angle
-    rays = polar_to_points(np.ones(len(line)), bearing)
+def _along_lines(scan, line, bearing, shift=0.0):
+    """Crossings on the fitted lines at bearings, moved by `shift` (metres) along the ray."""
+    rays = polar_to_points(np.ones(len(bearing)), bearing)
     turned = np.stack([-rays[:, 1], rays[:, 0], 0 * bearing], axis=1)
     u = scan.lines[line]
-    ray = rays[:, :2]
-    r = 1 / np.sum(u * ray, axis=1)
-    variance = np.einsum("ni,nij,nj->n", ray, scan.lines_covariance[line], ray)
-    range_sigma = r**2 * np.sqrt(variance)
-    if not across:
-        slope = -(r**2) * np.sum(u * turned[:, :2], axis=1)
-        by_bearing = slope[:, None] * rays + r[:, None] * turned
-        return (r + shift)[:, None] * rays, by_bearing, range_sigma
-    there, _ = plane_range(scan, rays, angle)
-    here, _ = plane_range(scan, rays, scan.sweep.pitch[line])
-    points = (scan.fitted[line, beam] + (there - here))[:, None] * rays
+    r = 1 / np.sum(u * rays[:, :2], axis=1)
+    slope = -(r**2) * np.sum(u * turned[:, :2], axis=1)
+    return _Crossings(
+        points=(r + shift)[:, None] * rays,
+        pitch=scan.sweep.pitch[line],
+        by_angle=slope[:, None] * rays + r[:, None] * turned,
+        range_sigma=_range_sigma(scan, line, rays),
+    )
+
+
+def _down_columns(scan, ends, pitch):
+    """Crossings at pitch angles: on the fitted lines, changed as the board's plane predicts."""
+    rays = polar_to_points(np.ones(len(pitch)), scan.sweep.bearings[ends.beam])
+    there, _ = plane_range(scan, rays, pitch)
+    here, _ = plane_range(scan, rays, scan.sweep.pitch[ends.line])
+    fitted = scan.fitted[ends.line, ends.beam]
+    points = (fitted + (there - here))[:, None] * rays
     rotation = scan.T_head_lrf.rotation.as_matrix()
     # d p / d pitch, in the LRF frame
     turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation
-    normal = tilt(scan.normal, -angle) @ rotation
+    normal = tilt(scan.normal, -pitch) @ rotation
     slide = np.sum(normal * turned, axis=1) / np.sum(normal * rays, axis=1)
-    return points, turned - slide[:, None] * rays, range_sigma
+    return _Crossings(
+        points=points,
+        pitch=pitch,
+        by_angle=turned - slide[:, None] * rays,
+        range_sigma=_range_sigma(scan, ends.line, rays),
+    )
 
 
-def plane_range(scan, rays, pitch):
-    """Range along rays (LRF frame) to the board's plane, and the cosine of their incidence."""
-    cosine = _to_platform(scan, rays, pitch) @ scan.normal
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return (
-            scan.distance - tilt(scan.T_head_lrf.translation, pitch) @ scan.normal
-        ) / cosine, cosine
+def _range_sigma(scan, line, rays):
+    """Standard deviation (n,) of the ranges of fitted lines along rays (n, 3), metres."""
+    ray = rays[:, :2]
+    inverse = np.sum(scan.lines[line] * ray, axis=1)
+    variance = np.einsum("ni,nij,nj->n", ray, scan.lines_covariance[line], ray)
+    return np.sqrt(variance) / inverse**2
 
 
 def _to_platform(scan, vectors, pitch):
@@ -361,7 +365,7 @@ def _to_platform(scan, vectors, pitch):
     return tilt(vectors @ scan.T_head_lrf.rotation.as_matrix().T, pitch)
 
 
-def _warp(scan, line, beam, end):
+def _warp(scan, ends):
     """How far the board lies from the fitted lines at their ends, and the sigma of that, metres.
 
     A board bends, and cardboard reads farther than paper. The outermost eighth of a line (15 beams
@@ -370,26 +374,22 @@ def _warp(scan, line, beam, end):
     fitted lines.
     """
     inwards = np.arange(WARPED_BEAMS)
-    count = np.clip(scan.mask[line].sum(axis=1) // 8, 1, WARPED_BEAMS)
-    at = beam[:, None] - end[:, None] * inwards
-    use = inwards < count[:, None]
-    use &= (at >= 0) & (at < scan.mask.shape[1])
-    cells = line[:, None], np.where(use, at, 0)
-    use &= scan.mask[cells]
+    count = np.clip(scan.mask[ends.line].sum(axis=1) // 8, 1, WARPED_BEAMS)
+    beams = ends.beam[:, None] - ends.end[:, None] * inwards
+    inside = (beams >= 0) & (beams < scan.mask.shape[1])
+    cells = ends.line[:, None], np.where(inside, beams, 0)
+    use = inside & (inwards < count[:, None]) & scan.mask[cells]
     misses = (scan.sweep.ranges - scan.fitted)[cells]
     middle = row_median(np.where(use, misses, np.nan))
     # of a median: pi / 2 times that of a mean
     noise = np.pi / 2 * scan.sigma_range**2 / np.maximum(use.sum(axis=1), 1)
-    shift = np.zeros(len(line))
-    sigma = np.zeros(len(line))
-    for mine in (end == -1, end == 1):
-        if mine.any():
-            variance = np.median(middle[mine] ** 2) / 0.455  # the median of chi2(1)
-            excess = max(variance - np.median(noise[mine]), 0.0)
-            whole = excess + noise[mine]
-            shift[mine] = middle[mine] * excess / whole
-            sigma[mine] = np.sqrt(excess * noise[mine] / whole)
-    return shift, sigma
+    excess = np.zeros(len(noise))
+    for way in np.unique(ends.end):
+        rows = ends.end == way
+        variance = np.median(middle[rows] ** 2) / MEDIAN_CHI2
+        excess[rows] = max(variance - np.median(noise[rows]), 0.0)
+    share = excess / (excess + noise)
+    return middle * share, np.sqrt(noise * share)
 
 
 def _inflation(by_angle, sigma, side, sides):
@@ -397,44 +397,43 @@ def _inflation(by_angle, sigma, side, sides):
 
     The spacing is along `by_angle`.
     """
-    out = np.ones(len(side))
+    factor = np.ones(len(side))
     for s in sides:
-        mine = side == s.side
-        way = s.ends[1] - s.ends[0]
-        direction = way / np.linalg.norm(way)
-        along = by_angle[mine] @ direction
-        across = by_angle[mine] - along[:, None] * direction
-        expected = np.sqrt(np.mean(sigma[mine] ** 2 * np.sum(across**2, axis=1)))
+        rows = side == s.side
+        along = by_angle[rows] @ s.direction
+        across = by_angle[rows] - along[:, None] * s.direction
+        expected = np.sqrt(np.mean(sigma[rows] ** 2 * np.sum(across**2, axis=1)))
         if expected > 0:
-            out[mine] = max(1.0, s.rms / expected)
-    return out
+            factor[rows] = max(1.0, s.rms / expected)
+    return factor
 
 
-def _group(scan, p_lrf, pitch, order, end, mixed, known):
+def _group(scan, crossing, order, end, mixed, known):
     """The straight sides in the board's plane: the side of each point (-1 for none), and the sides.
 
     Where a post or an easel stands close behind a board, its edge is bent: such (`mixed`) points
     are left out, unless most of the board's outline lies before something close (a wall), which
     moves all of it alike.
     """
-    if len(scan.sweep.pitch) == 1 or np.ptp(scan.sweep.pitch) < 1e-4:
+    if np.ptp(scan.sweep.pitch) < SAME_PITCH:
         return (end + 1) // 2, ()  # scans at one pitch show one point a side
+    pitch = crossing.pitch
     axes = plane_axes(scan.normal)
-    flat = lrf_to_platform(p_lrf, pitch, scan.T_head_lrf) @ axes.T
-    tolerance = max(_spacing(scan), EDGE_SCATTER)
-    shortest = 0.0
-    if len(flat):
-        shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0))
-    usable = ~mixed | (2 * mixed.sum() >= len(flat))
+    flat = lrf_to_platform(crossing.points, pitch, scan.T_head_lrf) @ axes.T
     side = np.full(len(flat), -1)
+    if len(flat) == 0:
+        return side, ()
+    tolerance = max(_spacing(scan), EDGE_SCATTER)
+    shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0))
+    usable = ~mixed | (2 * mixed.sum() >= len(flat))
     sides = []
-    for e in (-1, 1):
-        mine = np.flatnonzero((end == e) & usable)
-        left_out = np.unique(order[(end == e) & ~usable])  # makes no gap
-        place = order[mine] - np.searchsorted(left_out, order[mine])
-        for run in straight_runs(flat[mine], place, tolerance, shortest):
-            rows = mine[run]
-            new = _side_through(scan, flat[rows], axes, np.mean(pitch[rows]), e)
+    for hand in (-1, 1):
+        candidates = np.flatnonzero((end == hand) & usable)
+        left_out = np.unique(order[(end == hand) & ~usable])  # makes no gap
+        place = order[candidates] - np.searchsorted(left_out, order[candidates])
+        for run in straight_runs(flat[candidates], place, tolerance, shortest):
+            rows = candidates[run]
+            new = _side_through(scan, flat[rows], axes, np.mean(pitch[rows]), hand)
             same = [s.side for s in known if s.is_same(new)]
             number = same[0] if same else len(known) + len(sides)
             side[rows] = number
@@ -445,12 +444,10 @@ def _group(scan, p_lrf, pitch, order, end, mixed, known):
 def _spacing(scan):
     """Median distance of neighbouring beams at the ends of the board's scan lines, metres."""
     row, first, last = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
-    steps = []
-    for beam in (first, last):
-        bearing = scan.sweep.bearings[beam]
-        steps.append(_points_at(scan, row, beam, bearing, 0.0, False)[1])
-    by_bearing = np.median(np.linalg.norm(np.concatenate(steps), axis=1))
-    return float(by_bearing * np.median(np.diff(scan.sweep.bearings)))
+    bearing = scan.sweep.bearings[np.r_[first, last]]
+    by_bearing = _along_lines(scan, np.r_[row, row], bearing).by_angle
+    step = np.median(np.diff(scan.sweep.bearings))
+    return float(np.median(np.linalg.norm(by_bearing, axis=1)) * step)
 
 
 def _side_through(scan, flat, axes, pitch, end):
@@ -460,7 +457,7 @@ def _side_through(scan, flat, axes, pitch, end):
     scan_normal = _to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch)
     level = np.cross(scan_normal, scan.normal)  # of the scan line on the board
     cosine = abs(level @ (direction @ axes)) / np.linalg.norm(level)
-    variance = np.mean(across**2) * len(flat) / max(len(flat) - 2, 1)
+    variance = np.sum(across**2) / max(len(flat) - 2, 1)
     return ScanSide(
         side=-1,
         end=end,

@@ -1,104 +1,64 @@
-"""The part of every image around the board, kept while several passes look at it: decoding
-costs most.
-"""
+"""The part of an image around the board, kept for several passes: decoding costs most."""
 
-from mmap import mmap
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from lrfcal_lib.preprocess.edges_in_image import FARTHEST
+from lrfcal_lib.model.board import Board
+from lrfcal_lib.preprocess.outline_in_images import FARTHEST
 
-KEPT_BYTES = 800_000_000  # of all images: half of each of 40 with 12 megapixels
 ALONG = 1.0  # beyond the farthest distance at which edges are looked for, squares
 ROOM = 0.1  # of the part on each side: the lens bends what is predicted here without it
 ROOM_PX = 60  # edges are looked for 40 px beside their prediction
 
 
-class KeptImages:
-    """Images of a session, each decoded once where the part around the board finds room.
+@dataclass(frozen=True)
+class Part:
+    """The part of an image around the board.
 
-    The memory is shared with forked processes, so that one may use what another decoded.
-
-    Parameters
-    ----------
-    read : callable
-        ``read(record)`` gives the image, uint8.
-    board : Board
-        With a pattern.
+    `shape` is that of the image, `left` and `top` tell where the part begins.
     """
 
-    def __init__(self, read, board):
-        self.read = read
-        self.grid, self.rectangle = _grids(board)
-        self.slots = {}
-        self.shape = None
+    shape: tuple
+    left: int
+    top: int
+    pixels: np.ndarray
 
-    def make_room(self, records, image):
-        """Reserve room for these records; `image` tells how large theirs are."""
-        if not records:
-            return
-        self.slots = {(r.camera, r.file): i for i, r in enumerate(records)}
-        self.shape = image.shape
-        self.room = min(image.nbytes, KEPT_BYTES // len(records))
-        self.boxes = np.frombuffer(mmap(-1, 16 * len(records)), np.int32).reshape(-1, 4)
-        self.memory = np.frombuffer(mmap(-1, max(self.room, 1) * len(records)), np.uint8)
-
-    def keep(self, record, image, corners):
-        """Keep the part of an image around the board whose corners (k, 2) were found in it."""
-        number = self.slots.get((record.camera, record.file))
-        if number is None or image.shape != self.shape:
-            return
-        left, top, right, bottom = self._around(corners)
-        part = image[top:bottom, left:right]
-        if not 0 < part.nbytes <= self.room:
-            return
-        self._memory_of(number, part.shape)[:] = part
-        self.boxes[number] = left, top, right, bottom
-
-    def around_board(self, record):
-        """The image of a record, black where nothing of the board can be."""
-        number = self.slots.get((record.camera, record.file))
-        if number is None or not self.boxes[number].any():
-            return self.read(record)
-        left, top, right, bottom = self.boxes[number]
+    def image(self) -> np.ndarray:
+        """The image, black where nothing of the board can be."""
+        height, width = self.pixels.shape[:2]
         image = np.zeros(self.shape, np.uint8)  # the system gives memory where it is written to
-        shape = (bottom - top, right - left, *self.shape[2:])
-        image[top:bottom, left:right] = self._memory_of(number, shape)
+        image[self.top : self.top + height, self.left : self.left + width] = self.pixels
         return image
 
-    def _memory_of(self, number, shape):
-        """The room of a record in the shape of its part."""
-        start = number * self.room
-        return self.memory[start : start + int(np.prod(shape))].reshape(shape)
 
-    def _around(self, corners):
-        """Left, top, right and bottom of what may be looked at.
+def part_around(image: np.ndarray, corners: np.ndarray, board: Board) -> Part:
+    """The part of an image that may be looked at; all of it where that is behind the camera.
 
-        All of an image where that is behind the camera.
-        """
-        height, width = self.shape[:2]
-        homography = cv2.findHomography(self.grid, np.asarray(corners, float))[0]
-        ends = np.column_stack([self.rectangle, np.ones(4)]) @ homography.T
-        middle = np.append(self.grid.mean(axis=0), 1.0) @ homography.T
-        depth = ends[:, 2] / middle[2]
-        if not np.all(depth > 0):
-            return 0, 0, width, height
-        uv = ends[:, :2] / ends[:, 2:]
-        room = ROOM * np.ptp(uv, axis=0) + ROOM_PX
-        low = np.clip(uv.min(axis=0) - room, 0, [width, height]).astype(int)
-        high = np.clip(uv.max(axis=0) + room + 1, 0, [width, height]).astype(int)
-        return *low, *high
+    `corners` (k, 2) are those of the pattern of the `board`, in any of its orders, pixels.
+    """
+    height, width = image.shape[:2]
+    grid = board.pattern.points()[:, :2]
+    homography = cv2.findHomography(grid, np.asarray(corners, float))[0]
+    ends = np.column_stack([_rectangle(grid, board), np.ones(4)]) @ homography.T
+    middle = np.append(grid.mean(axis=0), 1.0) @ homography.T
+    depth = ends[:, 2] / middle[2]
+    if not np.all(depth > 0):
+        return Part(image.shape, 0, 0, image)
+    uv = ends[:, :2] / ends[:, 2:]
+    room = ROOM * np.ptp(uv, axis=0) + ROOM_PX
+    left, top = np.clip(uv.min(axis=0) - room, 0, [width, height]).astype(int)
+    right, bottom = np.clip(uv.max(axis=0) + room + 1, 0, [width, height]).astype(int)
+    return Part(image.shape, left, top, image[top:bottom, left:right].copy())
 
 
-def _grids(board):
-    """Corners of the pattern (k, 2) on the board, and of a rectangle about its middle that holds
-    all of the board.
+def _rectangle(grid, board):
+    """Corners (4, 2) of a rectangle about the middle of the pattern that holds all of the board.
 
     It holds the board also where the pattern is turned by 180 deg or mirrored (a square one also on
     its side): which order its corners are found in does not matter.
     """
-    grid = board.pattern.points()[:, :2]
     middle = grid.mean(axis=0)
     if board.corners is None:
         beyond = (FARTHEST + ALONG) * board.pattern.square
@@ -107,4 +67,4 @@ def _grids(board):
         half = np.max(np.abs(board.points()[:, :2] - middle), axis=0)
     if board.pattern.rows == board.pattern.columns:
         half = np.full(2, np.max(half))
-    return grid, middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

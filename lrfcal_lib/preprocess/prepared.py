@@ -9,7 +9,8 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.problem import LEAVES_OUT, Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
-from lrfcal_lib.preprocess.survey import Outline, small_squares, views_of
+from lrfcal_lib.preprocess.outline_in_images import Outline
+from lrfcal_lib.preprocess.survey import small_squares, views_of
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import SessionError

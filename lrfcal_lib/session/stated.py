@@ -5,7 +5,7 @@ import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import pydantic
@@ -76,7 +76,6 @@ SYSTEMATIC_ERROR = {
 # centimetres: so many standard deviations or steps of a range; the sheets above admit 2 to 4.2, and
 # 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
-MIRROR_TURN = 1 / 75.08  # s, of an LMS2xx: 148 us for a ninetieth of a turn on a real device
 ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobody stated the spot
 
 
@@ -410,6 +409,17 @@ def _lens(lens, info):
     return lens and lens.made(info.data.get("width"), info.data.get("height"))
 
 
+if TYPE_CHECKING:
+    Lens = CameraModel | None
+else:  # stated without the size of the image, which stands beside it
+    Lens = Annotated[
+        LensStated | None,
+        AfterValidator(_lens),
+        PlainSerializer(model_to_json),
+        Field(alias="intrinsics"),
+    ]
+
+
 @dataclass(frozen=True)
 class CameraInfo:
     """A camera of the rig.
@@ -432,12 +442,7 @@ class CameraInfo:
     mount: Literal["head", "platform"]
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1), AfterValidator(_few_pixels)]
-    model: Annotated[
-        LensStated | None,
-        AfterValidator(_lens),
-        PlainSerializer(model_to_json),
-        Field(alias="intrinsics"),
-    ] = None
+    model: Lens = None
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
 

@@ -120,7 +120,8 @@ def board_poses(
         (-0.1, 0.1),
         distances,
     ]
-    drawn = rng.uniform(*np.transpose(limits), (count, len(limits)))
+    low, high = np.transpose(limits)
+    drawn = rng.uniform(low, high, (count, len(limits)))
     right, up, away = drawn[:, 3:].T
     centre = np.column_stack([right * away, away, up * away])
     return list(_posed(drawn[:, 0], drawn[:, 1:3], centre, [0.105, 0.127, 0.0]))

@@ -15,13 +15,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.session.lms2xx_codec import (
-    Configuration,
-    encode_configuration,
-    encode_words,
-)
+from lrfcal_lib.model.kinematics import MIRROR_TURN
+from lrfcal_lib.session.lms2xx_codec import Configuration, encode_configuration, encode_words
 from lrfcal_lib.session.read import PLATFORM_COLUMNS
-from lrfcal_lib.session.stated import MIRROR_TURN, transform_to_json
+from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.session.write import SessionWriter, write_file
 from lrfcal_lib.simulate.beam import scan
 from lrfcal_lib.simulate.rig import Placement, Setup, held_close, placements_of, random

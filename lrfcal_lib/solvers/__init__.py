@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_difference
-from lrfcal_lib.solvers import lines, planes
+from lrfcal_lib.solvers import lines, plane_start, planes
 
 
 @dataclass(frozen=True)
@@ -109,9 +109,9 @@ METHODS = {
 SHIPPED = MappingProxyType(dict(METHODS))  # without rows that others put there later
 CANDIDATES = ("zhang_pless", "line")  # the better one is handed over where no joint estimate is
 STARTS = {
-    "crossing": (planes.start_from_planes, lines.start_from_lines, lines.start_from_scene),
-    "plane": (planes.start_from_planes,),
-    "scene": (planes.start_from_planes, lines.start_from_scene, lines.start_from_lines),
+    "crossing": (plane_start.start_from_planes, lines.start_from_lines, lines.start_from_scene),
+    "plane": (plane_start.start_from_planes,),
+    "scene": (plane_start.start_from_planes, lines.start_from_scene, lines.start_from_lines),
 }
 
 
@@ -311,12 +311,12 @@ def best_minimum(obs, uses, found):
     """
     misses = [misses_of(obs, uses, solution.transform) for solution in found]
     before = np.array([lies_before(obs, uses, solution.transform) for solution in found])
-    sizes = planes.sizes_of_minima(np.square(misses))
+    sizes = plane_start.sizes_of_minima(np.square(misses))
     order = np.lexsort([sizes, ~before])
     best = found[order[0]]
-    nearly = (before == before[order[0]]) & (sizes <= planes.NEARLY * sizes[order[0]])
+    nearly = (before == before[order[0]]) & (sizes <= plane_start.NEARLY * sizes[order[0]])
     alike = [found[i].transform for i in order if nearly[i]]
-    far = (T for T in alike if transform_difference(T, best.transform)[0] > planes.SAME_TURN)
+    far = (T for T in alike if transform_difference(T, best.transform)[0] > plane_start.SAME_TURN)
     return replace(best, rival=next(far, None))
 
 

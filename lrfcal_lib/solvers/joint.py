@@ -155,7 +155,7 @@ def solve_joint(
         raise DegenerateGeometry("no placement to calibrate with")
     obs, left_out = without_blind_cameras(obs, required)
     unknowns = chosen.unknowns(obs)
-    levels = Levels(sweep_sigma=tuple(chosen.sweep_sigma))
+    levels = Levels(sweep_sigma=chosen.sweep_sigma)
     coarsely_settled = False
     if start is None:
         obs, lost = without_lost_placements(obs)
@@ -179,7 +179,7 @@ def solve_joint(
     if chosen.noise == "estimate" or chosen.lapse:
         state = minimum(state, data, unknowns, LAST_STEP).state
     if required:  # a cause before what follows from it: edges that fit nowhere, say
-        refuse_contradiction(state, data, LAST_MISS)
+        refuse_contradiction(state, data, LAST_MISS, left_out)
     found = finished(obs, state, data, unknowns, required)
     return replace(found, excluded=tuple(left_out))
 

@@ -75,9 +75,11 @@ def without_lost_placements(obs):
     return obs.select(obs.placements[~lost]), left_out
 
 
-def refuse_contradiction(state: JointState, data: JointData, most: float) -> None:
-    """Raise DegenerateGeometry where images put a third of the boards more than `most` metres
-    off where they are.
+def refuse_contradiction(
+    state: JointState, data: JointData, most: float, left_out: list[Problem] | None = None
+) -> None:
+    """Raise DegenerateGeometry where a third of the placements contradict: images put their boards
+    more than `most` metres off where they are, or they are left out already for that.
     """
     used = data.view["used"]
     shown = used.any(axis=1)
@@ -86,12 +88,14 @@ def refuse_contradiction(state: JointState, data: JointData, most: float) -> Non
     lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=())
     shift = view_block(state, data, lone).residuals.reshape(used.shape + (6,))[..., 3:]
     misses = medians(np.linalg.norm(shift, axis=-1), used)
-    miss = np.quantile(misses[shown], 2 / 3)
-    if miss > most:
+    gone = sum(one.kind is CONTRADICTS and one.camera is None for one in left_out or ())
+    wrong = gone + np.sum(misses[shown] > most)
+    count = gone + np.sum(shown)
+    if 3 * wrong > count:
         raise DegenerateGeometry(
-            "images and scans contradict each other: for a third of the placements the board lies "
-            f"{1000 * miss:.0f} mm or more off where the images put it; check that images and "
-            "scans carry the right numbers"
+            f"images and scans contradict each other: for {wrong} of {count} placements the board "
+            f"lies more than {1000 * most:.0f} mm off where the images put it; check that images "
+            "and scans carry the right numbers"
         )
 
 

@@ -297,11 +297,11 @@ class JointSolution:
         rows[np.argsort(placement, kind="stable")] = padded[getattr(self.data, group)["used"]]
         return rows
 
-    def with_levels(self, **levels) -> "JointSolution":
+    def with_levels(self, **changed) -> "JointSolution":
         """The same estimate at other noise levels, fields of
         :class:`lrfcal_lib.solvers.joint_model.Levels` by name.
         """
-        levels = replace(self.data.levels, **levels)
+        levels = replace(self.data.levels, **changed)
         return replace(self, data=replace(self.data, levels=levels))
 
     def information(self) -> np.ndarray:
@@ -368,12 +368,12 @@ class JointSolution:
         blocks = named_blocks(self.state, self.data, wider)
         hessian, gradient, *_ = linearise(blocks.values())
         reduced, score, _ = eliminate(hessian, gradient, wider.shared)
-        names = wider.names(self.observations.cameras)
-        estimated = [names.index(name) for name in self.solution.names]
+        every = wider.names(self.observations.cameras)
+        estimated = [every.index(name) for name in self.solution.names]
         for term in HELD:
             if term.name in self.solution.names:
                 continue
-            free = [*estimated, names.index(term.name)]
+            free = [*estimated, every.index(term.name)]
             information = reduced.sum(axis=0)[np.ix_(free, free)]
             covariance = np.linalg.pinv(information, rcond=RANK, hermitian=True)
             step = -(covariance @ score.sum(axis=0)[free])[-1]

@@ -2,7 +2,9 @@
 the cameras turn.
 """
 
+from collections.abc import Iterator
 from contextlib import suppress
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -15,9 +17,10 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     pose_transform,
 )
-from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.model.kinematics import TILT_AXIS
+from lrfcal_lib.model.observations import CameraObservations, JointObservations, thin
 from lrfcal_lib.solvers.joint_model import JointState
-from lrfcal_lib.solvers.planes import start_from_planes
+from lrfcal_lib.solvers.plane_start import start_from_planes
 
 START_SOFTNESS = 0.2  # spot radii
 LEAST_TURN = np.radians(1.0)  # between two images of a camera for the axis
@@ -28,9 +31,10 @@ FEWEST_VIEWS = 5
 FEWEST_ANGLE_POINTS = 6  # on an edge, for its direction
 
 
-def start_states(obs, T0=None):
-    """Start values (JointState) to choose from, made one by one: each with those of the cameras'
-    other minima.
+def start_states(
+    obs: JointObservations, T0: RigidTransform | None = None
+) -> Iterator[list[JointState]]:
+    """Start values to choose from, made one by one: each with those of the cameras' other minima.
 
     From the closed form of the axis, from T0, from the stated platform, from an axis along x
     through the mirror; with cameras from scan lines at the pitch of their images, then from whole
@@ -40,45 +44,43 @@ def start_states(obs, T0=None):
         raise DegenerateGeometry(
             "no ranges on the boards' faces: a start value needs them; give one as start="
         )
-    reasons = []
-    made = 0
     direct = {}
     for camera, mount in enumerate(obs.mounts):
-        with suppress(DegenerateGeometry):
-            direct |= {camera: _camera(obs, camera)} if mount == "head" else {}
+        if mount == "head":
+            with suppress(DegenerateGeometry):
+                direct[camera] = _camera(obs, camera)
     heads = [_axis_from_cameras(obs, direct), T0, obs.T_head_lrf, RigidTransform.identity()]
-    for head in (h for h in heads if h is not None):
-        for known in [direct, {}] if direct else [{}]:
-            try:
-                poses = [
-                    known[i] if i in known else _camera(obs, i, head)
-                    for i in range(len(obs.cameras))
-                ]
-                first = [some[0] for some in poses]
-                others = [
-                    first[:i] + [T] + first[i + 1 :]
-                    for i, some in enumerate(poses)
-                    for T in some[1:]
-                ]
-                states = [state_of(obs, head, cameras) for cameras in (first, *others)]
-            except (DegenerateGeometry, np.linalg.LinAlgError) as error:
-                reasons.append(str(error))
-                continue
-            made += 1
-            yield states
-    if not made:
-        raise DegenerateGeometry(
-            "no start value for the joint estimate: " + "; ".join(dict.fromkeys(reasons))
-        )
+    ways = [direct, {}] if direct else [{}]
+    possible = False
+    reasons = []
+    for head, known in product(heads, ways):
+        if head is None:
+            continue
+        try:
+            states = _states(obs, head, known)
+        except (DegenerateGeometry, np.linalg.LinAlgError) as error:
+            reasons.append(str(error))
+            continue
+        possible = True
+        yield states
+    if not possible:
+        every = "; ".join(dict.fromkeys(reasons))
+        raise DegenerateGeometry(f"no start value for the joint estimate: {every}")
 
 
-def thin(rows, count):
-    """At most `count` of some rows, evenly spread."""
-    return (
-        rows
-        if len(rows) <= count
-        else rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
-    )
+def _states(obs, head, known):
+    """States with an axis: with the best pose of every camera, then with each other one of one
+    camera. Poses of some are `known`.
+    """
+    minima = []
+    for camera in range(len(obs.cameras)):
+        minima.append(known[camera] if camera in known else _camera(obs, camera, head))
+    best = [poses[0] for poses in minima]
+    states = [state_of(obs, head, best)]
+    for camera, poses in enumerate(minima):
+        for pose in poses[1:]:
+            states.append(state_of(obs, head, [*best[:camera], pose, *best[camera + 1 :]]))
+    return states
 
 
 def _camera(obs, camera, head=None):
@@ -87,30 +89,37 @@ def _camera(obs, camera, head=None):
     From whole sweeps, joined by a roughly known axis; of a camera on the head also from scan lines
     at the pitch of its images, which needs no axis.
     """
-    views = []
-    points = []
-    mine = np.flatnonzero(obs.view_camera == camera)
     name = obs.cameras[camera]
+    mine = np.flatnonzero(obs.view_camera == camera)
     if head is not None:
         mine = mine[np.unique(obs.view_placement[mine], return_index=True)[1]]
+    views = []
+    points = []
     for view in thin(mine, VIEWS):
-        rows = np.flatnonzero(obs.face_placement == obs.view_placement[view])
         pitch = obs.view_pitch[view]
+        rows = np.flatnonzero(obs.face_placement == obs.view_placement[view])
         if head is None:
             away = np.abs(obs.face_pitch[rows] - pitch)
             rows = rows[away <= min(away.min(initial=SAME_PITCH) + 1e-9, SAME_PITCH)]
-        if len(rows):
-            rows = thin(rows, POINTS)
-            p = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
-            turned = () if head is None else (obs.face_pitch[rows], head, obs.mounts[camera], pitch)
-            points.append(geometry.lrf_to_source(p, *turned) if turned else p)
-            views.append(view)
-    if len(views) < (FEWEST_VIEWS if head is None else 1):
+        if len(rows) == 0:
+            continue
+        rows = thin(rows, POINTS)
+        p = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
+        if head is not None:
+            p = geometry.lrf_to_source(p, obs.face_pitch[rows], head, obs.mounts[camera], pitch)
+        points.append(p)
+        views.append(view)
+    if len(views) < (1 if head is not None else FEWEST_VIEWS):
         raise DegenerateGeometry(f"camera '{name}' never sees a board that the scans hit")
-    planes = {"plane_points": np.concatenate(points)}
-    planes["plane_placement"] = np.repeat(np.arange(len(views)), [len(p) for p in points])
-    boards = {"board_poses": obs.view_pose[views], "board_covariance": obs.view_covariance[views]}
-    return start_from_planes(CameraObservations(None, name, **planes, **boards))
+    seen = CameraObservations(
+        None,
+        name,
+        plane_points=np.concatenate(points),
+        plane_placement=np.repeat(np.arange(len(views)), [len(p) for p in points]),
+        board_poses=obs.view_pose[views],
+        board_covariance=obs.view_covariance[views],
+    )
+    return start_from_planes(seen)
 
 
 def _axis_from_cameras(obs, poses):
@@ -118,64 +127,65 @@ def _axis_from_cameras(obs, poses):
     least squares.
     """
     for camera, (T_camera_lrf, *_) in poses.items():
-        turns = []
-        motions = []
-        for placement in range(len(obs.placements)):
-            mine = np.flatnonzero((obs.view_camera == camera) & (obs.view_placement == placement))
-            if len(mine) > 1:
-                first, last = mine[
-                    [np.argmin(obs.view_pitch[mine]), np.argmax(obs.view_pitch[mine])]
-                ]
-                turns.append(obs.view_pitch[last] - obs.view_pitch[first])
-                motions.append(obs.view_pose[last] @ np.linalg.inv(obs.view_pose[first]))
-        if np.max(turns, initial=0.0) > LEAST_TURN:
-            # the motions T_2 T_1^-1 are turns by -angle about one line in the camera
-            motions = np.array(motions)
-            lrf = T_camera_lrf.inv()
-            rotvec = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
-            direction = -np.sum(rotvec * np.array(turns)[:, None], axis=0)
-            A = (np.eye(3) - motions[:, :3, :3]).reshape(-1, 3)
-            point = np.linalg.lstsq(A, motions[:, :3, 3].ravel(), rcond=1e-3)[0]
-            direction = lrf.rotation.apply(direction / np.linalg.norm(direction))
-            return geometry.head_from_axis(geometry.TiltAxis(direction, lrf.apply(point)))
+        views = np.flatnonzero(obs.view_camera == camera)
+        views = views[np.lexsort((obs.view_pitch[views], obs.view_placement[views]))]
+        placements = obs.view_placement[views]
+        first = views[np.searchsorted(placements, np.unique(placements))]
+        last = views[np.searchsorted(placements, np.unique(placements), side="right") - 1]
+        turns = obs.view_pitch[last] - obs.view_pitch[first]
+        if turns.max() <= LEAST_TURN:
+            continue
+        # the motions T_2 T_1^-1 are turns by -angle about one line in the camera
+        T_camera_board = RigidTransform.from_matrix(obs.view_pose)
+        motions = T_camera_board[last] * T_camera_board[first].inv()
+        lrf = T_camera_lrf.inv()
+        direction = lrf.rotation.apply(-turns @ motions.rotation.as_rotvec())
+        A = (np.eye(3) - motions.rotation.as_matrix()).reshape(-1, 3)
+        point = np.linalg.lstsq(A, motions.translation.ravel(), rcond=1e-3)[0]
+        direction /= np.linalg.norm(direction)
+        return geometry.head_from_axis(geometry.TiltAxis(direction, lrf.apply(point)))
     return None
 
 
-def state_of(obs, head, cameras):
+def state_of(
+    obs: JointObservations, head: RigidTransform, cameras: list[RigidTransform]
+) -> JointState:
     """All unknowns from an axis and the cameras: boards from their first images, or from the
     scans alone.
     """
-    poses = np.stack([pose_array(T) for T in cameras]) if cameras else np.zeros((0, 3, 4))
-    sensor = np.array([0.0, 0.0, np.log(START_SOFTNESS), 0.0, 0.0])
+    poses = np.array([pose_array(T) for T in cameras]).reshape(-1, 3, 4)
     count = len(obs.placements)
-    edges = len(obs.edges)
     boards = np.zeros((count, 3, 4))
-    seen, first = np.unique(obs.view_placement, return_index=True)
-    if len(seen):
-        boards[seen] = boards_in_images(obs, pose_array(head), poses, first)
-    for placement in np.setdiff1d(np.arange(count), seen):
+    shown, first = np.unique(obs.view_placement, return_index=True)
+    if len(shown):
+        boards[shown] = boards_in_images(obs, pose_array(head), poses, first)
+    for placement in np.setdiff1d(np.arange(count), shown):
         boards[placement] = pose_array(board_from_scan(obs, placement, head))
     return JointState(
-        pose_array(head), poses, sensor, boards, np.zeros((count, 2)), np.zeros((count, edges))
+        head=pose_array(head),
+        cameras=poses,
+        sensor=np.array([0.0, 0.0, np.log(START_SOFTNESS), 0.0, 0.0]),
+        boards=boards,
+        sweeps=np.zeros((count, 2)),
+        sides=np.zeros((count, len(obs.edges))),
     )
 
 
-def boards_in_images(obs, head, cameras, views):
-    """``T_platform_board`` (n, 3, 4) from some views, each by itself.
+def boards_in_images(
+    obs: JointObservations, head: np.ndarray, cameras: np.ndarray, views: np.ndarray
+) -> np.ndarray:
+    """``T_platform_board`` (n, 3, 4) from some views (n,), each by itself.
 
     `head` and `cameras` as in JointState.
     """
     camera = obs.view_camera[views]
     on_head = np.array([mount == "head" for mount in obs.mounts])[camera]
-    pitch = Rotation.from_rotvec(np.outer(obs.view_pitch[views] * on_head, [1.0, 0.0, 0.0]))
+    pitch = np.where(on_head, obs.view_pitch[views], 0.0)
+    turn = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(pitch, TILT_AXIS)))
     T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
     T_camera_board = RigidTransform.from_matrix(obs.view_pose[views])
-    return pose_array(
-        RigidTransform.from_rotation(pitch)
-        * T_head_lrf
-        * pose_transform(cameras[camera]).inv()
-        * T_camera_board
-    )
+    boards = turn * T_head_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
+    return pose_array(boards)
 
 
 def board_from_scan(obs, placement, head):

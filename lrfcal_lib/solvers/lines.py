@@ -1,32 +1,39 @@
-"""Residuals of cameras from lines (eqs. 16-21), by likelihood, after Wasielewski and Strauss, after
-Bauermann.
-"""
+"""Cameras from lines (equations 16 to 21), after Wasielewski and Strauss, and after Bauermann."""
+
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import (
-    read_pose,
     sight_block,
     sight_normals,
 )
+from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import pinhole_jacobian
 from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
     DegenerateGeometry,
     apply_pose,
     gradient_by_pose,
-    motion_words,
     move_pose,
     moved_noise,
     noise_correction,
     pose_transform,
     rotate_points,
 )
-from lrfcal_lib.solvers.planes import shifted, start_rotations
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.solvers.plane_start import shifted, start_rotations
+from lrfcal_lib.solvers.planes import pose_unknowns
+
+# metres, of a crossing from its plane of sight, for the search of a start value
+START_SIGMA = 0.005
+AHEAD = 0.8  # of the points at least lie before the camera
+AGREEING = 0.75  # of the points tell the best start value; others may be wrong
 
 
-def distance_block(pose, obs):
+def distance_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     """Distances of crossings from the planes of sight (Wasielewski and Strauss), metres, with the
     noise of both.
 
@@ -50,7 +57,7 @@ def distance_block(pose, obs):
     return Block(plain.residuals, plain.jacobian, 1.0 / np.sqrt(variance), corrected=corrected)
 
 
-def point_block(pose, obs):
+def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     """Reprojection errors of named points (Bauermann), pixels; a loss judges u and v of a point
     together.
     """
@@ -82,61 +89,78 @@ def point_block(pose, obs):
     )
 
 
-def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, **options):
-    """The pose (..., 3, 4) of a camera by least squares, from ``residual(pose, obs) -> Block``.
+def estimate_pose(
+    residual,
+    obs: CameraObservations,
+    pose: np.ndarray,
+    *,
+    method: str,
+    uses: str,
+    weighted: bool = True,
+    **options,
+) -> Solution:
+    """The pose of a camera by least squares.
 
-    `uses` is the kind of observations that the residual has rows of. Without weights every residual
-    counts the same: the mean of their propagated variances.
+    Parameters
+    ----------
+    residual : callable
+        ``residual(pose, obs) -> Block``.
+    obs : CameraObservations
+    pose : ndarray, shape (..., 3, 4)
+        Start value of ``T_camera_source``.
+    method, uses : str
+        Its name, and the kind of observations that the residual has rows of.
+    weighted : bool
+        Without weights every residual counts the same: the mean of their propagated variances.
+    **options
+        Of :func:`lrfcal_lib.fit.least_squares.minimise`.
+
+    Returns
+    -------
+    Solution
     """
-
-    def evaluate(pose):
-        return residual(pose, obs)
 
     def equal_weights(pose, _):
         """The residuals with one weight for all, at a pose."""
-        weight = np.mean(evaluate(pose).whitener ** -2.0) ** -0.5
+        weight = np.mean(_variances(residual(pose, obs)), axis=-1, keepdims=True) ** -0.5
 
         def plain(pose):
-            block = evaluate(pose)
-            return Block(block.residuals, block.jacobian, np.full_like(block.residuals, weight))
+            block = residual(pose, obs)
+            weights = np.broadcast_to(weight, block.residuals.shape)
+            return Block(block.residuals, block.jacobian, weights)
 
         return plain
 
-    problem = evaluate
+    problem: Callable[..., Block] = partial(residual, obs=obs)
     earlier = []
     if not weighted:
         problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
+    placements = obs.group(uses)["placement"]
+    unknowns = pose_unknowns(method, obs.camera)
     return solve(
-        problem,
-        pose,
-        move_pose,
-        names=POSE_NAMES,
-        method=method,
-        read=read_pose,
-        groups=obs.group(uses)["placement"],
-        words=lambda direction: motion_words(direction, obs.camera),
-        earlier=earlier,
-        **options,
+        problem, pose, move_pose, groups=placements, earlier=earlier, **unknowns, **options
     )
 
 
-# metres, of a crossing from its plane of sight, for the search of a start value
-START_SIGMA = 0.005
+def _variances(block):
+    """Variance of every residual, from its whitener."""
+    if block.whitener.ndim == block.residuals.ndim:
+        return block.whitener**-2.0
+    return np.sum(np.linalg.inv(block.whitener) ** 2, axis=-1).reshape(block.residuals.shape)
 
 
-def start_from_lines(obs):
+def start_from_lines(obs: CameraObservations) -> RigidTransform:
     """From crossings and the image lines of their edges."""
     obs.require("crossing", 6)
     return _start_from_sights(obs.crossing_points, obs.crossing_lines, obs)
 
 
-def start_from_scene(obs):
+def start_from_scene(obs: CameraObservations) -> RigidTransform:
     """From named points: each is seen where a column and a row of the image cross."""
     obs.require("scene", 4)
     u, v = obs.scene_pixels.T
-    zero = np.zeros(len(u))
-    columns = np.column_stack([zero + 1, zero, -u])
-    rows = np.column_stack([zero, zero + 1, -v])
+    columns = np.column_stack([1 + 0 * u, 0 * u, -u])
+    rows = np.column_stack([0 * v, 1 + 0 * v, -v])
     lines = np.concatenate([columns, rows])
     return _start_from_sights(np.tile(obs.scene_points, (2, 1)), lines, obs)
 
@@ -157,12 +181,12 @@ def _start_from_sights(points, lines, obs):
         options = {"loss": loss, "scale": "auto", "max_iterations": 40}
         poses = minimise(evaluate, poses, move_pose, **options)[0]
     depth = apply_pose(poses, points)[..., 2]
-    ahead = (depth > 0).mean(axis=1) > 0.8
+    ahead = (depth > 0).mean(axis=1) > AHEAD
     if not ahead.any():
         raise DegenerateGeometry(
             f"camera '{obs.camera}': no pose puts the {len(points)} points in front of the camera"
         )
     poses = poses[ahead]
     angle = np.abs(sight_block(poses, points, normals, 1.0).residuals) / np.abs(depth[ahead])
-    best = np.sort(angle, axis=1)[:, : max(6, int(0.75 * len(points)))]
+    best = np.sort(angle, axis=1)[:, : max(6, int(AGREEING * len(points)))]
     return pose_transform(poses[np.argmin(np.sum(best**2, axis=1))])

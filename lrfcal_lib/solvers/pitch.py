@@ -20,7 +20,7 @@ from lrfcal_lib.model.geometry import (
     tilt,
 )
 from lrfcal_lib.model.observations import CameraObservations
-from lrfcal_lib.solvers.planes import start_from_planes
+from lrfcal_lib.solvers.plane_start import start_from_planes
 
 # independent numbers: a plane's distance and two angles; an edge's offset and angle
 PLANE_NUMBERS = 3

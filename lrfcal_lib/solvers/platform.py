@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS, chart_parameters, move_head
-from lrfcal_lib.fit.least_squares import Block, name_words, pad, solve
+from lrfcal_lib.fit.covariance import name_words
+from lrfcal_lib.fit.least_squares import Block, pad, solve
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
@@ -23,6 +24,7 @@ from lrfcal_lib.model.geometry import (
     lrf_to_platform,
     tilt,
 )
+from lrfcal_lib.model.observations import PlatformObservations
 
 # of boards: the right angle of the two edges, their distance (metres)
 SIGMA_SKEW = np.radians(0.2)
@@ -30,6 +32,7 @@ SIGMA_GAP = 0.002
 LEAST_SLOPE = 0.1  # nearer to a coordinate plane (6 degrees) a projected fit is useless
 # a combination of the four motions of the axis
 WORDS = partial(name_words, names=AXIS_WORDS, share=0.3)
+LEAST_SCATTER = 1e-6  # metres
 TINY = 1e-30  # of a complex step: derivatives without rounding
 
 
@@ -37,9 +40,16 @@ TINY = 1e-30  # of a complex step: derivatives without rounding
 class PlatformSolution:
     """The estimated tilt axis.
 
-    `solution` has the four unknowns ``(w_y, w_z, v_y, v_z)`` of T_head_lrf; `skew` and `gap` are
-    the deviation of the two edges from a right angle (radians) and their distance (metres) at each
-    placement used; `skipped` names the others with the reason.
+    Attributes
+    ----------
+    solution : Solution
+        Of the four unknowns ``(w_y, w_z, v_y, v_z)`` of ``T_head_lrf``.
+    placements : ndarray of int, shape (p,)
+        Those that were used.
+    skew, gap : ndarray, shape (p,)
+        Deviation of the two edges from a right angle (radians), and their distance (metres).
+    skipped : dict of int to str
+        The other placements, with the reason.
     """
 
     solution: Solution
@@ -52,19 +62,14 @@ class PlatformSolution:
     gauge = ("rotation about the tilt axis", "translation along the tilt axis")
 
     @property
-    def T_head_lrf(self):
+    def T_head_lrf(self) -> RigidTransform:
         """In the gauge of :func:`lrfcal_lib.model.geometry.head_from_axis`."""
         return head_from_axis(self.axis)
 
     @property
-    def axis(self):
+    def axis(self) -> geometry.TiltAxis:
         """The tilt axis in the LRF frame."""
         return axis_of(self.solution.transform)
-
-    @property
-    def converged(self):
-        """Whether the last step was small."""
-        return self.solution.converged
 
     def __repr__(self):
         count = f"{len(self.placements)} placements"
@@ -76,14 +81,16 @@ def start_head(T0):
     return head_from_axis(axis_of(RigidTransform.identity() if T0 is None else T0))
 
 
-def solve_platform(obs, T0=None, *, sigma_pitch=0.0):
+def solve_platform(
+    obs: PlatformObservations, T0: RigidTransform | None = None, *, sigma_pitch: float = 0.0
+) -> PlatformSolution:
     """The tilt axis from 3D line fits, weighted by propagated noise.
 
     Parameters
     ----------
     obs : PlatformObservations
     T0 : RigidTransform, optional
-        Start value of ``T_head_lrf``; an axis through the LRF's origin along its x when left out.
+        Start value of ``T_head_lrf``; by default the axis lies along the x axis of the LRF.
     sigma_pitch : float
         Standard deviation of a recorded pitch, radians.
 
@@ -106,39 +113,61 @@ def solve_platform(obs, T0=None, *, sigma_pitch=0.0):
     """
     gauge = start_head(T0)
     earlier = []
-    for final in (False, True):  # the second time in the gauge of the axis that was found
-        edge, face, boards, skipped = prepare_boards(obs, gauge)
-        number = int(edge["used"].sum())
-        p = len(boards)
-        points = number + int(face["used"].sum())
-        state = geometry.pose_array(gauge), np.array(list(boards.values())), np.zeros((p, 2))
-        found = solve(
-            partial(platform_blocks, edge=edge, face=face, sigma_pitch=sigma_pitch),
+    for final in (False, True):  # the second time in the gauge of the axis of the first
+        boards = prepare_boards(obs, gauge)
+        on_edges = int(boards.edge["used"].sum())
+        points = on_edges + int(boards.face["used"].sum())
+        p = len(boards.placements)
+        state = geometry.pose_array(gauge), boards.poses, np.zeros((p, 2))
+        solution = solve(
+            partial(platform_blocks, edge=boards.edge, face=boards.face, sigma_pitch=sigma_pitch),
             state,
             move_platform,
             names=AXIS_NAMES,
             method="platform_3d",
             words=WORDS,
             shared=4,
-            read=lambda state: (geometry.pose_transform(state[0]), chart_parameters(state[0])),
-            freedom=points + number + 2 * p - 4 - 8 * p,
+            read=lambda state: _read_head(state[0]),
+            freedom=points + on_edges + 2 * p - 4 - 8 * p,
             limit=0.5,
             max_iterations=100,
             n_observations=points,
             required=final,
             earlier=earlier,
         )
-        gauge = head_from_axis(axis_of(found.transform))
-        earlier = [found.cost_history]
-    return PlatformSolution(found, np.array(list(boards)), *found.state[2].T, skipped)
+        gauge = head_from_axis(axis_of(solution.transform))
+        earlier = [solution.cost_history]
+    _, _, bends = solution.state
+    return PlatformSolution(
+        solution, boards.placements, skew=bends[:, 0], gap=bends[:, 1], skipped=boards.skipped
+    )
 
 
-def prepare_boards(obs, T_head_lrf):
-    """Edge and face points padded by placement, start boards by placement, and who is skipped why.
+@dataclass(frozen=True)
+class Boards:
+    """Start values of boards, and the points on them.
 
-    `second` is 1 for points of edge 2 and 0 for others, those of a lone edge, too. Boards are pose
-    arrays (3, 4), ``T_platform_board``, with x along edge 1 and z along the normal.
+    Attributes
+    ----------
+    placements : ndarray of int, shape (p,)
+    poses : ndarray, shape (p, 3, 4)
+        ``T_platform_board``, with x along edge 1 and z along the normal.
+    edge, face : dict of str to ndarray, shapes (p, n, ...)
+        Columns of the points, padded by placement. `second` is 1 for points of edge 2 and 0 for
+        others, those of a lone edge, too.
+    skipped : dict of int to str
+        Why the other placements cannot be used.
     """
+
+    placements: np.ndarray
+    poses: np.ndarray
+    edge: dict[str, np.ndarray]
+    face: dict[str, np.ndarray]
+    skipped: dict[int, str]
+
+
+def prepare_boards(obs: PlatformObservations, T_head_lrf: RigidTransform) -> Boards:
+    """Boards and the points on them; DegenerateGeometry where no placement can be used."""
     edge = obs.group("edge")
     face = obs.group("face")
     p_edge = lrf_to_platform(edge["points"], edge["pitch"], T_head_lrf)
@@ -162,9 +191,9 @@ def prepare_boards(obs, T_head_lrf):
         raise DegenerateGeometry(f"no placement can be used for the tilt axis: {skipped}")
     edge["second"] = second
     face["second"] = np.zeros(len(p_face))
-    edge = _padded(edge, list(boards))
-    face = _padded(face, list(boards))
-    return edge, face, boards, skipped
+    placements = np.array(list(boards))
+    poses = np.array(list(boards.values()))
+    return Boards(placements, poses, _padded(edge, placements), _padded(face, placements), skipped)
 
 
 def _padded(group, placements):
@@ -233,20 +262,19 @@ def distances(state, group):
     head, boards, bends = state
     b, J, by_point, by_pitch = board_coordinates(head, boards, group["points"], group["pitch"])
     second = group["second"]
-    skew = bends[:, :1]
-    gap = bends[:, 1:]
-    c = second * np.cos(skew)
-    s = second * np.sin(skew)
-    inside = np.stack([c, 1 - second + s, 0 * c], axis=-1)
-    across = np.broadcast_to([0.0, 0.0, 1.0], inside.shape)
-    normals = np.stack([inside, across], axis=-2)
-    gaps = np.stack([0 * second, second * gap], axis=-1)
-    r = (normals @ b[..., None])[..., 0] - gaps
-    bend = np.zeros(r.shape + (2,))
-    bend[..., 0, 0] = c * b[..., 1] - s * b[..., 0]
-    bend[..., 1, 1] = -second
-    by_pitch = (normals @ by_pitch[..., None])[..., 0]
-    return r, np.concatenate([normals @ J, bend], axis=-1), normals @ by_point, by_pitch
+    cosine = second * np.cos(bends[:, :1])
+    sine = second * np.sin(bends[:, :1])
+    normals = np.zeros(b.shape[:2] + (2, 3))
+    normals[..., 0, 0] = cosine
+    normals[..., 0, 1] = 1 - second + sine
+    normals[..., 1, 2] = 1.0
+    r = np.matvec(normals, b)
+    r[..., 1] -= second * bends[:, 1:]
+    by_unknowns = np.zeros(r.shape + (12,))
+    by_unknowns[..., :10] = normals @ J
+    by_unknowns[..., 0, 10] = cosine * b[..., 1] - sine * b[..., 0]
+    by_unknowns[..., 1, 11] = -second
+    return r, by_unknowns, normals @ by_point, np.matvec(normals, by_pitch)
 
 
 def distance_block(state, group, sigma_pitch, which):
@@ -296,7 +324,9 @@ def move_platform(state, step):
     return move_head(head, common), geometry.move_pose(boards, pose), bends + bend
 
 
-def solve_projected(obs, T0=None, *, printed=False):
+def solve_projected(
+    obs: PlatformObservations, T0: RigidTransform | None = None, *, printed: bool = False
+) -> PlatformSolution:
     """The tilt axis by the paper's projected line fits.
 
     Parameters and errors are those of :func:`solve_platform`. Of the observations the edge points
@@ -326,33 +356,42 @@ def solve_projected(obs, T0=None, *, printed=False):
             f"projected fits: no placement can be used: {skipped}; use the 3D fits instead"
         )
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
-    options = {"obs": obs, "groups": groups.values(), "printed": printed}
-
-    def solved(head, scatter, **earlier):
-        """The fits with a given scatter about the lines."""
-        return solve(
-            partial(projected_block, scatter=scatter, **options),
-            geometry.pose_array(head),
+    scatter = 1.0
+    earlier = []
+    for final in (False, True):  # the second time with the scatter of the first
+        solution = solve(
+            partial(
+                projected_block,
+                obs=obs,
+                groups=groups.values(),
+                scatter=scatter,
+                printed=printed,
+            ),
+            geometry.pose_array(gauge),
             move_head,
             names=AXIS_NAMES,
             method="platform_projected",
             words=WORDS,
             groups=np.repeat(list(groups), rows),
             limit=np.inf,
-            read=lambda head: (geometry.pose_transform(head), chart_parameters(head)),
+            read=_read_head,
             max_iterations=100,
-            **earlier,
+            earlier=earlier,
         )
-
-    first = solved(gauge, 1.0)
-    freedom = max(len(first.residuals) - 4, 1)
-    scatter = max(np.sqrt(np.sum(first.residuals**2) / freedom), 1e-6)
-    gauge = head_from_axis(axis_of(first.transform))
-    found = solved(gauge, scatter, earlier=[first.cost_history])
+        if not final:
+            freedom = max(len(solution.residuals) - 4, 1)
+            scatter = max(np.sqrt(np.sum(solution.residuals**2) / freedom), LEAST_SCATTER)
+        gauge = head_from_axis(axis_of(solution.transform))
+        earlier = [solution.cost_history]
     # the last two of every placement
-    cosine, gap = scatter * found.residuals[np.cumsum(rows) - [[2], [1]]]
+    cosine, gap = scatter * solution.residuals[np.cumsum(rows) - [[2], [1]]]
     skew = np.arcsin(np.clip(cosine, -1, 1))
-    return PlatformSolution(found, np.array(list(groups)), skew, gap, skipped)
+    return PlatformSolution(solution, np.array(list(groups)), skew, gap, skipped)
+
+
+def _read_head(head):
+    """Transform and parameters of the axis."""
+    return geometry.pose_transform(head), chart_parameters(head)
 
 
 def _slanted(obs, p_platform):

@@ -1,11 +1,14 @@
-"""Ten seconds of streaming at every rate, in virtual time: every scan of the device is accounted for."""
+"""Instants of scans, sets of interlaced ones, and ten seconds of streaming at every rate, in virtual time."""
 
 import numpy as np
 import pytest
+from telegrams import encode_scan
 from virtual import INDEXED, lms
 
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import RATES, TURN_S, interval_s
+from lrfcal_lib.drivers.lms2xx_link import RATES
+from lrfcal_lib.drivers.lms2xx_scans import Assembler, ScanClock, interval_s, transfer_s
+from lrfcal_lib.model.kinematics import MIRROR_TURN
 
 # scans that a telegram takes by the manual's table 10-17: 812 (100/0.25), 732 (180/0.5), 372 bytes (180/1)
 TABLE = {9600: (16, 29, 30), 19200: (8, 15, 15), 38400: (4, 8, 8), 500000: (1, 1, 1)}
@@ -17,7 +20,7 @@ VARIANTS = {(100, 25): 812, (180, 50): 732, (180, 100): 372}
 def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate, variant):
     device = lms(baudrate=rate, variant=variant, configuration=INDEXED)
     with LMS2xx(device.path, host=device.host) as driver:
-        before = driver.counts
+        before = dict(driver.counts)
         driver.start()
         readings = driver.take(1)
         while readings[-1].time_s < readings[0].time_s + 10.0:
@@ -32,7 +35,7 @@ def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate,
     # a telegram that takes longer than a scan keeps those in between from being sent; they are counted by the index
     period, turns = TABLE[rate][[*VARIANTS].index(variant)], 100 // variant[1]
     assert set(np.diff([record.turn for record in truth])) == {period * turns}
-    assert interval_s(VARIANTS[variant], rate, turns * TURN_S) == pytest.approx(period * turns * TURN_S)
+    assert interval_s(VARIANTS[variant], rate, turns * MIRROR_TURN) == pytest.approx(period * turns * MIRROR_TURN)
     assert counts["dropped"] == (len(readings) - 1) * (period - 1)
     assert [r.time_s for r in readings] == pytest.approx([record.time_s for record in truth], abs=5e-4)
 
@@ -72,3 +75,43 @@ def test_no_set_of_interlaced_scans_is_lost_where_its_parts_are_read_late(indexe
     number = {record.telegram: record.number for record in device.scans}
     parts = [number[raw] for reading in readings for raw in reading.telegrams]
     assert parts == [*range(parts[0], parts[0] + 400)]
+
+
+def test_late_arrivals_do_not_shift_scans():
+    rng, clock = np.random.default_rng(1), ScanClock()
+    turns = np.cumsum(rng.integers(1, 40, 400))  # over many rounds of the index
+    late = np.where(rng.random(400) < 0.2, rng.exponential(0.05, 400), 0)
+    late[0] = 0
+    instants, steps = zip(*map(clock.place, (turns % 256).tolist(), 100.0 + turns * MIRROR_TURN + late), strict=True)
+    off = np.array(instants) - 100.0 - turns * MIRROR_TURN
+    assert np.median(off) == pytest.approx(0, abs=1e-9) and np.abs(off).max() < 0.01 < late.max()
+    assert list(steps[1:]) == np.diff(turns).tolist()
+
+
+def interlaced(partials, indexed, skipped=()):
+    """Readings that telegrams of interlaced scans complete; ranges tell where they belong."""
+    configuration, counts = INDEXED.changed(realtime_indices=indexed), {"dropped": 0, "stale": 0}
+    one, made = Assembler((100, 0.25), configuration, 500000, True, counts, ScanClock()), {}
+    for k, partial in enumerate(partials):
+        ranges = 1 + (4 * np.arange(181 - (partial > 0)) + partial) / 1000
+        raw = encode_scan(ranges, partial=partial, indices=(k % 256, k % 256) if indexed else None)
+        reading = None if k in skipped else one.feed(raw, 9 + k * MIRROR_TURN + transfer_s(len(raw), 500000))
+        made |= {k: reading} if reading else {}
+    return made
+
+
+FOUR = [2, 3, 4, 5, 8, 9, 10, 11]  # 0 and 1 of one set and 2 and 3 of the next are left
+
+
+@pytest.mark.parametrize(("indexed", "missing", "made"), [
+    *((indexed, [part], [3, 11]) for indexed in (True, False) for part in (4, 5, 6, 7)),
+    (True, FOUR, []), (False, FOUR, [7]),
+])  # fmt: skip
+
+
+def test_sets_with_a_missing_part_are_no_scan(indexed, missing, made):
+    """Without indices four that are missing in a row are not seen."""
+    found = interlaced([0, 1, 2, 3] * 3, indexed, missing)
+    assert list(found) == made
+    for reading in found.values():
+        np.testing.assert_allclose(reading.ranges, 1 + np.arange(721) / 1000, atol=1e-9)

@@ -33,7 +33,7 @@ def replace(settings, **changes):
     return HeadSettings(**{**vars(settings), **changes})
 
 
-FAST = HeadSettings(baudrate=38400, settle_s=0.08, stall_s=0.2, poll_s=0.01, reply_s=0.1, gap_s=0.005, retries=2,
+FAST = HeadSettings(baudrate=38400, settle_s=0.08, poll_s=0.01, reply_s=0.1, gap_s=0.005, retries=2,
                     reconnect_s=2.0)  # fmt: skip
 SPEEDS = 4.0, 67.0  # deg/s of the devices at speed bytes 0 and 0x3F: byte + 4
 TIMED = replace(FAST, tilt_speed=0x10, degrees_per_second=20.0)

@@ -1,0 +1,168 @@
+"""Name the sides that scans cross after the edges of the board, which the images place there."""
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.calibrate.observe import observe
+from lrfcal_lib.calibrate.recorded import platform_of, source_of
+from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
+from lrfcal_lib.preprocess.pattern_in_image import SMALL_SQUARE_PX
+from lrfcal_lib.preprocess.prepared import DroppedSide, Prepared
+from lrfcal_lib.preprocess.survey import small_squares
+from lrfcal_lib.solvers import find_outlying_placements, solve_camera
+
+# metres between a side in the cloud and the board edge it is named after, at most
+NAME_DISTANCE = 0.08
+# between them; a side turned more is none (a cloud cut by hand, an occluder)
+NAME_ANGLE = np.deg2rad(3.0)
+TURNED = 3.0  # sigma by which noise may turn the line through a side
+
+
+def name_sides(
+    prepared: Prepared,
+) -> tuple[dict[int, dict[int, str]], dict[int, dict[int, DroppedSide]], list[Problem]]:
+    """Name the sides that scans cross: the nearest edge of the board.
+
+    The cameras' poses come from the planes alone (Zhang and Pless), which needs no names. Sides
+    farther than 8 cm from every edge have none; nor has any where nobody knows the outline of the
+    board.
+
+    Parameters
+    ----------
+    prepared : Prepared
+
+    Returns
+    -------
+    names, dropped : dict of int to dict of int to str, or to DroppedSide
+        By placement and side number: edge names, and why sides have none.
+    problems : list of Problem
+        Of :func:`rough_poses`, and of sides without a name.
+    """
+    rough, problems = rough_poses(prepared)
+    names: dict = {}
+    dropped: dict = {}
+    if prepared.board.corners is None:
+        return names, dropped, problems
+    for camera, T_camera_source in rough.items():
+        for placement, view in prepared.views[camera].items():
+            posed = view.T_camera_board is not None and placement in prepared.scans
+            if not posed or placement in names:
+                continue
+            T_board_source = view.T_camera_board.inv() * T_camera_source
+            sides = _sides_on_board(prepared, camera, placement, T_board_source)
+            names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
+            for why in dropped[placement].values():
+                problems.append(Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement))
+    return names, dropped, problems
+
+
+def _sides_on_board(prepared, camera, placement, T_board_source):
+    """Points (n, 3) of the sides of a sweep by number, board frame, metres."""
+    source = source_of(prepared, camera, placement, platform_of(prepared))
+    sides: dict = {}
+    for edges in (prepared.edges["half_step"], prepared.swept["half_step"]):
+        if placement not in edges:
+            continue
+        scanned = edges[placement]
+        for number in np.unique(scanned.side[scanned.side >= 0]).tolist():
+            rows = scanned.side == number
+            points = source.points(scanned.points[rows], scanned.pitch[rows])
+            sides.setdefault(number, T_board_source.apply(points))
+    return sides
+
+
+def rough_poses(prepared: Prepared) -> tuple[dict[str, RigidTransform], list[Problem]]:
+    """Poses ``T_camera_source`` of the cameras from the planes alone, by camera, and a list of
+    Problem.
+
+    Problems are placements that disagree with all others, and why a camera has no pose.
+    """
+    rough = {}
+    problems = []
+    misses: dict = {}  # rms distance between planes, by placement and camera; 0 where they agree
+    for camera in prepared.views:
+        observations = observe(prepared, camera)
+        try:
+            inliers, outlying = find_outlying_placements(observations)
+            solution = solve_camera(observations.select(inliers), "zhang_pless")
+        except DegenerateGeometry as error:
+            problems.append(Problem(Stage.SIDES, ProblemKind.NO_POSE, str(error), camera=camera))
+            continue
+        rough[camera] = solution.transform
+        for placement in observations.placements.tolist():
+            misses.setdefault(placement, {})[camera] = outlying.get(placement, 0.0)
+    for placement, by_camera in misses.items():
+        if any(by_camera.values()):
+            words = f"{_disagreement(prepared, placement, by_camera)}; left out"
+            problems.append(Problem(Stage.SIDES, ProblemKind.OTHER_PLANE, words, placement))
+    return rough, problems
+
+
+def _disagreement(prepared, placement, misses):
+    """How the scan and the images of a placement disagree, and what may be wrong."""
+    wrong = [camera for camera, miss in misses.items() if miss]
+    off = f"its plane is {1000 * max(misses.values()):.0f} mm rms off the"
+    if not len(wrong) == len(misses) > 1:
+        return f"camera {wrong[0]}: {off} scan"
+    causes = "another surface, mixed readings"
+    views = {
+        c: {placement: seen[placement]} for c, seen in prepared.views.items() if placement in seen
+    }
+    if small_squares(views, prepared.board.pattern):
+        causes += (
+            f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be biased"
+        )
+    return f"scan: {off} board in the images of all {len(misses)} cameras ({causes})"
+
+
+def nearest_edges(
+    board: Board, sides: dict[int, np.ndarray]
+) -> tuple[dict[int, str], dict[int, DroppedSide]]:
+    """Edges of a board that sides of a scan lie on, each given once.
+
+    Parameters
+    ----------
+    board : Board
+    sides : dict of int to ndarray, shape (n, 3)
+        Points by side number, board frame, metres.
+
+    Returns
+    -------
+    names : dict of int to str
+    dropped : dict of int to DroppedSide
+        Why the others have no name.
+    """
+    lines = board.lines()
+    names = {}
+    dropped = {}
+    cost = np.zeros((len(sides), len(lines)))
+    for row, points in enumerate(sides.values()):
+        cost[row] = np.median(np.abs(points[:, :2] @ lines[:, :2].T + lines[:, 2]), axis=0)
+    numbers = list(sides)
+    for row, column in zip(*linear_sum_assignment(cost), strict=True):
+        number = numbers[row]
+        edge = board.edges[column]
+        distance = float(cost[row, column])
+        turn, allowed = _turn(sides[number], lines[column])
+        if distance > NAME_DISTANCE:
+            dropped[number] = DroppedSide(edge, distance)
+        elif turn > allowed:
+            dropped[number] = DroppedSide(edge, distance, turn)
+        else:
+            names[number] = edge
+    return names, dropped
+
+
+def _turn(points, line):
+    """Angle between a side and an edge, and how large it may be, radians: what noise may turn the
+    line through its points is allowed.
+    """
+    if len(points) <= 2:
+        return 0.0, NAME_ANGLE
+    _, direction, rms = fit_line(points)
+    flat = direction[:2] / np.linalg.norm(direction[:2])
+    noise = TURNED * rms * np.sqrt(12 / len(points)) / np.ptp(points @ direction)
+    return float(np.arcsin(min(abs(flat @ line[:2]), 1.0))), np.hypot(NAME_ANGLE, noise)

@@ -1,0 +1,165 @@
+"""What an LMS2xx remembers: its settings, and what its operating mode sends of the scans."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, UNITS, Configuration
+from lrfcal_lib.simulate.beam import VARIANTS
+
+BAUD_WORD = {9600: 0x8067, 19200: 0x8033, 38400: 0x8019, 500000: 0x8001}
+BAUD_COMMAND = {0x40: 38400, 0x41: 19200, 0x42: 9600, 0x48: 500000}
+# operating modes
+INSTALLATION = 0x00
+DIAGNOSIS = 0x10
+STREAM = 0x24
+REQUEST = 0x25
+MEAN = 0x26
+PART = 0x27
+INTERLACED = 0x2A
+REFLECTIVITY = 0x2B
+# bytes of their parameters (manual, 7.2): password; scans; first and last value; parts and these
+PARAMETERS = {
+    INSTALLATION: 8,
+    DIAGNOSIS: 0,
+    STREAM: 0,
+    REQUEST: 0,
+    MEAN: 1,
+    PART: 4,
+    INTERLACED: 0,
+    REFLECTIVITY: 6,
+}
+# code of the telegrams that they send
+STREAMED = {STREAM: SCAN, MEAN: 0xB6, PART: 0xB7, INTERLACED: SCAN, REFLECTIVITY: 0xF5}
+SCANS = range(2, 251)  # of a mean
+LAST = 401  # value that can be asked for; there may be fewer
+# as which mode a measuring mode encodes ranges; 13 and 14, remission, are those that CARMEN sets
+ENCODED = dict(zip(MODES, MODES, strict=True)) | {13: 0, 14: 0}
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Part of the scans that a mode sends; by default all."""
+
+    head: bytes = b""  # of its telegrams: the parameters of the mode
+    first: int = 1  # value that is sent, counted from 1
+    last: int = LAST
+    scans: int = 1  # whose mean is sent
+
+
+@dataclass
+class Memory:
+    """Settings of the device."""
+
+    model: str = "LMS221;302063;X01.27 "  # 21 characters, the answer to the type request
+    variant: tuple[int, int] = (180, 50)  # degrees and 1/100 degree
+    configuration: Configuration = field(default_factory=Configuration)
+    baudrate: int = 9600
+    mode: int = REQUEST  # operating mode, the sub-command of 0x20
+    address: int = 0
+    password: bytes = b"SICK_LMS"
+    flash_writes: int = 0  # since the device was made; the flash endures a few thousand
+
+    @property
+    def widest(self) -> int:
+        """Field of view that it can have, degrees."""
+        return 100 if self.model.startswith("LMS211") else 180
+
+    @property
+    def turns(self) -> int:
+        """Of the mirror for a scan."""
+        return 100 // self.variant[1]
+
+    def set_variant(self, variant: tuple[int, int]) -> bool:
+        """Take a variant.
+
+        Parameters
+        ----------
+        variant
+            Degrees and 1/100 degree.
+
+        Returns
+        -------
+        bool
+            Whether the device offers it.
+        """
+        offered = variant in VARIANTS and variant[0] <= self.widest
+        if offered:
+            self.variant = variant
+        return offered
+
+    def write_configuration(self, block: bytes) -> bool:
+        """Take a configuration.
+
+        Parameters
+        ----------
+        block
+            32 to 34 bytes.
+
+        Returns
+        -------
+        bool
+            Whether its values are possible.
+        """
+        block = bytes(block) + self.configuration.block[len(block) : codec.CONFIGURATION_BYTES]
+        if block[5] not in ENCODED or block[6] >= len(UNITS):
+            return False
+        self.configuration = Configuration(block)
+        self.flash_writes += 1
+        return True
+
+    def status_data(self) -> bytes:
+        """Data of the status reply 0xB1; offsets count from its code. What no driver reads is 0."""
+        configuration = self.configuration
+        parts = {
+            1: self.model[14:21].encode(),
+            8: bytes([self.mode]),
+            102: bytes([configuration.measuring_mode]),
+            107: words_of(self.variant),
+            116: words_of([BAUD_WORD[self.baudrate]]),
+            120: bytes([self.address, 1]),
+            122: bytes([UNITS.index(configuration.unit), 1]),
+        }
+        data = bytearray(153)
+        for at, part in parts.items():
+            data[at : at + len(part)] = part
+        return bytes(data[1:])
+
+
+def words_of(numbers: Sequence[int]) -> bytes:
+    """16-bit numbers as bytes.
+
+    Parameters
+    ----------
+    numbers
+        From 0 to 65535.
+    """
+    return np.array(numbers, "<u2").tobytes()
+
+
+def selection_of(mode: int, parameters: bytes) -> Selection | None:
+    """What a mode sends of the scans.
+
+    Parameters
+    ----------
+    mode
+        Sub-command of 0x20.
+    parameters
+        Behind it.
+
+    Returns
+    -------
+    Selection or None
+        None for a mode that there is not, and for parameters that it does not have.
+    """
+    if len(parameters) != PARAMETERS.get(mode):
+        return None
+    if mode == MEAN:
+        scans = parameters[0]
+        return Selection(parameters, scans=scans) if scans in SCANS else None
+    if mode in (PART, REFLECTIVITY):
+        first, last = np.frombuffer(parameters, "<u2")[-2:].tolist()
+        return Selection(parameters, first, last) if 1 <= first <= last <= LAST else None
+    return Selection()

@@ -1,0 +1,107 @@
+"""How well normal equations determine their unknowns: by the noise, and by placements left out."""
+
+import numpy as np
+
+# eigenvalues of scaled normal equations below this share of the largest are rounding errors
+RANK = 1e-13
+PARTAKES = 0.05  # share of a direction's largest component from which an unknown takes part in it
+ZERO = 1e-5  # a component of a direction below is a rounding error
+FEWEST = 3  # placements whose scatter tells anything
+
+
+def null_space(hessian: np.ndarray, scales: np.ndarray, limit: float = 1.0) -> np.ndarray:
+    """Directions that normal equations of whitened residuals do not determine.
+
+    Parameters
+    ----------
+    hessian : ndarray, shape (k, k)
+    scales : ndarray, shape (k,)
+        What counts as a change by one: 1 rad, 1 m, 1000 px.
+    limit : float
+        A direction is also unobservable when its standard deviation exceeds so many scales.
+
+    Returns
+    -------
+    ndarray, shape (m, k)
+        Increments, largest component 1, the worst first.
+    """
+    values, vectors = np.linalg.eigh(hessian * scales[:, None] * scales)
+    basis = vectors[:, values < np.maximum(RANK * values[-1], limit**-2)].T
+    # reduced echelon form with pivots at the largest entries: the basis with most zeros
+    left = list(range(len(basis)))
+    while left:
+        row, column = np.unravel_index(np.argmax(np.abs(basis[left])), basis[left].shape)
+        pivot = left.pop(row)
+        basis[pivot] /= basis[pivot, column]
+        others = np.arange(len(basis)) != pivot
+        basis[others] -= basis[others, column, None] * basis[pivot]
+    directions = np.where(np.abs(basis) < ZERO, 0.0, basis) * scales
+    return directions / np.max(np.abs(directions), axis=1, keepdims=True)
+
+
+def pseudo_inverse(hessian):
+    """Inverse of scaled normal equations on what they determine.
+
+    Eigenvalues below zero are rounding errors too.
+    """
+    values, vectors = np.linalg.eigh(hessian)
+    inverse = np.divide(
+        1.0, values, out=np.zeros_like(values), where=values > RANK * values[..., -1:]
+    )
+    return (vectors * inverse[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+
+
+def covariance_of(hessian, scales, lost):
+    """Inverse of normal equations. Unknowns that take part in an undetermined direction have an
+    infinite variance.
+
+    A pseudo-inverse calls such unknowns perfectly known; their covariances with others are set to
+    zero.
+    """
+    unit = scales[:, None] * scales
+    covariance = pseudo_inverse(hessian * unit) * unit
+    if not lost:  # or many trials
+        return covariance
+    lost = np.any(np.abs(null_space(hessian, scales, np.inf)) > PARTAKES, axis=0)
+    covariance = np.where(lost[:, None] | lost, 0.0, covariance)
+    return covariance + np.diag(np.where(lost, np.inf, 0.0))
+
+
+def name_words(direction, names, share=PARTAKES):
+    """Names (or words) of the unknowns with the largest components of a direction."""
+    large = np.abs(direction) > share * np.max(np.abs(direction))
+    return " with ".join(np.asarray(names)[large])
+
+
+def placement_covariance(hessians, scores):
+    """First-order jackknife over g placements, from what each adds to the normal equations.
+
+    `scores` are ``J^T r`` of each placement at the solution. Returned are the covariance and the
+    changes (..., g, k) of the estimate when that placement is left out; None with fewer than three
+    placements, or where the others do not determine the estimate.
+
+    Notes
+    -----
+    The sum of squared changes (CR3) is too large in the mean where placements carry unequal weight:
+    noise alone gives ``(g - 1) / g sum_g (inv(H - H_g) - inv(H))`` instead of ``inv(H)``. That
+    factor is taken off every unknown, so that scatter and noise can be compared.
+    """
+    groups = hessians.shape[-3]
+    total = np.sum(hessians, axis=-3, keepdims=True)
+    diagonal = np.sqrt(np.maximum(np.diagonal(total, axis1=-2, axis2=-1), 1e-300))
+    outer = diagonal[..., :, None] * diagonal[..., None, :]
+    scaled = (total - hessians) / outer
+    try:  # squared pivots: what the others say about one unknown more
+        pivots = np.linalg.cholesky(scaled).diagonal(axis1=-2, axis2=-1)
+    except np.linalg.LinAlgError:
+        return None, None
+    if groups < FEWEST or pivots.min() < 1e-6:
+        return None, None
+    without = np.linalg.inv(scaled)
+    shifts = (without @ (scores / diagonal)[..., None])[..., 0] / diagonal
+    share = (groups - 1) / groups
+    squares = share * np.swapaxes(shifts, -1, -2) @ shifts
+    whole = np.diagonal(np.linalg.inv(total / outer), axis1=-2, axis2=-1)
+    gained = np.diagonal(without, axis1=-2, axis2=-1) - whole
+    factor = np.sqrt(whole[..., 0, :] / (share * gained.sum(axis=-2)))
+    return factor[..., :, None] * squares * factor[..., None, :], shifts

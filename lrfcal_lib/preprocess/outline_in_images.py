@@ -1,0 +1,321 @@
+"""The outline of a board that nobody measured, from images of the pattern on it.
+
+A wide search finds straight edges parallel to the sides of the pattern, and which way round the
+board is in every image; the narrow search then finds each edge, and the outline is their median.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.fit.robust import robust_sigma
+from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.preprocess.edges_in_image import (
+    board_line,
+    loops,
+    on_board,
+    outward_line,
+    peaks,
+    sample,
+    step_contrast,
+)
+
+STEP = 0.02  # of the wide search, in squares
+APART = 4  # steps between profiles
+# squares outside the outermost inner corners
+NEAREST = 1.1
+FARTHEST = 6.0
+STEEPEST_SLOPE = 0.025  # of an edge against the side of the pattern
+SLOPES = 11
+SMOOTH_STEPS = 1.5  # of the derivative of a Gaussian across the edge
+AVERAGED_PROFILES = 3  # along the edge
+LEAST_CONTRAST = 8.0  # grey levels (norm over the colours) that make a step
+LEAST_SHARE = 0.3  # of the profiles that must lie inside the image
+# steps: an edge moves by a few millimetres between placements
+MOVES_WITHIN = 9
+MOVES_BETWEEN = 7
+LEAST_VOTES = 0.5  # share of the profiles that agree on an edge
+QUIET = 0.2  # mean share between two lines of a board
+LINE_WIDTH = 6  # steps of a line of a board in the votes
+TURN_ROUNDS = 50
+SIDES = ("top", "right", "bottom", "left")
+OPPOSITE = [2, 3, 0, 1]
+SIDE_NORMALS = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
+
+
+class OutlineNotSeen(ValueError):
+    """The images do not show where a board ends: a sheet on a wall, a background as bright."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """The outer edges of a board, measured in the scale of its pattern.
+
+    Attributes
+    ----------
+    board : Board
+        With its corners filled in.
+    lines : ndarray, shape (E, 3)
+        Board-frame lines ``a x + b y + c = 0``, unit normals out of the board, in the order of
+        ``board.edges``.
+    line_sd : ndarray, shape (E,)
+        Standard deviation over the views of an edge's offset at its middle, metres.
+    length_sd : dict of str to float
+        Standard deviation of an edge's length over the views that show it with both neighbours (NaN
+        below two), metres.
+    n_lengths : dict of str to int
+        Views that show the edge with both neighbours.
+    """
+
+    board: Board
+    lines: np.ndarray
+    line_sd: np.ndarray
+    length_sd: dict[str, float]
+    n_lengths: dict[str, int]
+
+
+def edge_votes(
+    image: np.ndarray, board: Board, model: CameraModel, pose: RigidTransform
+) -> np.ndarray:
+    """Share of the profiles that agree on an edge, by side and distance from the pattern.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (h, w) or (h, w, 3)
+    board : Board
+        With a pattern.
+    model : CameraModel
+    pose : RigidTransform
+        ``T_camera_board``.
+
+    Returns
+    -------
+    ndarray, shape (4, n)
+        For the sides SIDES and :func:`_distances`; NaN where less than 30 % of the profiles lie
+        inside the image.
+    """
+    pattern = board.pattern
+    distances = _distances(pattern)
+    slopes = np.linspace(-STEEPEST_SLOPE, STEEPEST_SLOPE, SLOPES) * APART
+    size = _size(pattern)
+    shares = []
+    for normal in SIDE_NORMALS:
+        along = np.abs(normal[::-1])
+        s = np.arange(-pattern.square, size @ along + pattern.square, APART * STEP * pattern.square)
+        corner = np.asarray(pattern.origin) + np.maximum(normal, 0) * size
+        xy = corner + s[None, :, None] * along + distances[:, None, None] * normal
+        strip = sample(image, model, on_board(xy, pose, model))
+        height = step_contrast(strip, SMOOTH_STEPS, along=AVERAGED_PROFILES)
+        column, place, _ = peaks(height, LEAST_CONTRAST)
+        weight = np.ones(len(column))
+        votes = loops().vote(column, place, weight, height.shape, slopes).max(axis=0)
+        visible = np.isfinite(strip[..., 0]).sum(axis=1)
+        share = votes / np.maximum(visible, 1)
+        shares.append(np.where(visible > LEAST_SHARE * len(s), share, np.nan))
+    return np.stack(shares)
+
+
+def turned_views(votes: np.ndarray, up: np.ndarray, leader: np.ndarray) -> np.ndarray:
+    """Which views see the pattern turned by 180 deg against the others.
+
+    Parameters
+    ----------
+    votes : ndarray, shape (v, 4, n)
+        Of :func:`edge_votes`.
+    up : ndarray, shape (v,)
+        Component of the board's y axis down the image: most views keep y down.
+    leader : ndarray of int, shape (v,)
+        The first of the views that are turned alike, see
+        :class:`lrfcal_lib.preprocess.turns.Alike`.
+
+    Returns
+    -------
+    ndarray of bool, shape (v,)
+    """
+    wide = uniform_filter1d(np.nan_to_num(votes), MOVES_WITHIN, axis=-1)
+    both = np.stack([wide, wide[:, OPPOSITE]])
+    turned = np.bincount(leader, up)[leader] < 0
+    for _ in range(TURN_ROUNDS):
+        mean = both[turned.astype(int), np.arange(len(votes))].mean(axis=0)
+        score = np.sum(both * mean, axis=(2, 3))
+        before = turned
+        turned = np.bincount(leader, score[1] - score[0])[leader] > 0
+        if np.array_equal(turned, before):
+            break
+    upright = np.where(turned, -up, up) > 0
+    return turned if np.mean(upright) >= 0.5 else ~turned
+
+
+def common_lines(votes: np.ndarray, board: Board) -> np.ndarray:
+    """Sides of a board that views turned alike agree on.
+
+    Parameters
+    ----------
+    votes : ndarray, shape (v, 4, n)
+        Of :func:`edge_votes`.
+    board : Board
+
+    Returns
+    -------
+    ndarray, shape (4, 3)
+        Board-frame lines, unit normals out of the board.
+
+    Raises
+    ------
+    OutlineNotSeen
+        Names the first edge that they do not agree on.
+    """
+    wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), MOVES_BETWEEN, axis=-1)
+    wide[wide < 0] = np.nan
+    distances = _distances(board.pattern)
+    fewest = min(3, len(votes))
+    places = []
+    for side, name in enumerate(SIDES):
+        of_side = wide[:, side]
+        enough = np.isfinite(of_side).sum(axis=0) >= fewest
+        mean = np.zeros(len(distances))
+        mean[enough] = np.nanmean(of_side[:, enough], axis=0)
+        place = _outer_peak(gaussian_filter1d(mean, 1.0))
+        if place is None:
+            raise OutlineNotSeen(
+                f"the images do not agree on the {name} edge of board '{board.name}': give the "
+                "corners of the board or pick edges by hand"
+            )
+        places.append(place)
+    return side_lines(board.pattern, distances[places])
+
+
+def side_lines(pattern: Chessboard, distances) -> np.ndarray:
+    """Board lines parallel to the sides of the pattern.
+
+    Parameters
+    ----------
+    pattern : Chessboard
+    distances : sequence of 4 floats
+        Outside the outermost inner corners: top, right, bottom, left; metres.
+
+    Returns
+    -------
+    ndarray, shape (4, 3)
+    """
+    corner = np.asarray(pattern.origin) + np.maximum(SIDE_NORMALS, 0) * _size(pattern)
+    offset = -np.sum(corner * SIDE_NORMALS, axis=1) - np.asarray(distances, float)
+    return np.column_stack([SIDE_NORMALS, offset])
+
+
+def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outline:
+    """Outer edges of the board from all images of all cameras.
+
+    Median over the views of the edge's offset at two places; the spread is 1.4826 times the median
+    deviation. A board bends between placements, so the spread is its own, not the noise of the
+    images.
+
+    Parameters
+    ----------
+    views : sequence of BoardView
+    board : Board
+    models : dict of str to CameraModel
+        By camera.
+
+    Returns
+    -------
+    Outline
+
+    Raises
+    ------
+    DegenerateGeometry
+        Names an edge that was found in no image.
+    """
+    usable = [view for view in views if not view.reason]
+    lines_of_views = []
+    for view in usable:
+        model = models[view.camera]
+        lines_of_views.append({edge.name: board_line(view, edge, model) for edge in view.edges})
+    lines = [
+        np.array([of_view[name] for of_view in lines_of_views if name in of_view])
+        for name in board.edges
+    ]
+    for name, of_edge in zip(board.edges, lines, strict=True):
+        if not len(of_edge):
+            raise DegenerateGeometry(
+                f"edge '{name}' of board '{board.name}' was found in none of {len(usable)} images: "
+                "pick it by hand in edges.csv or give the corners of the board"
+            )
+    rough = corners_of_lines([np.median(of_edge, axis=0) for of_edge in lines])
+    fitted = []
+    line_sd = []
+    for of_edge, start, end in zip(lines, rough, np.roll(rough, -1, axis=0), strict=True):
+        line, spread = _median_line(of_edge, np.stack([start, end]))
+        fitted.append(line)
+        line_sd.append(spread)
+    lengths = {}
+    for i, name in enumerate(board.edges):
+        trio = board.edges[i - 1], name, board.edges[(i + 1) % len(board.edges)]
+        lengths[name] = [
+            _length([of_view[each] for each in trio])
+            for of_view in lines_of_views
+            if of_view.keys() >= {*trio}
+        ]
+    return Outline(
+        board=replace(board, corners=corners_of_lines(fitted)),
+        lines=np.array(fitted),
+        line_sd=np.array(line_sd),
+        length_sd={name: _spread(of_edge) for name, of_edge in lengths.items()},
+        n_lengths={name: len(of_edge) for name, of_edge in lengths.items()},
+    )
+
+
+def _distances(pattern):
+    """Distances (n,) outside the outermost inner corners at which edges are looked for, metres."""
+    return np.arange(NEAREST, FARTHEST, STEP) * pattern.square
+
+
+def _size(pattern):
+    """Width and height of the grid of inner corners, metres."""
+    return np.array([pattern.columns - 1, pattern.rows - 1]) * pattern.square
+
+
+def _outer_peak(votes):
+    """Place of the board's edge in the votes (n,) of one side; None without one.
+
+    It is the last line before the clutter begins. Two lines of a board (the border of the sheet,
+    the edge) are quiet in between.
+    """
+    best = None
+    start = 0
+    for i in np.flatnonzero(votes >= LEAST_VOTES):
+        if votes[i] < votes[max(i - LINE_WIDTH, 0) : i + LINE_WIDTH + 1].max():
+            continue
+        gap = votes[start : max(i - 2 * LINE_WIDTH, start)]
+        if gap.size and gap.mean() > QUIET:
+            break
+        best = int(i)
+        start = best + 2 * LINE_WIDTH
+    return best
+
+
+def _length(trio):
+    """Length of the edge between its two neighbours, lines (3, 3) in order."""
+    corners = corners_of_lines(trio)
+    return np.linalg.norm(corners[2] - corners[1])
+
+
+def _median_line(lines, ends):
+    """Median line (of n, 3) from its offsets at two ends, and the spread at the middle."""
+    normal = np.median(lines[:, :2], axis=0)
+    normal /= np.linalg.norm(normal)
+    # where every line crosses the normals raised at the two ends
+    offsets = -(lines[:, :2] @ ends.T + lines[:, 2:]) / (lines[:, :2] @ normal)[:, None]
+    a, b = ends + np.median(offsets, axis=0)[:, None] * normal
+    return outward_line(a, b, normal), _spread(offsets.mean(axis=1))
+
+
+def _spread(values):
+    """Standard deviation about the median; NaN below two values."""
+    if len(values) < 2:
+        return float("nan")
+    return robust_sigma(values - np.median(values))

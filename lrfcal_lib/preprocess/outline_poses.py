@@ -1,0 +1,163 @@
+"""A dark board without pattern in an image: its outline, and all poses that explain it."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.model.board import Board, corners_of_lines
+from lrfcal_lib.model.camera import CameraModel, pinhole
+from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge
+from lrfcal_lib.preprocess.pattern_in_image import grey
+from lrfcal_lib.preprocess.pose_from_lines import pose_from_edges
+
+LEAST_AREA_SHARE = 0.002  # of the image
+LEAST_FILL = 0.9  # of the polygon by the dark region, and the other way round
+DARKNESS = np.array([0.4, 0.6, 0.8, 1.0, 1.2])  # thresholds, in units of Otsu's
+BLUR_PX = 1.0
+# a pose explains the outline when its corners fall this near, or within 4 sigma
+EXACT_PX = 0.5
+EXACT_CHI2 = 16  # a corner
+SAME_POSE = 1e-3  # radians
+
+
+@dataclass(frozen=True)
+class OutlinePose:
+    """A pose that explains an outline, its covariance (6, 6) of ``[w, v]``, and named edges."""
+
+    T_camera_board: RigidTransform
+    covariance: np.ndarray
+    edges: tuple[ImageEdge, ...]
+
+
+def find_polygon(image: np.ndarray, n_corners: int) -> np.ndarray:
+    """Corners of the largest dark convex polygon, to about a pixel.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (h, w) or (h, w, 3)
+    n_corners : int
+
+    Returns
+    -------
+    ndarray, shape (n_corners, 2)
+        Recorded pixels, in the turning sense right to down.
+
+    Raises
+    ------
+    EdgeNotSeen
+        If no dark region looks like such a polygon, or if it is cut by the image border.
+    """
+    picture = cv2.GaussianBlur(grey(image), (0, 0), BLUR_PX)
+    level = cv2.threshold(picture, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0]
+    best = None
+    best_area = LEAST_AREA_SHARE * picture.size
+    cut = False
+    for threshold in DARKNESS * level:
+        dark = (picture < threshold).astype(np.uint8)
+        for contour in cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
+            area = cv2.contourArea(contour)
+            if area <= best_area:
+                continue
+            corners = _polygon(contour, area, n_corners)
+            if corners is None:
+                continue
+            border = contour.reshape(-1, 2)
+            if np.any(border <= 1) or np.any(border >= np.array(picture.shape[::-1]) - 2):
+                cut = True
+            else:
+                best = corners
+                best_area = area
+    if best is not None:
+        return best
+    if cut:
+        raise EdgeNotSeen("the dark board is cut by the image border")
+    raise EdgeNotSeen(
+        f"no dark region with {n_corners} straight edges in the image: the board must stand out "
+        "from the rest"
+    )
+
+
+def outline_poses(edges, board: Board, model: CameraModel) -> list[OutlinePose]:
+    """All poses of a board that explain the sides of a polygon, most frontal first.
+
+    The printed side (z of the board) faces the camera. Three lines are six equations for six
+    unknowns: nearly every picture of a triangle can be any of its three turned versions, and each
+    of them in up to four poses. The list keeps them all; only other knowledge (a start value, the
+    LRF, another camera) can choose. A polygon with more sides is over-determined and leaves one or
+    two.
+
+    Parameters
+    ----------
+    edges : sequence of ImageEdge
+        In the turning sense of :func:`find_polygon`.
+    board : Board
+    model : CameraModel
+
+    Returns
+    -------
+    list of OutlinePose
+    """
+    # seen from the printed side x to y turns left, in the image (v down) that is the other way
+    # round
+    sides = list(edges)[::-1]
+    flat = board.points()
+    poses = []
+    for shift in range(len(sides)):
+        turned = sides[shift:] + sides[:shift]
+        named = tuple(
+            replace(edge, name=name) for edge, name in zip(turned, board.edges, strict=True)
+        )
+        corners = np.ascontiguousarray(corners_of_lines([edge.line for edge in named]))
+        for start in _starts(flat, corners, model):
+            if start.translation[2] <= 0 or frontal(start) <= 0:
+                continue
+            try:
+                pose, covariance, chi2 = pose_from_edges(named, board, model, start)
+            except np.linalg.LinAlgError:  # sides that bear wrong names
+                continue
+            off = np.linalg.norm(pinhole(pose.apply(flat), model) - corners, axis=1).max()
+            exact = off < EXACT_PX or chi2 < EXACT_CHI2 * len(corners)
+            turns = [pose.rotation * other.T_camera_board.rotation.inv() for other in poses]
+            known = any(turn.magnitude() < SAME_POSE for turn in turns)
+            if exact and frontal(pose) > 0 and not known:
+                poses.append(OutlinePose(pose, covariance, named))
+    return sorted(poses, key=lambda pose: -frontal(pose.T_camera_board))
+
+
+def frontal(pose: RigidTransform) -> float:
+    """Cosine between the board's z axis and the direction to the camera.
+
+    1 seen from the front, below 0 from behind.
+    """
+    normal = pose.rotation.as_matrix()[:, 2]
+    return float(-normal @ pose.translation / np.linalg.norm(pose.translation))
+
+
+def _polygon(contour, area, n_corners):
+    """The polygon around a contour; None where the region does not fill it or has other corners."""
+    hull = cv2.convexHull(contour)
+    if area < LEAST_FILL * cv2.contourArea(hull) or len(hull) < n_corners:
+        return None
+    if n_corners == 3:
+        corners = cv2.minEnclosingTriangle(hull)[1]
+    else:
+        corners = cv2.approxPolyN(hull, n_corners, None, -1.0, True)
+    if corners is None or corners.size != 2 * n_corners:
+        return None
+    if area < LEAST_FILL * cv2.contourArea(corners):
+        return None
+    corners = corners.reshape(-1, 2).astype(np.float32)
+    clockwise = cv2.contourArea(corners, True) > 0
+    return (corners if clockwise else corners[::-1]).astype(float)
+
+
+def _starts(flat, corners, model):
+    """Poses by OpenCV that put the corners (n, 3) of a board near pixels (n, 2)."""
+    if len(flat) == 3:
+        solved = cv2.solveP3P(flat, corners, model.matrix, None, cv2.SOLVEPNP_P3P)
+    else:
+        solved = cv2.solvePnPGeneric(flat, corners, model.matrix, None, flags=cv2.SOLVEPNP_IPPE)
+    for turn, shift in zip(solved[1], solved[2], strict=True):
+        yield RigidTransform.from_components(shift.ravel(), Rotation.from_rotvec(turn.ravel()))

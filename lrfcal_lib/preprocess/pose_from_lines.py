@@ -1,0 +1,120 @@
+"""The pose of a board from image lines of its edges."""
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.camera import CameraModel, pinhole, pinhole_jacobian
+from lrfcal_lib.model.geometry import (
+    gradient_by_pose,
+    move_pose,
+    pose_array,
+    pose_transform,
+    rotate_points,
+)
+
+ROUNDS = 15  # of Gauss-Newton
+SETTLED = 1e-12  # a smaller step (radians, metres) is the last
+
+
+def pose_from_edges(
+    edges, board: Board, model: CameraModel, start: RigidTransform, covariance=None
+) -> tuple[RigidTransform, np.ndarray, float]:
+    """Pose of a board from image lines: three, unless the start is an observation.
+
+    Parameters
+    ----------
+    edges : sequence of ImageEdge
+    board : Board
+    model : CameraModel
+    start : RigidTransform
+        ``T_camera_board``.
+    covariance : ndarray, shape (6, 6), optional
+        Of ``[w, v]`` of the start, where that is an observation.
+
+    Returns
+    -------
+    pose : RigidTransform
+    covariance : ndarray, shape (6, 6)
+    chi2 : float
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the lines lead to a pose behind the camera.
+    """
+    first = pose_array(start)
+    white = np.zeros((0, 6))
+    if covariance is not None:
+        white = np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def system(pose):
+        misses, by_pose = line_residuals(edges, board, model, pose)
+        turn = Rotation.from_matrix(pose[:, :3] @ first[:, :3].T)
+        moved = np.r_[turn.as_rotvec(), pose[:, 3] - first[:, 3]]
+        residuals = np.r_[misses.ravel(), white @ moved]
+        return residuals, np.concatenate([by_pose.reshape(-1, 6), white])
+
+    # plain Gauss-Newton: the weights of the lines move along with the pose, so that no sum of
+    # squares falls steadily, which the minimiser asks for
+    pose = first
+    residuals, jacobian = system(pose)
+    for _ in range(ROUNDS):
+        if not np.isfinite(jacobian).all():
+            raise np.linalg.LinAlgError("no pose explains these lines")
+        step = np.linalg.lstsq(jacobian, -residuals, rcond=1e-12)[0]
+        pose = move_pose(pose, step)
+        residuals, jacobian = system(pose)
+        if np.abs(step).max() < SETTLED:
+            break
+    information = jacobian.T @ jacobian
+    chi2 = float(residuals @ residuals)
+    return pose_transform(pose), np.linalg.pinv(information, hermitian=True), chi2
+
+
+def line_residuals(edges, board: Board, model: CameraModel, pose):
+    """Those of :func:`line_misses` for every edge's two corners."""
+    flat = board.points()
+    first = np.array([board.edges.index(edge.name) for edge in edges])
+    corners = np.stack([first, (first + 1) % len(flat)], axis=1)
+    return line_misses(edges, flat[corners], model, pose)
+
+
+def line_misses(edges, points, model: CameraModel, pose):
+    """Whitened distances of board points from image lines, and their derivatives.
+
+    Parameters
+    ----------
+    edges : sequence of ImageEdge
+        E of them.
+    points : ndarray, shape (E, n, 3)
+        Board frame, metres.
+    model : CameraModel
+    pose : ndarray, shape (3, 4)
+        ``T_camera_board``.
+
+    Returns
+    -------
+    misses : ndarray, shape (E, n)
+    by_pose : ndarray, shape (E, n, 6)
+        By ``[w, v]``.
+    """
+    lines = np.stack([edge.line for edge in edges])
+    turned = rotate_points(pose, points)
+    p_camera = turned + pose[:, 3]
+    uv = pinhole(p_camera, model)
+    distance = np.einsum("enk,ek->en", uv, lines[:, :2]) + lines[:, 2:]
+    by_point = np.einsum("ek,enkj->enj", lines[:, :2], pinhole_jacobian(p_camera, model))
+    by_pose = gradient_by_pose(turned, by_point)
+    white = _whiteners(edges, lines, uv)
+    return (white @ distance[..., None])[..., 0], white @ by_pose
+
+
+def _whiteners(edges, lines, uv):
+    """Inverse Cholesky factors (E, n, n) of the covariance of distances of pixels from lines."""
+    centres = np.stack([edge.centre for edge in edges])
+    covariance = np.stack([edge.covariance for edge in edges])
+    along = np.stack([lines[:, 1], -lines[:, 0]], axis=1)
+    lever = np.einsum("enk,ek->en", uv - centres[:, None], along)
+    design = np.stack([np.ones_like(lever), lever], axis=2)
+    return np.linalg.inv(np.linalg.cholesky(design @ covariance @ np.swapaxes(design, 1, 2)))

@@ -1,0 +1,107 @@
+"""Straight runs in a trace of points: random sample consensus, the longest run first."""
+
+import numpy as np
+
+FEWEST_POINTS = 5  # of a run
+MOST_RUNS = 4  # on one hand of a board
+LEAST_TURN = np.radians(8)  # between neighbouring sides that end scan lines on the same hand
+LONGEST_GAP = 5  # steps, or a tenth of the run
+TRIALS = 300
+REFINE_ROUNDS = 2
+
+
+def straight_runs(
+    points: np.ndarray, order: np.ndarray, tolerance: float, shortest: float
+) -> list[np.ndarray]:
+    """Split a trace into straight runs.
+
+    Runs with fewer than five points, too short, or turned by less than 8 deg against a longer one
+    (the same side, bent or frayed) are not returned.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 2)
+        Metres.
+    order : ndarray of int, shape (n,)
+        Place along the trace (scan line or beam number).
+    tolerance, shortest : float
+        From the line, and of a run, metres.
+
+    Returns
+    -------
+    list of ndarray of int
+        The points of each run.
+    """
+    rng = np.random.default_rng(0)
+    left = np.arange(len(points))
+    runs = []
+    directions = []
+    for _ in range(2 * MOST_RUNS):
+        if len(left) < FEWEST_POINTS or len(runs) == MOST_RUNS:
+            break
+        near = left[_consensus(points[left], tolerance, shortest / 2, rng)]
+        run = _without_gaps(near, order)
+        if len(run) < FEWEST_POINTS:
+            break
+        left = np.setdiff1d(left, run)
+        _, direction, along, _ = line_of(points[run])
+        turned = all(abs(direction @ other) < np.cos(LEAST_TURN) for other in directions)
+        if turned and np.ptp(along) >= shortest:
+            runs.append(run)
+            directions.append(direction)
+    return runs
+
+
+def line_of(points: np.ndarray, among=slice(None)):
+    """Least squares line of some points.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 2)
+        Metres.
+    among : index
+        Those that the line goes through.
+
+    Returns
+    -------
+    centre, direction : ndarray, shape (2,)
+    along, across : ndarray, shape (n,)
+        Places of all points, metres.
+    """
+    centre = points[among].mean(axis=0)
+    offset = points - centre
+    spread = offset[among].T @ offset[among]
+    direction = np.linalg.eigh(spread)[1][:, 1]
+    across = offset[:, 1] * direction[0] - offset[:, 0] * direction[1]
+    return centre, direction, offset @ direction, across
+
+
+def _without_gaps(run, order):
+    """The largest part of a run without a gap of more than a tenth of it (five steps at least)."""
+    if len(run) == 0:
+        return run
+    along = run[np.argsort(order[run], kind="stable")]
+    gaps = np.diff(order[along], prepend=order[along[0]]) > max(LONGEST_GAP, 0.1 * len(run))
+    part = np.cumsum(gaps)
+    return np.sort(along[part == np.bincount(part).argmax()])
+
+
+def _consensus(points, tolerance, apart, rng):
+    """Which points lie near the line that most agree with, after two least-squares refinements."""
+    a = points[rng.integers(len(points), size=TRIALS)]
+    b = points[rng.integers(len(points), size=TRIALS)]
+    length = np.linalg.norm(b - a, axis=1)
+    far = length > apart
+    if not far.any():
+        return np.zeros(len(points), bool)
+    along = (b - a)[far] / length[far, None]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    distance = normal @ points.T - np.sum(normal * a[far], axis=1)[:, None]
+    # The sum of truncated squares ranks lines through the middle of a trace above those along its
+    # rim.
+    best = np.minimum((distance / tolerance) ** 2, 1).sum(axis=1).argmin()
+    on = np.abs(distance[best]) < tolerance
+    for _ in range(REFINE_ROUNDS):
+        if on.sum() >= 2:
+            on = np.abs(line_of(points, on)[3]) < tolerance
+    return on

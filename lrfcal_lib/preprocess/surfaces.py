@@ -1,0 +1,367 @@
+"""Flat surfaces in a range image: pieces without a jump, planes, what may be a board."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import cdist, pdist
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.fit.robust import robust_sigma
+from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.geometry import fit_plane, lrf_to_platform, polar_to_points, tilt
+from lrfcal_lib.session.read import Sweep
+from lrfcal_lib.session.stated import LrfInfo
+
+# a face seen at a flatter angle than 10 deg is taken for a depth jump
+STEEPEST = np.tan(np.radians(80))
+# metres; what noise and dark print change between neighbouring beams of one face
+DEPTH_NOISE = 0.03
+PLANE_NOISE = 0.02  # metres; noise and warp of a board about its plane
+LONGEST_HOLE = 0.15  # metres; a gap without returns that does not end a surface (print, gloss)
+# metres; the farthest from its plane that a return of a noisy device still counts
+LARGEST_NOISE = 0.04
+SAME_PITCH = 1e-4  # radians: scan lines at one pitch
+FEWEST_POINTS = 12
+MOST_PLANES = 25  # of a surface
+SMALL_PART = 0.2  # of the largest connected part of a plane
+NEIGHBOURS = 0.3  # metres; points that may span a plane together
+TRIALS = 200  # of random sample consensus
+SAMPLE = 1500  # points that it looks at
+REFINE_ROUNDS = 3
+# share of its convex hull that a board fills; what clutter leaves on a plane is patchy
+LEAST_FILL = 0.5
+# that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
+FEWEST_LINES = 4
+LEAST_LENGTH = 0.3  # of a scan line on a board, in units of the root of its least area
+
+
+class BoardNotFound(ValueError):
+    """No board in a sweep; the message says what was seen instead."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A flat surface: its cells (L, B), unit normal (3,) and distance (metres), platform frame."""
+
+    mask: np.ndarray
+    normal: np.ndarray
+    distance: float
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Least and largest area (m2) and greatest length (m) of what may be the board."""
+
+    least: float
+    most: float
+    longest: float
+
+    def hold(self, area, length):
+        """Whether something has the board's size."""
+        return self.least < area < self.most and length < self.longest
+
+
+ANY_BOARD = Limits(0.02, 4.0, 4.0)  # when nothing is known about it
+
+
+def depth_jump(ranges, step):
+    """Change of range (metres) between beams a `step` apart that no face of a board makes."""
+    return DEPTH_NOISE + STEEPEST * np.asarray(ranges) * np.abs(step)
+
+
+def segments(ranges, *, jump=DEPTH_NOISE, bridge=0) -> np.ndarray:
+    """Cut scan lines at depth discontinuities; step (i) of the paper's preprocessing.
+
+    A change of range above `jump` (metres) a beam ends a piece, and a gap of more than `bridge`
+    beams. Returns the number by beam (L, B), ascending along the lines, -1 without a return.
+    """
+    valid = np.isfinite(ranges)
+    line, beam = np.nonzero(valid)
+    jump = np.broadcast_to(jump, ranges.shape)[valid]
+    bridge = np.broadcast_to(bridge, ranges.shape)[valid]
+    gap = np.diff(beam)
+    change = np.abs(np.diff(ranges[valid]))
+    broken = np.diff(line, prepend=-1) != 0
+    broken[1:] |= gap - 1 > bridge[1:]
+    broken[1:] |= change > gap * jump[1:]
+    labels = np.full(ranges.shape, -1)
+    labels[valid] = np.cumsum(broken) - 1
+    return labels
+
+
+def surfaces(ranges: np.ndarray, bearings: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+    """Connected surfaces of a range image: numbers (L, B) of pieces joined across the lines.
+
+    -1 without a return.
+    """
+    step = np.median(np.diff(bearings)) if len(bearings) > 1 else 0.0
+    near = np.where(np.isfinite(ranges), ranges, 1.0)
+    bridge = (LONGEST_HOLE / np.maximum(near * step, 1e-9)).astype(int)
+    pieces = segments(ranges, jump=depth_jump(near, step), bridge=bridge)
+    if not np.any(pieces >= 0):
+        return pieces
+    turned = np.diff(pitch)[:, None]
+    close = np.abs(np.diff(ranges, axis=0)) < depth_jump(near[1:], turned)
+    above = pieces[:-1][close]
+    below = pieces[1:][close]
+    n = pieces.max() + 1
+    graph = coo_array((np.ones(len(above)), (above, below)), shape=(n, n))
+    joined = connected_components(graph, directed=False)[1]
+    return np.where(pieces >= 0, joined[pieces], -1)
+
+
+def planar_surface(
+    sweep: Sweep,
+    T_head_lrf: RigidTransform,
+    board: Board | None,
+    rng: np.random.Generator,
+    lrf: LrfInfo | None = None,
+) -> Surface:
+    """The nearest flat connected surface of a board's size.
+
+    With all scan lines at one pitch they do not determine the plane; the one at right angles to the
+    scan plane is taken then.
+
+    Parameters
+    ----------
+    sweep : Sweep
+    T_head_lrf : RigidTransform
+        Only nominal.
+    board : Board or None
+        Tells the size.
+    rng : numpy.random.Generator
+        For the random sampling.
+    lrf : LrfInfo, optional
+        A spot that reads the board while it only touches it makes it larger by its radius.
+
+    Returns
+    -------
+    Surface
+
+    Raises
+    ------
+    BoardNotFound
+        Says what was seen instead.
+    """
+    ranges = sweep.ranges
+    if not np.isfinite(ranges).any():
+        raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
+    p_lrf = polar_to_points(ranges, sweep.bearings)
+    points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)
+    upright = None
+    if np.ptp(sweep.pitch) <= SAME_PITCH:
+        across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
+        upright = tilt(across_scan, float(sweep.pitch[0]))
+    rejected = []
+    best = None
+    best_reach = np.inf
+    for nearest, mask in _by_distance(sweep):
+        if nearest > best_reach:
+            break
+        for part in _planes(sweep, points, mask, upright, rng):
+            if ranges[part.mask].min() > best_reach:
+                continue
+            reach = float(np.median(ranges[part.mask]))
+            grown = 0.0 if lrf is None else float(lrf.spot_radius(reach))
+            limits = _size_limits(board, grown)
+            if upright is None:
+                part = _trimmed(part, points, limits)
+                area, length = plane_size(points[part.mask], part.normal)
+                fits = limits.hold(area, length)
+                fault = _fault(part, sweep, T_head_lrf, points)
+            else:
+                area = 0.0
+                length = float(np.ptp(points[part.mask] @ np.cross(part.normal, upright)))
+                fits = LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest
+                fault = ""
+            if not fits or fault:
+                rejected.append(f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m{fault}")
+            elif reach < best_reach:
+                best = part
+                best_reach = reach
+    if best is None:
+        words = "; ".join(rejected[:4]) or "no flat surface"
+        raise BoardNotFound(f"no flat surface of the board's size; seen: {words}")
+    return _grown(best, points)
+
+
+def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
+    """Random sample consensus over neighbours, then least squares over all that agree.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3)
+        Metres.
+    upright : ndarray, shape (3,), or None
+        A direction that the plane contains.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    (normal, distance) or None
+        None where the points do not determine a plane.
+    """
+    sample = points[rng.permutation(len(points))[:SAMPLE]]
+    seeds = sample[rng.integers(len(sample), size=TRIALS)]
+    apart = cdist(seeds, sample)
+    neighbours = (apart < NEIGHBOURS) & (apart > 1e-6)
+    lots = np.where(neighbours, rng.random(apart.shape), -1.0)
+    others = sample[np.argpartition(-lots, 1, axis=1)[:, :2]]
+    second = others[:, 1] - seeds if upright is None else upright
+    normals = np.cross(others[:, 0] - seeds, second)
+    length = np.linalg.norm(normals, axis=1)
+    good = length > 1e-9
+    if not good.any():
+        return None
+    normals = normals[good] / length[good, None]
+    offsets = np.sum(normals * seeds[good], axis=1)
+    misses = np.abs(normals @ sample.T - offsets[:, None])
+    best = np.sum(misses < PLANE_NOISE, axis=1).argmax()
+    normal = normals[best]
+    distance = offsets[best]
+    for _ in range(REFINE_ROUNDS):
+        on = points[np.abs(points @ normal - distance) < PLANE_NOISE]
+        if upright is not None:
+            on = np.concatenate([on + 0.1 * upright, on - 0.1 * upright])
+        try:
+            normal, distance = fit_plane(on)[:2]
+        except ValueError:  # too few points, or all on one line
+            return None
+    return normal, distance
+
+
+def plane_axes(normal: np.ndarray) -> np.ndarray:
+    """Two unit vectors in a plane, shape (2, 3): the first as level as the second is steep.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (3,)
+    """
+    other = [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0]
+    across = np.cross(normal, other)
+    across /= np.linalg.norm(across)
+    return np.stack([np.cross(across, normal), across])
+
+
+def plane_size(points: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
+    """Area (m2; 0 for a single line) and greatest length (m) of points in a plane."""
+    flat = points @ plane_axes(normal).T
+    try:
+        hull = ConvexHull(flat)
+    except QhullError:
+        return 0.0, float(np.linalg.norm(np.ptp(flat, axis=0)))
+    return float(hull.volume), float(pdist(flat[hull.vertices]).max())
+
+
+def row_ends(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First and last True of each row.
+
+    Parameters
+    ----------
+    mask : ndarray of bool, shape (n, m)
+
+    Returns
+    -------
+    rows, first, last : ndarray of int
+        Without rows that have none.
+    """
+    rows = np.flatnonzero(mask.any(axis=1))
+    first = mask[rows].argmax(axis=1)
+    from_end = mask[rows, ::-1].argmax(axis=1)
+    return rows, first, mask.shape[1] - 1 - from_end
+
+
+def _by_distance(sweep):
+    """Smallest range and cells (L, B) of the connected surfaces of a sweep, the nearest first."""
+    labels = surfaces(sweep.ranges, sweep.bearings, sweep.pitch)
+    numbers, counts = np.unique(labels[labels >= 0], return_counts=True)
+    numbers = numbers[counts >= FEWEST_POINTS]
+    nearest = ndimage.minimum(sweep.ranges, labels, numbers)
+    for k in np.argsort(nearest):
+        yield nearest[k], labels == numbers[k]
+
+
+def _planes(sweep, points, mask, upright, rng):
+    """Flat connected parts of a surface: the largest plane first, then what is left."""
+    left = mask.copy()
+    known = np.nan_to_num(points, nan=1e9)
+    for _ in range(MOST_PLANES):
+        if left.sum() < FEWEST_POINTS:
+            return
+        plane = best_plane(points[left], upright, rng)
+        if plane is None:
+            return
+        normal, distance = plane
+        on = left & (np.abs(known @ normal - distance) < PLANE_NOISE)
+        labels = surfaces(np.where(on, sweep.ranges, np.nan), sweep.bearings, sweep.pitch)
+        count = np.bincount(labels[labels >= 0])
+        for label in np.flatnonzero(count >= max(FEWEST_POINTS, SMALL_PART * count.max())):
+            yield Surface(labels == label, normal, distance)
+        left &= ~on
+
+
+def _trimmed(part, points, limits):
+    """A flat surface, where it has not the board's size without thin strips of floor or wall."""
+    if limits.hold(*plane_size(points[part.mask], part.normal)):
+        return part
+    whole = ndimage.binary_closing(part.mask, iterations=2)
+    core = ndimage.binary_opening(whole, np.ones((5, 5)))
+    labels, count = ndimage.label(core)
+    if count == 0:
+        return part
+    core = labels == np.bincount(labels[labels > 0]).argmax()
+    about = ndimage.binary_dilation(core, np.ones((3, 3)))
+    return replace(part, mask=part.mask & about)
+
+
+def _grown(surface, points):
+    """With the returns in and beside it that noise takes off its plane, but no farther."""
+    miss = np.abs(points @ surface.normal - surface.distance)
+    reach = np.clip(3 * robust_sigma(miss[surface.mask]), PLANE_NOISE, LARGEST_NOISE)
+    about = ndimage.binary_dilation(surface.mask, np.ones((3, 3)))
+    return replace(surface, mask=surface.mask | (about & (miss < reach)))
+
+
+def _size_limits(board, grown):
+    """Limits of a board with its outline grown (m)."""
+    if board is not None and board.corners is not None:
+        hull = ConvexHull(board.corners)
+        area = hull.volume
+        rim = hull.area  # of a plane figure: its circumference
+        length = pdist(board.corners).max()
+        return Limits(0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown)
+    if board is not None and board.pattern is not None:
+        pattern = board.pattern
+        sides = pattern.square * np.array([pattern.columns + 1, pattern.rows + 1])
+        area = np.prod(sides)
+        return Limits(0.3 * area, 4 * area, 2.5 * np.linalg.norm(sides))
+    return ANY_BOARD
+
+
+def _fault(surface, sweep, T_head_lrf, points):
+    """Why a surface is no face of a board: few scan lines, seen along itself, patchy; or ''."""
+    mask = surface.mask
+    lines = int(mask.any(axis=1).sum())
+    if lines < min(FEWEST_LINES, len(sweep.pitch)):
+        return f" on {lines} of {len(sweep.pitch)} scan lines"
+    cells = np.argwhere(mask)
+    rays = points[mask] - tilt(T_head_lrf.translation, sweep.pitch[cells[:, 0]])
+    cosine = np.abs(rays @ surface.normal) / np.linalg.norm(rays, axis=1)
+    if np.median(cosine) * STEEPEST < 1:
+        return " seen along itself"
+    try:
+        hull = ConvexHull(cells)
+    except QhullError:
+        return ""
+    corners = cells[hull.vertices]
+    sides = np.abs(np.roll(corners, -1, axis=0) - corners)
+    rim = np.gcd(*sides.T).sum()
+    within = hull.volume + rim / 2 + 1  # cells of the hull, by Pick's theorem
+    fill = len(cells) / within
+    if fill < LEAST_FILL:
+        return f" filled to {100 * fill:.0f} %"
+    return ""

@@ -1,0 +1,135 @@
+"""Boards that look the same when turned: one turn for all images of a placement."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.model.board import Chessboard
+
+# weight of the turn between two cameras where few placements tell: most look the same way, head up
+UPRIGHT = 0.05
+# a board frame whose z points into the board is believed when the other explains less than this
+# share
+CLEARLY = 0.95
+
+
+@dataclass(frozen=True)
+class Alike:
+    """Orders of a pattern's corners that belong together in images of one placement.
+
+    Attributes
+    ----------
+    leader : ndarray of int, shape (m,)
+        The first image of the same placement.
+    order : ndarray of int, shape (m, n)
+        The order in the image that goes with each order in the leader.
+    """
+
+    leader: np.ndarray
+    order: np.ndarray
+
+
+def turned_boards(pattern: Chessboard, orders: np.ndarray) -> RigidTransform:
+    """Turns of a board about the middle of its pattern that exchange its corners.
+
+    Parameters
+    ----------
+    pattern : Chessboard
+    orders : ndarray of int, shape (n, k)
+        See :func:`lrfcal_lib.preprocess.pattern_in_image.pattern_orders`.
+
+    Returns
+    -------
+    RigidTransform
+        A stack of n, board frame.
+    """
+    points = pattern.points()
+    middle = points.mean(axis=0)
+    offsets = points - middle
+    turns = [Rotation.align_vectors(offsets[order], offsets)[0] for order in orders]
+    rotation = Rotation.concatenate(turns)
+    return RigidTransform.from_components(middle - rotation.apply(middle), rotation)
+
+
+def alike(rotations, placements, cameras) -> Alike:
+    """Which orders of a pattern's corners belong together in the images of one placement.
+
+    Between two images of one camera the head turns by less than any two orders differ. How a camera
+    is turned against another is the same at all placements, which is true for one choice of the
+    orders only.
+
+    Parameters
+    ----------
+    rotations : sequence of Rotation
+        From the board to the camera, by image (m) a stack for every order that the corners may have
+        (n), the same orders in all images.
+    placements : sequence of int
+        By image; negative for an image of none, which stands alone.
+    cameras : sequence of str
+        By image.
+
+    Returns
+    -------
+    Alike
+    """
+    leaders = {}
+    leader = np.zeros(len(placements), int)
+    for i, placement in enumerate(placements):
+        alone = placement < 0
+        leader[i] = i if alone else leaders.setdefault(placement, i)
+    turn_of_camera = {}
+    for camera in dict.fromkeys(cameras):
+        turn_of_camera[camera] = _between(rotations, placements, cameras, cameras[0], camera)
+    order = []
+    for i, j in enumerate(leader):
+        turn = turn_of_camera[cameras[i]] * turn_of_camera[cameras[j]].inv()
+        off = [(rotations[i] * ahead.inv()).magnitude() for ahead in turn * rotations[j]]
+        order.append(np.argmin(off, axis=1))
+    return Alike(leader, np.array(order, int))
+
+
+def _between(rotations, placements, cameras, base, camera):
+    """Rotation from one camera to another on which most placements agree."""
+    if base == camera:
+        return Rotation.identity()
+    first = {base: {}, camera: {}}  # image of a placement
+    for rotation, placement, name in zip(rotations, placements, cameras, strict=True):
+        if name in first and placement >= 0:
+            first[name].setdefault(placement, rotation)
+    common = sorted(first[base].keys() & first[camera].keys())
+    if not common:
+        return Rotation.identity()
+    # every order in the one image that might go with the first order in the other
+    possible = [first[camera][p] * first[base][p][0].inv() for p in common]
+    candidates = Rotation.concatenate(possible)
+    cost = UPRIGHT * candidates.magnitude()
+    for turns in possible:
+        cost += [(turns * candidate.inv()).magnitude().min() for candidate in candidates]
+    return candidates[int(np.argmin(cost))]
+
+
+def decide(scores: np.ndarray, leader: np.ndarray) -> np.ndarray:
+    """One order for all images of a placement.
+
+    Parameters
+    ----------
+    scores : ndarray, shape (m, n)
+        How well each order explains each image, those that belong together in one column; orders
+        of a mirrored board frame are the second half.
+    leader : ndarray of int, shape (m,)
+        See :class:`Alike`.
+
+    Returns
+    -------
+    ndarray of int, shape (m,)
+        The columns chosen.
+    """
+    total = np.zeros(scores.shape)
+    np.add.at(total, leader, scores)
+    usual, mirrored = np.split(total, 2, axis=1)
+    if mirrored.max(axis=1).sum() < CLEARLY * usual.max(axis=1).sum():
+        best = usual.argmax(axis=1)
+    else:
+        best = usual.shape[1] + mirrored.argmax(axis=1)
+    return best[leader]

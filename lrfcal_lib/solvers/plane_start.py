@@ -1,0 +1,297 @@
+"""Start values of a camera from planes: minimal and closed forms, and the choice among minima."""
+
+from itertools import combinations
+from math import comb
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.fit.least_squares import minimise
+from lrfcal_lib.fit.residuals import SIGMA_FLOOR
+from lrfcal_lib.model.geometry import apply_pose, move_pose, pose_transform, transform_difference
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.solvers.planes import (
+    check_normals,
+    compress,
+    plane_block,
+    plane_residuals,
+    plane_sets,
+)
+
+SUBSETS = 400  # of the placements, tried at most
+MINIMAL = 40  # of them by the minimal solution, which has eight poses each
+SAME_TURN = np.radians(10.0)  # poses nearer to each other than this are one minimum
+MOST_APART = 6  # minima to choose from
+ROUGH_SIGMA = 0.005  # metres, of a point from its plane, for the search
+CAPPED = 16.0  # times the usual square: a larger miss (four standard deviations) fits no minimum
+NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
+SEEN = 0.8  # of the placements: a few may be wrong
+ROTATIONS = 200  # random ones, beside the 24 of a cube
+FLAT = 1e-3  # of its extent: what leaves a common plane less is a set of single scan lines
+
+
+def start_from_planes(obs: CameraObservations) -> RigidTransform:
+    """Start values of ``T_camera_source``: minimal and closed forms in random subsets of the
+    placements, least trimmed squares.
+
+    Parameters
+    ----------
+    obs : CameraObservations
+
+    Returns
+    -------
+    RigidTransform
+        A stack, mostly of one, the best one first. Others are minima far from it that explain the
+        placements nearly as well.
+
+    Raises
+    ------
+    DegenerateGeometry
+        With fewer than three placements, or boards that leave a motion open.
+    """
+    sets = plane_sets(obs)
+    check_normals(sets, obs.camera)
+    triangles = compress(sets, 1.0)
+    p = len(sets.placements)
+    frame, flat = common_plane(triangles)
+    threes = _threes(p)
+    few = threes[:MINIMAL]
+    candidates = [three_planes((triangles @ frame)[few], sets.boards[few]).reshape(-1, 3, 4)]
+    candidates[0] = candidates[0] @ frame.T
+    if not flat:
+        candidates.append(closed_form(triangles[threes], sets.boards[threes]))
+        candidates.append(closed_form(triangles[None], sets.boards[None]))
+    candidates = _before_boards(np.concatenate(candidates), sets, _centred(triangles)[1])
+
+    # more placements than a closed form uses; half of them may be wrong, or all but one right
+    squares = np.sort(_squares(candidates, triangles, sets), axis=1)
+    first = []
+    for count in {p // 2 + 2, max(p // 2 + 2, 7 if flat else 5)}:
+        order = np.argsort(squares[:, :count].mean(axis=1))
+        first += [*order[:4], *_apart(candidates, order)]
+    best = candidates[np.unique(first)]
+
+    def evaluate(pose):
+        return plane_block(pose, triangles / ROUGH_SIGMA, sets.boards, None, sets.number)
+
+    options: dict[str, Any] = {"max_iterations": 12, "tolerance": 0.01}
+    robust, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", **options)
+    plain, *_ = minimise(evaluate, robust, move_pose, **options)
+    minima = np.concatenate([robust, plain, best])
+    sizes = sizes_of_minima(_squares(minima, triangles, sets), sets.number)
+    apart = np.array(_apart(minima, np.argsort(sizes)))
+    return pose_transform(minima[apart[sizes[apart] <= NEARLY * sizes[apart[0]]]])
+
+
+def sizes_of_minima(squares: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Robust sizes (n,) of the misses at n minima, which tell the one that explains the data best.
+
+    Roots of weighted means of squares (n, k), each one counted up to `CAPPED` times the level: that
+    of the minimum with the smallest median, one level for all. The median alone would not see what
+    half of the data say.
+    """
+    level = np.median(squares, axis=1).min()
+    capped = np.minimum(squares, CAPPED * level + SIGMA_FLOOR**2)
+    return np.sqrt(np.average(capped, axis=1, weights=weights))
+
+
+def rival_words(camera: str, best: RigidTransform, other: RigidTransform) -> str:
+    """That another pose of a camera explains the data nearly as well."""
+    turn, shift = transform_difference(best, other)
+    return (
+        f"a second minimum explains the data nearly as well: camera '{camera}' "
+        f"{np.degrees(turn):.0f} deg and {1000 * shift:.0f} mm from where it is handed over; "
+        "record more placements that lean other ways"
+    )
+
+
+def common_plane(triangles):
+    """The plane that all compressed points of a recording lie in, and whether they do.
+
+    The first, (4, 4), turns rows ``[p, 1]`` into rows of a frame whose plane z = 0 it is. They do
+    for single scan lines in one plane of the LRF: how far noise scatters them within it tells
+    nothing.
+    """
+    root, centre = _centred(triangles.reshape(1, -1, 4))
+    _, spread, axes = np.linalg.svd(root[0])
+    frame = np.eye(4)
+    frame[:3, :3] = axes.T * np.array([1.0, 1.0, np.linalg.det(axes)])
+    frame[3, :3] = -centre[0] @ frame[:3, :3]
+    return frame, bool(spread[2] < FLAT * spread[0])
+
+
+def closed_form(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
+    """The linear solution of Zhang and Pless: the rotation from the planes' normals.
+
+    Parameters
+    ----------
+    triangles : ndarray, shape (n, k, 4, 4)
+        Compressed points of n sets of k placements, which span a plane each.
+    boards : ndarray, shape (n, k, 3, 4)
+        ``T_camera_board``.
+
+    Returns
+    -------
+    ndarray, shape (n, 3, 4)
+        ``T_camera_source``.
+    """
+    normal = boards[..., 2]
+    root, centre = _centred(triangles)
+    source = np.linalg.svd(root)[2][..., 2, :]
+    source = source * np.sign(np.vecdot(source, centre))[..., None]
+    camera = normal * np.where(np.vecdot(normal, boards[..., 3]) < 0, -1.0, 1.0)[..., None]
+    return _on_planes(np.swapaxes(camera, -1, -2) @ source, normal, boards[..., 3], centre)
+
+
+def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
+    """The minimal solution of Vasconcelos, Barreto and Nunes (2012).
+
+    That the directions of scan lines lie in the boards' planes leaves three dimensions to the first
+    two columns of R; two quadrics there make these orthogonal and of one length. Each of four
+    solutions has both signs; complex ones keep their real part.
+
+    Parameters
+    ----------
+    triangles : ndarray, shape (..., 3, 4, 4)
+        Compressed points of three single scan lines (z = 0).
+    boards : ndarray, shape (..., 3, 3, 4)
+        ``T_camera_board``.
+
+    Returns
+    -------
+    ndarray, shape (..., 8, 3, 4)
+        ``T_camera_source``.
+    """
+    normal = boards[..., 2]
+    root, centre = _centred(triangles)
+    along = np.linalg.svd(root[..., :2])[2][..., 0, :]
+    rows = (along[..., :, None] * normal[..., None, :]).reshape(*normal.shape[:-1], 6)
+    null = np.linalg.svd(rows)[2][..., 3:, :]
+    first = null[..., :3]
+    second = null[..., 3:]
+    first_length = first @ np.swapaxes(first, -1, -2)
+    second_length = second @ np.swapaxes(second, -1, -2)
+    angle = first @ np.swapaxes(second, -1, -2)
+    columns = _common_points(first_length - second_length, angle + np.swapaxes(angle, -1, -2))
+    columns = columns @ null
+    columns = np.concatenate([columns, -columns], axis=-2)
+    x = columns[..., :3]
+    y = columns[..., 3:]
+    rotation = np.stack([x, y, np.cross(x, y)], axis=-1)
+    rotation /= np.maximum(np.linalg.norm(x, axis=-1), 1e-12)[..., None, None]
+    each = (..., None, slice(None), slice(None))  # of the eight
+    return _on_planes(rotation, normal[each], boards[..., 3][each], centre[each])
+
+
+def shifted(rotation: np.ndarray, normal: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Poses (..., 3, 4) of rotations with the translation for which ``n . t = right`` fits best.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (..., 3, 3)
+    normal : ndarray, shape (..., k, 3)
+    right : ndarray, shape (..., k)
+        Metres.
+    """
+    return np.concatenate([rotation, np.linalg.pinv(normal) @ right[..., None]], axis=-1)
+
+
+def start_rotations() -> np.ndarray:
+    """The 24 rotations of a cube and random ones, shape (n, 3, 3)."""
+    drawn = Rotation.random(ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
+    return np.concatenate([Rotation.create_group("O").as_matrix(), drawn])
+
+
+def _threes(p):
+    """Sets of three of p placements to try: all of them, or many."""
+    if comb(p, 3) <= SUBSETS:
+        return np.array(list(combinations(range(p), 3)))
+    return np.argsort(np.random.default_rng(0).random((SUBSETS, p)), axis=1)[:, :3]
+
+
+def _before_boards(poses, sets, centres):
+    """Poses that put (most of) the boards before the camera, and the range finder on the side
+    that the camera sees.
+    """
+    normal = sets.boards[..., 2]
+    point = sets.boards[..., 3]
+    lrf_side = np.vecdot(poses[:, None, :, 3] - point, normal)
+    ahead = apply_pose(poses, centres)[..., 2] > 0
+    good = np.mean((lrf_side * -np.vecdot(point, normal) > 0) & ahead, axis=1)
+    return poses[(good >= min(SEEN, good.max())) & np.isfinite(poses).all(axis=(1, 2))]
+
+
+def _squares(poses, triangles, sets):
+    """Mean squared distances (n, p) of each placement's points from its plane, at n poses."""
+    residuals = plane_residuals(poses[:, None], triangles, sets.boards)
+    return np.sum(residuals**2, axis=2) / sets.number
+
+
+def _apart(poses, order):
+    """Indices of the first poses in some order that are turned against all before, `MOST_APART`."""
+    chosen = []
+    left = np.asarray(order)
+    while len(left) and len(chosen) < MOST_APART:
+        first = left[0]
+        chosen.append(first)
+        turns = np.trace(poses[left, :, :3] @ poses[first, :, :3].T, axis1=1, axis2=2)
+        left = left[turns < 1 + 2 * np.cos(SAME_TURN)]
+    return chosen
+
+
+def _centred(triangles):
+    """Scatter roots about the centroid (..., 3, 3), and the centroids (..., 3), of compressed
+    points.
+    """
+    rows = np.concatenate([triangles[..., 3:], triangles[..., :3]], axis=-1)
+    turned = np.linalg.qr(rows, mode="r")
+    return turned[..., 1:, 1:], turned[..., 0, 1:] / turned[..., 0, :1]
+
+
+def _on_planes(rotation, normal, point, centre):
+    """Poses with the proper rotations nearest to some matrices that put centroids on planes as
+    well as they can.
+    """
+    u, _, vt = np.linalg.svd(rotation)
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None, None]
+    rotation = np.concatenate([u[..., :2], u[..., 2:] * sign], axis=-1) @ vt
+    moved = centre @ np.swapaxes(rotation, -1, -2)
+    return shifted(rotation, normal, np.vecdot(normal, point - moved))
+
+
+@np.errstate(all="ignore")
+def _common_points(one, two):
+    """The four points ``[x, y, 1]`` (..., 4, 3) that two conics (..., 3, 3) share.
+
+    Real parts of complex ones.
+    """
+
+    def at(y):
+        """Numerator and denominator of x at y, and the resultant, which is zero where the
+        conics meet.
+        """
+        a, b, c = _in_x(one, y)
+        d, e, f = _in_x(two, y)
+        up = d * c - a * f
+        down = a * e - d * b
+        return up, down, up**2 - down * (b * f - e * c)
+
+    nodes = np.arange(-2.0, 3.0)
+    resultant = at(nodes)[2] @ np.linalg.inv(np.vander(nodes)).T
+    companion = np.zeros(resultant.shape[:-1] + (4, 4))
+    companion[..., 0, :] = -resultant[..., 1:] / resultant[..., :1]
+    companion[..., [1, 2, 3], [0, 1, 2]] = 1.0
+    # parallel boards leave nothing
+    y = np.linalg.eigvals(np.nan_to_num(companion, posinf=0.0, neginf=0.0))
+    up, down, _ = at(y)
+    points = np.stack([(up / down).real, y.real, np.ones(y.shape)], axis=-1)
+    return np.nan_to_num(points, posinf=0.0, neginf=0.0)
+
+
+def _in_x(conic, y):
+    """Coefficients of x^2, x and 1 of conics (..., 3, 3) at values of y (..., n)."""
+    entry = conic[..., None]
+    linear = 2 * (entry[..., 0, 1, :] * y + entry[..., 0, 2, :])
+    constant = entry[..., 1, 1, :] * y**2 + 2 * entry[..., 1, 2, :] * y + entry[..., 2, 2, :]
+    return entry[..., 0, 0, :], linear, constant

@@ -1,0 +1,110 @@
+"""The world behind emulated devices: scans, images, and who moves its board."""
+
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from fake_rig import make_rig, rig_data
+from test_emulated_rig import DEADLINE, SETUP, SMALL
+
+from lrfcal_lib.drivers.port import DeviceError
+from lrfcal_lib.emulators.head import Head
+from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld
+from lrfcal_lib.simulate import beam as lrf
+from lrfcal_lib.simulate.record import world_of
+from lrfcal_lib.simulate.rig import placements_of
+
+QUARTERS = np.arange(160, 561)
+
+
+@pytest.fixture(scope="module")
+def placements():
+    return placements_of(SETUP)[:4]
+
+
+@pytest.fixture
+def world(placements):
+    return EmulatedWorld(SETUP, placements=placements)
+
+
+@pytest.fixture
+def small(placements):
+    """A world whose images are small."""
+    return EmulatedWorld(SMALL, placements=placements)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.5])
+def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch_of_every_beam(world, placements, speed):
+    world.put(1)
+    beam, start = SETUP.rig.beam, float(np.mean(placements[0].sweep))
+    world.head = Head(SETUP.rig.platform, pitch=start)
+    world.head.move(0.0, start + 0.5, speed)
+    times = 0.1 + QUARTERS % 4 / 75.08
+    scans, _ = zip(*(world.scan(0, QUARTERS, times) for _ in range(30)), strict=True)
+    pitch, still = world.head.pitch(times), world_of(SETUP, placements[0].T_platform_board)
+    ideal = lrf.ideal_readings(beam, still, beam.bearings(), pitch + 0 * times, SETUP.rig.T_head_lrf)[0]
+    assert (np.ptp(pitch) > 0.01) == (speed > 0)
+    error = np.array(scans) - beam.systematic - ideal
+    assert np.nanstd(error) == pytest.approx(beam.sigma_range, rel=0.05)
+    assert abs(np.nanmean(error)) < 5 * beam.sigma_range / np.sqrt(error.size)
+
+
+def test_the_board_is_moved_by_who_records(world):
+    data, driver = rig_data(), make_rig()
+    assert driver.move_board(1) is False and driver.hold_close("left", 0) is False  # there it is a person
+    server = CameraServer(world)
+    server.start()
+    data["devices"]["control"] = server.control
+    driver = make_rig(data)
+    assert driver.move_board(2) and world.place.key == ("placement", 2)
+    assert driver.hold_close("left", 3) and world.place.key == ("close", "left", 3)
+    for call, message in (
+        (lambda: driver.move_board(9), "control http:.* 400 'no placement 9; there are 1, 2, 3, 4, and none'"),
+        (lambda: driver.move_board("x"), "invalid literal"),
+        (lambda: driver.hold_close("left", 99), "no view 99 of camera 'left'"),
+        (lambda: driver.hold_close("a/b", 0), "answers 404 'there are place/NUMBER"),
+    ):
+        with pytest.raises(DeviceError, match=message):
+            call()
+    server.close()
+    with pytest.raises(DeviceError, match="is 'python -m lrfcal_lib emulate' still running"):
+        driver.move_board(3)
+
+
+STRANGE = {  # what a web page could send: method, address, Host
+    "read": ("GET", "{control}/place/1", "{host}"),
+    "no token": ("POST", "{url}/place/1", "{host}"),
+    "another token": ("POST", "{url}/x/place/1", "{host}"),
+    "another name": ("POST", "{control}/place/1", "example.org"),
+    "another port": ("POST", "{control}/place/1", "127.0.0.1:80"),
+    "images by another name": ("GET", "{url}/left.mjpg", "example.org"),
+}
+
+
+@pytest.mark.parametrize("order", STRANGE)
+def test_no_web_page_moves_the_board(world, order):
+    server = CameraServer(world)
+    server.start()
+    names = {"url": server.url, "control": server.control, "host": server.host}
+    method, url, host = (text.format(**names) for text in STRANGE[order])
+    request = urllib.request.Request(url, method=method, headers={"Host": host})
+    with pytest.raises(urllib.error.HTTPError, match="40[34]"):
+        urllib.request.urlopen(request, timeout=DEADLINE)
+    assert world.place.key == ("placement", None)
+    server.close()
+
+
+def test_an_image_begun_before_a_move_is_not_sent(small):
+    server, drawn = CameraServer(small), []
+
+    def draw(name, scene, pitch):
+        drawn.append(pitch)
+        if len(drawn) == 1:
+            small.head.go(small.host.now(), 0.05, 2.0)
+        return b"%d" % len(drawn)
+
+    server._draw = draw
+    key, data = server.image("left", timeout=DEADLINE)
+    assert data == b"2" and key[2] == drawn[1] != drawn[0]
+    server.close()
