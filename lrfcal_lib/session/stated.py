@@ -466,7 +466,7 @@ def platform_to_json(
     T_head_lrf, sigma, continuous
         Fields of a Session; sigma is `platform_sigma`, radians and metres.
     """
-    platform = {"T_head_lrf": transform_to_json(T_head_lrf)}
+    platform: dict[str, Any] = {"T_head_lrf": transform_to_json(T_head_lrf)}
     if sigma is not None:
         direction, offset = sigma
         platform["sigma_direction_deg"] = round(math.degrees(direction), 9)
