@@ -108,7 +108,7 @@ def test_index_states_what_was_found_and_needs_no_other_file(finished, session):
     page = (finished[0] / "index.html").read_text()
     digest = report.hashlib.sha256((session / "session.json").read_bytes()).hexdigest()
     told = ["A wall", "Walls are flat.", "2.0 m", "Mean range", "<b>Figure 0.1.</b> One scan line &lt;of many&gt;."]
-    told += [digest, np.__version__, "<b>Table 0.1.</b> Errors", '<td data-label="method">lines, likelihood</td>']
+    told += [digest, np.__version__, "<b>Table 0.1.</b> Errors", '<td data-label="method">lines, half step</td>']
     told += [f'<td class="number" data-label="error [mm]">{cell}</td>' for cell in ("-2.0", "–")]
     assert [words for words in told if words not in page] == []
     assert "found before the failure" in page, "a notebook that fails has told what it found until then"

@@ -159,7 +159,7 @@ class EmulatedWorld:
         key = None
         if np.ptp(pitch) < STILL:  # a head at rest sees the same again and again
             key = place.key, len(quarters), quarters[0], round(float(pitch[0]) / STILL)
-        if key is None or self._still_key != key:
+        if self._still is None or key is None or self._still_key != key:
             self._still_key = key
             bearings = np.radians(quarters / 4)
             self._still = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import operator
 import os
 from collections.abc import Callable
 from functools import partial
@@ -200,7 +201,7 @@ def write_clouds(folder: str | Path, calibration: Calibration, method: str) -> l
         For a session that the calibration cannot colour, or a file that cannot be written. Every
         file is whole, or as it was before.
     """
-    written = spread(lambda task: task(), cloud_tasks(folder, calibration, method))
+    written = spread(operator.call, cloud_tasks(folder, calibration, method))
     return [file for files in reversed(written) for file in files]
 
 

@@ -1,6 +1,7 @@
 """A session after preprocessing: the board in every sweep and image, and what could not be used."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -180,24 +181,7 @@ def prepare_scans(session: Session) -> Prepared:
     edges: dict[str, dict] = {variant: {} for variant in VARIANTS}
     swept: dict[str, dict] = {variant: {} for variant in VARIANTS}
 
-    def look(placement):
-        """The board and its crossings in one sweep, or why not."""
-        try:
-            sweep = session.sweep(placement)
-            scan = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
-        except SessionError:
-            return Problem(
-                Stage.SCANS, ProblemKind.NO_BOARD, "no range in any scan line", placement
-            )
-        except BoardNotFound as error:
-            return Problem(Stage.SCANS, ProblemKind.NO_BOARD, str(error), placement)
-        along, sides = crossings(scan)
-        across = {}
-        if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
-            across, _ = crossings(scan, True, sides)
-        return scan, along, across
-
-    for result in spread(look, session.board_placements):
+    for result in spread(partial(_crossed, session), session.board_placements):
         if isinstance(result, Problem):
             problems.append(result)
             continue
@@ -208,6 +192,22 @@ def prepare_scans(session: Session) -> Prepared:
         for variant in across:
             swept[variant][scan.placement] = across[variant]
     return Prepared(session, session.board, scans, edges, swept, problems=tuple(problems))
+
+
+def _crossed(session, placement):
+    """The board and its crossings in one sweep, or why not."""
+    try:
+        sweep = session.sweep(placement)
+        scan = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
+    except SessionError:
+        return Problem(Stage.SCANS, ProblemKind.NO_BOARD, "no range in any scan line", placement)
+    except BoardNotFound as error:
+        return Problem(Stage.SCANS, ProblemKind.NO_BOARD, str(error), placement)
+    along, sides = crossings(scan)
+    across = {}
+    if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
+        across, _ = crossings(scan, True, sides)
+    return scan, along, across
 
 
 def prepare_images(prepared: Prepared) -> Prepared:

@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Sequence
 from numbers import Number
 from pathlib import Path
 
@@ -17,8 +18,9 @@ import matplotlib.pyplot as plt
 import pandas as pd
 from IPython import get_ipython
 from IPython.display import HTML, display
+from matplotlib.figure import Figure
 
-from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.shown import escape
 from lrfcal_lib.solvers import METHODS
 
@@ -43,7 +45,7 @@ OTHER_LABELS = {  # of what is no row of METHODS
 _found: dict[str, list] = {"figures": [], "tables": [], "findings": [], "verdicts": []}
 
 
-def set_up():
+def set_up() -> None:
     """Style figures and tables and keep libraries quiet; for a notebook that needs no session."""
     # read by Open3D when it is imported
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
@@ -61,17 +63,19 @@ def set_up():
         kind.clear()
 
 
-def start():
-    """First cell of a notebook: :func:`set_up`, then the Session ``LRFCAL_SESSION``, else the
-    shipped one.
-    """
+def start() -> Session:
+    """First cell of a notebook: the session of the report run, else the shipped one."""
     set_up()
     return open_session(os.environ.get("LRFCAL_SESSION") or SHIPPED)
 
 
-def report_file(name):
-    """Path of a file of the report (e.g. ``"cloud.ply"``), its folder made; None outside a report
-    run.
+def report_file(name: str) -> Path | None:
+    """Path of a file of the report, its folder made; None outside a report run.
+
+    Parameters
+    ----------
+    name
+        Within the report, such as ``"cloud.ply"``.
     """
     if not os.environ.get("LRFCAL_REPORT"):
         return None
@@ -80,18 +84,18 @@ def report_file(name):
     return path
 
 
-def save(fig, name, caption, *, main=True):
+def save(fig: Figure, name: str, caption: str, *, main: bool = True) -> None:
     """Show a figure with its caption, and keep it as ``figures/<name>.png`` in a report run.
 
     Parameters
     ----------
-    fig : matplotlib Figure
+    fig
         Closed afterwards.
-    name : str
+    name
         Lower-case letters, digits and underscores; others raise a ValueError.
-    caption : str
+    caption
         One or two sentences; what to see, not what the axes say.
-    main : bool
+    main
         Whether the first page of the report shows it.
     """
     _record("figures", name, {"name": name, "caption": caption, "main": main})
@@ -111,20 +115,20 @@ def save(fig, name, caption, *, main=True):
     plt.close(fig)
 
 
-def table(df, name, digits=3, caption=""):
+def table(df: pd.DataFrame, name: str, digits: int | dict[str, int] = 3, caption: str = "") -> HTML:
     """A table to show, its columns and methods in words, kept as ``tables/<name>.csv`` in a report
     run.
 
     Parameters
     ----------
-    df : DataFrame
+    df
         Tidy: one row an observation, units in the column names. Its index is not kept.
-    name : str
+    name
         Lower-case letters, digits and underscores; others raise a ValueError.
-    digits : int or dict of str to int
+    digits
         Decimals shown (all columns, or by column; 3 where a column is not named). The CSV keeps
         nine digits.
-    caption : str
+    caption
 
     Returns
     -------
@@ -153,14 +157,24 @@ def table(df, name, digits=3, caption=""):
     return HTML(made)
 
 
-def label_of(name):
-    """What a method is called in tables and figures; any other text as it is."""
+def label_of(name: str) -> str:
+    """What a method is called in tables and figures; any other text as it is.
+
+    Parameters
+    ----------
+    name
+    """
     return METHODS[name].label if name in METHODS else OTHER_LABELS.get(name, name)
 
 
-def in_words(text, column=False):
-    """An identifier in words: a method by its name, a column with its unit; everything else as it
-    is.
+def in_words(text: object, column: bool = False) -> object:
+    """An identifier in words: a method by its name; everything else as it is.
+
+    Parameters
+    ----------
+    text
+    column
+        It is the name of a column, whose last word may be its unit.
     """
     if not isinstance(text, str):
         return text
@@ -171,54 +185,66 @@ def in_words(text, column=False):
     return " ".join((*words, f"[{UNITS[last]}]" if column and last in UNITS else last))
 
 
-def finding(key, value, text, unit="", digits=3, *, main=True):
+def finding(
+    key: str, value: float | str, text: str, unit: str = "", digits: int = 3, *, main: bool = True
+) -> None:
     """Print a key result, and put it in ``findings.json`` and on the first page of the report.
 
     Parameters
     ----------
-    key : str
+    key
         Lower-case letters, digits and underscores (others raise a ValueError); unique over all
         notebooks.
-    value : float, int or str
+    value
         A verdict in words, or a number (NaN is said to be unknown).
-    text : str
+    text
         What the value is of, a phrase that reads without the notebook.
-    unit : str
-    digits : int
+    unit
+    digits
         Decimals.
-    main : bool
+    main
         Whether the first page shows it.
     """
-    shown = value = value.item() if hasattr(value, "item") else value
-    if isinstance(value, float):
-        shown, value = (
-            (f"{value:z.{digits}f}", value) if math.isfinite(value) else ("unknown", None)
-        )
+    known: float | str | None = value.item() if hasattr(value, "item") else value
+    shown = str(known)
+    if isinstance(known, float) and not math.isfinite(known):
+        shown = "unknown"
+        known = None
+    elif isinstance(known, float):
+        shown = f"{known:z.{digits}f}"
     shown = f"{shown} {unit}".strip()
-    _record(
-        "findings",
-        key,
-        {"key": key, "value": value, "unit": unit, "text": text, "shown": shown, "main": main},
-    )
+    entry = {"key": key, "value": known, "unit": unit, "text": text, "shown": shown, "main": main}
+    _record("findings", key, entry)
     print(f"{text}: {shown}")
 
 
-def verdict(title, sentences, record=None):
-    """Print sentences, the most important one first, and put them on the first page of the report
-    before all else.
+def verdict(title: str, sentences: Sequence[str], record: dict | None = None) -> None:
+    """Print sentences, and put them on the first page of the report before all else.
 
-    With the record of a :class:`lrfcal_lib.judge.verdict.Verdict` its answer and expected errors
-    stand in front.
+    Parameters
+    ----------
+    title
+    sentences
+        The most important one first.
+    record
+        Of a :class:`lrfcal_lib.judge.verdict.Verdict`: its answer and expected errors stand in
+        front.
     """
     sentences = [f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences]
     _record("verdicts", "verdict", {"title": title, "sentences": sentences, "record": record})
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 
-def asked(possible, why, *, rest=False):
-    """Whether a question can be put to a session; prints why not: what the session does not have.
+def asked(possible: object, why: str, *, rest: bool = False) -> bool:
+    """Whether a question can be put to a session; prints why not.
 
-    With `rest` nothing that follows can be asked either: until :func:`start` cells do nothing.
+    Parameters
+    ----------
+    possible
+    why
+        What the session does not have.
+    rest
+        Nothing that follows can be asked either: until :func:`start` cells do nothing.
     """
     if not possible:
         print(f"not asked: {why}")

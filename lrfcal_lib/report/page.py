@@ -5,9 +5,10 @@ numbered.
 import base64
 import html
 import re
-from itertools import chain
+from pathlib import Path
 from xml.etree import ElementTree
 
+import nbformat
 from bs4 import BeautifulSoup
 from latex2mathml.converter import convert
 from nbconvert.filters.highlight import Highlight2HTML
@@ -24,47 +25,65 @@ WIDTHS = ((9, "wide"), (3, "medium"), (0, "narrow"))
 class Renderer(IPythonRenderer):
     """Markdown of a notebook as HTML, its formulas as MathML."""
 
-    def inline_math(self, body):
+    def inline_math(self, body: str) -> str:
+        """A formula within a line."""
         return formula(body)
 
-    def block_math(self, body):
+    def block_math(self, body: str) -> str:
+        """A displayed formula, the number of its tag beside it."""
         number = re.search(r"\\tag\{(.*?)\}", body)
         drawn = formula(re.sub(r"\\tag\{.*?\}", "", body), display=True)
-        return (
-            f'<div class="formula"><div>{drawn}</div>'
-            + (f"<span>({number[1]})</span>" if number else "")
-            + "</div>"
-        )
+        beside = f"<span>({number[1]})</span>" if number else ""
+        return f'<div class="formula"><div>{drawn}</div>{beside}</div>'
 
-    def multiline_math(self, text):
+    def multiline_math(self, text: str) -> str:
+        """A displayed formula over several lines."""
         return self.block_math(text.strip("$"))
 
 
-def formula(latex, display=False):
-    """A formula as MathML; a displayed one in parts, so that lines can break where it says = or +,
-    or leaves a gap.
+def formula(latex: str, display: bool = False) -> str:
+    """A formula as MathML.
+
+    Parameters
+    ----------
+    latex
+    display
+        In parts, so that lines can break where it says = or +, or leaves a gap.
     """
     row = ElementTree.fromstring(re.sub(' xmlns="[^"]*"', "", convert(latex)))[0]
-    parts = [[]]
-    # what stands between \left and \right may be broken too
-    for node in chain.from_iterable(
-        node if display and node.tag == "mrow" else [node] for node in row
-    ):
-        if display and parts[-1] and node.tag == "mo" and node.text in ("=", "+"):
+    if not display:
+        inner = "".join(ElementTree.tostring(node, "unicode") for node in row)
+        return f"<math><mrow>{inner}</mrow></math>"
+    nodes: list[ElementTree.Element] = []
+    for node in row:
+        # what stands between \left and \right may be broken too
+        nodes += node if node.tag == "mrow" else [node]
+    parts = [""]
+    for node in nodes:
+        if parts[-1] and node.tag == "mo" and node.text in ("=", "+"):
             node.set("form", "infix")
-            parts.append([])
-        parts[-1].append(ElementTree.tostring(node, "unicode"))
-        if display and node.tag == "mspace" and float(node.get("width").removesuffix("em")) >= 1:
-            parts.append([])
-    drawn = '<math displaystyle="true">' if display else "<math>"
-    return " ".join(f"{drawn}<mrow>{''.join(part)}</mrow></math>" for part in parts)
+            parts.append("")
+        parts[-1] += ElementTree.tostring(node, "unicode")
+        if node.tag == "mspace" and float(node.get("width").removesuffix("em")) >= 1:
+            parts.append("")
+    return " ".join(f'<math displaystyle="true"><mrow>{part}</mrow></math>' for part in parts)
 
 
-def render(notebook, found, number, folder):
+def render(
+    notebook: nbformat.NotebookNode, found: dict, number: str, folder: Path
+) -> tuple[str, dict[str, str], dict[str, str]]:
     """The body of a notebook's page, and its figures and tables by name, as HTML.
 
-    `found` are the entries of :mod:`lrfcal_lib.report.notebook`; figures are taken from the
-    report's `folder`.
+    Parameters
+    ----------
+    notebook
+        Executed.
+    found
+        Entries of :mod:`lrfcal_lib.report.notebook`.
+    number
+        Of the notebook.
+    folder
+        Of the report, where its figures are.
     """
     figures = {
         entry["name"]: _figure(folder, entry, f"Figure {number}.{n}")
@@ -88,11 +107,11 @@ def render(notebook, found, number, folder):
             )
             for output in cell.outputs:
                 shown = _output(output)
-                if (caption := re.match(r'<p id="figure-(\w+)"', shown)) and figures.get(
-                    caption[1]
-                ):
+                caption = re.match(r'<p id="figure-(\w+)"', shown)
+                styled = re.search(r'<table id="T_(\w+)"', shown)
+                if caption and figures.get(caption[1]):
                     body[-1] = figures[caption[1]]  # the picture stands before its caption
-                elif (styled := re.search(r'<table id="T_(\w+)"', shown)) and styled[1] in tables:
+                elif styled and styled[1] in tables:
                     body.append(tables[styled[1]])
                 else:
                     body.append(turned(shown))

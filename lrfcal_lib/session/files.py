@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 from lrfcal_lib.session.shown import printable
 
@@ -49,7 +49,7 @@ def opened(
     within: str | PathLike | None = None,
     flags: int = os.O_RDONLY,
     most: int = LARGEST_FILE,
-) -> IO[bytes]:
+) -> Any:
     """Binary stream of a file in a session.
 
     Parameters

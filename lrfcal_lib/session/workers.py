@@ -47,8 +47,8 @@ def spread(work: Callable, items: Iterable) -> list:
     Parameters
     ----------
     work
-        Can be pickled, as the items, unless the processes are forked: a function of a module, or
-        ``functools.partial`` of one.
+        A function of a module, or ``functools.partial`` of one, which can be pickled, as the items.
+        Any other is shared by forked processes only, and done here where an executor is to do it.
     items
         What is done with one does not depend on the others.
 
@@ -62,7 +62,7 @@ def spread(work: Callable, items: Iterable) -> list:
     executor = _executor.get()
     cores = min(_cores.get(), len(items))
     results = {}
-    if executor is not None and len(items) > 1:
+    if executor is not None and len(items) > 1 and _can_travel(work):
         with suppress(BrokenExecutor):
             for number, result in enumerate(executor.map(partial(_packed, work), items)):
                 results[number] = result
@@ -72,6 +72,15 @@ def spread(work: Callable, items: Iterable) -> list:
         if number not in results:
             results[number] = _packed(work, item)
     return [pickle.loads(results[number]) for number in range(len(items))]
+
+
+def _can_travel(work):
+    """Whether another process can be told what to do."""
+    try:
+        pickle.dumps(work)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return False
+    return True
 
 
 def _packed(work, item):

@@ -9,7 +9,14 @@ from typing import Annotated
 import numpy as np
 import pydantic
 from numpy.typing import ArrayLike
-from pydantic import Field, InstanceOf, NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import (
+    AfterValidator,
+    Field,
+    InstanceOf,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+)
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -201,6 +208,11 @@ class Rig:
         return np.all(ahead & inside.all(axis=-1), axis=-1)
 
 
+def _three_or_none(values):
+    need(len(values) in (0, 3), "first, last and step are needed, or nothing")
+    return values
+
+
 @pydantic.dataclasses.dataclass(frozen=True)
 class Setup:
     """A recording to simulate; everything follows from it."""
@@ -213,7 +225,7 @@ class Setup:
     step: PositiveFloat = math.radians(0.25)  # between the stops of a sweep, radians
     intrinsics_views: NonNegativeInt = 20  # images of the board held close, a camera
     # first pitch, last pitch and step of the sweep of the room, radians; empty for none
-    room_sweep: tuple[float, ...] = ()
+    room_sweep: Annotated[tuple[float, ...], AfterValidator(_three_or_none)] = ()
     room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
     quality: Annotated[int, Field(ge=1, le=100)] = 95  # of JPEG
 
@@ -264,19 +276,24 @@ def load_setup(name: str) -> Setup:
         width, height = (round(v * scale) for v in c["size"])
         fx, fy, cx, cy = (v * scale for v in c["pinhole"])
         model = CameraModel(width, height, fx, fy, cx, cy, np.array(c["distortion"]))
-        cameras.append(
-            RigCamera(camera, model, mounting, guess, exposure=Exposure(**c["exposure"]))
-        )
-    head, head_stated = (
-        RigidTransform.from_components(
-            row[k]["shift"], Rotation.from_rotvec(row[k]["turn"], degrees=True)
-        )
-        for k in ("head", "head_stated")
-    )
+        cameras.append(RigCamera(camera, model, mounting, guess, Exposure(**c["exposure"])))
     beam = replace(LMS221, **row["beam"])
     platform = Platform(**_radians(row["platform"]))
-    rig = Rig(beam, platform, head, head_stated, tuple(cameras), printed_triangle())
+    rig = Rig(
+        beam,
+        platform,
+        _placed(row["head"]),
+        _placed(row["head_stated"]),
+        tuple(cameras),
+        printed_triangle(),
+    )
     return Setup(name, rig=rig, **{k: row[k] for k in names})
+
+
+def _placed(row):
+    """The transform of a shift and a turn."""
+    turn = Rotation.from_rotvec(row["turn"], degrees=True)
+    return RigidTransform.from_components(row["shift"], turn)
 
 
 def _radians(row):
@@ -322,9 +339,8 @@ def placements_of(setup: Setup) -> list[Placement]:
     """
     out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
     if setup.room_sweep:
-        number = 2 * setup.pairs + 1
         first, last, _ = setup.room_sweep
-        out.append(Placement(number, None, (first, last), setup.room_images))
+        out.append(Placement(2 * setup.pairs + 1, None, (first, last), setup.room_images))
     return out
 
 
@@ -466,18 +482,19 @@ def held_close(
         If it does not fit, or the board has no pattern.
     """
     m = camera.model
-    pattern = rig.board.pattern
-    out = []
-    need(
-        pattern or not count,
-        f"board '{rig.board.name}' has no pattern: it cannot serve for the intrinsics",
-    )
+    out: list[RigidTransform] = []
+    if count == 0:
+        return out
+    if rig.board.pattern is None:
+        raise ValueError(
+            f"board '{rig.board.name}' has no pattern: it cannot serve for the intrinsics"
+        )
+    points = rig.board.pattern.points()
     size = np.array([m.width, m.height])
     columns = int(np.ceil(np.sqrt(count * 4 / 3)))
     to_camera = Rotation.from_euler("x", 180, degrees=True)
-    rows = np.ceil(count / max(columns, 1))
+    rows = np.ceil(count / columns)
     for i in range(count):
-        points = pattern.points()
         row, column = divmod(i, columns)
         pixel = np.array([(column + 0.5) / columns, (row + 0.5) / rows]) * size
         for attempt in range(MOST_TRIES):

@@ -378,7 +378,7 @@ class World:
         directions = np.asarray(directions, float)
         origins, directions = np.broadcast_arrays(origins, directions)
         rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
-        ids = self._scene.cast_rays(o3d.core.Tensor(rays))["primitive_ids"].numpy()
+        ids = self._scene.cast_rays(_tensor(rays))["primitive_ids"].numpy()
         seen = ids != o3d.t.geometry.RaycastingScene.INVALID_ID
         face = np.where(seen, ids.astype(np.int64), -1)
         distance = np.full(len(face), np.inf)
@@ -448,12 +448,16 @@ class World:
             ask = share > 1e-3
             off = points[ask] + 2e-3 * normal[ask]  # metres, so that no surface shades itself
             rays = np.concatenate([off, 0.999 * way[ask]], axis=1, dtype=np.float32)
-            dark = self._scene.test_occlusions(o3d.core.Tensor(rays), 0.0, 1.0).numpy()
+            dark = self._scene.test_occlusions(_tensor(rays), 0.0, 1.0).numpy()
             light[ask] += strength * (share[ask] * ~dark)
         out = np.tile(SKY, (len(seen), 1))
         glow = np.array([t.glow for t in self.things])[thing]
         out[seen] = self.albedo(points, thing) * (light + glow)[:, None]
         return out
+
+
+def _tensor(rays):
+    return o3d.core.Tensor(rays)
 
 
 def furnished(*parts: str) -> list[Thing]:
@@ -481,8 +485,8 @@ def furnished_room(*more: Thing) -> World:
         "standing lamp",
         "small things",
     )
-    lamps = {name: np.array(value) for name, value in ROOM["lights"].items()}
-    lights = Lights(lamps["positions"], lamps["strengths"], float(lamps["ambient"]))
+    lamps = ROOM["lights"]
+    lights = Lights(np.array(lamps["positions"]), np.array(lamps["strengths"]), lamps["ambient"])
     return World([*furnished(*parts), *more], lights)
 
 
