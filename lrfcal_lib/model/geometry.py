@@ -145,34 +145,6 @@ def lrf_to_platform(p_lrf: ArrayLike, pitch: ArrayLike, T_head_lrf: RigidTransfo
     return tilt(T_head_lrf.apply(p_lrf), pitch)
 
 
-def lrf_to_source(p_lrf, pitch, T_head_lrf, mount, image_pitch=0.0):
-    """Points of a sweep in the frame a camera is fixed to (the *source* frame of a camera
-    calibration).
-
-    Parameters
-    ----------
-    p_lrf, pitch, T_head_lrf
-        See :func:`lrf_to_platform`.
-    mount : {'platform', 'head'}
-        What the camera is fixed to; ValueError for anything else.
-    image_pitch : float
-        Pitch at which the image was taken, radians; only used for a camera on the head.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        Platform coordinates for a camera on the base; for a camera on the head, LRF coordinates of
-        a scan that would have been taken at `image_pitch`.
-    """
-    if mount == "platform":
-        return lrf_to_platform(p_lrf, pitch, T_head_lrf)
-    if mount != "head":
-        raise ValueError(f"mount is 'head' or 'platform', got '{mount}'")
-    return T_head_lrf.inv().apply(
-        lrf_to_platform(p_lrf, np.asarray(pitch) - image_pitch, T_head_lrf)
-    )
-
-
 @dataclass(frozen=True)
 class TiltAxis:
     """The tilt axis as a line in the LRF frame: all that the platform calibration can know (4
