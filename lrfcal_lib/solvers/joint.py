@@ -231,12 +231,6 @@ def finished(obs, state, data, unknowns, required):
     """The last steps, in the gauge of the stated platform, and all that a solution says."""
     names = unknowns.names(obs.cameras)
 
-    def read(at):
-        """No transform, and the shared unknowns."""
-        poses = pose_parameters(at.cameras).ravel()
-        every = np.concatenate([chart_parameters(at.head), poses, at.sensor])
-        return None, every[unknowns.mask]
-
     found = solve(
         lambda at: named_blocks(at, data, unknowns).values(),
         in_stated_gauge(state, obs),
@@ -244,7 +238,7 @@ def finished(obs, state, data, unknowns, required):
         shared=unknowns.shared,
         names=names,
         method="joint",
-        read=read,
+        read=lambda at: (None, parameters_of(at, unknowns)),
         scales=[SCALES.get(name, 1.0) for name in names],
         words=lambda direction: joint_words(direction, names, obs.cameras),
         freedom=0,
@@ -275,3 +269,10 @@ def finished(obs, state, data, unknowns, required):
         lens_scale=lens.scatter,
     )
     return replace(solution, warnings=warnings_of(solution))
+
+
+def parameters_of(state: JointState, unknowns: Unknowns) -> np.ndarray:
+    """The shared unknowns of a state, (c,): axis, poses of the cameras, sensor."""
+    poses = pose_parameters(state.cameras).ravel()
+    every = np.concatenate([chart_parameters(state.head), poses, state.sensor])
+    return every[unknowns.mask]
