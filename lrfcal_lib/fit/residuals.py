@@ -11,9 +11,8 @@ from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, line_distance, line_through, project, undistort
 from lrfcal_lib.model.geometry import (
+    cross,
     gradient_by_pose,
-    moved_noise,
-    noise_correction,
     rotate_points,
 )
 from lrfcal_lib.model.observations import CameraObservations
@@ -60,7 +59,7 @@ def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
 
     The whitener holds the crossing's covariance, projected, and the line's; `corrected` is the
     Jacobian without what errors of the crossings put into it
-    (:func:`lrfcal_lib.model.geometry.noise_correction`).
+    (:func:`noise_correction`).
 
     Parameters
     ----------
@@ -196,3 +195,61 @@ def read_pose(pose: np.ndarray) -> tuple[RigidTransform, np.ndarray]:
         Rotation vector and translation, radians and metres.
     """
     return geometry.pose_transform(pose, proper=True), geometry.pose_parameters(pose)
+
+
+def noise_correction(
+    rotated: np.ndarray,
+    point: np.ndarray,
+    gradient: np.ndarray,
+    shift: np.ndarray,
+    factor: np.ndarray,
+    pinhole: bool = True,
+) -> np.ndarray:
+    """What errors in the points take from Jacobian rows by the pose: ``factor`` times half the
+    change of the variance.
+
+    Parameters
+    ----------
+    rotated, point : ndarray, shape (..., n, 3)
+        ``R p`` and ``R p + t``, metres.
+    gradient : ndarray, shape (..., n, 3)
+        Of a scalar by the moved point.
+    shift : ndarray, shape (..., n, 3)
+        The direction in which the noise pulls the point, see :func:`moved_noise`.
+    factor : ndarray, shape (..., n)
+        The weighted residual.
+    pinhole : bool
+        The scalar is ``l . pinhole(q)``; otherwise ``m . q``.
+
+    Returns
+    -------
+    ndarray, shape (..., n, 6)
+    """
+    by_turn = cross(shift, gradient)
+    by_shift = np.zeros_like(by_turn)
+    if pinhole:  # the gradient itself changes with the depth
+        depth = point[..., 2:]
+        by_shift = -gradient * shift[..., 2:] / depth
+        by_shift[..., 2] -= np.vecdot(gradient, shift) / depth[..., 0]
+        by_turn = by_turn + cross(rotated, by_shift)
+    return factor[..., None] * np.concatenate([by_turn, by_shift], axis=-1)
+
+
+def moved_noise(pose: np.ndarray, gradient: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """``R C R^T a``: where the noise of points pulls scalars of the moved points.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+    gradient : ndarray, shape (..., n, 3)
+        ``a``, by the moved points.
+    covariance : ndarray, shape (..., n, 3, 3)
+        Of the points in the source frame, square metres.
+
+    Returns
+    -------
+    ndarray, shape (..., n, 3)
+    """
+    in_source = gradient @ pose[..., :3]
+    pulled = (in_source[..., None, :] @ covariance)[..., 0, :]
+    return rotate_points(pose, pulled)

@@ -514,64 +514,6 @@ def gradient_by_pose(rotated: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     return np.concatenate([cross(rotated, gradient), gradient], axis=-1)
 
 
-def noise_correction(
-    rotated: np.ndarray,
-    point: np.ndarray,
-    gradient: np.ndarray,
-    shift: np.ndarray,
-    factor: np.ndarray,
-    pinhole: bool = True,
-) -> np.ndarray:
-    """What errors in the points take from Jacobian rows by the pose: ``factor`` times half the
-    change of the variance.
-
-    Parameters
-    ----------
-    rotated, point : ndarray, shape (..., n, 3)
-        ``R p`` and ``R p + t``, metres.
-    gradient : ndarray, shape (..., n, 3)
-        Of a scalar by the moved point.
-    shift : ndarray, shape (..., n, 3)
-        The direction in which the noise pulls the point, see :func:`moved_noise`.
-    factor : ndarray, shape (..., n)
-        The weighted residual.
-    pinhole : bool
-        The scalar is ``l . pinhole(q)``; otherwise ``m . q``.
-
-    Returns
-    -------
-    ndarray, shape (..., n, 6)
-    """
-    by_turn = cross(shift, gradient)
-    by_shift = np.zeros_like(by_turn)
-    if pinhole:  # the gradient itself changes with the depth
-        depth = point[..., 2:]
-        by_shift = -gradient * shift[..., 2:] / depth
-        by_shift[..., 2] -= np.vecdot(gradient, shift) / depth[..., 0]
-        by_turn = by_turn + cross(rotated, by_shift)
-    return factor[..., None] * np.concatenate([by_turn, by_shift], axis=-1)
-
-
-def moved_noise(pose: np.ndarray, gradient: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """``R C R^T a``: where the noise of points pulls scalars of the moved points.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3, 4)
-    gradient : ndarray, shape (..., n, 3)
-        ``a``, by the moved points.
-    covariance : ndarray, shape (..., n, 3, 3)
-        Of the points in the source frame, square metres.
-
-    Returns
-    -------
-    ndarray, shape (..., n, 3)
-    """
-    in_source = gradient @ pose[..., :3]
-    pulled = (in_source[..., None, :] @ covariance)[..., 0, :]
-    return rotate_points(pose, pulled)
-
-
 def axis_words(direction):
     """A direction in words: the name of an axis within 8 degrees, otherwise its components."""
     direction = np.asarray(direction, float) / np.linalg.norm(direction)

@@ -17,7 +17,7 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     pose_transform,
 )
-from lrfcal_lib.model.kinematics import TILT_AXIS
+from lrfcal_lib.model.kinematics import TILT_AXIS, SourceFrame
 from lrfcal_lib.model.observations import CameraObservations, JointObservations, thin
 from lrfcal_lib.solvers.joint_model import JointState
 from lrfcal_lib.solvers.plane_start import start_from_planes
@@ -106,7 +106,8 @@ def _camera(obs, camera, head=None):
         rows = thin(rows, POINTS)
         p = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
         if head is not None:
-            p = geometry.lrf_to_source(p, obs.face_pitch[rows], head, obs.mounts[camera], pitch)
+            frame = SourceFrame(head, obs.mounts[camera], pitch)
+            p = frame.apply(p, obs.face_pitch[rows])
         points.append(p)
         views.append(view)
     if len(views) < (1 if head is not None else FEWEST_VIEWS):

@@ -8,6 +8,8 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import (
+    moved_noise,
+    noise_correction,
     sight_block,
     sight_normals,
 )
@@ -18,8 +20,6 @@ from lrfcal_lib.model.geometry import (
     apply_pose,
     gradient_by_pose,
     move_pose,
-    moved_noise,
-    noise_correction,
     pose_transform,
     rotate_points,
 )
