@@ -19,9 +19,9 @@ from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     lrf_to_platform,
-    lrf_to_source,
     transform_difference,
 )
+from lrfcal_lib.model.kinematics import SourceFrame
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -298,7 +298,8 @@ def plane_observations(prepared, camera, reading):
         if mount == "head":
             image_pitch = reading.pitch * reading.image_pitch * views[placement].pitch
         p_lrf, pitch, _ = face_points(prepared.scans[placement], POINTS)
-        points.append(lrf_to_source(*reading.apply(p_lrf, pitch), T_head_lrf, mount, image_pitch))
+        frame = SourceFrame(T_head_lrf, mount, image_pitch)
+        points.append(frame.apply(*reading.apply(p_lrf, pitch)))
         placements.append(np.full(len(pitch), placement))
     return CameraObservations(
         model=prepared.models[camera],
