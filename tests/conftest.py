@@ -111,8 +111,8 @@ def calibrated(path):
 
 
 LONGEST = (
-    "test_notebooks_scant", "test_report", "test_image", "test_joint_bad_input", "test_falsified", "test_golden",
-    "test_alternatives", "test_joint", "test_record_emulated", "test_same_numbers", "test_camera_solver",
+    "test_notebooks_scant", "test_report", "test_intrinsics", "test_survey", "test_joint_bad_input", "test_falsified",
+    "test_golden", "test_alternatives", "test_joint", "test_record_emulated", "test_same_numbers", "test_solvers",
     "test_emulated_rig", "test_hostile_text", "test_joint_calibration", "test_record_bad_input",
 )  # fmt: skip
 ALONE = "test_stored_outputs_and_golden_tables", "test_tables_of_the_recording", "test_buttons_record"

@@ -19,7 +19,7 @@ from lrfcal_lib.judge.alternatives import (
     step_not_told,
     weigh,
 )
-from lrfcal_lib.judge.diagnosis import lens_words
+from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.geometry import hat
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
@@ -148,6 +148,6 @@ def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named, wi
     prepared = SimpleNamespace(
         board=SimpleNamespace(pattern=PATTERN), models={"left": model}, views={"left": views}, relief=None
     )
-    words = lens_words(prepared)
-    assert words == {} if named is None else named in words["left"]
-    assert ("use a lens below 110 deg" in words.get("left", "")) == wide
+    words = "".join(finding.words for finding in lens_findings(prepared))
+    assert words == "" if named is None else "camera 'left'" in words and named in words
+    assert ("use a lens below 110 deg" in words) == wide

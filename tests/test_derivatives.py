@@ -5,9 +5,9 @@
 import numpy as np
 import pytest
 from joint_draws import draw, rng
+from rendered_boards import MODEL, PATTERN, pose_of, view_poses
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case, numeric
-from test_image import MODEL, PATTERN, pose_of, view_poses
 from test_platform import ROUGH, TRUTH, make, pairs, pitched
 from test_uncertainty import CAMERA, moved_points, random_chain
 
@@ -17,7 +17,7 @@ from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.judge.uncertainty import carried
 from lrfcal_lib.model import camera
 from lrfcal_lib.model.geometry import move_pose, pose_array
-from lrfcal_lib.preprocess import intrinsics
+from lrfcal_lib.preprocess.bundle import Bundle, waves
 from lrfcal_lib.solvers import lines, pitch, planes, platform
 from lrfcal_lib.solvers.joint_model import SENSOR, Levels, Unknowns, gather, move_state
 from lrfcal_lib.solvers.joint_residuals import named_blocks
@@ -150,11 +150,12 @@ def chain_of_a_rig():
 def images():
     mounts = np.stack([np.eye(4), pose_of(0.1, (0.02, 0.03), (-0.1, 0.01, 0.02), (0, 0)).as_matrix()])[:, :3]
     poses, points = np.stack([p.as_matrix()[:3] for p in view_poses(2)]), PATTERN.points()
-    state = np.stack([MODEL.parameters, MODEL.parameters * 1.05]), mounts, poses, np.linspace(-1e-3, 2e-3, 21)
-    pixels, jacobian = intrinsics.predict(state, points, basis := intrinsics.waves(points))
+    lenses = np.stack([MODEL.parameters, MODEL.parameters * 1.05])
+    bundle = Bundle(lenses, mounts, poses, np.linspace(-1e-3, 2e-3, 21))
+    pixels, jacobian = bundle.predict(points, basis := waves(points))
     count = jacobian[0].size // pixels[0].size
     jacobian = jacobian.reshape(*pixels.shape, count)
-    yield jacobian, lambda s: intrinsics.predict(intrinsics.moved(state, s), points, basis)[0], count
+    yield jacobian, lambda s: bundle.moved(s).predict(points, basis)[0], count
 
 
 @pytest.mark.parametrize("cases", [projection, camera_methods, board_planes, tilt_axis, recorded_pitch,

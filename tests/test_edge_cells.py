@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_scan import HEAD, edge_points, scene, sweep_edges
+from scanned_boards import HEAD, edge_points, scene, sweep_edges
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan

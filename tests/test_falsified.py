@@ -12,7 +12,9 @@ from shared import DATA, campaign
 
 from lrfcal_lib.evaluate.monte_carlo import state_errors
 from lrfcal_lib.fit.result import PlatformPrior
-from lrfcal_lib.judge.verdict import contradicts_stated, diagnose, verdict
+from lrfcal_lib.judge.statements import contradicts_stated
+from lrfcal_lib.judge.verdict import verdict
+from lrfcal_lib.judge.weaknesses import diagnose
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.solvers.joint import solve_joint
@@ -89,7 +91,7 @@ def test_what_is_falsified_is_named(name):
 def test_cameras_are_told_apart_by_name_where_no_platform_and_no_guess_is_stated():
     """What counts in the other sense is told by `recording_faults`, see test_falsified_sessions."""
     reasons, *_ = judged(FALSIFIED["cameras exchanged"][0], 7, "platform", stated=False)
-    assert "folders?" in "".join(reason.words for reason in reasons)
+    assert "were the folders exchanged?" in "".join(reason.words for reason in reasons)
 
 
 def moved(solution, honest):

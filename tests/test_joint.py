@@ -5,16 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from joint_draws import MOUNTS, draw, none, rng, scores
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.evaluate.monte_carlo import state_errors
+from lrfcal_lib.evaluate.monte_carlo import bound, state_errors
+from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
+from lrfcal_lib.fit.least_squares import eliminate, linearise
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     axis_difference,
+    polar_to_points,
     pose_transform,
     transform_difference,
 )
-from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.joint import in_stated_gauge, solve_joint
+from lrfcal_lib.solvers.joint_model import Unknowns, gather, move_state
+from lrfcal_lib.solvers.joint_residuals import named_blocks
 
 SAME = 3e-4  # rad and m: a hundredth of the standard deviations, what steps of the solver leave
 PLAIN = ("range_offset", "edge_log_odds", "edge_log_softness")
@@ -39,6 +45,26 @@ def pitch_from_elsewhere(obs, found):
 
 def another_platform_stated(obs, found):
     return replace(obs, T_head_lrf=about_x(0.4, 0.3) * found.T_head_lrf), about_x(0.4, 0.3)
+
+
+def in_another_order(obs, chance):
+    """The same observations, placements and rows shuffled."""
+    order = chance.permutation(len(obs.placements))
+    rows = {group: chance.permutation(len(getattr(obs, f"{group}_placement"))) for group in ("face", "beam", "view")}
+    shuffled = obs.keep(**rows)
+    moved = {f"{group}_placement": np.argsort(order)[getattr(shuffled, f"{group}_placement")] for group in rows}
+    own = {name: getattr(obs, name)[order] for name in ("placements", "direction", "middle")}
+    return replace(shuffled, **moved, **own)
+
+
+@MOUNTS
+def test_the_order_of_placements_and_rows_changes_nothing(mount):
+    obs, *_ = draw(rng(), 8, mount=mount)
+    found, other = (solve_joint(each, noise="estimate") for each in (obs, in_another_order(obs, rng(1))))
+    assert np.all(np.abs(found.solution.parameters - other.solution.parameters) < 0.01 * found.solution.sigma)
+    np.testing.assert_allclose(other.solution.sigma, found.solution.sigma, rtol=1e-3)
+    for number, T in found.boards.items():
+        assert apart(other.boards[number], T) < SAME and np.isclose(found.misfit[number], other.misfit[number], rtol=1e-2)
 
 
 @MOUNTS
@@ -110,6 +136,55 @@ def test_the_direction_of_the_sweep_is_recovered():
     assert abs(found.sensor["pitch_by_direction"] - lag) < 4.5 * sigma < lag
     with pytest.raises(DegenerateGeometry, match="do not determine the pitch offset by sweep direction"):
         solve_joint(draw(rng(), 8)[0], sensor=sensor)  # cameras on the head lag alike
+
+
+def misses_of(state, obs):
+    """Whitened residuals of ranges and images, from the chain of transforms as one would write it down."""
+    T_head_lrf, boards = pose_transform(state.head), pose_transform(state.boards)
+    lifted = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(obs.face_pitch, [1, 0, 0])))
+    ray = polar_to_points(1.0, obs.face_bearing)
+    T_board_lrf = boards[obs.face_placement].inv() * lifted * T_head_lrf
+    start, way = T_board_lrf.apply(0 * ray), T_board_lrf.rotation.apply(ray)
+    ranges = (-start[:, 2] / way[:, 2] + state.sensor[0] - obs.face_range) / obs.face_sigma
+    cameras = pose_transform(state.cameras)[obs.view_camera] * RigidTransform.identity()
+    if obs.mounts[0] == "head":
+        lifted = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(obs.view_pitch, [1, 0, 0])))
+        cameras = cameras * (lifted * T_head_lrf).inv()
+    predicted, measured = cameras * boards[obs.view_placement], RigidTransform.from_matrix(obs.view_pose)
+    turn = (predicted.rotation * measured.rotation.inv()).as_rotvec()
+    images = np.concatenate([turn, predicted.translation - measured.translation], axis=1)[..., None]
+    white = np.linalg.solve(np.linalg.cholesky(obs.view_covariance), images)
+    return np.concatenate([ranges, white.ravel()])
+
+
+@MOUNTS
+def test_scipy_finds_the_same_rig(mount):
+    """Cameras on the base show the axis weakly, a curved valley: there it is known."""
+    obs, truth, _ = draw(rng(), 6, mount=mount)
+    obs = none(obs, "beam").keep(face=np.arange(len(obs.face_range)) % 3 == 0)
+    found = solve_joint(obs, start=truth, sensor=("range_offset",), axis=mount == "head")
+    unknowns, options = found.unknowns, dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
+
+    def moved(x):
+        return move_state(truth, (x[: unknowns.shared], x[unknowns.shared :].reshape(6, -1)), unknowns)
+
+    theirs = least_squares(lambda x: misses_of(moved(x), obs), np.zeros(unknowns.shared + 6 * unknowns.own), **options)
+    assert found.solution.cost_history[-1] == pytest.approx(theirs.cost, rel=1e-6)
+    away = state_errors(in_stated_gauge(moved(theirs.x), obs), found.state, unknowns)
+    assert np.abs(away / found.solution.sigma).max() < 1e-3
+    covariance = np.linalg.inv(theirs.jac.T @ theirs.jac)[: unknowns.shared, : unknowns.shared]
+    np.testing.assert_allclose(found.solution.sigma, np.sqrt(np.diag(covariance)), rtol=0.01)
+
+
+def test_the_bound_is_the_variance_of_the_score():
+    """Over 200 draws at the truth; chance alone leaves 2 %. What placements own is eliminated."""
+    unknowns, squares = Unknowns(2, 3), []
+    for seed in range(200):
+        obs, truth, _ = draw(rng(seed), 3, floor=LEAST_STEP, pitch_step=np.radians(2.0))
+        blocks = named_blocks(truth, gather(obs), unknowns)
+        score = eliminate(*linearise(blocks.values())[:2], unknowns.shared)[1].sum(axis=0)
+        squares.append(score @ bound(obs, truth, unknowns) @ score / len(score))
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.1)
 
 
 # subsets of the data

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.optimize
 
 from lrfcal_lib.fit.covariance import placement_covariance, pseudo_inverse
@@ -218,3 +219,16 @@ def test_large_residual_problem_converges_where_gauss_newton_diverges():
 
 def test_motions_in_words(delta, words):
     assert motion_words(delta, "right") == words
+
+
+def test_correlated_residuals_are_weighted_as_generalised_least_squares_does():
+    rng = np.random.default_rng(9)
+    A, y, roots = rng.normal(size=(30, 3)), rng.normal(size=30), rng.normal(size=(10, 3, 3)) + 2 * np.eye(3)
+    whole = scipy.linalg.block_diag(*(roots @ np.swapaxes(roots, 1, 2)))
+    covariance = np.linalg.inv(A.T @ np.linalg.solve(whole, A))
+    block = Block(-y, A, np.linalg.inv(roots))
+    found = fit(lambda x: replace(block, residuals=A @ x - y), np.zeros(3), names="abc")
+    np.testing.assert_allclose(found.parameters, covariance @ A.T @ np.linalg.solve(whole, y), atol=1e-12)
+    np.testing.assert_allclose(found.covariance / found.inflation, covariance, rtol=1e-9)
+    r = A @ found.parameters - y
+    assert found.chi2 == pytest.approx(r @ np.linalg.solve(whole, r))

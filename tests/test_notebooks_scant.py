@@ -10,7 +10,7 @@ from shared import campaign
 from tiny_sessions import record, rectangle
 
 from lrfcal_lib.calibrate.pipeline import calibrate
-from lrfcal_lib.judge import verdict
+from lrfcal_lib.judge import statements, verdict
 from lrfcal_lib.report.calibrate import calibrate_session
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
@@ -66,7 +66,7 @@ LATER = ("lines", "03"), ("lines", "07"), ("wall", "04"), ("wall", "05"), ("edge
 def test_runs_to_the_end_and_says_what_is_not_asked(path, scant, monkeypatch, request):
     """Live what says something of its own; all other notebooks, and the looks of all figures, in make campaign."""
     kind, session, stages = scant
-    monkeypatch.setattr(verdict, "LIES", {name: verdict.LIES[name] for name in FEW})
+    monkeypatch.setattr(statements, "LIES", {name: statements.LIES[name] for name in FEW})
     told = run_plainly(path, session, stages, stages / "report", drawn="campaign" in request.config.option.markexpr)
     assert SAYS.get((kind, path.stem[:2]), "") in told
     assert " nan " not in told

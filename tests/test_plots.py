@@ -9,8 +9,7 @@ from figure_checks import complaints
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard
-from lrfcal_lib.judge.uncertainty import SigmaMap
-from lrfcal_lib.plots import recording, results, rig
+from lrfcal_lib.plots import recording, rig
 from lrfcal_lib.session.read import Sweep
 
 
@@ -88,23 +87,6 @@ def test_measured_edges_lie_on_the_rendered_corners(ax):
 def test_look_at_refuses_an_impossible_view(eye):
     with pytest.raises(ValueError, match="choose another eye or another up"):
         rig.look_at(eye, [0, 0, 1])
-
-
-SIGMA = SigmaMap(np.array([10.0, 20, 30]), np.array([5.0, 15]), np.array([1.0, 2.0]), np.array([
-    [[1.0, 2, 3], [4, 5, 6]], [[np.inf, np.inf, np.inf], [2, 2, 2]]]), {"axis": np.full((2, 2, 3), 1e-3),
-    "range noise": np.zeros((2, 2, 3))})  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("index", "title", "drawn"),
-    [(0, "left at 1 m: 3.9 px rms", [1, 2, 3, 4, 5, 6]), (1, "left at 2 m: no bound", [2, 2, 2])],
-)
-def test_map_of_projection_sigma(ax, index, title, drawn):
-    results.projection_map(ax, SIGMA, index, "left")
-    assert labels(ax) == ("u [px]", "v [px]") and ax.get_aspect() == 1 and ax.get_title() == title
-    mesh = ax.collections[0]
-    assert falls(ax.get_ylim()) and mesh.get_clim() == (0.0, max(drawn))
-    assert mesh.get_array().compressed().tolist() == drawn
 
 
 FAULTS = {

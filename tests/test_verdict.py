@@ -10,7 +10,7 @@ from shared import DATA, campaign
 
 from lrfcal_lib import __main__
 from lrfcal_lib.calibrate import pipeline
-from lrfcal_lib.judge import verdict
+from lrfcal_lib.judge import statements, verdict, weaknesses
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.preprocess.prepared import DroppedSide
 from lrfcal_lib.session.read import open_session
@@ -38,8 +38,8 @@ def test_what_the_maker_admits_is_stated_or_known_of_the_model(stated, admitted)
 )
 def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers):
     """Millimetres; of as much of a joint calibration as tells it. By as much all ranges may be wrong."""
-    monkeypatch.setattr(verdict, "doubtful", lambda *arguments, **options: [])
-    monkeypatch.setattr(verdict, "not_an_offset", lambda *arguments: None)
+    monkeypatch.setattr(statements, "doubtful", lambda *arguments, **options: [])
+    monkeypatch.setattr(statements, "not_an_offset", lambda *arguments: None)
     seen, sensor = SimpleNamespace(face_range=np.array([2.0])), {"range_offset": offset / 1000, "pitch_scale": 0.0}
     level = {"converged": True, "noise": {"face_scale": 1.0}, "sigma": {"range_offset": sigma / 1000}}
     solution = SimpleNamespace(
@@ -49,7 +49,7 @@ def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers
         session=SimpleNamespace(lrf=lrf(systematic_error=0.004), T_head_lrf=None, cameras={}, board=triangle_board()),
         board=triangle_board(),
     )
-    found, doubt = verdict.contradicts_stated(SimpleNamespace(solution=solution, prepared=prepared))
+    found, doubt = statements.contradicts_stated(SimpleNamespace(solution=solution, prepared=prepared))
     assert [reason.answer for reason in found] == answers
     assert doubt == (abs(offset) / 1000 if found else 0.0)
     assert all("board" in r.words and "squares" in r.words and f"{offset} mm" in r.words for r in found)
@@ -66,7 +66,7 @@ def test_an_edge_that_lies_elsewhere_in_most_scans_is_a_reason(dropped, named, w
         names={p: {0: "ab", 1: "bc"} for p in range(named)} | {p: {0: "ab"} for p in range(100, 100 + dropped)},
         dropped={p: {1: turned} for p in range(100, 100 + dropped)},
     )
-    reasons = verdict.sides_elsewhere(prepared)
+    reasons = list(weaknesses.sides_elsewhere(prepared))
     assert [reason.kind for reason in reasons] == ["outline"] * (words is not None)
     assert all("edge 'bc'" in reason.words and words in reason.words for reason in reasons)
 
@@ -83,7 +83,8 @@ def test_an_edge_stated_wrong_is_named_by_a_whole_session(length, tmp_path):
 
 
 def test_errors_beyond_all_bounds_are_not_numbers():
-    assert verdict.bounded({"cloud_mm": 1.7e30, "left_px": 12.0}) == {"cloud_mm": np.inf, "left_px": 12.0}
+    assert verdict.bounded(1.7e30) == np.inf
+    assert verdict.bounded(12.0) == 12.0
 
 
 @pytest.mark.parametrize(("session", "warned"), [("sim_quick", True), ("sim_lms221", False)])

@@ -25,7 +25,7 @@ from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
 from lrfcal_lib.drivers.rig_file import Placement, RigFileError, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
-from lrfcal_lib.judge.verdict import YES, judge, sight_of, verdict
+from lrfcal_lib.judge.verdict import YES, judge, verdict
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.solvers import CANDIDATES
@@ -172,7 +172,7 @@ def advise(session: Session) -> str:
         solution = calibrate_jointly(prepared).solution
     except DegenerateGeometry as error:
         return f"not determined yet: {error}"
-    judged = verdict(solution, prepared.models, **sight_of(prepared))
+    judged = verdict(solution, prepared.models, field_of_view=prepared.session.lrf.field_of_view)
     if judged.answer == YES:
         return ""
     if judged.suggestion:
@@ -235,6 +235,12 @@ class Collector(Closed):
     def emulated(self) -> bool:
         """Whether the board moves by itself."""
         return self.rig is not None and self.rig.stated.devices.control is not None
+
+    @property
+    def limits_deg(self) -> Any:
+        """Lowest and highest pitch of the head."""
+        rig, _ = self._needed()
+        return rig.stated.devices.head.pitch_limits_deg
 
     @property
     def finished(self) -> tuple[int, ...]:

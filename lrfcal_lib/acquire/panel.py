@@ -315,9 +315,8 @@ class Panel(Closed):
             parts.rig.value = str(rig_named(parts.rig.value))
             parts.session.value = str(self.session)
             rig = collector.connect(parts.rig.value, self.session)
-            limits: Any = rig.stated.devices.head.pitch_limits_deg
             with parts.slider.hold_trait_notifications():
-                parts.slider.min, parts.slider.max = limits
+                parts.slider.min, parts.slider.max = collector.limits_deg
             parts.show_pictures(rig.cameras)
             self._begin_sweep(collector.task())
             self._quit.clear()

@@ -33,6 +33,7 @@ from lrfcal_lib.emulators.lms2xx_memory import (
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, encode_telegram
+from lrfcal_lib.session.lms2xx_frame import Telegram
 
 LOG = logging.getLogger(__name__)
 ACK = b"\x06"
@@ -192,7 +193,7 @@ class EmulatedLms(SerialDevice):
         self.requests.append((self.host.time(), raw))
         self.obey(codec.parse_telegram(raw), at)
 
-    def obey(self, telegram: codec.Telegram, at: float) -> None:
+    def obey(self, telegram: Telegram, at: float) -> None:
         """Do what a telegram says, and answer it.
 
         Parameters

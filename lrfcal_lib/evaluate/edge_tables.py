@@ -5,13 +5,16 @@ from itertools import product
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtri
 
 from lrfcal_lib.calibrate.combined import combined_outlines
 from lrfcal_lib.calibrate.outline import outline_of
+from lrfcal_lib.calibrate.pipeline import JointCalibration
+from lrfcal_lib.evaluate.truth import Truth
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.preprocess.prepared import VARIANTS
+from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
 
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
@@ -33,22 +36,30 @@ LENGTH_COLUMNS = (
 )
 
 
-def edge_point_table(prepared, truth):
+def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
     """Bias of each rule for the edge point against the true edge, across it within the plane.
 
-    Columns variant, edge, n, bias_mm (positive outside the board), sd_mm.
+    Parameters
+    ----------
+    prepared : Prepared
+    truth : Truth
+
+    Returns
+    -------
+    DataFrame
+        Columns variant, edge, n, bias_mm (positive outside the board), sd_mm.
     """
     rows = []
     lines = dict(zip(truth.board.edges, truth.board.lines(), strict=True))
     for variant in VARIANTS:
         misses = {edge: [np.zeros(0)] for edge in lines}
         for placement, names in prepared.names.items():
-            found = prepared.edges[variant][placement]
-            pitch = truth.pitch[placement][found.line]
-            p_platform = geometry.lrf_to_platform(found.points, pitch, truth.T_head_lrf)
+            scanned = prepared.edges[variant][placement]
+            pitch = truth.pitch[placement][scanned.line]
+            p_platform = geometry.lrf_to_platform(scanned.points, pitch, truth.T_head_lrf)
             p_board = truth.boards[placement].inv().apply(p_platform)
             for side, edge in names.items():
-                p_side = p_board[found.side == side, :2]
+                p_side = p_board[scanned.side == side, :2]
                 misses[edge].append(p_side @ lines[edge][:2] + lines[edge][2])
         for edge, parts in misses.items():
             miss = pd.Series(1000 * np.concatenate(parts))
@@ -57,7 +68,11 @@ def edge_point_table(prepared, truth):
     return pd.DataFrame(rows, columns=["variant", "edge", "n", "bias_mm", "sd_mm"])
 
 
-def edge_lengths(prepared, T_head_lrf=None, joint=None):
+def edge_lengths(
+    prepared: Prepared,
+    T_head_lrf: RigidTransform | None = None,
+    joint: JointCalibration | None = None,
+) -> pd.DataFrame:
     """Edges of the board measured in the cloud of every placement, beside the paper's own row.
 
     Parameters
@@ -80,7 +95,6 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
         ('combined'). `sigma_mm` holds all that is known to be uncertain for 'combined', and only
         the scatter of points about the sides for the others.
     """
-
     known = {}
     if prepared.board.corners is not None:
         known = prepared.board.lengths()
@@ -123,18 +137,26 @@ def _outlines(prepared, variant, T_head_lrf):
     return out
 
 
-def neighbours(edges, name):
+def neighbours(edges: tuple[str, ...], name: str) -> set[str]:
     """The edges that meet the edge of this name; `edges` stand in order around the board."""
     i = edges.index(name)
     return {edges[i - 1], edges[(i + 1) % len(edges)]}
 
 
-def edge_summary(table):
-    """Errors of an :func:`edge_lengths` table, of measured edges only.
+def edge_summary(table: pd.DataFrame) -> pd.DataFrame:
+    """Errors of measured edges.
 
-    Columns source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm,
-    within_90_percent (share of the errors inside their 90 % intervals; NaN where nothing is said
-    about them).
+    Parameters
+    ----------
+    table : DataFrame
+        Of :func:`edge_lengths`.
+
+    Returns
+    -------
+    DataFrame
+        Columns source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm,
+        within_90_percent (share of the errors inside their 90 % intervals; NaN where nothing is
+        said about them).
     """
     table = table[table.measured_mm.notna()]
     size = table.error_mm.abs()

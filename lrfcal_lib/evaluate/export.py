@@ -152,7 +152,7 @@ def file_hashes(session: Session) -> dict[str, str]:
     hashes = {}
     for file in sorted(stated | images):
         with opened(file, session.path) as stream:
-            digest = hashlib.file_digest(stream, "sha256")
+            digest = hashlib.sha256(stream.read())
         hashes[file.relative_to(session.path).as_posix()] = digest.hexdigest()
     return hashes
 

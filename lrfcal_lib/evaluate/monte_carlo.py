@@ -1,11 +1,12 @@
 """Monte-Carlo trials of the joint estimate and of single shots, beside bound and truth."""
 
 import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import logit
 from scipy.stats import binom, chi2
 
@@ -18,14 +19,14 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     pose_transform,
 )
-from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.model.observations import CameraObservations, JointObservations
 from lrfcal_lib.preprocess.board_in_scan import fit_lines
 from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
 from lrfcal_lib.preprocess.surfaces import row_ends
 from lrfcal_lib.simulate.draw import ShotSetup
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import in_stated_gauge
-from lrfcal_lib.solvers.joint_model import JointState, gather
+from lrfcal_lib.solvers.joint_model import JointState, Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import named_blocks
 
 INTERVAL = 0.9
@@ -103,7 +104,7 @@ def joint_truth(
     return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, *own), obs)
 
 
-def monte_carlo(draw, solve, seeds):
+def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials:
     """Solve many draws whose truth is known: :class:`Trials`.
 
     Parameters
@@ -123,21 +124,20 @@ def monte_carlo(draw, solve, seeds):
     """
     rows = []
     failed = {}
-    names = None
+    names: tuple = ()
     for seed in seeds:
         obs, truth = draw(np.random.default_rng(seed))
         try:
-            found = solve(obs)
-        except DegenerateGeometry as reason:
-            failed[int(seed)] = str(reason)
+            joint = solve(obs)
+        except DegenerateGeometry as error:
+            failed[int(seed)] = str(error)
             continue
-        if names is None:
-            names = found.solution.names
-        if names != found.solution.names:
-            raise ValueError(f"seed {seed} estimates {found.solution.names}, earlier ones {names}")
-        error = state_errors(found.state, truth, found.unknowns)
-        limit = bound(obs, truth, found.unknowns)
-        rows.append((int(seed), error, found.solution.covariance, limit))
+        if names and names != joint.solution.names:
+            raise ValueError(f"seed {seed} estimates {joint.solution.names}, earlier ones {names}")
+        names = joint.solution.names
+        errors = state_errors(joint.state, truth, joint.unknowns)
+        limit = bound(obs, truth, joint.unknowns)
+        rows.append((int(seed), errors, joint.solution.covariance, limit))
     if not rows:
         last = list(failed.values())[-1] if failed else "no seed given"
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
@@ -145,10 +145,14 @@ def monte_carlo(draw, solve, seeds):
     return Trials(names, seeds, errors, covariances, bounds, failed)
 
 
-def state_errors(state, truth, unknowns):
+def state_errors(state: JointState, truth: JointState, unknowns: Unknowns) -> np.ndarray:
     """Increments (c,) of the shared unknowns that take the truth to an estimate.
 
-    Both are JointStates in one gauge.
+    Parameters
+    ----------
+    state, truth : JointState
+        In one gauge.
+    unknowns : Unknowns
     """
     estimated = np.concatenate([state.head[None], state.cameras])
     true = np.concatenate([truth.head[None], truth.cameras])
@@ -163,13 +167,27 @@ def pose_errors(poses, true):
     return np.concatenate([turn.as_rotvec(), poses[..., 3] - true[..., 3]], axis=-1)
 
 
-def bound(obs, truth, unknowns):
-    """Cramer-Rao bound (c, c) of the shared unknowns from the expected information at the truth.
+def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.ndarray:
+    """Cramer-Rao bound of the shared unknowns from the expected information at the truth.
 
     Nothing of the drawn values enters but which beams and views there are, so it checks the
     covariance that a solver takes from its own residuals. Board poses, and whatever else a
-    placement owns, count as unknown. DegenerateGeometry when the data leave a direction of the
-    shared unknowns open.
+    placement owns, count as unknown.
+
+    Parameters
+    ----------
+    obs : JointObservations
+    truth : JointState
+    unknowns : Unknowns
+
+    Returns
+    -------
+    ndarray, shape (c, c)
+
+    Raises
+    ------
+    DegenerateGeometry
+        When the data leave a direction of the shared unknowns open.
     """
     data = gather(obs)
     hit = np.ones_like(data.beam["hit"])
@@ -177,15 +195,15 @@ def bound(obs, truth, unknowns):
     none_read = replace(data, beam=data.beam | {"hit": ~hit})
     read = named_blocks(truth, all_read, unknowns)
     missed = named_blocks(truth, none_read, unknowns)
-    hessian = 0.0
+    size = unknowns.shared + unknowns.own
+    hessian = np.zeros((len(obs.placements), size, size))
     for name, block in read.items():
         J = block.white_jacobian
         if name == "beam":  # expected: over both readings, weighted by how likely each is
-            chance = np.exp(-block.cost)[..., None]
             other = missed[name].white_jacobian
-            hessian = hessian + np.swapaxes(other, -1, -2) @ ((1 - chance) * other)
-            J = np.sqrt(chance) * J
-        hessian = hessian + np.swapaxes(J, -1, -2) @ J
+            hessian += other.mT @ (-np.expm1(-block.cost)[..., None] * other)
+            J = np.exp(-block.cost / 2)[..., None] * J
+        hessian += J.mT @ J
     total = np.sum(reduced_hessian(hessian, unknowns.shared), axis=0)
     scale = 1 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))
     values, vectors = np.linalg.eigh(total * scale[:, None] * scale)
@@ -198,22 +216,29 @@ def bound(obs, truth, unknowns):
     return (vectors / values) @ vectors.T * scale[:, None] * scale
 
 
-def groups_of(names):
+def groups_of(names: Sequence[str]) -> dict[str, tuple[list[int], str, float]]:
     """Unknowns in groups of one unit: dict of words to (indices, unit, factor to that unit)."""
-    out = {}
+    groups: dict[str, tuple[list[int], str, float]] = {}
     for i, name in enumerate(names):
         for pattern, (words, unit, factor) in GROUPS.items():
             if re.fullmatch(pattern, name):
                 group = re.sub(pattern, words, name)
-                out.setdefault(group, ([], unit, factor))[0].append(i)
+                groups.setdefault(group, ([], unit, factor))[0].append(i)
                 break
         else:
             raise ValueError(f"'{name}' belongs to no group of unknowns")
-    return out
+    return groups
 
 
-def spread(covariance, names):
-    """Standard deviation of each group of unknowns in its unit: root of the trace of covariance."""
+def spread(covariance: np.ndarray, names: Sequence[str]) -> dict[str, float]:
+    """Standard deviation of each group of unknowns in its unit: root of the trace of covariance.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (c, c)
+    names : sequence of str
+        Of the unknowns.
+    """
     variance = np.diagonal(covariance)
     out = {}
     for words, (index, _, factor) in groups_of(names).items():
@@ -221,14 +246,25 @@ def spread(covariance, names):
     return out
 
 
-def consistency(trials):
+def consistency(trials: Trials) -> pd.DataFrame:
     """How errors compare with the bound and with what the solver states, by group and pooled.
 
-    Columns group, unit, rmse, crb (root of the mean trace of the bounds, or of the stated
-    covariances where there are none), rmse_over_crb, stated_over_crb, coverage of 90 % intervals,
-    nees (mean normalised squared error by number of unknowns), limits of chance of three of them
-    (_low, _high), trials, failed. The last row pools all unknowns, each by its own bound. A
-    ValueError with fewer than ten trials, or errors that are not finite.
+    Parameters
+    ----------
+    trials : Trials
+
+    Returns
+    -------
+    DataFrame
+        Columns group, unit, rmse, crb (root of the mean trace of the bounds), rmse_over_crb,
+        stated_over_crb, coverage of 90 % intervals, nees (mean normalised squared error by number
+        of unknowns), limits of chance of three of them (_low, _high), trials, failed. The last row
+        pools all unknowns, each by its own bound.
+
+    Raises
+    ------
+    ValueError
+        With fewer than ten trials, or errors that are not finite.
     """
     count = len(trials.seeds)
     if count < FEWEST_TRIALS:
@@ -275,7 +311,7 @@ def _judge(trials, index, factor):
         "rmse_over_crb": rmse / crb,
         "stated_over_crb": stated / crb,
         "coverage": np.mean(np.abs(e) < half_width),
-        "nees": np.mean(np.sum(e * normalised, axis=-1)) / len(index),
+        "nees": np.mean(np.vecdot(e, normalised)) / len(index),
     }
     row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(chi2.ppf(LIMITS, free) / free)
     row["coverage_low"], row["coverage_high"] = binom.ppf(LIMITS, seen, INTERVAL) / seen
@@ -336,12 +372,12 @@ def _crossing_points(ranges, setup, last_beam):
     ray = polar_to_points(1.0, ends)
     across = np.cross([0.0, 0.0, 1.0], ray)
     u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
-    r = 1 / np.sum(u * ray, axis=-1)  # to the fitted line u . p = 1
-    by_bearing = -(r**2) * np.sum(u * across, axis=-1)  # the range's change
+    r = 1 / np.vecdot(u, ray)  # to the fitted line u . p = 1
+    by_bearing = -(r**2) * np.vecdot(u, across)  # the range's change
     turned = r[..., None] * across + by_bearing[..., None] * ray
     of_line = np.linalg.inv(information) * setup.sigma_range**2
     flat_ray = ray[..., :2]
-    variance = r**4 * np.einsum("nei,nij,nej->ne", flat_ray, of_line, flat_ray)
+    variance = r**4 * np.vecdot(flat_ray @ of_line, flat_ray)
     spacing = _outer(turned * setup.step * UNIFORM)
     return r[..., None] * ray, variance[..., None, None] * _outer(ray) + spacing
 
@@ -384,10 +420,10 @@ def shots_table(shots: dict, setup: ShotSetup, rng: np.random.Generator) -> pd.D
         error of the pose over 6).
     """
     true = shots["T_camera_lrf"]
-    turn = Rotation.from_rotvec(rng.normal(0, 0.05, (len(true), 3))).as_matrix()
+    near = pose_transform(true)
+    turn = Rotation.from_rotvec(rng.normal(0, 0.05, (len(true), 3)))
     shift = rng.normal(0, 0.05, (len(true), 3))
-    near = np.concatenate([turn @ true[..., :3], true[..., 3:] + shift[..., None]], axis=-1)
-    T0 = pose_transform(near)
+    T0 = RigidTransform.from_components(near.translation + shift, turn * near.rotation)
     half = observations(shots, setup)
     solutions = {
         "line_last_beam": solve_camera(observations(shots, setup, last_beam=True), "line", T0),
@@ -402,7 +438,7 @@ def shots_table(shots: dict, setup: ShotSetup, rng: np.random.Generator) -> pd.D
             "method": method,
             "rotation_median_deg": np.degrees(np.median(np.linalg.norm(error[:, :3], axis=1))),
             "translation_median_mm": 1000 * np.median(np.linalg.norm(error[:, 3:], axis=1)),
-            "nees": np.mean(np.sum(error * normalised, axis=-1)) / 6,
+            "nees": np.mean(np.vecdot(error, normalised)) / 6,
         }
         rows.append(row)
     return pd.DataFrame(rows)

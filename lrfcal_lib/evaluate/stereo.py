@@ -7,7 +7,8 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.geometry import transform_difference
-from lrfcal_lib.preprocess.intrinsics import adjust_robust, board_pose, waves
+from lrfcal_lib.preprocess.bundle import adjust_robust, waves
+from lrfcal_lib.preprocess.intrinsics import board_pose
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers import METHODS
 

@@ -1,5 +1,7 @@
 """How well normal equations determine their unknowns: by the noise, and by placements left out."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 # eigenvalues of scaled normal equations below this share of the largest are rounding errors
@@ -39,10 +41,17 @@ def null_space(hessian: np.ndarray, scales: np.ndarray, limit: float = 1.0) -> n
     return directions / np.max(np.abs(directions), axis=1, keepdims=True)
 
 
-def pseudo_inverse(hessian):
+def pseudo_inverse(hessian: np.ndarray) -> np.ndarray:
     """Inverse of scaled normal equations on what they determine.
 
-    Eigenvalues below zero are rounding errors too.
+    Parameters
+    ----------
+    hessian : ndarray, shape (..., k, k)
+        Eigenvalues below zero are rounding errors too.
+
+    Returns
+    -------
+    ndarray, shape (..., k, k)
     """
     values, vectors = np.linalg.eigh(hessian)
     inverse = np.divide(
@@ -67,18 +76,37 @@ def covariance_of(hessian, scales, lost):
     return covariance + np.diag(np.where(lost, np.inf, 0.0))
 
 
-def name_words(direction, names, share=PARTAKES):
-    """Names (or words) of the unknowns with the largest components of a direction."""
+def name_words(direction: np.ndarray, names: Sequence[str], share: float = PARTAKES) -> str:
+    """Names (or words) of the unknowns with the largest components of a direction.
+
+    Parameters
+    ----------
+    direction : ndarray, shape (k,)
+    names : sequence of str, length k
+    share : float
+        Of the largest component, below which an unknown is not named.
+    """
     large = np.abs(direction) > share * np.max(np.abs(direction))
     return " with ".join(np.asarray(names)[large])
 
 
-def placement_covariance(hessians, scores):
+def placement_covariance(
+    hessians: np.ndarray, scores: np.ndarray
+) -> tuple[np.ndarray | None, np.ndarray | None]:
     """First-order jackknife over g placements, from what each adds to the normal equations.
 
-    `scores` are ``J^T r`` of each placement at the solution. Returned are the covariance and the
-    changes (..., g, k) of the estimate when that placement is left out; None with fewer than three
-    placements, or where the others do not determine the estimate.
+    Parameters
+    ----------
+    hessians : ndarray, shape (..., g, k, k)
+    scores : ndarray, shape (..., g, k)
+        ``J^T r`` of each placement at the solution.
+
+    Returns
+    -------
+    covariance : ndarray, shape (..., k, k)
+    changes : ndarray, shape (..., g, k)
+        Of the estimate when that placement is left out. Both are None with fewer than three
+        placements, or where the others do not determine the estimate.
 
     Notes
     -----

@@ -5,6 +5,7 @@ likelihood.
 from functools import cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import log_ndtr
 
 ROOT_2PI = np.sqrt(2 * np.pi)
@@ -13,20 +14,37 @@ LEAST_STEP = 0.15
 LEAST_SHARE = 1e-12  # of a spot, so that odds stay finite
 
 
-def disc_share(x):
-    """Share of a unit disc inside a straight edge `x` radii inside of its centre: 1 for x <=
-    -1, 0 for x >= 1.
+def disc_share(x: np.ndarray) -> np.ndarray:
+    """Share of a unit disc inside a straight edge.
+
+    Parameters
+    ----------
+    x : array_like
+        How far inside of the disc's centre the edge lies, radii.
+
+    Returns
+    -------
+    ndarray
+        1 for x <= -1, 0 for x >= 1.
     """
     x = np.clip(np.asarray(x, float), -1.0, 1.0)
     return (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi
 
 
-def disc_edge(log_odds):
-    """Where an edge cuts a unit disc so that its inner share has log odds ``ln(share / (1 -
-    share))``.
+def disc_edge(log_odds: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Where an edge cuts a unit disc, from its inner share; inverts :func:`disc_share`.
 
-    Inverts :func:`disc_share`; returns the distance x of the disc's centre from the edge in radii,
-    positive outside, between -1 and 1, and ``dx / dlog_odds`` (negative).
+    Parameters
+    ----------
+    log_odds : array_like
+        ``ln(share / (1 - share))``.
+
+    Returns
+    -------
+    x : ndarray
+        Distance of the disc's centre from the edge in radii, positive outside, -1 to 1.
+    slope : ndarray
+        ``dx / dlog_odds`` (negative).
     """
     log_odds = np.asarray(log_odds, float)
     table, odds = _table()
@@ -53,40 +71,84 @@ def _slope(x):
     return slope, np.log(inside / outside)
 
 
-def edge_shift(log_odds, radius, background=0.0):
-    """By how far a spot's centre may lie outside an edge and still read the board, and its
-    derivative by `log_odds`.
+def edge_shift(
+    log_odds: ArrayLike, radius: np.ndarray, background: ArrayLike = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """By how far a spot's centre may lie outside an edge and still read the board.
 
-    Metres, positive where boards look larger. The log odds are the sensor's, for a background as
-    far and as bright as the board; `background` is what the real one adds: ``-2 ln(d_background /
-    d_board)``, 0 where it is not known.
+    Parameters
+    ----------
+    log_odds : array_like
+        The sensor's, for a background as far and as bright as the board.
+    radius : array_like
+        Of the spot, metres.
+    background : array_like
+        What the real one adds: ``-2 ln(d_background / d_board)``, 0 where it is not known.
+
+    Returns
+    -------
+    shift : ndarray
+        Metres, positive where boards look larger.
+    slope : ndarray
+        Its derivative by `log_odds`.
     """
     x, slope = disc_edge(log_odds + np.asarray(background, float))
     return radius * x, radius * slope
 
 
-def flip_sigma(softness, radius, step):
-    """Standard deviation of where readings flip (metres), and ``d ln sigma / d ln softness``, 0
-    (all floor) to 1.
+def flip_sigma(
+    softness: float, radius: np.ndarray, step: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviation of where readings flip.
 
-    `softness` is in spot radii. Beams a step apart (metres, at the board) cannot show a sharper
-    edge than a floor.
+    Parameters
+    ----------
+    softness : float
+        Spot radii.
+    radius : ndarray
+        Of the spot, metres.
+    step : ndarray
+        To the next beam at the board, metres: it cannot show a sharper edge than a floor.
+
+    Returns
+    -------
+    sigma : ndarray
+        Metres.
+    share : ndarray
+        ``d ln sigma / d ln softness``, 0 (all floor) to 1.
     """
     soft = softness * np.asarray(radius, float)
     sigma = np.hypot(soft, LEAST_STEP * np.asarray(step, float))
     return sigma, (soft / sigma) ** 2
 
 
-def beam_terms(margin, sigma, hit, lapse=0.0):
+def beam_terms(
+    margin: np.ndarray, sigma: np.ndarray, hit: np.ndarray, lapse: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Negative log likelihood of single beams near an edge, a probit: ``P(hit) = Phi(margin /
     sigma)``.
 
-    `margin` and `sigma` (metres) are how far inside the place where readings flip the beam's centre
-    lies (shift - distance from the edge), and the standard deviation of that place; `hit` tells
-    whether the board was read, `lapse` is the share of beams that say nothing (something hid or
-    bent the edge there): their pull fades with distance. Returned are cost, score (its derivative
-    by the margin) and the observed information on the margin, never negative; with `lapse` that of
-    the majorising function of an EM step.
+    Parameters
+    ----------
+    margin : ndarray
+        How far inside the place where readings flip the beam's centre lies (shift - distance from
+        the edge), metres.
+    sigma : ndarray
+        Standard deviation of that place, metres.
+    hit : ndarray of bool
+        Whether the board was read.
+    lapse : float
+        Share of beams that say nothing (something hid or bent the edge there): their pull fades
+        with distance.
+
+    Returns
+    -------
+    cost : ndarray
+    score : ndarray
+        Derivative of the cost by the margin.
+    information : ndarray
+        The observed one on the margin, never negative; with `lapse` that of the majorising function
+        of an EM step.
     """
     sign = np.where(hit, 1.0, -1.0)
     z = sign * np.asarray(margin, float) / sigma

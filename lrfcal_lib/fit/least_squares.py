@@ -89,10 +89,18 @@ class Block:
         return self.whitened(self.jacobian if self.corrected is None else self.corrected)
 
 
-def medians(values, used):
-    """Medians of the used values (..., n) of every row, 0 where there are none.
+def medians(values: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Medians of the used values of every row; many times as fast as np.nanmedian.
 
-    Many times as fast as np.nanmedian.
+    Parameters
+    ----------
+    values : ndarray, shape (..., n)
+    used : ndarray of bool, shape (..., n)
+
+    Returns
+    -------
+    ndarray, shape (...)
+        0 where there are none.
     """
     count = used.sum(axis=-1, keepdims=True)
     ordered = np.sort(np.where(used, values, np.inf), axis=-1)
@@ -232,9 +240,18 @@ def eliminate(
     return hessian[:, :c, :c] - taken[..., :c], gradient[:, :c] - taken[..., c], back
 
 
-def reduced_hessian(hessian, shared):
-    """What each placement says about the shared unknowns once its own are eliminated, shape (p,
-    c, c).
+def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
+    """What each placement says about the shared unknowns once its own are eliminated.
+
+    Parameters
+    ----------
+    hessian : ndarray, shape (p, k, k)
+    shared : int
+        The first c unknowns.
+
+    Returns
+    -------
+    ndarray, shape (p, c, c)
     """
     return eliminate(hessian, np.zeros(hessian.shape[:2]), shared)[0]
 
@@ -484,9 +501,10 @@ def solve(
     )
     blocks = once(minimum.state)
     axes = -1 if shared is None else (-2, -1)
-    roots = linearise(blocks, loss, scale, axes).roots
-    pairs = zip(blocks, roots, strict=True)
-    weights = [np.ones_like(b.white) if root is None else root**2 for b, root in pairs]
+    weights = []
+    for block in blocks:
+        of_block = _weigh(block, loss, scale, axes)[0]
+        weights.append(np.ones_like(block.white) if of_block is None else of_block)
     return _solution(question, minimum, blocks, np.concatenate(weights, axis=-1), shared)
 
 
@@ -552,12 +570,22 @@ def _solution(question, minimum, blocks, weights, shared):
     )
 
 
-def pad(group, count, width=1):
-    """Arrays of a group (with `placement`, an index below `count`) sorted into rectangles (count,
-    n, ...).
+def pad(group: dict[str, np.ndarray], count: int, width: int = 1) -> dict[str, np.ndarray]:
+    """Arrays sorted by placement into rectangles, zeros behind the rows of each.
 
-    Rows of a placement keep their order; zeros stand behind them, and `used` marks what is no
-    padding. n is `width` at least.
+    Parameters
+    ----------
+    group : dict of str to ndarray, shapes (m, ...)
+        With `placement`, indices below `count`.
+    count : int
+        Number of placements.
+    width : int
+        Of the rectangles, at least.
+
+    Returns
+    -------
+    dict of str to ndarray, shapes (count, n, ...)
+        Without `placement`; `used` marks what is no padding. Rows of a placement keep their order.
     """
     order = np.argsort(group["placement"], kind="stable")
     number = np.bincount(group["placement"], minlength=count)

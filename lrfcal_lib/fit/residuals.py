@@ -5,6 +5,7 @@ from planes.
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.model import geometry
@@ -15,6 +16,7 @@ from lrfcal_lib.model.geometry import (
     noise_correction,
     rotate_points,
 )
+from lrfcal_lib.model.observations import CameraObservations
 
 # metres; no printed board is flatter, and a board along the beam has no range noise across it
 SIGMA_FLOOR = 1e-4
@@ -52,7 +54,7 @@ def line_gradients(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) ->
     return np.stack([by_x, by_y, by_z], axis=-1)
 
 
-def line_block(pose: np.ndarray, obs) -> Block:
+def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     """Distances d(e, ab) of projected crossings from their image lines: :func:`line_residuals` as a
     Block.
 
@@ -77,9 +79,19 @@ def line_block(pose: np.ndarray, obs) -> Block:
     return Block(residuals, jacobian, 1 / np.sqrt(variance), corrected=jacobian - correction)
 
 
-def sight_block(pose, points, normals, sigma):
-    """Distances of points (..., n, 3) from planes through the camera centre with unit normals
-    (..., n, 3), metres.
+def sight_block(pose: np.ndarray, points: np.ndarray, normals: np.ndarray, sigma: float) -> Block:
+    """Distances of points from planes through the camera centre, metres.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+        ``T_camera_source``.
+    points : ndarray, shape (..., n, 3)
+        Source frame, metres.
+    normals : ndarray, shape (..., n, 3)
+        Of the planes, see :func:`sight_normals`.
+    sigma : float
+        Of every distance, metres.
     """
     rotated = rotate_points(pose, points)
     residuals = np.sum(normals * (rotated + pose[..., None, :, 3]), axis=-1)
@@ -87,16 +99,30 @@ def sight_block(pose, points, normals, sigma):
     return Block(residuals, jacobian, np.full(residuals.shape, 1.0 / sigma))
 
 
-def sight_normals(lines, model):
-    """Unit normals of the planes through the camera centre and image lines, and lengths of
-    ``K^T l``.
+def sight_normals(lines: np.ndarray, model: CameraModel) -> tuple[np.ndarray, np.ndarray]:
+    """Planes through the camera centre and image lines.
+
+    Parameters
+    ----------
+    lines : ndarray, shape (..., 3)
+        Undistorted pixels.
+    model : CameraModel
+
+    Returns
+    -------
+    normals : ndarray, shape (..., 3)
+        Unit vectors, camera frame.
+    lengths : ndarray, shape (...)
+        Of ``K^T l``.
     """
     raw = lines @ model.matrix
     length = np.linalg.norm(raw, axis=-1)
     return raw / length[..., None], length
 
 
-def edge_residuals_px(obs, transform, model=None):
+def edge_residuals_px(
+    obs: CameraObservations, transform: RigidTransform, model: CameraModel | None = None
+) -> np.ndarray:
     """Signed distances of the projected crossings from their image lines, equation (20).
 
     Parameters
@@ -129,12 +155,23 @@ def edge_residuals_px(obs, transform, model=None):
     return line_block(geometry.pose_array(transform), obs).residuals
 
 
-def plane_residuals_m(obs, transform, board_poses=None):
-    """Signed distances (m,) of the board-face points from the planes the camera sees under
-    ``T_camera_source``.
+def plane_residuals_m(
+    obs: CameraObservations, transform: RigidTransform, board_poses: np.ndarray | None = None
+) -> np.ndarray:
+    """Signed distances of the board-face points from the planes the camera sees.
 
-    Metres, along the board's z; NaN for placements whose board pose the camera does not know.
-    `board_poses` are other poses than ``obs.board_poses`` (of a joint refinement).
+    Parameters
+    ----------
+    obs : CameraObservations
+    transform : RigidTransform
+        ``T_camera_source``.
+    board_poses : ndarray, shape (p, 4, 4), optional
+        Other poses than ``obs.board_poses`` (of a joint refinement).
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        Metres, along the board's z; NaN for placements whose board pose the camera does not know.
     """
     poses = obs.board_poses if board_poses is None else board_poses
     out = np.full(len(obs.plane_points), np.nan)
@@ -145,6 +182,17 @@ def plane_residuals_m(obs, transform, board_poses=None):
     return out
 
 
-def read_pose(pose):
-    """Transform and parameters of a pose state."""
+def read_pose(pose: np.ndarray) -> tuple[RigidTransform, np.ndarray]:
+    """Transform and parameters of a pose state.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+
+    Returns
+    -------
+    transform : RigidTransform
+    parameters : ndarray, shape (..., 6)
+        Rotation vector and translation, radians and metres.
+    """
     return geometry.pose_transform(pose, proper=True), geometry.pose_parameters(pose)

@@ -10,16 +10,29 @@ NORMAL = 1.4826  # standard deviation of a normal variable over the median of it
 TUKEY = 4.685
 
 
-def robust_sigma(misses, least=0.0):
-    """Standard deviation, at least `least`, of misses (n,) that are normal about zero but for
-    outliers.
+def robust_sigma(misses: np.ndarray, least: float = 0.0) -> float:
+    """Standard deviation of misses that are normal about zero but for outliers.
+
+    Parameters
+    ----------
+    misses : ndarray, shape (n,)
+    least : float
+        Never smaller than this.
     """
     return max(NORMAL * float(np.median(np.abs(misses))), least)
 
 
-def biweight(misses, sigma):
-    """Tukey's weights (...): 1 for a miss of zero, 0 beyond TUKEY standard deviations.
+def biweight(misses: np.ndarray, sigma: float | np.ndarray) -> np.ndarray:
+    """Tukey's weights: 1 for a miss of zero, 0 beyond TUKEY standard deviations.
 
-    NaN stays.
+    Parameters
+    ----------
+    misses : ndarray, shape (...)
+        NaN stays.
+    sigma : float or ndarray
+
+    Returns
+    -------
+    ndarray, shape (...)
     """
     return np.clip(1 - (misses / (TUKEY * sigma)) ** 2, 0, None) ** 2

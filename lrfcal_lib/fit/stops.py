@@ -10,8 +10,19 @@ from lrfcal_lib.fit.least_squares import Block
 SAME_STOP = np.radians(0.001)  # of recorded pitch angles: platforms record steps of 0.01 deg or so
 
 
-def same_stop(pitch, used):
-    """Which images of a placement (p, v) were taken at one stop, shape (p, v, v)."""
+def same_stop(pitch: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Which images of a placement were taken at one stop.
+
+    Parameters
+    ----------
+    pitch : ndarray, shape (p, v)
+        Recorded, radians.
+    used : ndarray of bool, shape (p, v)
+
+    Returns
+    -------
+    ndarray of bool, shape (p, v, v)
+    """
     stop = np.rint(pitch / SAME_STOP)
     return (stop[:, :, None] == stop[:, None, :]) & used[:, :, None] & used[:, None, :]
 

@@ -2,19 +2,22 @@
 cause and remedy.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtr, stdtrit
 
+from lrfcal_lib.judge.findings import Kind, by_sign
 from lrfcal_lib.model.geometry import (
     axis_difference,
     axis_of,
     transform_difference,
 )
+from lrfcal_lib.session.read import Session
 from lrfcal_lib.solvers.joint_model import SENSOR
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
@@ -34,6 +37,10 @@ FAR_SHIFT = 0.3
 # log odds; sides are expected to deviate no more than this while statements are weighed
 ALIKE = 0.15
 LEVER = 0.2  # metres, weighs turns against shifts
+CHECK = (
+    "check its statement; bearings or pitch of the other sense, or exchanged folders of cameras "
+    "look like this"
+)
 # of the best alternative's likelihood ratio: another one explains the data nearly as well
 AS_GOOD = 0.6
 
@@ -81,32 +88,35 @@ def _views_and_outline(obs, s):
 
 
 def _bearings(obs, s):
-    turned = (
-        MIDDLE + (bearing - MIDDLE) * (1 + s) for bearing in (obs.face_bearing, obs.beam_bearing)
+    """Bearings stretched by s about the middle."""
+    return replace(
+        obs,
+        face_bearing=MIDDLE + (obs.face_bearing - MIDDLE) * (1 + s),
+        beam_bearing=MIDDLE + (obs.beam_bearing - MIDDLE) * (1 + s),
     )
-    return replace(obs, **dict(zip(("face_bearing", "beam_bearing"), turned, strict=True)))
 
 
 def _lag(obs, s):
-    late = {
-        "face_pitch": s * obs.direction[obs.face_placement],
-        "beam_pitch": s * obs.direction[obs.beam_placement],
-    }
-    return replace(obs, **{name: getattr(obs, name) + by for name, by in late.items()})
+    """The pitch of scan lines later by s (radians) in the sense of the sweep."""
+    return replace(
+        obs,
+        face_pitch=obs.face_pitch + s * obs.direction[obs.face_placement],
+        beam_pitch=obs.beam_pitch + s * obs.direction[obs.beam_placement],
+    )
 
 
 ALTERNATIVES = {
-    "squares": Alternative(
+    Kind.SQUARES: Alternative(
         _views,
         "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
         "measure a square over many of them",
     ),
-    "outline": Alternative(
+    Kind.OUTLINE: Alternative(
         lambda obs, s: replace(obs, corners=obs.corners * (1 + s)),
         "the board's outline is {size} +- {sigma} % {sign} than stated",
         "measure the board's edges",
     ),
-    "ranges": Alternative(
+    Kind.RANGES: Alternative(
         lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)),
         "all ranges are {size} +- {sigma} % {sign}",
         "measure a square and an edge of the board, check the unit of the ranges",
@@ -115,20 +125,20 @@ ALTERNATIVES = {
             "too long, or board and squares larger than stated",
         ),
     ),
-    "bearings": Alternative(
+    Kind.BEARINGS: Alternative(
         _bearings,
         "bearings are {size} +- {sigma} % too {sign}",
         "check the angular step that session.json states",
         ("small", "large"),
     ),
-    "spot": Alternative(
+    Kind.SPOT: Alternative(
         lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)),
         "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
         "state spot_exit_m and spot_divergence_rad as its maker does",
         worth=0.2,
         reach=5.0,
     ),
-    "lag": Alternative(
+    Kind.LAG: Alternative(
         _lag,
         "the pitch of scan lines comes {size} +- {sigma} deg {sign} in the sense of the sweep",
         "check the time stamps of pitch and scans, sweep slower or stop for every scan",
@@ -149,15 +159,15 @@ def alternatives_of(prepared):
     stated = dict(ALTERNATIVES)
     pattern = prepared.board.pattern
     if pattern is None:
-        del stated["squares"]
+        del stated[Kind.SQUARES]
     elif prepared.session.board.corners is None:
-        del stated["outline"]
-        stated["squares"] = replace(stated["squares"], change=_views_and_outline)
+        del stated[Kind.OUTLINE]
+        stated[Kind.SQUARES] = replace(stated[Kind.SQUARES], change=_views_and_outline)
     else:
         about_first_corner = partial(_views, origin=pattern.origin)
-        stated["squares"] = replace(stated["squares"], change=about_first_corner)
+        stated[Kind.SQUARES] = replace(stated[Kind.SQUARES], change=about_first_corner)
     if prepared.session.lrf.spot_exit is None:
-        del stated["spot"]
+        del stated[Kind.SPOT]
     return stated
 
 
@@ -196,90 +206,81 @@ class Doubt:
         return self.ratio > stdtrit(self.freedom, ndtr(deviations)) ** 2
 
 
-def weigh(solution, admitted_offset, stated=ALTERNATIVES):
-    """Every alternative tested by itself, all that was estimated free: list of Doubt, the likeliest
-    first.
+def weigh(
+    solution: JointSolution,
+    admitted_offset: float,
+    stated: Mapping[Kind, Alternative] = ALTERNATIVES,
+) -> list[Doubt]:
+    """Every alternative tested by itself, all that was estimated free, the likeliest first.
 
-    A score test at the solution: no estimate is repeated. The standard deviation is the larger one
-    of noise and scatter over placements. A range offset takes up what a wrong size does to ranges;
-    it is expected to be what the maker admits.
+    A score test at the solution: no estimate is repeated. A range offset takes up what a wrong size
+    does to ranges; it is expected to be what the maker admits.
 
     Parameters
     ----------
-    solution : JointSolution
-    admitted_offset : float
+    solution
+    admitted_offset
         Of the range finder's maker, metres.
-    stated : dict of str to Alternative
+    stated
         What may be wrong.
     """
-    test = ScoreTest.at(solution, admitted_offset)
+    # sides that may deviate, and beams that may say nothing, would take up what a wrong statement
+    # does to edges
+    side_sigma = min(solution.noise["side_sigma"], ALIKE)
+    tested = solution.with_levels(side_sigma=side_sigma, lapse=0.0)
     doubts = []
     for kind, alternative in stated.items():
-        doubt = test.doubt(kind, alternative)
+        doubt = doubt_about(kind, alternative, tested, admitted_offset)
         if 0 < doubt.sigma < UNKNOWN * alternative.worth:
             doubts.append(doubt)
     return sorted(doubts, key=lambda doubt: -doubt.ratio)
 
 
-@dataclass(frozen=True)
-class ScoreTest:
-    """The joint estimate at its solution, ready to be asked for one unknown more.
+def doubt_about(kind, alternative, solution, admitted_offset):
+    """What the data say of an alternative, a Doubt.
 
-    Attributes
-    ----------
-    solution : JointSolution
-        With noise levels for the test: sides that may deviate, and beams that may say nothing,
-        would take up what a wrong statement does to edges.
-    prior, pull : ndarray, shape (c + 1,)
-        Information on the shared unknowns and one more that the maker's range offset adds, and its
-        score.
+    The standard deviation is the larger one of noise and scatter over placements.
     """
+    names = solution.solution.names
+    score = solution.score(alternative.change(solution.observations, STEP), STEP)
+    information = score.information.sum(axis=0)
+    gradient = score.gradient.sum(axis=0)
+    if "range_offset" in names:
+        where = names.index("range_offset")
+        expected = 1 / (ADMITTED * admitted_offset) ** 2
+        information[where, where] += expected
+        gradient[where] += expected * solution.sensor["range_offset"]
+    covariance = np.linalg.pinv(information, rcond=1e-13, hermitian=True)
+    step = -covariance @ gradient
+    value = float(step[-1])
+    # what each placement still pulls at the value found
+    pulls = (score.gradient + score.information @ step) @ covariance[-1]
+    freedom = max(len(pulls) - 1, 1)
+    noise = covariance[-1, -1]
+    scatter = np.sum(pulls**2) * len(pulls) / freedom
+    sigma = float(np.sqrt(max(noise, scatter)))
 
-    solution: JointSolution
-    prior: np.ndarray
-    pull: np.ndarray
-
-    @classmethod
-    def at(cls, solution, admitted_offset):
-        """The test at a JointSolution."""
-        names = solution.solution.names
-        prior = np.zeros(len(names) + 1)
-        pull = np.zeros(len(names) + 1)
-        if "range_offset" in names:
-            where = names.index("range_offset")
-            prior[where] = 1 / (ADMITTED * admitted_offset) ** 2
-            pull[where] = prior[where] * solution.sensor["range_offset"]
-        side_sigma = min(solution.noise["side_sigma"], ALIKE)
-        return cls(solution.with_levels(side_sigma=side_sigma, lapse=0.0), prior, pull)
-
-    def doubt(self, kind, alternative):
-        """What the data say of an alternative, a Doubt."""
-        score = self.solution.score(alternative.change(self.solution.observations, STEP), STEP)
-        information = score.information.sum(axis=0) + np.diag(self.prior)
-        covariance = np.linalg.pinv(information, rcond=1e-13, hermitian=True)
-        step = -covariance @ (score.gradient.sum(axis=0) + self.pull)
-        value = float(step[-1])
-        # what each placement still pulls at the value found
-        pulls = (score.gradient + score.information @ step) @ covariance[-1]
-        freedom = max(len(pulls) - 1, 1)
-        noise = covariance[-1, -1]
-        scatter = np.sum(pulls**2) * len(pulls) / freedom
-        sigma = float(np.sqrt(max(noise, scatter)))
-        along = covariance[:-1, -1] / max(noise, 1e-300) * value
-        handed = [i for i, name in enumerate(self.solution.solution.names) if name not in SENSOR]
-        moves = np.abs(along[handed]) / self.solution.solution.trusted_sigma[handed]
-        sizes = {"size": abs(value), "sigma": sigma}
-        sizes = {name: f"{size * alternative.unit:.2g}" for name, size in sizes.items()}
-        words = alternative.words.format(**sizes, sign=alternative.signs[int(value < 0)])
-        return Doubt(
-            kind=kind,
-            value=value,
-            sigma=sigma,
-            ratio=float((value / max(sigma, 1e-300)) ** 2),
-            freedom=freedom if scatter > noise else np.inf,
-            moved=float(np.max(moves, initial=0.0)),
-            words=f"{words}: {alternative.remedy}",
-        )
+    handed = [i for i, name in enumerate(names) if name not in SENSOR]
+    moves = (
+        covariance[handed, -1]
+        / max(noise, 1e-300)
+        * value
+        / solution.solution.trusted_sigma[handed]
+    )
+    words = alternative.words.format(
+        size=f"{abs(value) * alternative.unit:.2g}",
+        sigma=f"{sigma * alternative.unit:.2g}",
+        sign=by_sign(value, *alternative.signs),
+    )
+    return Doubt(
+        kind=kind,
+        value=value,
+        sigma=sigma,
+        ratio=(value / max(sigma, 1e-300)) ** 2,
+        freedom=freedom if scatter > noise else np.inf,
+        moved=float(np.max(np.abs(moves), initial=0.0)),
+        words=f"{words}: {alternative.remedy}",
+    )
 
 
 def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
@@ -336,10 +337,10 @@ def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):
         return None
     best = weigh(solution, HELD, stated)[0]
     far_better = best.ratio > max((offset / sigma) ** 2 / AS_GOOD, INSTEAD**2)
-    if best.kind != "bearings" or not far_better:
+    if best.kind != Kind.BEARINGS or not far_better:
         return None
     for free in weigh(solution, admitted_offset, stated):
-        if free.kind == "bearings" and abs(best.value - free.value) > ASKED * free.sigma:
+        if free.kind == Kind.BEARINGS and abs(best.value - free.value) > ASKED * free.sigma:
             return None
     if best.moved < MOVED and not _certain(best, stated):
         return None
@@ -348,64 +349,88 @@ def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):
     )
 
 
-def far_from_stated(joint):
-    """What lies far from where session.json puts it (JointCalibration): list of words and by what
-    angle (radians).
+@dataclass(frozen=True)
+class Far:
+    """Something that lies far from where it is stated: in words, and by what angle (radians)."""
+
+    words: str
+    angle: float
+
+
+def far_from_stated(joint) -> list[Far]:
+    """What lies far from where session.json puts it.
 
     A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of
     the other sense turns the axis about: only the statement of the platform, a camera's guess, or
     its name can tell.
+
+    Parameters
+    ----------
+    joint : JointCalibration
     """
+    far = far_axis(joint) + far_cameras(joint)
+    return far or exchanged_sides(joint.solution)
+
+
+def far_axis(joint):
+    """The tilt axis, if it is Far from where it is stated."""
     session = joint.prepared.session
     solution = joint.solution
+    if session.T_head_lrf is None or not joint.settings["axis"]:
+        return []
+    apart = axis_difference(solution.axis, axis_of(session.T_head_lrf))
+    variance = np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1)
+    sigma = np.hypot(session.platform_sigma, np.sqrt(variance))
+    if np.all(apart <= FAR * sigma):
+        return []
+    words = f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
+    return [Far(words, apart[0])]
+
+
+def guesses_of(session: Session) -> dict[str, RigidTransform]:
+    """Where session.json guesses cameras to stand, by name.
+
+    Parameters
+    ----------
+    session
+    """
+    cameras = session.cameras.items()
+    return {name: camera.guess for name, camera in cameras if camera.guess is not None}
+
+
+def far_cameras(joint):
+    """Cameras that are Far from where they are guessed, or stand where another one is guessed."""
+    guesses = guesses_of(joint.prepared.session)
     far = []
-    why = (
-        "check its statement; bearings or pitch of the other sense, or exchanged folders of "
-        "cameras look like this"
-    )
-    if session.T_head_lrf is not None and joint.settings["axis"]:
-        found = axis_difference(solution.axis, axis_of(session.T_head_lrf))
-        own = np.sqrt(np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1))
-        if np.any(found > FAR * np.hypot(session.platform_sigma, own)):
-            far.append(
-                (
-                    f"the tilt axis lies {_apart(*found)} from where session.json states it: {why}",
-                    found[0],
-                )
-            )
-    guesses = {
-        name: found.guess for name, found in session.cameras.items() if found.guess is not None
-    }
-    for camera in (name for name in solution.transforms if name in guesses):
-        apart = {
-            name: transform_difference(solution.transforms[camera], guess)
-            for name, guess in guesses.items()
-        }
+    for camera, transform in joint.solution.transforms.items():
+        if camera not in guesses:
+            continue
+        apart = {name: transform_difference(transform, guess) for name, guess in guesses.items()}
         turn, shift = apart[camera]
         nearest = min(apart, key=lambda name: apart[name][0] * LEVER + apart[name][1])
         if turn > FAR_TURN or shift > FAR_SHIFT:
-            far.append(
-                (f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {why}", turn)
-            )
+            words = f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {CHECK}"
+            far.append(Far(words, turn))
         elif nearest != camera:
-            far.append(
-                (
-                    f"camera '{camera}' stands where camera '{nearest}' is said to stand: "
-                    "exchanged folders?",
-                    turn,
-                )
+            words = (
+                f"camera '{camera}' stands where camera '{nearest}' is said to stand: were the "
+                "folders exchanged?"
             )
-    sides = {camera: _seat(solution, camera)[0] for camera in solution.transforms if not far}
-    for left, right in permutations(sides, 2):
-        if "left" in left.lower() and "right" in right.lower() and sides[left] > sides[right]:
-            off = 1000 * (sides[left] - sides[right])
-            far.append(
-                (
-                    f"camera '{left}' sits {off:.0f} mm to the right of camera '{right}': "
-                    "exchanged folders?",
-                    0.0,
-                )
+            far.append(Far(words, turn))
+    return far
+
+
+def exchanged_sides(solution):
+    """Cameras that are called left and right, and stand the other way round."""
+    far = []
+    for left, right in permutations(solution.transforms, 2):
+        offset = _seat(solution, left)[0] - _seat(solution, right)[0]
+        if "left" in left.lower() and "right" in right.lower() and offset > 0:
+            words = (
+                f"camera '{left}' is {1000 * offset:.0f} mm to the right of camera '{right}': were "
+                "the folders exchanged?"
             )
+            far.append(Far(words, 0.0))
     return far
 
 
@@ -418,17 +443,21 @@ def _apart(angle, distance):
     return f"{np.degrees(angle):.1f} deg and {1000 * distance:.0f} mm"
 
 
-def places_of_cameras(solution):
-    """Where the cameras of a JointSolution stand, in words: who mixed up their folders sees it
-    here.
+def places_of_cameras(solution: JointSolution) -> list[str]:
+    """Where the cameras stand, in words: who mixed up their folders sees it here.
+
+    Parameters
+    ----------
+    solution
     """
-    words = []
+    sentences = []
     for camera in solution.transforms:
         x, y, z = 1000 * _seat(solution, camera)
-        sides = ((x, "right", "left"), (y, "before", "behind"), (z, "above", "below"))
-        places = [f"{abs(v):.0f} mm {names[int(v < 0)]}" for v, *names in sides]
-        words.append(
-            f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the "
-            "range finder."
+        side = by_sign(x, "right", "left")
+        before = by_sign(y, "in front of", "behind")
+        above = by_sign(z, "above", "below")
+        sentences.append(
+            f"Seen along the middle beam, camera '{camera}' is {abs(x):.0f} mm to the {side} of, "
+            f"{abs(y):.0f} mm {before} and {abs(z):.0f} mm {above} the range finder."
         )
-    return words
+    return sentences

@@ -4,13 +4,15 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc, fdtrc
 
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
-from lrfcal_lib.preprocess.intrinsics import adjust_robust, raised_points
+from lrfcal_lib.preprocess.bundle import adjust_robust
+from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_solution import JointSolution
@@ -91,7 +93,7 @@ class Step:
 
     camera: int
     row: int
-    p_value: float
+    p_value: float = 0.0
     change: np.ndarray | None = None
 
 
@@ -115,32 +117,23 @@ def camera_changes(
     list of CameraChange
         In the order in which they were found, the clearest first.
     """
-    camera_of = {name: name for name in solution.observations.cameras}
-    changes = []
+    cameras = list(solution.observations.cameras)  # of the poses
+    changes: list[CameraChange] = []
     while len(changes) < MOST_CHANGES and (step := likeliest_step(solution)):
-        name = solution.observations.cameras[step.camera]
-        camera = camera_of[name]
+        camera = cameras[step.camera]
         # errors of the intrinsics make small steps out of nothing, which no estimate confirms
         if largest_motion(solution, step, prepared.models[camera]) < LEAST_SIZE:
             return changes
-        later = f"{camera} from placement {solution.observations.placements[step.row]}"
-        parted = with_two_poses(solution.observations, step, later)
-        try:
-            solution = solve_joint(parted, required=False, **settings)
-        except DegenerateGeometry:
+        parted = with_change(solution.observations, step, camera, prepared, settings)
+        if parted is None:
             return changes
-        if not {name, later} <= solution.transforms.keys():
-            return changes
-        change = change_between(solution, name, later, camera, prepared)
-        if not (change.moved or change.zoomed):
-            return changes
-        camera_of[later] = camera
+        solution, change = parted
+        cameras.append(camera)
         changes.append(change)
         if change.zoomed:  # two poses do not make up for that: what is left looks like more steps
             return changes
     # what is hopeless also with two poses of a camera has another cause
-    explained = max(solution.noise["face_scale"], solution.noise["view_scale"]) < NOISY
-    return changes if solution.converged and explained else []
+    return changes if explains(solution) else []
 
 
 def large_changes(obs: JointObservations, prepared: Prepared, settings: dict) -> list[CameraChange]:
@@ -165,55 +158,60 @@ def large_changes(obs: JointObservations, prepared: Prepared, settings: dict) ->
         return []
     for index, camera in enumerate(obs.cameras):
         others = [name for name in obs.cameras if name != camera]
-        with suppress(DegenerateGeometry):
+        try:
             without = solve_joint(obs.with_cameras(others), required=False, **settings)
-            if not without.converged or len(without.boards) < FEWEST_PLACEMENTS:
-                continue
+        except DegenerateGeometry:
+            continue
+        if without.converged and len(without.boards) >= FEWEST_PLACEMENTS:
             known = obs.select(without.boards)
-            step = Step(index, row_of_largest_step(known, index, without), 0.0)
-            later = f"{camera} from placement {known.placements[step.row]}"
-            parted = with_two_poses(known, step, later)
-            solution = solve_joint(parted, required=False, **settings)
-            noise = max(solution.noise["face_scale"], solution.noise["view_scale"])
-            if (
-                {camera, later} <= solution.transforms.keys()
-                and solution.converged
-                and noise < NOISY
-            ):
-                change = change_between(solution, camera, later, camera, prepared)
-                if change.moved or change.zoomed:
-                    return [change]
+            step = Step(index, row_of_largest_step(known, index, without))
+            parted = with_change(known, step, camera, prepared, settings)
+            if parted is not None and explains(parted[0]):
+                return [parted[1]]
     return []
 
 
+def explains(solution: JointSolution) -> bool:
+    """Whether an estimate leaves residuals that are anything like the noise.
+
+    Parameters
+    ----------
+    solution
+    """
+    noise = solution.noise
+    return solution.converged and max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
+
+
+def with_change(obs, step, camera, prepared, settings):
+    """The estimate with two poses of a camera and the CameraChange between them; None if none."""
+    first = obs.cameras[step.camera]
+    later = f"{camera} from placement {obs.placements[step.row]}"
+    with suppress(DegenerateGeometry):
+        solution = solve_joint(with_two_poses(obs, step, later), required=False, **settings)
+        if {first, later} <= solution.transforms.keys():
+            change = change_between(solution, first, later, camera, prepared)
+            if change.moved or change.zoomed:
+                return solution, change
+    return None
+
+
 def row_of_largest_step(obs, camera, solution):
-    """The row of placements from which on the poses of a camera (index) are others.
+    """The row of placements at which the pose of a camera (index) changes most.
 
     `solution` knows the boards from other cameras and scans.
     """
     mine = np.flatnonzero(obs.view_camera == camera)
     rows = obs.view_placement[mine]
-    poses = []
-    for view, row in zip(mine, rows, strict=True):
-        board = solution.boards[int(obs.placements[row])]
-        pose = RigidTransform.from_matrix(obs.view_pose[view]) * board.inv()
-        if obs.mounts[camera] == "head":
-            turn = Rotation.from_rotvec([obs.view_pitch[view], 0.0, 0.0])
-            pose = pose * RigidTransform.from_rotation(turn)
-        poses.append(pose)
-    turns = [(pose.rotation * poses[0].rotation.inv()).as_rotvec() for pose in poses]
-    shifts = [pose.translation for pose in poses]
-    numbers = np.column_stack([LEVER * np.array(turns), shifts])
-
-    def scatter(row):
-        """What is left with two poses, one before and one from a row on."""
-        parts = (numbers[rows < row], numbers[rows >= row])
-        return sum(np.abs(part - np.median(part, axis=0)).sum() for part in parts)
-
-    places = range(BESIDE, len(obs.placements) - BESIDE + 1)
-    return min(
-        (row for row in places if _seen_beside(obs, camera, row)), key=scatter, default=BESIDE
-    )
+    boards = [solution.boards[int(number)] for number in obs.placements[rows]]
+    poses = RigidTransform.from_matrix(obs.view_pose[mine])
+    poses = poses * RigidTransform.concatenate(boards).inv()
+    if obs.mounts[camera] == "head":
+        turns = np.outer(obs.view_pitch[mine], [1.0, 0.0, 0.0])
+        poses = poses * RigidTransform.from_rotation(Rotation.from_rotvec(turns))
+    turns = (poses.rotation * poses[0].rotation.inv()).as_rotvec()
+    by_view = pd.DataFrame(np.column_stack([LEVER * turns, poses.translation]))
+    steps = by_view.groupby(rows).median().diff().abs().sum(axis=1)
+    return int(steps.iloc[BESIDE : len(steps) - BESIDE + 1].idxmax())
 
 
 def likeliest_step(solution):
@@ -233,8 +231,7 @@ def likeliest_step(solution):
         columns = solution.columns(f"{name}_")
         for row in range(BESIDE, last + 1):
             if _seen_beside(solution.observations, camera, row):
-                p_value, change = _chance_of_step(score, columns, row)
-                tested.append(Step(camera, row, p_value, change))
+                tested.append(Step(camera, row, *_chance_of_step(score, columns, row)))
     best = min(tested, key=lambda step: step.p_value, default=None)
     if best is None or best.p_value * len(tested) > LEVEL:
         return None
@@ -259,7 +256,8 @@ def _chance_of_step(score, columns, row):
     repeated = np.concatenate([np.arange(shared), columns])
     kept = np.ones((count, len(repeated)))
     kept[~later, shared:] = 0.0
-    whole = score.information[:, repeated][:, :, repeated] * kept[:, :, None] * kept[:, None, :]
+    both = kept[:, :, None] * kept[:, None, :]
+    whole = both * score.information[:, repeated[:, None], repeated]
     gradient = score.gradient[:, repeated] * kept
 
     covariance = np.linalg.pinv(whole.sum(axis=0), rcond=RCOND, hermitian=True)
@@ -306,13 +304,15 @@ def change_between(solution, first, later, camera, prepared):
     change = solution.transforms[later] * solution.transforms[first].inv()
     shift = solution.transforms[later].translation - solution.transforms[first].translation
     both = solution.covariance(f"{first}_", f"{later}_")
-    spread = both[:POSE, :POSE] + both[POSE:, POSE:] - both[:POSE, POSE:] - both[POSE:, :POSE]
+    later_less_first = np.hstack([-np.eye(POSE), np.eye(POSE)])
+    spread = later_less_first @ both @ later_less_first.T
     sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
     both_parts = np.concatenate([change.rotation.as_rotvec(), shift])
     square = both_parts @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ both_parts
 
     views = obs.view_camera == index
-    middles = obs.view_pose[views, :3, :2] @ obs.corners.mean(axis=0) + obs.view_pose[views, :3, 3]
+    middle = [*obs.corners.mean(axis=0), 0.0]
+    middles = RigidTransform.from_matrix(obs.view_pose[views]).apply(middle)
     motion = project(middles, model) - project(change.inv().apply(middles), model)
     rows = np.unique(obs.view_placement[views])
     earlier = np.unique(obs.view_placement[obs.view_camera == obs.cameras.index(first)])

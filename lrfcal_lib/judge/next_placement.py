@@ -1,365 +1,42 @@
-"""What a joint estimate knows badly, and which placement would help most if recorded next."""
+"""Which placement of the board would help a joint estimate most if it were recorded next."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.judge.uncertainty import beams_to, marginal
+from lrfcal_lib.judge.findings import by_sign
+from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of, columns_of
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.solvers.joint import UNSEEN
-from lrfcal_lib.solvers.joint_solution import WORDS
+from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
+from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
+from lrfcal_lib.solvers.joint_solution import JointSolution
 
-LEANS = {"": (0, 0), "back": (-1, 0), "forward": (1, 0), "left": (0, -1), "right": (0, 1)}
-PLACES = {
-    "distances": (1.0, 1.5, 2.0, 2.5, 3.0),
-    "bearings": tuple(np.radians([-20, -10, 0, 10, 20])),
-    "elevations": tuple(np.radians([-12, 0, 12])),
-    "turns": tuple(np.radians(np.arange(0, 360, 60))),
-    "leans": tuple(np.radians([0, 35])),
+# how a board leans out of the upright plane that faces the LRF: turns about its x and y, degrees
+LEANS = {
+    "upright": (0, 0),
+    "leaning back by 35 deg": (-35, 0),
+    "leaning forward by 35 deg": (35, 0),
+    "facing left by 35 deg": (0, -35),
+    "facing right by 35 deg": (0, 35),
 }
-FIELD_OF_VIEW = (np.radians(40), np.radians(140))
-PITCH_LIMITS = (np.radians(-30), np.radians(30))
+# where the middle of a board is put
+PLACES = (
+    (1.0, 1.5, 2.0, 2.5, 3.0),  # metres from the LRF
+    (-20, -10, 0, 10, 20),  # degrees to the left
+    (-12, 0, 12),  # degrees up
+    (0, 60, 120, 180, 240, 300),  # degrees in the board's plane, anticlockwise as the rig sees it
+    range(len(LEANS)),
+)
+FIELD_OF_VIEW = (np.radians(40), np.radians(140))  # bearings, of the paper's LMS 200
+PITCH_LIMITS = (np.radians(-30), np.radians(30))  # of a head that is asked to look at a board
 LATTICE = np.linspace(*PITCH_LIMITS, 41)  # pitch angles that images are tried at
-# of each camera on the head, spread over the pitch angles at which every camera sees the board
-IMAGES = 3
-MARGIN = 0.02  # of the image, that a board keeps from its border
+IMAGES = 3  # of each camera on the head, spread over the pitch angles at which all see the board
+MARGIN = 0.04  # of the image, that a board keeps from its border, distortion included
 STEEPEST = np.radians(60.0)  # incidence of beams and of lines of sight
-THINNED = 3  # times fewer ranges and beams than a placement has, each counted as often: time
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
-# of a direction, components above this share of the largest are named, and so many of them
-LARGE = 0.5
-MOST = 3
-
-
-def outline(solution):
-    """Corners of the board, shape (e, 3), metres."""
-    corners = solution.observations.corners
-    return np.column_stack([corners, np.zeros(len(corners))])
-
-
-def board_grid(solution, distances, bearings, elevations, turns, leans):
-    """All combinations of a grid of poses, visible or not; leans above zero in four directions.
-
-    A DataFrame with distance of the board's middle from the LRF (metres), bearing to the left,
-    elevation, turn in the board's plane (anticlockwise as the rig sees it; 0 with the board's x to
-    the right), lean out of the upright plane that faces the LRF (radians), towards ('back' with the
-    top farther away, 'forward', 'left', 'right'; '' upright); and ``T_platform_board``, shape (n,
-    3, 4).
-    """
-    rows = []
-    for *place, lean, way in product(distances, bearings, elevations, turns, leans, LEANS):
-        if bool(lean) == bool(way):
-            rows.append((*place, lean, way))
-    columns = ["distance", "bearing", "elevation", "turn", "lean", "towards"]
-    places = pd.DataFrame(rows, columns=columns)
-    gaze = Rotation.from_euler("ZX", places[["bearing", "elevation"]])
-    tip = places[["lean"]].to_numpy() * [(*LEANS[way], 0) for way in places.towards]
-    spin = Rotation.from_rotvec(places[["turn"]].to_numpy() * [0.0, 0.0, 1.0])
-    face = gaze * geometry.AHEAD * Rotation.from_rotvec(tip) * spin
-    head = solution.T_head_lrf
-    rotation = (head.rotation * face).as_matrix()
-    ahead = gaze.apply([0.0, 1.0, 0.0])
-    centre = head.apply(places[["distance"]].to_numpy() * ahead)
-    origin = centre - rotation @ outline(solution).mean(axis=0)
-    return places, np.concatenate([rotation, origin[..., None]], axis=-1)
-
-
-def visible(boards, solution, models, field_of_view):
-    """Which boards (m,) lie wholly in all views, and the pitch angles (m, k) of their images."""
-    points = geometry.apply_pose(boards, outline(solution))
-    normals = boards[:, :, 2]
-    bearing, pitch, _ = beams_to(points, solution.T_head_lrf)
-    inside = (bearing > field_of_view[0]) & (bearing < field_of_view[1])
-    inside &= (pitch > PITCH_LIMITS[0]) & (pitch < PITCH_LIMITS[1])
-    inside &= _facing(points - solution.T_head_lrf.translation, normals)
-    rows = np.flatnonzero(inside.all(axis=1))
-    seen = np.ones((len(LATTICE), len(rows)), bool)
-    for name in solution.transforms:
-        pose = camera_poses(solution, name, LATTICE)
-        model = models[name]
-        p = geometry.apply_pose(pose[:, None], points[rows])
-        size = np.array([model.width, model.height])
-        uv = project(p, model)
-        border = MARGIN * size
-        # far outside the image the lens model folds back: only rays near the image count
-        depth = np.where(p[..., 2:] > 0, p[..., 2:], np.nan)
-        tangent = np.abs(p[..., :2] / depth)
-        near = tangent < 0.65 * size / [model.fx, model.fy]
-        inside = near & (uv > border) & (uv < size - border)
-        facing = _facing(p, geometry.rotate_points(pose, normals[rows]))
-        seen &= np.all(inside.all(axis=-1) & facing, axis=2)
-    ever = seen.any(axis=0)
-    seen = seen[:, ever]
-    first = np.argmax(seen, axis=0)
-    last = len(LATTICE) - 1 - np.argmax(seen[::-1], axis=0)
-    low = LATTICE[first]
-    high = LATTICE[last]
-    share = np.array([0.5])
-    if "head" in solution.observations.mounts:
-        share = np.linspace(0, 1, IMAGES)
-    return rows[ever], low[:, None] + (high - low)[:, None] * share
-
-
-def _facing(sight, normals):
-    """Whether lines of sight (..., n, k, 3) meet the fronts of boards (..., n, 3) steeply."""
-    towards = -np.sum(sight * normals[..., None, :], axis=-1)
-    return towards > np.cos(STEEPEST) * np.linalg.norm(sight, axis=-1)
-
-
-def camera_poses(solution, name, pitch):
-    """``T_camera_platform`` of a camera at pitch angles (n,), shape (n, 3, 4)."""
-    pose = geometry.pose_array(solution.camera_at(name, pitch))
-    return np.broadcast_to(pose, (len(pitch), 3, 4))
-
-
-def _view_covariance(pose, features, model):
-    """Covariance (n, 6, 6) of board poses (n, 4, 4) in a camera from features known to 1 px."""
-    turned = geometry.rotate_points(pose[:, :3], features)
-    by_point = project_jacobians(turned + pose[:, None, :3, 3], model)[0]
-    J = geometry.gradient_by_pose(turned[..., None, :], by_point)
-    return np.linalg.inv(np.einsum("nkai,nkaj->nij", J, J))
-
-
-def typical_placement(solution):
-    """Number of the placement of median information."""
-    by_unknown = np.diagonal(solution.information(), axis1=1, axis2=2)
-    told = by_unknown @ scales_of(solution, solution.solution.names) ** 2
-    return list(solution.boards)[np.argsort(told)[len(told) // 2]]
-
-
-def points_on_board(solution, placement, bearing, pitch):
-    """Where beams (k,) meet the plane of a placement's board, metres in its frame, (k, 3)."""
-    board = solution.boards[placement]
-    pitch = solution.corrections.pitch(placement, pitch)
-    ray = geometry.polar_to_points(1.0, bearing)
-    ends = board.inv().apply(geometry.lrf_to_platform(ray, pitch, solution.T_head_lrf))
-    start = board.inv().apply(geometry.lrf_to_platform(0 * ray, pitch, solution.T_head_lrf))
-    way = ends - start
-    return start - start[:, 2:] / way[:, 2:] * way
-
-
-def spot_growth(solution):
-    """Radius of the spot by distance, a polynomial."""
-    obs = solution.observations
-    radius = pd.Series(obs.beam_radius).groupby(obs.beam_placement).median()
-    distance = np.linalg.norm(solution.board_poses[radius.index, :, 3], axis=1)
-    if not len(radius):
-        return np.array([0.0, 0.005])
-    if len(radius) < 2 or np.ptp(distance) < 0.1 or np.ptp(radius) < 1e-6:
-        return np.array([0.0, radius.median()])
-    return np.polyfit(distance, radius, 1)
-
-
-def _views(boards, pitches, solution, models, features):
-    """Poses of the boards in all images, as well known beside 1 px as the recorded ones are."""
-    obs = solution.observations
-    parts = []
-    if features is None:
-        corners = outline(solution)
-        middles = (corners + np.roll(corners, 1, axis=0)) / 2
-        features = np.concatenate([corners, middles])
-    for number, (name, mount) in enumerate(zip(solution.transforms, obs.mounts, strict=True)):
-        model = models[name]
-        mine = obs.view_camera == number
-        pixels = np.ones(6)
-        if mine.any():
-            expected = _view_covariance(obs.view_pose[mine], features, model)
-            ratio = obs.view_covariance[mine] / expected
-            pixels = np.sqrt(np.median(np.diagonal(ratio, axis1=1, axis2=2), axis=0))
-        images = pitches if mount == "head" else pitches[:, :1]
-        for pitch in images.T:
-            T_camera_platform = geometry.pose_transform(camera_poses(solution, name, pitch))
-            pose = (T_camera_platform * geometry.pose_transform(boards)).as_matrix()
-            covariance = _view_covariance(pose, features, model)
-            part = {
-                "view_camera": np.full(len(pitch), number),
-                "view_pitch": pitch,
-                "view_pose": pose,
-                "view_covariance": covariance * np.outer(pixels, pixels),
-                "view_placement": np.arange(len(pitch)),
-                "view_lens": np.zeros((len(pitch), 6, 9)),
-            }
-            parts.append(part)
-    if not parts:
-        return {}
-    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-
-
-def candidate_information(boards, pitches, solution, models, features=None):
-    """Information that each candidate would add about the shared unknowns, shape (n, c, c).
-
-    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images. A candidate
-    shows what the typical placement of the recording showed, points of the face and beams about the
-    edges, from where it stands: spots grow with the distance, and beams get fewer the smaller the
-    board looks. Cameras see `features` of it (k, 3), those of its outline when left out. Its own
-    pose and sweep are eliminated; at the noise levels of the solution.
-    """
-    home = typical_placement(solution)
-    typical = solution.observations.select([home])
-    typical = typical.keep(
-        face=np.arange(len(typical.face_range)) % THINNED == 0,
-        beam=np.arange(len(typical.beam_hit)) % THINNED == 0,
-    )
-    middle = outline(solution).mean(axis=0, keepdims=True)
-    home_board = geometry.pose_array(solution.boards[home])[None]
-    _, distance, size = _as_seen(home_board, middle, solution.T_head_lrf)
-    pitch, away, seen = _as_seen(boards, middle, solution.T_head_lrf)
-    # as many more of them as the board looks larger, at most as many as a placement has
-    recorded = max(np.bincount(solution.observations.face_placement).max(initial=0), 1)
-    most = np.sqrt(recorded / max(THINNED * len(typical.face_range), 1))
-    more = np.minimum(seen / size, most)
-    spot = spot_growth(solution)
-    grown = np.polyval(spot, away) / np.polyval(spot, distance)
-    farther = replace(
-        typical,
-        placements=np.arange(len(boards)),
-        direction=np.ones(len(boards), int),
-        middle=pitch[:, 0],
-        **_faces(typical, home, boards, more, solution),
-        **_edge_beams(typical, home, boards, grown, away / distance, solution),
-        **_views(boards, pitches, solution, models, features),
-    )
-    return solution.forecast(farther, boards, THINNED * more[:, 0], home)
-
-
-def _faces(typical, home, boards, more, solution):
-    """Ranges to the points of a typical face on other boards (n, 3, 4), `more` (n, 1) times as
-    many.
-    """
-    points = points_on_board(solution, home, typical.face_bearing, typical.face_pitch)
-    bearing, pitch, distance = _beams(points, boards, solution)
-    return {
-        "face_range": distance.ravel(),
-        "face_bearing": bearing.ravel(),
-        "face_pitch": pitch.ravel(),
-        "face_sigma": (typical.face_sigma / (THINNED**0.5 * more)).ravel(),
-        "face_placement": np.repeat(np.arange(len(boards)), len(points)),
-    }
-
-
-def _edge_beams(typical, home, boards, grown, farther, solution):
-    """Beams about the edges of other boards (n, 3, 4) where spots and distances have grown
-    (n, 1).
-    """
-    points = points_on_board(solution, home, typical.beam_bearing, typical.beam_pitch)
-    # beams stay as many spots off the edge as they were
-    line = typical.lines()[typical.beam_edge]
-    off = np.sum((points + [0, 0, 1.0]) * line, axis=-1)
-    moved = points + (grown * off - off)[..., None] * line * [1.0, 1.0, 0.0]
-    bearing, pitch, _ = _beams(moved, boards, solution)
-    n = len(boards)
-    return {
-        "beam_bearing": bearing.ravel(),
-        "beam_pitch": pitch.ravel(),
-        "beam_hit": np.tile(typical.beam_hit, n),
-        "beam_edge": np.tile(typical.beam_edge, n),
-        "beam_radius": (typical.beam_radius * grown).ravel(),
-        "beam_background": np.tile(typical.beam_background, n),
-        "beam_step": (typical.beam_step * farther).ravel(),
-        "beam_placement": np.repeat(np.arange(n), len(points)),
-    }
-
-
-def _as_seen(boards, middle, T_head_lrf):
-    """Pitch and range (n, 1) of beams to the middle (1, 3) of boards (n, 3, 4), and their size."""
-    points = geometry.apply_pose(boards, middle)
-    _, pitch, away = beams_to(points, T_head_lrf)
-    sight = points - T_head_lrf.translation
-    cosine = np.abs(np.vecdot(sight, boards[:, None, :, 2])) / away
-    return pitch, away, np.sqrt(cosine) / away
-
-
-def _beams(points, boards, solution):
-    """Recorded bearing and pitch, and range (n, k) of beams to points (..., k, 3) on boards (n, 3,
-    4).
-    """
-    bearing, pitch, distance = beams_to(geometry.apply_pose(boards, points), solution.T_head_lrf)
-    return bearing, pitch / (1 + solution.sensor["pitch_scale"]), distance
-
-
-@dataclass(frozen=True)
-class Direction:
-    """A combination of unknowns that is known more or less well by itself.
-
-    `sigma` is its standard deviation, metres at a distance of 2 m; inf where it is not observed.
-    """
-
-    words: str
-    sigma: float
-
-
-def scales_of(solution, names):
-    """How much of each unknown makes a metre at 2 m."""
-    radii = solution.observations.beam_radius
-    radius = np.median(radii) if len(radii) else 0.01
-    turns = (*AXIS_NAMES[:2], "pitch_scale", "pitch_by_direction")
-    scales = np.ones(len(names))
-    for i, name in enumerate(names):
-        if name == "edge_log_odds":
-            scales[i] = 2.0 / radius
-        elif name in turns or name.endswith(("_rx", "_ry", "_rz")):
-            scales[i] = 1 / RADIUS
-    return scales
-
-
-def observability(solution):
-    """Directions of the scaled information of a JointSolution, a list, the least known first.
-
-    The softness of the edges is eliminated.
-    """
-    names = np.array(solution.solution.names)
-    index = np.flatnonzero(names != "edge_log_softness")
-    scales = scales_of(solution, names[index])
-    H = marginal(solution.information().sum(axis=0), index) * scales[:, None] * scales
-    values, vectors = np.linalg.eigh(H)
-    least = max(1e-13 * values[-1], UNSEEN**-2)
-    cameras = tuple(solution.transforms)
-    sigmas = np.where(values > least, np.maximum(values, least) ** -0.5, np.inf)
-    out = []
-    for vector, sigma in zip(vectors.T, sigmas.tolist(), strict=True):
-        out.append(Direction(direction_words(vector, names[index], cameras), sigma))
-    return out
-
-
-def direction_words(direction, names, cameras):
-    """A direction (k,) of unknowns, scaled to metres at 2 m, in words.
-
-    What cameras have in common is said once.
-    """
-    relative = np.asarray(direction) / np.max(np.abs(direction))
-    value = dict(zip(names, relative, strict=True))
-    words = [(abs(value[name]), what) for name, what in WORDS.items() if name in value]
-    kinds = {
-        "rotation about": geometry.POSE_NAMES[:3],
-        "shift along": geometry.POSE_NAMES[3:],
-    }
-    for kind, part in kinds.items():
-        vectors = {}
-        for camera in cameras:
-            vectors[f"camera '{camera}'"] = np.array([value[f"{camera}_{p}"] for p in part])
-        for who, vector in _in_common(vectors).items():
-            size = np.linalg.norm(vector)
-            axes = np.array(["x", "y", "z"])[np.abs(vector) > 0.4 * size]
-            if size:
-                words.append((size, f"{kind} {' and '.join(axes)} of {who}"))
-    words.sort(key=lambda pair: -pair[0])
-    least = LARGE * words[0][0]
-    return " with ".join(what for size, what in words[:MOST] if size > least)
-
-
-def _in_common(vectors):
-    """Their mean as that of all cameras where the vectors (3,) of several cameras are alike."""
-    if len(vectors) > 1:
-        mean = np.mean([*vectors.values()], axis=0)
-        apart = max(np.linalg.norm(vector - mean) for vector in vectors.values())
-        if apart < 0.3 * np.linalg.norm(mean):
-            return {"all cameras": mean}
-    return vectors
 
 
 @dataclass(frozen=True)
@@ -369,138 +46,273 @@ class Suggestion:
     Attributes
     ----------
     T_platform_board : RigidTransform
-    place : Series
-        A row of :func:`board_grid`.
+    place : tuple of float
+        Distance (metres), bearing, elevation and turn (degrees), number of `LEANS`.
     pitches : ndarray, shape (k,)
-        Of the images, radians; None where no camera is on the head.
-    before, after : dict of str to float
-        Standard deviation of 'axis' and of each camera, metres at 2 m (root of the sum of the
-        variances of rotation times 2 m and of translation), of the propagated noise.
+        Of the images, radians; empty where no camera is on the head.
     gain, median_gain : float
-        By how much the standard deviation of all of them shrinks, a fraction; of all candidates,
-        what a placement chosen blindly brings.
+        By how much the standard deviation of axis and cameras together shrinks, a fraction, at the
+        propagated noise; of all candidates, what a placement chosen blindly brings.
     """
 
     T_platform_board: RigidTransform
-    place: pd.Series
-    pitches: np.ndarray | None
-    before: dict
-    after: dict
+    place: tuple[float, ...]
+    pitches: np.ndarray
     gain: float
     median_gain: float
 
-    def words(self):
+    def words(self) -> str:
         """The pose in words, like ``board 1.5 m ahead, 20 deg to the left, upright``."""
-        place = self.place
-        parts = [f"board {self.place.distance:.1f} m ahead"]
-        right_or_left = "to the left" if place.bearing > 0 else "to the right"
-        down_or_up = "up" if place.elevation > 0 else "down"
-        for angle, way in ((place.bearing, right_or_left), (place.elevation, down_or_up)):
-            if round(np.degrees(angle)):
-                parts.append(f"{abs(np.degrees(angle)):.0f} deg {way}")
-        if round(np.degrees(place.turn)):
-            parts.append(f"turned {np.degrees(place.turn):.0f} deg in its plane")
-        parts.append(self.lean_words())
-        words = ", ".join(parts)
-        if self.pitches is None:
-            return words
-        *most, last = [f"{np.degrees(p):+.0f}" for p in self.pitches]
-        return f"{words}; images at pitch {', '.join(most)} and {last} deg"
+        distance, bearing, elevation, turn, lean = self.place
+        parts = [f"board {distance:.1f} m ahead"]
+        if bearing:
+            parts.append(f"{abs(bearing):.0f} deg to the {by_sign(bearing, 'left', 'right')}")
+        if elevation:
+            parts.append(f"{abs(elevation):.0f} deg {by_sign(elevation, 'up', 'down')}")
+        if turn:
+            parts.append(f"turned by {turn:.0f} deg in its plane")
+        words = ", ".join([*parts, list(LEANS)[int(lean)]])
+        if len(self.pitches):
+            *most, last = [f"{pitch:+.0f}" for pitch in np.degrees(self.pitches)]
+            words += f"; images at pitch {', '.join(most)} and {last} deg"
+        return words
 
-    def lean_words(self):
-        """How the board leans."""
-        towards = self.place.towards
-        if not towards:
-            return "upright"
-        way = f"leaning {towards}" if towards in ("back", "forward") else f"facing {towards} by"
-        return f"{way} {np.degrees(self.place.lean):.0f} deg"
-
-    def sentence(self):
+    def sentence(self) -> str:
         """What to record next and what it brings."""
-        known = []
-        for name, sigma in self.before.items():
-            after = brief(1000 * self.after[name])
-            known.append(f"{name} {brief(1000 * sigma)} to {after} mm")
-        gain = f"{100 * self.gain:.0f} % less"
-        blindly = f"a blindly chosen placement: {100 * self.median_gain:.0f} %"
         return (
-            f"Record next: {self.words()}. Predicted standard deviations at 2 m: "
-            f"{', '.join(known)} ({gain}; {blindly})."
+            f"Record next: {self.words()}. The standard deviations of axis and cameras would "
+            f"shrink by about {100 * self.gain:.0f} % (after a placement chosen blindly by "
+            f"{100 * self.median_gain:.0f} %)."
         )
 
 
-def brief(value):
-    """A number with two digits, or more before the point."""
-    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
-
-
-def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features=None, places=None):
+def suggest_placement(
+    solution: JointSolution,
+    models: dict[str, CameraModel],
+    field_of_view: tuple[float, float] = FIELD_OF_VIEW,
+) -> Suggestion:
     """The board pose and pitch angles of images that would make axis and cameras known best.
 
-    Their summed variances are made least.
+    Of a grid of poses that the LRF and all cameras see, the one that leaves the least sum of their
+    variances.
 
     Parameters
     ----------
-    solution : JointSolution
-    models : dict of str to CameraModel
-        Of every camera of the solution; a ValueError where one is missing.
-    field_of_view : tuple of float
+    solution
+    models
+        Of every camera of the solution.
+    field_of_view
         Bearings that the LRF measures, radians.
-    features : ndarray, shape (k, 3), optional
-        What the cameras see of the board (its pattern), metres.
-    places : dict of str to sequence of float, optional
-        Replaces entries of `PLACES`.
 
     Raises
     ------
     DegenerateGeometry
         When no pose of the grid is seen by all.
     """
-    missing = [c for c in solution.transforms if c not in models]
-    if missing:
-        raise ValueError(
-            f"camera '{missing[0]}' has no intrinsics: give its CameraModel in `models`"
-        )
-    grid, boards = board_grid(solution, **PLACES | (places or {}))
-    rows, pitches = visible(boards, solution, models, field_of_view)
-    if len(rows) == 0:
+    grid = np.array(list(product(*PLACES)))
+    boards = board_poses(solution, grid)
+    pitches = pitches_of_images(boards, solution, models, field_of_view)
+    seen = np.isfinite(pitches[:, 0])
+    if not seen.any():
         low, high = np.degrees(PITCH_LIMITS)
-        raise geometry.DegenerateGeometry(
+        raise DegenerateGeometry(
             f"none of {len(grid)} board poses lies wholly in the view of the LRF and of all "
-            f"cameras at a pitch from {low:.0f} to {high:.0f} deg: give other distances, wider "
-            "limits, or check the calibration"
+            f"cameras at a pitch from {low:.0f} to {high:.0f} deg: check the field of view and "
+            "the calibration"
         )
+    grid = grid[seen]
+    boards = boards[seen]
+    pitches = pitches[seen]
     known = solution.information().sum(axis=0)
-    added = candidate_information(boards[rows], pitches, solution, models, features)
-    # what is not observed counts as known to a metre at 2 m, not better, so that it can be compared
-    # as well
-    scales = scales_of(solution, solution.solution.names)
-    unit = np.outer(scales, scales)
-    prior = np.eye(len(unit))
-    before = group_sigma(np.linalg.inv(known * unit + prior) * unit, solution)
-    after = group_sigma(np.linalg.inv((known + added) * unit + prior) * unit, solution)
-    total = np.sqrt(sum(sigma**2 for sigma in before.values()))
-    totals = np.sqrt(sum(sigma**2 for sigma in after.values()))
-    best = int(np.argmin(totals))
-    gains = 1 - totals / total
-    T_platform_board = geometry.pose_transform(boards[rows[best]])
-    place = grid.iloc[rows[best]]
-    pitches = pitches[best] if "head" in solution.observations.mounts else None
-    after = {name: sigma[best] for name, sigma in after.items()}
+    added = candidate_information(boards, pitches, solution, models)
+    before = total_sigma(known, solution)
+    after = total_sigma(known + added, solution)
+    best = int(np.argmin(after))
+    if "head" not in solution.observations.mounts:
+        pitches = pitches[:, :0]
     return Suggestion(
-        T_platform_board, place, pitches, before, after, gains[best], np.median(gains)
+        T_platform_board=geometry.pose_transform(boards[best]),
+        place=tuple(grid[best].tolist()),
+        pitches=pitches[best],
+        gain=float(1 - after[best] / before),
+        median_gain=float(1 - np.median(after) / before),
     )
 
 
-def group_sigma(covariance, solution):
-    """Standard deviations of axis and cameras, metres at 2 m, from covariances (..., c, c)."""
-    names = np.array(solution.solution.names)
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1) / scales_of(solution, names) ** 2
-    groups = {"axis": np.isin(names, AXIS_NAMES)}
+def total_sigma(information, solution):
+    """Standard deviation of axis and cameras together, metres at 2 m, from information (..., c, c).
+
+    What is not observed counts as known to a metre at 2 m, so that it can be compared as well.
+    """
+    scales = scales_of(solution)
+    unit = np.outer(scales, scales)
+    covariance = np.linalg.inv(information * unit + np.eye(len(unit))) * unit
+    return np.sqrt(sum(sigma**2 for sigma in group_sigma(covariance, solution).values()))
+
+
+def scales_of(solution: JointSolution) -> np.ndarray:
+    """How much of each pose, (c,), shifts what lies 2 m away by a metre; 1 of other unknowns."""
+    turns = [*AXIS_NAMES[:2], "pitch_scale", "pitch_by_direction"]
     for camera in solution.transforms:
-        groups[camera] = np.char.startswith(names, f"{camera}_")
-    out = {}
-    for name, rows in groups.items():
-        if rows.any():
-            out[name] = np.sqrt(variance[..., rows].sum(axis=-1))
-    return out
+        turns += [f"{camera}_{name}" for name in POSE_NAMES[:3]]
+    return np.where(np.isin(solution.solution.names, turns), 1 / RADIUS, 1.0)
+
+
+def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np.ndarray]:
+    """Standard deviations of axis and cameras, metres at 2 m, from covariances of the unknowns.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., c, c)
+    solution
+
+    Returns
+    -------
+    dict of str to ndarray, shape (...)
+        Of 'axis' and of each camera, as far as they were unknown.
+    """
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1) / scales_of(solution) ** 2
+    columns = {"axis": solution.columns("axis_") + solution.columns("offset_")}
+    for camera in solution.transforms:
+        columns[camera] = solution.columns(f"{camera}_")
+    return {
+        name: np.sqrt(variance[..., index].sum(axis=-1)) for name, index in columns.items() if index
+    }
+
+
+def outline(solution: JointSolution) -> np.ndarray:
+    """Corners of the board, shape (e, 3), metres.
+
+    Parameters
+    ----------
+    solution
+    """
+    corners = solution.observations.corners
+    return np.column_stack([corners, np.zeros(len(corners))])
+
+
+def sights(boards: np.ndarray, solution: JointSolution) -> np.ndarray:
+    """From the LRF to the middles of boards ``T_platform_board`` (n, 3, 4): metres, (n, 3)."""
+    middle = geometry.apply_pose(boards, outline(solution).mean(axis=0, keepdims=True))
+    return middle[:, 0] - solution.T_head_lrf.translation
+
+
+def board_poses(solution, grid):
+    """``T_platform_board`` (n, 3, 4) of boards at the places (n, 5) of a grid, see `PLACES`."""
+    distance, bearing, elevation, turn, lean = grid.T
+    gaze = Rotation.from_euler("ZX", np.column_stack([bearing, elevation]), degrees=True)
+    leans = np.array([(*angles, 0) for angles in LEANS.values()])[lean.astype(int)]
+    tip = Rotation.from_rotvec(leans, degrees=True)
+    spin = Rotation.from_rotvec(turn[:, None] * [0, 0, 1], degrees=True)
+    rotation = solution.T_head_lrf.rotation * gaze * geometry.AHEAD * tip * spin
+    middle = solution.T_head_lrf.apply(distance[:, None] * gaze.apply([0.0, 1.0, 0.0]))
+    origin = middle - rotation.apply(outline(solution).mean(axis=0))
+    return np.concatenate([rotation.as_matrix(), origin[..., None]], axis=-1)
+
+
+def pitches_of_images(boards, solution, models, field_of_view):
+    """Pitch angles (n, k) of images in which all cameras see whole boards (n, 3, 4), radians.
+
+    NaN for boards that the LRF or a camera does not see wholly, or a camera too much from the side.
+    """
+    points = geometry.apply_pose(boards, outline(solution))
+    bearing, pitch, _ = beams_to(points, solution.T_head_lrf)
+    inside = (bearing > field_of_view[0]) & (bearing < field_of_view[1])
+    inside &= (pitch > PITCH_LIMITS[0]) & (pitch < PITCH_LIMITS[1])
+    visible = np.tile(inside.all(axis=1), (len(LATTICE), 1))
+    for name in solution.transforms:
+        for row, pitch in enumerate(LATTICE):
+            T_camera_platform = solution.camera_at(name, pitch)
+            p_camera = T_camera_platform.apply(points.reshape(-1, 3)).reshape(points.shape)
+            normals = T_camera_platform.rotation.apply(boards[:, :, 2])
+            visible[row] &= wholly_in_image(p_camera, normals, models[name])
+
+    first = LATTICE[np.argmax(visible, axis=0)]
+    last = LATTICE[len(LATTICE) - 1 - np.argmax(visible[::-1], axis=0)]
+    pitches = np.linspace(first, last, IMAGES, axis=1)
+    return np.where(visible.any(axis=0)[:, None], pitches, np.nan)
+
+
+def wholly_in_image(p_camera, normals, model):
+    """Which boards, by corners (n, e, 3) and normals (n, 3) in a camera's frame, are in view."""
+    size = np.array([model.width, model.height])
+    uv = pinhole(p_camera, model)  # far outside the image a lens model would fold back
+    inside = (uv > MARGIN * size) & (uv < size - MARGIN * size) & (p_camera[..., 2:] > 0)
+    towards = -np.vecdot(p_camera, normals[:, None])
+    facing = towards > np.cos(STEEPEST) * np.linalg.norm(p_camera, axis=-1)
+    return np.all(inside.all(axis=-1) & facing, axis=1)
+
+
+def candidate_information(boards, pitches, solution, models):
+    """Information that boards would add about the shared unknowns, shape (n, c, c).
+
+    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images. Points of a
+    board that a scan knows, with its errors, are compared with where images show them; all images
+    share the errors of the one scan.
+    """
+    obs = solution.observations
+    beams = beams_to(geometry.apply_pose(boards, points_of_face(solution)), solution.T_head_lrf)
+    images = [pitches if mount == "head" else pitches[:, :1] for mount in obs.mounts]
+    count = sum(at.shape[1] for at in images)
+    by_scan = np.sqrt(count) * scan_sigma(solution, boards)[:, None]
+    unknowns = len(solution.solution.names)
+    information = np.zeros((len(boards), unknowns, unknowns))
+    for camera, at in zip(obs.cameras, images, strict=True):
+        model = models[camera]
+        by_image = image_sigma(solution, camera, model)
+        chain = chain_of(solution, camera)
+        links = columns_of(solution, camera)
+        unknown = links >= 0
+        index = links[unknown]
+        for pitch in at.T:
+            p_camera, by_link, _ = carried(chain, *beams, image_pitch=pitch[:, None])
+            by_point = project_jacobians(p_camera, model)[0]
+            sigma = np.hypot(by_image, by_scan * model.fx / p_camera[..., 2])
+            J = (by_point @ by_link)[..., unknown] / sigma[..., None, None]
+            J = J.reshape(len(boards), -1, len(index))
+            information[:, index[:, None], index] += np.swapaxes(J, -1, -2) @ J
+    return information
+
+
+def points_of_face(solution):
+    """Points (e, 3) half-way from the middle of the board to its corners, metres.
+
+    They are spread about the middle as the face is.
+    """
+    corners = outline(solution)
+    return (corners + corners.mean(axis=0)) / 2
+
+
+def scan_sigma(solution, boards):
+    """Standard deviation of each of the :func:`points_of_face` of boards in a scan, metres, (n,).
+
+    As in the recorded scans, in proportion to how large the boards look from the LRF, and never
+    less.
+    """
+    by_shift = np.linalg.inv(solution.board_information()[:, 3:, 3:])
+    variance = len(outline(solution)) * np.linalg.trace(by_shift) / 3
+    usual = np.median(variance * solid_angle(solution, solution.board_poses))
+    return np.sqrt(np.maximum(usual / solid_angle(solution, boards), variance.min()))
+
+
+def solid_angle(solution, boards):
+    """How large boards (n, 3, 4) look from the LRF, relative to their area, (n,)."""
+    sight = sights(boards, solution)
+    distance = np.linalg.norm(sight, axis=1)
+    return np.abs(np.vecdot(sight, boards[:, :, 2])) / distance**3
+
+
+def image_sigma(solution, camera, model):
+    """Standard deviation of each of the :func:`points_of_face` in images of a camera, pixels.
+
+    So that together they tell shifts of the board as well as the recorded images do.
+    """
+    obs = solution.observations
+    number = obs.cameras.index(camera)
+    views = obs.view_camera == number
+    by_shift = np.linalg.inv(obs.view_covariance[views])[:, 3, 3]
+    by_pixel = (model.fx / obs.view_pose[views, 2, 3]) ** 2
+    variance = solution.noise["view_scale"] ** 2 * np.median(by_pixel / by_shift)
+    if obs.mounts[number] == "head":  # all points of an image share the error of its pitch
+        variance += (model.fx * solution.noise.get("sigma_pitch", 0.0)) ** 2
+    return np.sqrt(variance * len(points_of_face(solution)))

@@ -1,18 +1,33 @@
 """What is usable of every placement of the board, and why the rest is not."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import pandas as pd
 
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.preprocess.prepared import Prepared
 
-def placements_table(prepared, observations):
+
+def placements_table(
+    prepared: Prepared, observations: Mapping[tuple[str, str], CameraObservations]
+) -> pd.DataFrame:
     """Every placement of the board: what is usable of it, and why not.
 
-    Columns placement, used, reason, n_scan_lines, n_points, then one column ``edges_<camera>`` a
-    camera: the number of edges of the board that a scan crosses and the camera sees. `observations`
-    by camera and variant.
+    Parameters
+    ----------
+    prepared
+    observations
+        By camera and variant.
+
+    Returns
+    -------
+    DataFrame
+        Columns placement, used, reason, n_scan_lines, n_points, then one column ``edges_<camera>``
+        a camera: the number of edges of the board that a scan crosses and the camera sees.
     """
     rows = []
-    own = {camera: observations[camera, "half_step"] for camera in prepared.views}
+    by_camera = {camera: observations[camera, "half_step"] for camera in prepared.views}
     for placement in prepared.session.board_placements:
         mask = np.zeros((0, 0), bool)
         if placement in prepared.scans:
@@ -28,12 +43,12 @@ def placements_table(prepared, observations):
                 notes += [f"{camera} {edge}: {why}" for edge, why in view.rejected]
         row = {
             "placement": placement,
-            "used": any(placement in obs.all_placements for obs in own.values()),
+            "used": any(placement in obs.all_placements for obs in by_camera.values()),
             "reason": prepared.left_out.get(placement) or "; ".join(notes),
             "n_scan_lines": int(mask.any(axis=1).sum()),
             "n_points": int(mask.sum()),
         }
-        for camera, obs in own.items():
+        for camera, obs in by_camera.items():
             crossed = obs.crossing_edge[obs.crossing_placement == placement]
             row[f"edges_{camera}"] = len(np.unique(crossed))
         rows.append(row)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtri
 
@@ -12,8 +13,15 @@ from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
 from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
-from lrfcal_lib.judge.camera_changes import LEVER, NOISY, camera_changes, large_changes
-from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
+from lrfcal_lib.judge.alternatives import guesses_of
+from lrfcal_lib.judge.camera_changes import LEVER, camera_changes, explains, large_changes
+from lrfcal_lib.judge.findings import by_sign
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    lrf_to_platform,
+    lrf_to_source,
+    transform_difference,
+)
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -155,20 +163,25 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     session = prepared.session
     found = [fault for fault in faults_of_files(session) if not fault.harmless]
     found += dark_images(session)
-    misread = misread_recording(prepared) if hopeless(joint) else []
-    if misread or not prepared.views or not prepared.scans:
-        return found + misread
-    found += faults_of_changes(changes_of_cameras(calibration), tuple(prepared.views))
-    return found if joint is None else found + exchanged_placements(calibration)
+    if hopeless(joint):
+        misread = misread_recording(prepared)
+        if misread:
+            return found + misread
+    if prepared.views and prepared.scans:
+        found += faults_of_changes(changes_of_cameras(calibration), tuple(prepared.views))
+        if joint is not None:
+            found += exchanged_placements(calibration)
+    return found
 
 
 def changes_of_cameras(calibration):
     """The CameraChanges of a Calibration, also where its joint estimate explains nothing."""
     prepared = calibration.prepared
     joint = calibration.joint
-    changes = [] if joint is None else camera_changes(joint.solution, prepared, joint.settings)
-    if changes or explains(joint):
-        return changes
+    if joint is not None:
+        changes = camera_changes(joint.solution, prepared, joint.settings)
+        if changes or explains(joint.solution):
+            return changes
     views = {camera: list(own.values()) for camera, own in prepared.views.items()}
     obs = observe_joint(prepared, views)
     return large_changes(obs, prepared, joint_settings(prepared, obs))
@@ -181,43 +194,39 @@ def explained(faults: list[Fault]) -> bool:
 
 def hopeless(joint):
     """Whether a JointCalibration (or None) explains so little that something may be misread."""
-    return not explains(joint) or bool(joint.solution.unobservable)
-
-
-def explains(joint):
-    """Whether a JointCalibration (or None) leaves residuals that are anything like the noise."""
-    if joint is None or not joint.solution.converged:
-        return False
-    noise = joint.solution.noise
-    return max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
+    return joint is None or not explains(joint.solution) or bool(joint.solution.unobservable)
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:
-    """Units and senses that are not as stated: read otherwise, scans and images agree."""
+    """Units and senses that are not as stated: read otherwise, scans and images agree.
+
+    Parameters
+    ----------
+    prepared
+    """
     session = prepared.session
     if len(prepared.scans) <= len(session.board_placements) / 2:
-        shown = [reading for reading in UNITS if shows_boards(session, reading)]
-        return [Fault("unit", reading.words, severe=True) for reading in shown[:1]]
+        for reading in UNITS:
+            if shows_boards(session, reading):
+                return [Fault(reading.kind, reading.words, severe=True)]
+        return []
 
     stated = board_misses(prepared, AS_STATED)
     if not stated or _worst(stated) < MISREAD:
         return []
-    mirrored = {
-        camera: found
-        for camera, found in board_misses(prepared, MIRRORED).items()
-        if camera in stated and _fits({camera: found}, {camera: stated[camera]})
-    }
-    if mirrored and len(mirrored) < len(stated):
-        return [
-            _mirrored_camera(camera, stated[camera], found) for camera, found in mirrored.items()
-        ]
+    mirrored = []
+    for camera, miss in board_misses(prepared, MIRRORED).items():
+        if camera in stated and _fits({camera: miss}, {camera: stated[camera]}):
+            mirrored.append(_mirrored_camera(camera, stated[camera], miss))
+    if 0 < len(mirrored) < len(stated):
+        return mirrored
 
-    every: tuple[tuple[Reading, ...], ...] = (SENSES, IMAGES, UNITS)
-    for readings in every:
-        misses = {reading: board_misses(prepared, reading) for reading in readings}
-        fitting = [reading for reading in readings if _fits(misses[reading], stated)]
+    groups: tuple[tuple[Reading, ...], ...] = (SENSES, IMAGES, UNITS)
+    for group in groups:
+        misses = {reading: board_misses(prepared, reading) for reading in group}
+        fitting = {reading: miss for reading, miss in misses.items() if _fits(miss, stated)}
         if fitting:
-            return [_misread(prepared, fitting, misses, stated)]
+            return [_misread(prepared, fitting, stated)]
     return []
 
 
@@ -254,22 +263,18 @@ def _worst(misses):
 
 def board_misses(prepared, reading):
     """The BoardMiss of every camera that has one, with the recording read in some way."""
-    found = {}
+    misses = {}
     noise = np.median([scan.sigma_range for scan in prepared.scans.values()])
     for camera in prepared.views:
         obs = plane_observations(prepared, camera, reading)
         with suppress(DegenerateGeometry, np.linalg.LinAlgError):
             transform = solve_camera(obs, "zhang_pless_printed").transform
-            residuals = np.abs(plane_residuals_m(obs, transform))
-            each = [
-                np.median(residuals[obs.plane_placement == p])
-                for p in np.unique(obs.plane_placement)
-            ]
-            square = np.median(each) ** 2 - (HALF * reading.ranges * noise) ** 2
-            found[camera] = BoardMiss(
-                float(np.sqrt(max(square, LEAST_MISS**2))), transform, planes=len(each)
-            )
-    return found
+            residuals = pd.Series(np.abs(plane_residuals_m(obs, transform)))
+            each = residuals.groupby(obs.plane_placement).median()
+            square = each.median() ** 2 - (HALF * reading.ranges * noise) ** 2
+            size = float(np.sqrt(max(square, LEAST_MISS**2)))
+            misses[camera] = BoardMiss(size, transform, planes=len(each))
+    return misses
 
 
 def plane_observations(prepared, camera, reading):
@@ -282,9 +287,7 @@ def plane_observations(prepared, camera, reading):
         if view.T_camera_board is not None
     }
     poses = np.array([view.T_camera_board.as_matrix() for view in views.values()]).reshape(-1, 4, 4)
-    if (
-        reading.mirrored
-    ):  # of a chessboard the mirror image is one, too: its normal and place are mirrored
+    if reading.mirrored:  # the mirror image of a chessboard is one: normal and place are mirrored
         mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
         poses = mirror @ poses @ mirror
 
@@ -333,16 +336,15 @@ def _mirrored_camera(camera, stated, found):
     return Fault("sense", words, severe=True, camera=camera)
 
 
-def _misread(prepared, fitting, misses, stated):
-    """The Fault of a recording that fits with some Readings, the likeliest first."""
-
-    best = min(_worst(misses[reading]) for reading in fitting)
-    likely = [reading for reading in fitting if _worst(misses[reading]) < AS_GOOD * best]
+def _misread(prepared, fitting, stated):
+    """The Fault of a recording that fits with some Readings (BoardMisses of each), likely first."""
+    best = min(map(_worst, fitting.values()))
+    likely = [reading for reading, misses in fitting.items() if _worst(misses) < AS_GOOD * best]
     # a mirrored cloud fits mirrored images: only where the cameras are said to be can tell
-    likely.sort(key=lambda r: (_far_from_guess(prepared, misses[r]), _worst(misses[r])))
+    likely.sort(key=lambda r: (_far_from_guess(prepared, fitting[r]), _worst(fitting[r])))
     causes = "; or ".join(reading.words for reading in likely)
     words = (
-        f"{causes}; scans lie {1000 * _worst(misses[likely[0]]):.0f} mm off the boards in the "
+        f"{causes}; scans lie {1000 * _worst(fitting[likely[0]]):.0f} mm off the boards in the "
         f"images then, as recorded {1000 * _worst(stated):.0f} mm"
     )
     return Fault(likely[0].kind, words, severe=True)
@@ -350,11 +352,7 @@ def _misread(prepared, fitting, misses, stated):
 
 def _far_from_guess(prepared, found):
     """How far cameras stand from where session.json guesses them, metres; 0 without guesses."""
-    guesses = {
-        name: camera.guess
-        for name, camera in prepared.session.cameras.items()
-        if camera.guess is not None
-    }
+    guesses = guesses_of(prepared.session)
     total = 0.0
     for camera in guesses.keys() & found.keys():
         turn, shift = transform_difference(found[camera].transform, guesses[camera])
@@ -367,14 +365,17 @@ def faults_of_changes(changes, cameras):
     found = []
     for change in changes:
         at_once = {other.camera for other in changes if other.after == change.after}
-        words = _zoomed(change) if change.zoomed else _moved(change)
-        if len(at_once) == len(cameras) and not change.zoomed:
-            words = f"{words} (or the range finder was: all cameras changed at once)"
+        kind = "camera moved"
+        words = _moved(change)
+        if change.zoomed:
+            kind = "camera zoomed"
+            words = _zoomed(change)
+        elif len(at_once) == len(cameras):
+            words += " (or the range finder was: all cameras changed at once)"
         remedy = (
             "fix what is loose and record anew, or make two sessions: one of the placements up to "
             f"{change.before}, one from {change.after} on"
         )
-        kind = "camera zoomed" if change.zoomed else "camera moved"
         severe = change.size_px > SEVERE_PX
         concerned = (change.after,)
         found.append(Fault(kind, f"{words}; {remedy}", severe, False, change.camera, concerned))
@@ -384,7 +385,7 @@ def faults_of_changes(changes, cameras):
 def _zoomed(change):
     """A CameraChange of the image scale, in words."""
     size = f"{100 * abs(change.zoom):.2f} +- {100 * change.zoom_sigma:.2f} %"
-    way = "larger" if change.zoom > 0 else "smaller"
+    way = by_sign(change.zoom, "larger", "smaller")
     return (
         f"the images of camera '{change.camera}' are {size} {way} from placement {change.after} "
         f"on, {change.corner_px:.1f} px at their corners: zoom, focus or image size were changed"
@@ -437,19 +438,18 @@ def _same_board(calibration, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
     prepared = calibration.prepared
     solution = calibration.joint.solution
-    board = prepared.board
-    corners = board.pattern.points() if board.corners is None else board.corners
+    corners = prepared.board.corners
+    if corners is None:
+        corners = prepared.board.pattern.points()
     middle = corners.mean(axis=0)[:2]
     p_lrf, pitch, _ = face_points(scan, POINTS)
+    p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
     agree = []
-    for camera, transform in solution.transforms.items():
+    for camera in solution.transforms:
         view = prepared.views[camera].get(placement)
-        if view is None or view.T_camera_board is None:
-            continue
-        mount = prepared.session.cameras[camera].mount
-        image_pitch = view.pitch if mount == "head" else 0.0
-        points = lrf_to_source(p_lrf, pitch, solution.T_head_lrf, mount, image_pitch)
-        on_board = view.T_camera_board.inv().apply(transform.apply(points))
-        beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
-        agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
+        if view is not None and view.T_camera_board is not None:
+            T_camera_platform = solution.camera_at(camera, view.pitch)
+            on_board = (view.T_camera_board.inv() * T_camera_platform).apply(p_platform)
+            beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
+            agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
     return bool(agree) and all(agree)

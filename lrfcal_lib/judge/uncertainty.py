@@ -7,11 +7,13 @@ nothing to the axis.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import null_space
 from lrfcal_lib.fit.least_squares import reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.model.camera import project_jacobians, undistort
+from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
     hat,
@@ -21,14 +23,10 @@ from lrfcal_lib.model.geometry import (
     tilt,
 )
 from lrfcal_lib.solvers.joint import SCALES, UNSEEN
+from lrfcal_lib.solvers.joint_solution import JointSolution
 
+# what may be wrong about the way of a beam: radians and metres; metres, a fraction, radians
 COLUMNS = (*AXIS_NAMES, *POSE_NAMES, "range_offset", "pitch_scale", "pitch_by_direction")
-PARTS = {
-    "axis": range(4),
-    "camera": range(4, 10),
-    "range offset": range(10, 11),
-    "pitch": range(11, 13),
-}
 # a motion that moves a point less than this, relative to all others, does not matter to it
 SEEN = 1e-3
 ROUNDS = 12  # of the search for the beam that ends in a pixel
@@ -38,90 +36,79 @@ ROUNDS = 12  # of the search for the beam that ends in a pixel
 class Chain:
     """From a beam to the frame of an image, and how well each link is known.
 
-    `head` is ``T_head_lrf`` (3, 4); `camera` ``T_camera_lrf`` of a camera on the head, or
-    ``T_camera_platform``, None for points of the cloud. `covariances`, each (13, 13), are those of
-    `COLUMNS` (increments ``[w, v]`` of the transforms; metres; fraction; radians): where there are
-    several, the one that gives more counts, quantity by quantity. `unseen` (m, 13) are motions that
-    nothing determines: what depends on them has no bound. `sweep_sigma`: offset (radians) and
-    stretch of the pitch that every sweep has of its own.
+    Attributes
+    ----------
+    head : ndarray, shape (3, 4)
+        ``T_head_lrf``.
+    camera : ndarray, shape (3, 4), or None
+        ``T_camera_lrf`` of a camera on the head, or ``T_camera_platform``; None for points of the
+        cloud.
+    on_head : bool
+    covariances : tuple of ndarray, shape (13, 13)
+        Of `COLUMNS` (increments ``[w, v]`` of the transforms). Where there are several, the one
+        that gives more counts, quantity by quantity.
+    unseen : ndarray, shape (m, 13)
+        Motions that nothing determines: what depends on them has no bound.
+    sweep_sigma : tuple of float
+        Of the offset (radians) and the stretch that the pitch of every sweep has of its own.
     """
 
     head: np.ndarray
     camera: np.ndarray | None
     on_head: bool
-    covariances: tuple
+    covariances: tuple[np.ndarray, ...]
     unseen: np.ndarray
-    sweep_sigma: tuple = (0.0, 0.0)
+    sweep_sigma: tuple[float, float] = (0.0, 0.0)
+
+    def doubted(self, doubt: float) -> "Chain":
+        """The same where all ranges may be wrong by so many metres beside what is known.
+
+        Boards of a wrong size stand elsewhere before the cameras: the range offset or the cameras'
+        places have taken it up.
+        """
+        taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
+        unsure = np.diag(doubt**2 * taken_up)
+        return replace(self, covariances=tuple(C + unsure for C in self.covariances))
 
 
-@dataclass(frozen=True)
-class SigmaMap:
-    """Standard deviations over an image or a field of view.
-
-    Attributes
-    ----------
-    columns : ndarray, shape (c,)
-        Pixels u, or bearings (radians).
-    rows : ndarray, shape (r,)
-        Pixels v, or pitch angles (radians).
-    distances : ndarray, shape (d,)
-        Metres.
-    sigma : ndarray, shape (d, r, c)
-        Root mean square distance from the true place, pixels or metres; inf where a motion that
-        matters is not determined, NaN where no scan reaches.
-    parts : dict of str to ndarray, shape (d, r, c)
-        The same with only some links uncertain: 'axis', 'camera', 'range offset', 'pitch', 'sweep',
-        and for points 'range noise', which `sigma` does not contain. Errors of axis and camera may
-        compensate: parts larger than the whole are no contradiction.
-    """
-
-    columns: np.ndarray
-    rows: np.ndarray
-    distances: np.ndarray
-    sigma: np.ndarray
-    parts: dict
-
-    def rms(self):
-        """Root mean square over what scans reach, shape (d,); inf where they reach nothing."""
-        number = np.sum(~np.isnan(self.sigma), axis=(1, 2))
-        mean = np.nansum(self.sigma**2, axis=(1, 2)) / np.maximum(number, 1)
-        return np.where(number > 0, np.sqrt(mean), np.inf)
+def columns_of(solution: JointSolution, camera: str | None = None) -> np.ndarray:
+    """Where each of `COLUMNS` stands among the shared unknowns, -1 where it was none, (13,)."""
+    names = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
+    place = {name: i for i, name in enumerate(solution.solution.names)}
+    return np.array([place.get(name, -1) for name in names])
 
 
-def marginal(hessian, index):
-    """Information on some unknowns with the others eliminated, shape (k, k)."""
-    others = np.setdiff1d(np.arange(len(hessian)), index)
-    order = np.concatenate([index, others]).astype(int)
-    return reduced_hessian(hessian[np.ix_(order, order)][None], len(index))[0]
-
-
-def chain_of(solution, camera=None):
+def chain_of(solution: JointSolution, camera: str | None = None) -> Chain:
     """The chain of a joint solution to a camera, or to points of the cloud.
 
-    A ValueError if there is no such camera.
+    Parameters
+    ----------
+    solution
+    camera
+        Its name; None for points of the cloud.
     """
-    if camera is not None and camera not in solution.transforms:
-        cameras = ", ".join(solution.transforms) or "none"
-        raise ValueError(f"cameras are {cameras}; got '{camera}'")
     estimate = solution.solution
-    wanted = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
-    place = {name: i for i, name in enumerate(estimate.names)}
-    index = np.array([place.get(name, -1) for name in wanted])
+    index = columns_of(solution, camera)
     known = index >= 0
     covariances = []
-    for C in (estimate.covariance, estimate.trusted):
-        part = C[np.ix_(index, index)]
+    for whole in (estimate.covariance, estimate.trusted):
+        part = whole[np.ix_(index, index)]
         # zero for what is known; what has no bound is among `unseen`
         estimated = np.outer(known, known) & np.isfinite(part)
         covariances.append(np.where(estimated, part, 0.0))
+
     # What stays open beside the links leaves no trace: cameras that planes fix are known, whatever
     # the edge bias.
-    scales = np.array([SCALES.get(name, 1.0) for name in estimate.names])
-    scaled = solution.information().sum(axis=0) * scales[:, None] * scales
-    hessian = marginal(scaled, index[known])
-    motions = null_space(hessian, np.ones(len(hessian)), UNSEEN) * scales[index[known]]
-    unseen = np.zeros((len(motions), len(wanted)))
-    unseen[:, known] = motions
+    links = index[known]
+    others = np.setdiff1d(np.arange(len(estimate.names)), links)
+    order = np.concatenate([links, others])
+    scales = np.array([SCALES.get(name, 1.0) for name in estimate.names])[order]
+    whole = solution.information().sum(axis=0)[np.ix_(order, order)]
+    hessian = reduced_hessian((whole * scales[:, None] * scales)[None], len(links))[0]
+    motions = null_space(hessian, np.ones(len(links)), UNSEEN)
+    unseen = np.zeros((len(motions), len(COLUMNS)))
+    unseen[:, known] = motions * scales[: len(links)]
+
     on_head = True
     pose = None
     if camera is not None:
@@ -132,40 +119,163 @@ def chain_of(solution, camera=None):
     return Chain(head, pose, on_head, tuple(covariances), unseen, solution.sweep_sigma)
 
 
-def carried(chain, bearing, pitch, distance, image_pitch=0.0):
+def projection_sigma(
+    chain: Chain,
+    model: CameraModel,
+    distances: ArrayLike,
+    grid: tuple[int, int],
+    *,
+    image_pitch: float = 0.0,
+    pitches: tuple[float, float] = (-np.pi, np.pi),
+) -> np.ndarray:
+    """How far off the pixel of an LRF point may be, over the image.
+
+    Every point is measured at its own pitch, the image at `image_pitch`. For a camera on the head
+    the tilt axis matters the more, the farther the two are apart.
+
+    Parameters
+    ----------
+    chain
+        To the camera.
+    model
+    distances : array_like, shape (d,)
+        From the LRF, metres.
+    grid
+        Columns and rows, see :func:`pixel_grid`.
+    image_pitch
+        Radians.
+    pitches
+        First and last pitch of the sweeps, radians. A sweep's own stretch acts about their middle
+        (cameras on the base).
+
+    Returns
+    -------
+    ndarray, shape (d, rows, columns)
+        Root mean square distance from the true pixel; inf where a motion that matters is not
+        determined, NaN where no scan reaches.
+    """
+    away = np.reshape(distances, (-1, 1, 1))
+    bearing, pitch = beams_of_pixels(chain, model, pixel_grid(model, grid), away, image_pitch)
+    points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
+    P, *_ = project_jacobians(points, model)
+    offset, stretch = chain.sweep_sigma
+    sigma_pitch = np.hypot(offset, stretch * (pitch - np.mean(pitches)))
+    if chain.on_head:  # the offset is that of the image, too
+        sigma_pitch = stretch * (pitch - image_pitch)
+    by_sweep = sigma_pitch * np.linalg.norm((P @ by_pitch[..., None])[..., 0], axis=-1)
+    sigma = np.hypot(spread(chain, P @ by_link), by_sweep)
+    low, high = pitches
+    return np.where((pitch >= low) & (pitch <= high), sigma, np.nan)
+
+
+def pixel_grid(model: CameraModel, grid: tuple[int, int]) -> np.ndarray:
+    """Middles of the cells that columns and rows cut an image into, (rows, columns, 2), pixels."""
+    columns, rows = grid
+    u = (np.arange(columns) + 0.5) * model.width / columns - 0.5
+    v = (np.arange(rows) + 0.5) * model.height / rows - 0.5
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def point_sigma(
+    chain: Chain,
+    bearings: np.ndarray,
+    pitches: np.ndarray,
+    distances: ArrayLike,
+    *,
+    reference: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far off a reconstructed point may be, over the field of view.
+
+    Relative to the head at the pitch `reference`: a turn of the whole cloud does not count. Errors
+    of single sweeps do: they shift sweeps against each other. The range noise of single points is
+    no part of it.
+
+    Parameters
+    ----------
+    chain
+        To the cloud.
+    bearings, pitches, distances : array_like, shapes (c,), (r,), (d,)
+        Radians, radians, metres.
+    reference
+        Radians.
+
+    Returns
+    -------
+    ndarray, shape (d, r, c)
+        Metres; inf where a motion that matters is not determined.
+    ndarray, shape (d, r, c)
+        What errors of single sweeps contribute, metres.
+    """
+    away = np.reshape(distances, (-1, 1, 1))
+    _, by_link, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
+    offset, stretch = chain.sweep_sigma
+    sigma_pitch = np.hypot(offset, stretch * (pitches - reference))[:, None]
+    by_sweep = sigma_pitch * np.linalg.norm(by_pitch, axis=-1)
+    return np.hypot(spread(chain, by_link), by_sweep), by_sweep
+
+
+def root_mean_square(sigma: np.ndarray) -> float:
+    """Of what scans reach (no NaN); inf where they reach nothing."""
+    reached = sigma[~np.isnan(sigma)]
+    return float(np.sqrt(np.mean(reached**2))) if reached.size else np.inf
+
+
+def range_noise(solution: JointSolution) -> float:
+    """Standard deviation of one range as the solution found or took it, metres.
+
+    Parameters
+    ----------
+    solution
+    """
+    if not len(solution.observations.face_sigma):
+        return 0.0
+    return float(np.median(solution.observations.face_sigma) * solution.noise["face_scale"])
+
+
+def carried(
+    chain: Chain,
+    bearing: ArrayLike,
+    pitch: ArrayLike,
+    distance: ArrayLike,
+    image_pitch: float | np.ndarray = 0.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ends of beams in the frame of an image, and what moves them.
 
-    Of beams with bearing, pitch (radians) and distance from the mirror (metres), and for an image
-    of a camera on the head at `image_pitch`: points (..., 3) in the camera frame (without a camera
-    the LRF frame of a scan at that pitch), metres, and their derivatives by `COLUMNS` (..., 3, 13)
-    and by the pitch of the beam (..., 3).
+    Parameters
+    ----------
+    chain
+    bearing, pitch, distance : array_like, shape (...)
+        Of the beams: radians, and metres from the mirror.
+    image_pitch
+        Of a camera on the head, radians.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Points in the camera frame (without a camera the LRF frame of a scan at `image_pitch`),
+        metres.
+    ndarray, shape (..., 3, 13)
+        Their derivatives by `COLUMNS`.
+    ndarray, shape (..., 3)
+        Their derivatives by the pitch of the beam.
     """
-    beams = (np.asarray(values, float) for values in (bearing, pitch, distance))
-    bearing, pitch, distance = np.broadcast_arrays(*beams)
+    bearing, pitch, distance = np.broadcast_arrays(bearing, pitch, distance)
     R = chain.head[:, :3]
     t = chain.head[:, 3]
-    identity = np.eye(3)
-    turn = pitch
-    back = 0.0  # 1 where the image is taken from the head: points go back through the axis
-    if chain.on_head:
-        turn = pitch - image_pitch
-        back = 1.0
-    d_head = polar_to_points(np.ones_like(distance), bearing) @ R.T
-    p = distance[..., None] * d_head
-    x = tilt(p + t, turn)
-    axes = tilt(np.broadcast_to(identity, turn.shape + (3, 3)), turn[..., None])
-    M = np.swapaxes(axes, -1, -2)  # rotation by the turn
-    by_rotation = back * hat(x - t) - M @ hat(p)
-    by_translation = M - back * identity
-    by_head = np.concatenate([by_rotation, by_translation], axis=-1)
-    by_axis = by_head[..., [1, 2, 4, 5]]  # a turn about x and a shift along it change nothing
-    by_range = -tilt(d_head, turn)[..., None]
-    by_turn = np.cross([1.0, 0.0, 0.0], x)[..., None]
-    by_scale = by_turn * turn[..., None, None]
-    by_direction = (1 - back) * by_turn
-    A = identity
-    if chain.on_head:
-        A = R.T
+    back = float(chain.on_head)  # 1: points go back through the axis to the head at the image
+    turn = pitch - back * image_pitch
+    beam = polar_to_points(1.0, bearing) @ R.T
+    p_head = distance[..., None] * beam
+    x = tilt(p_head + t, turn)
+    M = np.swapaxes(tilt(np.eye(3), turn[..., None]), -1, -2)
+    # a turn of the head about x and a shift along it change nothing
+    by_turn_of_axis = (back * hat(x - t) - M @ hat(p_head))[..., 1:]
+    by_shift_of_axis = (M - back * np.eye(3))[..., 1:]
+    by_pitch = np.cross([1.0, 0.0, 0.0], x)
+    by_scale = turn[..., None] * by_pitch
+    by_sensor = np.stack([-tilt(beam, turn), by_scale, (1 - back) * by_pitch], axis=-1)
+
+    A = R.T if chain.on_head else np.eye(3)
     points = (x - back * t) @ A.T
     by_camera = np.zeros((*points.shape, 6))
     if chain.camera is not None:
@@ -173,16 +283,26 @@ def carried(chain, bearing, pitch, distance, image_pitch=0.0):
         A = C @ A
         points = points @ C.T
         by_camera[..., :3] = -hat(points)
-        by_camera[..., 3:] = identity
+        by_camera[..., 3:] = np.eye(3)
         points = points + chain.camera[:, 3]
-    columns = [A @ by_axis, by_camera, A @ by_range, A @ by_scale, A @ by_direction]
-    return points, np.concatenate(columns, axis=-1), (A @ by_turn)[..., 0]
+    by_axis = A @ np.concatenate([by_turn_of_axis, by_shift_of_axis], axis=-1)
+    by_link = np.concatenate([by_axis, by_camera, A @ by_sensor], axis=-1)
+    return points, by_link, by_pitch @ A.T
 
 
-def spread(chain, jacobian):
-    """Root mean square error of quantities with a Jacobian (..., m, 13).
+def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
+    """Root mean square error of quantities that the links of a chain move.
 
-    Inf where an undetermined motion matters.
+    Parameters
+    ----------
+    chain
+    jacobian : ndarray, shape (..., m, 13)
+        Of m quantities by `COLUMNS`.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Of all m together, in their unit; inf where an undetermined motion matters.
     """
     variance = 0.0
     for C in chain.covariances:
@@ -195,10 +315,21 @@ def spread(chain, jacobian):
     return np.where(np.any(matters, axis=-1), np.inf, np.sqrt(variance))
 
 
-def beams_to(points, T_head_lrf):
-    """Bearing, pitch (radians) and range (metres) at which scans reach points (platform frame).
+def beams_to(
+    points: ArrayLike, T_head_lrf: RigidTransform
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bearing, pitch (radians) and range (metres) at which scans reach points.
 
-    Shapes (...) for points (..., 3); NaN where the scan plane never gets there.
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Platform frame, metres.
+    T_head_lrf
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Each of the three; NaN where the scan plane never gets there.
     """
     points = np.asarray(points, float)
     R = T_head_lrf.rotation.as_matrix()
@@ -218,8 +349,7 @@ def beams_to(points, T_head_lrf):
 
 def beams_of_pixels(chain, model, uv, distance, image_pitch):
     """Bearing and pitch of beams of a given length that end on the rays of pixels (..., 2)."""
-    normal = (undistort(uv, model) - [model.cx, model.cy]) / [model.fx, model.fy]
-    ray = np.concatenate([normal, np.ones_like(normal[..., :1])], axis=-1)
+    ray = np.insert(undistort(uv, model), 2, 1.0, axis=-1) @ np.linalg.inv(model.matrix).T
     ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     depth = distance * np.ones(ray.shape[:-1])
     for _ in range(ROUNDS):
@@ -231,119 +361,3 @@ def beams_of_pixels(chain, model, uv, distance, image_pitch):
     if chain.on_head:
         pitch = pitch + image_pitch
     return bearing, pitch
-
-
-def _sigma_map(chain, axes, jacobian, by_pitch, turn, offset):
-    """Standard deviations from Jacobians (d, r, c, m, 13) and by the pitch (d, r, c, m) of beams.
-
-    The beams are `turn` off the middle; `offset` says whether the offset that the pitch of every
-    sweep has of its own matters.
-    """
-    parts = {}
-    for name, columns in PARTS.items():
-        link = np.isin(range(len(COLUMNS)), columns)
-        parts[name] = spread(chain, jacobian * link)
-    sigma_offset, sigma_stretch = chain.sweep_sigma
-    sigma_pitch = np.hypot(offset * sigma_offset, sigma_stretch * turn)
-    parts["sweep"] = sigma_pitch * np.linalg.norm(by_pitch, axis=-1)
-    sigma = np.hypot(spread(chain, jacobian), parts["sweep"])
-    return SigmaMap(*axes, sigma, parts)
-
-
-def projection_sigma(
-    solution, camera, model, distances, grid=(32, 24), *, image_pitch=0.0, pitches=None
-):
-    """How far off the pixel of an LRF point may be, over the image.
-
-    Every point is measured at its own pitch, the image at `image_pitch`. For a camera on the head
-    the tilt axis matters the more, the farther the two are apart.
-
-    Parameters
-    ----------
-    solution : JointSolution or Chain
-    camera : str
-        Ignored for a Chain.
-    model : CameraModel
-    distances : array_like, shape (d,)
-        From the LRF, metres.
-    grid : tuple of int
-        Columns and rows of the map.
-    image_pitch : float
-        Radians.
-    pitches : tuple of float, optional
-        First and last pitch of the sweeps, radians: pixels that they do not reach stay NaN. A
-        sweep's own stretch acts about their middle (cameras on the base).
-
-    Returns
-    -------
-    SigmaMap
-        Pixels.
-    """
-    chain, distances = _asked(solution, camera, distances)
-    columns, rows = grid
-    u = (np.arange(columns) + 0.5) * model.width / columns - 0.5
-    v = (np.arange(rows) + 0.5) * model.height / rows - 0.5
-    uv = np.stack(np.meshgrid(u, v), axis=-1)
-    away = distances[:, None, None]
-    bearing, pitch = beams_of_pixels(chain, model, uv, away, image_pitch)
-    points, J, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
-    P = project_jacobians(points, model)[0]
-    by_pitch = (P @ by_pitch[..., None])[..., 0]
-    middle = image_pitch
-    if pitches is not None and not chain.on_head:
-        middle = np.mean(pitches)
-    axes = u, v, distances
-    out = _sigma_map(chain, axes, P @ J, by_pitch, pitch - middle, not chain.on_head)
-    if pitches is None:
-        return replace(out, sigma=np.where(np.isnan(pitch), np.nan, out.sigma))
-    low, high = pitches
-    reached = (pitch >= low) & (pitch <= high)
-    return replace(out, sigma=np.where(reached, out.sigma, np.nan))
-
-
-def point_sigma(solution, bearings, pitches, distances, *, reference=0.0):
-    """How far off a reconstructed point may be, over the field of view.
-
-    Relative to the head at the pitch `reference`: a turn of the whole cloud does not count. Errors
-    of single sweeps do: they shift sweeps against each other.
-
-    Parameters
-    ----------
-    solution : JointSolution or Chain
-    bearings, pitches, distances : array_like, shapes (c,), (r,), (d,)
-        Radians, radians, metres.
-    reference : float
-        Radians.
-
-    Returns
-    -------
-    SigmaMap
-        Metres. `sigma` is the calibration's part, common to all points near each other;
-        ``parts['range noise']`` is that of every single point.
-    """
-    chain, distances = _asked(solution, None, distances)
-    bearings = np.atleast_1d(bearings).astype(float)
-    pitches = np.atleast_1d(pitches).astype(float)
-    away = distances[:, None, None]
-    _, J, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
-    axes = bearings, pitches, distances
-    out = _sigma_map(chain, axes, J, by_pitch, (pitches - reference)[:, None], True)
-    out.parts["range noise"] = np.full(out.sigma.shape, range_noise(solution))
-    return out
-
-
-def range_noise(solution):
-    """Standard deviation of one range as the solution found or took it, metres (0 for a Chain)."""
-    if isinstance(solution, Chain) or not len(solution.observations.face_sigma):
-        return 0.0
-    return float(np.median(solution.observations.face_sigma) * solution.noise["face_scale"])
-
-
-def _asked(solution, camera, distances):
-    """The chain of a solution (or the Chain given) and distances as an array."""
-    distances = np.atleast_1d(np.asarray(distances, float))
-    if not (np.isfinite(distances).all() and distances.min() > 0):
-        raise ValueError(f"distances must be positive, metres; got {distances.tolist()}")
-    if isinstance(solution, Chain):
-        return solution, distances
-    return chain_of(solution, camera), distances

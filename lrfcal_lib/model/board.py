@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.geometry import cross
 
@@ -89,9 +90,18 @@ class Board:
         return np.asarray(self.corners, float)
 
 
-def outline_lines(corners):
-    """Lines ``a x + b y + c = 0`` (n, 3) of a polygon's sides, unit normals outwards; row i from
-    corner i to i + 1.
+def outline_lines(corners: ArrayLike) -> np.ndarray:
+    """Lines ``a x + b y + c = 0`` of a polygon's sides, unit normals outwards.
+
+    Parameters
+    ----------
+    corners : array_like, shape (n, 2)
+        Metres.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Row i from corner i to i + 1.
     """
     corners = np.asarray(corners, float)
     following = np.roll(corners, -1, axis=0)
@@ -102,22 +112,38 @@ def outline_lines(corners):
     return np.column_stack([normal, -np.sum(normal * corners, axis=1)])
 
 
-def corners_of_lines(lines):
-    """Corners (..., n, 2) of a polygon from its sides (..., n, 3): corner i is where side i - 1
-    meets side i.
+def corners_of_lines(lines: ArrayLike) -> np.ndarray:
+    """Corners of a polygon from its sides: corner i is where side i - 1 meets side i.
+
+    Parameters
+    ----------
+    lines : array_like, shape (..., n, 3)
+        ``(a, b, c)`` of ``a x + b y + c = 0``.
+
+    Returns
+    -------
+    ndarray, shape (..., n, 2)
     """
     lines = np.asarray(lines, float)
     points = cross(np.roll(lines, 1, axis=-2), lines)
     return points[..., :2] / points[..., 2:]
 
 
-def triangle_board(ab=0.315, ac=0.380, name="triangle", pattern=None):
-    """The paper's board: a triangle with its right angle A in the origin, B on +x and C on +y,
-    metres.
+def triangle_board(
+    ab: float = 0.315, ac: float = 0.380, name: str = "triangle", pattern: Chessboard | None = None
+) -> Board:
+    """The paper's board: a triangle with its right angle A in the origin, B on +x and C on +y.
 
     The paper states 315, 380 and 491 mm; a right angle makes the third edge 493.58 mm (the stated
     one closes at 89.4 deg), so the exact right angle is used here. Edges are ``ab``, ``bc``,
     ``ca``.
+
+    Parameters
+    ----------
+    ab, ac : float
+        Lengths of the two legs, metres.
+    name : str
+    pattern : Chessboard, optional
     """
     corners = np.array([[0.0, 0.0], [ab, 0.0], [0.0, ac]])
     return Board(name, ("ab", "bc", "ca"), corners, pattern, ("ab", "ca"))

@@ -72,9 +72,19 @@ class CameraModel:
         return replace(self, **matrix, distortion=distortion, covariance=covariance, rms_px=rms_px)
 
 
-def pinhole(p_camera, model):
-    """Project points (..., 3) to undistorted pixels (..., 2), NaN where z <= 0; equation (19), K
-    without a lens.
+def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
+    """Project points to undistorted pixels, equation (19): K without a lens.
+
+    Parameters
+    ----------
+    p_camera : array_like, shape (..., 3)
+        Metres.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        NaN where z <= 0.
     """
     x, y, z = np.moveaxis(np.asarray(p_camera, float), -1, 0)
     z = np.where(z > 0, z, np.nan)
@@ -83,8 +93,20 @@ def pinhole(p_camera, model):
     return np.stack([u, v], axis=-1)
 
 
-def pinhole_jacobian(p_camera, model):
-    """Derivative of :func:`pinhole` by the point, shape (..., 2, 3), pixels per metre."""
+def pinhole_jacobian(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
+    """Derivative of :func:`pinhole` by the point.
+
+    Parameters
+    ----------
+    p_camera : array_like, shape (..., 3)
+        Metres.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., 2, 3)
+        Pixels per metre.
+    """
     p_camera = np.asarray(p_camera, float)
     x, y, z = np.moveaxis(p_camera, -1, 0)
     J = np.zeros(p_camera.shape[:-1] + (2, 3))
@@ -96,12 +118,18 @@ def pinhole_jacobian(p_camera, model):
 
 
 def lens_terms(x, y, k1, k2, k3, k4, k5):
-    """Equation (18) at normalised coordinates: by how much the radius grows, and the tangential
-    shifts of x and y.
+    """Equation (18): by how much the radius grows, and the tangential shifts of x and y.
 
     The radial part is read as 1 + k1 r^2 + k2 r^4 + k5 r^6; the growth is what it has beyond 1. For
     numbers, for arrays, and to be compiled by numba: a literal in it would turn single precision
     into double.
+
+    Parameters
+    ----------
+    x, y : float or ndarray
+        Normalised coordinates, x / z and y / z.
+    k1, k2, k3, k4, k5 : float
+        The paper's order, see :class:`CameraModel`.
     """
     r2 = x * x + y * y
     growth = r2 * (k1 + r2 * (k2 + r2 * k5))
@@ -110,9 +138,20 @@ def lens_terms(x, y, k1, k2, k3, k4, k5):
     return growth, shift_x, shift_y
 
 
-def distort(normalized, distortion):
-    """Lens distortion of normalised image coordinates (x / z, y / z), shape (..., 2), equation
-    (18).
+def distort(normalized: ArrayLike, distortion: np.ndarray) -> np.ndarray:
+    """Lens distortion, equation (18).
+
+    Parameters
+    ----------
+    normalized : array_like, shape (..., 2)
+        ``(x / z, y / z)``.
+    distortion : array_like, shape (5,)
+        (k1, k2, k3, k4, k5).
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Normalised coordinates.
     """
     normalized = np.asarray(normalized, float)
     x = normalized[..., 0]
@@ -121,12 +160,19 @@ def distort(normalized, distortion):
     return np.stack([x * (1 + growth) + shift_x, y * (1 + growth) + shift_y], axis=-1)
 
 
-def fold(model):
+def fold(model: CameraModel) -> float:
     """Squared distance ``(x^2 + y^2) / z^2`` at which radial distortion turns back: points beyond
     are not in the image.
 
-    Infinite for a lens that never does: ``1 + 3 k1 r^2 + 5 k2 r^4 + 7 k5 r^6`` is the slope of
-    equation (18).
+    Parameters
+    ----------
+    model : CameraModel
+
+    Returns
+    -------
+    float
+        Infinite for a lens that never does: ``1 + 3 k1 r^2 + 5 k2 r^4 + 7 k5 r^6`` is the slope of
+        equation (18).
     """
     k1, k2, _, _, k5 = model.distortion
     return _fold(float(k1), float(k2), float(k5))
@@ -142,8 +188,20 @@ def _fold(k1, k2, k5):
     return float(min(real[real > 0], default=np.inf))
 
 
-def project(p_camera, model):
-    """Project points (..., 3) to pixels (..., 2), NaN where z <= 0; equations (18) and (19)."""
+def project(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
+    """Project points to pixels, equations (18) and (19).
+
+    Parameters
+    ----------
+    p_camera : array_like, shape (..., 3)
+        Metres.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        NaN where z <= 0.
+    """
     p_camera = np.asarray(p_camera, float)
     z = np.where(p_camera[..., 2:] > 0, p_camera[..., 2:], np.nan)
     distorted = distort(p_camera[..., :2] / z, model.distortion)
@@ -177,9 +235,18 @@ def project_jacobians(p_camera: ArrayLike, model: CameraModel) -> tuple[np.ndarr
     return J[..., 3:6], J[..., 6:15]
 
 
-def undistort(uv, model):
-    """Undistorted pixels (..., 2) of image points: of a camera with the same K and no lens
-    distortion.
+def undistort(uv: ArrayLike, model: CameraModel) -> np.ndarray:
+    """Undistorted pixels of image points: of a camera with the same K and no lens distortion.
+
+    Parameters
+    ----------
+    uv : array_like, shape (..., 2)
+        Pixels.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
     """
     uv = np.asarray(uv, float)
     if uv.size == 0:
@@ -190,9 +257,17 @@ def undistort(uv, model):
     return out.reshape(uv.shape)
 
 
-def line_through(a, b):
-    """Pixel line ``l0 u + l1 v + l2 = 0`` with ``l0^2 + l1^2 = 1`` through two pixels, shape (...,
-    3).
+def line_through(a: ArrayLike, b: ArrayLike) -> np.ndarray:
+    """Pixel line ``l0 u + l1 v + l2 = 0`` with ``l0^2 + l1^2 = 1`` through two pixels.
+
+    Parameters
+    ----------
+    a, b : array_like, shape (..., 2)
+        ValueError where they are the same.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
     """
     a, b = np.broadcast_arrays(np.asarray(a, float), b)
     along = b - a
@@ -203,7 +278,18 @@ def line_through(a, b):
     return np.concatenate([normal, -np.sum(normal * a, axis=-1, keepdims=True)], axis=-1)
 
 
-def line_distance(uv, line):
-    """Signed distance of pixels from lines, equation (20) with its sign kept; pixels."""
+def line_distance(uv: ArrayLike, line: ArrayLike) -> np.ndarray:
+    """Signed distance of pixels from lines, equation (20) with its sign kept; pixels.
+
+    Parameters
+    ----------
+    uv : array_like, shape (..., 2)
+    line : array_like, shape (..., 3)
+        See :func:`line_through`.
+
+    Returns
+    -------
+    ndarray, shape (...)
+    """
     line = np.asarray(line, float)
     return np.sum(np.asarray(uv, float) * line[..., :2], axis=-1) + line[..., 2]

@@ -5,6 +5,7 @@ motions in words.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
 # axes of a camera that looks ahead of the LRF, and of an upright board with its print towards it
@@ -17,8 +18,17 @@ class DegenerateGeometry(ValueError):
     """
 
 
-def hat(v):
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3), ``hat(v) @ u == cross(v, u)``."""
+def hat(v: ArrayLike) -> np.ndarray:
+    """Cross-product matrices, ``hat(v) @ u == cross(v, u)``.
+
+    Parameters
+    ----------
+    v : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
     v = np.asarray(v, dtype=float)
     upper = np.zeros(v.shape + (3,))
     upper[..., 0, 1] = -v[..., 2]
@@ -27,15 +37,24 @@ def hat(v):
     return upper - np.swapaxes(upper, -1, -2)
 
 
-def cross(a, b):
-    """Cross product along the last axis; several times faster than `numpy.cross` on stacks."""
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross product along the last axis; several times faster than `numpy.cross` on stacks.
+
+    Parameters
+    ----------
+    a, b : ndarray, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
     x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
     z = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return np.stack([x, y, z], axis=-1)
 
 
-def polar_to_points(ranges, bearings):
+def polar_to_points(ranges: ArrayLike, bearings: ArrayLike) -> np.ndarray:
     """Points of a 2D scan in the LRF frame, Li et al. 2009, equation (17).
 
     Parameters
@@ -56,9 +75,22 @@ def polar_to_points(ranges, bearings):
     return np.stack([x, y, 0.0 * ranges], axis=-1)
 
 
-def polar_covariance(ranges, bearings, sigma_range, sigma_bearing):
-    """Covariance (..., 3, 3) of polar points in the LRF frame, from independent errors along and
-    across the beam.
+def polar_covariance(
+    ranges: ArrayLike, bearings: ArrayLike, sigma_range: ArrayLike, sigma_bearing: ArrayLike
+) -> np.ndarray:
+    """Covariance of polar points from independent errors along and across the beam.
+
+    Parameters
+    ----------
+    ranges, bearings : array_like, shape (...)
+        Metres and radians.
+    sigma_range, sigma_bearing : array_like, broadcastable to `ranges`
+        Standard deviations, metres and radians.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        LRF frame, square metres.
     """
     sigma_range = np.asarray(sigma_range, float)
     ranges, bearings, sigma_range = np.broadcast_arrays(ranges, bearings, sigma_range)
@@ -72,7 +104,7 @@ def _outer(v):
     return v[..., :, None] * v[..., None, :]
 
 
-def tilt(points, pitch):
+def tilt(points: ArrayLike, pitch: ArrayLike) -> np.ndarray:
     """Turn points about the tilt axis, from the head to the platform frame, equations (4) and (5).
 
     Parameters
@@ -93,7 +125,7 @@ def tilt(points, pitch):
     return np.stack([x + 0 * cosine, cosine * y - sine * z, sine * y + cosine * z], axis=-1)
 
 
-def lrf_to_platform(p_lrf, pitch, T_head_lrf):
+def lrf_to_platform(p_lrf: ArrayLike, pitch: ArrayLike, T_head_lrf: RigidTransform) -> np.ndarray:
     """Points of scans in the fixed platform frame, ``p_platform = Rx(pitch) (R p_lrf + t)``,
     equation (6).
 
@@ -104,6 +136,11 @@ def lrf_to_platform(p_lrf, pitch, T_head_lrf):
     pitch : array_like, broadcastable to ``p_lrf.shape[:-1]``
         Radians.
     T_head_lrf : RigidTransform
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Metres.
     """
     return tilt(T_head_lrf.apply(p_lrf), pitch)
 
@@ -158,10 +195,13 @@ class TiltAxis:
         return f"TiltAxis(direction=({direction}), foot_mm=({foot_mm}))"
 
 
-def axis_of(T_head_lrf):
+def axis_of(T_head_lrf: RigidTransform) -> TiltAxis:
     """The tilt axis that a head transform stands for: ``R^T e_x`` through ``-R^T t``.
 
-    Turning about x and sliding along x change nothing.
+    Parameters
+    ----------
+    T_head_lrf : RigidTransform
+        Turning it about x and sliding it along x change nothing.
     """
     lrf_head = T_head_lrf.inv()
     direction = lrf_head.rotation.apply([1.0, 0.0, 0.0])
@@ -169,10 +209,18 @@ def axis_of(T_head_lrf):
     return TiltAxis(direction, point - direction * (direction @ point))
 
 
-def head_from_axis(axis):
+def head_from_axis(axis: TiltAxis) -> RigidTransform:
     """The head transform that turns the LRF least: the gauge used in this repository.
 
-    It has the smallest rotation that maps the axis' direction to x, and no shift along the axis.
+    Parameters
+    ----------
+    axis : TiltAxis
+
+    Returns
+    -------
+    RigidTransform
+        ``T_head_lrf`` with the smallest rotation that maps the axis' direction to x, and no shift
+        along the axis.
     """
     direction = np.asarray(axis.direction, float)
     turn = np.cross(direction, [1.0, 0.0, 0.0])
@@ -183,8 +231,12 @@ def head_from_axis(axis):
     return RigidTransform.from_components(-rotation.apply(axis.foot), rotation)
 
 
-def paper_parameters(T_head_lrf):
+def paper_parameters(T_head_lrf: RigidTransform) -> tuple[np.ndarray, float]:
     """Phi and t_y of equations (1) and (2) for the same tilt axis.
+
+    Parameters
+    ----------
+    T_head_lrf : RigidTransform
 
     Returns
     -------
@@ -206,23 +258,51 @@ def paper_parameters(T_head_lrf):
     return np.array([phi_x, phi_y, phi_z]), ty
 
 
-def head_from_paper(phi, ty):
-    """``T_head_lrf`` from phi (radians) and ty (metres), equations (1) to (3) with ``R = Rx Ry Rz``
-    (x last).
+def head_from_paper(phi: ArrayLike, ty: float) -> RigidTransform:
+    """``T_head_lrf`` by equations (1) to (3) with ``R = Rx Ry Rz`` (x last).
+
+    Parameters
+    ----------
+    phi : array_like, shape (3,)
+        Radians.
+    ty : float
+        Metres.
     """
     return RigidTransform.from_components([0.0, ty, 0.0], Rotation.from_euler("XYZ", phi))
 
 
-def axis_difference(a, b):
-    """Angle between two axes (radians) and the distance of their foot points (metres)."""
+def axis_difference(a: TiltAxis, b: TiltAxis) -> tuple[float, float]:
+    """How far two axes are apart.
+
+    Parameters
+    ----------
+    a, b : TiltAxis
+
+    Returns
+    -------
+    angle : float
+        Radians.
+    offset : float
+        Distance of their foot points, metres.
+    """
     sine = np.linalg.norm(np.cross(a.direction, b.direction))
     angle = float(np.arctan2(sine, a.direction @ b.direction))
     return angle, float(np.linalg.norm(a.foot - b.foot))
 
 
-def transform_difference(a, b):
-    """Rotation angle (radians) and translation distance (metres) between two transforms with the
-    same frames.
+def transform_difference(a: RigidTransform, b: RigidTransform) -> tuple[float, float]:
+    """How far two transforms with the same frames are apart.
+
+    Parameters
+    ----------
+    a, b : RigidTransform
+
+    Returns
+    -------
+    angle : float
+        Radians.
+    distance : float
+        Of the translations, metres.
     """
     turn = a.rotation * b.rotation.inv()
     return float(turn.magnitude()), float(np.linalg.norm(a.translation - b.translation))
@@ -238,12 +318,27 @@ def _principal(points):
     return centre, variances, axes
 
 
-def fit_plane(points):
-    """Total least squares plane ``normal . p = distance`` of points (n, 3), rows with NaN ignored.
+def fit_plane(points: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Total least squares plane ``normal . p = distance``.
 
-    Returns the unit normal, away from the origin, the origin's distance (>= 0), and the root mean
-    square distance of the points. DegenerateGeometry with fewer than three points, or all on one
-    line.
+    Parameters
+    ----------
+    points : array_like, shape (n, 3)
+        Metres; rows with NaN are ignored.
+
+    Returns
+    -------
+    normal : ndarray, shape (3,)
+        Unit vector, away from the origin.
+    distance : float
+        Of the origin, never negative, metres.
+    rms : float
+        Of the points' distances, metres.
+
+    Raises
+    ------
+    DegenerateGeometry
+        With fewer than three points, or all on one line.
     """
     points = np.asarray(points, float)
     points = points[np.isfinite(points).all(axis=1)]
@@ -260,11 +355,25 @@ def fit_plane(points):
     return normal, float(normal @ centre), float(np.sqrt(max(values[0], 0.0)))
 
 
-def fit_line(points):
-    """Total least squares line of points (n, 2 or 3): their centre, the unit direction, their rms
-    distance.
+def fit_line(points: ArrayLike) -> tuple[np.ndarray, np.ndarray, float]:
+    """Total least squares line of points.
 
-    DegenerateGeometry with fewer than two distinct points.
+    Parameters
+    ----------
+    points : array_like, shape (n, 2) or (n, 3)
+
+    Returns
+    -------
+    centre : ndarray, shape (2,) or (3,)
+    direction : ndarray, shape (2,) or (3,)
+        Unit vector.
+    rms : float
+        Of the points' distances.
+
+    Raises
+    ------
+    DegenerateGeometry
+        With fewer than two distinct points.
     """
     points = np.asarray(points, float)
     if len(points) < 2 or np.ptp(points, axis=0).max() == 0:
@@ -276,16 +385,29 @@ def fit_line(points):
 POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 
-def pose_array(transform):
-    """Top three rows of a transform's matrix, shape (..., 3, 4): the form the solvers
-    move about.
+def pose_array(transform: RigidTransform) -> np.ndarray:
+    """Top three rows of a transform's matrix: the form the solvers move about.
+
+    Parameters
+    ----------
+    transform : RigidTransform
+        One, or a stack.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 4)
     """
     return transform.as_matrix()[..., :3, :].copy()
 
 
-def pose_transform(pose, proper=False):
-    """The `RigidTransform` (one, or a stack) of a pose array, shape (..., 3, 4); `proper` ones hold
-    exact rotations.
+def pose_transform(pose: np.ndarray, proper: bool = False) -> RigidTransform:
+    """The transform (one, or a stack) of a pose array.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+    proper : bool
+        The rotations are exact, and need not be made so.
     """
     whole = np.zeros((*pose.shape[:-2], 4, 4))
     whole[..., :3, :] = pose
@@ -295,14 +417,33 @@ def pose_transform(pose, proper=False):
     )  # much faster than from components
 
 
-def exp_rotation(w):
-    """Rotation matrices of rotation vectors, shape (..., 3) -> (..., 3, 3)."""
+def exp_rotation(w: ArrayLike) -> np.ndarray:
+    """Rotation matrices of rotation vectors.
+
+    Parameters
+    ----------
+    w : array_like, shape (..., 3)
+        Radians.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
     return Rotation.from_rotvec(w).as_matrix()
 
 
-def log_rotation(R):
-    """Rotation vectors of rotation matrices, shape (..., 3, 3) -> (..., 3); they are taken to be
-    exact.
+def log_rotation(R: np.ndarray) -> np.ndarray:
+    """Rotation vectors of rotation matrices.
+
+    Parameters
+    ----------
+    R : ndarray, shape (..., 3, 3)
+        Taken to be exact.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Radians.
     """
     if R.ndim == 2:
         return Rotation.from_matrix(R, assume_valid=True).as_rotvec()
@@ -320,50 +461,114 @@ def log_rotation(R):
     return w
 
 
-def pose_parameters(pose):
-    """Rotation vector and translation of pose arrays, shape (..., 6), in the order of
-    `POSE_NAMES`.
+def pose_parameters(pose: np.ndarray) -> np.ndarray:
+    """Rotation vectors and translations in the order of `POSE_NAMES`.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+
+    Returns
+    -------
+    ndarray, shape (..., 6)
+        Radians and metres.
     """
     return np.concatenate([log_rotation(pose[..., :3]), pose[..., 3]], axis=-1)
 
 
-def move_pose(pose, delta):
-    """Small change of poses (..., 3, 4): ``R <- exp(w) R``, ``t <- t + v`` with ``delta = [w, v]``
-    (..., 6).
+def move_pose(pose: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    """Small change of poses: ``R <- exp(w) R``, ``t <- t + v``.
 
-    Radians and metres, in the destination frame.
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+    delta : ndarray, shape (..., 6)
+        ``[w, v]``, radians and metres, in the destination frame.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 4)
     """
     turned = exp_rotation(delta[..., :3]) @ pose[..., :3]
     return np.concatenate([turned, (pose[..., 3] + delta[..., 3:6])[..., None]], axis=-1)
 
 
-def rotate_points(pose, points):
-    """``R p`` of points (..., n, 3) or (n, 3) under poses (..., 3, 4), shape (..., n, 3)."""
+def rotate_points(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """``R p`` of points under poses.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+    points : ndarray, shape (..., n, 3) or (n, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., n, 3)
+    """
     return points @ np.swapaxes(pose[..., :3], -1, -2)
 
 
-def apply_pose(pose, points):
-    """``R p + t`` of points (..., n, 3) or (n, 3) under poses (..., 3, 4), shape (..., n, 3)."""
+def apply_pose(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """``R p + t`` of points under poses.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+    points : ndarray, shape (..., n, 3) or (n, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., n, 3)
+    """
     return rotate_points(pose, points) + pose[..., None, :, 3]
 
 
-def gradient_by_pose(rotated, gradient):
-    """Jacobian rows (..., n, 6) by ``[w, v]`` of scalars with gradient ``a`` (..., n, 3) by the
-    moved point.
+def gradient_by_pose(rotated: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Jacobian rows of scalars by ``[w, v]`` of the pose that moves their points.
 
-    ``a . (w x R p) + a . v = [R p x a, a] . [w, v]``; `rotated` is ``R p``, without the
-    translation.
+    ``a . (w x R p) + a . v = [R p x a, a] . [w, v]``.
+
+    Parameters
+    ----------
+    rotated : ndarray, shape (..., n, 3)
+        ``R p``, without the translation.
+    gradient : ndarray, shape (..., n, 3)
+        ``a``, of the scalars by the moved points.
+
+    Returns
+    -------
+    ndarray, shape (..., n, 6)
     """
     return np.concatenate([cross(rotated, gradient), gradient], axis=-1)
 
 
-def noise_correction(rotated, point, gradient, shift, factor, pinhole=True):
+def noise_correction(
+    rotated: np.ndarray,
+    point: np.ndarray,
+    gradient: np.ndarray,
+    shift: np.ndarray,
+    factor: np.ndarray,
+    pinhole: bool = True,
+) -> np.ndarray:
     """What errors in the points take from Jacobian rows by the pose: ``factor`` times half the
     change of the variance.
 
-    `rotated` and `point` are ``R p`` and ``R p + t``, `gradient` that of a scalar by the moved
-    point, ``l . pinhole(q)`` or, with `pinhole` False, ``m . q``, `shift` (:func:`moved_noise`) the
-    direction in which the noise pulls the point, `factor` (..., n) the weighted residual.
+    Parameters
+    ----------
+    rotated, point : ndarray, shape (..., n, 3)
+        ``R p`` and ``R p + t``, metres.
+    gradient : ndarray, shape (..., n, 3)
+        Of a scalar by the moved point.
+    shift : ndarray, shape (..., n, 3)
+        The direction in which the noise pulls the point, see :func:`moved_noise`.
+    factor : ndarray, shape (..., n)
+        The weighted residual.
+    pinhole : bool
+        The scalar is ``l . pinhole(q)``; otherwise ``m . q``.
+
+    Returns
+    -------
+    ndarray, shape (..., n, 6)
     """
     by_turn = cross(shift, gradient)
     by_shift = np.zeros_like(by_turn)
@@ -375,9 +580,20 @@ def noise_correction(rotated, point, gradient, shift, factor, pinhole=True):
     return factor[..., None] * np.concatenate([by_turn, by_shift], axis=-1)
 
 
-def moved_noise(pose, gradient, covariance):
-    """``R C R^T a`` of source-frame covariances and gradients by the moved point, shape (..., n,
-    3).
+def moved_noise(pose: np.ndarray, gradient: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """``R C R^T a``: where the noise of points pulls scalars of the moved points.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+    gradient : ndarray, shape (..., n, 3)
+        ``a``, by the moved points.
+    covariance : ndarray, shape (..., n, 3, 3)
+        Of the points in the source frame, square metres.
+
+    Returns
+    -------
+    ndarray, shape (..., n, 3)
     """
     in_source = gradient @ pose[..., :3]
     pulled = (in_source[..., None, :] @ covariance)[..., 0, :]
@@ -394,9 +610,14 @@ def axis_words(direction):
     return "({:.2f}, {:.2f}, {:.2f})".format(*(direction + 0.0))
 
 
-def motion_words(delta, frame):
-    """Name a small motion ``[w, v]`` by its direction, e.g. ``translation along x of the left
-    frame``.
+def motion_words(delta: np.ndarray, frame: str) -> str:
+    """Name a small motion by its direction, e.g. ``translation along x of the left frame``.
+
+    Parameters
+    ----------
+    delta : array_like, shape (6,)
+        ``[w, v]``.
+    frame : str
     """
     w = np.asarray(delta[:3], float)
     v = np.asarray(delta[3:6], float)
@@ -410,59 +631,131 @@ def motion_words(delta, frame):
     return f"{words} with translation along {axis_words(v)}"
 
 
-def point_set(positions, point, distance, tolerance):
-    """Positions (..., 3) that a point at a measured distance allows: a spherical shell around it,
-    figure 3 (a).
+def point_set(
+    positions: ArrayLike, point: ArrayLike, distance: float, tolerance: float
+) -> np.ndarray:
+    """Which positions a point at a measured distance allows: a spherical shell around it, figure
+    3 (a).
+
+    Parameters
+    ----------
+    positions : array_like, shape (..., 3)
+    point : array_like, shape (3,)
+    distance, tolerance : float
+        Metres.
+
+    Returns
+    -------
+    ndarray of bool, shape (...)
     """
     away = np.linalg.norm(np.asarray(positions, float) - point, axis=-1)
     return np.abs(away - distance) <= tolerance
 
 
-def line_set(positions, point, direction, distance, tolerance):
-    """Positions (..., 3) that a line with one hit point at a measured distance allows: a cylinder,
-    figure 3 (b).
+def line_set(
+    positions: ArrayLike, point: ArrayLike, direction: np.ndarray, distance: float, tolerance: float
+) -> np.ndarray:
+    """Which positions a line with one hit point at a measured distance allows: a cylinder, figure
+    3 (b).
 
-    Which point of the line (through `point`, with unit `direction`) was hit is not known.
+    Parameters
+    ----------
+    positions : array_like, shape (..., 3)
+    point, direction : array_like, shape (3,)
+        A point of the line and its unit direction; which point was hit is not known.
+    distance, tolerance : float
+        Metres.
+
+    Returns
+    -------
+    ndarray of bool, shape (...)
     """
     away = np.linalg.norm(np.cross(np.asarray(positions, float) - point, direction), axis=-1)
     return away <= distance + tolerance
 
 
-def plane_set(positions, point, normal, distance, tolerance):
-    """Positions (..., 3) that a plane with one hit point at a measured distance allows: a slab,
-    figure 3 (c).
+def plane_set(
+    positions: ArrayLike, point: ArrayLike, normal: ArrayLike, distance: float, tolerance: float
+) -> np.ndarray:
+    """Which positions a plane with one hit point at a measured distance allows: a slab, figure
+    3 (c).
 
-    The unit `normal` points towards the sensor.
+    Parameters
+    ----------
+    positions : array_like, shape (..., 3)
+    point, normal : array_like, shape (3,)
+        Of the plane; the unit normal points towards the sensor.
+    distance, tolerance : float
+        Metres.
+
+    Returns
+    -------
+    ndarray of bool, shape (...)
     """
     height = (np.asarray(positions, float) - point) @ np.asarray(normal, float)
     return (height >= -tolerance) & (height <= distance + tolerance)
 
 
-def shell_volume(distance, tolerance):
-    """Volume of a spherical shell of half thickness `tolerance`, cubic metres."""
+def shell_volume(distance: float, tolerance: float) -> float:
+    """Volume of a spherical shell, cubic metres.
+
+    Parameters
+    ----------
+    distance : float
+        Radius of its middle, metres.
+    tolerance : float
+        Half its thickness, metres.
+    """
     return 4 / 3 * np.pi * ((distance + tolerance) ** 3 - max(distance - tolerance, 0.0) ** 3)
 
 
-def crossing_volume(radius, angle):
-    """Volume common to two cylinders of equal radius whose axes meet at an angle (radians), cubic
-    metres.
+def crossing_volume(radius: float, angle: ArrayLike) -> np.ndarray:
+    """Volume common to two cylinders whose axes meet, ``16 r^3 / (3 sin angle)``.
 
-    ``16 r^3 / (3 sin angle)``: smallest for perpendicular axes, infinite for parallel ones.
+    Parameters
+    ----------
+    radius : float
+        Of both, metres.
+    angle : array_like, shape (...)
+        Between the axes, radians.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Cubic metres: smallest for perpendicular axes, infinite for parallel ones.
     """
     sine = np.abs(np.sin(np.asarray(angle, float)))
     with np.errstate(divide="ignore"):
         return np.where(sine > 1e-15, 16 * radius**3 / 3 / sine, np.inf)
 
 
-def ball(radius, count, rng):
-    """Positions drawn evenly from a ball around the origin, shape (count, 3), metres."""
+def ball(radius: float, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Positions drawn evenly from a ball around the origin.
+
+    Parameters
+    ----------
+    radius : float
+        Metres.
+    count : int
+    rng : Generator
+
+    Returns
+    -------
+    ndarray, shape (count, 3)
+    """
     positions = rng.normal(size=(count, 3))
     positions /= np.linalg.norm(positions, axis=1, keepdims=True)
     return radius * positions * np.cbrt(rng.uniform(size=(count, 1)))
 
 
-def triangle_angle(ab, ac, bc):
-    """Angle at A of a triangle with the given sides, radians (law of cosines)."""
+def triangle_angle(ab: float, ac: float, bc: float) -> float:
+    """Angle at A of a triangle, radians (law of cosines).
+
+    Parameters
+    ----------
+    ab, ac, bc : float
+        Lengths of the sides; ValueError where they make no triangle.
+    """
     cosine = (ab**2 + ac**2 - bc**2) / (2 * ab * ac)
     if abs(cosine) > 1:
         raise ValueError(

@@ -1,6 +1,5 @@
-"""Figures of results: bars, strips, maps, uncertainty, diagnosis."""
+"""Figures of results: bars, strips and points."""
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,15 +13,11 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots.recording import COLORS, SERIES, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
-LEVELS = 5
-LEAST_HEIGHT = 20.0  # degrees of a map: that of a head which hardly moves would be a line
 SPREAD: dict[str, Any] = {
     "capsize": 2,
     "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]},
 }  # of bars
 WORST = 4.0  # times the median: a placement that fits so badly is an outlier
-SHOWN = 6  # least known combinations of unknowns
-ROW = 64  # letters
 
 
 def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
@@ -179,100 +174,6 @@ def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
         title = f"least: {mean.idxmin()}"
     ax.set_title(title)
     ax.legend()
-
-
-def projection_map(ax, found, index=0, name=""):
-    """Standard deviation over an image of where points of the LRF project, at a map's distance.
-
-    `found` is a SigmaMap of :func:`lrfcal_lib.judge.uncertainty.projection_sigma`; inf and NaN
-    stay white.
-    """
-    _sigma_map(ax, found, index, "px", name)
-    ax.invert_yaxis()
-    ax.set(xlabel="u [px]", ylabel="v [px]")
-
-
-def point_map(ax, found, index=0):
-    """Standard deviation of points over the field of view, of ``uncertainty.point_sigma``."""
-    _sigma_map(ax, found, index, "mm", "cloud", np.degrees(1.0), 1000.0)
-    middle = np.mean(ax.get_ylim())
-    height = max(np.ptp(ax.get_ylim()), LEAST_HEIGHT)
-    ax.set_ylim(middle - height / 2, middle + height / 2)
-    ax.invert_xaxis()
-    ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]")
-
-
-def _sigma_map(ax, found, index, unit, name, angle=1.0, scale=1.0):
-    """Colours and labelled lines of equal standard deviation.
-
-    `angle` and `scale` are factors to the units shown.
-    """
-    at = (angle * found.columns, angle * found.rows)
-    good = np.ma.masked_invalid(scale * found.sigma[index])
-    shading = "nearest" if good.count() < good.size else "gouraud"
-    top = good.max() if good.count() else 1.0
-    mesh = ax.pcolormesh(*at, good, cmap="viridis", shading=shading, vmin=0.0, vmax=top)
-    ax.grid(False)
-    if good.count() and good.max() > 1.05 * good.min():
-        lines = ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8)
-        ax.clabel(lines, fontsize=8, fmt="%.3g")
-    label = f"standard deviation [{unit}]"
-    ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.8, format="%.3g")
-    ax.set_aspect("equal")
-    rms = scale * found.rms()[index]
-    size = f"{rms:.2g} {unit} rms" if np.isfinite(rms) else "no bound"
-    ax.set_title(f"{name} at {found.distances[index]:g} m: {size}")
-
-
-def point_parts(ax, found):
-    """What axis, range offset and pitch add to the error of a point, by distance.
-
-    SigmaMap of ``point_sigma``.
-    """
-    rms = {name: np.sqrt(np.mean(part**2, axis=(1, 2))) for name, part in found.parts.items()}
-    shown = {name: value for name, value in rms.items() if np.any(value > 0)}
-    dots = {"marker": "o", "markersize": 3.5}
-    for index, (name, value) in enumerate(shown.items()):
-        style = ":" if name == "range noise" else "--"
-        color = SERIES[index % len(SERIES)]
-        ax.plot(found.distances, 1000 * value, style, color=color, label=name, **dots)
-    whole = 1000 * found.rms()
-    if np.any(whole > 0):
-        ax.plot(found.distances, whole, "-", color=COLORS["truth"], label="calibration", **dots)
-    ax.set(xlabel="distance [m]", ylabel="standard deviation [mm]")
-    ax.set_ylim(0, 1.35 * ax.get_ylim()[1])
-    ax.set_title(f"calibration: {whole[-1]:.2g} mm at {found.distances[-1]:g} m")
-    ax.legend(ncols=2, loc="upper left")
-
-
-def observability_bars(ax: Axes, directions: Sequence) -> None:
-    """The least known combinations of unknowns, in words.
-
-    Parameters
-    ----------
-    ax
-    directions
-        Of ``next_placement.observability``, the least known first.
-    """
-    shown = directions[:SHOWN]
-    sigma = 1000 * np.array([direction.sigma for direction in shown])
-    known = np.isfinite(sigma)
-    longest = 1.15 * sigma[known].max(initial=0.0) or 1.0
-    for row, value in enumerate(sigma):
-        if known[row]:
-            ax.barh(row, value, 0.6, color=COLORS["fit"])
-            ax.text(value, row, f" {value:.2g} mm", va="center")
-        else:
-            ax.barh(row, longest, 0.6, color=COLORS["outlier"])
-            ax.text(0.0, row, " not determined", va="center", color="white")
-    title = f"{(~known).sum()} motions are not determined"
-    if known.all():
-        title = f"least known: {sigma[0]:.2g} mm at 2 m"
-    ax.set_title(title)
-    ax.set(xlim=(0, 1.12 * longest), xlabel="standard deviation at 2 m [mm]")
-    rows_of(ax, [textwrap.fill(direction.words, ROW) for direction in shown])
-    ax.tick_params(axis="y", labelsize=8)
-    ax.grid(False, axis="y")
 
 
 def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:

@@ -8,6 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines
 from lrfcal_lib.model.camera import CameraModel, line_distance, project, undistort
 from lrfcal_lib.model.geometry import pose_array
+from lrfcal_lib.preprocess.bundle import SIGMA_FLOOR_PX
 from lrfcal_lib.preprocess.edges_in_image import (
     FULL_CONTRAST,
     EdgeNotSeen,
@@ -18,7 +19,7 @@ from lrfcal_lib.preprocess.edges_in_image import (
     sample,
     step_contrast,
 )
-from lrfcal_lib.preprocess.intrinsics import SIGMA_FLOOR_PX, board_pose, raised_points
+from lrfcal_lib.preprocess.intrinsics import board_pose, raised_points
 from lrfcal_lib.preprocess.outline_poses import find_polygon, outline_poses
 from lrfcal_lib.preprocess.pose_from_lines import line_residuals, pose_from_edges
 
@@ -166,7 +167,7 @@ def order_scores(
 
 
 def pose_with_edges(
-    view: BoardView, board: Board, model: CameraModel, relief: np.ndarray | None = None
+    view, board, model: CameraModel, relief: np.ndarray | None = None
 ) -> tuple[RigidTransform, np.ndarray]:
     """Pose of a board from the corners of its pattern and its edges, weighted by their covariances.
 
@@ -181,6 +182,7 @@ def pose_with_edges(
     view : BoardView
         With the pose from the corners alone.
     board : Board
+        With a pattern.
     model : CameraModel
     relief : ndarray, shape (k,), optional
         Heights of the corners, metres.
@@ -209,7 +211,7 @@ def pose_with_edges(
     variance = max(fits.min() / (2 * visible.sum()), SIGMA_FLOOR_PX**2)
     # no agreement of the edges makes up for corners that fit worse than this
     most = fits.min() + AGREE_CHI2 * len(view.edges) * variance
-    best = None
+    best = starts[0]
     least = np.inf
     for fit, (pose, covariance) in zip(fits, starts, strict=True):
         if fit > most:
@@ -223,7 +225,7 @@ def pose_with_edges(
         misses, _ = line_residuals(view.edges, board, model, pose_array(pose))
         off = np.minimum(np.sum(misses**2, axis=1), AGREE_CHI2)
         cost = squares(pose) / variance + off.sum()
-        if best is None or cost < least:
+        if cost < least:
             best = pose, covariance
             least = cost
     return best

@@ -4,30 +4,35 @@ import numpy as np
 from scipy import ndimage
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess.board_in_scan import median_step
+from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
     BORDER,
     MIXING,
+    ScanEdges,
     background_odds,
     beyond,
     plane_range,
 )
 from lrfcal_lib.preprocess.surfaces import DEPTH_NOISE, plane_axes
+from lrfcal_lib.session.stated import LrfInfo
 
 REACH = 2  # beams (or scan lines) on either side of a boundary
 CORNER = 1.0  # spot radii: a spot nearer than this to a second edge may reach over it
 SURE = 5.0  # standard deviations of a range: what is nearer to the board's plane read the board
 
 
-def edge_cells(scan, along, swept, lrf):
+def edge_cells(
+    scan: BoardScan, along: ScanEdges, swept: ScanEdges | None, lrf: LrfInfo
+) -> np.recarray:
     """The beams about every boundary of the board, along and across the scan lines.
 
     Parameters
     ----------
     scan : BoardScan
-    along, swept : ScanEdges
-        Of :func:`lrfcal_lib.preprocess.edges_in_scan.crossings`, along and across the scan lines;
-        None instead of `swept` for a single shot.
+    along : ScanEdges
+        Of :func:`lrfcal_lib.preprocess.edges_in_scan.crossings`.
+    swept : ScanEdges or None
+        The same across the scan lines; None for a single shot.
     lrf : LrfInfo
         Knows the spot.
 
@@ -46,36 +51,65 @@ def edge_cells(scan, along, swept, lrf):
         outline has such a background they stay, with `background` 0; so do all cells where most
         boundaries have no return behind them (clouds cut to the board).
     """
-    found = [edges for edges in (along, swept) if edges is not None]
+    ways = [edges for edges in (along, swept) if edges is not None]
     sweep = scan.sweep
-    line = np.concatenate([edges.line[edges.side >= 0] for edges in found])
-    beam = np.concatenate([edges.beam[edges.side >= 0] for edges in found])
-    step = np.concatenate([edges.step[edges.side >= 0] for edges in found])
-    side = np.concatenate([edges.side[edges.side >= 0] for edges in found])
+    line = np.concatenate([edges.line[edges.side >= 0] for edges in ways])
+    beam = np.concatenate([edges.beam[edges.side >= 0] for edges in ways])
+    step = np.concatenate([edges.step[edges.side >= 0] for edges in ways])
+    side = np.concatenate([edges.side[edges.side >= 0] for edges in ways])
     rays = polar_to_points(1.0, sweep.bearings)
     board, cosine = plane_range(scan, rays, sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
     radius = lrf.spot_radius(board)
+
     here = board[line, beam]
     behind = beyond(scan, line, beam, step)
-    seen = np.isfinite(behind)
+    visible = np.isfinite(behind)
     mixed = behind - here < MIXING
-    close = len(seen) == 0 or np.mean(seen) < 0.5 or np.mean(mixed) >= 0.5
-    if close:
-        odds = np.zeros(len(here))
-        usable = np.arange(len(here))
-    else:
+    close = len(visible) == 0 or np.mean(visible) < 0.5 or np.mean(mixed) >= 0.5
+    odds = np.zeros(len(here))
+    usable = np.arange(len(here))
+    if not close:
         odds = background_odds(here, behind)
-        usable = np.flatnonzero(seen & ~mixed)
+        usable = np.flatnonzero(visible & ~mixed)
+
     row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape)
-    # before a far background also beams that noise takes off the plane read the board
+    cells = line, beam
+    hit, keep = _readings(scan, cells, k, board, radius, close)
+    sides = [s for edges in ways for s in edges.sides]
+    reach = (CORNER * radius / np.abs(cosine))[cells]
+    keep &= _on_one_side(scan, cells, board, reach, sides, side[row])
+    across = step[row, 0] != 0
+    columns = {
+        "line": line,
+        "beam": beam,
+        "bearing": sweep.bearings[beam],
+        "pitch": sweep.pitch[line],
+        "hit": hit,
+        "side": side[row],
+        "range_m": board[cells],
+        "radius": radius[cells],
+        "background": odds[row],
+        "across": across,
+        "step": np.where(across, median_step(sweep.pitch), median_step(sweep.bearings)),
+    }
+    names = ",".join(columns)
+    return np.rec.fromarrays([*columns.values()], names=names)[keep]  # type: ignore[call-overload]
+
+
+def _readings(scan, cells, k, board, radius, close):
+    """Which cells, k steps from a boundary, read the board, and which can be told.
+
+    `board` and `radius` (L, B) are the range of the board's plane and of the spot there; `close`
+    where most of the outline has a background that melts into the board's echo.
+    """
+    sweep = scan.sweep
     near = max(SURE * scan.sigma_range, DEPTH_NOISE)
-    gaps = median_step(sweep.pitch), median_step(sweep.bearings)
+    miss = sweep.ranges - board
+    excess = miss[cells]
+    hit = scan.mask[cells]
     with np.errstate(invalid="ignore"):
-        miss = sweep.ranges - board
-        excess = miss[line, beam]
-        hit = scan.mask[line, beam]
-        if not close:
+        if not close:  # also beams that noise takes off the plane read the board
             hit = hit | (np.abs(excess) < near)
         # without what hides the board, and without holes: nothing, or something near, read inside
         # the boundary
@@ -84,25 +118,9 @@ def edge_cells(scan, along, swept, lrf):
         if not close:
             mixing = (np.abs(miss) > near) & (miss < MIXING)
             size = np.nanmedian((radius / board)[scan.mask])
-            keep &= ~_within_a_spot(mixing, size, gaps)[line, beam]
-    sides = [s for edges in found for s in edges.sides]
-    reach = (CORNER * radius / np.abs(cosine))[line, beam]
-    keep &= _on_one_side(scan, (line, beam), board, reach, sides, side[row])
-    across = step[row, 0] != 0
-    cells = {
-        "line": line,
-        "beam": beam,
-        "bearing": sweep.bearings[beam],
-        "pitch": sweep.pitch[line],
-        "hit": hit,
-        "side": side[row],
-        "range_m": board[line, beam],
-        "radius": radius[line, beam],
-        "background": odds[row],
-        "across": across,
-        "step": np.where(across, *gaps),
-    }
-    return np.rec.fromarrays([*cells.values()], names=[*cells])[keep]
+            gaps = median_step(sweep.pitch), median_step(sweep.bearings)
+            keep &= ~_within_a_spot(mixing, size, gaps)[cells]
+    return hit, keep
 
 
 def _within_a_spot(mixing, size, gaps):

@@ -1,7 +1,4 @@
-"""Straight edges in an image at sub-pixel level: profiles, votes, a robust line fit.
-
-The wide search.
-"""
+"""Straight edges in an image at sub-pixel level: profiles across, votes, a robust line."""
 
 from dataclasses import dataclass
 
@@ -9,7 +6,7 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.fit.robust import biweight, robust_sigma
-from lrfcal_lib.model.camera import fold, line_through, pinhole
+from lrfcal_lib.model.camera import CameraModel, fold, line_through, pinhole
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -24,6 +21,17 @@ SYSTEMATIC_PX = 0.1
 FULL_CONTRAST = 30.0
 PICK_SIGMA_PX = 1.0  # of a point clicked by hand
 BEHIND = -1e6  # pixels; where points behind the camera are drawn
+NEAR_PX = 2.0  # from the prediction: what must lie inside the image
+LONGEST = 8  # times the image
+SLOPES = 41  # of lines that are voted for
+STEEPEST = 24  # samples from the middle of a line to its end
+TOLERANCE_PX = 1.5  # from the line of most votes
+FIT_ROUNDS = 12
+LEAST_SIGMA = 0.02  # samples
+SETTLED = 1e-7  # samples
+# of the correlation of averaged profiles, which share pixels, whatever a short series says
+LEAST_CORRELATION = 1.1 * AVERAGED_PROFILES
+SOKAL = 3.0  # window of an integrated autocorrelation, in units of the latter
 
 
 @dataclass(frozen=True)
@@ -61,6 +69,125 @@ class EdgeNotSeen(ValueError):
     """An edge cannot be used in this image; the message is the reason."""
 
 
+@dataclass(frozen=True)
+class _Fit:
+    """A line ``place = offset + slope column`` in a strip, in samples.
+
+    `covariance` (2, 2) is of offset and slope, `columns` are those of the peaks that it goes
+    through, `rms` is their distance.
+    """
+
+    offset: float
+    slope: float
+    covariance: np.ndarray
+    columns: np.ndarray
+    rms: float
+
+
+def refine_edge(
+    image: np.ndarray,
+    model: CameraModel,
+    name: str,
+    start: np.ndarray,
+    end: np.ndarray,
+    outward: np.ndarray,
+    half_width: float,
+    prior_px: float = np.inf,
+) -> ImageEdge:
+    """Find a straight edge near a predicted stretch.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (h, w) or (h, w, 3)
+    model : CameraModel
+    name : str
+        Of the edge.
+    start, end : ndarray, shape (2,)
+        Predicted ends, undistorted pixels.
+    outward : ndarray, shape (2,)
+        Any vector that points out of the board.
+    half_width : float
+        How far to both sides the edge is looked for, pixels.
+    prior_px : float
+        Standard deviation of the prediction: of two lines with similar support the nearer one is
+        taken.
+
+    Returns
+    -------
+    ImageEdge
+
+    Raises
+    ------
+    EdgeNotSeen
+        With the reason.
+    """
+    length = np.linalg.norm(end - start)
+    if min(*start, *end) <= BEHIND:
+        raise EdgeNotSeen("it passes behind the camera")
+    if not LEAST_PROFILES <= length < LONGEST * max(image.shape):
+        raise EdgeNotSeen(f"its predicted length is {length:.0f} px")
+    along = (end - start) / length
+    normal = np.array([along[1], -along[0]])
+    normal = normal * np.sign(normal @ outward)
+    columns = np.arange(int(length) + 1)
+    pad = 3 * SMOOTH_PX + 1
+    across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
+    on_edge = start + columns[None, :, None] * along
+    strip = sample(image, model, on_edge + across[:, None, None] * normal)
+    near = strip[np.abs(across) <= NEAR_PX, :, 0]
+    visible = int(np.isfinite(near).all(axis=0).sum())
+    if visible < max(LEAST_PROFILES, LEAST_SHARE * len(columns)):
+        share = 100 * visible / len(columns)
+        raise EdgeNotSeen(f"cut by the image border: {share:.0f}% of it inside the image")
+    fit = _line_in_strip(strip, visible, across, half_width, prior_px)
+    middle = fit.columns.mean()
+    seen = np.array([fit.columns.min(), fit.columns.max(), middle])[:, None]
+    off = across[0] + ACROSS_STEP_PX * (fit.offset + fit.slope * seen)
+    first, last, centre = start + seen * along + off * normal
+    line = outward_line(first, last, normal)
+    to_middle = np.array([[1.0, middle], [0.0, 1.0]])
+    covariance = to_middle @ fit.covariance @ to_middle.T * ACROSS_STEP_PX**2
+    stretch = max(np.ptp(fit.columns), 1)
+    covariance += np.diag([1.0, 12 / stretch**2]) * SYSTEMATIC_PX**2
+    # a slope ds moves the far end outwards; the angle turns the normal from u to v
+    turn = -np.sign(along @ [-line[1], line[0]])
+    return ImageEdge(
+        name=name,
+        line=line,
+        covariance=covariance * np.outer([1, turn], [1, turn]),
+        centre=centre,
+        ends=np.stack([first, last]),
+        n_points=len(fit.columns),
+        rms_px=fit.rms * ACROSS_STEP_PX,
+    )
+
+
+def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
+    """The edge through two points clicked by hand.
+
+    Parameters
+    ----------
+    name : str
+    ends : ndarray, shape (2, 2)
+        Undistorted pixels.
+    inner : ndarray, shape (2,)
+        A point of the board, likewise.
+
+    Returns
+    -------
+    ImageEdge
+    """
+    length = np.linalg.norm(ends[1] - ends[0])
+    centre = ends.mean(axis=0)
+    if length < 1:
+        raise ValueError(
+            f"edge '{name}' was picked with two points {length:.2f} px apart: pick them far apart"
+        )
+    line = outward_line(ends[0], ends[1], centre - inner)
+    covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
+    return ImageEdge(name, line, covariance, centre, ends, n_points=2, rms_px=0.0)
+
+
 def loops():
     """The compiled loops; numba takes half a second to load."""
     from lrfcal_lib.preprocess import profiles
@@ -68,7 +195,7 @@ def loops():
     return profiles
 
 
-def sample(image, model, uv):
+def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:
     """Colours (..., channels) at undistorted pixels (..., 2), bilinear; NaN outside the image.
 
     `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid.
@@ -118,155 +245,10 @@ def peaks(height, least=LEAST_CONTRAST):
     return column, row + 1 + 0.5 * (a - c) / bend, b
 
 
-def fit_line(column, place, offset, slope, tolerance, rounds=12):
-    """Robust line ``place = offset + slope column`` through the peaks near a start line.
-
-    Near are those within `tolerance` samples; Tukey's biweight. Returns the offset and slope (2,),
-    their covariance, which peaks were kept, and their rms. Neighbouring profiles share pixels and
-    the same dents, so errors are correlated along the edge; the covariance is multiplied by the
-    integrated autocorrelation of the residuals.
-    """
-    design = np.column_stack([np.ones(len(column)), column])
-    for _ in range(rounds):
-        residual = place - offset - slope * column
-        near = np.abs(residual) < tolerance
-        if near.sum() < 3:
-            return np.array([offset, slope]), np.full((2, 2), np.inf), near, np.inf
-        sigma = robust_sigma(residual[near], least=0.02)
-        weight = np.where(near, biweight(residual, sigma), 0)
-        normal = design.T @ (design * weight[:, None])
-        new = np.linalg.solve(normal, design.T @ (weight * place))
-        done = np.allclose(new, [offset, slope], rtol=0, atol=1e-7)
-        offset, slope = new
-        if done:
-            break
-    kept = weight > 0
-    residual = (place - offset - slope * column)[kept]
-    variance = residual @ residual / max(kept.sum() - 2, 1)
-    # averaged profiles share pixels: their errors are correlated at least that much, whatever a
-    # short series says
-    factor = max(correlation_factor(column[kept], residual), 1.1 * AVERAGED_PROFILES)
-    covariance = np.linalg.inv(design[kept].T @ design[kept]) * variance * factor
-    return new, covariance, kept, float(np.sqrt(np.mean(residual**2)))
-
-
-def correlation_factor(column, residual, window=3.0):
-    """Integrated autocorrelation of residuals along the edge, ``1 + 2 sum rho``, at least 1.
-
-    With Sokal's window.
-    """
-    place = column - column.min()
-    length = place.max() + 1
-    series = np.zeros(length)
-    present = np.zeros(length)
-    series[place] = residual
-    present[place] = 1.0
-    mean_product = _autocorrelation(series) / np.maximum(_autocorrelation(present), 1)
-    rho = mean_product / max(mean_product[0], 1e-300)
-    # a line was taken out: the residuals of white noise already sum to about -1, so no further
-    # correction is needed
-    total = 1 + 2 * np.cumsum(np.r_[0.0, rho[1 : length // 3]])
-    beyond = np.flatnonzero(np.arange(len(total)) >= window * total)
-    last = beyond[0] if len(beyond) else -1
-    return float(max(total[last], 1.0))
-
-
-def _autocorrelation(series):
-    """Sums of products of a series (n,) with itself, by the distance apart."""
-    size = 2 ** int(np.ceil(np.log2(2 * len(series))))
-    power = np.abs(np.fft.rfft(series, size)) ** 2
-    return np.fft.irfft(power, size)[: len(series)]
-
-
-def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np.inf, most=np.inf):
-    """Find a straight edge near a predicted stretch: an ImageEdge, or EdgeNotSeen with the reason.
-
-    `start` and `end` are the predicted ends (undistorted pixels), `outward` any vector that points
-    out of the board; the edge is searched `half_width` pixels to both sides. `prior_px` is the
-    standard deviation of the prediction: of two lines with similar support the nearer one is taken.
-    A profile stands at every pixel, or at `most` that many.
-    """
-    length = np.linalg.norm(end - start)
-    if min(*start, *end) <= BEHIND:
-        raise EdgeNotSeen("it passes behind the camera")
-    if not LEAST_PROFILES <= length < 8 * max(image.shape):
-        raise EdgeNotSeen(f"its predicted length is {length:.0f} px")
-    along = (end - start) / length
-    normal = np.array([along[1], -along[0]])
-    normal = normal * np.sign(normal @ outward)
-    apart = max(int(length / most), 1)
-    columns = np.arange(0, int(length) + 1, apart)
-    pad = 3 * SMOOTH_PX + 1
-    across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    on_edge = start + columns[None, :, None] * along
-    strip = sample(image, model, on_edge + across[:, None, None] * normal)
-    near = strip[np.abs(across) <= 2.0, :, 0]
-    visible = int(np.isfinite(near).all(axis=0).sum())
-    if visible < max(LEAST_PROFILES, LEAST_SHARE * len(columns)):
-        share = 100 * visible / len(columns)
-        raise EdgeNotSeen(f"cut by the image border: {share:.0f}% of it inside the image")
-    fitted, covariance, profiles, rms = _line_in_strip(strip, visible, across, half_width, prior_px)
-    offset, slope = fitted
-    seen = apart * profiles
-    slope = slope / apart
-    covariance = covariance / np.outer([1, apart], [1, apart])
-    middle = seen.mean()
-    to_middle = np.array([[1.0, middle], [0.0, 1.0]])
-    covariance = to_middle @ covariance @ to_middle.T * ACROSS_STEP_PX**2
-    covariance += np.diag([1.0, 12 / max(np.ptp(seen), 1) ** 2]) * SYSTEMATIC_PX**2
-    column = np.array([seen.min(), seen.max(), middle])[:, None]
-    off = across[0] + ACROSS_STEP_PX * (offset + slope * column)
-    points = start + column * along + off * normal
-    line = outward_line(points[0], points[1], normal)
-    # a slope ds moves the far end outwards; the angle turns the normal from u to v
-    turn = -np.sign(along @ [-line[1], line[0]])
-    covariance = covariance * np.outer([1, turn], [1, turn])
-    return ImageEdge(name, line, covariance, points[2], points[:2], len(seen), rms * ACROSS_STEP_PX)
-
-
-def _line_in_strip(strip, visible, across, half_width, prior_px):
-    """Line of most votes in a strip: offset and slope, covariance, profiles that show it, rms."""
-    height = step_contrast(strip, SMOOTH_PX / ACROSS_STEP_PX)
-    count = height.shape[1]
-    column, place, contrast = peaks(height)
-    widest = min(half_width / ACROSS_STEP_PX, 24)
-    slopes = np.linspace(-1, 1, 41) * widest / count * 2
-    weight = contrast / (contrast + FULL_CONTRAST)
-    votes = loops().vote(column, place, weight, height.shape, slopes)
-    # the prediction is as uncertain at either end as it is in the middle
-    tilted = slopes[:, None] * ACROSS_STEP_PX * count / 2
-    likely = np.exp(-0.5 * (across**2 + tilted**2) / prior_px**2)
-    allowed = (np.abs(across) <= half_width) * likely
-    turned, at = np.unravel_index(np.argmax(votes * allowed), votes.shape)
-    slope = slopes[turned]
-    offset = at - slope * (count - 1) / 2
-    tolerance = 1.5 / ACROSS_STEP_PX
-    line, covariance, kept, rms = fit_line(column, place, offset, slope, tolerance)
-    support = len(np.unique(column[kept])) / visible
-    if support < LEAST_SUPPORT or kept.sum() < LEAST_PROFILES:
-        raise EdgeNotSeen(f"no clear edge: {100 * support:.0f}% of the profiles agree on a line")
-    return line, covariance, column[kept], rms
-
-
 def outward_line(a, b, outward):
     """Pixel (or board) line through two points whose unit normal points to one side."""
     line = line_through(a, b)
     return line if line[:2] @ outward > 0 else -line
-
-
-def picked_edge(name, ends, inner):
-    """The edge through two points clicked by hand (2, 2).
-
-    `inner` is a point of the board. Undistorted pixels.
-    """
-    length = np.linalg.norm(ends[1] - ends[0])
-    centre = ends.mean(axis=0)
-    if length < 1:
-        raise ValueError(
-            f"edge '{name}' was picked with two points {length:.2f} px apart: pick them far apart"
-        )
-    covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
-    return ImageEdge(name, outward_line(*ends, centre - inner), covariance, centre, ends, 2, 0.0)
 
 
 def board_line(view, edge, model):
@@ -286,3 +268,78 @@ def on_board(xy, pose, model):
     """
     points = np.column_stack([xy.reshape(-1, 2), np.zeros(xy.size // 2)])
     return np.nan_to_num(pinhole(pose.apply(points), model), nan=BEHIND).reshape(xy.shape)
+
+
+def _line_in_strip(strip, visible, across, half_width, prior_px):
+    """The line of most votes in a strip (across, along, channels)."""
+    height = step_contrast(strip, SMOOTH_PX / ACROSS_STEP_PX)
+    count = height.shape[1]
+    column, place, contrast = peaks(height)
+    widest = min(half_width / ACROSS_STEP_PX, STEEPEST)
+    slopes = np.linspace(-1, 1, SLOPES) * widest / count * 2
+    weight = contrast / (contrast + FULL_CONTRAST)
+    votes = loops().vote(column, place, weight, height.shape, slopes)
+    # the prediction is as uncertain at either end as it is in the middle
+    tilted = slopes[:, None] * ACROSS_STEP_PX * count / 2
+    likely = np.exp(-0.5 * (across**2 + tilted**2) / prior_px**2)
+    allowed = (np.abs(across) <= half_width) * likely
+    turned, at = np.unravel_index(np.argmax(votes * allowed), votes.shape)
+    slope = slopes[turned]
+    fit = _fit_line(column, place, at - slope * (count - 1) / 2, slope)
+    support = len(np.unique(fit.columns)) / visible
+    if support < LEAST_SUPPORT or len(fit.columns) < LEAST_PROFILES:
+        raise EdgeNotSeen(f"no clear edge: {100 * support:.0f}% of the profiles agree on a line")
+    return fit
+
+
+def _fit_line(column, place, offset, slope):
+    """Robust line through the peaks near a start line (Tukey's biweight).
+
+    Neighbouring profiles share pixels and the same dents, so errors are correlated along the edge;
+    the covariance is multiplied by the integrated autocorrelation of the residuals.
+    """
+    design = np.column_stack([np.ones(len(column)), column])
+    line = np.array([offset, slope])
+    for _ in range(FIT_ROUNDS):
+        residuals = place - design @ line
+        near = np.abs(residuals) < TOLERANCE_PX / ACROSS_STEP_PX
+        if near.sum() < 3:
+            return _Fit(*line, np.full((2, 2), np.inf), column[near], np.inf)
+        sigma = robust_sigma(residuals[near], least=LEAST_SIGMA)
+        weight = np.where(near, biweight(residuals, sigma), 0)
+        normal = design.T @ (design * weight[:, None])
+        before = line
+        line = np.linalg.solve(normal, design.T @ (weight * place))
+        if np.allclose(line, before, rtol=0, atol=SETTLED):
+            break
+    kept = weight > 0
+    residuals = (place - design @ line)[kept]
+    variance = residuals @ residuals / max(len(residuals) - 2, 1)
+    factor = max(_correlation_factor(column[kept], residuals), LEAST_CORRELATION)
+    covariance = np.linalg.inv(design[kept].T @ design[kept]) * variance * factor
+    return _Fit(*line, covariance, column[kept], float(np.sqrt(np.mean(residuals**2))))
+
+
+def _correlation_factor(column, residuals):
+    """Integrated autocorrelation of residuals along the edge, ``1 + 2 sum rho``, at least 1."""
+    place = column - column.min()
+    length = place.max() + 1
+    series = np.zeros(length)
+    series[place] = residuals
+    present = np.zeros(length)
+    present[place] = 1.0
+    mean_product = _autocorrelation(series) / np.maximum(_autocorrelation(present), 1)
+    rho = mean_product / max(mean_product[0], 1e-300)
+    # a line was taken out: the residuals of white noise already sum to about -1, so no further
+    # correction is needed
+    total = 1 + 2 * np.cumsum(np.r_[0.0, rho[1 : length // 3]])
+    wide = np.arange(len(total)) >= SOKAL * total
+    wide[-1] = True
+    return float(max(total[wide.argmax()], 1.0))
+
+
+def _autocorrelation(series):
+    """Sums of products of a series (n,) with itself, by the distance apart."""
+    size = 2 ** int(np.ceil(np.log2(2 * len(series))))
+    power = np.abs(np.fft.rfft(series, size)) ** 2
+    return np.fft.irfft(power, size)[: len(series)]

@@ -306,12 +306,16 @@ def _ends(scan, across):
     angles = sweep.pitch if across else sweep.bearings
     inner = angles[cell[keep]]
     outer = angles[cell[keep] + way]
-    turned = outer - inner if across else np.median(np.diff(angles))
+    end = way
+    if across:
+        turned = outer - inner
+        number = np.arange(len(angles))
+        if len(angles) > 1 and np.polyfit(number, angles, 1)[0] <= 0:
+            end = -way  # a sweep downwards
+    else:
+        turned = np.median(np.diff(angles))
     here = scan.fitted[line, beam]
     after = sweep.ranges[line + step[:, 0], beam + step[:, 1]]
-    end = way
-    if across and len(angles) > 1 and np.polyfit(np.arange(len(angles)), angles, 1)[0] <= 0:
-        end = -way  # a sweep downwards
     visible = ~(after < here - depth_jump(here, turned))  # nothing nearer hides the board
     ends = line, beam, step, end, inner, outer
     return _Ends(*(part[visible] for part in ends))

@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from lrfcal_lib.model.board import Board
 from lrfcal_lib.preprocess.outline_in_images import FARTHEST
+from lrfcal_lib.preprocess.pattern_in_image import square_axes
 
 ALONG = 1.0  # beyond the farthest distance at which edges are looked for, squares
-ROOM = 0.1  # of the part on each side: the lens bends what is predicted here without it
+NEARER = 2.0  # times as large as the largest square of the pattern: what is nearer to the camera
 ROOM_PX = 60  # edges are looked for 40 px beside their prediction
 
 
@@ -33,38 +32,30 @@ class Part:
         return image
 
 
-def part_around(image: np.ndarray, corners: np.ndarray, board: Board) -> Part:
-    """The part of an image that may be looked at; all of it where that is behind the camera.
+def part_around(image: np.ndarray, corners: np.ndarray, board) -> Part:
+    """The part of an image that may be looked at.
 
-    `corners` (k, 2) are those of the pattern of the `board`, in any of its orders, pixels.
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (h, w) or (h, w, 3)
+    corners : ndarray, shape (k, 2)
+        Of the pattern, in any of its orders, pixels.
+    board : Board
+        With a pattern.
+
+    Returns
+    -------
+    Part
     """
-    height, width = image.shape[:2]
-    grid = board.pattern.points()[:, :2]
-    homography = cv2.findHomography(grid, np.asarray(corners, float))[0]
-    ends = np.column_stack([_rectangle(grid, board), np.ones(4)]) @ homography.T
-    middle = np.append(grid.mean(axis=0), 1.0) @ homography.T
-    depth = ends[:, 2] / middle[2]
-    if not np.all(depth > 0):
-        return Part(image.shape, 0, 0, image)
-    uv = ends[:, :2] / ends[:, 2:]
-    room = ROOM * np.ptp(uv, axis=0) + ROOM_PX
-    left, top = np.clip(uv.min(axis=0) - room, 0, [width, height]).astype(int)
-    right, bottom = np.clip(uv.max(axis=0) + room + 1, 0, [width, height]).astype(int)
+    pattern = board.pattern
+    beyond = FARTHEST + ALONG  # squares
+    if board.corners is not None:
+        grid = pattern.points()[:, :2]
+        low = grid.min(axis=0) - board.corners.min(axis=0)
+        high = board.corners.max(axis=0) - grid.max(axis=0)
+        beyond = max(*low, *high) / pattern.square
+    sides = np.linalg.norm(square_axes(corners, (pattern.columns, pattern.rows)), axis=1)
+    room = NEARER * beyond * sides.max() + ROOM_PX
+    left, top = np.maximum(corners.min(axis=0) - room, 0).astype(int)
+    right, bottom = (corners.max(axis=0) + room + 1).astype(int)
     return Part(image.shape, left, top, image[top:bottom, left:right].copy())
-
-
-def _rectangle(grid, board):
-    """Corners (4, 2) of a rectangle about the middle of the pattern that holds all of the board.
-
-    It holds the board also where the pattern is turned by 180 deg or mirrored (a square one also on
-    its side): which order its corners are found in does not matter.
-    """
-    middle = grid.mean(axis=0)
-    if board.corners is None:
-        beyond = (FARTHEST + ALONG) * board.pattern.square
-        half = np.ptp(grid, axis=0) / 2 + beyond
-    else:
-        half = np.max(np.abs(board.points()[:, :2] - middle), axis=0)
-    if board.pattern.rows == board.pattern.columns:
-        half = np.full(2, np.max(half))
-    return middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

@@ -79,15 +79,14 @@ class Outline:
 
 
 def edge_votes(
-    image: np.ndarray, board: Board, model: CameraModel, pose: RigidTransform
+    image: np.ndarray, pattern: Chessboard, model: CameraModel, pose: RigidTransform
 ) -> np.ndarray:
     """Share of the profiles that agree on an edge, by side and distance from the pattern.
 
     Parameters
     ----------
     image : ndarray of uint8, shape (h, w) or (h, w, 3)
-    board : Board
-        With a pattern.
+    pattern : Chessboard
     model : CameraModel
     pose : RigidTransform
         ``T_camera_board``.
@@ -98,7 +97,6 @@ def edge_votes(
         For the sides SIDES and :func:`_distances`; NaN where less than 30 % of the profiles lie
         inside the image.
     """
-    pattern = board.pattern
     distances = _distances(pattern)
     slopes = np.linspace(-STEEPEST_SLOPE, STEEPEST_SLOPE, SLOPES) * APART
     size = _size(pattern)
@@ -150,7 +148,7 @@ def turned_views(votes: np.ndarray, up: np.ndarray, leader: np.ndarray) -> np.nd
     return turned if np.mean(upright) >= 0.5 else ~turned
 
 
-def common_lines(votes: np.ndarray, board: Board) -> np.ndarray:
+def common_lines(votes: np.ndarray, board) -> np.ndarray:
     """Sides of a board that views turned alike agree on.
 
     Parameters
@@ -158,6 +156,7 @@ def common_lines(votes: np.ndarray, board: Board) -> np.ndarray:
     votes : ndarray, shape (v, 4, n)
         Of :func:`edge_votes`.
     board : Board
+        With a pattern.
 
     Returns
     -------
@@ -309,7 +308,9 @@ def _median_line(lines, ends):
     normal = np.median(lines[:, :2], axis=0)
     normal /= np.linalg.norm(normal)
     # where every line crosses the normals raised at the two ends
-    offsets = -(lines[:, :2] @ ends.T + lines[:, 2:]) / (lines[:, :2] @ normal)[:, None]
+    distance = lines[:, :2] @ ends.T + lines[:, 2:]
+    cosine = lines[:, :2] @ normal
+    offsets = -distance / cosine[:, None]
     a, b = ends + np.median(offsets, axis=0)[:, None] * normal
     return outward_line(a, b, normal), _spread(offsets.mean(axis=1))
 

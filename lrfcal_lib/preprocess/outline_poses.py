@@ -103,7 +103,7 @@ def outline_poses(edges, board: Board, model: CameraModel) -> list[OutlinePose]:
     # round
     sides = list(edges)[::-1]
     flat = board.points()
-    poses = []
+    poses: list[OutlinePose] = []
     for shift in range(len(sides)):
         turned = sides[shift:] + sides[:shift]
         named = tuple(

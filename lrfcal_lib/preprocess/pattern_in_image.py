@@ -1,12 +1,13 @@
-"""The printed chessboard in an image: its inner corners at sub-pixel level, and the orders that
-they may have.
-"""
+"""The printed chessboard in an image: its inner corners at sub-pixel level, and their orders."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.polynomial.polynomial import polyvander2d
 from scipy.ndimage import map_coordinates, spline_filter
+
+from lrfcal_lib.model.board import Chessboard
 
 # larger images are searched at a reduced size: the detectors' time grows with it
 SEARCH_PIXELS = 1.5e6
@@ -17,15 +18,17 @@ LEAST_REACH = 0.25  # of a square: large images are soft
 MARGIN = 2.0  # half windows around the corners: what a turned window and its blur reach
 REFINE_ROUNDS = 20
 FARTHEST_MOVE = 0.25  # of a square, in each look
+# around rough corners where sectors are looked for near by: share of their extent, pixels
+AROUND = 0.22
+AROUND_PX = 4
 SMOOTH_ENOUGH_PX = 0.07  # corners that fit a smooth grid this well need no second start
 BEYOND = 0.3  # where to look outside the outermost corners, squares
 LEAST_BEYOND = 0.25  # contrast there, a share of that inside
 SMALL_SQUARE_PX = 9.0  # below it the blur of a corner reaches into the squares behind
 # Scale common to all images of rendered boards with cut outermost squares. Blurred by 0.5 to 1 px
-# it
-# is right within 0.02 % from 5 px a square on; blurred by 1.5 px it is 0.09 % too large at 6 px
-# (along
-# the shorter side), 0.02 % at 8 px, below 0.003 % at 10 px. Nobody states the blur of an image.
+# it is right within 0.02 % from 5 px a square on; blurred by 1.5 px it is 0.09 % too large at 6 px
+# (along the shorter side), 0.02 % at 8 px, below 0.003 % at 10 px. Nobody states the blur of an
+# image.
 SCALE_ERROR = 0.001
 SCALE_ERROR_AT_PX = 6.0
 SCALE_ERROR_POWER = 6
@@ -52,14 +55,30 @@ class PatternNotFound(ValueError):
     """The image does not show the whole printed pattern."""
 
 
-def grey(image):
-    """8-bit grey image of a grey or BGR image; ValueError for anything else."""
+def grey(image) -> np.ndarray:
+    """8-bit grey image of a grey or BGR image.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (h, w) or (h, w, 3)
+
+    Returns
+    -------
+    ndarray of uint8, shape (h, w)
+
+    Raises
+    ------
+    ValueError
+        For anything else.
+    """
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.size == 0:
         raise ValueError(
             f"an image must be uint8 of shape (h, w) or (h, w, 3), got {image.dtype} {image.shape}"
         )
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if image.ndim == 2:
+        return image
+    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
 class PatternFinder:
@@ -79,28 +98,46 @@ class PatternFinder:
     image itself.
     """
 
-    def __init__(self, pattern):
+    def __init__(self, pattern: Chessboard):
         self.size = pattern.columns, pattern.rows
         self.negatives = (False, True)
 
-    def __call__(self, image):
-        """Recorded pixels of the corners, (columns * rows, 2), x right, y down on the printed side.
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """The corners in an image, x right, y down on the printed side.
 
         A chessboard looks the same when it is turned by 180 deg:
-        :mod:`lrfcal_lib.preprocess.survey` resolves that. PatternNotFound where no detector finds
-        all corners; ValueError for what is no 8-bit image.
+        :mod:`lrfcal_lib.preprocess.survey` resolves that.
+
+        Parameters
+        ----------
+        image : ndarray of uint8, shape (h, w) or (h, w, 3)
+
+        Returns
+        -------
+        ndarray, shape (columns * rows, 2)
+            Recorded pixels.
+
+        Raises
+        ------
+        PatternNotFound
+            Where no detector finds all corners.
+        ValueError
+            For what is no 8-bit image.
         """
         picture = grey(image)
         corners = self._in_reduced(picture)
         if corners is None:
             columns, rows = self.size
-            looks_for = f"no chessboard with {columns} x {rows} inner corners"
-            raise PatternNotFound(f"{looks_for} in the image: it must be whole, and not glare")
+            raise PatternNotFound(
+                f"no chessboard with {columns} x {rows} inner corners in the image: it must be "
+                "whole, and not glare"
+            )
         grid = corners.reshape(self.size[1], self.size[0], 2)
         x = grid[0, -1] - grid[0, 0]
         y = grid[-1, 0] - grid[0, 0]
-        clockwise = x[0] * y[1] - x[1] * y[0] > 0
-        return (grid if clockwise else grid[::-1]).reshape(-1, 2)
+        if x[0] * y[1] - x[1] * y[0] <= 0:  # a mirrored image
+            grid = grid[::-1]
+        return grid.reshape(-1, 2)
 
     def _in_reduced(self, picture):
         """Corners of a large picture by way of a reduced one, or without it where that shows
@@ -109,9 +146,11 @@ class PatternFinder:
         times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
         if times <= 1:
             return self._search(picture)
-        height, width = (length // times for length in picture.shape)
+        height = picture.shape[0] // times
+        width = picture.shape[1] // times
         whole = picture[: height * times, : width * times]
-        corners = self._search(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
+        reduced = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+        corners = self._search(reduced)
         if corners is None:
             return self._search(picture, thorough=False)
         # pixel (0, 0) is the centre of a pixel, of the reduced one as well
@@ -126,10 +165,10 @@ class PatternFinder:
             rough = sectors(picture, self.size, 0)
             if rough is None and thorough:
                 rough = sectors(picture, self.size)
-            corners = None if rough is None else refine_corners(picture, rough, self.size)
-        if corners is None or not _ends_in_squares(picture, corners, self.size):
-            return None
-        return corners
+            if rough is None:
+                return None
+            corners = refine_corners(picture, rough, self.size)
+        return corners if _ends_in_squares(picture, corners, self.size) else None
 
     def _classic(self, picture):
         """Rough corners by the classic detector, the last successful of picture and negative
@@ -179,14 +218,14 @@ def _smoothest(picture, size, rough):
         return refined
     low = rough.min(axis=0)
     high = rough.max(axis=0)
-    margin = 0.22 * (high - low) + 4
-    low = np.maximum(low - margin, 0).astype(int)
-    high = np.minimum(high + margin, picture.shape[::-1]).astype(int)
-    part = np.ascontiguousarray(picture[low[1] : high[1], low[0] : high[0]])
+    margin = AROUND * (high - low) + AROUND_PX
+    left, top = np.maximum(low - margin, 0).astype(int)
+    right, bottom = np.minimum(high + margin, picture.shape[::-1]).astype(int)
+    part = np.ascontiguousarray(picture[top:bottom, left:right])
     start = sectors(part, size, 0)
     if start is None:
         return refined
-    other = refine_corners(picture, start + low, size)
+    other = refine_corners(picture, start + [left, top], size)
     return refined if noise <= grid_noise(other, size) else other
 
 
@@ -196,11 +235,16 @@ def grid_noise(corners, size):
     Smooth are a homography and polynomials of third order (second below 16 corners): lens
     distortion, a bent sheet.
     """
-    y, x = (np.mgrid[: size[1], : size[0]] / (max(size) - 1) * 2 - 1).reshape(2, -1)
-    order = 3 if len(x) >= 16 else 2
-    homography = cv2.findHomography(np.column_stack([x, y]), np.asarray(corners, float))[0]
-    left = corners - cv2.perspectiveTransform(np.column_stack([x, y])[None], homography)[0]
-    design = np.stack([x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)], axis=1)
+    row, column = np.mgrid[: size[1], : size[0]].reshape(2, -1)
+    x = column / (max(size) - 1) * 2 - 1
+    y = row / (max(size) - 1) * 2 - 1
+    grid = np.column_stack([x, y])
+    order = 3 if len(grid) >= 16 else 2
+    homography = cv2.findHomography(grid, np.asarray(corners, float))[0]
+    left = corners - cv2.perspectiveTransform(grid[None], homography)[0]
+    design = polyvander2d(x, y, [order, order])
+    powers = np.add.outer(np.arange(order + 1), np.arange(order + 1)).ravel()
+    design = design[:, powers <= order]
     noise = left - design @ np.linalg.lstsq(design, left, rcond=None)[0]
     return float(np.sqrt(np.mean(np.sum(noise**2, axis=1))))
 
@@ -261,10 +305,10 @@ def symmetric_points(picture, points, size, reach, look):
         arms = np.swapaxes(axes @ offsets, 1, 2)  # (n, m, 2)
         pairs = np.stack([points[:, None] + arms, points[:, None] - arms])
         inside = np.all((pairs >= 0) & (pairs <= last), axis=(0, 3))
-        there, opposite = sample(spline, pairs, look.order)
+        there, opposite = interpolated(spline, pairs, look.order)
         differs = there - opposite
-        by_u = np.subtract(*sample(slope_u, pairs))
-        by_v = np.subtract(*sample(slope_v, pairs))
+        by_u = np.subtract(*interpolated(slope_u, pairs))
+        by_v = np.subtract(*interpolated(slope_v, pairs))
         jacobian = np.stack([by_u, by_v], axis=2)
         weighted = (inside * weight)[..., None] * jacobian
         normal = weighted.swapaxes(1, 2) @ jacobian
@@ -279,16 +323,14 @@ def symmetric_points(picture, points, size, reach, look):
     return points
 
 
-def sample(picture, places, order=1):
+def interpolated(picture, places, order=1):
     """A picture, or its splines of an order, at places (..., 2), pixels."""
     rows_first = np.moveaxis(places, -1, 0)[::-1]
     return map_coordinates(picture, rows_first, order=order, prefilter=False, mode="nearest")
 
 
 def square_axes(corners, size):
-    """Sides of the squares around every corner, (n, 2, 2): columns along a row and along a
-    column.
-    """
+    """Sides of the squares around every corner, (n, 2, 2): along a row, along a column."""
     grid = np.reshape(corners, (size[1], size[0], 2))
     along = np.gradient(grid, axis=1)
     across = np.gradient(grid, axis=0)
@@ -307,9 +349,7 @@ def square_px(corners, size):
 
 
 def scale_error(side_px):
-    """Standard deviation of the scale of corners refined on squares of a side in pixels, a
-    share.
-    """
+    """Standard deviation, a share, of the scale of corners whose squares have a side in pixels."""
     error = SCALE_ERROR * (SCALE_ERROR_AT_PX / side_px) ** SCALE_ERROR_POWER
     return float(np.fmin(error, LARGEST_SCALE_ERROR))  # the largest for a side that is NaN
 
@@ -319,27 +359,41 @@ def _ends_in_squares(picture, corners, size):
     is taken a row off.
     """
     grid = corners.reshape(size[1], size[0], 2)
-    for side in (np.rot90(grid, k) for k in range(4)):
-        edge, inner = (side[:2, 1:] + side[:2, :-1]) / 2
-        both = np.array([edge - BEYOND * (inner - edge), edge + BEYOND * (inner - edge)])
-        seen = np.all((both >= 0) & (both <= np.array(picture.shape[::-1]) - 1), axis=(0, 2))
-        outside, inside = cv2.remap(picture, both.astype(np.float32), None, cv2.INTER_LINEAR)[
-            :, seen
-        ].astype(float)
-        sign = np.resize([1.0, -1.0], len(seen))[seen]
-        sign -= sign.mean() if len(sign) else 0.0
-        if (sign @ outside) * (sign @ inside) > -LEAST_BEYOND * (sign @ inside) ** 2:
+    last = np.array(picture.shape[::-1]) - 1
+    for turns in range(4):
+        edge, inner = np.rot90(grid, turns)[:2]
+        edge = (edge[1:] + edge[:-1]) / 2
+        inner = (inner[1:] + inner[:-1]) / 2
+        away = BEYOND * (inner - edge)
+        places = np.array([edge - away, edge + away])
+        visible = np.all((places >= 0) & (places <= last), axis=(0, 2))
+        if not visible.any():
+            continue
+        colours = cv2.remap(picture, places.astype(np.float32), None, cv2.INTER_LINEAR)
+        outside, inside = colours[:, visible].astype(float)
+        sign = np.resize([1.0, -1.0], len(visible))[visible]
+        sign -= sign.mean()
+        contrast = sign @ inside
+        if (sign @ outside) * contrast > -LEAST_BEYOND * contrast**2:
             return False
     return True
 
 
-def pattern_orders(pattern, mirrored=True):
-    """Orders of the corners that a chessboard allows, shape (n, k): as indices into the corners
-    that were found.
+def pattern_orders(pattern: Chessboard, mirrored: bool = True) -> np.ndarray:
+    """Orders of the corners that a chessboard allows.
 
-    The first is the given one, the second the pattern turned by 180 deg; square patterns may also
-    stand on their side. With `mirrored`, the second half counts from the last row: x to y turns the
-    other way (frames whose z points out).
+    Parameters
+    ----------
+    pattern : Chessboard
+    mirrored : bool
+        Add a second half that counts from the last row: x to y turns the other way (frames whose z
+        points out).
+
+    Returns
+    -------
+    ndarray of int, shape (n, k)
+        Indices into the corners of an image. The first order is the given one, the second the
+        pattern turned by 180 deg; square patterns may also stand on their side.
     """
     grid = np.arange(pattern.rows * pattern.columns).reshape(pattern.rows, pattern.columns)
     orders = [grid, grid[::-1, ::-1]]
@@ -351,18 +405,28 @@ def pattern_orders(pattern, mirrored=True):
     return np.stack([order.ravel() for order in orders])
 
 
-def spread_views(pixels, count):
-    """Which views of a pattern (their corners, k by 2) differ most: at most `count` places, the
-    largest view first.
+def spread_views(pixels, count: int) -> list[int]:
+    """Which views of a pattern differ most, the largest view first.
 
     Each of the others is the one whose corners lie farthest from those of all views before it.
+
+    Parameters
+    ----------
+    pixels : sequence of ndarray, shape (k, 2)
+        Corners by view.
+    count : int
+        At most.
+
+    Returns
+    -------
+    list of int
     """
     if not len(pixels):
         return []
     pixels = np.asarray(pixels, float)
     flat = pixels.reshape(len(pixels), -1)
     size = np.ptp(pixels, axis=1).prod(axis=1)
-    chosen = []
+    chosen: list[int] = []
     nearest = np.full(len(flat), np.inf)
     while len(chosen) < min(count, len(flat)):
         chosen.append(int(np.argmax(nearest if chosen else size)))

@@ -35,8 +35,21 @@ class PitchNoise:
     offset: float = 0.0
     stretch: float = 0.0
 
-    def sigma(self, pitch, middle):
-        """Standard deviation of recorded pitch angles, radians."""
+    def sigma(self, pitch: np.ndarray, middle: float) -> np.ndarray:
+        """Standard deviation of recorded pitch angles.
+
+        Parameters
+        ----------
+        pitch : ndarray
+            Recorded, radians.
+        middle : float
+            Of the sweep, radians.
+
+        Returns
+        -------
+        ndarray
+            Radians.
+        """
         return np.hypot(self.offset, self.stretch * (np.asarray(pitch) - middle))
 
 
@@ -114,12 +127,21 @@ class Prepared:
     problems: tuple[Problem, ...] = ()
 
     @property
-    def left_out(self) -> dict[int, str]:
+    def left_out(self) -> dict[int | None, str]:
         """Why whole placements are left out, by placement."""
         return {p.placement: p.words for p in self.problems if p.kind in LEAVES_OUT}
 
     def problems_of(self, kind: ProblemKind) -> list[Problem]:
-        """Those of one kind."""
+        """Those of one kind.
+
+        Parameters
+        ----------
+        kind : ProblemKind
+
+        Returns
+        -------
+        list of Problem
+        """
         return [problem for problem in self.problems if problem.kind == kind]
 
     def seen(self, camera, placement):
@@ -142,15 +164,22 @@ class Prepared:
 
 
 @cached
-def prepare_scans(session):
+def prepare_scans(session: Session) -> Prepared:
     """The board in every sweep of a session, and its edge points in both variants.
 
-    A Prepared without cameras.
+    Parameters
+    ----------
+    session : Session
+
+    Returns
+    -------
+    Prepared
+        Without cameras.
     """
     scans = {}
     problems = []
-    edges = {variant: {} for variant in VARIANTS}
-    swept = {variant: {} for variant in VARIANTS}
+    edges: dict[str, dict] = {variant: {} for variant in VARIANTS}
+    swept: dict[str, dict] = {variant: {} for variant in VARIANTS}
 
     for result in spread(partial(_crossed, session), session.board_placements):
         if isinstance(result, Problem):
@@ -181,31 +210,42 @@ def _crossed(session, placement):
     return scan, along, across
 
 
-def prepare_images(prepared):
-    """The same with the board in every image of the session, the cameras' intrinsics, and the
-    board's outline.
+def prepare_images(prepared: Prepared) -> Prepared:
+    """The same with the cameras of the session.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        Of :func:`prepare_scans`.
+
+    Returns
+    -------
+    Prepared
+        With the board in every image, the cameras' intrinsics, and the board's outline.
     """
     try:
-        seen = views_of(prepared.session, one_per_placement=True)
+        surveyed = views_of(prepared.session, one_per_placement=True)
     except DegenerateGeometry as error:  # what remains is a session without cameras
         words = f"no image can be used: {error}"
         lost = Problem(Stage.IMAGES, ProblemKind.NO_IMAGES, words)
         return replace(prepared, problems=(*prepared.problems, lost))
-    # an image that belongs to no placement is left out
-    views = {
-        c: {v.placement: v for v in sorted(own, key=lambda v: v.placement) if v.placement >= 0}
-        for c, own in seen.views.items()
-    }
+    views = {}
+    for camera, of_camera in surveyed.views.items():
+        ordered = sorted(of_camera, key=lambda view: view.placement)
+        # an image that belongs to no placement is left out
+        views[camera] = {view.placement: view for view in ordered if view.placement >= 0}
     problems = list(prepared.problems)
-    if seen.unseen:
-        words = f"faces of the board only: {seen.unseen}"
+    if surveyed.unseen:
+        words = f"faces of the board only: {surveyed.unseen}"
         problems.append(Problem(Stage.IMAGES, ProblemKind.NO_OUTLINE, words))
-    for camera, words in small_squares(views, seen.board.pattern).items():
+    for camera, words in small_squares(views, surveyed.board.pattern).items():
         problems.append(Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera))
-    found = {
-        "board": seen.board,
-        "outline": seen.outline,
-        "relief": seen.relief,
-        "problems": tuple(problems),
-    }
-    return replace(prepared, models=seen.models, views=views, **found)
+    return replace(
+        prepared,
+        models=surveyed.models,
+        views=views,
+        board=surveyed.board,
+        outline=surveyed.outline,
+        relief=surveyed.relief,
+        problems=tuple(problems),
+    )

@@ -34,8 +34,8 @@ def straight_runs(
     """
     rng = np.random.default_rng(0)
     left = np.arange(len(points))
-    runs = []
-    directions = []
+    runs: list[np.ndarray] = []
+    directions: list[np.ndarray] = []
     for _ in range(2 * MOST_RUNS):
         if len(left) < FEWEST_POINTS or len(runs) == MOST_RUNS:
             break
@@ -81,8 +81,8 @@ def _without_gaps(run, order):
     if len(run) == 0:
         return run
     along = run[np.argsort(order[run], kind="stable")]
-    gaps = np.diff(order[along], prepend=order[along[0]]) > max(LONGEST_GAP, 0.1 * len(run))
-    part = np.cumsum(gaps)
+    steps = np.diff(order[along], prepend=order[along[0]])
+    part = np.cumsum(steps > max(LONGEST_GAP, 0.1 * len(run)))
     return np.sort(along[part == np.bincount(part).argmax()])
 
 

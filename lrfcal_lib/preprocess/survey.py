@@ -254,7 +254,7 @@ def small_squares(views, pattern) -> dict[str, str]:
     dict of str to str
         By camera; those that have such images.
     """
-    words = {}
+    words: dict[str, str] = {}
     if pattern is None:
         return words
     size = (pattern.columns, pattern.rows)
@@ -530,7 +530,7 @@ def _by_votes(shots, orders, read, board, models):
     for shot, corners in zip(shots, orders.corners[:, 0], strict=True):
         model = models[shot.record.camera]
         pose = board_pose(corners, board.pattern, model)[0]
-        votes.append(edge_votes(shot.image(read), board, model, pose))
+        votes.append(edge_votes(shot.image(read), board.pattern, model, pose))
         up.append(pose.rotation.as_matrix()[1, 1])
     votes = np.stack(votes)
     turned = turned_views(votes, np.array(up), orders.leader)

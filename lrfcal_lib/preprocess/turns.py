@@ -73,7 +73,7 @@ def alike(rotations, placements, cameras) -> Alike:
     -------
     Alike
     """
-    leaders = {}
+    leaders: dict[int, int] = {}
     leader = np.zeros(len(placements), int)
     for i, placement in enumerate(placements):
         alone = placement < 0

@@ -7,6 +7,7 @@ solver.
 """
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -87,8 +88,19 @@ class ShotSetup(Devices):
         return np.radians(40) + self.step * np.arange(count)
 
 
-def bench(rng, cameras=("left", "right"), **settings):
-    """A :class:`Bench` like the paper's, mounted wrongly by some degrees and centimetres."""
+def bench(
+    rng: np.random.Generator, cameras: Sequence[str] = ("left", "right"), **settings
+) -> Bench:
+    """A rig like the paper's, mounted wrongly by some degrees and centimetres.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    cameras : sequence of str
+        Their names.
+    **settings
+        Other attributes of :class:`Bench`.
+    """
     turn = Rotation.from_rotvec([0.0, *rng.normal(0, 0.02, 2)])
     head = RigidTransform.from_components([0.0, *rng.normal(0, 0.05, 2)], turn)
     poses = {}
@@ -127,13 +139,21 @@ def board_poses(
     return list(_posed(drawn[:, 0], drawn[:, 1:3], centre, [0.105, 0.127, 0.0]))
 
 
-def observe(bench, poses, rng, *, images=3, span=None, noise=1.0):
+def observe(
+    bench: Bench,
+    poses: Sequence[RigidTransform],
+    rng: np.random.Generator,
+    *,
+    images: int = 3,
+    span: float | None = None,
+    noise: float = 1.0,
+) -> dict:
     """Draw what the rig records of boards.
 
     Parameters
     ----------
     bench : Bench
-    poses : list of RigidTransform
+    poses : sequence of RigidTransform
         ``T_platform_board``.
     rng : numpy.random.Generator
     images : int
@@ -341,7 +361,7 @@ def _shots(setup, rng, T_camera_lrf):
     usable &= (edges[:, 0] != edges[:, 1]) & (second < -CLEAR).all(axis=1)
 
     true = pose_array(T_camera_lrf * T_lrf_board)
-    corners = board.corners @ np.swapaxes(true[..., :2], 1, 2) + true[:, None, :, 3]
+    corners = board.corners @ true[..., :2].mT + true[:, None, :, 3]
     uv = pinhole(corners, setup.model)
     inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
     usable &= inside.all(axis=(1, 2)) & (corners[..., 2] > 0).all(axis=1)
@@ -425,16 +445,16 @@ def _seen_poses(devices, true, rng, noise):
     """Poses (n, 3, 4) of boards as their pattern tells them, and their covariances."""
     pattern = devices.board.pattern
     corners = CORNERS if pattern is None else pattern.points()
-    turned = corners @ np.swapaxes(true[..., :3], -1, -2)
+    turned = corners @ true[..., :3].mT
     points = turned + true[:, None, :, 3]
     by_point = project_jacobians(points.reshape(-1, 3), devices.model)[0]
     by_point = by_point.reshape(points.shape[:2] + (2, 3))
     J = np.concatenate([np.cross(turned[:, :, None], by_point), by_point], axis=-1)
     J = J.reshape(len(true), 2 * len(corners), 6)
-    information = np.swapaxes(J, -1, -2) @ J
+    information = J.mT @ J
     covariance = np.linalg.inv(information) * devices.sigma_px**2
-    unit = rng.standard_normal((len(true), 6, 1))
-    error = noise * (np.linalg.cholesky(covariance) @ unit)[..., 0]
+    unit = rng.standard_normal((len(true), 6))
+    error = noise * np.matvec(np.linalg.cholesky(covariance), unit)
     rotation = Rotation.from_rotvec(error[:, :3]).as_matrix() @ true[..., :3]
     translation = true[..., 3:] + error[:, 3:, None]
     return np.concatenate([rotation, translation], axis=-1), covariance

@@ -1,18 +1,24 @@
-"""Calibration methods of one camera on one least-squares core: the same observations in, a
-`Solution` out.
-"""
+"""Calibration methods of one camera: the same observations in, a `Solution` out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 from scipy.special import chdtri
 
 from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m
+from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_difference
+from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers import lines, plane_start, planes
+
+ACCEPTED = 0.999  # a good placement is accepted with this probability, were the errors normal
+NUMBERS = 2  # a plane's distance and the slope of the scan: neighbouring points err together
+OUTLIER_ROUNDS = 11  # placements come and go no more after a few
 
 
 @dataclass(frozen=True)
@@ -53,57 +59,77 @@ class Method:
 PLAIN = {"weighted": False}  # as published: every residual counts the same
 METHODS = {
     "line_printed": Method(
-        "one_scan", "crossing", 6, "lines as the paper prints them", line_block, options=PLAIN
+        variant="one_scan",
+        uses="crossing",
+        fewest=6,
+        label="lines as the paper prints them",
+        residual=line_block,
+        options=PLAIN,
     ),
     "line_last_beam": Method(
-        "last_beam",
-        "crossing",
-        6,
-        "lines, last beam, all edges",
-        line_block,
+        variant="last_beam",
+        uses="crossing",
+        fewest=6,
+        label="lines, last beam, all edges",
+        residual=line_block,
         options=PLAIN,
         along=True,
     ),
-    "line": Method("half_step", "crossing", 6, "lines, half step", line_block),
+    "line": Method(
+        variant="half_step",
+        uses="crossing",
+        fewest=6,
+        label="lines, half step",
+        residual=line_block,
+    ),
     "zhang_pless_printed": Method(
-        "half_step",
-        "plane",
-        3,
-        "Zhang-Pless, unweighted",
-        planes.plane_block,
-        planes.estimate_from_planes,
-        PLAIN,
+        variant="half_step",
+        uses="plane",
+        fewest=3,
+        label="Zhang-Pless, unweighted",
+        residual=planes.plane_block,
+        estimate=planes.estimate_from_planes,
+        options=PLAIN,
     ),
     "zhang_pless": Method(
-        "half_step", "plane", 3, "Zhang-Pless", planes.plane_block, planes.estimate_from_planes
+        variant="half_step",
+        uses="plane",
+        fewest=3,
+        label="Zhang-Pless",
+        residual=planes.plane_block,
+        estimate=planes.estimate_from_planes,
     ),
     "zhang_pless_k": Method(
-        "half_step",
-        "plane",
-        3,
-        "Zhang-Pless with K",
-        planes.planes_and_pattern,
-        planes.estimate_with_lens,
-        {"lens": 4},
+        variant="half_step",
+        uses="plane",
+        fewest=3,
+        label="Zhang-Pless with K",
+        residual=planes.planes_and_pattern,
+        estimate=planes.estimate_with_lens,
+        options={"lens": 4},
     ),
     "zhang_pless_joint": Method(
-        "half_step",
-        "plane",
-        3,
-        "Zhang-Pless with K and lens",
-        planes.planes_and_pattern,
-        planes.estimate_with_lens,
+        variant="half_step",
+        uses="plane",
+        fewest=3,
+        label="Zhang-Pless with K and lens",
+        residual=planes.planes_and_pattern,
+        estimate=planes.estimate_with_lens,
     ),
     "wasielewski_strauss": Method(
-        "half_step",
-        "crossing",
-        6,
-        "Wasielewski-Strauss, in space",
-        lines.distance_block,
+        variant="half_step",
+        uses="crossing",
+        fewest=6,
+        label="Wasielewski-Strauss, in space",
+        residual=lines.distance_block,
         options=PLAIN,
     ),
     "bauermann": Method(
-        "half_step", "scene", 3, "after Bauermann, outline corners", lines.point_block
+        variant="half_step",
+        uses="scene",
+        fewest=3,
+        label="after Bauermann, outline corners",
+        residual=lines.point_block,
     ),
 }
 SHIPPED = MappingProxyType(dict(METHODS))  # without rows that others put there later
@@ -115,11 +141,24 @@ STARTS = {
 }
 
 
-def starting_transform(obs, uses="crossing"):
-    """Start values of ``T_camera_source`` (one, or a stack with the best one first) from what the
-    observations hold.
+def starting_transform(obs: CameraObservations, uses: str = "crossing") -> RigidTransform:
+    """Start values of ``T_camera_source`` from what the observations hold.
 
-    Raises DegenerateGeometry when no way determines the pose, with the reason of each.
+    Parameters
+    ----------
+    obs : CameraObservations
+    uses : {'crossing', 'plane', 'scene'}
+        What they are for: these observations are asked first.
+
+    Returns
+    -------
+    RigidTransform
+        One, or a stack with the best one first.
+
+    Raises
+    ------
+    DegenerateGeometry
+        When no way determines the pose, with the reason of each.
     """
     reasons = []
     for way in STARTS[uses]:
@@ -130,14 +169,21 @@ def starting_transform(obs, uses="crossing"):
     raise DegenerateGeometry("no start value, give T0. " + " | ".join(reasons))
 
 
-def row_of(method):
+def row_of(method: str) -> Method:
     """The Method of a name as `METHODS` has it now; ValueError for a name that is not there."""
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}: use one of {', '.join(METHODS)}")
     return METHODS[method]
 
 
-def solve_camera(observations, method=None, T0=None, *, search=True, **options):
+def solve_camera(
+    observations: CameraObservations,
+    method: str | None = None,
+    T0: RigidTransform | None = None,
+    *,
+    search: bool = True,
+    **options,
+) -> Solution:
     """The pose of a camera by one of the methods.
 
     Parameters
@@ -178,26 +224,26 @@ def solve_camera(observations, method=None, T0=None, *, search=True, **options):
     obs = observations.along() if row.along else observations
     obs.require(row.uses, row.fewest)
     options = {"method": method, "uses": row.uses} | row.options | options
-    found = []
-    problem = None
+    points = getattr(obs, f"{row.uses}_points")
     starts = [] if T0 is None else [pose_array(T0)]
-    if T0 is None or (search and T0.single and getattr(obs, f"{row.uses}_points").ndim == 2):
+    if T0 is None or (search and T0.single and points.ndim == 2):
         try:
             starts += [*pose_array(starting_transform(obs, row.uses)).reshape(-1, 3, 4)]
         except DegenerateGeometry:
             if T0 is None:
                 raise
+    minima = []
+    problems = []
     for pose in starts:
-        trials = np.broadcast_shapes(getattr(obs, f"{row.uses}_points").shape[:-2], pose.shape[:-2])
+        trials = np.broadcast_shapes(points.shape[:-2], pose.shape[:-2])
+        start = np.broadcast_to(pose, trials + (3, 4))
         try:
-            found.append(
-                row.estimate(row.residual, obs, np.broadcast_to(pose, trials + (3, 4)), **options)
-            )
+            minima.append(row.estimate(row.residual, obs, start, **options))
         except (DegenerateGeometry, np.linalg.LinAlgError) as error:
-            problem = problem or error
-    if not found:
-        raise problem
-    return found[0] if len(found) == 1 else best_minimum(obs, row.uses, found)
+            problems.append(error)
+    if not minima:
+        raise problems[0]
+    return minima[0] if len(minima) == 1 else best_minimum(obs, row.uses, minima)
 
 
 def _solve_best(obs, T0, **options):
@@ -205,21 +251,23 @@ def _solve_best(obs, T0, **options):
     if obs.crossing_points.ndim > 2:
         raise ValueError(f"many trials at once: name the method, one of {', '.join(METHODS)}")
     solutions = {}
-    problem = None
+    problems = []
     for method in CANDIDATES:
         try:
             solutions["camera", method] = solve_camera(obs, method, T0, **options)
         except DegenerateGeometry as error:
-            problem = problem or error
+            problems.append(error)
     if not solutions:
-        raise problem
+        raise problems[0]
     best = best_method({"camera": obs}, solutions)
     if best is None:  # too few placements to leave one out
         return next(iter(solutions.values()))
     return solutions["camera", best]
 
 
-def left_out(obs, judge, method, full):
+def left_out(
+    obs: CameraObservations, judge: CameraObservations, method: str, full: Solution
+) -> Iterator[tuple[CameraObservations, Solution]]:
     """Calibrations from all placements but one, and what that one shows.
 
     Parameters
@@ -245,7 +293,9 @@ def left_out(obs, judge, method, full):
             )
 
 
-def best_method(observations, solutions):
+def best_method(
+    observations: dict[str, CameraObservations], solutions: dict[tuple[str, str], Solution]
+) -> str | None:
     """Of `CANDIDATES` the method with the least product of its left-out edge and plane errors.
 
     A method that fits its own feature and fails on the other one (lines bent by a wide laser spot,
@@ -288,14 +338,12 @@ def best_method(observations, solutions):
 
 def _left_out_errors(obs, method, full):
     """Root mean squares of left-out crossings (pixels) and face points (metres)."""
-    edges = []
-    planes_m = []
+    edges = [np.zeros(0)]
+    faces = [np.zeros(0)]
     for held, solution in left_out(obs, obs.along(), method, full):
         edges.append(edge_residuals_px(held, solution.transform))
-        planes_m.append(plane_residuals_m(held, solution.transform))
-    return tuple(
-        np.sqrt(_mean(np.square(np.concatenate([[], *part])))) for part in (edges, planes_m)
-    )
+        faces.append(plane_residuals_m(held, solution.transform))
+    return [np.sqrt(_mean(np.concatenate(errors) ** 2)) for errors in (edges, faces)]
 
 
 def _mean(values):
@@ -305,44 +353,47 @@ def _mean(values):
     return values.mean() if len(values) else np.nan
 
 
-def best_minimum(obs, uses, found):
-    """The best of some Solutions, with another one as `rival` that explains the data nearly as
+def best_minimum(obs, uses, minima):
+    """The best of several Solutions, with another one as `rival` that explains the data nearly as
     well.
     """
-    misses = [misses_of(obs, uses, solution.transform) for solution in found]
-    before = np.array([lies_before(obs, uses, solution.transform) for solution in found])
-    sizes = plane_start.sizes_of_minima(np.square(misses))
+    squares = [_misses(obs, uses, solution.transform) ** 2 for solution in minima]
+    sizes = plane_start.sizes_of_minima(np.array(squares))
+    before = np.array([_lies_before(obs, uses, solution.transform) for solution in minima])
     order = np.lexsort([sizes, ~before])
-    best = found[order[0]]
-    nearly = (before == before[order[0]]) & (sizes <= plane_start.NEARLY * sizes[order[0]])
-    alike = [found[i].transform for i in order if nearly[i]]
-    far = (T for T in alike if transform_difference(T, best.transform)[0] > plane_start.SAME_TURN)
-    return replace(best, rival=next(far, None))
+    best = order[0]
+    nearly = (before == before[best]) & (sizes <= plane_start.NEARLY * sizes[best])
+    for i in order[nearly[order]]:
+        turn, _ = transform_difference(minima[i].transform, minima[best].transform)
+        if turn > plane_start.SAME_TURN:
+            return replace(minima[best], rival=minima[i].transform)
+    return minima[best]
 
 
-def misses_of(obs, uses, transform):
+def _misses(obs, uses, transform):
     """Distances or pixels by which observations miss at a pose."""
-    block = {"crossing": line_block, "scene": lines.point_block}.get(uses)
-    if block is None:
-        misses = plane_residuals_m(obs, transform)
+    if uses == "crossing":
+        misses = line_block(pose_array(transform), obs).residuals
+    elif uses == "scene":
+        misses = lines.point_block(pose_array(transform), obs).residuals
     else:
-        misses = block(pose_array(transform), obs).residuals
+        misses = plane_residuals_m(obs, transform)
     return misses[np.isfinite(misses)]
 
 
-def lies_before(obs, uses, transform):
+def _lies_before(obs, uses, transform):
     """Whether a pose puts (most of) the board before the camera."""
     depth = transform.apply(getattr(obs, f"{uses}_points"))[:, 2]
     return bool(np.mean(depth < 0) <= 0.5)
 
 
-ACCEPTED = 0.999  # a good placement is accepted with this probability, were the errors normal
-NUMBERS = 2  # a plane's distance and the slope of the scan: neighbouring points err together
-
-
-def find_outlying_placements(obs):
+def find_outlying_placements(obs: CameraObservations) -> tuple[list[int], dict[int, float]]:
     """Find placements whose planes disagree with the others', without being told how many there
     are.
+
+    Parameters
+    ----------
+    obs : CameraObservations
 
     Returns
     -------
@@ -361,24 +412,30 @@ def find_outlying_placements(obs):
     Residuals are compared with their own level, not with the stated noise: the median over the
     accepted placements of the mean square, divided by its expectation, sets the scale.
     """
-    keep = None
-    some = obs
-    options = {"scale": "auto", "weighted": False}
-    T = solve_camera(obs, "zhang_pless", loss="cauchy", **options).transform
-    for _ in range(11):
-        residuals = plane_residuals_m(obs, T)
-        known = np.isfinite(residuals)
-        placements, index, count = np.unique(
-            obs.plane_placement[known], return_inverse=True, return_counts=True
-        )
-        mean = np.bincount(index, residuals[known] ** 2) / count
-        level = np.median(mean if keep is None else mean[keep]) / chdtri(NUMBERS, 0.5)
-        before = keep
-        keep = mean <= level * chdtri(NUMBERS, 1 - ACCEPTED)
-        if np.array_equal(before, keep):
+    plain = partial(solve_camera, method="zhang_pless", scale="auto", weighted=False)
+    T = plain(obs, loss="cauchy").transform
+    placements, mean = _mean_squares(obs, T)
+    accepted = np.ones(len(placements), bool)
+    for number in range(OUTLIER_ROUNDS):
+        level = np.median(mean[accepted]) / chdtri(NUMBERS, 0.5)
+        before = accepted
+        accepted = mean <= level * chdtri(NUMBERS, 1 - ACCEPTED)
+        if number > 0 and np.array_equal(before, accepted):
             break
-        some = obs.select(placements[keep])
-        T = solve_camera(some, "zhang_pless", T, search=False, **options).transform
-    return placements[keep].tolist(), dict(
-        zip(placements[~keep].tolist(), np.sqrt(mean[~keep]).tolist(), strict=True)
+        inliers = obs.select(placements[accepted])
+        T = plain(inliers, T0=T, search=False).transform
+        _, mean = _mean_squares(obs, T)
+    errors = np.sqrt(mean[~accepted]).tolist()
+    return placements[accepted].tolist(), dict(
+        zip(placements[~accepted].tolist(), errors, strict=True)
     )
+
+
+def _mean_squares(obs, transform):
+    """Placements, and mean squares of their points' distances from the planes."""
+    residuals = plane_residuals_m(obs, transform)
+    known = np.isfinite(residuals)
+    placements, index, count = np.unique(
+        obs.plane_placement[known], return_inverse=True, return_counts=True
+    )
+    return placements, np.bincount(index, residuals[known] ** 2) / count

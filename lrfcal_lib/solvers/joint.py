@@ -40,7 +40,7 @@ from lrfcal_lib.solvers.joint_model import (
 from lrfcal_lib.solvers.joint_noise import estimate_noise, settled
 from lrfcal_lib.solvers.joint_residuals import MOST_STEPS, minimum, named_blocks
 from lrfcal_lib.solvers.joint_search import best_start, coarse
-from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words
+from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words, warnings_of
 
 # what counts as a change by one, beside rad and m
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
@@ -264,7 +264,7 @@ def finished(obs, state, data, unknowns, required):
         covariance_placements=by_placements,
     )
     squares = misfits(named_blocks(found.state, data, unknowns), data)
-    return JointSolution(
+    solution = JointSolution(
         found,
         obs,
         data,
@@ -274,3 +274,4 @@ def finished(obs, state, data, unknowns, required):
         lens=lens.covariance,
         lens_scale=lens.scatter,
     )
+    return replace(solution, warnings=warnings_of(solution))

@@ -51,7 +51,7 @@ def without_blind_cameras(obs, required):
         return obs, []
     left_out = []
     for name in blind:
-        words = "never sees the board: its pose stays open"
+        words = "it never sees the board, its pose stays open"
         left_out.append(Problem(Stage.JOINT, ProblemKind.NO_IMAGES, words, camera=name))
     if required:
         words = "; ".join(map(str, left_out))

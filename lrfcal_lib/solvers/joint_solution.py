@@ -1,6 +1,5 @@
 """What the joint estimate hands over: the rig, how well it is known, and what may be doubted."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -10,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.edge_likelihood import disc_edge
-from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
+from lrfcal_lib.fit.least_squares import Block, eliminate, linearise
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import pose_array, pose_parameters, pose_transform
@@ -104,6 +103,8 @@ class JointSolution:
     lens_scale : float
         By how much errors of the intrinsics let board poses in images scatter, in stated standard
         deviations.
+    warnings : tuple of str
+        See :func:`warnings_of`.
     """
 
     solution: Solution
@@ -114,6 +115,7 @@ class JointSolution:
     misfit: dict[int, float]
     lens: np.ndarray
     lens_scale: float
+    warnings: tuple[str, ...] = ()
 
     @property
     def excluded_placements(self) -> dict[int, str]:
@@ -332,98 +334,14 @@ class JointSolution:
         hessian, gradient, *_ = linearise(blocks.values())
         return Score(*eliminate(hessian, gradient, shared)[:2])
 
-    def forecast(
-        self, observations: JointObservations, boards: np.ndarray, weight: np.ndarray, like: int
-    ) -> np.ndarray:
-        """Information on the shared unknowns from placements that were not recorded, (n, c, c).
+    def board_information(self) -> np.ndarray:
+        """What the scans of every placement say about the pose of its board, shape (p, 6, 6).
 
-        Parameters
-        ----------
-        observations : JointObservations
-            Of n placements; measured ranges do not matter.
-        boards : ndarray, shape (n, 3, 4)
-            ``T_platform_board``.
-        weight : ndarray, shape (n,)
-            How many beams about the edges each one stands for.
-        like : int
-            Number of the placement whose backgrounds they have.
+        By increments ``[w, v]`` of ``T_platform_board``, with everything else known.
         """
-        row = list(self.boards).index(like)
-        data = gather(observations, self.data.levels)
-        data.beam["used"] = data.beam["used"] * weight[:, None]
-        state = self.state.of_placements(np.full(len(boards), row))
-        state = replace(state, boards=boards, sweeps=np.zeros_like(state.sweeps))
-        hessian = linearise(named_blocks(state, data, self.unknowns).values()).hessian
-        return reduced_hessian(hessian, self.unknowns.shared)
-
-    def held_at_zero(self) -> Iterator[tuple[Held, float, float]]:
-        """Errors of the pitch that were held at zero, their squared scores (standard deviations)
-        and the values they would take.
-
-        Each one is tested by itself, with all that was estimated free.
-        """
-        names = [term.name for term in HELD]
-        sensor = tuple(dict.fromkeys((*self.unknowns.sensor, *names)))
-        wider = replace(self.unknowns, sensor=sensor)
-        blocks = named_blocks(self.state, self.data, wider)
-        hessian, gradient, *_ = linearise(blocks.values())
-        reduced, score, _ = eliminate(hessian, gradient, wider.shared)
-        every = wider.names(self.observations.cameras)
-        estimated = [every.index(name) for name in self.solution.names]
-        for term in HELD:
-            if term.name in self.solution.names:
-                continue
-            free = [*estimated, every.index(term.name)]
-            information = reduced.sum(axis=0)[np.ix_(free, free)]
-            covariance = np.linalg.pinv(information, rcond=RANK, hermitian=True)
-            step = -(covariance @ score.sum(axis=0)[free])[-1]
-            yield term, float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)
-
-    def _scatter(self):
-        """Groups of observations in words, the field that states their noise, and the size of their
-        whitened residuals: 1 agrees with it.
-        """
-        if "face" in self.blocks:
-            z = self.blocks["face"].white[self.data.face["used"]]
-            yield "ranges", "face_sigma", np.sqrt(np.mean(z**2) / self.data.levels.face_share)
-        if "view" in self.blocks:
-            camera = self.data.view["camera"]
-            z = self.blocks["view"].white.reshape(camera.shape + (6,))
-            for number, name in enumerate(self.observations.cameras):
-                mine = self.data.view["used"] & (camera == number)
-                # more views than placements: what a board's own pose takes up is minor
-                if mine.sum() > len(camera):
-                    what = f"poses of the board in camera '{name}'"
-                    yield what, "view_covariance", np.sqrt(np.mean(z[mine] ** 2))
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What is suspicious beyond convergence and unobservable motions, in words: noise that
-        contradicts what is stated, a weak axis, errors of the pitch that the data ask for.
-        """
-        words = []
-        for what, stated, level in self._scatter():
-            if not NOISE_LIMITS[0] < level < NOISE_LIMITS[1]:
-                words.append(
-                    f"the {what} scatter {level:.2g} times what is stated ({stated}): standard "
-                    "deviations of the result are off alike; noise='estimate' takes the level from "
-                    "the residuals"
-                )
-        if self.unknowns.axis:
-            turn, shift = np.linalg.norm(self.solution.sigma[:4].reshape(2, 2), axis=1)
-            if turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET:
-                words.append(
-                    f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, "
-                    f"{1000 * shift:.0f} mm): sweep over a larger pitch range, take images at more "
-                    "pitch angles, or state the platform with its accuracy"
-                )
-        for term, square, value in self.held_at_zero():
-            if square > ASKED and abs(value) > term.least:
-                words.append(
-                    f"the data ask for {term.words}, about {term.unit * value:+.2f} "
-                    f"{term.unit_words}, which was held at zero"
-                )
-        return tuple(words)
+        of_scans = [self.blocks[group] for group in ("face", "beam") if group in self.blocks]
+        board = self.unknowns.columns["board"]
+        return linearise(of_scans).hessian[:, board, board]
 
     def __repr__(self):
         return f"JointSolution({len(self.boards)} placements, {self.solution!r})"
@@ -440,3 +358,74 @@ def joint_words(direction: np.ndarray, names: tuple[str, ...], cameras: tuple[st
             words.append(geometry.motion_words(direction[index], camera))
     words += [WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS]
     return " with ".join(words)
+
+
+def warnings_of(solution: JointSolution) -> tuple[str, ...]:
+    """What is suspicious beyond convergence and unobservable motions, in words: noise that
+    contradicts what is stated, a weak axis, errors of the pitch that the data ask for.
+    """
+    words = []
+    for what, stated, level in _scatter(solution):
+        if not NOISE_LIMITS[0] < level < NOISE_LIMITS[1]:
+            words.append(
+                f"the {what} scatter {level:.2g} times what is stated ({stated}): standard "
+                "deviations of the result are off alike; noise='estimate' takes the level from "
+                "the residuals"
+            )
+    if solution.unknowns.axis:
+        turn, shift = np.linalg.norm(solution.solution.sigma[:4].reshape(2, 2), axis=1)
+        if turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET:
+            words.append(
+                f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, "
+                f"{1000 * shift:.0f} mm): sweep over a larger pitch range, take images at more "
+                "pitch angles, or state the platform with its accuracy"
+            )
+    for term, square, value in _held_at_zero(solution):
+        if square > ASKED and abs(value) > term.least:
+            words.append(
+                f"the data ask for {term.words}, about {term.unit * value:+.2f} "
+                f"{term.unit_words}, which was held at zero"
+            )
+    return tuple(words)
+
+
+def _scatter(solution):
+    """Groups of observations in words, the field that states their noise, and the size of their
+    whitened residuals: 1 agrees with it.
+    """
+    if "face" in solution.blocks:
+        z = solution.blocks["face"].white[solution.data.face["used"]]
+        yield "ranges", "face_sigma", np.sqrt(np.mean(z**2) / solution.data.levels.face_share)
+    if "view" in solution.blocks:
+        camera = solution.data.view["camera"]
+        z = solution.blocks["view"].white.reshape(camera.shape + (6,))
+        for number, name in enumerate(solution.observations.cameras):
+            mine = solution.data.view["used"] & (camera == number)
+            # more views than placements: what a board's own pose takes up is minor
+            if mine.sum() > len(camera):
+                what = f"poses of the board in camera '{name}'"
+                yield what, "view_covariance", np.sqrt(np.mean(z[mine] ** 2))
+
+
+def _held_at_zero(solution):
+    """Errors of the pitch that were held at zero, their squared scores (standard deviations)
+    and the values they would take.
+
+    Each one is tested by itself, with all that was estimated free.
+    """
+    names = [term.name for term in HELD]
+    sensor = tuple(dict.fromkeys((*solution.unknowns.sensor, *names)))
+    wider = replace(solution.unknowns, sensor=sensor)
+    blocks = named_blocks(solution.state, solution.data, wider)
+    hessian, gradient, *_ = linearise(blocks.values())
+    reduced, score, _ = eliminate(hessian, gradient, wider.shared)
+    names = wider.names(solution.observations.cameras)
+    estimated = [names.index(name) for name in solution.solution.names]
+    for term in HELD:
+        if term.name in solution.solution.names:
+            continue
+        free = [*estimated, names.index(term.name)]
+        information = reduced.sum(axis=0)[np.ix_(free, free)]
+        covariance = np.linalg.pinv(information, rcond=RANK, hermitian=True)
+        step = -(covariance @ score.sum(axis=0)[free])[-1]
+        yield term, float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)

@@ -64,15 +64,16 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     rotated = rotate_points(pose, obs.scene_points)
     moved = rotated + pose[..., None, :, 3]
     by_point = pinhole_jacobian(moved, obs.model)
-    focal = [obs.model.fx, obs.model.fy]
-    principal = [obs.model.cx, obs.model.cy]
-    errors = moved[..., :2] / moved[..., 2:] * focal + principal - obs.scene_pixels
+    # behind the camera the formula goes on (mirrored), as in `line_residuals`
+    u = obs.model.fx * moved[..., 0] / moved[..., 2] + obs.model.cx
+    v = obs.model.fy * moved[..., 1] / moved[..., 2] + obs.model.cy
+    errors = np.stack([u, v], axis=-1) - obs.scene_pixels
 
     by_source = by_point @ pose[..., None, :, :3]  # by the point in the source frame
-    pulled = obs.scene_covariance @ np.swapaxes(by_source, -1, -2)
+    pulled = obs.scene_covariance @ by_source.mT
     noise = by_source @ pulled + obs.scene_sigma_px[..., None, None] ** 2 * np.eye(2)
-    force = np.linalg.solve(noise, errors[..., None])
-    shift = (pulled @ force)[..., 0] @ np.swapaxes(pose[..., :3], -1, -2)
+    force = np.linalg.solve(noise, errors[..., None])[..., 0]
+    shift = np.matvec(pulled, force) @ pose[..., :3].mT
 
     one = np.ones(errors.shape[:-1])
     gradients = [by_point[..., 0, :], by_point[..., 1, :]]  # of u and of v
@@ -131,8 +132,8 @@ def estimate_pose(
 
         return plain
 
-    problem: Callable[..., Block] = partial(residual, obs=obs)
-    earlier = []
+    problem: Callable[[np.ndarray], Block] = partial(residual, obs=obs)
+    earlier: list[np.ndarray] = []
     if not weighted:
         problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
     placements = obs.group(uses)["placement"]
@@ -171,7 +172,7 @@ def _start_from_sights(points, lines, obs):
     """
     normals, _ = sight_normals(lines, obs.model)
     rotations = start_rotations()
-    offsets = -np.vecdot(normals, points @ np.swapaxes(rotations, -1, -2))
+    offsets = -np.vecdot(normals, points @ rotations.mT)
     poses = shifted(rotations, normals, offsets)
 
     def evaluate(pose):
@@ -179,7 +180,7 @@ def _start_from_sights(points, lines, obs):
 
     for loss in (None, "cauchy"):
         options = {"loss": loss, "scale": "auto", "max_iterations": 40}
-        poses = minimise(evaluate, poses, move_pose, **options)[0]
+        poses = minimise(evaluate, poses, move_pose, **options).state
     depth = apply_pose(poses, points)[..., 2]
     ahead = (depth > 0).mean(axis=1) > AHEAD
     if not ahead.any():

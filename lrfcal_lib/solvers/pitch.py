@@ -19,6 +19,7 @@ from lrfcal_lib.model.geometry import (
     pose_parameters,
     tilt,
 )
+from lrfcal_lib.model.kinematics import TILT_AXIS
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.plane_start import start_from_planes
 
@@ -154,7 +155,8 @@ def estimate_pitch_errors(
     turn = np.array([direction[p] for p in placements.tolist()])
     rows = gather(list(cameras.values()), placements)
     each = np.eye(len(placements))[rows.placement]
-    away = rows.pitch - np.array([middle[p] for p in placements.tolist()])[rows.placement]
+    middles = np.array([middle[p] for p in placements.tolist()])
+    away = rows.pitch - middles[rows.placement]
     # columns: by how much the unknowns of a model change the pitch of each row
     columns = {"none": each[:, :0]}
     if {-1, 1} <= set(turn.tolist()):
@@ -166,17 +168,16 @@ def estimate_pitch_errors(
     numbers = _count_numbers(rows, len(poses), len(placements))
     models = {}
     by_direction = (np.nan, np.nan)
-    wanted = before = None
     for name, by_unknown in columns.items():
         solution = _solve(name, rows, by_unknown, poses)
         model = _model(name, solution, rows, turn, numbers)
         if name == "direction":
             by_direction = (float(solution.parameters[-1]), float(model.offset_sigma[0]))
-        if before is not None:
-            model = model.tested(before, numbers)
-        if wanted is None or model.tested(wanted, numbers).p_value < LEVEL:
+        if name == "none":
+            wanted = before = model
+        if model.tested(wanted, numbers).p_value < LEVEL:
             wanted = model
-        models[name] = before = model
+        models[name] = before = model.tested(before, numbers)
     return PitchErrors(placements, turn, *by_direction, models, wanted.name)
 
 
@@ -264,8 +265,9 @@ def pitch_blocks(state, rows, by_unknown):
     cameras = len(poses)
     pose = poses[rows.camera]
     q = tilt(rows.points, by_unknown @ errors)
-    rotated = np.einsum("nij,nj->ni", pose[:, :, :3], q)
-    by_angle = np.einsum("nij,nj->ni", pose[:, :, :3], cross(np.array([1.0, 0.0, 0.0]), q))
+    R = pose[:, :, :3]
+    rotated = np.matvec(R, q)
+    by_angle = np.matvec(R, cross(TILT_AXIS, q))
     distances = np.vecdot(rows.normal, rotated + pose[:, :, 3]) - rows.distance
     of_camera = np.arange(6 * cameras) // 6 == rows.camera[:, None]
     by_pose = np.tile(gradient_by_pose(rotated, rows.normal), (1, cameras)) * of_camera
@@ -287,11 +289,13 @@ def _solve(name, rows, by_unknown, poses):
 
     def read(state):
         """No transform, and all unknowns."""
-        return None, np.concatenate([pose_parameters(state[0]).ravel(), state[1]])
+        poses, errors = state
+        return None, np.concatenate([pose_parameters(poses).ravel(), errors])
 
     def move(state, step):
         """Retraction of poses and unknowns of the pitch."""
-        return move_pose(state[0], step[:first].reshape(-1, 6)), state[1] + step[first:]
+        poses, errors = state
+        return move_pose(poses, step[:first].reshape(-1, 6)), errors + step[first:]
 
     return solve(
         lambda state: pitch_blocks(state, rows, by_unknown),
@@ -316,7 +320,7 @@ def _model(name, solution, rows, turn, numbers):
     unit = SIGMA * np.sqrt(len(poses))  # metres, of a residual
     distances = solution.residuals[: len(rows.weight)] / rows.weight * unit
     # what a scan scatters about its own plane tells nothing of the pitch
-    scatter = np.einsum("nij,nj->ni", poses[rows.camera][:, :, :3], rows.scatter)
+    scatter = np.matvec(poses[rows.camera][:, :, :3], rows.scatter)
     away = distances - np.vecdot(rows.normal, scatter)
     misfit = float(np.sum((rows.weight * away / unit) ** 2))
     # the offset common to all sweeps goes with the cameras' poses
@@ -333,7 +337,8 @@ def _model(name, solution, rows, turn, numbers):
         centre = np.eye(p) - 1 / p
         first = 6 * len(poses)
         offset = centre @ errors[:p]
-        sigma = np.sqrt(np.diag(centre @ known.covariance[first:, first:][:p, :p] @ centre))
+        of_offsets = known.covariance[first : first + p, first : first + p]
+        sigma = np.sqrt(np.diag(centre @ of_offsets @ centre))
         stretch[: len(errors) - p] = errors[p:]
     return PitchModel(
         name,

@@ -1,8 +1,8 @@
 """Start values of a camera from planes: minimal and closed forms, and the choice among minima."""
 
+from functools import partial
 from itertools import combinations
 from math import comb
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -28,6 +28,8 @@ CAPPED = 16.0  # times the usual square: a larger miss (four standard deviations
 NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
 SEEN = 0.8  # of the placements: a few may be wrong
 ROTATIONS = 200  # random ones, beside the 24 of a cube
+FEWEST_PLANES = 5  # that judge a candidate
+FEWEST_LINES = 7  # the same, where placements are single scan lines
 FLAT = 1e-3  # of its extent: what leaves a common plane less is a set of single scan lines
 
 
@@ -57,17 +59,18 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     frame, flat = common_plane(triangles)
     threes = _threes(p)
     few = threes[:MINIMAL]
-    candidates = [three_planes((triangles @ frame)[few], sets.boards[few]).reshape(-1, 3, 4)]
-    candidates[0] = candidates[0] @ frame.T
+    in_frame = three_planes(triangles[few] @ frame, sets.boards[few])
+    forms = [in_frame.reshape(-1, 3, 4) @ frame.T]
     if not flat:
-        candidates.append(closed_form(triangles[threes], sets.boards[threes]))
-        candidates.append(closed_form(triangles[None], sets.boards[None]))
-    candidates = _before_boards(np.concatenate(candidates), sets, _centred(triangles)[1])
+        forms.append(closed_form(triangles[threes], sets.boards[threes]))
+        forms.append(closed_form(triangles[None], sets.boards[None]))
+    candidates = _before_boards(np.concatenate(forms), sets, _centred(triangles)[1])
 
     # more placements than a closed form uses; half of them may be wrong, or all but one right
     squares = np.sort(_squares(candidates, triangles, sets), axis=1)
     first = []
-    for count in {p // 2 + 2, max(p // 2 + 2, 7 if flat else 5)}:
+    half = p // 2 + 2
+    for count in {half, max(half, FEWEST_LINES if flat else FEWEST_PLANES)}:
         order = np.argsort(squares[:, :count].mean(axis=1))
         first += [*order[:4], *_apart(candidates, order)]
     best = candidates[np.unique(first)]
@@ -75,13 +78,14 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     def evaluate(pose):
         return plane_block(pose, triangles / ROUGH_SIGMA, sets.boards, None, sets.number)
 
-    options: dict[str, Any] = {"max_iterations": 12, "tolerance": 0.01}
-    robust, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", **options)
-    plain, *_ = minimise(evaluate, robust, move_pose, **options)
+    rough = partial(minimise, evaluate, retract=move_pose, max_iterations=12, tolerance=0.01)
+    robust = rough(state=best, loss="cauchy", scale="auto").state
+    plain = rough(state=robust).state
     minima = np.concatenate([robust, plain, best])
     sizes = sizes_of_minima(_squares(minima, triangles, sets), sets.number)
     apart = np.array(_apart(minima, np.argsort(sizes)))
-    return pose_transform(minima[apart[sizes[apart] <= NEARLY * sizes[apart[0]]]])
+    nearly = sizes[apart] <= NEARLY * sizes[apart[0]]
+    return pose_transform(minima[apart[nearly]])
 
 
 def sizes_of_minima(squares: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
@@ -97,7 +101,15 @@ def sizes_of_minima(squares: np.ndarray, weights: np.ndarray | None = None) -> n
 
 
 def rival_words(camera: str, best: RigidTransform, other: RigidTransform) -> str:
-    """That another pose of a camera explains the data nearly as well."""
+    """That another pose of a camera explains the data nearly as well.
+
+    Parameters
+    ----------
+    camera : str
+        Its name.
+    best, other : RigidTransform
+        What is handed over, and its rival.
+    """
     turn, shift = transform_difference(best, other)
     return (
         f"a second minimum explains the data nearly as well: camera '{camera}' "
@@ -115,9 +127,10 @@ def common_plane(triangles):
     """
     root, centre = _centred(triangles.reshape(1, -1, 4))
     _, spread, axes = np.linalg.svd(root[0])
+    axes[2] *= np.linalg.det(axes)
     frame = np.eye(4)
-    frame[:3, :3] = axes.T * np.array([1.0, 1.0, np.linalg.det(axes)])
-    frame[3, :3] = -centre[0] @ frame[:3, :3]
+    frame[:3, :3] = axes.T
+    frame[3, :3] = -axes @ centre[0]
     return frame, bool(spread[2] < FLAT * spread[0])
 
 
@@ -140,8 +153,9 @@ def closed_form(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
     root, centre = _centred(triangles)
     source = np.linalg.svd(root)[2][..., 2, :]
     source = source * np.sign(np.vecdot(source, centre))[..., None]
-    camera = normal * np.where(np.vecdot(normal, boards[..., 3]) < 0, -1.0, 1.0)[..., None]
-    return _on_planes(np.swapaxes(camera, -1, -2) @ source, normal, boards[..., 3], centre)
+    outward = np.vecdot(normal, boards[..., 3]) >= 0
+    camera = np.where(outward[..., None], normal, -normal)
+    return _on_planes(camera.mT @ source, normal, boards[..., 3], centre)
 
 
 def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
@@ -166,14 +180,14 @@ def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
     normal = boards[..., 2]
     root, centre = _centred(triangles)
     along = np.linalg.svd(root[..., :2])[2][..., 0, :]
-    rows = (along[..., :, None] * normal[..., None, :]).reshape(*normal.shape[:-1], 6)
-    null = np.linalg.svd(rows)[2][..., 3:, :]
+    rows = along[..., :, None] * normal[..., None, :]
+    null = np.linalg.svd(rows.reshape(*normal.shape[:-1], 6))[2][..., 3:, :]
     first = null[..., :3]
     second = null[..., 3:]
-    first_length = first @ np.swapaxes(first, -1, -2)
-    second_length = second @ np.swapaxes(second, -1, -2)
-    angle = first @ np.swapaxes(second, -1, -2)
-    columns = _common_points(first_length - second_length, angle + np.swapaxes(angle, -1, -2))
+    first_length = first @ first.mT
+    second_length = second @ second.mT
+    angle = first @ second.mT
+    columns = _common_points(first_length - second_length, angle + angle.mT)
     columns = columns @ null
     columns = np.concatenate([columns, -columns], axis=-2)
     x = columns[..., :3]
@@ -194,7 +208,8 @@ def shifted(rotation: np.ndarray, normal: np.ndarray, right: np.ndarray) -> np.n
     right : ndarray, shape (..., k)
         Metres.
     """
-    return np.concatenate([rotation, np.linalg.pinv(normal) @ right[..., None]], axis=-1)
+    shift = np.linalg.pinv(normal) @ right[..., None]
+    return np.concatenate([rotation, shift], axis=-1)
 
 
 def start_rotations() -> np.ndarray:
@@ -218,8 +233,10 @@ def _before_boards(poses, sets, centres):
     point = sets.boards[..., 3]
     lrf_side = np.vecdot(poses[:, None, :, 3] - point, normal)
     ahead = apply_pose(poses, centres)[..., 2] > 0
-    good = np.mean((lrf_side * -np.vecdot(point, normal) > 0) & ahead, axis=1)
-    return poses[(good >= min(SEEN, good.max())) & np.isfinite(poses).all(axis=(1, 2))]
+    facing = lrf_side * -np.vecdot(point, normal) > 0
+    share = np.mean(facing & ahead, axis=1)
+    good = share >= min(SEEN, share.max())
+    return poses[good & np.isfinite(poses).all(axis=(1, 2))]
 
 
 def _squares(poses, triangles, sets):
@@ -254,9 +271,9 @@ def _on_planes(rotation, normal, point, centre):
     well as they can.
     """
     u, _, vt = np.linalg.svd(rotation)
-    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None, None]
-    rotation = np.concatenate([u[..., :2], u[..., 2:] * sign], axis=-1) @ vt
-    moved = centre @ np.swapaxes(rotation, -1, -2)
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    rotation = u @ vt
+    moved = centre @ rotation.mT
     return shifted(rotation, normal, np.vecdot(normal, point - moved))
 
 
@@ -291,7 +308,7 @@ def _common_points(one, two):
 
 def _in_x(conic, y):
     """Coefficients of x^2, x and 1 of conics (..., 3, 3) at values of y (..., n)."""
-    entry = conic[..., None]
-    linear = 2 * (entry[..., 0, 1, :] * y + entry[..., 0, 2, :])
-    constant = entry[..., 1, 1, :] * y**2 + 2 * entry[..., 1, 2, :] * y + entry[..., 2, 2, :]
-    return entry[..., 0, 0, :], linear, constant
+    xx, xy, x = np.moveaxis(conic[..., 0, :, None], -2, 0)
+    _, yy, y1 = np.moveaxis(conic[..., 1, :, None], -2, 0)
+    one = conic[..., 2, 2, None]
+    return xx, 2 * (xy * y + x), yy * y**2 + 2 * y1 * y + one

@@ -168,7 +168,7 @@ def check_normals(sets: PlaneSets, camera: str) -> None:
 def source_planes(pose, boards):
     """Planes of boards (..., 3, 4) in the source frame, ``plane . [P, 1] = 0``, shape (..., 4)."""
     normal = boards[..., 2]
-    across = (np.swapaxes(pose[..., :3], -1, -2) @ normal[..., None])[..., 0]
+    across = np.matvec(pose[..., :3].mT, normal)
     last = np.vecdot(normal, pose[..., 3] - boards[..., 3])
     return np.concatenate([across, last[..., None]], axis=-1)
 
@@ -189,7 +189,7 @@ def compress(sets: PlaneSets, weights) -> np.ndarray:
 def _noise_across(sets, planes):
     """What pulls points off planes (..., p, n, 3), metres^2, and their variance across them."""
     across = planes[..., :3]
-    pull = (sets.covariance @ across[..., None, :, None])[..., 0]
+    pull = np.matvec(sets.covariance, across[..., None, :])
     return pull, np.vecdot(pull, across[..., None, :]) + SIGMA_FLOOR**2
 
 
@@ -198,7 +198,8 @@ def equal_weights(sets, pose):
     squares), (..., 1, 1).
     """
     _, variance = _noise_across(sets, source_planes(pose[..., None, :, :], sets.boards))
-    return (np.sum(variance * sets.used, axis=(-1, -2), keepdims=True) / sets.used.sum()) ** -0.5
+    total = np.sum(variance * sets.used, axis=(-1, -2), keepdims=True)
+    return np.sqrt(sets.used.sum() / total)
 
 
 def correct_and_compress(sets: PlaneSets, pose: np.ndarray):
@@ -216,8 +217,8 @@ def correct_and_compress(sets: PlaneSets, pose: np.ndarray):
     moved = sets.points - pull * (distance * weights**2)[..., None]
     basis, triangles = np.linalg.qr(_with_one(moved) * weights[..., None])
     whole = weights * distance
-    visible = np.matvec(np.swapaxes(basis, -1, -2), whole)
-    rest = np.sum(whole**2, axis=(-1, -2)) - np.sum(visible**2, axis=(-1, -2))
+    visible = np.matvec(basis.mT, whole)
+    rest = np.sum(np.vecdot(whole, whole) - np.vecdot(visible, visible), axis=-1)
     return triangles, visible - np.matvec(triangles, planes), rest
 
 
@@ -230,7 +231,9 @@ def plane_block(pose, triangles, boards, whitener=None, count=None, offset=0.0) 
     """
     residuals, by_pose, _ = plane_terms(pose[..., None, :, :], triangles, boards, offset)
     shape = residuals.shape[:-2] + (-1,)
-    whitener = np.broadcast_to(np.eye(4) if whitener is None else whitener, residuals.shape + (4,))
+    if whitener is None:
+        whitener = np.eye(4)
+    whitener = np.broadcast_to(whitener, residuals.shape + (4,))
     return Block(residuals.reshape(shape), by_pose.reshape(shape + (6,)), whitener, count)
 
 
@@ -239,7 +242,7 @@ def board_whitener(pose, triangles, boards, board_covariance):
     placement.
     """
     _, _, by_board = plane_terms(pose[..., None, :, :], triangles, boards)
-    covariance = np.eye(4) + by_board @ board_covariance @ np.swapaxes(by_board, -1, -2)
+    covariance = np.eye(4) + by_board @ board_covariance @ by_board.mT
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
@@ -250,7 +253,7 @@ def plane_terms(pose, triangles, boards, offset=0.0):
     residuals = plane_residuals(pose, triangles, boards, offset)
     normal = boards[..., 2]
     by_pose = np.zeros(residuals.shape + (6,))  # of h
-    by_pose[..., :3, :3] = np.swapaxes(pose[..., :3], -1, -2) @ hat(normal)
+    by_pose[..., :3, :3] = pose[..., :3].mT @ hat(normal)
     by_pose[..., 3, 3:] = normal
     by_board = -by_pose
     by_board[..., 3, :3] = cross(normal, pose[..., 3] - boards[..., 3])
@@ -273,7 +276,8 @@ def plane_error(obs: CameraObservations, solution: Solution) -> float:
     distance = plane_residuals_m(obs, solution.transform)
     known = np.isfinite(distance)
     _, index = np.unique(obs.plane_placement[known], return_inverse=True)
-    return float(np.sqrt(np.mean((np.bincount(index, distance[known]) / np.bincount(index)) ** 2)))
+    means = np.bincount(index, distance[known]) / np.bincount(index)
+    return float(np.sqrt(np.mean(means**2)))
 
 
 def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> list[Block]:
@@ -346,7 +350,7 @@ def estimate_with_lens(
     error = plane_error(obs, solution)
     numbers = int(np.sum(plane_sets(obs).number) + visible.sum())
     state = (pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3])
-    earlier = []
+    earlier: list[np.ndarray] = []
     for _ in range(2):
         planes, rest = _planes_at(obs, state, error)
         solution = solve(
@@ -392,8 +396,10 @@ def _move_with_lens(state, step):
     """Retraction of pose, intrinsics (the first of them, as many as are free) and board poses."""
     pose, intrinsics, boards = state
     common, by_placement = step
-    change = np.pad(common[6:], (0, LENS - len(common[6:])))
-    return move_pose(pose, common[:6]), intrinsics + change, move_pose(boards, by_placement)
+    change = common[6:]
+    held = LENS - len(change)
+    refined = intrinsics + np.pad(change, (0, held))
+    return move_pose(pose, common[:6]), refined, move_pose(boards, by_placement)
 
 
 def _read_with_lens(state, lens):
@@ -407,8 +413,8 @@ def _with_refined_model(solution, obs, lens):
     _, intrinsics, boards = solution.state
     corners = 2 * len(obs.pattern_points)
     errors = solution.residuals[:, -corners:] * obs.pattern_sigma_px
-    # per corner, as OpenCV has it
-    rms = float(np.sqrt(2 * np.sum(errors**2) / np.isfinite(obs.pattern_pixels).sum()))
+    visible = np.isfinite(obs.pattern_pixels).sum() / 2
+    rms = float(np.sqrt(np.sum(errors**2) / visible))  # per corner, as OpenCV has it
     covariance = np.pad(solution.covariance[6:, 6:], (0, LENS - lens))
     model = obs.model.with_parameters(intrinsics, covariance, rms)
     return replace(solution, model=model, board_poses=pose_transform(boards).as_matrix())

@@ -112,7 +112,7 @@ def solve_platform(
     placement with one edge serves too when it has face points.
     """
     gauge = start_head(T0)
-    earlier = []
+    earlier: list[np.ndarray] = []
     for final in (False, True):  # the second time in the gauge of the axis of the first
         boards = prepare_boards(obs, gauge)
         on_edges = int(boards.edge["used"].sum())
@@ -240,15 +240,15 @@ def board_coordinates(head, boards, points, pitch):
     rotated = points @ head[:, :3].T
     q = tilt(rotated + head[:, 3], pitch)
     lever = q - boards[:, None, :, 3]
-    to_board = np.swapaxes(boards[:, None, :, :3], -1, -2)
-    Rx = np.swapaxes(tilt(np.eye(3), pitch[..., None]), -1, -2)
+    to_board = boards[:, None, :, :3].mT
+    Rx = tilt(np.eye(3), pitch[..., None]).mT
     turned = to_board @ Rx
     eye = np.broadcast_to(np.eye(3), turned.shape)
     by_head = turned @ np.concatenate([-hat(rotated), eye], axis=-1)
     by_board = to_board @ np.concatenate([hat(lever), -eye], axis=-1)
     J = np.concatenate([by_head[..., AXIS_COLUMNS], by_board], axis=-1)
     turn = geometry.cross(np.array([1.0, 0.0, 0.0]), q)
-    by_pitch = (to_board @ turn[..., None])[..., 0]
+    by_pitch = np.matvec(to_board, turn)
     return lever @ boards[:, :, :3], J, turned @ head[:, :3], by_pitch
 
 
@@ -280,13 +280,14 @@ def distances(state, group):
 def distance_block(state, group, sigma_pitch, which):
     """Some of the :func:`distances` of a group, whitened by the noise of points and pitch."""
     r, J, by_point, by_pitch = (x[:, :, which] for x in distances(state, group))
-    pull = group["covariance"] @ np.swapaxes(by_point, -1, -2)
+    pull = group["covariance"] @ by_point.mT
     by_pitch = sigma_pitch * by_pitch
     noise = by_point @ pull + by_pitch[..., :, None] * by_pitch[..., None, :]
-    force = np.linalg.solve(noise, r[..., None])
-    points = group["points"] - (pull @ force)[..., 0]
-    pitch = group["pitch"] - sigma_pitch * np.sum(by_pitch * force[..., 0], axis=-1)
-    corrected = distances(state, group | {"points": points, "pitch": pitch})[1][:, :, which]
+    force = np.linalg.solve(noise, r[..., None])[..., 0]
+    points = group["points"] - np.matvec(pull, force)
+    pitch = group["pitch"] - sigma_pitch * np.vecdot(by_pitch, force)
+    moved = group | {"points": points, "pitch": pitch}
+    corrected = distances(state, moved)[1][:, :, which]
     whitener = np.linalg.inv(np.linalg.cholesky(noise)) * group["used"][..., None, None]
     p = len(r)
     J = J.reshape(p, -1, 12)
@@ -329,12 +330,28 @@ def solve_projected(
 ) -> PlatformSolution:
     """The tilt axis by the paper's projected line fits.
 
-    Parameters and errors are those of :func:`solve_platform`. Of the observations the edge points
-    are used, without their covariance; that of the result comes from the scatter of the residuals.
     Placements with an edge parallel to a coordinate plane are skipped: their projected fits would
-    divide by zero. Which planes these are is a matter of the chart: of that of this repository,
-    where the LRF is turned least, or (`printed`) of the paper's, where it lies on the y axis of the
-    head, ``t = (0, t_y, 0)``.
+    divide by zero.
+
+    Parameters
+    ----------
+    obs : PlatformObservations
+        The edge points are used, without their covariance; that of the result comes from the
+        scatter of the residuals.
+    T0 : RigidTransform, optional
+        As of :func:`solve_platform`.
+    printed : bool
+        The chart, hence the coordinate planes, are the paper's: the LRF lies on the y axis of the
+        head, ``t = (0, t_y, 0)``. Otherwise that of this repository, where the LRF is turned least.
+
+    Returns
+    -------
+    PlatformSolution
+
+    Raises
+    ------
+    DegenerateGeometry
+        When no placement can be used.
 
     Notes
     -----
@@ -357,7 +374,7 @@ def solve_projected(
         )
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
     scatter = 1.0
-    earlier = []
+    earlier: list[np.ndarray] = []
     for final in (False, True):  # the second time with the scatter of the first
         solution = solve(
             partial(
@@ -421,8 +438,19 @@ def _slanted(obs, p_platform):
 def projected_block(head, obs, groups, scatter=1.0, printed=False):
     """The six terms of equation (15) of every placement over their common scatter.
 
-    `groups` are rows of edge 1 and rows of edge 2. The Jacobian by the axis chart comes from
-    complex steps, exact but for rounding.
+    The Jacobian by the axis chart comes from complex steps, exact but for rounding.
+
+    Parameters
+    ----------
+    head : ndarray, shape (3, 4)
+        ``T_head_lrf``.
+    obs : PlatformObservations
+    groups : iterable of (ndarray, ndarray)
+        Rows of the edge points on edges 1 and 2, of every placement.
+    scatter : float
+        Metres.
+    printed : bool
+        As of :func:`solve_projected`.
     """
     rotated = obs.edge_points @ head[:, :3].T
     eye = np.broadcast_to(np.eye(3), rotated.shape + (3,))

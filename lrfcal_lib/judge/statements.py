@@ -1,0 +1,175 @@
+"""Does session.json state the devices as they are? What the data contradict."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from lrfcal_lib.calibrate.pipeline import JointCalibration
+from lrfcal_lib.judge.alternatives import (
+    Doubt,
+    alternatives_of,
+    doubtful,
+    far_from_stated,
+    not_an_offset,
+)
+from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, by_sign, no_if
+from lrfcal_lib.judge.weaknesses import ABSURD
+from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.solvers.joint import solve_joint
+
+CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
+SIZES = (Kind.SQUARES, Kind.RANGES)  # an error of them is one of all distances
+LARGE_SIZE = 0.02  # error of a size that no estimate survives
+LARGE_SCALE = 0.01  # of the pitch
+RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
+NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be weighed"
+# statements that are falsified on purpose, as relative errors of alternatives
+LIES = {
+    "as recorded": {},
+    "squares 5 % too small": {Kind.SQUARES: -0.05},
+    "all sizes 5 % too large": {Kind.OUTLINE: 0.05, Kind.SQUARES: 0.05},
+    "angular step 3 % too large": {Kind.BEARINGS: 0.03},
+}
+
+
+def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
+    """What the data contradict of what session.json states.
+
+    What :mod:`lrfcal_lib.judge.alternatives` finds, a range offset that no maker admits, the
+    scale of the pitch, axis and cameras far from where they are stated.
+
+    Parameters
+    ----------
+    joint
+
+    Returns
+    -------
+    list of Finding
+    float
+        By how much all ranges are off if a size is wrong, metres.
+    """
+    solution = joint.solution
+    if not solution.converged:
+        words = f"{NOT_WEIGHED}: the estimate has not converged"
+        return [Finding(NO, Kind.NOT_WEIGHED, words)], 0.0
+    findings = []
+    doubts, instead = contradictions(joint)
+    level = solution.noise["face_scale"]
+    if doubts:
+        findings.append(finding_of(doubts))
+    elif level > ABSURD:
+        why = f"no single error explains why ranges fit {level:.0f} times worse than stated"
+        findings.append(Finding(NO, Kind.NOT_WEIGHED, f"{NOT_WEIGHED}: {why}"))
+    sizes = [abs(doubt.value) for doubt in doubts if doubt.kind in SIZES]
+    range_doubt = max(sizes, default=0.0) * float(np.median(solution.observations.face_range))
+    beyond = []
+    if instead not in doubts:
+        beyond = list(beyond_admitted(joint))
+    if beyond or instead in doubts:
+        range_doubt = max(range_doubt, abs(solution.sensor["range_offset"]))
+    findings += [*beyond, *beyond_spot(solution), *pitch_turns_otherwise(solution)]
+    for far in far_from_stated(joint):
+        severe = far.angle > np.pi / 2
+        findings.append(Finding(no_if(severe), Kind.FAR_FROM_STATED, far.words))
+    return findings, range_doubt
+
+
+def contradictions(joint) -> tuple[list[Doubt], Doubt | None]:
+    """Statements that the data contradict, and one that stands for a range offset, which may be of
+    them.
+    """
+    stated = alternatives_of(joint.prepared)
+    admitted = joint.prepared.session.lrf.admitted_offset
+    # a spot that is no evenly lit disc looks like one of another size, which does no harm
+    doubts = doubtful(joint.solution, admitted, stated, faint=(Kind.SPOT,))
+    instead = not_an_offset(joint.solution, admitted, stated)
+    if instead and (not doubts or doubts[0].kind == instead.kind):
+        return [instead], instead
+    return doubts, instead
+
+
+def finding_of(doubts):
+    """The Finding of statements (Doubts, the likeliest first) that explain the data alike."""
+    best = doubts[0]
+    certain = best.ratio > (2 * CONTRADICTS) ** 2
+    large = best.kind in SIZES and abs(best.value) > LARGE_SIZE
+    causes = "; or ".join(doubt.words for doubt in doubts)
+    words = f"statements contradict the data: {causes}"
+    return Finding(no_if(certain and large), best.kind, words)
+
+
+def beyond_admitted(joint) -> Iterator[Finding]:
+    """A range offset that the maker of the range finder does not admit."""
+    offset = joint.solution.sensor["range_offset"]
+    admitted = joint.prepared.session.lrf.admitted_offset
+    margin = CONTRADICTS * joint.solution.sigma.get("range_offset", 0.0)
+    if abs(offset) > admitted + margin:
+        words = (
+            f"the range offset of {1000 * offset:.0f} mm exceeds the {1000 * admitted:.0f} mm that "
+            "the maker of the range finder admits (session.json may state systematic_error_m): "
+            "check the stated size of the board and of the squares of its chessboard (the expected "
+            "errors count this as an error of every range), the unit of the ranges and the angular "
+            "step"
+        )
+        severe = abs(offset) > 2 * admitted + margin
+        yield Finding(no_if(severe), Kind.RANGE_OFFSET, words)
+
+
+def beyond_spot(solution) -> Iterator[Finding]:
+    """Readings that change where the stated spot no longer touches the board."""
+    bias = solution.edge_bias
+    if abs(bias) > RIM:
+        words = (
+            f"readings change at the rim of the stated spot ({100 * bias:.0f} % of its radius "
+            "outside the edges): state spot_exit_m and spot_divergence_rad as they are, or measure "
+            "the board's edges"
+        )
+        yield Finding(CARE, Kind.SPOT, words)
+
+
+def pitch_turns_otherwise(solution) -> Iterator[Finding]:
+    """A platform that turns more or less than its recorded pitch says."""
+    scale = solution.sensor["pitch_scale"]
+    sigma = solution.sigma.get("pitch_scale", 0.0)
+    if abs(scale) > max(CONTRADICTS * sigma, LARGE_SCALE):
+        words = (
+            f"the platform turns {100 * abs(scale):.1f} +- {100 * sigma:.1f} % "
+            f"{by_sign(scale, 'more', 'less')} than its recorded pitch says: check its gear or "
+            "encoder (the estimate has taken this off)"
+        )
+        yield Finding(CARE, Kind.PITCH_SCALE, words)
+
+
+def falsified(joint: JointCalibration) -> pd.DataFrame:
+    """Statements falsified on purpose, everything estimated again: what is doubted first.
+
+    Parameters
+    ----------
+    joint
+
+    Returns
+    -------
+    DataFrame
+        Columns falsified, range_offset_mm (that the estimate finds), doubted (words).
+    """
+    rows = []
+    stated = alternatives_of(joint.prepared)
+    for name, sizes in LIES.items():
+        obs = joint.observations
+        for kind, size in sizes.items():
+            if kind in stated:
+                obs = stated[kind].change(obs, size)
+        offset = np.nan
+        try:
+            solution = joint.solution
+            if sizes:
+                solution = solve_joint(obs, required=False, **joint.settings)
+            offset = solution.sensor["range_offset"]
+            findings, _ = contradicts_stated(replace(joint, solution=solution))
+            doubted = [finding.words for finding in findings] or ["nothing"]
+        except DegenerateGeometry as error:
+            doubted = [f"refused: {error}"]
+        rows.append((name, 1000 * offset, doubted[0]))
+    return pd.DataFrame(rows, columns=["falsified", "range_offset_mm", "doubted"])

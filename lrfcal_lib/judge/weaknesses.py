@@ -1,0 +1,331 @@
+"""What is weak about a joint estimate, and about the recording behind any result."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lrfcal_lib.calibrate.pipeline import Calibration, largest_range
+from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, no_if
+from lrfcal_lib.judge.next_placement import group_sigma, sights
+from lrfcal_lib.judge.placements import placements_table
+from lrfcal_lib.model.problem import LEAVES_OUT
+from lrfcal_lib.preprocess.prepared import Prepared
+from lrfcal_lib.solvers.joint_solution import JointSolution
+
+# placements: too few, and few
+FEWEST = 3
+FEW = 6
+PARALLEL = np.radians(6.0)  # normals of the boards about their mean
+SAME_DISTANCE = 0.12  # range of the distances, relative to their median
+SMALL_PITCH = np.radians(3.0)  # range of the recorded pitch
+SMALL_IMAGE_PITCH = np.radians(2.0)  # range within a placement of images of a camera on the head
+MISFIT = 4.0  # normalised squared residual, relative to the median placement's
+MODEL_ERROR = 2.5  # scatter over placements, in standard deviations of the noise
+# residuals in units of the stated noise: worth a word, and not that noise at all
+STATED = 2.5
+ABSURD = 10.0
+DEPENDENT = 0.2  # share of independent errors: sigma comes from a fifth of the ranges only
+LOST = 0.1  # share of the placements that may be left out without a warning
+UNSEEN = 0.2  # share of the placements that a camera may miss without a warning
+MOST = 0.5  # share of the scans across an edge: where so many lie elsewhere, its statement does
+
+
+def diagnose(solution: JointSolution) -> list[Finding]:
+    """Weaknesses of a joint estimate and of the recording behind it.
+
+    Parameters
+    ----------
+    solution
+
+    Returns
+    -------
+    list of Finding
+    """
+    return [
+        *weak_estimate(solution),
+        *weak_placements(solution),
+        *weak_pitch(solution),
+        *weak_poses(solution),
+        *large_residuals(solution),
+        *(Finding(CARE, Kind.WARNING, words) for words in solution.warnings),
+    ]
+
+
+def weak_estimate(solution) -> Iterator[Finding]:
+    """What keeps the estimate from an answer."""
+    if not solution.converged:
+        iterations = solution.solution.iterations
+        words = f"the estimate has not converged after {iterations} iterations"
+        yield Finding(NO, Kind.CONVERGENCE, words)
+    obs = solution.observations
+    for number, camera in enumerate(obs.cameras):
+        count = len(np.unique(obs.view_placement[obs.view_camera == number]))
+        if count < FEWEST:
+            words = f"camera '{camera}' sees the board in {count} placements only"
+            yield Finding(CARE, Kind.CAMERAS, words)
+    if solution.unobservable:
+        words = f"the data do not determine {'; '.join(solution.unobservable)}"
+        yield Finding(NO, Kind.UNOBSERVABLE, words)
+
+
+def weak_placements(solution) -> Iterator[Finding]:
+    """The number of placements."""
+    count = len(solution.boards)
+    if count < FEW:
+        words = f"{count} placements only, {FEW} or more are needed to see errors of the model"
+        yield Finding(no_if(count < FEWEST), Kind.PLACEMENTS, words)
+
+
+def weak_pitch(solution) -> Iterator[Finding]:
+    """The pitch of scans and images, which shows the axis."""
+    if AXIS_NAMES[0] not in solution.solution.names:
+        return
+    obs = solution.observations
+    of_view = np.isin(obs.view_camera, np.flatnonzero(np.array(obs.mounts) == "head"))
+    image_pitch = obs.view_pitch[of_view]
+    image_placement = obs.view_placement[of_view]
+    pitch = np.concatenate([obs.face_pitch, obs.beam_pitch, image_pitch])
+    placement = np.concatenate([obs.face_placement, obs.beam_placement, image_placement])
+    where = " within a placement"
+    if "platform" in obs.mounts:  # a camera on the base ties all placements together
+        placement = np.zeros_like(placement)
+        where = ""
+    span = largest_range(pitch, placement)
+    if span < SMALL_PITCH:
+        words = (
+            f"the recorded pitch ranges over {np.degrees(span):.1f} deg only{where}: the tilt axis "
+            "is hardly determined"
+        )
+        yield Finding(NO, Kind.PITCH, words)
+    elif len(image_pitch) and largest_range(image_pitch, image_placement) < SMALL_IMAGE_PITCH:
+        words = (
+            "every placement has its images at one pitch: the tilt axis rests on the scans of "
+            "small boards"
+        )
+        yield Finding(CARE, Kind.IMAGE_PITCH, words)
+
+
+def weak_poses(solution) -> Iterator[Finding]:
+    """Boards that stand alike."""
+    boards = solution.board_poses
+    if len(boards) < 2:
+        return
+    normals = boards[:, :, 2]
+    mean = normals.mean(axis=0)
+    apart = np.arccos(np.clip(normals @ mean / np.linalg.norm(mean), -1, 1)).max()
+    if apart < PARALLEL:
+        words = (
+            f"all boards are parallel (within {np.degrees(apart):.1f} deg): lean them every way "
+            "by 20 deg and more"
+        )
+        yield Finding(CARE, Kind.PARALLEL, words)
+    distance = np.linalg.norm(sights(boards, solution), axis=1)
+    if np.ptp(distance) < SAME_DISTANCE * np.median(distance):
+        words = (
+            f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): "
+            "errors at other distances are extrapolated, and a range offset is hard to tell from "
+            "shifts"
+        )
+        yield Finding(CARE, Kind.DISTANCE, words)
+
+
+def large_residuals(solution) -> Iterator[Finding]:
+    """What residuals and their scatter over placements say against the model."""
+    usual = max(np.median([*solution.misfit.values()]), 1.0)
+    misfits = [
+        f"{placement} ({np.sqrt(square / usual):.1f} times)"
+        for placement, square in solution.misfit.items()
+        if square > MISFIT * usual
+    ]
+    if misfits:
+        words = f"placements fit much worse than the others: {', '.join(misfits)}"
+        yield Finding(CARE, Kind.MISFIT, words)
+    if solution.excluded:
+        yield Finding(CARE, Kind.EXCLUDED, "; ".join(map(str, solution.excluded)))
+
+    ratio = scatter_over_placements(solution)
+    worst = max(ratio, key=ratio.__getitem__)
+    if ratio[worst] > MODEL_ERROR:
+        what = "the axis" if worst == "axis" else f"camera '{worst}'"
+        words = (
+            f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: "
+            "an error of the model"
+        )
+        yield Finding(CARE, Kind.MODEL_ERROR, words)
+
+    noise = {"ranges": solution.noise["face_scale"]} | noise_of_images(solution)
+    large = [f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED]
+    if large:
+        words = f"residuals are larger than the stated noise ({', '.join(large)})"
+        yield Finding(no_if(max(noise.values()) > ABSURD), Kind.NOISE, words)
+
+    # beams about an edge always repeat errors: they share a background
+    share = solution.noise["face_share"]
+    if share < DEPENDENT:
+        words = (
+            f"only {100 * share:.0f} % of the errors of ranges are independent: neighbouring "
+            "ranges have the same error (boards that bend, a pitch that is off)"
+        )
+        yield Finding(CARE, Kind.DEPENDENT, words)
+
+
+def scatter_over_placements(solution):
+    """Scatter of axis and cameras over placements, in standard deviations of the noise."""
+    clustered = solution.solution.covariance_placements
+    if clustered is None:
+        return {"axis": 0.0}
+    noise = group_sigma(solution.solution.covariance, solution)
+    scatter = group_sigma(clustered, solution)
+    return {name: scatter[name] / max(sigma, 1e-12) for name, sigma in noise.items()}
+
+
+def noise_of_images(solution: JointSolution) -> dict[str, float]:
+    """How far board poses in the images of each camera scatter, in stated standard deviations.
+
+    By its name in words. All cameras have one level; how their residuals differ tells whose it is.
+    What errors of the intrinsics cause is taken off.
+
+    Parameters
+    ----------
+    solution
+    """
+    obs = solution.observations
+    if len(obs.view_camera) == 0:
+        return {}
+    level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)
+    factors = np.linalg.cholesky(obs.view_covariance)
+    white = np.linalg.solve(factors, solution.residuals("view")[..., None])[..., 0]
+    squares = np.mean(white**2, axis=1)
+    usual = max(np.mean(squares), np.finfo(float).tiny)
+    scatter = {}
+    for number, camera in enumerate(obs.cameras):
+        mean = np.mean(squares[obs.view_camera == number])
+        scatter[f"images of '{camera}'"] = float(level * np.sqrt(mean / usual))
+    return scatter
+
+
+def sides_elsewhere(prepared: Prepared) -> Iterator[Finding]:
+    """Edges of the board that lie elsewhere than stated in most scans across them.
+
+    Parameters
+    ----------
+    prepared
+
+    Yields
+    ------
+    Finding
+        One an edge.
+    """
+    elsewhere = [side for sides in prepared.dropped.values() for side in sides.values()]
+    for edge in prepared.board.edges:
+        dropped = [side for side in elsewhere if side.edge == edge]
+        crossed = len(dropped) + sum(edge in names.values() for names in prepared.names.values())
+        if len(dropped) >= FEWEST and len(dropped) > MOST * crossed:
+            turn = np.degrees(np.median([side.turn for side in dropped]))
+            off = 1000 * np.median([side.distance for side in dropped])
+            words = (
+                f"the board's edge '{edge}' lies elsewhere than its outline says in "
+                f"{len(dropped)} of {crossed} scans ({off:.0f} mm off, turned by {turn:.1f} deg) "
+                "and is not used there: measure the board's edges (corners_m)"
+            )
+            yield Finding(CARE, Kind.OUTLINE, words)
+
+
+def blind_cameras(prepared: Prepared) -> Iterator[Finding]:
+    """Cameras that do not see the board in many placements.
+
+    Parameters
+    ----------
+    prepared
+
+    Yields
+    ------
+    Finding
+        One a camera.
+    """
+    placements = prepared.session.board_placements
+    for camera, views in prepared.views.items():
+        why = {p: views[p].reason if p in views else "no image" for p in placements}
+        unseen = [f"{placement} ({words})" for placement, words in why.items() if words]
+        if len(unseen) > UNSEEN * len(placements):
+            words = (
+                f"camera '{camera}' does not see the board in {len(unseen)} of {len(placements)} "
+                f"placements: {', '.join(unseen)}"
+            )
+            yield Finding(CARE, Kind.LEFT_OUT, words)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What a result does not rest on.
+
+    Attributes
+    ----------
+    recorded : int
+        Number of placements of the board.
+    placements : dict of int to str
+        Why whole placements are left out.
+    parts : list of str
+        Parts that are left out beside them, and why.
+    """
+
+    recorded: int
+    placements: dict[int, str]
+    parts: list[str]
+
+    @property
+    def many(self) -> bool:
+        """Whether more placements are left out than may be without a warning."""
+        return len(self.placements) > LOST * self.recorded
+
+    @property
+    def words(self) -> str:
+        """The placements that are left out, counted, with their reasons."""
+        why = ", ".join(f"{placement} ({words})" for placement, words in self.placements.items())
+        return f"{len(self.placements)} of {self.recorded} placements are left out: {why}"
+
+    @property
+    def note(self) -> str:
+        """What became of all placements, as far as it is no finding."""
+        notes = []
+        if not self.placements:
+            notes.append(f"All {self.recorded} placements were used.")
+        elif not self.many:
+            notes.append(f"{self.words}.")
+        if self.parts:
+            parts = "; ".join(self.parts)
+            notes.append(f"Parts left out beside whole placements: {len(self.parts)} ({parts}).")
+        return " ".join(notes)
+
+
+def left_out(calibration: Calibration, method: str) -> LeftOut:
+    """All placements that the result of a method does not rest on.
+
+    Parameters
+    ----------
+    calibration
+    method
+        Whose camera poses are handed over.
+    """
+    prepared = calibration.prepared
+    table = placements_table(prepared, calibration.observations).set_index("placement")
+    used = set(table.index[table.used]) - set(prepared.left_out)
+    excluded: dict[int, str] = {}
+    images: list[str] = []
+    if method == "joint" and calibration.joint is not None:
+        solution = calibration.joint.solution
+        used = set(solution.boards)
+        excluded = solution.excluded_placements
+        images = [str(problem) for problem in solution.excluded if problem.camera is not None]
+    placements = {}
+    for number in table.index:
+        if number not in used:
+            stated = excluded.get(number) or prepared.left_out.get(number)
+            placements[number] = stated or table.reason[number] or "no edge"
+    parts = [str(problem) for problem in prepared.problems if problem.kind not in LEAVES_OUT]
+    lost = LeftOut(len(table), placements, parts)
+    if lost.many:  # otherwise a finding says it
+        return replace(lost, parts=parts + images)
+    return lost

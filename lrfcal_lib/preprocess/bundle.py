@@ -1,0 +1,322 @@
+"""Bundle adjustment of chessboard corners: intrinsics, mounting, poses, the waves of the sheet."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.fit.least_squares import Block, minimise
+from lrfcal_lib.model.camera import CameraModel, project, project_jacobians
+from lrfcal_lib.model.geometry import (
+    apply_pose,
+    gradient_by_pose,
+    move_pose,
+    pose_array,
+    pose_transform,
+    rotate_points,
+)
+
+SIGMA_FLOOR_PX = 0.05  # corner detectors are never better than this on real prints
+OUTLIER_SIGMAS = 4.5
+RAYLEIGH_MEDIAN = 1.1774  # median of the length of a vector (2,) of normal variables
+ROBUST_ROUNDS = 6
+UP = np.array([0.0, 0.0, 1.0])
+LENS = 9  # fx, fy, cx, cy, k1..k5
+POSE = 6  # [w, v]
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """What predicts the corners of a sheet in the images of rigidly mounted cameras.
+
+    Attributes
+    ----------
+    lenses : ndarray, shape (c, 9)
+    mounting : ndarray, shape (c, 3, 4)
+        ``T_camera_first``; the first is the identity and no unknown.
+    poses : ndarray, shape (v, 3, 4)
+        ``T_first_board``.
+    shape : ndarray, shape (m,)
+        Coefficients of the heights of the corners in a basis.
+    """
+
+    lenses: np.ndarray
+    mounting: np.ndarray
+    poses: np.ndarray
+    shape: np.ndarray
+
+    @property
+    def ends(self) -> np.ndarray:
+        """Where the unknowns of each kind end, in the order of the attributes: (4,)."""
+        mounts = POSE * (len(self.mounting) - 1)
+        return np.cumsum([self.lenses.size, mounts, POSE * len(self.poses), len(self.shape)])
+
+    def moved(self, step: np.ndarray) -> "Bundle":
+        """After a step (n,) of all unknowns; poses move by ``[w, v]``."""
+        lens, mount, pose, shape = np.split(step, self.ends[:-1])
+        others = move_pose(self.mounting[1:], mount.reshape(-1, POSE))
+        return Bundle(
+            lenses=self.lenses + lens.reshape(-1, LENS),
+            mounting=np.concatenate([self.mounting[:1], others]),
+            poses=move_pose(self.poses, pose.reshape(-1, POSE)),
+            shape=self.shape + shape,
+        )
+
+    def predict(self, points: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels of the corners of a sheet, and their derivatives by all unknowns.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, 3)
+            Corners of a flat sheet, board frame, metres.
+        basis : ndarray, shape (k, m)
+            Heights over it.
+
+        Returns
+        -------
+        pixels : ndarray, shape (c, v, k, 2)
+        jacobian : ndarray, shape (c, v, k, 2, n)
+        """
+        raised = points + (basis @ self.shape)[:, None] * UP
+        turned = rotate_points(self.poses, raised)
+        p_first = turned + self.poses[:, None, :, 3]
+        corners = (len(self.lenses), *p_first.shape[:-1], 2)
+        pixels = np.zeros(corners)
+        jacobian = np.zeros((*corners, self.ends[-1]))
+        lens_end, mount_end, pose_end, _ = self.ends
+        for i, (lens, mount) in enumerate(zip(self.lenses, self.mounting, strict=True)):
+            mounted = rotate_points(mount, p_first)
+            fx, fy, cx, cy = lens[:4]
+            model = CameraModel(1, 1, fx, fy, cx, cy, lens[4:])
+            by_point, by_lens = project_jacobians(mounted + mount[:, 3], model)
+            # the derivatives by fx and fy are the distorted normalised coordinates themselves
+            distorted = np.stack([by_lens[..., 0, 0], by_lens[..., 1, 1]], axis=-1)
+            pixels[i] = lens[:2] * distorted + lens[2:4]
+            by_first = by_point @ mount[:, :3]
+            by_pose = gradient_by_pose(turned[..., None, :], by_first)
+            by_height = np.einsum("vkij,vj->vki", by_first, self.poses[:, :, 2])
+            J = jacobian[i]
+            J[..., LENS * i : LENS * (i + 1)] = by_lens
+            if i > 0:
+                start = lens_end + POSE * (i - 1)
+                J[..., start : start + POSE] = gradient_by_pose(mounted[..., None, :], by_point)
+            for view in range(len(self.poses)):
+                start = mount_end + POSE * view
+                J[view, ..., start : start + POSE] = by_pose[view]
+            J[..., pose_end:] = by_height[..., None] * basis[:, None]
+        return pixels, jacobian
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Least squares over corners seen by rigidly mounted cameras.
+
+    Attributes
+    ----------
+    models : tuple of CameraModel
+        With covariances and rms where the intrinsics were free.
+    mounting : RigidTransform
+        A stack of ``T_camera_first``; the first is the identity.
+    mounting_covariance : ndarray, shape (cameras - 1, 6, 6)
+        Of ``[w, v]``.
+    poses : RigidTransform
+        A stack of ``T_first_board``.
+    pose_covariance : ndarray, shape (views, 6, 6)
+        Of ``[w, v]``.
+    relief : ndarray, shape (k,)
+        Heights of the corners over the sheet's mean plane, metres.
+    residuals : ndarray, shape (cameras, views, k, 2)
+        Recorded minus predicted pixels, NaN where a corner was not used.
+    sigma_px : float
+        Of one coordinate.
+    bic : float
+        Bayesian information criterion: compares adjustments of the same corners.
+    """
+
+    models: tuple[CameraModel, ...]
+    mounting: RigidTransform
+    mounting_covariance: np.ndarray
+    poses: RigidTransform
+    pose_covariance: np.ndarray
+    relief: np.ndarray
+    residuals: np.ndarray
+    sigma_px: float
+    bic: float
+
+
+def waves(points: np.ndarray) -> np.ndarray:
+    """Heights that corners of a sheet may have over its mean plane: a basis.
+
+    Parameters
+    ----------
+    points : ndarray, shape (k, 3)
+
+    Returns
+    -------
+    ndarray, shape (k, k - 3)
+    """
+    planes = np.column_stack([np.ones(len(points)), points[:, :2]])
+    u, _, _ = np.linalg.svd(planes)
+    return u[:, 3:]
+
+
+def adjust(
+    pixels, points, models, poses, mounting=None, *, intrinsics=True, basis=None, fixed=()
+) -> Adjustment:
+    """Bundle adjustment of chessboard views with analytic derivatives.
+
+    Parameters
+    ----------
+    pixels : ndarray, shape (cameras, views, k, 2)
+        NaN where a corner was not found.
+    points : ndarray, shape (k, 3)
+        The corners on the board, metres.
+    models : sequence of CameraModel
+        Start values, as the next two.
+    poses : RigidTransform
+        A stack of ``T_first_board``.
+    mounting : RigidTransform, optional
+        A stack of ``T_camera_first``; may be left out for a single camera.
+    intrinsics : bool
+        Whether they are unknown, but for the `fixed` places in fx, fy, cx, cy, k1..k5.
+    basis : ndarray, shape (k, m), optional
+        Heights that all views may have in common; those of :func:`waves` hold no plane, so that the
+        poses are those of the sheet's mean plane.
+    fixed : sequence of int
+
+    Returns
+    -------
+    Adjustment
+
+    Raises
+    ------
+    ValueError
+        If there are more unknowns than coordinates.
+    """
+    basis = np.zeros((len(points), 0)) if basis is None else basis
+    mounting = RigidTransform.identity(1) if mounting is None else mounting
+    start = Bundle(
+        lenses=np.stack([model.parameters for model in models]),
+        mounting=pose_array(mounting),
+        poses=pose_array(poses),
+        shape=np.zeros(basis.shape[1]),
+    )
+    free = np.ones(start.ends[-1], bool)
+    free[: start.ends[0]] = intrinsics
+    for place in fixed:
+        free[place : start.ends[0] : LENS] = False
+    visible = np.isfinite(pixels)
+    if visible.sum() < free.sum():
+        raise ValueError(
+            f"{visible.sum()} image coordinates cannot determine {free.sum()} unknowns: use more "
+            "views"
+        )
+
+    def evaluate(bundle):
+        predicted, jacobian = bundle.predict(points, basis)
+        misses = np.where(visible, predicted - pixels, 0.0).ravel()
+        jacobian = jacobian.reshape(misses.size, -1)[:, free]
+        return Block(misses, jacobian, visible.ravel().astype(float))
+
+    def retract(bundle, step):
+        whole = np.zeros(len(free))
+        whole[free] = step
+        return bundle.moved(whole)
+
+    bundle = minimise(evaluate, start, retract)[0]
+    adjustment = _adjustment(bundle, evaluate(bundle), visible, free, models, basis)
+    if not intrinsics:
+        adjustment = replace(adjustment, models=tuple(models))
+    return adjustment
+
+
+def adjust_robust(pixels, points, models, poses, mounting=None, **options) -> Adjustment:
+    """As :func:`adjust`, without corners far off the rest (glare, a shadow).
+
+    Every corner is judged again in every round, so that one that its neighbour pulled out comes
+    back.
+
+    Parameters
+    ----------
+    pixels, points, models, poses, mounting, **options
+        Those of :func:`adjust`.
+
+    Returns
+    -------
+    Adjustment
+    """
+    result = adjust(pixels, points, models, poses, mounting, **options)
+    used = np.isfinite(result.residuals)
+    for _ in range(ROBUST_ROUNDS):
+        raised = points + result.relief[:, None] * UP
+        misses = np.empty(pixels.shape)
+        for i, model in enumerate(result.models):
+            p_camera = apply_pose(pose_array(result.mounting[i] * result.poses), raised)
+            misses[i] = pixels[i] - project(p_camera, model)
+        distance = np.linalg.norm(misses, axis=-1)
+        sigma = max(np.nanmedian(distance) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX)
+        before = used
+        used = np.broadcast_to((distance <= OUTLIER_SIGMAS * sigma)[..., None], pixels.shape)
+        if np.array_equal(used, before):
+            break
+        kept = np.where(used, pixels, np.nan)
+        result = adjust(kept, points, result.models, result.poses, result.mounting, **options)
+    return result
+
+
+def better(result: Adjustment, pixels, points, **options) -> Adjustment:
+    """The same corners adjusted otherwise, where the Bayesian information criterion prefers that.
+
+    Parameters
+    ----------
+    result : Adjustment
+    pixels, points, **options
+        Those of :func:`adjust`.
+
+    Returns
+    -------
+    Adjustment
+    """
+    same = np.where(np.isfinite(result.residuals), pixels, np.nan)
+    other = adjust(same, points, result.models, result.poses, **options)
+    return other if other.bic < result.bic else result
+
+
+def _adjustment(bundle, block, visible, free, models, basis):
+    """The Adjustment that a solved bundle is."""
+    count = int(visible.sum())
+    error = block.residuals @ block.residuals
+    variance = max(error / max(count - free.sum(), 1), 1e-18)
+    jacobian = block.jacobian[visible.ravel()]
+    normal = jacobian.T @ jacobian
+    # pixels, radians and metres mix safely
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scale = np.outer(scale, scale)
+    inverse = np.linalg.pinv(normal * scale, hermitian=True)
+    covariance = np.zeros((len(free), len(free)))
+    covariance[np.ix_(free, free)] = variance * inverse * scale
+
+    def blocks(start, end, size):
+        """Those of the unknowns from start to end, size by size."""
+        rows = np.arange(start, end).reshape(-1, size)
+        return covariance[rows[:, :, None], rows[:, None]]
+
+    lens_end, mount_end, pose_end, _ = bundle.ends
+    residuals = np.where(visible, -block.residuals.reshape(visible.shape), np.nan)
+    adjusted = []
+    spreads = blocks(0, lens_end, LENS)
+    for model, lens, spread, misses in zip(models, bundle.lenses, spreads, residuals, strict=True):
+        rms = float(np.sqrt(2 * np.nanmean(misses**2)))  # of distances, as OpenCV counts it
+        adjusted.append(model.with_parameters(lens, spread, rms))
+    penalty = free.sum() * np.log(count)
+    return Adjustment(
+        models=tuple(adjusted),
+        mounting=pose_transform(bundle.mounting),
+        mounting_covariance=blocks(lens_end, mount_end, POSE),
+        poses=pose_transform(bundle.poses),
+        pose_covariance=blocks(mount_end, pose_end, POSE),
+        relief=basis @ bundle.shape,
+        residuals=residuals,
+        sigma_px=float(np.sqrt(variance)),
+        bic=float(count * np.log(max(error, 1e-300) / count) + penalty),
+    )

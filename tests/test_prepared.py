@@ -1,0 +1,39 @@
+"""A session after preprocessing: what cannot be used."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rendered_boards import SHEET, pixels_of_squares
+
+from lrfcal_lib.calibrate import naming
+from lrfcal_lib.model.problem import ProblemKind
+from lrfcal_lib.preprocess import prepared, survey
+from lrfcal_lib.preprocess.board_in_image import (
+    BoardView,
+)
+
+
+def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
+    views = {
+        "left": [BoardView("left", placement=4, pixels=pixels_of_squares(7.0))],
+        "right": [BoardView("right", placement=4, pixels=pixels_of_squares(12.0))],
+    }
+    seen = survey.Survey(views, {}, None, SHEET)
+    monkeypatch.setattr(prepared, "views_of", lambda session, **options: seen)
+    problems = prepared.prepare_images(prepared.Prepared(None, SHEET, {}, {}, {})).problems
+    (problem,) = problems
+    assert problem.kind == ProblemKind.SMALL_SQUARES and problem.camera == "left"
+    assert "placements 4), 7.0 px at least" in problem.words and str(problem).startswith("camera 'left': squares")
+
+
+@pytest.mark.parametrize(("side", "named"), [(7.0, True), (12.0, False)])
+def test_where_all_cameras_contradict_a_scan_small_squares_are_a_cause(monkeypatch, side, named):
+    views = {c: {4: BoardView(c, placement=4, pixels=pixels_of_squares(side))} for c in ("left", "right")}
+    data = SimpleNamespace(placements=np.array([4]), select=lambda inliers: None)
+    monkeypatch.setattr(naming, "observe", lambda prepared, camera: data)
+    monkeypatch.setattr(naming, "find_outlying_placements", lambda obs: ([], {4: 0.02}))
+    monkeypatch.setattr(naming, "solve_camera", lambda obs, method: SimpleNamespace(transform=None))
+    (problem,) = naming.rough_poses(SimpleNamespace(views=views, board=SHEET))[1]
+    assert problem.placement == 4 and "another surface" in problem.words
+    assert ("or the images: squares below 9 px" in problem.words) == named
