@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lrfcal_lib.model import board as b
-from lrfcal_lib.model.geometry import triangle_angle
+from lrfcal_lib.model.feature_sets import triangle_angle
 
 
 @pytest.mark.parametrize("flip", [1, -1])

@@ -38,15 +38,6 @@ def test_turning_about_x_and_sliding_along_x_do_not_change_the_axis():
     assert max(g.axis_difference(g.axis_of(T), g.axis_of(other))) < 1e-12
 
 
-def test_head_and_platform_sources_agree_through_the_head():
-    """And a camera on the head sees a scan at its own pitch unchanged."""
-    rng = np.random.default_rng(7)
-    T, p, pitch = random_transform(rng), rng.normal(size=(5, 3)), rng.normal(size=5)
-    head = g.lrf_to_source(p, pitch, T, "head", 0.2)
-    np.testing.assert_allclose(g.lrf_to_platform(head, 0.2, T), g.lrf_to_source(p, pitch, T, "platform"), atol=1e-14)
-    np.testing.assert_allclose(g.lrf_to_source(p, 0.3, T, "head", 0.3), p, atol=1e-14)
-
-
 def test_plane_and_line_fits_recover_exact_data():
     rng = np.random.default_rng(8)
     normal, distance, rms = g.fit_plane(np.column_stack([rng.normal(size=(9, 2)), np.full(9, -2.0)]))
@@ -61,7 +52,6 @@ def test_plane_and_line_fits_recover_exact_data():
     (g.fit_plane, [np.zeros((2, 3))], "plane needs three"),
     (g.fit_plane, [np.outer(np.arange(5.0), [1, 1, 1])], "unobservable"),
     (g.fit_line, [np.ones((4, 3))], "two distinct points"),
-    (g.lrf_to_source, [np.zeros((1, 3)), 0.0, RigidTransform.identity(), "roof"], "'platform', got 'roof'"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(function, arguments, words):
     with pytest.raises(ValueError, match=words):

@@ -7,6 +7,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from syntax import count_nodes
 
 LIBRARY = Path(__file__).resolve().parents[1] / "lrfcal_lib"
 # a folder imports from the floors below it, never from another folder on its own floor; the commands stand on the roof
@@ -101,23 +102,6 @@ ALONE = {  # code; modules and nodes at most; what it must not load
         ("session", "preprocess", "judge", "evaluate", "solvers.joint", "solvers.pitch", "calibrate.reconstruct"),
     ),
 }  # fmt: skip
-
-
-UNCOUNTED = (ast.expr_context, ast.operator, ast.cmpop, ast.boolop, ast.unaryop, ast.arguments, ast.arg, ast.alias,
-             ast.keyword)  # fmt: skip
-
-
-def count_nodes(path):
-    """Nodes of a file's syntax tree: what a reader has to take in, without docstrings and annotations."""
-    tree = ast.parse(path.read_text())
-    for node in ast.walk(tree):
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
-            del node.body[0]
-        if isinstance(node, ast.FunctionDef):
-            node.returns = None
-        if isinstance(node, ast.arg):
-            node.annotation = None
-    return sum(not isinstance(node, UNCOUNTED) for node in ast.walk(tree))
 
 
 @pytest.mark.parametrize("what", ALONE)

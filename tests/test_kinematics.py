@@ -67,3 +67,12 @@ def test_corrections_take_off_what_was_added():
     np.testing.assert_allclose(WRONG.pitch(4, -0.1), -0.1 * 1.02 + 0.004)
     np.testing.assert_allclose(WRONG.pitch(5, -0.1), -0.1 * 1.02)  # nothing is known of that sweep
     np.testing.assert_allclose(replace(WRONG, sweeps={}).pitch(4, -0.1), -0.1 * 1.02)
+
+
+def test_head_and_platform_sources_agree_through_the_head():
+    """And a camera on the head sees a scan at its own pitch unchanged."""
+    p_lrf = polar_to_points(RANGES, BEARINGS)
+    on_head = SourceFrame(HEAD, "head", 0.2).apply(p_lrf, PITCH)
+    on_base = SourceFrame(HEAD, "platform").apply(p_lrf, PITCH)
+    np.testing.assert_allclose(lrf_to_platform(on_head, 0.2, HEAD), on_base, atol=1e-14)
+    np.testing.assert_allclose(SourceFrame(HEAD, "head", 0.3).apply(p_lrf, np.full(4, 0.3)), p_lrf, atol=1e-14)

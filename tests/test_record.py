@@ -90,6 +90,7 @@ def test_a_session_holds_what_the_devices_gave(path, cameras):
     complete(make_rig(listed(-4, 0, 4, cameras=cameras)), path)
     session = open_session(path)
     assert session.placements == (1, 2, 3) and "stop-and-go" in session.reference["recording"]
+    assert not session.continuous
     assert session.telegrams.report()["outcomes"] == {"scan": 9, "other": 1, "wrong CRC": 0, "truncated": 0}
 
 
@@ -106,6 +107,7 @@ def test_the_platform_log_tells_commanded_and_measured_pitch(path, feedback):
 def test_a_continuous_sweep_is_written_with_its_track_and_a_scene_as_one(path):
     rig = make_rig(rig_data(mode="continuous", pitch_deg=[-4, 8, 1], placements=[{"number": 1, "board": False}]))
     write(rig, path).finish()
+    assert open_session(path).continuous
     sweep, scenes = open_session(path).sweep(1), open_session(path).scene_placements
     assert len(sweep.pitch) > 5 and np.all(np.diff(sweep.pitch) >= 0) and np.ptp(np.degrees(sweep.pitch)) > 10
     told = rows(path, "platform.csv")[1:]

@@ -10,6 +10,7 @@ from lrfcal_lib.judge import uncertainty
 from lrfcal_lib.judge.uncertainty import Chain, beams_to, point_sigma, projection_sigma
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.kinematics import SourceFrame
 from lrfcal_lib.simulate.draw import ShotSetup
 
 HEAD = RigidTransform.from_components([0.0, 0.03, -0.05], Rotation.from_rotvec([0.0, 0.02, -0.03]))
@@ -29,7 +30,8 @@ def moved_points(chain, bearing, pitch, distance, change, image_pitch):
     head = geometry.pose_transform(geometry.move_pose(chain.head, np.insert(change[:4], [0, 2], 0.0)))
     scale = lambda angle: angle * (1 + change[11]) + change[12]  # noqa: E731
     p = geometry.polar_to_points(distance - change[10], bearing)
-    source = geometry.lrf_to_source(p, scale(pitch), head, "head" if chain.on_head else "platform", scale(image_pitch))
+    frame = SourceFrame(head, "head" if chain.on_head else "platform", scale(image_pitch))
+    source = frame.apply(p, scale(pitch))
     if chain.camera is None:
         return source
     return geometry.pose_transform(geometry.move_pose(chain.camera, change[4:10])).apply(source)

@@ -140,7 +140,7 @@ def combined_outlines(
                 continue
             states[placement] = state
             if case.images:
-                block = sight_block(state, case, scale)
+                block = image_block(state, case, scale)
                 r = block.white
                 J = block.white_jacobian
                 square += np.sum(r**2)
@@ -309,7 +309,7 @@ def blocks_of(state, case, scale):
     if unknowns.sides:
         blocks.append(joint_residuals.side_block(*of_joint))
     if case.images:
-        blocks.append(sight_block(state, case, scale))
+        blocks.append(image_block(state, case, scale))
     blocks.append(_rows(case.whitener @ state.change, case.whitener))
     count = 2 * len(case.middle)
     width = unknowns.shared + unknowns.own + count
@@ -353,7 +353,7 @@ def side_columns(J, edge, state, case):
     return columns.reshape(*edge.shape, -1)
 
 
-def sight_block(state, case, scale):
+def image_block(state, case, scale):
     """Distances (undistorted pixels) of two points of a side from the line in which an image
     shows it, whitened.
     """

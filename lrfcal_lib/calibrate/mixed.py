@@ -1,6 +1,5 @@
 """Mixed pixels: readings of a spot that meets two surfaces hang between them."""
 
-from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
@@ -45,12 +44,12 @@ def mixed(ranges: np.ndarray, steps: tuple[float, float], lrf: LrfInfo) -> np.nd
         Metres.
     """
     spots = _spots(ranges, steps, lrf)
-    sides = _beside(ranges, spots, lrf.sigma_range)
+    asked, dented, nearer = _beside(ranges, spots, lrf.sigma_range)
     planes = _Planes(ranges, spots, lrf.sigma_range)
     odd = np.zeros(ranges.shape, bool)
-    at = np.nonzero(sides.asked)
+    at = np.nonzero(asked)
     odd[at] = ~planes.hold(ranges[at], at, 0.6)
-    at = np.nonzero(sides.dented)
+    at = np.nonzero(dented)
     odd[at] |= _before_a_plane(planes, ranges, at)
     at = np.nonzero(odd)
     others = _Planes(np.where(odd, np.nan, ranges), spots, lrf.sigma_range)
@@ -58,7 +57,7 @@ def mixed(ranges: np.ndarray, steps: tuple[float, float], lrf: LrfInfo) -> np.nd
     about = np.rint(9 * uniform_filter(odd.astype(float), 3, mode="constant")) - odd
     alike = np.where(odd, about > 1, (about > 4) & np.isfinite(ranges))
     wide = np.minimum(*spots) > 2
-    return np.where(np.where(wide, alike, odd), np.maximum(sides.nearer, 1e-6), 0.0)
+    return np.where(np.where(wide, alike, odd), np.maximum(nearer, 1e-6), 0.0)
 
 
 def _spots(ranges, steps, lrf):
@@ -77,20 +76,12 @@ def _samples(spots, share, fewest):
     return samples
 
 
-class _Sides(NamedTuple):
-    """What both sides of readings say, arrays (l, b).
-
-    `asked`: other ranges on both sides, one of them within a pulse. `dented`: both sides farther.
-    `nearer`: how far before the reading the nearer side is, metres.
-    """
-
-    asked: np.ndarray
-    dented: np.ndarray
-    nearer: np.ndarray
-
-
 def _beside(ranges, spots, sigma):
-    """Compare readings with those half a spot and a spot away, in all directions: _Sides."""
+    """Compare readings with those half a spot and a spot away, in all directions.
+
+    Arrays (l, b): whether both sides are at other ranges, one of them within a pulse; whether both
+    are farther; how far before the reading the nearer side is, metres.
+    """
     place = np.indices(ranges.shape)
     size = np.array(ranges.shape)[:, None, None]
     asked = np.zeros(ranges.shape, bool)
@@ -110,7 +101,7 @@ def _beside(ranges, spots, sigma):
             dented |= (np.min(away, axis=0) > 2 * sigma) & (least < PULSE)
         within = np.where(np.array(away) > -PULSE, away, 0.0)
         nearer = np.maximum(nearer, -within.min(axis=0))
-    return _Sides(asked, dented, nearer)
+    return asked, dented, nearer
 
 
 class _Window(NamedTuple):
@@ -126,17 +117,6 @@ class _Window(NamedTuple):
     steep: float
     rough: float
     share: float
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Planes in inverse range: slopes by line and by beam (2, n), range at the places asked about
-    (n,), and whether they fit there (n,).
-    """
-
-    slope: np.ndarray
-    there: np.ndarray
-    good: np.ndarray
 
 
 class _Planes:
@@ -173,10 +153,11 @@ class _Planes:
         return sums, np.prod([2 * half + 1 for half in reach], axis=0)
 
     def fit(self, sums, at, rough):
-        """Planes of sums (n, 4, 4), as they are at places (line, beam): a _Fit.
+        """Planes in inverse range of sums (n, 4, 4), as they are at places (line, beam).
 
-        They fit where their residuals are less than `rough` sigma and the place is not far from
-        what they were fitted to.
+        Slopes by line and by beam (2, n), range there (n,), and whether they fit (n,): where their
+        residuals are less than `rough` sigma and the place is not far from what they were fitted
+        to.
         """
         number = np.maximum(sums[:, 0, 0], 1e-9)
         mean = (sums[:, 0, 1:] / number[:, None]).T
@@ -192,7 +173,7 @@ class _Planes:
         lever = 1 / number + (yy * x**2 - 2 * xy * x * y + xx * y**2) / area
         good = (number >= 4) & (inverse > 0) & (rms < rough * self.sigma * inverse**2)
         there = 1 / np.where(inverse > 0, inverse, np.nan)
-        return _Fit(slope, there, good & (lever < FARTHEST))
+        return slope, there, good & (lever < FARTHEST)
 
     def hold(self, readings, at, share):
         """Which readings (n,) at (line, beam) lie on a plane of a window about them, of which that
@@ -220,12 +201,12 @@ class _Planes:
         reach = [half[at] for half in window.reach]
         centre = [i + where * half for i, where, half in zip(at, place, reach, strict=True)]
         sums, whole = self.sums(centre, reach)
-        plane = self.fit(sums, at, window.rough)
-        good = plane.good & (sums[:, 0, 0] >= window.share * whole)
+        slope, there, good = self.fit(sums, at, window.rough)
+        good &= sums[:, 0, 0] >= window.share * whole
         for d in window.narrow:
-            rise = np.abs(plane.slope[d]) * plane.there**2  # metres a sample
+            rise = np.abs(slope[d]) * there**2  # metres a sample
             good &= rise < window.steep * self.sigma / self.spots[d][at]
-        return good & (np.abs(readings - plane.there) <= SIGMAS * self.sigma)
+        return good & (np.abs(readings - there) <= SIGMAS * self.sigma)
 
 
 def _before_a_plane(planes, ranges, at):
@@ -248,9 +229,9 @@ def _before_a_plane(planes, ranges, at):
         all_of_it, number = planes.sums(at, whole)
         near, fewer = planes.sums(at, strip)
         beside = all_of_it - near
-        plane = planes.fit(beside, at, 1.3)
-        depth = (plane.there - ranges[at]) / planes.sigma
-        good = plane.good & (beside[:, 0, 0] >= 0.8 * (number - fewer))
+        _, there, good = planes.fit(beside, at, 1.3)
+        depth = (there - ranges[at]) / planes.sigma
+        good &= beside[:, 0, 0] >= 0.8 * (number - fewer)
         good &= (depth > SIGMAS) & (depth < 10)
-        before |= good & (plane.there - mean[at] > SIGMAS * planes.sigma)
+        before |= good & (there - mean[at] > SIGMAS * planes.sigma)
     return before

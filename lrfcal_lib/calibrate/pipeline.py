@@ -334,7 +334,17 @@ def joint_settings(prepared: Prepared, observations: JointObservations) -> dict:
 
 
 def largest_range(values: np.ndarray, groups: np.ndarray) -> float:
-    """Largest range of the values of one group, 0 where there are none."""
+    """Largest range of the values of one group.
+
+    Parameters
+    ----------
+    values, groups : ndarray, shape (n,)
+
+    Returns
+    -------
+    float
+        0 where there are none.
+    """
     return max((np.ptp(values[groups == group]) for group in np.unique(groups)), default=0.0)
 
 

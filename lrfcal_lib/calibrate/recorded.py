@@ -93,7 +93,18 @@ def in_platform(
 
 
 def platform_of(prepared: Prepared, T_head_lrf: RigidTransform | None = None) -> RigidTransform:
-    """The platform to use: the one given, else the session's, else a tilt axis along x."""
+    """The platform to use.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    T_head_lrf : RigidTransform, optional
+
+    Returns
+    -------
+    RigidTransform
+        The one given, else the session's, else a tilt axis along x.
+    """
     for T in (T_head_lrf, prepared.session.T_head_lrf):
         if T is not None:
             return T

@@ -158,9 +158,18 @@ def file_hashes(session: Session) -> dict[str, str]:
 
 
 def write_calibration(path: str | Path, record: dict) -> None:
-    """Write a :func:`calibration_record` as JSON, NaN as null.
+    """Write a calibration as JSON, NaN as null.
 
-    ValueError if it cannot be written.
+    Parameters
+    ----------
+    path : path-like
+    record : dict
+        Of :func:`calibration_record`.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be written.
     """
     plain = json.loads(json.dumps(record), parse_constant=lambda name: None)
     with whole(path) as draft:
@@ -199,8 +208,17 @@ def write_clouds(folder: str | Path, calibration: Calibration, method: str) -> l
 def cloud_tasks(
     folder: str | Path, calibration: Calibration, method: str
 ) -> list[Callable[[], list[Path]]]:
-    """The clouds that can be had, see :func:`write_clouds`: calls that write one each and return
-    its files, the longest work first.
+    """The clouds that can be had, as work that may be shared.
+
+    Parameters
+    ----------
+    folder, calibration, method
+        See :func:`write_clouds`.
+
+    Returns
+    -------
+    list of callable
+        Each writes one cloud and returns its files; the longest work first.
     """
     prepared = calibration.prepared
     session = prepared.session

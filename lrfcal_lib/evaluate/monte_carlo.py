@@ -201,8 +201,9 @@ def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.n
         J = block.white_jacobian
         if name == "beam":  # expected: over both readings, weighted by how likely each is
             other = missed[name].white_jacobian
-            hessian += other.mT @ (-np.expm1(-block.cost)[..., None] * other)
-            J = np.exp(-block.cost / 2)[..., None] * J
+            chance = np.exp(-np.asarray(block.cost))[..., None]
+            hessian += other.mT @ ((1 - chance) * other)
+            J = np.sqrt(chance) * J
         hessian += J.mT @ J
     total = np.sum(reduced_hessian(hessian, unknowns.shared), axis=0)
     scale = 1 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))

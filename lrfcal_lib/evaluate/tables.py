@@ -39,7 +39,18 @@ SCAN_COLUMNS = (
 
 
 def unit_of(parameter: str) -> tuple[str, float]:
-    """Unit in which a parameter is shown, and the factor from radians and metres."""
+    """Unit in which a parameter is shown.
+
+    Parameters
+    ----------
+    parameter : str
+
+    Returns
+    -------
+    unit : str
+    factor : float
+        From radians and metres.
+    """
     for names, unit in UNITS.items():
         if re.fullmatch(names, parameter):
             return unit
@@ -47,7 +58,17 @@ def unit_of(parameter: str) -> tuple[str, float]:
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square of the finite values; NaN where there are none."""
+    """Root mean square.
+
+    Parameters
+    ----------
+    values : array_like
+
+    Returns
+    -------
+    float
+        Of the finite values; NaN where there are none.
+    """
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
     if not len(values):

@@ -53,9 +53,8 @@ def prior_terms(head: np.ndarray, prior: PlatformPrior) -> tuple[np.ndarray, np.
     arm = np.array([0.0, head[1, 3], head[2, 3]])
     r = np.r_[along[2], -along[1], (turn @ arm)[1:] - reference[1:, 3]]
     J = np.zeros((4, 4))
-    by_turn = (
-        turn @ hat(np.array([[1.0, 0.0, 0.0], arm]))[..., 1:]
-    )  # of R^T e_x and R^T t by w_y, w_z
+    # of R^T e_x and R^T t by w_y, w_z
+    by_turn = turn @ hat(np.array([[1.0, 0.0, 0.0], arm]))[..., 1:]
     J[:2, :2] = by_turn[0, [2, 1]] * [[1.0], [-1.0]]
     J[2:, :2] = by_turn[1, 1:]
     J[2:, 2:] = turn[1:, 1:]

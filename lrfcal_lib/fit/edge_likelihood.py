@@ -27,8 +27,8 @@ def disc_share(x: np.ndarray) -> np.ndarray:
     ndarray
         1 for x <= -1, 0 for x >= 1.
     """
-    x = np.clip(np.asarray(x, float), -1.0, 1.0)
-    return (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi
+    inside = np.clip(np.asarray(x, float), -1.0, 1.0)
+    return (np.arccos(inside) - inside * np.sqrt(1 - inside**2)) / np.pi
 
 
 def disc_edge(log_odds: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -92,8 +92,8 @@ def edge_shift(
     slope : ndarray
         Its derivative by `log_odds`.
     """
-    x, slope = disc_edge(log_odds + np.asarray(background, float))
-    return radius * x, radius * slope
+    x, slope = disc_edge(np.add(log_odds, background))
+    return np.multiply(radius, x), np.multiply(radius, slope)
 
 
 def flip_sigma(

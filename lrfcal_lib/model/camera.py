@@ -145,7 +145,7 @@ def distort(normalized: ArrayLike, distortion: np.ndarray) -> np.ndarray:
     ----------
     normalized : array_like, shape (..., 2)
         ``(x / z, y / z)``.
-    distortion : array_like, shape (5,)
+    distortion : ndarray, shape (5,)
         (k1, k2, k3, k4, k5).
 
     Returns

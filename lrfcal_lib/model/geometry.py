@@ -145,34 +145,6 @@ def lrf_to_platform(p_lrf: ArrayLike, pitch: ArrayLike, T_head_lrf: RigidTransfo
     return tilt(T_head_lrf.apply(p_lrf), pitch)
 
 
-def lrf_to_source(p_lrf, pitch, T_head_lrf, mount, image_pitch=0.0):
-    """Points of a sweep in the frame a camera is fixed to (the *source* frame of a camera
-    calibration).
-
-    Parameters
-    ----------
-    p_lrf, pitch, T_head_lrf
-        See :func:`lrf_to_platform`.
-    mount : {'platform', 'head'}
-        What the camera is fixed to; ValueError for anything else.
-    image_pitch : float
-        Pitch at which the image was taken, radians; only used for a camera on the head.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        Platform coordinates for a camera on the base; for a camera on the head, LRF coordinates of
-        a scan that would have been taken at `image_pitch`.
-    """
-    if mount == "platform":
-        return lrf_to_platform(p_lrf, pitch, T_head_lrf)
-    if mount != "head":
-        raise ValueError(f"mount is 'head' or 'platform', got '{mount}'")
-    return T_head_lrf.inv().apply(
-        lrf_to_platform(p_lrf, np.asarray(pitch) - image_pitch, T_head_lrf)
-    )
-
-
 @dataclass(frozen=True)
 class TiltAxis:
     """The tilt axis as a line in the LRF frame: all that the platform calibration can know (4
@@ -323,7 +295,7 @@ def fit_plane(points: np.ndarray) -> tuple[np.ndarray, float, float]:
 
     Parameters
     ----------
-    points : array_like, shape (n, 3)
+    points : ndarray, shape (n, 3)
         Metres; rows with NaN are ignored.
 
     Returns
@@ -355,12 +327,12 @@ def fit_plane(points: np.ndarray) -> tuple[np.ndarray, float, float]:
     return normal, float(normal @ centre), float(np.sqrt(max(values[0], 0.0)))
 
 
-def fit_line(points: ArrayLike) -> tuple[np.ndarray, np.ndarray, float]:
+def fit_line(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Total least squares line of points.
 
     Parameters
     ----------
-    points : array_like, shape (n, 2) or (n, 3)
+    points : ndarray, shape (n, 2) or (n, 3)
 
     Returns
     -------
@@ -615,7 +587,7 @@ def motion_words(delta: np.ndarray, frame: str) -> str:
 
     Parameters
     ----------
-    delta : array_like, shape (6,)
+    delta : ndarray, shape (6,)
         ``[w, v]``.
     frame : str
     """
@@ -629,137 +601,3 @@ def motion_words(delta: np.ndarray, frame: str) -> str:
     if shift < 0.02 * turn:
         return words
     return f"{words} with translation along {axis_words(v)}"
-
-
-def point_set(
-    positions: ArrayLike, point: ArrayLike, distance: float, tolerance: float
-) -> np.ndarray:
-    """Which positions a point at a measured distance allows: a spherical shell around it, figure
-    3 (a).
-
-    Parameters
-    ----------
-    positions : array_like, shape (..., 3)
-    point : array_like, shape (3,)
-    distance, tolerance : float
-        Metres.
-
-    Returns
-    -------
-    ndarray of bool, shape (...)
-    """
-    away = np.linalg.norm(np.asarray(positions, float) - point, axis=-1)
-    return np.abs(away - distance) <= tolerance
-
-
-def line_set(
-    positions: ArrayLike, point: ArrayLike, direction: np.ndarray, distance: float, tolerance: float
-) -> np.ndarray:
-    """Which positions a line with one hit point at a measured distance allows: a cylinder, figure
-    3 (b).
-
-    Parameters
-    ----------
-    positions : array_like, shape (..., 3)
-    point, direction : array_like, shape (3,)
-        A point of the line and its unit direction; which point was hit is not known.
-    distance, tolerance : float
-        Metres.
-
-    Returns
-    -------
-    ndarray of bool, shape (...)
-    """
-    away = np.linalg.norm(np.cross(np.asarray(positions, float) - point, direction), axis=-1)
-    return away <= distance + tolerance
-
-
-def plane_set(
-    positions: ArrayLike, point: ArrayLike, normal: ArrayLike, distance: float, tolerance: float
-) -> np.ndarray:
-    """Which positions a plane with one hit point at a measured distance allows: a slab, figure
-    3 (c).
-
-    Parameters
-    ----------
-    positions : array_like, shape (..., 3)
-    point, normal : array_like, shape (3,)
-        Of the plane; the unit normal points towards the sensor.
-    distance, tolerance : float
-        Metres.
-
-    Returns
-    -------
-    ndarray of bool, shape (...)
-    """
-    height = (np.asarray(positions, float) - point) @ np.asarray(normal, float)
-    return (height >= -tolerance) & (height <= distance + tolerance)
-
-
-def shell_volume(distance: float, tolerance: float) -> float:
-    """Volume of a spherical shell, cubic metres.
-
-    Parameters
-    ----------
-    distance : float
-        Radius of its middle, metres.
-    tolerance : float
-        Half its thickness, metres.
-    """
-    return 4 / 3 * np.pi * ((distance + tolerance) ** 3 - max(distance - tolerance, 0.0) ** 3)
-
-
-def crossing_volume(radius: float, angle: ArrayLike) -> np.ndarray:
-    """Volume common to two cylinders whose axes meet, ``16 r^3 / (3 sin angle)``.
-
-    Parameters
-    ----------
-    radius : float
-        Of both, metres.
-    angle : array_like, shape (...)
-        Between the axes, radians.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Cubic metres: smallest for perpendicular axes, infinite for parallel ones.
-    """
-    sine = np.abs(np.sin(np.asarray(angle, float)))
-    with np.errstate(divide="ignore"):
-        return np.where(sine > 1e-15, 16 * radius**3 / 3 / sine, np.inf)
-
-
-def ball(radius: float, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Positions drawn evenly from a ball around the origin.
-
-    Parameters
-    ----------
-    radius : float
-        Metres.
-    count : int
-    rng : Generator
-
-    Returns
-    -------
-    ndarray, shape (count, 3)
-    """
-    positions = rng.normal(size=(count, 3))
-    positions /= np.linalg.norm(positions, axis=1, keepdims=True)
-    return radius * positions * np.cbrt(rng.uniform(size=(count, 1)))
-
-
-def triangle_angle(ab: float, ac: float, bc: float) -> float:
-    """Angle at A of a triangle, radians (law of cosines).
-
-    Parameters
-    ----------
-    ab, ac, bc : float
-        Lengths of the sides; ValueError where they make no triangle.
-    """
-    cosine = (ab**2 + ac**2 - bc**2) / (2 * ab * ac)
-    if abs(cosine) > 1:
-        raise ValueError(
-            f"sides {ab}, {ac} and {bc} make no triangle: "
-            "each must be shorter than the sum of the others"
-        )
-    return float(np.arccos(cosine))

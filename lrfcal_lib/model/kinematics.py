@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import lrf_to_source, tilt
+from lrfcal_lib.model.geometry import lrf_to_platform, tilt
 
 TILT_AXIS = np.array([1.0, 0.0, 0.0])  # of the head and of the platform
 MIRROR_TURN = 1 / 75.08  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real LMS200
@@ -89,7 +89,10 @@ class SourceFrame:
         """Points (..., 3) of scans at some true pitch (...), moved from the LRF frame to this one,
         metres.
         """
-        return lrf_to_source(p_lrf, pitch, self.T_head_lrf, self.mount, self.image_pitch)
+        p_platform = lrf_to_platform(p_lrf, self._turn(pitch), self.T_head_lrf)
+        if self.mount == "platform":
+            return p_platform
+        return self.T_head_lrf.inv().apply(p_platform)
 
     def rotation(self, pitch: np.ndarray) -> np.ndarray:
         """Rotation matrices (n, 3, 3) from the LRF at some true pitch (n,) to this frame."""

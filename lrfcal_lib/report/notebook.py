@@ -13,6 +13,7 @@ import re
 from collections.abc import Sequence
 from numbers import Number
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import pandas as pd
@@ -167,7 +168,7 @@ def label_of(name: str) -> str:
     return METHODS[name].label if name in METHODS else OTHER_LABELS.get(name, name)
 
 
-def in_words(text: object, column: bool = False) -> object:
+def in_words(text: object, column: bool = False) -> Any:
     """An identifier in words: a method by its name; everything else as it is.
 
     Parameters

@@ -1,22 +1,22 @@
-"""What to record next comes true, and weak recordings are named before any number is shown."""
+"""Weak recordings are named before any number is shown."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
-from lrfcal_lib.judge import next_placement
 from lrfcal_lib.judge.verdict import verdict
-from lrfcal_lib.judge.weaknesses import diagnose
+from lrfcal_lib.judge.weaknesses import diagnose, sides_elsewhere
+from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
+from lrfcal_lib.preprocess.prepared import DroppedSide
 from lrfcal_lib.simulate.draw import bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
-
-NOWHERE = (0.0, 0.01)  # bearings
 
 
 def seen(rig, poses, rng, **settings):
@@ -40,35 +40,6 @@ def good():
     rng = np.random.default_rng(1)
     rig, poses = bench(rng), board_poses(rng, 8)
     return rig, poses, solve(rig, poses, rng)
-
-
-@pytest.fixture(scope="module")
-def suggested(good):
-    rig, _, solution = good
-    return next_placement.suggest_placement(solution, models_of(rig))
-
-
-def test_the_suggested_placement_brings_what_it_promises(good, suggested):
-    rig, poses, solution = good
-
-    def with_board(pose, seed):
-        """By how much one more placement really shrinks the uncertainty."""
-        found = solve(rig, [*poses, pose], np.random.default_rng(seed))
-        before, after = (next_placement.group_sigma(s.solution.covariance, s) for s in (solution, found))
-        return 1 - np.linalg.norm([*after.values()]) / np.linalg.norm([*before.values()])
-
-    gain = with_board(suggested.T_platform_board, 5)
-    assert gain > 0.8 * suggested.gain and 1 - gain == pytest.approx(1 - suggested.gain, rel=0.2)
-    blind = [with_board(pose, 6) for pose in board_poses(np.random.default_rng(7), 5)]
-    assert gain > 1.2 * np.median(blind) and suggested.gain > 1.5 * suggested.median_gain > 0
-
-
-def test_suggestions_refuse_bad_input(good):
-    rig, _, solution = good
-    with pytest.raises(DegenerateGeometry, match="none of .* board poses lies wholly in the view"):
-        next_placement.suggest_placement(solution, models_of(rig), field_of_view=NOWHERE)
-    last = verdict(solution, models_of(rig), field_of_view=NOWHERE).sentences()[-1]
-    assert last.startswith("No placement can be suggested: none of")
 
 
 def test_a_good_recording_is_trusted(good):
@@ -166,3 +137,19 @@ def test_large_errors_forbid_trust(good):
     wide = replace(solution, solution=replace(solution.solution, covariance=4e4 * solution.solution.covariance))
     found = verdict(wide, models_of(rig), suggest=False)
     assert found.answer == "no" and "the expected error at 2 m is" in found.sentences()[0]
+
+
+@pytest.mark.parametrize(
+    ("dropped", "named", "words"),
+    [(16, 0, "16 of 16 scans (12 mm off, turned by 8.0 deg)"), (9, 7, "9 of 16"), (8, 8, None), (2, 0, None)],
+)
+def test_an_edge_that_lies_elsewhere_in_most_scans_is_a_reason(dropped, named, words):
+    turned = DroppedSide("bc", 0.012, np.radians(8.0))
+    prepared = SimpleNamespace(
+        board=triangle_board(),
+        names={p: {0: "ab", 1: "bc"} for p in range(named)} | {p: {0: "ab"} for p in range(100, 100 + dropped)},
+        dropped={p: {1: turned} for p in range(100, 100 + dropped)},
+    )
+    reasons = list(sides_elsewhere(prepared))
+    assert [reason.kind for reason in reasons] == ["outline"] * (words is not None)
+    assert all("edge 'bc'" in reason.words and words in reason.words for reason in reasons)

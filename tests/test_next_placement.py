@@ -1,0 +1,48 @@
+"""What to record next comes true."""
+
+import numpy as np
+import pytest
+from test_weaknesses import models_of, solve
+
+from lrfcal_lib.judge.next_placement import group_sigma, suggest_placement
+from lrfcal_lib.judge.verdict import verdict
+from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.simulate.draw import bench, board_poses
+
+NOWHERE = (0.0, 0.01)  # bearings, radians
+
+
+@pytest.fixture(scope="module")
+def good():
+    rng = np.random.default_rng(1)
+    rig, poses = bench(rng), board_poses(rng, 8)
+    return rig, poses, solve(rig, poses, rng)
+
+
+@pytest.fixture(scope="module")
+def suggested(good):
+    rig, _, solution = good
+    return suggest_placement(solution, models_of(rig))
+
+
+def test_the_suggested_placement_brings_what_it_promises(good, suggested):
+    rig, poses, solution = good
+
+    def with_board(pose, seed):
+        """By how much one more placement really shrinks the uncertainty."""
+        found = solve(rig, [*poses, pose], np.random.default_rng(seed))
+        before, after = (group_sigma(s.solution.covariance, s) for s in (solution, found))
+        return 1 - np.linalg.norm([*after.values()]) / np.linalg.norm([*before.values()])
+
+    gain = with_board(suggested.T_platform_board, 5)
+    assert gain > 0.8 * suggested.gain and 1 - gain == pytest.approx(1 - suggested.gain, rel=0.2)
+    blind = [with_board(pose, 6) for pose in board_poses(np.random.default_rng(7), 5)]
+    assert gain > 1.2 * np.median(blind) and suggested.gain > 1.5 * suggested.median_gain > 0
+
+
+def test_suggestions_refuse_bad_input(good):
+    rig, _, solution = good
+    with pytest.raises(DegenerateGeometry, match="none of .* board poses lies wholly in the view"):
+        suggest_placement(solution, models_of(rig), field_of_view=NOWHERE)
+    last = verdict(solution, models_of(rig), field_of_view=NOWHERE).sentences()[-1]
+    assert last.startswith("No placement can be suggested: none of")
