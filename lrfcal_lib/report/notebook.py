@@ -152,7 +152,7 @@ def table(df: pd.DataFrame, name: str, digits: int | dict[str, int] = 3, caption
         lambda c: escape(in_words(c, True)), axis=1
     )
     styler = styler.hide(axis="index").set_uuid(name)
-    caption = caption or in_words(name).capitalize()
+    caption = caption or str(in_words(name)).capitalize()
     made = styler.set_caption(escape(caption)).to_html()
     _record("tables", name, {"name": name, "caption": caption, "html": made})
     return HTML(made)
