@@ -36,7 +36,9 @@ def _one_thread():
         sys.modules["cv2"].setNumThreads(1)
     if os.path.exists("/proc/self/maps"):
         with open("/proc/self/maps", encoding="utf-8", errors="surrogateescape") as maps:
-            files = {line.split(maxsplit=5)[5].strip() for line in maps if "openblas" in line}
+            files = {
+                line.split(maxsplit=5)[5].strip() for line in maps if "openblas" in line
+            }
         for library in map(ctypes.CDLL, files):
             # NumPy's, SciPy's, OpenCV's
             for name in ("scipy_openblas{}64_", "scipy_openblas{}", "openblas{}"):

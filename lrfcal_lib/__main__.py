@@ -126,13 +126,18 @@ def _add_sessions(verbs):
 
 def _add_rigs(verbs):
     """Verbs that have to do with devices."""
-    record = verbs.add_parser("record", help="record a session with a rig, real or emulated")
+    record = verbs.add_parser(
+        "record", help="record a session with a rig, real or emulated"
+    )
     record.add_argument(
-        "rig_file", help="JSON: the rig, its devices and what to record ('emulate' writes one)"
+        "rig_file",
+        help="JSON: the rig, its devices and what to record ('emulate' writes one)",
     )
     record.add_argument("session", help="folder of the new session")
     record.add_argument(
-        "--resume", action="store_true", help="go on with a session; finished placements stay"
+        "--resume",
+        action="store_true",
+        help="go on with a session; finished placements stay",
     )
     record.add_argument(
         "--placements", type=how_many, metavar="N", help="record N placements of the plan"
@@ -146,7 +151,8 @@ def _add_rigs(verbs):
         "setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221"
     )
     emulate.add_argument(
-        "--rig-file", help="write a new file for 'record', removed at the end unless changed"
+        "--rig-file",
+        help="write a new file for 'record', removed at the end unless changed",
     )
     emulate.add_argument("--seed", type=int, default=0, help="of noise")
     emulate.add_argument(
@@ -168,9 +174,13 @@ def _add_report(verbs):
         help="folders of sessions (default: the shipped one)",
     )
     report.add_argument("--out", help="folder of the report (default reports/<session>)")
-    report.add_argument("--jobs", type=int, default=2, help="notebooks executed at the same time")
     report.add_argument(
-        "--store", action="store_true", help="store the executed notebooks instead of a report"
+        "--jobs", type=int, default=2, help="notebooks executed at the same time"
+    )
+    report.add_argument(
+        "--store",
+        action="store_true",
+        help="store the executed notebooks instead of a report",
     )
 
 

@@ -54,17 +54,22 @@ SURVEYED = 4  # images in a survey
 CHUNK = 1_000_000  # points that growth hands over at a time
 SHORT = 0.02  # seconds
 ROWS = {"face": 40, "beam": 30}
-MODEL = CameraModel(1024, 768, 900.0, 900.0, 512.0, 384.0, np.array([-0.2, 0.1, 0.001, -0.001, 0.0]))
+MODEL = CameraModel(
+    1024, 768, 900.0, 900.0, 512.0, 384.0, np.array([-0.2, 0.1, 0.001, -0.001, 0.0])
+)
 
 
 def seconds(repeats, *functions):
     """Median times of calls that take turns (so that both meet the same load), short ones ten times a turn."""
-    calls, times = [], np.zeros((repeats, len(functions)))
+    calls = []
+    times = np.zeros((repeats, len(functions)))
     for function in functions:  # to warm up, and to see which are short
         taken = [elapsed(function) for _ in range(2)]
         calls.append(10 if min(taken) < SHORT else 1)
     for row in times:
-        row[:] = [elapsed(function, n) for function, n in zip(functions, calls, strict=True)]
+        row[:] = [
+            elapsed(function, n) for function, n in zip(functions, calls, strict=True)
+        ]
     return np.median(times, axis=0).tolist()
 
 
@@ -93,8 +98,11 @@ def cameras(size):
     start = solve_camera(obs, "line").transform
     x0 = np.r_[start.rotation.as_rotvec(), start.translation] + 0.02
     T0 = RigidTransform.from_components(x0[3:], Rotation.from_rotvec(x0[:3]))
-    points = obs.crossing_points + rng.normal(0, 0.002, (size["trials"], *obs.crossing_points.shape))
-    trials, some = replace(obs, crossing_points=points), points[: max(1, len(points) // 20)]
+    points = obs.crossing_points + rng.normal(
+        0, 0.002, (size["trials"], *obs.crossing_points.shape)
+    )
+    trials = replace(obs, crossing_points=points)
+    some = points[: max(1, len(points) // 20)]
 
     def scipy(points):
         def residuals(x):
@@ -103,21 +111,41 @@ def cameras(size):
 
         return least_squares(residuals, x0, method="lm").x
 
-    calls = [lambda: solve_camera(obs, "line", T0, search=False), lambda: scipy(obs.crossing_points)]
+    calls = [
+        lambda: solve_camera(obs, "line", T0, search=False),
+        lambda: scipy(obs.crossing_points),
+    ]
     ours, theirs = seconds(3 * size["repeats"], *calls)
-    yield "camera_solve_ms", 1000 * ours, "camera_solve_vs_scipy", "scipy lm, numeric Jacobian", theirs / ours, calls[0]
+    yield (
+        "camera_solve_ms",
+        1000 * ours,
+        "camera_solve_vs_scipy",
+        "scipy lm, numeric Jacobian",
+        theirs / ours,
+        calls[0],
+    )
     calls = [lambda: solve_camera(trials, "line", T0), lambda: [scipy(p) for p in some]]
     ours, theirs = seconds(size["repeats"], *calls)
     faster = theirs * len(points) / len(some) / ours
-    yield "monte_carlo_1000_s", ours, "monte_carlo_vs_scipy", "scipy in a loop", faster, calls[0]
+    yield (
+        "monte_carlo_1000_s",
+        ours,
+        "monte_carlo_vs_scipy",
+        "scipy in a loop",
+        faster,
+        calls[0],
+    )
 
 
 def problem(count):
     """A drawn session with so many rows of each group a placement, evenly picked."""
-    obs, masks = draw(np.random.default_rng(0), count)[0], {}
+    obs = draw(np.random.default_rng(0), count)[0]
+    masks = {}
     for name, most in ROWS.items():
         places = getattr(obs, f"{name}_placement")
-        rows = np.concatenate([thin(np.flatnonzero(places == p), most) for p in range(count)])
+        rows = np.concatenate(
+            [thin(np.flatnonzero(places == p), most) for p in range(count)]
+        )
         masks[name] = np.isin(np.arange(len(places)), rows)
     return obs.keep(**masks)
 
@@ -130,31 +158,52 @@ def with_gtsam(count):
     import gtsam
 
     obs = none(problem(count), "beam")
-    data, unknowns, start = gather(obs), Unknowns(2, 3, sensor=("range_offset",)), next(start_states(obs))[0]
-    c, pieces = unknowns.shared, []
+    data = gather(obs)
+    unknowns = Unknowns(2, 3, sensor=("range_offset",))
+    start = next(start_states(obs))[0]
+    c = unknowns.shared
+    pieces = []
     for p in range(count):
-        groups = {name: {k: v[[p]] for k, v in getattr(data, name).items()} for name in ("face", "beam", "view")}
-        piece = replace(data, **groups, middle=data.middle[[p]], direction=data.direction[[p]])
+        groups = {
+            name: {k: v[[p]] for k, v in getattr(data, name).items()}
+            for name in ("face", "beam", "view")
+        }
+        piece = replace(
+            data, **groups, middle=data.middle[[p]], direction=data.direction[[p]]
+        )
         pieces.append((start.of_placements([p]), piece))
 
     def error(p, values, jacobians):
         at, piece = pieces[p]
         moved = move_state(at, (values.atVector(0), values.atVector(p + 1)[None]), unknowns)
-        parts = [(b.white, b.white_jacobian) for b in named_blocks(moved, piece, unknowns).values()]
+        parts = [
+            (b.white, b.white_jacobian)
+            for b in named_blocks(moved, piece, unknowns).values()
+        ]
         r, J = (np.concatenate(rows, axis=1)[0] for rows in zip(*parts, strict=True))
         if jacobians is not None:
-            jacobians[0], jacobians[1] = np.asfortranarray(J[:, :c]), np.asfortranarray(J[:, c:])
+            jacobians[0], jacobians[1] = (
+                np.asfortranarray(J[:, :c]),
+                np.asfortranarray(J[:, c:]),
+            )
         return r
 
-    graph, first = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph = gtsam.NonlinearFactorGraph()
+    first = gtsam.Values()
     first.insert(0, np.zeros(c))
     for p in range(count):
         first.insert(p + 1, np.zeros(unknowns.own))
         noise = gtsam.noiseModel.Unit.Create(len(error(p, first, None)))
-        graph.add(gtsam.CustomFactor(noise, [0, p + 1], lambda _, values, H, p=p: error(p, values, H)))
+        graph.add(
+            gtsam.CustomFactor(
+                noise, [0, p + 1], lambda _, values, H, p=p: error(p, values, H)
+            )
+        )
 
     def run():
-        found = gtsam.LevenbergMarquardtOptimizer(graph, first, gtsam.LevenbergMarquardtParams()).optimize()
+        found = gtsam.LevenbergMarquardtOptimizer(
+            graph, first, gtsam.LevenbergMarquardtParams()
+        ).optimize()
         own = np.stack([found.atVector(p + 1) for p in range(count)])
         return move_state(start, (found.atVector(0), own), unknowns)
 
@@ -173,7 +222,14 @@ def joint(size):
         print("no GTSAM here: its ratio stays empty", file=sys.stderr)
     ours, *others = seconds(size["repeats"], *calls)
     faster = others[0] / ours if others else np.nan
-    yield "joint_100_s", ours, "joint_vs_gtsam", "GTSAM's iterations, a factor a placement", faster, calls[0]
+    yield (
+        "joint_100_s",
+        ours,
+        "joint_vs_gtsam",
+        "GTSAM's iterations, a factor a placement",
+        faster,
+        calls[0],
+    )
 
 
 def scene(rng, count):
@@ -190,9 +246,13 @@ def painter(image):
 
 def colouring(size):
     """Points coloured from one image with occlusion, against OpenCV and a depth buffer."""
-    rng, count = np.random.default_rng(1), size["points"]
-    image, points = rng.integers(0, 255, (768, 1024, 3), dtype=np.uint8), scene(rng, count)
-    zero, ahead, some = np.zeros(3), np.tile(np.float32([0, 0, -1]), (count, 1)), points[::10].astype(float)
+    rng = np.random.default_rng(1)
+    count = size["points"]
+    image = rng.integers(0, 255, (768, 1024, 3), dtype=np.uint8)
+    points = scene(rng, count)
+    zero = np.zeros(3)
+    ahead = np.tile(np.float32([0, 0, -1]), (count, 1))
+    some = points[::10].astype(float)
 
     def paint():
         one = painter(image)
@@ -212,20 +272,39 @@ def colouring(size):
 
     ours, tenth = seconds(size["repeats"], paint, with_opencv)
     against = "cv2.projectPoints, depth buffer, cv2.remap"
-    yield "colour_mpoints_per_s", count / 1e6 / ours, "colour_vs_cv2", against, 10 * tenth / ours, paint
+    yield (
+        "colour_mpoints_per_s",
+        count / 1e6 / ours,
+        "colour_vs_cv2",
+        against,
+        10 * tenth / ours,
+        paint,
+    )
 
 
 def decoding(size):
     """Telegrams of an LMS2xx found, checked and decoded, against one by one in plain Python."""
-    raw = [encode_scan(r) for r in np.random.default_rng(2).uniform(1, 8, (size["telegrams"] // 100, 361))]
+    raw = [
+        encode_scan(r)
+        for r in np.random.default_rng(2).uniform(1, 8, (size["telegrams"] // 100, 361))
+    ]
     data = b"".join(raw) * 100
 
     def whole():
         stream = split_stream(data)
         return decode_scans(data, stream.offset, stream.length)
 
-    ours, theirs = seconds(size["repeats"], whole, lambda: [decode_scan(one) for one in raw])
-    yield "decode_mb_per_s", len(data) / 1e6 / ours, "decode_vs_plain", "one by one", 100 * theirs / ours, whole
+    ours, theirs = seconds(
+        size["repeats"], whole, lambda: [decode_scan(one) for one in raw]
+    )
+    yield (
+        "decode_mb_per_s",
+        len(data) / 1e6 / ours,
+        "decode_vs_plain",
+        "one by one",
+        100 * theirs / ours,
+        whole,
+    )
 
 
 def images(size):
@@ -249,8 +328,12 @@ def images(size):
 
     def see():
         """The whole survey of one camera's images, of which all are the same."""
-        records = [replace(record, placement=i, file=Path(f"{i}.png")) for i in range(SURVEYED)]
-        return survey(records, lambda r: cv2.imdecode(png, cv2.IMREAD_COLOR), board, {"left": model})
+        records = [
+            replace(record, placement=i, file=Path(f"{i}.png")) for i in range(SURVEYED)
+        ]
+        return survey(
+            records, lambda r: cv2.imdecode(png, cv2.IMREAD_COLOR), board, {"left": model}
+        )
 
     repeats = min(size["repeats"], 3)
     yield "image_12mp_s", seconds(repeats, find)[0], None, "", np.nan, find
@@ -264,8 +347,18 @@ def commands(size):
         if size["session"]:
             with TemporaryDirectory() as folder:
                 shutil.copytree(ROOT / "data" / size["session"], Path(folder, "session"))
-                command = [sys.executable, "-m", "lrfcal_lib", verb, "session", *["--out", "out"] * (verb == "report")]
-                environment = os.environ | {"LRFCAL_CACHE": f"{folder}/cache", "PYTHONPATH": str(ROOT)}
+                command = [
+                    sys.executable,
+                    "-m",
+                    "lrfcal_lib",
+                    verb,
+                    "session",
+                    *["--out", "out"] * (verb == "report"),
+                ]
+                environment = os.environ | {
+                    "LRFCAL_CACHE": f"{folder}/cache",
+                    "PYTHONPATH": str(ROOT),
+                }
                 where = {"cwd": folder, "env": environment, "stdout": subprocess.DEVNULL}
                 taken = elapsed(partial(subprocess.run, command, check=True, **where))
         yield key, taken, None, "", np.nan, None
@@ -274,7 +367,9 @@ def commands(size):
 def paint_blocks(count):
     """Colour so many points block by block: seconds and the largest memory of this process, MB."""
     image = np.random.default_rng(1).integers(0, 255, (768, 1024, 3), dtype=np.uint8)
-    one, ahead, taken = painter(image), np.tile(np.float32([0, 0, -1]), (min(count, CHUNK), 1)), 0.0
+    one = painter(image)
+    ahead = np.tile(np.float32([0, 0, -1]), (min(count, CHUNK), 1))
+    taken = 0.0
     one.paint(scene(np.random.default_rng(0), 10), ahead[:10])  # loads the compiled loops
     for work in (one.hide, lambda points: one.paint(points, ahead)):
         rng = np.random.default_rng(2)  # the same points again
@@ -283,7 +378,9 @@ def paint_blocks(count):
             begin = time.perf_counter()
             work(points)
             taken += time.perf_counter() - begin
-    status = Path("/proc/self/status").read_text()  # getrusage would count the parent's memory
+    status = Path(
+        "/proc/self/status"
+    ).read_text()  # getrusage would count the parent's memory
     return taken, int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
@@ -291,12 +388,20 @@ def growth(size):
     """Time and memory by number of points (a process each) and of placements."""
     for count in size["growth"]:
         command = [sys.executable, __file__, "--paint", str(count)]
-        taken, peak = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        taken, peak = json.loads(
+            subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        )
         yield "colouring", "points", count, taken, peak
     for count in size["placements"]:
         obs = problem(count)
         taken = seconds(min(size["repeats"], 3), lambda obs=obs: solve_joint(obs))[0]
-        yield "joint estimate", "placements", count, taken, memory(lambda obs=obs: solve_joint(obs))
+        yield (
+            "joint estimate",
+            "placements",
+            count,
+            taken,
+            memory(lambda obs=obs: solve_joint(obs)),
+        )
 
 
 def plot(table, path):
@@ -314,29 +419,51 @@ def plot(table, path):
 
 def main(out, size=None):
     """Measure everything at a size and write bench.json, bench.csv and growth.png."""
-    size, rows, figures = size or FULL, [], {}
+    size = size or FULL
+    rows = []
+    figures = {}
     for part in (cameras, joint, colouring, decoding, images, commands):
         for key, value, ratio_key, against, times_faster, call in part(size):
-            rows.append([key, value, against, times_faster, memory(call) if call else np.nan])
+            rows.append(
+                [key, value, against, times_faster, memory(call) if call else np.nan]
+            )
             figures |= {key: value, ratio_key: times_faster} if ratio_key else {key: value}
-            print(f"{key} {value:.4g}" + (f", {times_faster:.3g} times {against}" if against else ""), flush=True)
-    grown = pd.DataFrame(growth(size), columns=["what", "of", "count", "seconds", "peak_mb"])
+            print(
+                f"{key} {value:.4g}"
+                + (f", {times_faster:.3g} times {against}" if against else ""),
+                flush=True,
+            )
+    grown = pd.DataFrame(
+        growth(size), columns=["what", "of", "count", "seconds", "peak_mb"]
+    )
     figures["peak_mb_1e8_points"] = grown[grown["of"] == "points"]["peak_mb"].iloc[-1]
     print(grown.round(3).to_string(index=False))
     out.mkdir(parents=True, exist_ok=True)
-    table = pd.DataFrame(rows, columns=["figure", "value", "against", "times_faster", "memory_mb"])
+    table = pd.DataFrame(
+        rows, columns=["figure", "value", "against", "times_faster", "memory_mb"]
+    )
     table.to_csv(out / "bench.csv", index=False, float_format="%.5g")
     plot(grown, out / "growth.png")
-    figures = {key: None if np.isnan(value) else float(f"{value:.5g}") for key, value in figures.items()}
+    figures = {
+        key: None if np.isnan(value) else float(f"{value:.5g}")
+        for key, value in figures.items()
+    }
     figures["growth"] = json.loads(grown.to_json(orient="records"))
-    figures["sizes"], figures["machine"] = size, {"cpus": os.cpu_count(), "load": os.getloadavg()[0]}
+    figures["sizes"], figures["machine"] = (
+        size,
+        {"cpus": os.cpu_count(), "load": os.getloadavg()[0]},
+    )
     (out / "bench.json").write_text(json.dumps(figures, indent=1) + "\n")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "reports" / "bench")
-    parser.add_argument("--without-commands", action="store_true", help="without the minutes of calibrate and report")
+    parser.add_argument(
+        "--without-commands",
+        action="store_true",
+        help="without the minutes of calibrate and report",
+    )
     parser.add_argument("--paint", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.paint:

@@ -14,7 +14,9 @@ import pytest
 from shared import FOLDER, QUICK, ROOT, chromium, shared_folder, stages
 
 matplotlib.use("Agg")
-sys.modules["rfc3987_syntax"] = None  # a grammar of internet addresses, which nbformat would load: 3 s a process
+sys.modules["rfc3987_syntax"] = (
+    None  # a grammar of internet addresses, which nbformat would load: 3 s a process
+)
 
 
 def pytest_configure(config):
@@ -69,7 +71,11 @@ def browser(request):
     options = ["--no-sandbox", "--disable-dev-shm-usage"]  # CI runs as root, in a container
     options += getattr(request, "param", ["--disable-gpu"])
     with sync_playwright() as playwright:
-        yield (browser := playwright.chromium.launch(executable_path=program, args=options, timeout=120_000))
+        yield (
+            browser := playwright.chromium.launch(
+                executable_path=program, args=options, timeout=120_000
+            )
+        )
         browser.close()
 
 
@@ -115,8 +121,24 @@ LONGEST = (
     "test_golden", "test_alternatives", "test_joint", "test_record_emulated", "test_same_numbers", "test_solvers",
     "test_emulated_rig", "test_hostile_text", "test_joint_calibration", "test_record_bad_input",
 )  # fmt: skip
-ALONE = "test_stored_outputs_and_golden_tables", "test_tables_of_the_recording", "test_buttons_record"
-NOTEBOOKS = ("08", "07", "09", "[1", "05", "06", "04", "03", "02", "01", "00")  # who works out stages waits for nobody
+ALONE = (
+    "test_stored_outputs_and_golden_tables",
+    "test_tables_of_the_recording",
+    "test_buttons_record",
+)
+NOTEBOOKS = (
+    "08",
+    "07",
+    "09",
+    "[1",
+    "05",
+    "06",
+    "04",
+    "03",
+    "02",
+    "01",
+    "00",
+)  # who works out stages waits for nobody
 
 
 def pytest_collection_modifyitems(items):
@@ -125,8 +147,14 @@ def pytest_collection_modifyitems(items):
     def rank(item):
         if item.name.startswith(ALONE):
             return next((k for k, name in enumerate(NOTEBOOKS) if name in item.name), 0)
-        return len(NOTEBOOKS) + (LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+        return len(NOTEBOOKS) + (
+            LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST)
+        )
 
     items.sort(key=rank)
     for item in items:
-        item.add_marker(pytest.mark.xdist_group(item.name if item.name.startswith(ALONE) else item.path.stem))
+        item.add_marker(
+            pytest.mark.xdist_group(
+                item.name if item.name.startswith(ALONE) else item.path.stem
+            )
+        )

@@ -65,15 +65,23 @@ class Head:
     def true(self, instant):
         """Pitch at an instant of the sweep."""
         begun, first, last = self.sweep
-        return float(first + np.sign(last - first) * np.clip(self.speed * (instant - begun), 0, abs(last - first)))
+        return float(
+            first
+            + np.sign(last - first)
+            * np.clip(self.speed * (instant - begun), 0, abs(last - first))
+        )
 
     def note(self):
         """Append to the track; a head that arrived meanwhile is noted when it did."""
         begun, first, last = self.sweep
         arrives = begun + abs(last - first) / self.speed
         before = self.track[-1][0] if self.track else -math.inf
-        for instant in [arrives, self.clock()] if before < arrives < self.clock() else [self.clock()]:
-            measured = self.has_feedback and (instant == begun or instant >= arrives or not self.silent_moving)
+        for instant in (
+            [arrives, self.clock()] if before < arrives < self.clock() else [self.clock()]
+        ):
+            measured = self.has_feedback and (
+                instant == begun or instant >= arrives or not self.silent_moving
+            )
             # between readings a head that moves is only reckoned, badly: nobody may use that where readings exist
             wrong = 0.0 if measured or not self.has_feedback else math.radians(3)
             self.track = [*self.track, (instant, self.true(instant) + wrong, measured)]
@@ -83,7 +91,9 @@ class Head:
             raise self.fail
         if self.sweep is not None:
             self.note()
-        return self.sweep is not None and abs(self.true(self.clock()) - self.sweep[2]) > 1e-9
+        return (
+            self.sweep is not None and abs(self.true(self.clock()) - self.sweep[2]) > 1e-9
+        )
 
     def finish_sweep(self):
         self.clock.now += 0.05
@@ -100,11 +110,20 @@ class Head:
 class Lrf:
     """Scans the wall at the head's pitch."""
 
-    type, firmware, variant, port = "LMS221", "X01.27", (100.0, 1.0), "/dev/fake"
+    type = "LMS221"
+    firmware = "X01.27"
+    variant = (100.0, 1.0)
+    port = "/dev/fake"
     configuration = Configuration().changed(unit="mm")
 
     def __init__(self, head, clock):
-        self.head, self.clock, self.streaming, self.silent, self.stale = head, clock, False, False, 0.0
+        self.head, self.clock, self.streaming, self.silent, self.stale = (
+            head,
+            clock,
+            False,
+            False,
+            0.0,
+        )
         self.readings, self.wait, self.lost, self.reconnects = [], lambda: None, 0, 0
 
     def start(self, interlaced=False):
@@ -122,7 +141,9 @@ class Lrf:
             self.head.note()
         times = instant + (np.arange(BEAMS) / 360) * 0.0133
         ranges = np.full(BEAMS, 2.0 + pitch)
-        self.readings.append(Reading((telegram(pitch),), ranges, None, BEARINGS, instant, times, -1, -1))
+        self.readings.append(
+            Reading((telegram(pitch),), ranges, None, BEARINGS, instant, times, -1, -1)
+        )
         return self.readings[-1]
 
     def request(self):
@@ -175,8 +196,16 @@ def rig_data(cameras=("left",), **plan):
     edges = ["a", "b", "c"]
     board = {"name": "triangle", "edges": edges, "features": edges[:2], "corners_m": [[0, 0], [0.4, 0], [0, 0.3]],
              "pattern": {"kind": "chessboard", "columns": 4, "rows": 5, "square_m": 0.03}}  # fmt: skip
-    lrf = {"model": "LMS221", "field_of_view_deg": [40, 140], "bearing_step_deg": 1.0, "sigma_range_m": 0.01}
-    named = {c: {"mount": "head", "width": SIZE[0], "height": SIZE[1], "intrinsics": None} for c in cameras}
+    lrf = {
+        "model": "LMS221",
+        "field_of_view_deg": [40, 140],
+        "bearing_step_deg": 1.0,
+        "sigma_range_m": 0.01,
+    }
+    named = {
+        c: {"mount": "head", "width": SIZE[0], "height": SIZE[1], "intrinsics": None}
+        for c in cameras
+    }
     return {
         "board": board,
         "rig": {"lrf": lrf, "platform": {"T_head_lrf": None}, "cameras": named},
@@ -206,7 +235,9 @@ def make_rig(data=None, *, feedback=True, silent_moving=False):
     stated = rig_of(json.loads(json.dumps(data or rig_data())))
     head = Head(clock, feedback, silent_moving)
     cameras = {name: Camera(name, head, clock) for name in stated.cameras}
-    rig = Rig(stated, Lrf(head, clock), head, cameras, host=SimpleNamespace(now=clock, time=clock))
+    rig = Rig(
+        stated, Lrf(head, clock), head, cameras, host=SimpleNamespace(now=clock, time=clock)
+    )
     rig._closing.callback(head.close)
     return rig
 

@@ -33,7 +33,9 @@ def changed(where=lambda obs, group: slice(None), **new):
 
 def pitched(function):
     """All recorded pitch angles."""
-    return changed(face_pitch=function, beam_pitch=function, view_pitch=function, middle=function)
+    return changed(
+        face_pitch=function, beam_pitch=function, view_pitch=function, middle=function
+    )
 
 
 def of_one(obs, group, placement=2):

@@ -91,7 +91,9 @@ def change_images(folder, change, cameras=None, first=0):
         if chosen and (first == 0 or record.placement >= first):
             pixels = change(cv2.imread(str(record.file)))
             quality = [cv2.IMWRITE_JPEG_QUALITY, 95] if record.file.suffix == ".jpg" else []
-            replaced(record.file, cv2.imencode(record.file.suffix, pixels, quality)[1].tobytes())
+            replaced(
+                record.file, cv2.imencode(record.file.suffix, pixels, quality)[1].tobytes()
+            )
 
 
 def copy_images(pairs):
@@ -119,13 +121,17 @@ def placement_twice(folder):
     session = open_session(folder)
     first, second = two_placements(session)
     for camera in session.cameras:
-        pairs = zip(session.images(camera, first), session.images(camera, second), strict=False)
+        pairs = zip(
+            session.images(camera, first), session.images(camera, second), strict=False
+        )
         copy_images(list(pairs))
 
     def copy(scans):
         rows = np.flatnonzero(scans["placement"] == first)
         others = np.flatnonzero(scans["placement"] == second)
-        order = np.r_[np.arange(others[0]), rows, np.arange(others[-1] + 1, len(scans["pitch"]))]
+        order = np.r_[
+            np.arange(others[0]), rows, np.arange(others[-1] + 1, len(scans["pitch"]))
+        ]
         per_line = [key for key in scans if key != "bearings"]
         number = scans["placement"]
         for key in per_line:
@@ -151,7 +157,11 @@ def warped(scale=1.0, shift=0.0):
         move = (1 - scale) * middle + [shift, 0.0]
         matrix = np.array([[scale, 0, move[0]], [0, scale, move[1]]])
         return cv2.warpAffine(
-            pixels, matrix, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+            pixels,
+            matrix,
+            (width, height),
+            flags=cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_REPLICATE,
         )
 
     return change
@@ -215,7 +225,8 @@ def pitch_times(factor):
 
 
 def exchange_folders(folder):
-    left, right = folder / "images" / "left", folder / "images" / "right"
+    left = folder / "images" / "left"
+    right = folder / "images" / "right"
     left.rename(folder / "images" / "spare")
     right.rename(left)
     (folder / "images" / "spare").rename(right)
@@ -247,7 +258,9 @@ def numbers_ahead(folder):
 def image_pitch_in_radians(folder):
     def change(rows):
         for row in rows:
-            row["pitch_deg"] = row["pitch_deg"] and repr(float(row["pitch_deg"]) * np.pi / 180)
+            row["pitch_deg"] = row["pitch_deg"] and repr(
+                float(row["pitch_deg"]) * np.pi / 180
+            )
 
     change_rows(folder, change)
 
@@ -308,7 +321,9 @@ WAYS = {
     "camera zoomed": Way(camera_zoomed, ("camera zoomed",), "placement 11"),
     "images mirrored": Way(mirrored, ("sense",), "mirrored"),
     "images of one camera mirrored": Way(one_mirrored, ("sense",), "mirrored"),
-    "ranges in inches": Way(lambda folder: change_scans(folder, in_inches), ("unit",), "inches"),
+    "ranges in inches": Way(
+        lambda folder: change_scans(folder, in_inches), ("unit",), "inches"
+    ),
     "max_range_m exceeded": Way(
         lambda folder: change_statements(folder, beyond), ("beyond range",), "max_range_m"
     ),
@@ -318,7 +333,9 @@ WAYS = {
     "pitch in degrees": Way(pitch_times(180 / np.pi), ("refused",), "degrees"),
     "cameras exchanged": Way(exchange_folders, ("far from stated",), "folders"),
     "bearings reversed": Way(
-        lambda folder: change_scans(folder, turned_round), ("sense", "far from stated"), "sense"
+        lambda folder: change_scans(folder, turned_round),
+        ("sense", "far from stated"),
+        "sense",
     ),
     "pitch reversed": Way(pitch_times(-1.0), ("sense", "far from stated"), "sense"),
     "images of half the size": Way(half_size, ("lens",), "image size", ("sim_lms221",)),

@@ -14,17 +14,39 @@ from lrfcal_lib.emulators.lms2xx import ACK, RESET_S, EmulatedLms
 from lrfcal_lib.emulators.lms2xx_memory import BAUD_WORD
 from lrfcal_lib.session import lms2xx_codec as codec
 
-DELAY_S, AWAY_S, SLIP_S, JUMP = 0.7, 0.5, 0.3, 1000  # JUMP in hundredths of a degree
+DELAY_S = 0.7
+AWAY_S = 0.5
+SLIP_S = 0.3
+JUMP = 1000  # JUMP in hundredths of a degree
 BYTES = {  # what some do to the bytes of a reply, about a place in it
     "drop": lambda data, i, _: data[:i] + data[i + 1 :],
-    "flip": lambda data, i, rng: data[:i] + bytes([data[i] ^ 1 << int(rng.integers(8))]) + data[i + 1 :],
+    "flip": lambda data, i, rng: (
+        data[:i] + bytes([data[i] ^ 1 << int(rng.integers(8))]) + data[i + 1 :]
+    ),
     "insert": lambda data, i, rng: data[: i + 1] + rng.bytes(1) + data[i + 1 :],
     "cut": lambda data, i, _: data[:i],
     "noise": lambda data, _, rng: rng.bytes(int(rng.integers(1, 21))) + data,
-    "checksum": lambda data, _, rng: data[:-1] + bytes([data[-1] ^ int(rng.integers(1, 256))]),
+    "checksum": lambda data, _, rng: (
+        data[:-1] + bytes([data[-1] ^ int(rng.integers(1, 256))])
+    ),
 }
-REQUEST = {"request_drop": BYTES["drop"], "request_flip": BYTES["flip"], "deaf": lambda *_: b""}
-LINE = (*BYTES, *REQUEST, "address", "foreign", "silence", "delay", "twice", "stale", "echo", "unplug")
+REQUEST = {
+    "request_drop": BYTES["drop"],
+    "request_flip": BYTES["flip"],
+    "deaf": lambda *_: b"",
+}
+LINE = (
+    *BYTES,
+    *REQUEST,
+    "address",
+    "foreign",
+    "silence",
+    "delay",
+    "twice",
+    "stale",
+    "echo",
+    "unplug",
+)
 LMS = (*LINE, "nak", "no_ack", "refused", "reboot", "rate", "skip", "status")
 HEAD = (*LINE, "mute", "stall", "slip", "jump")
 
@@ -64,7 +86,10 @@ class Faults:
         """Bytes as they are after those of the faults that hit them; each changes something where it can."""
         for name, change in changes.items():
             if data and self.hit(name):
-                tries = (change(data, int(self.rng.integers(len(data))), self.rng) for _ in range(100))
+                tries = (
+                    change(data, int(self.rng.integers(len(data))), self.rng)
+                    for _ in range(100)
+                )
                 data = next((changed for changed in tries if changed != data), data)
         return data
 
@@ -95,7 +120,9 @@ class FaultyLine:
     def reply(self, raw, at, then=None):
         kind = raw[4:5] if raw[:1] == b"\x02" else raw[-4:-3]
         old, self._last[kind] = self._last.get(kind), raw
-        data = self.faults.mangle(self.prepare(old if old is not None and self.hit("stale") else raw), BYTES)
+        data = self.faults.mangle(
+            self.prepare(old if old is not None and self.hit("stale") else raw), BYTES
+        )
         at += DELAY_S * self.hit("delay")
         data = b"" if self.hit("silence") else data
         for _ in range(self.hit("twice")):
@@ -120,7 +147,11 @@ class FaultyLms(FaultyLine, EmulatedLms):
         if self.hit("reboot"):
             return self.at(at + RESET_S, self.restart)
         if self.hit("rate"):
-            memory.baudrate = int(self.faults.rng.choice([rate for rate in BAUD_WORD if rate != memory.baudrate]))
+            memory.baudrate = int(
+                self.faults.rng.choice(
+                    [rate for rate in BAUD_WORD if rate != memory.baudrate]
+                )
+            )
         return self.answer(at, 0x92) if self.hit("refused") else super().obey(telegram, at)
 
     def emit(self, scan, at, then=None):
@@ -135,8 +166,12 @@ class FaultyLms(FaultyLine, EmulatedLms):
             told = codec.parse_telegram(raw)
             status = 0xD3 if self.hit("status") else raw[-3]
             address = 0x80 | (raw[1] + 5) % 0x80 if self.hit("address") else raw[1]
-            raw = codec.encode_telegram(told.code, told.data, status=status, address=address)
-        return codec.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
+            raw = codec.encode_telegram(
+                told.code, told.data, status=status, address=address
+            )
+        return (
+            codec.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
+        )
 
 
 class FaultyHead(FaultyLine, EmulatedHead):
@@ -148,9 +183,16 @@ class FaultyHead(FaultyLine, EmulatedHead):
 
     known = HEAD
 
-    def __init__(self, *args, confirms=False, echo=False, watchdog_s=None, invert=False, **options):
+    def __init__(
+        self, *args, confirms=False, echo=False, watchdog_s=None, invert=False, **options
+    ):
         super().__init__(*args, **options)
-        self.confirms, self.echo, self.watchdog_s, self.inverted = confirms, echo, watchdog_s, invert
+        self.confirms, self.echo, self.watchdog_s, self.inverted = (
+            confirms,
+            echo,
+            watchdog_s,
+            invert,
+        )
 
     def receive(self, data, at):
         if self.echo:
@@ -161,7 +203,16 @@ class FaultyHead(FaultyLine, EmulatedHead):
         """A frame as a head that hangs upside down understands it."""
         ways = frame.command2 & (pelco_d.UP | pelco_d.DOWN)
         if frame.command2 == pelco_d.SET_TILT:
-            return replace(frame, **dict(zip(("data1", "data2"), divmod(-frame.value % pelco_d.TURN, 256), strict=True)))
+            return replace(
+                frame,
+                **dict(
+                    zip(
+                        ("data1", "data2"),
+                        divmod(-frame.value % pelco_d.TURN, 256),
+                        strict=True,
+                    )
+                ),
+            )
         if frame.command2 & 1 or not ways:
             return frame
         return replace(frame, command2=frame.command2 ^ (pelco_d.UP | pelco_d.DOWN))
@@ -177,7 +228,8 @@ class FaultyHead(FaultyLine, EmulatedHead):
 
     def moved(self, frame, at):
         moves = frame.command2 & (pelco_d.UP | pelco_d.DOWN) and not frame.command2 & 1
-        head, until = self.head, self.absolute_until
+        head = self.head
+        until = self.absolute_until
         stalls = (moves or frame.command2 == pelco_d.SET_TILT) and self.hit("stall")
         self.head = copy(head) if stalls else head  # another one moves
         super().obey(frame, at)
@@ -193,10 +245,20 @@ class FaultyHead(FaultyLine, EmulatedHead):
     def prepare(self, raw):
         """A reply with the faults that keep its checksum sound."""
         if len(raw) == pelco_d.FRAME and raw[3] == pelco_d.TILT and self.inverted:
-            raw = encode_extended(raw[1], raw[3], -int.from_bytes(raw[4:6], "big") % pelco_d.TURN)
+            raw = encode_extended(
+                raw[1], raw[3], -int.from_bytes(raw[4:6], "big") % pelco_d.TURN
+            )
         if len(raw) == pelco_d.FRAME and raw[3] == pelco_d.TILT and self.hit("jump"):
-            raw = encode_extended(raw[1], raw[3], (int.from_bytes(raw[4:6], "big") + JUMP) % pelco_d.TURN)
+            raw = encode_extended(
+                raw[1], raw[3], (int.from_bytes(raw[4:6], "big") + JUMP) % pelco_d.TURN
+            )
         if len(raw) >= pelco_d.GENERAL and raw[0] == SYNC and self.hit("address"):
             other = raw[1] % 255 + 1
-            raw = bytes([SYNC, other]) + raw[2:-1] + bytes([(raw[-1] + other - raw[1]) % 256])
-        return encode_extended(self.habits.address, 0x5D, 0x1234) + raw if self.hit("foreign") else raw
+            raw = (
+                bytes([SYNC, other]) + raw[2:-1] + bytes([(raw[-1] + other - raw[1]) % 256])
+            )
+        return (
+            encode_extended(self.habits.address, 0x5D, 0x1234) + raw
+            if self.hit("foreign")
+            else raw
+        )

@@ -43,16 +43,34 @@ from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
 from lrfcal_lib.session.write import SessionWriter, finish
 
-SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
+SEED = 11
+MEMORY = 500_000_000
+LONGEST_S = 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])
-READ = (sys.prefix, sys.base_prefix, LIBRARY, __file__, "/proc/self", "/proc/cpuinfo")  # by Python itself
-BATCH, SURVEYED = 2000, 0.02  # cases of a process; share of the cases in which the images are looked at, which is slow
+READ = (
+    sys.prefix,
+    sys.base_prefix,
+    LIBRARY,
+    __file__,
+    "/proc/self",
+    "/proc/cpuinfo",
+)  # by Python itself
+BATCH = 2000
+SURVEYED = 0.02  # cases of a process; share of the cases in which the images are looked at, which is slow
 BOMBED = 0.0005  # share of the damages that unpack to much or take long to read; they take seconds to make
 MODEL = CameraModel(160, 120, 150.0, 150.0, 79.5, 59.5, np.zeros(5))
 LRF = LrfInfo("made up", (0.0, np.pi), np.radians(1.0), 0.005)
-HEAD = RigidTransform.from_components([0.01, 0.02, -0.03], Rotation.from_rotvec([0.1, -0.2, 0.3]))
+HEAD = RigidTransform.from_components(
+    [0.01, 0.02, -0.03], Rotation.from_rotvec([0.1, -0.2, 0.3])
+)
 PATTERN = Chessboard(5, 4, 0.05, (0.05, 0.05))
-SQUARE = Board("square", ("ab", "bc", "cd", "da"), [[0, 0], [0.3, 0], [0.3, 0.25], [0, 0.25]], PATTERN, ("ab", "da"))
+SQUARE = Board(
+    "square",
+    ("ab", "bc", "cd", "da"),
+    [[0, 0], [0.3, 0], [0.3, 0.25], [0, 0.25]],
+    PATTERN,
+    ("ab", "da"),
+)
 NASTY = [
     "", "0", "-1", "1e999", "-1e308", "nan", "NaN", "Infinity", "null", "true", '""', "[]", "{}", "0.5", "65536",
     "1e-300", str(2**31), str(2**63 - 1), str(2**63), str(-(2**63)), str(2**64), "9" * 5000, "1" + "0" * 400,
@@ -74,44 +92,85 @@ def picture(seed):
     rng = np.random.default_rng(seed)
     turn = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix()
     pose = np.column_stack([turn[:, :2], [-0.15, -0.12, rng.uniform(0.45, 0.6)]])
-    image = cv2.warpPerspective(flat, MODEL.matrix @ pose @ np.diag([1e-3, 1e-3, 1.0]), (160, 120), borderValue=128)
+    image = cv2.warpPerspective(
+        flat, MODEL.matrix @ pose @ np.diag([1e-3, 1e-3, 1.0]), (160, 120), borderValue=128
+    )
     return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
 
 
 def make_sessions(folder):
     """Scan lines, and telegrams of a recording that was interrupted; each with images; and a rig file."""
-    cameras = [CameraInfo("left", "head", 160, 120, None, HEAD), CameraInfo("right", "platform", 160, 120, MODEL)]
-    bearings, pitch = np.radians(np.arange(60.0, 121.0)), np.radians([-1.0, 0.0, 1.0])
+    cameras = [
+        CameraInfo("left", "head", 160, 120, None, HEAD),
+        CameraInfo("right", "platform", 160, 120, MODEL),
+    ]
+    bearings = np.radians(np.arange(60.0, 121.0))
+    pitch = np.radians([-1.0, 0.0, 1.0])
     with SessionWriter(folder / "scans", SQUARE, LRF, cameras, HEAD) as writer:
         for placement in (1, 2):
-            writer.add_sweep(placement, np.full((3, 61), 1.9 + 0.1 * placement), bearings, pitch, [0.0, 1, 2], np.ones((3, 61)))
-            writer.add_image("right", picture(placement), placement, pitch=0.1, time_s=placement)
+            writer.add_sweep(
+                placement,
+                np.full((3, 61), 1.9 + 0.1 * placement),
+                bearings,
+                pitch,
+                [0.0, 1, 2],
+                np.ones((3, 61)),
+            )
+            writer.add_image(
+                "right", picture(placement), placement, pitch=0.1, time_s=placement
+            )
         for view in range(3):
-            writer.add_image("left", picture(3 + view), 1 + view % 2, pitch=0.1, purpose="intrinsics")
-    rows = "left,images/left/0001.png,ab,1,2,20,3\nright,images/right/0001.png,bc,1,2,30,3\n"
+            writer.add_image(
+                "left", picture(3 + view), 1 + view % 2, pitch=0.1, purpose="intrinsics"
+            )
+    rows = (
+        "left,images/left/0001.png,ab,1,2,20,3\nright,images/right/0001.png,bc,1,2,30,3\n"
+    )
     (folder / "scans" / "edges.csv").write_text("camera,file,edge,u1,v1,u2,v2\n" + rows)
-    stated, head = json.loads((folder / "scans" / "session.json").read_text()), transform_to_json(HEAD)
-    truth = {"T_head_lrf": head, "board": stated["board"], "boards": {"1": {"T_platform_board": head}}}
-    truth |= {"cameras": {c: {"T_camera_lrf": head} for c in ("left", "right")}, "sweeps": {"1": {"pitch_rad": [0.1]}}}
+    stated = json.loads((folder / "scans" / "session.json").read_text())
+    head = transform_to_json(HEAD)
+    truth = {
+        "T_head_lrf": head,
+        "board": stated["board"],
+        "boards": {"1": {"T_platform_board": head}},
+    }
+    truth |= {
+        "cameras": {c: {"T_camera_lrf": head} for c in ("left", "right")},
+        "sweeps": {"1": {"pitch_rad": [0.1]}},
+    }
     (folder / "scans" / "truth.json").write_text(json.dumps(truth))
     with recorder(folder / "telegrams") as writer:
         add(writer, 1)
         writer.begin_placement(2)
         record(writer, 2)
     (folder / "rig").mkdir()
-    rig = rig_data(placements=[{"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}])
-    rig["devices"]["head"] |= HeadSettings(degrees_per_second=4.0, repeat_s=0.5).model_dump(mode="json")
+    rig = rig_data(
+        placements=[
+            {"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}
+        ]
+    )
+    rig["devices"]["head"] |= HeadSettings(degrees_per_second=4.0, repeat_s=0.5).model_dump(
+        mode="json"
+    )
     rig["devices"]["cameras"]["left"] |= {"exposure": 0.01, "silence_s": 10}
     (folder / "rig" / "rig.json").write_text(json.dumps(rig))
     write_source(folder / "import", np.random.default_rng(0))
     (folder / "outside").mkdir()
     for name in ("secret", "secret.png"):
-        (folder / "outside" / name).write_bytes(cv2.imencode(".png", picture(0))[1].tobytes())
+        (folder / "outside" / name).write_bytes(
+            cv2.imencode(".png", picture(0))[1].tobytes()
+        )
 
 
 def recorder(path):
     """Goes on with the session of telegrams."""
-    return SessionRecorder(path, triangle_board(), LRF, [CameraInfo("left", "head", 160, 120, MODEL)], resume=True)
+    return SessionRecorder(
+        path,
+        triangle_board(),
+        LRF,
+        [CameraInfo("left", "head", 160, 120, MODEL)],
+        resume=True,
+    )
 
 
 def add(writer, placement):
@@ -123,7 +182,12 @@ def add(writer, placement):
 
 def record(writer, placement):
     """What a placement adds to it."""
-    writer.add_telegrams(placement, [encode_scan(np.full(181, 2.0))] * 2, [0.0, 0.1], [placement, placement + 0.5])
+    writer.add_telegrams(
+        placement,
+        [encode_scan(np.full(181, 2.0))] * 2,
+        [0.0, 0.1],
+        [placement, placement + 0.5],
+    )
     writer.add_image("left", picture(placement), placement, pitch=0.1, time_s=placement)
     writer.add_platform([(placement, 0.1, np.nan)])
 
@@ -138,7 +202,9 @@ def any_of(rng, *values):
 
 def header_bomb(path):
     """An array whose header is 900 MB of blanks."""
-    with zipfile.ZipFile(path / "lrf" / "scans.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+    with zipfile.ZipFile(
+        path / "lrf" / "scans.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1
+    ) as archive:
         with archive.open("ranges.npy", "w", force_zip64=True) as member:
             member.write(b"\x93NUMPY\2\0" + struct.pack("<I", 900_000_000))
             for _ in range(45):
@@ -147,7 +213,9 @@ def header_bomb(path):
 
 def packed_bomb(path):
     """An array and 600 MB of zeros, packed as numpy does not."""
-    with zipfile.ZipFile(path / "lrf" / "scans.npz", "w", zipfile.ZIP_BZIP2, compresslevel=1) as archive:
+    with zipfile.ZipFile(
+        path / "lrf" / "scans.npz", "w", zipfile.ZIP_BZIP2, compresslevel=1
+    ) as archive:
         with archive.open("ranges.npy", "w", force_zip64=True) as member:
             member.write(array_of(header_of("(6, 61)", "<f8")))
             for _ in range(30):
@@ -157,17 +225,32 @@ def packed_bomb(path):
 def directory_bomb(path):
     """An archive with a million entries of no content behind those of a session."""
     file = path / "lrf" / "scans.npz"
-    data, entries = file.read_bytes(), 1_000_000
+    data = file.read_bytes()
+    entries = 1_000_000
     end = data.rfind(b"PK\5\6")
     (first,) = struct.unpack("<I", data[end + 16 : end + 20])
     entry = b"PK\1\2" + bytes(24) + struct.pack("<H", 7) + bytes(16)
-    table = data[first:end] + b"".join(entry + b"%07d" % number for number in range(entries))
-    large = b"PK\6\6" + struct.pack("<Q2H2L4Q", 44, 45, 45, 0, 0, entries + 6, entries + 6, len(table), first)
+    table = data[first:end] + b"".join(
+        entry + b"%07d" % number for number in range(entries)
+    )
+    large = b"PK\6\6" + struct.pack(
+        "<Q2H2L4Q", 44, 45, 45, 0, 0, entries + 6, entries + 6, len(table), first
+    )
     where = b"PK\6\7" + struct.pack("<LQL", 0, first + len(table), 1)
-    file.write_bytes(data[:first] + table + large + where + b"PK\5\6" + struct.pack("<4H2LH", *OVER))
+    file.write_bytes(
+        data[:first] + table + large + where + b"PK\5\6" + struct.pack("<4H2LH", *OVER)
+    )
 
 
-OVER = (0, 0, 2**16 - 1, 2**16 - 1, 2**32 - 1, 2**32 - 1, 0)  # end of an archive: larger numbers stand before it
+OVER = (
+    0,
+    0,
+    2**16 - 1,
+    2**16 - 1,
+    2**32 - 1,
+    2**32 - 1,
+    0,
+)  # end of an archive: larger numbers stand before it
 
 
 def as_jpeg(path, size, change, **options):
@@ -176,19 +259,33 @@ def as_jpeg(path, size, change, **options):
     new = old.with_suffix(".jpg")
     old.unlink()
     black = np.zeros((size[1], size[0], 3), np.uint8)
-    data = cv2.imencode(".jpg", black, [x for pair in options.items() for x in (getattr(cv2, pair[0]), pair[1])])[1]
+    data = cv2.imencode(
+        ".jpg",
+        black,
+        [x for pair in options.items() for x in (getattr(cv2, pair[0]), pair[1])],
+    )[1]
     new.write_bytes(change(data.tobytes()))
     for table in (path / "images.csv", path / "edges.csv"):
         table.write_text(table.read_text().replace("left/0001.png", "left/0001.jpg"))
     state_size(new, size)
-    first = next(line for line in (path / "images.csv").read_text().splitlines() if "0001.jpg" in line)
-    others = [line for line in (path / "images.csv").read_text().splitlines() if "left/" not in line]
+    first = next(
+        line
+        for line in (path / "images.csv").read_text().splitlines()
+        if "0001.jpg" in line
+    )
+    others = [
+        line
+        for line in (path / "images.csv").read_text().splitlines()
+        if "left/" not in line
+    ]
     (path / "images.csv").write_text("\n".join([*others, first]) + "\n")
 
 
 def segments_bomb(path, mark=b"\xff\xe5"):
     """A JPEG with twelve million empty segments before its size."""
-    as_jpeg(path, (160, 120), lambda data: data[:2] + 12_000_000 * (mark + b"\0\2") + data[2:])
+    as_jpeg(
+        path, (160, 120), lambda data: data[:2] + 12_000_000 * (mark + b"\0\2") + data[2:]
+    )
 
 
 def remarks_bomb(path):
@@ -209,7 +306,8 @@ def scans_bomb(path):
 def chunks_bomb(path):
     """A PNG with four million empty chunks before its pixels."""
     file = path / "images" / "left" / "0001.png"
-    data, chunk = file.read_bytes(), b"abCd"
+    data = file.read_bytes()
+    chunk = b"abCd"
     chunk = bytes(4) + chunk + struct.pack(">I", zipfile.crc32(chunk))
     file.write_bytes(data[:33] + 4_000_000 * chunk + data[33:])
 
@@ -231,13 +329,26 @@ def damage(rng, path):
     if rng.random() < BOMBED and (path / "edges.csv").is_file():
         with suppress(Exception):  # another damage was there before
             return any_of(rng, *BOMBS)(path)
-    files = sorted(p for p in path.rglob("*") if not p.is_symlink() and p.is_file() and p.stat().st_size < 100_000_000)
+    files = sorted(
+        p
+        for p in path.rglob("*")
+        if not p.is_symlink() and p.is_file() and p.stat().st_size < 100_000_000
+    )
     if not files:
         return
     file = any_of(rng, *files)
-    if file.suffix in (".png", ".jpg") and rng.random() < 0.6:  # small tables and statements matter as much
+    if (
+        file.suffix in (".png", ".jpg") and rng.random() < 0.6
+    ):  # small tables and statements matter as much
         file = any_of(rng, *files)
-    kinds = {".json": text, ".csv": any_of(rng, text, rows), ".npz": arrays, ".bin": raw, ".pcd": points, ".m": text}
+    kinds = {
+        ".json": text,
+        ".csv": any_of(rng, text, rows),
+        ".npz": arrays,
+        ".bin": raw,
+        ".pcd": points,
+        ".m": text,
+    }
     kind = kinds.get(file.suffix, pixels)
     try:
         any_of(rng, kind, kind, kind, kind, raw, other)(rng, file)
@@ -248,8 +359,16 @@ def damage(rng, path):
 def raw(rng, file):
     """Any bytes."""
     data = file.read_bytes()[:1_000_000]
-    at, n = int(rng.integers(len(data) + 1)), any_of(rng, 1, 4, 100)
-    middle = any_of(rng, b"", bytes(n), rng.bytes(n), rng.bytes(n) + data[at : at + n], 2 * data[at : at + n])
+    at = int(rng.integers(len(data) + 1))
+    n = any_of(rng, 1, 4, 100)
+    middle = any_of(
+        rng,
+        b"",
+        bytes(n),
+        rng.bytes(n),
+        rng.bytes(n) + data[at : at + n],
+        2 * data[at : at + n],
+    )
     file.write_bytes(any_of(rng, data[:at], data[:at] + middle + data[at + n :]))
 
 
@@ -259,7 +378,11 @@ def text(rng, file):
     ends = [i for i, c in enumerate(words) if c in ",:[]{}\n "]
     first = int(rng.integers(len(ends) - 1))
     last = int(rng.integers(first + 1, len(ends))) if rng.random() < 0.2 else first + 1
-    file.write_bytes((words[: ends[first] + 1] + any_of(rng, *NASTY) + words[ends[last] :]).encode("utf-8", "replace"))
+    file.write_bytes(
+        (words[: ends[first] + 1] + any_of(rng, *NASTY) + words[ends[last] :]).encode(
+            "utf-8", "replace"
+        )
+    )
 
 
 def points(rng, file):
@@ -274,7 +397,8 @@ def points(rng, file):
 def rows(rng, file):
     """Lines that are gone, doubled, many, or have another cell."""
     lines = file.read_text().splitlines()
-    at, many = int(rng.integers(len(lines))), 300_000 if rng.random() < 0.01 else 1
+    at = int(rng.integers(len(lines)))
+    many = 300_000 if rng.random() < 0.01 else 1
     cells = lines[at].split(",")
     cells[rng.integers(len(cells))] = any_of(rng, *NASTY)
     lines[at : at + 1] = any_of(rng, [], lines[at : at + 1] * (1 + many), [",".join(cells)])
@@ -295,17 +419,49 @@ def arrays(rng, file):
     """Other arrays than a session's, headers that lie, and archives that unpack to much."""
     with zipfile.ZipFile(file) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
-    name, how = any_of(rng, *sorted(members)), rng.integers(4)
+    name = any_of(rng, *sorted(members))
+    how = rng.integers(4)
     if how == 0:
-        shape = any_of(rng, "(100000, 100000)", "(-1, 61)", "()", "(6,)", "(2**40,)", "(6, 61", "(6, 61, 1)")
-        kind = any_of(rng, "<f8", "<f4", "|O", "<U9", "|b1", "<c16", "|V1000000", "<i8", "<M8[s]", ">f8", "x", "|S0")
-        members[name] = array_of(header_of(shape, kind), any_of(rng, 1, 1, 2, 9)) + bytes(1000)
+        shape = any_of(
+            rng,
+            "(100000, 100000)",
+            "(-1, 61)",
+            "()",
+            "(6,)",
+            "(2**40,)",
+            "(6, 61",
+            "(6, 61, 1)",
+        )
+        kind = any_of(
+            rng,
+            "<f8",
+            "<f4",
+            "|O",
+            "<U9",
+            "|b1",
+            "<c16",
+            "|V1000000",
+            "<i8",
+            "<M8[s]",
+            ">f8",
+            "x",
+            "|S0",
+        )
+        members[name] = array_of(header_of(shape, kind), any_of(rng, 1, 1, 2, 9)) + bytes(
+            1000
+        )
     elif how == 1:
-        value, shape = any_of(rng, 0.0, np.nan, np.inf, -1.0, 1e300), any_of(rng, (6, 61), (0, 61), (61,), (3, 3000))
-        np.save(stream := io.BytesIO(), np.full(shape, value, any_of(rng, float, np.float32, np.complex128, ">f8")))
+        value = any_of(rng, 0.0, np.nan, np.inf, -1.0, 1e300)
+        shape = any_of(rng, (6, 61), (0, 61), (61,), (3, 3000))
+        np.save(
+            stream := io.BytesIO(),
+            np.full(shape, value, any_of(rng, float, np.float32, np.complex128, ">f8")),
+        )
         members[name] = stream.getvalue()
     elif how == 2:
-        members[any_of(rng, "extra.npy", "../outside/secret", name[:-4], "ranges.npy/")] = members.pop(name)
+        members[any_of(rng, "extra.npy", "../outside/secret", name[:-4], "ranges.npy/")] = (
+            members.pop(name)
+        )
     else:
         members[name] += bytes(any_of(rng, 10, 100_000, 30_000_000))
     with zipfile.ZipFile(file, "w", any_of(rng, 0, 8, 12, 14), compresslevel=1) as archive:
@@ -321,10 +477,18 @@ def pixels_of(png, size, kind=(8, 2, 0, 0, 0)):
 
 def pixels(rng, file):
     """Other images: another kind or size, and headers that promise many pixels, which the session may state too."""
-    size = any_of(rng, (160, 120), (120, 160), (1, 1), (5000, 1), (30000, 30000), (5000, 4000))
-    data = cv2.imencode(any_of(rng, ".png", ".jpg"), np.zeros((120, 160, any_of(rng, 1, 3, 4)), np.uint8))[1].tobytes()
+    size = any_of(
+        rng, (160, 120), (120, 160), (1, 1), (5000, 1), (30000, 30000), (5000, 4000)
+    )
+    data = cv2.imencode(
+        any_of(rng, ".png", ".jpg"), np.zeros((120, 160, any_of(rng, 1, 3, 4)), np.uint8)
+    )[1].tobytes()
     if data[:4] == b"\x89PNG":
-        data = pixels_of(data, size, (any_of(rng, 8, 16), any_of(rng, 0, 2, 3, 6), 0, 0, any_of(rng, 0, 1)))
+        data = pixels_of(
+            data,
+            size,
+            (any_of(rng, 8, 16), any_of(rng, 0, 2, 3, 6), 0, 0, any_of(rng, 0, 1)),
+        )
     else:
         at = data.find(b"\xff\xc0") + 5
         data = data[:at] + struct.pack(">HH", *size[::-1]) + data[at + 4 :]
@@ -349,13 +513,21 @@ def other(rng, file):
     if rng.random() < 0.2 and file.parent != root:
         shutil.rmtree(file.parent)
         return os.symlink(outside.parent, file.parent)
-    file = any_of(rng, file, file, file, file.with_name(file.name + ".draft"), root / "writer.lock")
+    file = any_of(
+        rng, file, file, file, file.with_name(file.name + ".draft"), root / "writer.lock"
+    )
     file.unlink(missing_ok=True)
     if (how := rng.integers(6)) == 0:
         file.touch()
         return os.truncate(file, 3_000_000_000)
     targets = "/dev/zero", outside, outside.parent
-    return os.symlink(targets[how - 1], file) if how < 4 else os.mkfifo(file) if how == 4 else None
+    return (
+        os.symlink(targets[how - 1], file)
+        if how < 4
+        else os.mkfifo(file)
+        if how == 4
+        else None
+    )
 
 
 # ---------------------------------------------------------------------------------------------- what is done with it
@@ -366,14 +538,21 @@ def use(rng, path, kind):
     if kind in OWN:
         return [_caught(OWN[kind], path)]
     read = any_of(rng, validate, _survey if rng.random() < SURVEYED else read_all)
-    return [_caught(work, path) for work in (read, *[any_of(rng, _go_on, finish)] * (rng.random() < 0.3))]
+    return [
+        _caught(work, path)
+        for work in (read, *[any_of(rng, _go_on, finish)] * (rng.random() < 0.3))
+    ]
 
 
 def _open_rig(path):
     """What is stated can be asked of the drivers, and no time is endless."""
     devices = read_rig_file(path / "rig.json").devices
     for one in (devices.lrf, devices.head, *devices.cameras.values()):
-        times = [value for name, value in vars(one).items() if name.endswith("_s") and value is not None]
+        times = [
+            value
+            for name, value in vars(one).items()
+            if name.endswith("_s") and value is not None
+        ]
         assert max(times, default=0) <= 3600
     for one in (devices.lrf, devices.head):
         with suppress(PortError):
@@ -388,7 +567,10 @@ def _import(path):
         assert str(path) in str(error), error
 
 
-OWN = {"rig": _open_rig, "import": _import}  # what these name belongs to who wrote them, and may lie anywhere
+OWN = {
+    "rig": _open_rig,
+    "import": _import,
+}  # what these name belongs to who wrote them, and may lie anywhere
 
 
 def _survey(path):
@@ -414,12 +596,16 @@ def _caught(work, *arguments):
         work(*arguments)
         return None
     except Exception as raised:
-        error, trace, last = raised, traceback.format_exc(), traceback.extract_tb(raised.__traceback__)[-1]
+        error = raised
+        trace = traceback.format_exc()
+        last = traceback.extract_tb(raised.__traceback__)[-1]
     if "MemoryError" in trace or "nsufficient memory" in trace:
         return "memory", repr(error)[:200], trace
     ours = [SessionError, RigFileError] + [OSError] * (work in (_go_on, finish))
     if work in (read_all, _survey) and last.filename.startswith(LIBRARY):
-        ours.append(ValueError)  # what the preprocessing raises itself is documented as ValueError
+        ours.append(
+            ValueError
+        )  # what the preprocessing raises itself is documented as ValueError
     return None if isinstance(error, tuple(ours)) else ("foreign", repr(error)[:200], trace)
 
 
@@ -434,7 +620,9 @@ class Watch:
         self.baits = [folder / "outside", *(folder / "outside").iterdir()]
         with self:
             self.baits[1].read_bytes()
-        assert self.seen == [f"used {self.baits[1]}"], "this file system does not tell what is read"
+        assert self.seen == [f"used {self.baits[1]}"], (
+            "this file system does not tell what is read"
+        )
         sys.addaudithook(self._heard)
 
     def __enter__(self):
@@ -445,11 +633,26 @@ class Watch:
     def __exit__(self, *_):
         self.on = False
         times = [(path, path.stat()) for path in self.baits]
-        self.seen += [f"used {path}" for path, found in times if (found.st_atime, found.st_mtime) != (0, 1)]
+        self.seen += [
+            f"used {path}"
+            for path, found in times
+            if (found.st_atime, found.st_mtime) != (0, 1)
+        ]
 
     def _heard(self, event, arguments):
-        if self.on and event in ("open", "os.listdir", "os.mkdir", "os.remove", "os.rename", "os.truncate"):
-            name = os.fsdecode(arguments[0]) if isinstance(arguments[0], str | bytes | os.PathLike) else ""
+        if self.on and event in (
+            "open",
+            "os.listdir",
+            "os.mkdir",
+            "os.remove",
+            "os.rename",
+            "os.truncate",
+        ):
+            name = (
+                os.fsdecode(arguments[0])
+                if isinstance(arguments[0], str | bytes | os.PathLike)
+                else ""
+            )
             inside = name == self.case or name.startswith((self.case + "/", *READ))
             if os.path.isabs(name) and (not inside or ".." in name.split("/")):
                 self.seen.append(f"{event} {name}")
@@ -457,7 +660,8 @@ class Watch:
 
 def run_case(number, seed, sound, folder, watch):
     """One case; the findings as (kind, text, traceback)."""
-    rng, case = np.random.default_rng([seed, number]), folder / "case"
+    rng = np.random.default_rng([seed, number])
+    case = folder / "case"
     shutil.rmtree(case, ignore_errors=True)
     kind = ("scans", "telegrams", "telegrams", "scans", "rig", "import")[number % 6]
     shutil.copytree(sound / kind, case, symlinks=True)
@@ -473,13 +677,17 @@ def _batch(numbers, seed, base, at):
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if len(numbers) > 1:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what image libraries say about damaged images
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), 2
+        )  # what image libraries say about damaged images
     folder = Path(tempfile.mkdtemp(dir=base))
     shutil.copytree(base / "sound" / "outside", folder / "outside")
     watch = Watch(folder)
     with (base / "findings").open("a", buffering=1) as out:
         for at.value in numbers:
-            signal.setitimer(signal.ITIMER_PROF, LONGEST_S)  # of the processor: a busy machine is no hang
+            signal.setitimer(
+                signal.ITIMER_PROF, LONGEST_S
+            )  # of the processor: a busy machine is no hang
             signal.setitimer(signal.ITIMER_REAL, 15 * LONGEST_S)
             for finding in run_case(at.value, seed, base / "sound", folder, watch):
                 out.write(json.dumps([at.value, *finding]) + "\n")
@@ -495,16 +703,23 @@ def _run_batch(numbers, seed, base):
         child.start()
         child.join()
         if child.exitcode:
-            kind = "hang" if -child.exitcode in (signal.SIGPROF, signal.SIGALRM) else "crash"
+            kind = (
+                "hang" if -child.exitcode in (signal.SIGPROF, signal.SIGALRM) else "crash"
+            )
             with (base / "findings").open("a") as out:
-                out.write(json.dumps([at.value, kind, f"exit code {child.exitcode}", ""]) + "\n")
+                out.write(
+                    json.dumps([at.value, kind, f"exit code {child.exitcode}", ""]) + "\n"
+                )
         numbers = numbers[numbers.index(at.value) + 1 :]
 
 
 def run(cases, seed, workers):
     """Run numbered cases; the findings as lists [number, kind, text, traceback]."""
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
-    with tempfile.TemporaryDirectory(prefix="lrfcal-fuzz-", dir=memory) as base, ThreadPoolExecutor(workers) as pool:
+    with (
+        tempfile.TemporaryDirectory(prefix="lrfcal-fuzz-", dir=memory) as base,
+        ThreadPoolExecutor(workers) as pool,
+    ):
         base = Path(base)
         (base / "sound").mkdir()
         make_sessions(base / "sound")
@@ -517,12 +732,25 @@ def run(cases, seed, workers):
 def main():
     """From the command line."""
     options = argparse.ArgumentParser(description=__doc__)
-    for name, value in (("cases", 200_000), ("seed", SEED), ("workers", os.cpu_count()), ("case", None)):
+    for name, value in (
+        ("cases", 200_000),
+        ("seed", SEED),
+        ("workers", os.cpu_count()),
+        ("case", None),
+    ):
         options.add_argument(f"--{name}", type=int, default=value)
     asked = options.parse_args()
-    found = run(range(asked.cases) if asked.case is None else [asked.case], asked.seed, asked.workers)
+    found = run(
+        range(asked.cases) if asked.case is None else [asked.case],
+        asked.seed,
+        asked.workers,
+    )
     for number, kind, text, trace in found:
-        print(f"{kind} {text}: --seed {asked.seed} --case {number}", trace * (asked.case is not None), sep="\n")
+        print(
+            f"{kind} {text}: --seed {asked.seed} --case {number}",
+            trace * (asked.case is not None),
+            sep="\n",
+        )
     print(len(found), "findings")
     return bool(found)
 

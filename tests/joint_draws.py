@@ -24,22 +24,43 @@ def scores(found, truth):
 def square_per_number(found, truth):
     """Normalised squared error of axis and cameras: 1 on the average where the covariance tells the truth."""
     count = 4 + 6 * len(found.transforms)
-    error, k = state_errors(found.state, truth, found.unknowns)[:count], found.solution.covariance[:count, :count]
+    error = state_errors(found.state, truth, found.unknowns)[:count]
+    k = found.solution.covariance[:count, :count]
     return error @ np.linalg.solve(k, error) / count
 
 
-def draw(rng, count=10, *, cameras=("left", "right"), seen=None, distances=(1.0, 2.5), lean=None, **settings):
+def draw(
+    rng,
+    count=10,
+    *,
+    cameras=("left", "right"),
+    seen=None,
+    distances=(1.0, 2.5),
+    lean=None,
+    **settings,
+):
     """Observations, truth and the bench itself; settings of Bench, or of observe with the prefix `see_`."""
     see = {key[4:]: settings.pop(key) for key in list(settings) if key.startswith("see_")}
-    settings = {"pitch_step": COARSE, "range_offset": OFFSET, "bias": rng.uniform(-0.5, 0.5)} | settings
+    settings = {
+        "pitch_step": COARSE,
+        "range_offset": OFFSET,
+        "bias": rng.uniform(-0.5, 0.5),
+    } | settings
     rig = bench(rng, cameras, **settings)
     poses = board_poses(rng, count, distances) if lean is None else lean(rng, count)
     obs = JointObservations(**observe(rig, poses, rng, **see))
     obs = obs if seen is None else obs.with_cameras(seen)
-    known = {"range_offset": rig.range_offset, "bias": rig.bias, "softness": rig.softness, "pitch_scale": rig.stretch}
+    known = {
+        "range_offset": rig.range_offset,
+        "bias": rig.bias,
+        "softness": rig.softness,
+        "pitch_scale": rig.stretch,
+    }
     return obs, joint_truth(obs, rig.T_head_lrf, rig.cameras, poses, **known), rig
 
 
 def none(obs, *groups):
     """The observations without some groups."""
-    return obs.keep(**{name: np.zeros(len(getattr(obs, f"{name}_placement")), bool) for name in groups})
+    return obs.keep(
+        **{name: np.zeros(len(getattr(obs, f"{name}_placement")), bool) for name in groups}
+    )

@@ -14,8 +14,10 @@ from lrfcal_lib.model.observations import CameraObservations, JointObservations
 
 AHEAD = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 FACING = Rotation.from_euler("x", 180, degrees=True)
-COUNT, NOISE = 19, 0.006  # placements, metres
-FEWEST_BEAMS, ARRIVING = 9, 0.8  # on a board; share of the beams that come back
+COUNT = 19
+NOISE = 0.006  # placements, metres
+FEWEST_BEAMS = 9
+ARRIVING = 0.8  # on a board; share of the beams that come back
 HALF_BOARD = np.array([0.15, 0.20])  # metres
 
 
@@ -26,10 +28,13 @@ def near_scanner(rng, lean):
     )
     bearings = np.radians(np.arange(0.0, 360.0))
     rays = np.stack([np.cos(bearings), np.sin(bearings), 0 * bearings], axis=1)
-    points, boards = [], []
+    points = []
+    boards = []
     while len(boards) < COUNT:
         leant = Rotation.from_rotvec([*rng.uniform(-lean, lean, 2), 0.0])
-        turn = AHEAD.inv() * leant * Rotation.from_euler("z", rng.uniform(-0.3, 0.3)) * FACING
+        turn = (
+            AHEAD.inv() * leant * Rotation.from_euler("z", rng.uniform(-0.3, 0.3)) * FACING
+        )
         away = rng.uniform(0.5, 1.1)
         centre = np.array([rng.uniform(-0.25, 0.25) * away, away, rng.uniform(-0.08, 0.08)])
         T_lrf_board = RigidTransform.from_components(centre, turn)
@@ -61,12 +66,15 @@ def with_scans_exchanged(obs, rng, count=4):
     for before, after in zip(some, np.roll(some, 1), strict=True):
         placement[obs.plane_placement == before] = after
     order = np.argsort(placement, kind="stable")
-    return replace(obs, plane_placement=placement[order], plane_points=obs.plane_points[order])
+    return replace(
+        obs, plane_placement=placement[order], plane_points=obs.plane_points[order]
+    )
 
 
 def as_rig(obs):
     """The same for the joint estimate: a camera on a head that never pitches."""
-    n, points = len(obs.placements), obs.plane_points
+    n = len(obs.placements)
+    points = obs.plane_points
     return JointObservations(
         placements=obs.placements,
         direction=np.zeros(n, int),

@@ -33,31 +33,65 @@ def read(path):
 
 
 def code_cells(notebook):
-    return [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
+    return [
+        cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()
+    ]
 
 
-WITH_SESSION = [p for p in NOTEBOOKS if any("notebook.start(" in cell.source for cell in code_cells(read(p)))]
+WITH_SESSION = [
+    p
+    for p in NOTEBOOKS
+    if any("notebook.start(" in cell.source for cell in code_cells(read(p)))
+]
 
 
 def solutions(path):
     """Code of the exercises' solutions, folded away in the text of a notebook."""
     texts = [cell.source for cell in read(path).cells if cell.cell_type == "markdown"]
-    return [code for text in texts for code in re.findall(r"<details>.*?```python\n(.*?)```", text, re.S)]
+    return [
+        code
+        for text in texts
+        for code in re.findall(r"<details>.*?```python\n(.*?)```", text, re.S)
+    ]
 
 
 def run_nbval(path, report):
     """Run a notebook under nbval, which compares its outputs. Its tables go to the folder `report`."""
-    command = [sys.executable, "-c", NBVAL, "-q", "-p", "nbval.plugin", "-p", "no:cacheprovider", "--tb=short"]
+    command = [
+        sys.executable,
+        "-c",
+        NBVAL,
+        "-q",
+        "-p",
+        "nbval.plugin",
+        "-p",
+        "no:cacheprovider",
+        "--tb=short",
+    ]
     command += ["--nbval", "--nbval-current-env", f"--nbval-cell-timeout={CELL_SECONDS}"]
     command += ["--nbval-sanitize-with", "tests/nbval_sanitize.cfg", str(path)]
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("LRFCAL_")}
-    environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", cache.VARIABLE: str(stages())}
-    environment |= {"LRFCAL_REPORT": str(report), "LRFCAL_NOTEBOOK": path.stem, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    environment = {
+        key: value for key, value in os.environ.items() if not key.startswith("LRFCAL_")
+    }
+    environment |= {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        cache.VARIABLE: str(stages()),
+    }
+    environment |= {
+        "LRFCAL_REPORT": str(report),
+        "LRFCAL_NOTEBOOK": path.stem,
+        "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
+    }
     environment[RECORDINGS] = str(report / "recordings")
     tests = Path(__file__).parent
-    environment["PYTHONPATH"] = os.pathsep.join([str(tests), *filter(None, [environment.get("PYTHONPATH")])])
+    environment["PYTHONPATH"] = os.pathsep.join(
+        [str(tests), *filter(None, [environment.get("PYTHONPATH")])]
+    )
     environment["PYTHONSTARTUP"] = str(tests / "kernel_start.py")
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True
+    )
 
 
 def run_plainly(path, session, folder, report, *, drawn=True):
@@ -66,7 +100,8 @@ def run_plainly(path, session, folder, report, *, drawn=True):
     After them the solutions of its exercises. Where nothing else can be asked it ends there. Its figures, if they are
     drawn, must be legible, with titles and units. Of its files only the tables are written.
     """
-    ended, complaints = [], []
+    ended = []
+    complaints = []
 
     def heard(possible, why, *, rest=False):
         ended.extend([why] * bool(rest and not possible))
@@ -76,11 +111,23 @@ def run_plainly(path, session, folder, report, *, drawn=True):
         return report_file(name) if name.startswith("tables/") else None
 
     told, names = io.StringIO(), {"display": lambda shown: None}
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told), matplotlib.rc_context():
-        variables = {"LRFCAL_SESSION": session, cache.VARIABLE: folder, "LRFCAL_REPORT": report}
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(told),
+        matplotlib.rc_context(),
+    ):
+        variables = {
+            "LRFCAL_SESSION": session,
+            cache.VARIABLE: folder,
+            "LRFCAL_REPORT": report,
+        }
         for name, value in (variables | {"LRFCAL_NOTEBOOK": path.stem}).items():
             patch.setenv(name, str(value))
-        shown = figure_checks.checked(save, complaints) if drawn else lambda fig, *args, **options: plt.close(fig)
+        shown = (
+            figure_checks.checked(save, complaints)
+            if drawn
+            else lambda fig, *args, **options: plt.close(fig)
+        )
         patch.setattr("lrfcal_lib.report.notebook.save", shown)
         patch.setattr("lrfcal_lib.report.notebook.asked", heard)
         patch.setattr("lrfcal_lib.report.notebook.report_file", tables_only)
@@ -96,7 +143,10 @@ def run_plainly(path, session, folder, report, *, drawn=True):
 
 def tables_of(path):
     """Names of the tables that a notebook may write."""
-    return re.findall(r'notebook\.table\([^"]*, "(\w+)"', "\n".join(cell.source for cell in code_cells(read(path))))
+    return re.findall(
+        r'notebook\.table\([^"]*, "(\w+)"',
+        "\n".join(cell.source for cell in code_cells(read(path))),
+    )
 
 
 def check_tables(report, name, path):
@@ -104,13 +154,20 @@ def check_tables(report, name, path):
 
     That is 3e-6, or 2e-5 mm, deg or px: solvers stop within some 1e-5 of their standard deviations.
     """
-    folders, own = (report / "tables", GOLDEN / name), tables_of(path)
-    found, stored = ({p.name: p for p in folder.glob("*.csv") if p.stem in own} for folder in folders)
+    folders = (report / "tables", GOLDEN / name)
+    own = tables_of(path)
+    found, stored = (
+        {p.name: p for p in folder.glob("*.csv") if p.stem in own} for folder in folders
+    )
     if os.environ.get("STORE_GOLDEN"):  # make golden
         for file in stored.values():
             file.unlink()
         stored = {file: Path(shutil.copy(found[file], folders[1] / file)) for file in found}
-    assert found.keys() == stored.keys(), "make golden stores the tables of all sessions anew"
+    assert found.keys() == stored.keys(), (
+        "make golden stores the tables of all sessions anew"
+    )
     for file in sorted(stored):
         tables = (pd.read_csv(folder[file]) for folder in (found, stored))
-        pd.testing.assert_frame_equal(*tables, check_exact=False, rtol=3e-6, atol=2e-5, obj=f"{name}/{file}")
+        pd.testing.assert_frame_equal(
+            *tables, check_exact=False, rtol=3e-6, atol=2e-5, obj=f"{name}/{file}"
+        )

@@ -12,7 +12,9 @@ from lrfcal_lib.preprocess.board_in_scan import find_board
 from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.session.read import Sweep
 
-HEAD = RigidTransform.from_components([0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03]))
+HEAD = RigidTransform.from_components(
+    [0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03])
+)
 SQUARE = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.8, 0], [0.8, 0.7], [0, 0.7]]), None,
                ("left", "top"))  # fmt: skip
 TRIANGLE = triangle_board()
@@ -30,7 +32,9 @@ def facing(distance=1.6, roll=8.0, tilt=20.0, centre=(0.4, 0.35), x=0.0):
     """``T_platform_board`` of a board that faces the sensor (its y axis down), turned about two axes."""
     upright = Rotation.from_matrix(np.array([[1, 0, 0], [0, 0, 1.0], [0, -1, 0]]))
     rotation = upright * Rotation.from_euler("ZX", [roll, tilt], degrees=True)
-    return RigidTransform.from_components(np.array([x, distance, 0.0]) - rotation.apply([*centre, 0]), rotation)
+    return RigidTransform.from_components(
+        np.array([x, distance, 0.0]) - rotation.apply([*centre, 0]), rotation
+    )
 
 
 @dataclass
@@ -60,13 +64,17 @@ class Scene:
 
     def in_lrf(self, vectors, pitch):
         """Directions given in the board frame as the LRF sees them at a pitch."""
-        at_head = Rotation.from_euler("x", -pitch[:, None]).apply(self.pose.rotation.apply(vectors))
+        at_head = Rotation.from_euler("x", -pitch[:, None]).apply(
+            self.pose.rotation.apply(vectors)
+        )
         return HEAD.rotation.inv().apply(at_head)
 
     def variance(self, edges):
         """Of edge points across their nearest edge, as their covariance says."""
         edge = self.edge_errors(edges)[1]
-        n = self.in_lrf(np.column_stack([self.board.lines()[edge, :2], 0 * edges.pitch]), edges.pitch)
+        n = self.in_lrf(
+            np.column_stack([self.board.lines()[edge, :2], 0 * edges.pitch]), edges.pitch
+        )
         return np.einsum("ni,nij,nj->n", n, edges.covariance, n)
 
 
@@ -74,7 +82,9 @@ def beams_of(sweep):
     """Origins and directions (L, B, 3) of all beams, platform frame."""
     pitch = np.repeat(sweep.pitch[:, None], len(sweep.bearings), axis=1)
     origin = lrf_to_platform(np.zeros(pitch.shape + (3,)), pitch, HEAD)
-    return origin, lrf_to_platform(polar_to_points(np.ones(pitch.shape), sweep.bearings), pitch, HEAD) - origin
+    return origin, lrf_to_platform(
+        polar_to_points(np.ones(pitch.shape), sweep.bearings), pitch, HEAD
+    ) - origin
 
 
 def on_plane(sweep, normal, offset):
@@ -90,14 +100,28 @@ def scene(board=SQUARE, pose=None, step=0.25, view=(55, 125), pitch=(-20, 20), p
     """Rays against a board in front of a wall (None: nothing behind it)."""
     pose = facing() if pose is None else pose
     bearings = np.radians(np.arange(view[0], view[1] + step / 2, step))
-    pitches = np.radians(np.arange(pitch[0], pitch[1] + 1e-9, pitch_step)) if np.ndim(pitch) else np.radians([pitch])
-    sweep = Sweep(1, np.zeros((len(pitches), len(bearings))), bearings, pitches, np.full(len(pitches), np.nan))
+    pitches = (
+        np.radians(np.arange(pitch[0], pitch[1] + 1e-9, pitch_step))
+        if np.ndim(pitch)
+        else np.radians([pitch])
+    )
+    sweep = Sweep(
+        1,
+        np.zeros((len(pitches), len(bearings))),
+        bearings,
+        pitches,
+        np.full(len(pitches), np.nan),
+    )
     normal = pose.rotation.apply([0, 0, 1.0])
     ranges, hits = on_plane(sweep, normal, normal @ pose.translation)
-    inside = Polygon(board.corners).contains_points(pose.inv().apply(hits.reshape(-1, 3))[:, :2])
+    inside = Polygon(board.corners).contains_points(
+        pose.inv().apply(hits.reshape(-1, 3))[:, :2]
+    )
     on = inside.reshape(ranges.shape) & (ranges > 0)
     behind = np.nan if wall is None else on_plane(sweep, np.array([0.0, 1.0, 0.0]), wall)[0]
-    ranges = np.where(on, ranges, behind) + sigma * np.random.default_rng(seed).standard_normal(on.shape)
+    ranges = np.where(on, ranges, behind) + sigma * np.random.default_rng(
+        seed
+    ).standard_normal(on.shape)
     return spoiled(Scene(sweep, on, pose, board), ranges)
 
 
@@ -110,4 +134,9 @@ def found(s):
 
 
 def noisy_triangle(seed=0, roll=25.0, **options):
-    return scene(TRIANGLE, facing(1.5, roll, 20.0, (0.1, 0.13)), seed=seed, **({"sigma": 0.01} | options))
+    return scene(
+        TRIANGLE,
+        facing(1.5, roll, 20.0, (0.1, 0.13)),
+        seed=seed,
+        **({"sigma": 0.01} | options),
+    )

@@ -15,7 +15,9 @@ DATA = ROOT / "data"
 QUICK = DATA / "sim_quick"
 campaign = pytest.mark.campaign  # see pyproject.toml
 FOLDER = "LRFCAL_TESTS"  # environment variable, set by conftest.py
-STRINGS = int(os.environ.get("LRFCAL_FUZZ", 20_000))  # random byte strings for each parser; a million in make fuzz
+STRINGS = int(
+    os.environ.get("LRFCAL_FUZZ", 20_000)
+)  # random byte strings for each parser; a million in make fuzz
 
 
 def shared_folder():
@@ -39,9 +41,14 @@ def until(holds, longest_s=120.0):
 @contextmanager
 def at_write(monkeypatch, number, action):
     """Let something happen instead of the n-th write (from 0) that is to be safe on the disk, and of all after it."""
-    fsync, left = os.fsync, iter(range(number))
+    fsync = os.fsync
+    left = iter(range(number))
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", lambda handle: action() if next(left, None) is None else fsync(handle))
+        patch.setattr(
+            os,
+            "fsync",
+            lambda handle: action() if next(left, None) is None else fsync(handle),
+        )
         yield
 
 
@@ -51,8 +58,13 @@ def disk_full():
 
 def chromium():
     """The program; skips where no browser can be had, which CI must have."""
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    reasons = [] if found else ["there is no Chromium: run 'sudo apt-get install -y chromium'"]
+    found = next(
+        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),
+        None,
+    )
+    reasons = (
+        [] if found else ["there is no Chromium: run 'sudo apt-get install -y chromium'"]
+    )
     if find_spec("playwright") is None:
         reasons.append("there is no playwright: run 'pip install -r environment.txt'")
     if reasons:

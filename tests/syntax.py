@@ -50,7 +50,11 @@ def source_of(path):
             docstrings.update(range(first.lineno, first.end_lineno + 1))
         if isinstance(node, FUNCTIONS):
             node.returns = None
-            for argument in [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]:
+            for argument in [
+                *node.args.posonlyargs,
+                *node.args.args,
+                *node.args.kwonlyargs,
+            ]:
                 argument.annotation = None
     lines = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):

@@ -32,7 +32,9 @@ SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 def solved(seed, change=lambda obs: obs, **settings):
     obs, _, rig = draw(rng(seed), 12, **settings)
-    return solve_joint(change(obs), rig.T_head_lrf, sensor=SENSOR, noise="estimate", required=False)
+    return solve_joint(
+        change(obs), rig.T_head_lrf, sensor=SENSOR, noise="estimate", required=False
+    )
 
 
 @pytest.mark.parametrize(
@@ -42,42 +44,58 @@ def solved(seed, change=lambda obs: obs, **settings):
       for k, v in (("squares", -0.05), ("ranges", 0.02), ("lag", -0.005)))],
 )  # fmt: skip
 def test_a_wrong_statement_is_named_with_its_size(kind, value, mount):
-    doubts = doubtful(solved(5, lambda obs: ALTERNATIVES[kind].change(obs, value), mount=mount), ADMITTED)
+    doubts = doubtful(
+        solved(5, lambda obs: ALTERNATIVES[kind].change(obs, value), mount=mount), ADMITTED
+    )
     assert kind in [doubt.kind for doubt in doubts]
     found = next(doubt for doubt in doubts if doubt.kind == kind)
     assert found.value == pytest.approx(-value, abs=0.25 * abs(value) + 3 * found.sigma)
-    assert ALTERNATIVES[kind].remedy in found.words and ALTERNATIVES[kind].signs[int(value > 0)] in found.words
+    assert (
+        ALTERNATIVES[kind].remedy in found.words
+        and ALTERNATIVES[kind].signs[int(value > 0)] in found.words
+    )
 
 
 def doubt_about_squares(seed, by, corners):
     """What the data say of the squares with the board's origin moved by `by` (metres)."""
 
     def change(obs):
-        poses, arm = obs.view_pose.copy(), obs.view_pose[:, :3, :2] @ by
+        poses = obs.view_pose.copy()
+        arm = obs.view_pose[:, :3, :2] @ by
         poses[:, :3, 3] += arm
         turn = np.tile(np.eye(6), (len(poses), 1, 1))
         turn[:, 3:, :3] = -hat(arm)
         covariance = turn @ obs.view_covariance @ np.swapaxes(turn, -1, -2)
-        return replace(obs, view_pose=poses, view_covariance=covariance, corners=obs.corners - by)
+        return replace(
+            obs, view_pose=poses, view_covariance=covariance, corners=obs.corners - by
+        )
 
     solution = solved(seed, change)
     pattern = Chessboard(4, 5, 0.029, tuple(np.array([0.05, 0.05]) - by))
     lrf = SimpleNamespace(spot_exit=None)
     session = SimpleNamespace(lrf=lrf, board=SimpleNamespace(corners=corners))
-    stated = alternatives_of(SimpleNamespace(session=session, board=SimpleNamespace(pattern=pattern)))
-    return next(doubt for doubt in weigh(solution, ADMITTED, stated) if doubt.kind == "squares")
+    stated = alternatives_of(
+        SimpleNamespace(session=session, board=SimpleNamespace(pattern=pattern))
+    )
+    return next(
+        doubt for doubt in weigh(solution, ADMITTED, stated) if doubt.kind == "squares"
+    )
 
 
 @pytest.mark.parametrize("corners", [None, "stated"])
 def test_what_the_data_say_of_squares_does_not_depend_on_the_origin(corners):
-    here, there = (doubt_about_squares(5, np.array(by), corners) for by in ((0.0, 0.0), (0.315, 0.38)))
+    here, there = (
+        doubt_about_squares(5, np.array(by), corners) for by in ((0.0, 0.0), (0.315, 0.38))
+    )
     assert there.value == pytest.approx(here.value, abs=0.1 * here.sigma)
     assert there.sigma == pytest.approx(here.sigma, rel=0.2)
 
 
 def test_an_outline_that_the_images_measured_is_no_statement():
     plain = SimpleNamespace(pattern=None)
-    session = SimpleNamespace(lrf=SimpleNamespace(spot_exit=0.01), board=SimpleNamespace(corners=None))
+    session = SimpleNamespace(
+        lrf=SimpleNamespace(spot_exit=0.01), board=SimpleNamespace(corners=None)
+    )
     assert "squares" not in alternatives_of(SimpleNamespace(session=session, board=plain))
     printed = SimpleNamespace(pattern=PATTERN)
     assert "outline" not in alternatives_of(SimpleNamespace(session=session, board=printed))
@@ -86,15 +104,22 @@ def test_an_outline_that_the_images_measured_is_no_statement():
 
 @pytest.mark.parametrize(("value", "mount"), [(0.03, "head"), (-0.03, "platform")])
 def test_an_angular_step_that_is_off_is_no_range_offset(value, mount):
-    solution = solved(7, lambda obs: ALTERNATIVES["bearings"].change(obs, value), mount=mount)
+    solution = solved(
+        7, lambda obs: ALTERNATIVES["bearings"].change(obs, value), mount=mount
+    )
     found = not_an_offset(solution, ADMITTED)
     assert found.value == pytest.approx(-value, abs=0.25 * abs(value) + 5 * found.sigma)
-    assert "check the angular step" in found.words and "instead of a range offset" in found.words
+    assert (
+        "check the angular step" in found.words
+        and "instead of a range offset" in found.words
+    )
 
 
 @pytest.mark.parametrize(("offset", "mount"), [(0.03, "platform"), (0.06, "head")])
 def test_a_range_offset_is_no_angular_step(offset, mount):
-    solution = solved(7, lambda obs: replace(obs, face_range=obs.face_range + offset), mount=mount)
+    solution = solved(
+        7, lambda obs: replace(obs, face_range=obs.face_range + offset), mount=mount
+    )
     assert not_an_offset(solution, ADMITTED) is None
 
 
@@ -106,29 +131,43 @@ def test_a_step_that_the_data_cannot_tell_is_said_where_the_result_hangs_on_it(m
     assert told or "taken as stated: these data tell it to " in words
 
 
-def test_what_bearings_explain_alone_must_not_be_contradicted_where_both_are_free(monkeypatch):
+def test_what_bearings_explain_alone_must_not_be_contradicted_where_both_are_free(
+    monkeypatch,
+):
     """An offset of 18 mm that a maker admits looked like bearings 1.4 % too large in 2 of 24 honest sessions."""
     solution = solved(7, lambda obs: ALTERNATIVES["bearings"].change(obs, 0.03))
     told = weigh(solution, ADMITTED)
     free = next(doubt for doubt in told if doubt.kind == "bearings")
     away = replace(free, value=free.value + 0.02, sigma=0.004)
     answers = {ADMITTED: [away], HELD: weigh(solution, HELD)}
-    monkeypatch.setattr(alternatives, "weigh", lambda solution, admitted, stated: answers[admitted])
+    monkeypatch.setattr(
+        alternatives, "weigh", lambda solution, admitted, stated: answers[admitted]
+    )
     assert not_an_offset(solution, ADMITTED) is None
 
 
 def fisheye_views(field_deg, count, rng, size=(640, 480)):
     """Corners of a chessboard as a lens of the equidistant law shows them (a pinhole below 90 deg)."""
-    points, views = PATTERN.points() - PATTERN.points().mean(axis=0), []
+    points = PATTERN.points() - PATTERN.points().mean(axis=0)
+    views = []
     f = size[0] / 2 / np.radians(field_deg / 2)
     while len(views) < count:
-        off, around = rng.uniform(0, np.radians(0.42 * field_deg)), rng.uniform(0, 2 * np.pi)
-        at = np.array([np.sin(off) * np.cos(around), 0.75 * np.sin(off) * np.sin(around), np.cos(off)])
-        face = Rotation.align_vectors([at], [[0, 0, 1]])[0] * Rotation.from_euler("xyz", rng.uniform(-0.7, 0.7, 3))
+        off = rng.uniform(0, np.radians(0.42 * field_deg))
+        around = rng.uniform(0, 2 * np.pi)
+        at = np.array(
+            [np.sin(off) * np.cos(around), 0.75 * np.sin(off) * np.sin(around), np.cos(off)]
+        )
+        face = Rotation.align_vectors([at], [[0, 0, 1]])[0] * Rotation.from_euler(
+            "xyz", rng.uniform(-0.7, 0.7, 3)
+        )
         p = face.apply(points) + rng.uniform(0.35, 1.0) * at
         across = np.hypot(p[:, 0], p[:, 1])
         bent = f * (np.arctan2(across, p[:, 2]) if field_deg > 90 else across / p[:, 2])
-        uv = p[:, :2] * (bent / across)[:, None] + np.array(size) / 2 + rng.normal(0, 0.1, (len(p), 2))
+        uv = (
+            p[:, :2] * (bent / across)[:, None]
+            + np.array(size) / 2
+            + rng.normal(0, 0.1, (len(p), 2))
+        )
         if p[:, 2].min() > 0.02 and (np.abs(uv / size - 0.5) < 0.49).all():
             views.append(uv)
     return views
@@ -146,7 +185,10 @@ def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named, wi
     views = {i: SimpleNamespace(pixels=uv, T_camera_board=first_pose(PATTERN.points(), uv, model), reason="")
              for i, uv in enumerate(pixels)}  # fmt: skip
     prepared = SimpleNamespace(
-        board=SimpleNamespace(pattern=PATTERN), models={"left": model}, views={"left": views}, relief=None
+        board=SimpleNamespace(pattern=PATTERN),
+        models={"left": model},
+        views={"left": views},
+        relief=None,
     )
     words = "".join(finding.words for finding in lens_findings(prepared))
     assert words == "" if named is None else "camera 'left'" in words and named in words

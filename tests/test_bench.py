@@ -16,6 +16,10 @@ calibrate_s report_s peak_mb_1e8_points
 def test_the_bench_writes_every_figure(tmp_path):
     bench.main(tmp_path, bench.TINY)
     found = json.loads((tmp_path / "bench.json").read_text())
-    empty = {"calibrate_s", "report_s", "joint_vs_gtsam"}  # not at this size; where there is no GTSAM
+    empty = {
+        "calibrate_s",
+        "report_s",
+        "joint_vs_gtsam",
+    }  # not at this size; where there is no GTSAM
     assert all(found[key] > 0 for key in KEYS if key not in empty) and empty <= set(found)
     assert "GTSAM" in (tmp_path / "bench.csv").read_text()

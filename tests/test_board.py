@@ -16,7 +16,9 @@ def test_lines_point_outwards_whatever_the_order_of_the_corners(flip):
 
 def test_corners_come_back_from_lines():
     corners = np.array([[0, 0], [2, 0.1], [2.2, 1.5], [-0.3, 1]])
-    np.testing.assert_allclose(b.corners_of_lines(b.outline_lines(corners)), corners, atol=1e-12)
+    np.testing.assert_allclose(
+        b.corners_of_lines(b.outline_lines(corners)), corners, atol=1e-12
+    )
 
 
 def test_an_unmeasured_outline_is_refused():

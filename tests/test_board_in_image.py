@@ -50,22 +50,32 @@ FAR = pose_of(0.3, (0.14, -0.1), (0.1, 0.0, 3.0))
 def far_view(sigma, seed, edges=()):
     pixels = pixels_of([FAR], sigma, seed)[0]
     pose, covariance, _ = board_pose(pixels, PATTERN, MODEL)
-    return BoardView(pixels=pixels, T_camera_board=pose, covariance=covariance, edges=tuple(edges))
+    return BoardView(
+        pixels=pixels, T_camera_board=pose, covariance=covariance, edges=tuple(edges)
+    )
 
 
 def noisy_edges(pose, seed, sigma=0.1):
     """All four edges as a detector with that error (of the two ends alike) would see them, and their covariances."""
-    rng, out = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    out = []
     for i, name in enumerate(SHEET.edges):
         exact = true_line(name, pose)
-        ends = on_board(pose, CORNERS[[i, (i + 1) % 4]]) + rng.normal(0, sigma, (2, 1)) * exact[:2]
-        edge = picked_edge(name, ends, ends.mean(axis=0) - exact[:2])  # by a hand that errs by a pixel
+        ends = (
+            on_board(pose, CORNERS[[i, (i + 1) % 4]])
+            + rng.normal(0, sigma, (2, 1)) * exact[:2]
+        )
+        edge = picked_edge(
+            name, ends, ends.mean(axis=0) - exact[:2]
+        )  # by a hand that errs by a pixel
         out.append(replace(edge, covariance=sigma**2 * edge.covariance))
     return out
 
 
 def test_corners_and_edges_together_are_better_and_know_how_much():
-    chi2, alone, both = [], [], []
+    chi2 = []
+    alone = []
+    both = []
     for seed in range(60):
         view = far_view(0.1, seed, noisy_edges(FAR, 100 + seed))
         pose, covariance = pose_with_edges(view, SHEET, MODEL)
@@ -81,13 +91,23 @@ def test_corners_and_edges_together_are_better_and_know_how_much():
 def test_edges_tell_a_pose_from_its_mirror_in_depth():
     wrong = mirrored_pose(FAR, PATTERN)
     assert turned(wrong, FAR) > 0.2
-    np.testing.assert_allclose(mirrored_pose(wrong, PATTERN).as_matrix(), FAR.as_matrix(), atol=1e-12)
-    view = replace(far_view(0.05, 1), T_camera_board=wrong, covariance=np.diag([1e-4] * 3 + [1e-6] * 3))
-    assert turned(pose_with_edges(replace(view, edges=noisy_edges(FAR, 2)), SHEET, MODEL)[0], FAR) < 0.05
+    np.testing.assert_allclose(
+        mirrored_pose(wrong, PATTERN).as_matrix(), FAR.as_matrix(), atol=1e-12
+    )
+    view = replace(
+        far_view(0.05, 1), T_camera_board=wrong, covariance=np.diag([1e-4] * 3 + [1e-6] * 3)
+    )
+    assert (
+        turned(
+            pose_with_edges(replace(view, edges=noisy_edges(FAR, 2)), SHEET, MODEL)[0], FAR
+        )
+        < 0.05
+    )
 
 
 def test_an_edge_that_contradicts_the_corners_is_left_out():
-    view, edges = far_view(0.05, 1), noisy_edges(FAR, 3, 0.05)
+    view = far_view(0.05, 1)
+    edges = noisy_edges(FAR, 3, 0.05)
     good, _ = pose_with_edges(replace(view, edges=edges[:3]), SHEET, MODEL)
     moved = replace(edges[3], line=edges[3].line + [0, 0, 9.0])
     same, _ = pose_with_edges(replace(view, edges=[*edges[:3], moved]), SHEET, MODEL)
@@ -101,7 +121,13 @@ def test_an_edge_that_contradicts_the_corners_is_left_out():
 def test_edges_of_a_known_board_at_any_roll(roll):
     pose = pose_of(roll)
     view = seen(render(pose))
-    assert (view.file, view.reason, view.rejected, view.placement, view.pitch) == ("a.png", "", (), 3, 0.1)
+    assert (view.file, view.reason, view.rejected, view.placement, view.pitch) == (
+        "a.png",
+        "",
+        (),
+        3,
+        0.1,
+    )
     assert [e.name for e in view.edges] == list(SHEET.edges)
     assert worst_edge(view, pose) < 0.05 and turned(view.T_camera_board, pose) < 0.003
     centre = on_board(pose, [[0.12, 0.095]])[0]
@@ -109,12 +135,19 @@ def test_edges_of_a_known_board_at_any_roll(roll):
 
 
 def test_the_order_of_corners_follows_the_outline():
-    for pose, background in zip(view_poses(3, seed=6), (170.0, clutter(1), clutter(2)), strict=True):
-        picture, exact = render(pose, background=background), pixels_of([pose])[0]
+    for pose, background in zip(
+        view_poses(3, seed=6), (170.0, clutter(1), clutter(2)), strict=True
+    ):
+        picture = render(pose, background=background)
+        exact = pixels_of([pose])[0]
         for start in pattern_orders(PATTERN):
             orders = exact[start][pattern_orders(PATTERN)]
-            poses = RigidTransform.concatenate([first_pose(PATTERN.points(), pixels, MODEL) for pixels in orders])
-            np.testing.assert_array_equal(orders[np.argmax(order_scores(picture, SHEET, MODEL, poses))], exact)
+            poses = RigidTransform.concatenate(
+                [first_pose(PATTERN.points(), pixels, MODEL) for pixels in orders]
+            )
+            np.testing.assert_array_equal(
+                orders[np.argmax(order_scores(picture, SHEET, MODEL, poses))], exact
+            )
 
 
 def test_what_cannot_be_used_is_listed_with_the_reason():
@@ -126,7 +159,10 @@ def test_what_cannot_be_used_is_listed_with_the_reason():
     view = view_board(np.zeros((100, 120, 3), np.uint8), SHEET, MODEL)
     assert "120 x 100" in view.reason and "640 x 480" in view.reason
     view = seen(BLANK + np.uint8(80))
-    assert "inner corners" in view.reason and (view.edges, view.T_camera_board) == ((), None)
+    assert "inner corners" in view.reason and (view.edges, view.T_camera_board) == (
+        (),
+        None,
+    )
 
 
 def test_picks_override_the_detector():
@@ -139,7 +175,8 @@ def test_picks_override_the_detector():
     ]
     view = seen(render(pose), picks=picks)
     assert [e.name for e in view.edges if e.n_points == 2] == ["top"]
-    top, ends = view.edge("top"), undistort(picks[0].ends, MODEL)
+    top = view.edge("top")
+    ends = undistort(picks[0].ends, MODEL)
     np.testing.assert_allclose(top.ends, ends, atol=1e-9)
     assert np.abs(line_distance(ends, top.line)).max() < 1e-9
     assert line_distance(on_board(pose, [[0.12, 0.095]])[0], top.line) < 0

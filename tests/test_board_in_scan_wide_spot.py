@@ -14,9 +14,13 @@ from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.beam import LMS221, ideal_readings
 from lrfcal_lib.simulate.scene import Thing, World, plain, polygon, rectangle
 
-HEAD, BOARD, LEAN = RigidTransform.identity(), triangle_board(), np.radians(35.0)
+HEAD = RigidTransform.identity()
+BOARD = triangle_board()
+LEAN = np.radians(35.0)
 WIDE = {"spot_exit": 0.030, "divergence": 0.015}
-LRF = LrfInfo("wide", (0.0, np.pi), np.radians(0.5), 0.003, spot_exit=0.030, spot_divergence=0.015)
+LRF = LrfInfo(
+    "wide", (0.0, np.pi), np.radians(0.5), 0.003, spot_exit=0.030, spot_divergence=0.015
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +34,12 @@ def sweep():
     world = World([
         Thing(polygon(BOARD.corners), (plain, (0.5,) * 3), pose), Thing(rectangle(9.0, 9.0), (plain, (0.3,) * 3), wall)
     ])  # fmt: skip
-    bearings, pitch = np.radians(np.arange(78, 102.1, 0.5)), np.radians(np.arange(-11, 11.1, 0.5))
+    bearings = np.radians(np.arange(78, 102.1, 0.5))
+    pitch = np.radians(np.arange(-11, 11.1, 0.5))
     at, up = (v.ravel() for v in np.meshgrid(bearings, pitch))
-    reading = ideal_readings(replace(LMS221, **WIDE), world, at, up, HEAD)[0].reshape(len(pitch), len(bearings))
+    reading = ideal_readings(replace(LMS221, **WIDE), world, at, up, HEAD)[0].reshape(
+        len(pitch), len(bearings)
+    )
     noise = 0.003 * np.random.default_rng(0).standard_normal(reading.shape)
     return Sweep(1, reading + noise, bearings, pitch, np.zeros(len(pitch)))
 
@@ -45,13 +52,19 @@ def lean_of(scan):
 
 def test_a_board_grown_by_the_stated_spot_is_found(sweep):
     scan = find_board(sweep, BOARD, HEAD, LRF)
-    points = lrf_to_platform(polar_to_points(sweep.ranges, sweep.bearings), sweep.pitch[:, None], HEAD)[scan.mask]
+    points = lrf_to_platform(
+        polar_to_points(sweep.ranges, sweep.bearings), sweep.pitch[:, None], HEAD
+    )[scan.mask]
     assert np.abs(points[:, 1] - 1.6).max() < 0.3
     with pytest.raises(BoardNotFound, match="no flat surface of the board's size"):
-        find_board(sweep, BOARD, HEAD)  # nobody says how wide the spot is: too large for the board
+        find_board(
+            sweep, BOARD, HEAD
+        )  # nobody says how wide the spot is: too large for the board
 
 
 def test_spots_that_reach_over_the_edge_do_not_straighten_the_board(sweep):
     scan = find_board(sweep, BOARD, HEAD, LRF)
     assert lean_of(scan) == pytest.approx(LEAN, abs=np.radians(0.35))
-    assert LEAN - lean_of(replace(scan, spot=0.0)) > np.radians(0.5)  # as much as two beams leave
+    assert LEAN - lean_of(replace(scan, spot=0.0)) > np.radians(
+        0.5
+    )  # as much as two beams leave

@@ -45,8 +45,11 @@ class Stage:
 
 def test_the_same_is_worked_out_once(folder, session):
     stage = Stage()
-    first, again = stage.run(session, 1, joint=True), stage.run(open_session(session.path), 1, joint=True)
-    assert stage.calls == again["count"] == 1 and np.array_equal(first["values"], again["values"])
+    first = stage.run(session, 1, joint=True)
+    again = stage.run(open_session(session.path), 1, joint=True)
+    assert stage.calls == again["count"] == 1 and np.array_equal(
+        first["values"], again["values"]
+    )
     assert sorted(file.suffix for file in folder.iterdir()) == [".lock", ".pickle"]
 
 
@@ -90,7 +93,9 @@ def test_a_folder_that_others_may_write_to_is_refused(folder, session, mode):
     folder.mkdir()
     folder.chmod(mode)
     stage = Stage()
-    with pytest.raises(ValueError, match=f"others may write to '{folder}' .*mode {mode:o}.*chmod go-w"):
+    with pytest.raises(
+        ValueError, match=f"others may write to '{folder}' .*mode {mode:o}.*chmod go-w"
+    ):
         stage.run(session)
     folder.chmod(0o755)
     stage.run(session)

@@ -29,7 +29,13 @@ def drawn(seed, count=14, **settings):
     """Observations of a sound recording, what solves them, and what is known of the cameras."""
     obs, _, rig = draw(rng(seed), count, pitch_step=np.radians(2.0), **settings)
     prior = PlatformPrior(rig.T_head_lrf, np.radians(3.0), 0.03)
-    settings = {"sensor": SENSOR, "noise": "estimate", "lapse": 0.01, "sides": True, "axis": True}
+    settings = {
+        "sensor": SENSOR,
+        "noise": "estimate",
+        "lapse": 0.01,
+        "sides": True,
+        "axis": True,
+    }
     models = dict.fromkeys(rig.cameras, rig.model)
     prepared = SimpleNamespace(models=models, board=SimpleNamespace(pattern=None))
     return obs, settings | {"prior": prior}, prepared
@@ -76,7 +82,11 @@ def test_a_camera_that_is_knocked_is_named_with_its_size(seed, mount, turn_deg, 
         "record anew",
     ):
         assert words in fault.words
-    assert (fault.kind, fault.camera, fault.placements) == ("camera moved", "left", (change.after,))
+    assert (fault.kind, fault.camera, fault.placements) == (
+        "camera moved",
+        "left",
+        (change.after,),
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,10 +96,17 @@ def test_a_camera_that_is_knocked_is_named_with_its_size(seed, mount, turn_deg, 
 def test_a_camera_that_zooms_is_named_with_its_size(seed, mount, growth):
     obs, settings, prepared = drawn(seed, mount=mount)
     (change,) = found_in(changed(obs, (1,), growth=growth), settings, prepared)
-    assert (change.camera, change.after, change.zoomed) == ("right", obs.placements[FIRST], True)
+    assert (change.camera, change.after, change.zoomed) == (
+        "right",
+        obs.placements[FIRST],
+        True,
+    )
     assert change.zoom == pytest.approx(growth, abs=0.25 * abs(growth))
     (fault,) = faults_of_changes([change], obs.cameras)
-    assert fault.kind == "camera zoomed" and ("larger" if growth > 0 else "smaller") in fault.words
+    assert (
+        fault.kind == "camera zoomed"
+        and ("larger" if growth > 0 else "smaller") in fault.words
+    )
 
 
 @campaign
@@ -100,10 +117,14 @@ def test_a_camera_that_zooms_is_named_with_its_size(seed, mount, growth):
         (8, "platform", [0.0, 9.0, 0.0], [0.2, 0.0, 0.1]),
     ],
 )
-def test_a_change_beyond_every_estimate_is_seen_by_the_other_cameras(seed, mount, turn_deg, shift):
+def test_a_change_beyond_every_estimate_is_seen_by_the_other_cameras(
+    seed, mount, turn_deg, shift
+):
     obs, settings, prepared = drawn(seed, mount=mount)
     assert large_changes(obs, prepared, settings) == []
-    (change,) = large_changes(changed(obs, turn_deg=turn_deg, shift=shift), prepared, settings)
+    (change,) = large_changes(
+        changed(obs, turn_deg=turn_deg, shift=shift), prepared, settings
+    )
     assert (change.camera, change.after) == ("left", obs.placements[FIRST])
     turn = np.radians(np.linalg.norm(turn_deg))
     assert change.turn == pytest.approx(turn, abs=5 * change.turn_sigma)
@@ -114,7 +135,9 @@ def test_where_all_cameras_change_at_once_it_may_be_the_range_finder():
     obs, settings, prepared = drawn(7)
     both = found_in(changed(obs, (0, 1), turn_deg=[0.0, 1.0, 0.0]), settings, prepared)
     assert {change.camera for change in both} == {"left", "right"}
-    assert all("range finder" in fault.words for fault in faults_of_changes(both, obs.cameras))
+    assert all(
+        "range finder" in fault.words for fault in faults_of_changes(both, obs.cameras)
+    )
 
 
 @campaign
@@ -139,7 +162,9 @@ def ordered(obs):
     return replace(obs, **moved, direction=obs.direction[order], middle=obs.middle[order])
 
 
-@pytest.mark.parametrize("order", [lambda obs: obs, ordered], ids=["as drawn", "near to far"])
+@pytest.mark.parametrize(
+    "order", [lambda obs: obs, ordered], ids=["as drawn", "near to far"]
+)
 @pytest.mark.parametrize(
     "seed", [21, *(pytest.param(seed, marks=campaign) for seed in range(100, 120))]
 )
@@ -157,8 +182,12 @@ def test_too_few_placements_say_nothing():
 def test_a_step_that_moves_no_board_in_the_images_needs_no_other_estimate(monkeypatch):
     """Errors of the intrinsics look like one of a third of a pixel, as in data/sim_lms221."""
     obs, settings, prepared = drawn(7)
-    solution = solve_joint(changed(obs, turn_deg=(0.02, 0.0, 0.0)), required=False, **settings)
-    step = Step(camera=0, row=FIRST, p_value=0.0, change=np.array([0.0, 3e-4, 0.0, 0.0, 0.0, 0.0]))
+    solution = solve_joint(
+        changed(obs, turn_deg=(0.02, 0.0, 0.0)), required=False, **settings
+    )
+    step = Step(
+        camera=0, row=FIRST, p_value=0.0, change=np.array([0.0, 3e-4, 0.0, 0.0, 0.0, 0.0])
+    )
     assert 0.1 < largest_motion(solution, step, prepared.models["left"]) < LEAST_SIZE
     monkeypatch.setattr("lrfcal_lib.judge.camera_changes.likeliest_step", lambda _: step)
     monkeypatch.setattr("lrfcal_lib.judge.camera_changes.solve_joint", None)

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.calibrate.cameras import KnownAxis, calibrate_platform, combine, stated_covariance
+from lrfcal_lib.calibrate.cameras import (
+    KnownAxis,
+    calibrate_platform,
+    combine,
+    stated_covariance,
+)
 from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import axis_difference, axis_of, pose_array
@@ -18,7 +23,9 @@ STATED = stated_covariance(SIGMA)
 
 def head(seed):
     rng = np.random.default_rng(seed)
-    return RigidTransform.from_components(rng.normal(0, 0.1, 3), Rotation.from_rotvec(rng.normal(0, 0.05, 3)))
+    return RigidTransform.from_components(
+        rng.normal(0, 0.1, 3), Rotation.from_rotvec(rng.normal(0, 0.05, 3))
+    )
 
 
 def apart(one, other):
@@ -28,8 +35,14 @@ def apart(one, other):
 
 def estimate(T_head_lrf, covariance, scatter=None):
     inner = dict.fromkeys(field.name for field in fields(Solution))
-    inner |= {"parameters": chart_parameters(pose_array(T_head_lrf)), "covariance": covariance, "n_placements": 20}
-    return KnownAxis(T_head_lrf, Solution(**inner | {"covariance_placements": scatter}).trusted)
+    inner |= {
+        "parameters": chart_parameters(pose_array(T_head_lrf)),
+        "covariance": covariance,
+        "n_placements": 20,
+    }
+    return KnownAxis(
+        T_head_lrf, Solution(**inner | {"covariance_placements": scatter}).trusted
+    )
 
 
 @pytest.mark.parametrize(("scale", "scatter", "wins"), [
@@ -38,7 +51,9 @@ def estimate(T_head_lrf, covariance, scatter=None):
     (1e8, 1e-8 * STATED, head(1)),  # placements that agree by chance do not outweigh the stated axis
 ])  # fmt: skip
 def test_the_better_known_axis_wins(scale, scatter, wins):
-    combined = combine(estimate(head(2), scale * STATED, scatter), KnownAxis(head(1), STATED))
+    combined = combine(
+        estimate(head(2), scale * STATED, scatter), KnownAxis(head(1), STATED)
+    )
     assert apart(combined.T_head_lrf, wins) < 1e-6
     assert (np.diag(combined.covariance) <= np.diag(STATED) * (1 + 1e-9)).all()
 
@@ -50,4 +65,7 @@ def test_an_axis_that_nothing_tells_is_assumed_and_named_so():
     assert np.allclose(platform.transform("combined").as_matrix(), np.eye(4))
     assert "neither stated nor determined" in platform.problem("combined").words
     stated = calibrate_platform(nothing, head(1), SIGMA)
-    assert stated.problem("combined") is None and stated.axes["combined"] is stated.axes["stated"]
+    assert (
+        stated.problem("combined") is None
+        and stated.axes["combined"] is stated.axes["stated"]
+    )

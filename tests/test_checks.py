@@ -19,14 +19,25 @@ def quick():
 def test_good_placements_are_green(quick):
     for number in (1, 2, 3, 4):
         lights = check_placement(quick, number, advice=lambda session: "")
-        assert [light.name for light in lights] == ["scan", "edges", "camera left", "camera right", "information"]
+        assert [light.name for light in lights] == [
+            "scan",
+            "edges",
+            "camera left",
+            "camera right",
+            "information",
+        ]
         assert {light.state for light in lights} == {"ok"}
     (scene,) = check_placement(quick, 5)
     assert scene.state == "ok" and "scene: 85 scan lines" in scene.text
 
 
 def some(sweep, which):
-    return replace(sweep, ranges=sweep.ranges[which], pitch=sweep.pitch[which], time_s=sweep.time_s[which])
+    return replace(
+        sweep,
+        ranges=sweep.ranges[which],
+        pitch=sweep.pitch[which],
+        time_s=sweep.time_s[which],
+    )
 
 
 @pytest.mark.parametrize(("change", "state", "text"), [
@@ -37,8 +48,6 @@ def some(sweep, which):
     (lambda image: (image * 0.1 + 100).astype(np.uint8), "warn", "little contrast"),
     (np.zeros_like, "bad", "no chessboard with"),
 ])  # fmt: skip
-
-
 def test_images_that_are_blurred_dark_bright_or_empty_are_seen(quick, change, state, text):
     image = change(quick.read_image(quick.images("left", 2)[0]))
     light = check_image(image, quick.board, name="camera left")
@@ -52,8 +61,6 @@ def test_images_that_are_blurred_dark_bright_or_empty_are_seen(quick, change, st
     (lambda sweep: some(sweep, slice(None, len(sweep.pitch) // 2)), "warn", "line hits it: sweep farther"),
     (lambda sweep: some(sweep, slice(0, None, 10)), "warn", "take a smaller step"),
 ])  # fmt: skip
-
-
 def test_the_board_missing_cut_off_or_hardly_hit_is_seen(quick, change, state, text):
     first, *rest = check_scan(change(quick.sweep(2)), quick.board, quick.T_head_lrf)
     assert first.state == state and text in first.text and bool(rest) == (state == "warn")

@@ -12,14 +12,23 @@ SIGMA = 0.0005
 
 def boards(excess, count=40, size=1.0):
     """Lengths of some placements that scatter `excess` times as much as they say."""
-    rng, found = np.random.default_rng(5), {}
+    rng = np.random.default_rng(5)
+    found = {}
     for placement in range(1, count + 1):
-        lengths = {name: size * length + excess * SIGMA * rng.standard_normal() for name, length in TRUE.items()}
-        found[placement] = MeasuredBoard(np.eye(4), {}, {}, lengths, sigma=dict.fromkeys(lengths, SIGMA)), frozenset()
+        lengths = {
+            name: size * length + excess * SIGMA * rng.standard_normal()
+            for name, length in TRUE.items()
+        }
+        found[placement] = (
+            MeasuredBoard(np.eye(4), {}, {}, lengths, sigma=dict.fromkeys(lengths, SIGMA)),
+            frozenset(),
+        )
     return found
 
 
-@pytest.mark.parametrize(("excess", "grown"), [(0.5, 1.0), (1.0, 1.0), (2.0, 2.0), (5.0, 5.0)])
+@pytest.mark.parametrize(
+    ("excess", "grown"), [(0.5, 1.0), (1.0, 1.0), (2.0, 2.0), (5.0, 5.0)]
+)
 @pytest.mark.parametrize("size", [1.0, 1.1])
 def test_lengths_that_scatter_more_than_they_say_are_less_well_known(excess, grown, size):
     """Whatever the board's true size is; lengths stay as they are."""
@@ -27,7 +36,10 @@ def test_lengths_that_scatter_more_than_they_say_are_less_well_known(excess, gro
     after = as_scattered(before)
     sigma = [value for board, _ in after.values() for value in board.sigma.values()]
     assert np.mean(sigma) / SIGMA == pytest.approx(grown, rel=0.12)
-    assert all(after[placement][0].lengths == board.lengths for placement, (board, _) in before.items())
+    assert all(
+        after[placement][0].lengths == board.lengths
+        for placement, (board, _) in before.items()
+    )
 
 
 def test_single_lengths_stay_as_they_are():

@@ -9,7 +9,13 @@ from syntax import FUNCTIONS, density
 LIBRARY = sorted((ROOT / "lrfcal_lib").rglob("*.py"))
 TESTS = sorted((ROOT / "tests").glob("*.py"))
 MOST = {  # see CONTRIBUTING.md
-    "library": {"nodes": 136_000, "median": 5, "densest tenth": 13, "parallel": 8, "ternary": 15}
+    "library": {
+        "nodes": 136_000,
+        "median": 5,
+        "densest tenth": 13,
+        "parallel": 8,
+        "ternary": 15,
+    }
     | {"comprehensions": 45, "long": 0, "skips": 0},
     "tests": {"median": 6, "parallel": 12},
 }
@@ -22,12 +28,18 @@ LEAST_DOCUMENTED = 250  # functions whose docstring says what goes in
 @pytest.mark.parametrize("what", MOST)
 def test_code_is_not_packed(what):
     figures = density(LIBRARY if what == "library" else TESTS)
-    too_much = {name: figures[name] for name, most in MOST[what].items() if figures[name] > most}
+    too_much = {
+        name: figures[name] for name, most in MOST[what].items() if figures[name] > most
+    }
     assert not too_much
 
 
 def functions(path):
-    return [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, FUNCTIONS)]
+    return [
+        node
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, FUNCTIONS)
+    ]
 
 
 def code_lines(function):
@@ -51,12 +63,21 @@ def test_files_and_functions_are_short(path):
 def test_what_goes_in_is_documented():
     every = [function for path in LIBRARY for function in functions(path)]
     public = [function for function in every if not function.name.startswith("_")]
-    assert sum("Parameters\n" in (ast.get_docstring(f) or "") for f in public) >= LEAST_DOCUMENTED
+    assert (
+        sum("Parameters\n" in (ast.get_docstring(f) or "") for f in public)
+        >= LEAST_DOCUMENTED
+    )
 
 
 def test_a_packed_line_is_counted(tmp_path):
     packed = tmp_path / "packed.py"
-    packed.write_text('"""Words do not count."""\na, b = [x for x in (1, 2)], 3 if True else 4\n')
+    packed.write_text(
+        '"""Words do not count."""\na, b = [x for x in (1, 2)], 3 if True else 4\n'
+    )
     figures = density([packed])
-    assert (figures["parallel"], figures["ternary"], figures["comprehensions"]) == (1000, 1000, 1000)
+    assert (figures["parallel"], figures["ternary"], figures["comprehensions"]) == (
+        1000,
+        1000,
+        1000,
+    )
     assert figures["nodes"] == 17 and figures["median"] == figures["densest tenth"] > 13

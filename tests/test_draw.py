@@ -17,7 +17,9 @@ def test_shots_are_as_many_as_asked_for_and_cross_two_edges_each():
         "boards": (3, 5, 3, 4), "board_covariance": (3, 5, 6, 6),
     }  # fmt: skip
     assert (shots["edges"][..., 0] != shots["edges"][..., 1]).all()
-    assert np.isnan(shots["ranges"][..., [0, -1]]).all(), "lines begin and end off the board"
+    assert np.isnan(shots["ranges"][..., [0, -1]]).all(), (
+        "lines begin and end off the board"
+    )
 
 
 def test_readings_lie_on_the_boards_that_the_pattern_shows():
@@ -27,11 +29,19 @@ def test_readings_lie_on_the_boards_that_the_pattern_shows():
     bearings = setup.bearings()
     for ranges, board in zip(shots["ranges"][0], shots["boards"][0], strict=True):
         hit = np.isfinite(ranges)
-        flat = np.column_stack([np.cos(bearings), np.sin(bearings), 0 * bearings])[hit] * ranges[hit, None]
+        flat = (
+            np.column_stack([np.cos(bearings), np.sin(bearings), 0 * bearings])[hit]
+            * ranges[hit, None]
+        )
         on_board = pose_transform(board).inv().apply(T_camera_lrf.apply(flat))
         assert np.abs(on_board[:, 2]).max() < 1e-4
 
 
 def test_boards_that_cannot_be_drawn_are_refused():
     with pytest.raises(ValueError, match="hardly ever"):
-        draw_shots(ShotSetup(distances=(40.0, 41.0), step=np.radians(1.0)), np.random.default_rng(0), 2, 2)
+        draw_shots(
+            ShotSetup(distances=(40.0, 41.0), step=np.radians(1.0)),
+            np.random.default_rng(0),
+            2,
+            2,
+        )

@@ -11,13 +11,20 @@ from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.edge_cells import edge_cells
 from lrfcal_lib.session.stated import LrfInfo
 
-LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005, spot_exit=0.01, spot_divergence=0.004)
+LRF = LrfInfo(
+    "test", (0.0, np.pi), np.radians(0.25), 0.005, spot_exit=0.01, spot_divergence=0.004
+)
 
 
 def cells_of(made, change=None):
-    sweep = made.sweep if change is None else replace(made.sweep, ranges=change(made.sweep.ranges.copy()))
+    sweep = (
+        made.sweep
+        if change is None
+        else replace(made.sweep, ranges=change(made.sweep.ranges.copy()))
+    )
     board = board_in_scan.find_board(sweep, made.board, HEAD)
-    along, swept = edge_points(board), sweep_edges(board)
+    along = edge_points(board)
+    swept = sweep_edges(board)
     return board, edge_cells(board, along, swept, LRF)
 
 
@@ -66,11 +73,15 @@ def test_all_sides_have_cells_and_each_side_is_one_edge(made, found):
     sides = np.unique(found[1].side)
     assert len(sides) == 4 and set(nearest) == {0, 1, 2, 3}
     for side in sides:
-        mine = (found[1].side == side) & ~found[1].hit  # inside, beside a corner, the other edge may be nearer
+        mine = (found[1].side == side) & ~found[
+            1
+        ].hit  # inside, beside a corner, the other edge may be nearer
         assert len(set(nearest[mine])) == 1
 
 
-def test_holes_what_hides_the_board_and_a_post_close_behind_are_left_out_but_a_close_wall_is_not(made):
+def test_holes_what_hides_the_board_and_a_post_close_behind_are_left_out_but_a_close_wall_is_not(
+    made,
+):
     first = np.flatnonzero(made.on[75])[0]
 
     def spoil(ranges):
@@ -79,7 +90,9 @@ def test_holes_what_hides_the_board_and_a_post_close_behind_are_left_out_but_a_c
         return ranges
 
     _, cells = cells_of(made, change=spoil)
-    assert not ((cells.line >= 70) & (cells.line < 80) & (np.abs(cells.beam - first) < 12)).any()
+    assert not (
+        (cells.line >= 70) & (cells.line < 80) & (np.abs(cells.beam - first) < 12)
+    ).any()
     assert not ((cells.line >= 50) & (cells.line < 65) & ~cells.across).any()
     _, near = cells_of(scene(wall=2.3, sigma=0.004))
     assert len(near) > 500 and not near.background.any()

@@ -26,14 +26,18 @@ def test_edge_of_a_disc_inverts_its_share():
     x, slope = disc_edge(log_odds)
     share = disc_share(x)
     np.testing.assert_allclose(np.log(share / (1 - share)), log_odds, atol=1e-8)
-    np.testing.assert_allclose(slope, numeric(lambda v: disc_edge(v)[0], log_odds, 1e-5), rtol=1e-5)
+    np.testing.assert_allclose(
+        slope, numeric(lambda v: disc_edge(v)[0], log_odds, 1e-5), rtol=1e-5
+    )
     assert (slope < 0).all() and (np.abs(x) < 1).all()
 
 
 @pytest.mark.parametrize("margin", [-50.0, -1.0, 1.0, 50.0])
 def test_tails_are_finite(margin):
     for hit in (True, False):
-        assert all(np.isfinite(v).all() for v in beam_terms(np.array([margin]), 1e-3, hit, 1e-3))
+        assert all(
+            np.isfinite(v).all() for v in beam_terms(np.array([margin]), 1e-3, hit, 1e-3)
+        )
 
 
 def test_a_lapse_bounds_what_one_beam_costs():

@@ -25,7 +25,9 @@ def behind(s, centre, width, length, depth):
     normal = normal * np.sign(normal[1])
     r, points = on_plane(s.sweep, normal, normal @ s.pose.translation + depth)
     at = s.pose.inv().apply(points.reshape(-1, 3))[:, :2].reshape(r.shape + (2,)) - centre
-    strip = (np.abs(at[..., 0]) < width / 2) & (at[..., 1] > 0) & (at[..., 1] < length) & ~s.on
+    strip = (
+        (np.abs(at[..., 0]) < width / 2) & (at[..., 1] > 0) & (at[..., 1] < length) & ~s.on
+    )
     ranges = np.where(strip, np.minimum(r, s.sweep.ranges), s.sweep.ranges)
     near = np.where(np.isfinite(ranges) & (s.on | strip), ranges, np.nan)
     padded = np.pad(near, ((0, 0), (2, 2)), constant_values=np.nan)
@@ -49,7 +51,8 @@ def test_a_post_behind_the_board_is_no_part_of_it(roll):
 
 @pytest.mark.parametrize("across", [False, True])
 def test_half_step_is_unbiased_and_last_beam_lies_half_a_step_inside(across):
-    errors, spacing = {"last_beam": [], "half_step": []}, 1.65 * np.radians(0.25)
+    errors = {"last_beam": [], "half_step": []}
+    spacing = 1.65 * np.radians(0.25)
     rolls = [3.0] if across else np.linspace(5, 14, 7)
     for s in (scene(pose=facing(roll=roll)) for roll in rolls):
         for variant, own in errors.items():
@@ -59,13 +62,16 @@ def test_half_step_is_unbiased_and_last_beam_lies_half_a_step_inside(across):
     assert abs(half.mean()) < 0.1 and -0.65 < last.mean() < -0.35
     assert np.abs(half).max() < 0.75 and last.max() < 0.25
     if across:  # columns see the edges that lie along the scan lines
-        assert {x.end for x in e.sides} == {-1, 1} and np.mean(np.isin(s.edge_errors(e)[1][e.side >= 0], [0, 2])) > 0.97
+        assert {x.end for x in e.sides} == {-1, 1} and np.mean(
+            np.isin(s.edge_errors(e)[1][e.side >= 0], [0, 2])
+        ) > 0.97
         assert 0.6 < np.mean((s.edge_errors(e)[0] ** 2 / s.variance(e))[e.side >= 0]) < 1.5
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.006, 0.01])
 def test_the_covariance_of_edge_points_is_realistic(sigma):
-    across, ranges = [], []
+    across = []
+    ranges = []
     for seed, roll in enumerate(np.linspace(5, 14, 6)):
         s = scene(pose=facing(roll=roll), sigma=sigma, seed=seed)
         e = edge_points(found(s))
@@ -80,23 +86,38 @@ def test_the_covariance_of_edge_points_is_realistic(sigma):
 def test_four_sides_are_found_and_named_alike_by_lines_and_columns_in_both_variants():
     s = scene(pose=facing(roll=32.0), sigma=0.004)
     b = found(s)
-    lines, columns = edge_points(b), sweep_edges(b)
-    assert len(lines.sides) == 4 and {x.side for x in lines.sides} == {x.side for x in columns.sides}
-    names = [[np.bincount(s.edge_errors(e)[1][e.side == k]).argmax() for k in range(4)] for e in (lines, columns)]
-    assert names[0] == names[1] and sorted(names[0]) == [0, 1, 2, 3] and s.worst(lines) < 0.008
+    lines = edge_points(b)
+    columns = sweep_edges(b)
+    assert len(lines.sides) == 4 and {x.side for x in lines.sides} == {
+        x.side for x in columns.sides
+    }
+    names = [
+        [np.bincount(s.edge_errors(e)[1][e.side == k]).argmax() for k in range(4)]
+        for e in (lines, columns)
+    ]
+    assert (
+        names[0] == names[1] and sorted(names[0]) == [0, 1, 2, 3] and s.worst(lines) < 0.008
+    )
     along, sides = crossings(b)
-    for e, last in ((lines, along["last_beam"]), (columns, crossings(b, True, sides)[0]["last_beam"])):
+    for e, last in (
+        (lines, along["last_beam"]),
+        (columns, crossings(b, True, sides)[0]["last_beam"]),
+    ):
         np.testing.assert_array_equal([e.side, e.line], [last.side, last.line])
 
 
 def directions(s, e):
     """Each side with the angle between it and the true edge nearest to its points, radians."""
-    edge, lines = s.edge_errors(e)[1], s.board.lines()
+    edge = s.edge_errors(e)[1]
+    lines = s.board.lines()
     p = s.pose.inv().apply(lrf_to_platform(e.points, e.pitch, HEAD))[:, :2]
     for side in e.sides:
         mine = e.side == side.side
         along = np.linalg.svd(p[mine] - p[mine].mean(axis=0))[2][0]
-        yield side, np.arcsin(min(abs(along @ lines[np.bincount(edge[mine]).argmax(), :2]), 1.0))
+        yield (
+            side,
+            np.arcsin(min(abs(along @ lines[np.bincount(edge[mine]).argmax(), :2]), 1.0)),
+        )
 
 
 def turn_sigma(side):
@@ -110,19 +131,29 @@ def test_sides_are_turned_as_little_as_their_scatter_says():
         b = found(s := noisy_triangle(seed, roll=10.0 + 40 * seed))
         for e in (edge_points(b), sweep_edges(b)):
             turned += [angle / turn_sigma(side) for side, angle in directions(s, e)]
-    assert len(turned) > 30 and max(turned) < 1.5  # a spot of no size before an even wall does better than a real one
+    assert (
+        len(turned) > 30 and max(turned) < 1.5
+    )  # a spot of no size before an even wall does better than a real one
 
 
 @pytest.mark.parametrize("fill", [np.nan, 3.4, 0.5])
 def test_holes_do_not_make_edges(fill):
     s = scene(sigma=0.003)
-    rng, ranges, rows = np.random.default_rng(3), s.sweep.ranges.copy(), np.flatnonzero(s.on.any(axis=1))
+    rng = np.random.default_rng(3)
+    ranges = s.sweep.ranges.copy()
+    rows = np.flatnonzero(s.on.any(axis=1))
     middle = s.on.argmax(axis=1) + s.on.sum(axis=1) // 2
     for row in rows[5:-5:2]:
-        ranges[row, middle[row] + rng.integers(-25, 20) + np.arange(rng.integers(1, 8))] = fill
-    holed, clean = edge_points(found(spoiled(s, ranges))), edge_points(found(s))
+        ranges[row, middle[row] + rng.integers(-25, 20) + np.arange(rng.integers(1, 8))] = (
+            fill
+        )
+    holed = edge_points(found(spoiled(s, ranges)))
+    clean = edge_points(found(s))
     np.testing.assert_array_equal(holed.line, clean.line)
-    assert s.worst(holed) < 0.008 and np.linalg.norm(holed.points - clean.points, axis=1).max() < 0.01
+    assert (
+        s.worst(holed) < 0.008
+        and np.linalg.norm(holed.points - clean.points, axis=1).max() < 0.01
+    )
 
 
 def test_where_view_or_sweep_end_or_something_hides_the_board_is_no_edge():

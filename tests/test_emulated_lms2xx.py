@@ -8,10 +8,12 @@ from lrfcal_lib.session.lms2xx_codec import encode_telegram
 from lrfcal_lib.simulate.beam import VARIANTS
 
 ZEROS = "00 " * 21
-TYPE, STATUS, ERRORS, CONFIG, SCAN, RESET = (
-    "02 00 01 00 3A 1E 12", "02 00 01 00 31 15 12", "02 00 01 00 32 16 12", "02 00 01 00 74 50 12",
-    "02 00 02 00 30 01 31 18", "02 00 01 00 10 34 12",
-)  # fmt: skip
+TYPE = "02 00 01 00 3A 1E 12"
+STATUS = "02 00 01 00 31 15 12"
+ERRORS = "02 00 01 00 32 16 12"
+CONFIG = "02 00 01 00 74 50 12"
+SCAN = "02 00 02 00 30 01 31 18"
+RESET = "02 00 01 00 10 34 12"  # fmt: skip
 STOP = "02 00 02 00 20 25 35 08"
 INSTALL = "02 00 0A 00 20 00 53 49 43 4B 5F 4C 4D 53 BE C5"
 VARIANT = {v: encode_telegram(0x3B, np.array(v, "<u2").tobytes()) for v in VARIANTS}
@@ -26,7 +28,8 @@ def bench(rate=None, **options):
 
 # ------------------------------------------------------------------------------------------------ byte-exact replies
 
-DONE, REFUSED = "A0 00 10 16 0A", "92 10 7F 33"
+DONE = "A0 00 10 16 0A"
+REFUSED = "92 10 7F 33"
 TYPE_REPLY = "BA 4C 4D 53 32 32 31 3B 33 30 32 30 36 33 3B 58 30 31 2E 32 37 20 10 02 EB"
 
 
@@ -56,13 +59,15 @@ TYPE_REPLY = "BA 4C 4D 53 32 32 31 3B 33 30 32 30 36 33 3B 58 30 31 2E 32 37 20 
             [encode_telegram(0x30, b"\x55")], [encode_telegram(0x3B, b"\xb4\0")])),
     ],
 )  # fmt: skip
-
-
 def test_replies_of_the_fact_sheet(requests, reply, settings):
-    one, body = bench(**settings), bytes.fromhex(reply)
+    one = bench(**settings)
+    body = bytes.fromhex(reply)
     for request in requests:
         answer = one.send(request)
-    assert answer == b"\x06" + bytes([0x02, 0x80]) + (len(body) - 2).to_bytes(2, "little") + body
+    assert (
+        answer
+        == b"\x06" + bytes([0x02, 0x80]) + (len(body) - 2).to_bytes(2, "little") + body
+    )
 
 
 @pytest.mark.parametrize(("request_", "answer"), [
@@ -70,8 +75,6 @@ def test_replies_of_the_fact_sheet(requests, reply, settings):
     (encode_telegram(0x3A, address=2), ""), (STOP, "06 02 81 03 00 A0 00 10 36 1A"),
     (encode_telegram(0x20, b"\x25", address=1), "06 02 81 03 00 A0 00 10 36 1A"),
 ])  # fmt: skip
-
-
 def test_a_damaged_request_is_answered_nak_and_one_to_another_address_not(request_, answer):
     assert bench(address=1).send(request_) == bytes.fromhex(answer)
 
@@ -90,11 +93,20 @@ def test_reset_tells_its_power_on_string():
 
 
 @pytest.mark.parametrize(
-    ("request_", "least", "most"),  # milliseconds to the last byte, as measured at 38400 Bd on a real device
-    [(STOP, 66, 91), (TYPE, 75, 80), (STATUS, 107, 114), (CONFIG, 75, 76), (SCAN, 190, 300), (WRITE_TL, 128, 129)],
+    (
+        "request_",
+        "least",
+        "most",
+    ),  # milliseconds to the last byte, as measured at 38400 Bd on a real device
+    [
+        (STOP, 66, 91),
+        (TYPE, 75, 80),
+        (STATUS, 107, 114),
+        (CONFIG, 75, 76),
+        (SCAN, 190, 300),
+        (WRITE_TL, 128, 129),
+    ],
 )
-
-
 def test_times_of_replies(request_, least, most):
     one = bench(baudrate=38400, mode=0)
     one.send(request_)

@@ -22,7 +22,10 @@ from lrfcal_lib.simulate.rig import load_setup, placements_of
 
 DEADLINE = 180.0  # s, against hanging
 SETUP = load_setup("sim_quick")
-SMALL = replace(SETUP, rig=scaled(replace(SETUP.rig, platform=replace(SETUP.rig.platform, settle=0.1)), 64))
+SMALL = replace(
+    SETUP,
+    rig=scaled(replace(SETUP.rig, platform=replace(SETUP.rig.platform, settle=0.1)), 64),
+)
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +64,19 @@ class Quiet:
 
 
 TAKEN = {  # what is there already, and what is said of it
-    "a file": (lambda file: file.write_text("mine"), "exists already, and is not written over: name another file"),
-    "a folder": (lambda file: file.mkdir(), "exists already, and is not written over: name another file"),
+    "a file": (
+        lambda file: file.write_text("mine"),
+        "exists already, and is not written over: name another file",
+    ),
+    "a folder": (
+        lambda file: file.mkdir(),
+        "exists already, and is not written over: name another file",
+    ),
     "a dangling link": (lambda file: file.symlink_to("nowhere"), "exists already"),
-    "no folder": (lambda file: file.parent.rmdir(), "No such file or directory.*a folder that exists"),
+    "no folder": (
+        lambda file: file.parent.rmdir(),
+        "No such file or directory.*a folder that exists",
+    ),
 }
 
 
@@ -75,7 +87,10 @@ def test_a_rig_file_takes_no_other_file_s_place(tmp_path, case):
     file.parent.mkdir()
     make(file)
     before = file.read_text() if file.is_file() else sorted(tmp_path.rglob("*"))
-    with pytest.raises(ValueError, match=f"{file}: .*{words}"), written_rig_file(Quiet(), file):
+    with (
+        pytest.raises(ValueError, match=f"{file}: .*{words}"),
+        written_rig_file(Quiet(), file),
+    ):
         pytest.fail("it was written")
     assert (file.read_text() if file.is_file() else sorted(tmp_path.rglob("*"))) == before
 
@@ -85,18 +100,28 @@ def replace_by_another(file):
     file.write_text("another")
 
 
-@pytest.mark.parametrize("change", [lambda file: file.write_text("mine"), replace_by_another])
+@pytest.mark.parametrize(
+    "change", [lambda file: file.write_text("mine"), replace_by_another]
+)
 def test_a_rig_file_that_somebody_changed_stays(tmp_path, change, capsys):
     file = tmp_path / "rig.json"
     with written_rig_file(Quiet(), file):
         assert json.loads(file.read_text()) == {"plan": {}}
         change(file)
         changed = file.read_bytes()
-    assert file.read_bytes() == changed and f"{file}: was changed, so it stays" in capsys.readouterr().out
+    assert (
+        file.read_bytes() == changed
+        and f"{file}: was changed, so it stays" in capsys.readouterr().out
+    )
 
 
 def test_a_rig_file_on_a_full_disk_leaves_nothing(tmp_path, little_space):
-    with little_space(5), pytest.raises(ValueError, match="rig.json: cannot be written .File too large.: name another"):
+    with (
+        little_space(5),
+        pytest.raises(
+            ValueError, match="rig.json: cannot be written .File too large.: name another"
+        ),
+    ):
         with written_rig_file(Quiet(), tmp_path / "rig.json"):
             pytest.fail("it was written")
     assert list(tmp_path.iterdir()) == []
@@ -106,7 +131,10 @@ def test_an_existing_rig_file_ends_the_command_line_at_once(tmp_path, capsys):
     file = tmp_path / "rig.json"
     file.write_text("mine")
     assert command_line.main(["emulate", "--rig-file", str(file)]) == 1
-    assert f"error: {file}: exists already" in capsys.readouterr().err and file.read_text() == "mine"
+    assert (
+        f"error: {file}: exists already" in capsys.readouterr().err
+        and file.read_text() == "mine"
+    )
 
 
 def test_the_command_line_cleans_up(tmp_path):
@@ -114,7 +142,11 @@ def test_the_command_line_cleans_up(tmp_path):
     call = [sys.executable, "-m", "lrfcal_lib", "emulate", "--rig-file", str(file)]
     run = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
     until(lambda: file.exists() or run.poll() is not None)
-    said = "".join(iter(run.stdout.readline, f"  rig file {file}   python -m lrfcal_lib record --help\n"))
+    said = "".join(
+        iter(
+            run.stdout.readline, f"  rig file {file}   python -m lrfcal_lib record --help\n"
+        )
+    )
     assert "place/NUMBER puts it at 1, 2" in said
     devices = json.loads(file.read_text())["devices"]
     folder = Path(devices["lrf"]["port"]).parent
@@ -124,6 +156,9 @@ def test_the_command_line_cleans_up(tmp_path):
     order = urllib.request.Request(f"{devices['control']}/place/1", method="POST")
     assert urllib.request.urlopen(order, timeout=DEADLINE).status == 204
     run.send_signal(signal.SIGTERM)
-    assert "the emulated rig is gone" in run.communicate(timeout=DEADLINE)[0] and run.returncode == 0
+    assert (
+        "the emulated rig is gone" in run.communicate(timeout=DEADLINE)[0]
+        and run.returncode == 0
+    )
     assert not file.exists() and not folder.exists()
     port.close()

@@ -35,15 +35,21 @@ def small(placements):
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.5])
-def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch_of_every_beam(world, placements, speed):
+def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch_of_every_beam(
+    world, placements, speed
+):
     world.put(1)
-    beam, start = SETUP.rig.beam, float(np.mean(placements[0].sweep))
+    beam = SETUP.rig.beam
+    start = float(np.mean(placements[0].sweep))
     world.head = Head(SETUP.rig.platform, pitch=start)
     world.head.move(0.0, start + 0.5, speed)
     times = 0.1 + QUARTERS % 4 / 75.08
     scans, _ = zip(*(world.scan(0, QUARTERS, times) for _ in range(30)), strict=True)
-    pitch, still = world.head.pitch(times), world_of(SETUP, placements[0].T_platform_board)
-    ideal = lrf.ideal_readings(beam, still, beam.bearings(), pitch + 0 * times, SETUP.rig.T_head_lrf)[0]
+    pitch = world.head.pitch(times)
+    still = world_of(SETUP, placements[0].T_platform_board)
+    ideal = lrf.ideal_readings(
+        beam, still, beam.bearings(), pitch + 0 * times, SETUP.rig.T_head_lrf
+    )[0]
     assert (np.ptp(pitch) > 0.01) == (speed > 0)
     error = np.array(scans) - beam.systematic - ideal
     assert np.nanstd(error) == pytest.approx(beam.sigma_range, rel=0.05)
@@ -51,8 +57,11 @@ def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch_of_every_beam(worl
 
 
 def test_the_board_is_moved_by_who_records(world):
-    data, driver = rig_data(), make_rig()
-    assert driver.move_board(1) is False and driver.hold_close("left", 0) is False  # there it is a person
+    data = rig_data()
+    driver = make_rig()
+    assert (
+        driver.move_board(1) is False and driver.hold_close("left", 0) is False
+    )  # there it is a person
     server = CameraServer(world)
     server.start()
     data["devices"]["control"] = server.control
@@ -60,7 +69,10 @@ def test_the_board_is_moved_by_who_records(world):
     assert driver.move_board(2) and world.place.key == ("placement", 2)
     assert driver.hold_close("left", 3) and world.place.key == ("close", "left", 3)
     for call, message in (
-        (lambda: driver.move_board(9), "control http:.* 400 'no placement 9; there are 1, 2, 3, 4, and none'"),
+        (
+            lambda: driver.move_board(9),
+            "control http:.* 400 'no placement 9; there are 1, 2, 3, 4, and none'",
+        ),
         (lambda: driver.move_board("x"), "invalid literal"),
         (lambda: driver.hold_close("left", 99), "no view 99 of camera 'left'"),
         (lambda: driver.hold_close("a/b", 0), "answers 404 'there are place/NUMBER"),
@@ -68,7 +80,9 @@ def test_the_board_is_moved_by_who_records(world):
         with pytest.raises(DeviceError, match=message):
             call()
     server.close()
-    with pytest.raises(DeviceError, match="is 'python -m lrfcal_lib emulate' still running"):
+    with pytest.raises(
+        DeviceError, match="is 'python -m lrfcal_lib emulate' still running"
+    ):
         driver.move_board(3)
 
 
@@ -96,7 +110,8 @@ def test_no_web_page_moves_the_board(world, order):
 
 
 def test_an_image_begun_before_a_move_is_not_sent(small):
-    server, drawn = CameraServer(small), []
+    server = CameraServer(small)
+    drawn = []
 
     def draw(name, scene, pitch):
         drawn.append(pitch)

@@ -33,7 +33,9 @@ def ply(cloud, tmp_path_factory):
 
 
 WRITERS = {  # by the name of the file
-    "calibration.json": lambda path, cloud, ply: write_calibration(path, {"numbers": [0.5] * LITTLE}),
+    "calibration.json": lambda path, cloud, ply: write_calibration(
+        path, {"numbers": [0.5] * LITTLE}
+    ),
     "cloud.ply": lambda path, cloud, ply: write_ply(path, cloud),
     "scene.pcd": lambda path, cloud, ply: write_pcd(path, ply),
 }
@@ -41,7 +43,9 @@ WRITERS = {  # by the name of the file
 
 @pytest.mark.parametrize("before", [None, "of an earlier run"])
 @pytest.mark.parametrize("name", WRITERS)
-def test_on_a_full_disk_a_file_stays_as_it_was(cloud, ply, tmp_path, little_space, name, before):
+def test_on_a_full_disk_a_file_stays_as_it_was(
+    cloud, ply, tmp_path, little_space, name, before
+):
     file = tmp_path / name
     if before is not None:
         file.write_text(before)
@@ -64,16 +68,26 @@ def test_a_cloud_that_breaks_off_leaves_no_file(cloud, tmp_path):
 
 def test_clouds_of_another_rig_are_refused_and_leave_no_file(quick, tmp_path):
     other = replace(quick.prepared, session=open_session(DATA / "sim_lms221"))
-    with pytest.raises(ValueError, match="camera 'left' has 640 x 480 pixels, its image 1024 x 768"):
+    with pytest.raises(
+        ValueError, match="camera 'left' has 640 x 480 pixels, its image 1024 x 768"
+    ):
         write_clouds(tmp_path, replace(quick, prepared=other), "joint")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_session_of_scenes_is_coloured_by_the_calibration_of_another(quick, tmp_path):
     session = quick.prepared.session
-    scenes = replace(session, placements=session.scene_placements, image_records=session.images(purpose="scene"))
-    found = write_clouds(tmp_path, replace(quick, prepared=replace(quick.prepared, session=scenes)), "joint")
-    assert [file.name for file in found] == ["scene.ply", "scene.pcd"] and all(map(type(found[0]).is_file, found))
+    scenes = replace(
+        session,
+        placements=session.scene_placements,
+        image_records=session.images(purpose="scene"),
+    )
+    found = write_clouds(
+        tmp_path, replace(quick, prepared=replace(quick.prepared, session=scenes)), "joint"
+    )
+    assert [file.name for file in found] == ["scene.ply", "scene.pcd"] and all(
+        map(type(found[0]).is_file, found)
+    )
 
 
 @pytest.fixture
@@ -82,7 +96,9 @@ def calibrate(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv(cache.VARIABLE, str(stages()))
 
     def calibrate(session):
-        code = command_line.main(["calibrate", str(session), "--out", str(tmp_path / "out")])
+        code = command_line.main(
+            ["calibrate", str(session), "--out", str(tmp_path / "out")]
+        )
         return code, *capsys.readouterr()
 
     return calibrate
@@ -91,8 +107,15 @@ def calibrate(tmp_path, monkeypatch, capsys):
 def test_calibrate_on_a_full_disk_says_so(calibrate, quick, tmp_path, little_space):
     with little_space(LITTLE):
         code, _, complaint = calibrate(QUICK)
-    assert code == 1 and complaint.startswith(f"error: {tmp_path}") and complaint.count("\n") == 1
-    assert ".ply: cannot be written (File too large): free some space, or name another folder" in complaint
+    assert (
+        code == 1
+        and complaint.startswith(f"error: {tmp_path}")
+        and complaint.count("\n") == 1
+    )
+    assert (
+        ".ply: cannot be written (File too large): free some space, or name another folder"
+        in complaint
+    )
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -103,5 +126,7 @@ def test_calibrate_says_that_scenes_are_no_boards(calibrate, tmp_path):
         writer.add_image("left", pixels(), 1, pitch=0.0, purpose="scene")
     code, said, complaint = calibrate(path)
     assert code == 3 and complaint == "" and said.count("\n") == 1
-    assert said.startswith(f"{path}: all placements show scenes, and a calibration needs the board: record three")
+    assert said.startswith(
+        f"{path}: all placements show scenes, and a calibration needs the board: record three"
+    )
     assert not (tmp_path / "out").exists()

@@ -23,7 +23,12 @@ STATED = np.radians(3.0), 0.03
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 
-LMS200 = {"spot": (0.012, 0.0044), "sigma_range": 0.005, "sigma_px": 0.1, "pitch_step": np.radians(1.0)}
+LMS200 = {
+    "spot": (0.012, 0.0044),
+    "sigma_range": 0.005,
+    "sigma_px": 0.1,
+    "pitch_step": np.radians(1.0),
+}
 QUARTER = {"step": np.radians(0.25), "sigma_px": 0.15, "pitch_step": np.radians(1.0)}
 FINE = {"pitch_step": np.radians(1.0)}
 
@@ -44,23 +49,46 @@ HARMFUL = {
     "angular step 1 % too large": scaled(bearings=-0.01),
     "spot stated twice as wide": changed(beam_radius=lambda radius: 2.0 * radius),
     "spot stated half as wide": changed(beam_radius=lambda radius: 0.5 * radius),
-    **{f"an edge stated {100 * share:.0f} % longer": edge_longer(share) for share in (0.05, 0.1, 0.2, 0.3)},
+    **{
+        f"an edge stated {100 * share:.0f} % longer": edge_longer(share)
+        for share in (0.05, 0.1, 0.2, 0.3)
+    },
 }
 
 
 def estimated(change, seed, mount="head", stated=True, **devices):
     """As much of a JointCalibration of falsified observations as is judged, the truth, and the rig."""
-    obs, truth, rig = draw(rng(seed), 16, mount=mount, **({"pitch_step": np.radians(2.0)} | devices))
+    obs, truth, rig = draw(
+        rng(seed), 16, mount=mount, **({"pitch_step": np.radians(2.0)} | devices)
+    )
     prior = PlatformPrior(rig.T_head_lrf, *STATED)
-    settings = {"sensor": SENSOR, "noise": "estimate", "lapse": 0.01, "sides": True, "axis": True, "prior": prior}
+    settings = {
+        "sensor": SENSOR,
+        "noise": "estimate",
+        "lapse": 0.01,
+        "sides": True,
+        "axis": True,
+        "prior": prior,
+    }
     T_head_lrf, settings["prior"] = (rig.T_head_lrf, prior) if stated else (None, None)
-    solution = solve_joint(change(replace(obs, T_head_lrf=T_head_lrf)), required=False, **settings)
-    cameras = {name: SimpleNamespace(guess=pose if stated else None) for name, pose in rig.cameras.items()}
+    solution = solve_joint(
+        change(replace(obs, T_head_lrf=T_head_lrf)), required=False, **settings
+    )
+    cameras = {
+        name: SimpleNamespace(guess=pose if stated else None)
+        for name, pose in rig.cameras.items()
+    }
     lrf = LrfInfo("home-made", (0.9, 2.2), 0.002, 0.005)
     board = replace(rig.board, pattern=Chessboard(4, 5, 0.029))
-    session = SimpleNamespace(lrf=lrf, board=board, T_head_lrf=T_head_lrf, platform_sigma=STATED, cameras=cameras)
+    session = SimpleNamespace(
+        lrf=lrf, board=board, T_head_lrf=T_head_lrf, platform_sigma=STATED, cameras=cameras
+    )
     prepared = SimpleNamespace(session=session, board=board)
-    return SimpleNamespace(prepared=prepared, solution=solution, settings=settings), truth, rig
+    return (
+        SimpleNamespace(prepared=prepared, solution=solution, settings=settings),
+        truth,
+        rig,
+    )
 
 
 def judged(change, seed, *options, **devices):
@@ -68,9 +96,15 @@ def judged(change, seed, *options, **devices):
     joint, truth, rig = estimated(change, seed, *options, **devices)
     solution = joint.solution
     reasons, doubt = contradicts_stated(joint)
-    reasons += verdict(solution, dict.fromkeys(rig.cameras, rig.model), suggest=False, doubt=doubt).reasons
+    reasons += verdict(
+        solution, dict.fromkeys(rig.cameras, rig.model), suggest=False, doubt=doubt
+    ).reasons
     whole = len(solution.boards) == len(truth.boards)
-    return reasons, state_errors(solution.state, truth, solution.unknowns)[:16] if whole else None, solution
+    return (
+        reasons,
+        state_errors(solution.state, truth, solution.unknowns)[:16] if whole else None,
+        solution,
+    )
 
 
 LIVE = (  # what test_alternatives does not falsify; the others in make campaign
@@ -79,12 +113,17 @@ LIVE = (  # what test_alternatives does not falsify; the others in make campaign
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in LIVE else campaign) for n in FALSIFIED])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if n in LIVE else campaign) for n in FALSIFIED]
+)
 def test_what_is_falsified_is_named(name):
     change, kinds = FALSIFIED[name]
     reasons, errors, solution = judged(change, 7)
     named = {reason.kind for reason in reasons} & set(kinds)
-    harmless = errors is not None and np.abs(errors / solution.solution.trusted_sigma[:16]).max() < 3.5
+    harmless = (
+        errors is not None
+        and np.abs(errors / solution.solution.trusted_sigma[:16]).max() < 3.5
+    )
     assert named or (harmless and not kinds), [reason.words for reason in reasons]
 
 
@@ -100,15 +139,25 @@ def moved(solution, honest):
     return np.abs(change / solution.solution.trusted_sigma[:16]).max()
 
 
-RIGS = [(2, "head", FINE), (3, "head", LMS200), (2, "head", QUARTER), (2, "platform", LMS200)]
+RIGS = [
+    (2, "head", FINE),
+    (3, "head", LMS200),
+    (2, "head", QUARTER),
+    (2, "platform", LMS200),
+]
 QUICKLY = "angular step 1 % too small"
 
 
 @pytest.mark.parametrize(
     ("seed", "mount", "devices", "names"),
-    [(3, "head", LMS200, [QUICKLY]), *(pytest.param(*rig, list(HARMFUL), marks=campaign) for rig in RIGS)],
+    [
+        (3, "head", LMS200, [QUICKLY]),
+        *(pytest.param(*rig, list(HARMFUL), marks=campaign) for rig in RIGS),
+    ],
 )
-def test_what_moves_the_result_by_two_standard_deviations_is_never_silent(seed, mount, devices, names):
+def test_what_moves_the_result_by_two_standard_deviations_is_never_silent(
+    seed, mount, devices, names
+):
     honest = judged(lambda obs: obs, seed, mount, **devices)[2]
     for name in names:
         reasons, _, solution = judged(HARMFUL[name], seed, mount, **devices)
@@ -124,7 +173,9 @@ def test_nor_is_it_in_recordings(request, name):
     for what, change in HARMFUL.items():
         falsified = change(joint.observations)
         solution = solve_joint(falsified, required=False, **joint.settings)
-        reasons = contradicts_stated(replace(joint, solution=solution))[0] + diagnose(solution)
+        reasons = contradicts_stated(replace(joint, solution=solution))[0] + diagnose(
+            solution
+        )
         if list(solution.boards) == list(joint.solution.boards):
             assert reasons or moved(solution, joint.solution) < 2.0, what
 
@@ -137,18 +188,31 @@ def test_noise_names_the_camera():
 
 
 def test_after_an_estimate_that_has_not_converged_nothing_is_weighed():
-    joint, *_ = estimated(lambda obs: scaled(squares=0.05)(obs).select(obs.placements[:8]), 7, "platform")
-    assert [reason.kind for reason in contradicts_stated(joint)[0]][0] in ("squares", "ranges")
-    lost = replace(joint.solution, solution=replace(joint.solution.solution, converged=False))
+    joint, *_ = estimated(
+        lambda obs: scaled(squares=0.05)(obs).select(obs.placements[:8]), 7, "platform"
+    )
+    assert [reason.kind for reason in contradicts_stated(joint)[0]][0] in (
+        "squares",
+        "ranges",
+    )
+    lost = replace(
+        joint.solution, solution=replace(joint.solution.solution, converged=False)
+    )
     reasons, doubt = contradicts_stated(SimpleNamespace(**vars(joint) | {"solution": lost}))
     assert [reason.kind for reason in reasons] == ["not weighed"] and doubt == 0.0
 
 
 @pytest.mark.parametrize(
     ("seed", "mount"),
-    [(11, "head"), (12, "platform"), *(pytest.param(*one, marks=campaign) for one in ((11, "platform"), (12, "head")))],
+    [
+        (11, "head"),
+        (12, "platform"),
+        *(pytest.param(*one, marks=campaign) for one in ((11, "platform"), (12, "head"))),
+    ],
 )
 def test_an_honest_recording_gives_no_alarm(seed, mount):
     reasons, errors, solution = judged(lambda obs: obs, seed, mount)
-    assert [reason.kind for reason in reasons if reason.kind not in ("error", "distance")] == []
+    assert [
+        reason.kind for reason in reasons if reason.kind not in ("error", "distance")
+    ] == []
     assert np.abs(errors / solution.solution.trusted_sigma[:16]).max() < 4.0

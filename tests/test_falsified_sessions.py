@@ -54,8 +54,23 @@ def test_what_was_done_is_named(name, folder):
 
 ACCUSATIONS = {
     *ALTERNATIVES,
-    *("repeated image", "repeated scan", "beyond range", "field of view", "dark", "exchanged"),
-    *("camera moved", "camera zoomed", "sense", "unit", "far from stated", "lens", "range offset"),
+    *(
+        "repeated image",
+        "repeated scan",
+        "beyond range",
+        "field of view",
+        "dark",
+        "exchanged",
+    ),
+    *(
+        "camera moved",
+        "camera zoomed",
+        "sense",
+        "unit",
+        "far from stated",
+        "lens",
+        "range offset",
+    ),
 }
 
 

@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from falsified_sessions import WAYS, Way, change_images, change_scans, copied, other_clock, replaced
+from falsified_sessions import (
+    WAYS,
+    Way,
+    change_images,
+    change_scans,
+    copied,
+    other_clock,
+    replaced,
+)
 from shared import DATA, QUICK
 
 from lrfcal_lib.acquire.checks import check_image, check_placement
@@ -33,7 +41,9 @@ def one_camera_of_another_clock(folder):
     """Times that are right, but for those of one camera."""
     other_clock(folder)
     table = (folder / "images.csv").read_text().splitlines()
-    table = [line if ",left," in line else "," + line.partition(",")[2] for line in table[1:]]
+    table = [
+        line if ",left," in line else "," + line.partition(",")[2] for line in table[1:]
+    ]
     header = "t_s,camera,file,placement,pitch_deg,purpose"
     replaced(folder / "images.csv", "\n".join([header, *table, ""]).encode())
 
@@ -91,7 +101,9 @@ def test_an_image_without_light_is_called_dark(folder):
 
 
 def test_a_copy_shares_nothing_that_is_changed(folder):
-    before = {file: file.read_bytes() for file in sorted(QUICK.rglob("*")) if file.is_file()}
+    before = {
+        file: file.read_bytes() for file in sorted(QUICK.rglob("*")) if file.is_file()
+    }
     change_images(folder, lambda pixels: pixels // 2, ("left",))
     WAYS["field of view"].change(folder)
     WAYS["pitch reversed"].change(folder)

@@ -8,7 +8,9 @@ from lrfcal_lib.model import geometry as g
 
 
 def random_transform(rng, angle=1.0, shift=0.3):
-    return RigidTransform.from_components(rng.normal(size=3) * shift, Rotation.from_rotvec(rng.normal(size=3) * angle))
+    return RigidTransform.from_components(
+        rng.normal(size=3) * shift, Rotation.from_rotvec(rng.normal(size=3) * angle)
+    )
 
 
 def test_polar_points_lie_in_the_scan_plane_at_their_range():
@@ -19,8 +21,13 @@ def test_polar_points_lie_in_the_scan_plane_at_their_range():
 
 def test_tilt_is_the_rotation_about_x():
     rng = np.random.default_rng(2)
-    p, pitch = rng.normal(size=(20, 3)), rng.normal(size=20)
-    np.testing.assert_allclose(g.tilt(p, pitch), Rotation.from_rotvec(np.outer(pitch, [1, 0, 0])).apply(p), atol=1e-14)
+    p = rng.normal(size=(20, 3))
+    pitch = rng.normal(size=20)
+    np.testing.assert_allclose(
+        g.tilt(p, pitch),
+        Rotation.from_rotvec(np.outer(pitch, [1, 0, 0])).apply(p),
+        atol=1e-14,
+    )
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.1, 1e-7])
@@ -40,7 +47,9 @@ def test_turning_about_x_and_sliding_along_x_do_not_change_the_axis():
 
 def test_plane_and_line_fits_recover_exact_data():
     rng = np.random.default_rng(8)
-    normal, distance, rms = g.fit_plane(np.column_stack([rng.normal(size=(9, 2)), np.full(9, -2.0)]))
+    normal, distance, rms = g.fit_plane(
+        np.column_stack([rng.normal(size=(9, 2)), np.full(9, -2.0)])
+    )
     np.testing.assert_allclose(np.r_[normal, distance], [0, 0, -1, 2], atol=1e-12)
     assert rms < 1e-9
     _, direction, rms = g.fit_line(np.outer(rng.normal(size=9), [1, 2, 2]) / 3 + 1)

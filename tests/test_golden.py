@@ -1,15 +1,28 @@
 """The tables of a small session, to the sixth digit; those of two others are compared where their notebooks run."""
 
 import pytest
-from notebook_runs import GOLDEN, NOTEBOOKS, WITH_SESSION, check_tables, run_plainly, tables_of
+from notebook_runs import (
+    GOLDEN,
+    NOTEBOOKS,
+    WITH_SESSION,
+    check_tables,
+    run_plainly,
+    tables_of,
+)
 from shared import QUICK, campaign, stages
 
 
 @pytest.mark.parametrize(
-    "path", [pytest.param(p, marks=campaign if p.stem > "05" else (), id=p.stem) for p in WITH_SESSION]
+    "path",
+    [
+        pytest.param(p, marks=campaign if p.stem > "05" else (), id=p.stem)
+        for p in WITH_SESSION
+    ],
 )
 def test_tables_of_the_small_session(path, tmp_path):
-    run_plainly(path, QUICK, stages(), tmp_path, drawn=False)  # figures are looked at on both larger sessions
+    run_plainly(
+        path, QUICK, stages(), tmp_path, drawn=False
+    )  # figures are looked at on both larger sessions
     check_tables(tmp_path, "sim_quick", path)
 
 

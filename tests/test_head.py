@@ -57,10 +57,14 @@ class Contrary(Head):
 
 def terse(raw):
     """Replies of some heads: tilts without sync and address, and one byte for a confirmation."""
-    return bytes([0, *raw[3:6], sum(raw[3:6]) % 256]) if len(raw) == pelco_d.FRAME else b"\x01"
+    return (
+        bytes([0, *raw[3:6], sum(raw[3:6]) % 256]) if len(raw) == pelco_d.FRAME else b"\x01"
+    )
 
 
-def emulated(*, head=Head, limits=(-math.pi / 2, math.pi / 2), settle=0.0, prepare=None, **options):
+def emulated(
+    *, head=Head, limits=(-math.pi / 2, math.pi / 2), settle=0.0, prepare=None, **options
+):
     """An emulated head on a virtual host; keywords are its habits."""
     options = {"baudrate": 38400, "speeds": SPEEDS, "go_speed": 120.0} | options
     device = virtual.head(head=head(Platform(settle=settle, limits=limits)), **options)
@@ -141,7 +145,9 @@ def test_heads_of_every_kind_move_to_where_they_are_sent(opened, kind):
     for degrees in (15.0, -10.0):  # the first one learns
         pitch = head.move_to(degrees * DEGREE)
         assert halted(device) and pitch == near(degrees, tolerance)
-        assert device.pitch() == pytest.approx(pitch, abs=(0.05 if head.has_feedback else 2.0) * DEGREE)
+        assert device.pitch() == pytest.approx(
+            pitch, abs=(0.05 if head.has_feedback else 2.0) * DEGREE
+        )
         assert head.pitch() == (pytest.approx(pitch, abs=0.05 * DEGREE), head.has_feedback)
         assert not head.moving()
 
@@ -157,7 +163,9 @@ def test_limits_are_named_and_nothing_moves(opened):
     device, head = opened()
     before = len(device.frames)
     for call in (head.move_to, head.start_sweep):
-        with pytest.raises(OutOfRange, match="-70.00 deg is beyond the head's limits of -60 to 60"):
+        with pytest.raises(
+            OutOfRange, match="-70.00 deg is beyond the head's limits of -60 to 60"
+        ):
             call(-70 * DEGREE)
     assert isinstance(pytest.raises(ValueError, head.move_to, math.nan).value, OutOfRange)
     assert len(device.frames) == before
@@ -172,26 +180,59 @@ def swept(degrees):
     return lambda head: head.start_sweep(degrees * DEGREE) or head.finish_sweep()
 
 
-TEN, PARTIAL, NONE = to(10), {"feedback": "partial"}, {"feedback": "none"}
+TEN = to(10)
+PARTIAL = {"feedback": "partial"}
+NONE = {"feedback": "none"}
 SLOW = replace(FAST, tilt_speed=0x08, degrees_per_second=12.0)
 FAILURES = [  # settings, habits, fault that lasts, call, what it raises
-    (FAST, {"limits": (-0.1, 0.1)}, None, lambda head: (to(5)(head), to(30)(head)), Refused,
-     "stays at 5.73 deg on its way to 30.00"),
+    (
+        FAST,
+        {"limits": (-0.1, 0.1)},
+        None,
+        lambda head: (to(5)(head), to(30)(head)),
+        Refused,
+        "stays at 5.73 deg on its way to 30.00",
+    ),
     (SURE, {}, "stall", TEN, Refused, "does not move: look for an end stop"),
-    (FAST, PARTIAL | {"head": Contrary}, None, to(30), Refused, "the other way: set invert"),
-    (replace(FAST, absolute=True), PARTIAL, None, to(10), Refused, "does not obey set-tilt"),
+    (
+        FAST,
+        PARTIAL | {"head": Contrary},
+        None,
+        to(30),
+        Refused,
+        "the other way: set invert",
+    ),
+    (
+        replace(FAST, absolute=True),
+        PARTIAL,
+        None,
+        to(10),
+        Refused,
+        "does not obey set-tilt",
+    ),
     (FAST, {}, "deaf", PanTilt.pitch, NoReply, "address 1 and 38400 Bd"),
     (FAST, {}, "deaf", TEN, NoReply, "address 1 and 38400 Bd"),
     (FAST, PARTIAL, None, swept(50), NoReply, "speed is unknown: state degrees_per_second"),
     (FAST, {"head": Contrary}, None, swept(50), Refused, "the other way"),
     (SLOW, {}, "stall", swept(20), Refused, "the sweep does not get to its end"),
     (FAST, {}, None, PanTilt.finish_sweep, DeviceError, "there was no sweep"),
-    (FAST, {}, None, lambda head: head.start_sweep(0.1, speed=64), ValueError, "speed is 64"),
+    (
+        FAST,
+        {},
+        None,
+        lambda head: head.start_sweep(0.1, speed=64),
+        ValueError,
+        "speed is 64",
+    ),
 ]
 
 
-@pytest.mark.parametrize(("settings", "habits", "fault", "call", "error", "message"), FAILURES)
-def test_what_cannot_be_is_said_and_the_head_stands(opened, settings, habits, fault, call, error, message):
+@pytest.mark.parametrize(
+    ("settings", "habits", "fault", "call", "error", "message"), FAILURES
+)
+def test_what_cannot_be_is_said_and_the_head_stands(
+    opened, settings, habits, fault, call, error, message
+):
     device, head = opened(settings, **habits)
     if fault is not None:
         device.faults.inject(fault, seconds=1e6)
@@ -213,7 +254,8 @@ SWEEPS = {"full": {}, "echo and general": {"echo": True, "confirms": True}, "sil
 def test_sweep_logs_the_pitch(opened, habits):
     device, head = opened(SLOW, **habits)
     head.move_to(-15 * DEGREE)
-    host, truth = device.host, []
+    host = device.host
+    truth = []
     begun = host.time()
     head.start_sweep(15 * DEGREE)
     assert head.moving()
@@ -240,8 +282,6 @@ def test_sweep_logs_the_pitch(opened, habits):
 @pytest.mark.parametrize(("settings", "habits", "stop", "above"), [
     (TIMED, NONE, PanTilt.stop, 5), (SURE, {}, PanTilt.emergency_stop, None),
 ])  # fmt: skip
-
-
 def test_stop_from_another_thread_ends_a_move(opened, settings, habits, stop, above):
     device, head = opened(settings, **habits)
     later(device, lambda: stop(head), degrees=above)
@@ -292,12 +332,17 @@ def test_the_end_of_the_process_stops_the_head(tmp_path, way):
             until(lambda: device.head.moving(device.host.now()) == moving)
 
         call = [sys.executable, "-c", SWEEPING, device.path, "0" if way == "exit" else "60"]
-        process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        process = subprocess.Popen(
+            call, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
         assert process.stdout.readline() == "moving\n"
         if way != "exit":
             becomes(moving=True)
             process.send_signal(getattr(signal, way))
-        assert process.wait(timeout=60) == {"exit": 0, "SIGTERM": 143, "SIGINT": -signal.SIGINT}[way]
+        assert (
+            process.wait(timeout=60)
+            == {"exit": 0, "SIGTERM": 143, "SIGINT": -signal.SIGINT}[way]
+        )
         assert process.stdout.read() == "files closed\n"
         becomes(moving=False)
     assert device.error is None
@@ -341,8 +386,6 @@ def test_head_that_falls_silent_in_a_move(opened):
     ({}, {"echo": True}, NoReply, "does not echo"),
     (None, {}, WrongDevice, "no Pelco-D at 38400 Bd"),
 ])  # fmt: skip
-
-
 def test_what_was_stated_and_does_not_come(habits, changes, error, message):
     device = emulated(**habits or {})
     if habits is None:
@@ -353,14 +396,20 @@ def test_what_was_stated_and_does_not_come(habits, changes, error, message):
         PanTilt("nowhere", FAST, host=device.host)
 
 
-@pytest.mark.parametrize("changes", [{"feedback": True}, {"feedback": True, "reply_s": 1.0}, {"feedback": "auto"}])
+@pytest.mark.parametrize(
+    "changes",
+    [{"feedback": True}, {"feedback": True, "reply_s": 1.0}, {"feedback": "auto"}],
+)
 def test_what_to_state_for_a_head_that_answers_late(changes):
     device = emulated()
     reply = device.reply
     device.reply = lambda raw, at: reply(raw, at + 0.6)
     settings = replace(FAST, **changes)
     if changes == {"feedback": True}:
-        with pytest.raises(NoReply, match='longer reply_s than 0.1 s if it answers late, or feedback "auto"'):
+        with pytest.raises(
+            NoReply,
+            match='longer reply_s than 0.1 s if it answers late, or feedback "auto"',
+        ):
             driven(device, settings)
     else:
         with driven(device, settings) as head:
@@ -373,7 +422,8 @@ def test_no_fault_ends_in_a_wrong_pitch(opened, kind):
     device, head = opened(replace(FAST, retries=3, reconnect_s=3.0), settle=0.05)
     for goal in (4, -4):
         device.faults.inject(kind, 1 if kind == "unplug" else 2)
-        begun, pitch = device.host.now(), None
+        begun = device.host.now()
+        pitch = None
         with contextlib.suppress(DeviceError):
             pitch = head.move_to(goal * DEGREE)
         assert device.host.now() - begun < 10

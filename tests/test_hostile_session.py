@@ -23,9 +23,18 @@ from lrfcal_lib.session.lock import alone
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
 
-SCANS = ["session.json", "lrf/scans.npz", "images.csv", "edges.csv", "images/left/0001.png", "truth.json"]
+SCANS = [
+    "session.json",
+    "lrf/scans.npz",
+    "images.csv",
+    "edges.csv",
+    "images/left/0001.png",
+    "truth.json",
+]
 FILES = [f"scans/{name}" for name in SCANS]
-FILES += [f"telegrams/{name}" for name in ("lrf/telegrams.bin", "lrf/index.csv", "platform.csv")]
+FILES += [
+    f"telegrams/{name}" for name in ("lrf/telegrams.bin", "lrf/index.csv", "platform.csv")
+]
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +69,16 @@ def test_only_plain_files_of_a_size_are_read(folder, name, told):
         fuzz.read_all(folder / name.partition("/")[0])
 
 
-LINKS = {"is a link": Path.symlink_to, r"has another name elsewhere \(a hard link\); copy": Path.hardlink_to}
+LINKS = {
+    "is a link": Path.symlink_to,
+    r"has another name elsewhere \(a hard link\); copy": Path.hardlink_to,
+}
 
 
-WRITTEN_ANEW = ("images.csv", "lrf/index.csv")  # as a draft, when a recording goes on, without what was broken off
+WRITTEN_ANEW = (
+    "images.csv",
+    "lrf/index.csv",
+)  # as a draft, when a recording goes on, without what was broken off
 
 
 @pytest.mark.parametrize("link", LINKS)
@@ -97,7 +112,10 @@ def lying(path, shape, kind="<f8"):
 def stated_header(path):
     """Ranges whose header would be 896 MB long, of which a few are there."""
     with zipfile.ZipFile(path / "lrf" / "scans.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("ranges.npy", b"\x93NUMPY\2\0" + (896_000_000).to_bytes(4, "little") + b" " * 1_000_000)
+        archive.writestr(
+            "ranges.npy",
+            b"\x93NUMPY\2\0" + (896_000_000).to_bytes(4, "little") + b" " * 1_000_000,
+        )
 
 
 def many_members(path):
@@ -151,30 +169,51 @@ def named_again(path):
         table.write(",left,images//left/./0001.png,2,,board\n")
 
 
-DEEP, LONG = "[" * 100_000, "9" * 5000
+DEEP = "[" * 100_000
+LONG = "9" * 5000
 DAMAGE = {
-    "scans.npz: 10000000000 values of scan lines, more than": lambda p: lying(p, "(100000, 100000)"),
-    "scans.npz: ranges cannot be read: it holds [|]V1000000": lambda p: lying(p, "(6, 61)", "|V1000000"),
+    "scans.npz: 10000000000 values of scan lines, more than": lambda p: lying(
+        p, "(100000, 100000)"
+    ),
+    "scans.npz: ranges cannot be read: it holds [|]V1000000": lambda p: lying(
+        p, "(6, 61)", "|V1000000"
+    ),
     "scans.npz: cannot be read .*; truncated": lambda p: lying(p, "(6, 61"),
     "scans.npz: cannot be read .*expected 896000000 bytes got 9988": stated_header,
     "scans.npz: holds 206 files, more than 100; write it again": many_members,
     "scans.npz: ranges is packed in another way than numpy does; write it again": repacked,
-    "0001.jpg: a JPEG of 110 scans, more than 100; write": jpeg(scans_again, IMWRITE_JPEG_PROGRESSIVE=1),
+    "0001.jpg: a JPEG of 110 scans, more than 100; write": jpeg(
+        scans_again, IMWRITE_JPEG_PROGRESSIVE=1
+    ),
     "0001.jpg: a JPEG of 11000 segments of remarks, more than 10000": jpeg(
         lambda data: data[:2] + 11_000 * b"\xff\xe1\0\2" + data[2:]
     ),
-    "0001.jpg: the image is truncated after": jpeg(lambda data: data[:2] + 10_000 * b"\xff\xe5\0\2" + data[2:]),
-    "images.csv line 7: 'images//left/./0001.png' stands in line 4 already; remove one": lambda p: named_again(p),
-    "left.height is 30000: at most 30000000 pixels": bomb,
-    "session.json: not JSON .*recursion": replaced("session.json", '"source": ""', f'"source": {DEEP}'),
-    "session.json: not JSON .*integer": replaced("session.json", '"source": ""', f'"source": {LONG}'),
-    "session.json: nested deeper": replaced("session.json", '"source": ""', '"source": ' + "[" * 90 + "]" * 90),
-    "placements.0 is inf: a finite number": replaced("session.json", '"placements": [\n  1', '"placements": [1e999'),
-    "left.width is inf: a finite number": replaced("session.json", "160", "1e999"),
-    "truth.json .*simulate the session again.* 'items'": lambda p: (p / "truth.json").write_text(
-        json.dumps(json.loads((p / "truth.json").read_text()) | {"cameras": []})
+    "0001.jpg: the image is truncated after": jpeg(
+        lambda data: data[:2] + 10_000 * b"\xff\xe5\0\2" + data[2:]
     ),
-    "truth.json .*key 'T_camera_platform' is missing": replaced("truth.json", '{"T_camera_lrf"', '{"pose"'),
+    "images.csv line 7: 'images//left/./0001.png' stands in line 4 already; remove one": lambda p: (
+        named_again(p)
+    ),
+    "left.height is 30000: at most 30000000 pixels": bomb,
+    "session.json: not JSON .*recursion": replaced(
+        "session.json", '"source": ""', f'"source": {DEEP}'
+    ),
+    "session.json: not JSON .*integer": replaced(
+        "session.json", '"source": ""', f'"source": {LONG}'
+    ),
+    "session.json: nested deeper": replaced(
+        "session.json", '"source": ""', '"source": ' + "[" * 90 + "]" * 90
+    ),
+    "placements.0 is inf: a finite number": replaced(
+        "session.json", '"placements": [\n  1', '"placements": [1e999'
+    ),
+    "left.width is inf: a finite number": replaced("session.json", "160", "1e999"),
+    "truth.json .*simulate the session again.* 'items'": lambda p: (
+        p / "truth.json"
+    ).write_text(json.dumps(json.loads((p / "truth.json").read_text()) | {"cameras": []})),
+    "truth.json .*key 'T_camera_platform' is missing": replaced(
+        "truth.json", '{"T_camera_lrf"', '{"pose"'
+    ),
     "truth.json .*it is None: an object is needed": lambda p: (p / "truth.json").write_text(
         json.dumps(json.loads((p / "truth.json").read_text()) | {"T_head_lrf": None})
     ),
@@ -202,7 +241,9 @@ def limited(call):
     """What a call yields, as text, in a process with the memory and the time of `make fuzz`."""
     same = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", LIMITED, call]
-    return subprocess.run(command, env=same, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+    return subprocess.run(
+        command, env=same, stdout=subprocess.PIPE, text=True, check=True
+    ).stdout.strip()
 
 
 @campaign
@@ -230,7 +271,9 @@ def test_opencv_s_refusals_are_errors_in_the_values():
     points = fuzz.PATTERN.points()
     with pytest.raises(ValueError, match="20 corners do not determine a pose"):
         first_pose(points, np.full((20, 2), 1e300), fuzz.MODEL)
-    with pytest.raises(ValueError, match="3 views of the pattern do not determine the intrinsics"):
+    with pytest.raises(
+        ValueError, match="3 views of the pattern do not determine the intrinsics"
+    ):
         estimate_intrinsics([np.zeros((20, 2))] * 3, fuzz.PATTERN, (0, 0))
 
 
@@ -260,7 +303,10 @@ def test_a_lock_whose_file_was_removed_is_not_held(folder, monkeypatch):
             return lock(*arguments)
 
         monkeypatch.setattr(fcntl, "flock", late)
-        with pytest.raises(SessionError, match="writes this session"), alone(folder / "scans"):
+        with (
+            pytest.raises(SessionError, match="writes this session"),
+            alone(folder / "scans"),
+        ):
             pytest.fail("two hold it")
 
 
@@ -280,7 +326,9 @@ def take(path, times, both):
 def test_never_two_hold_the_lock(tmp_path, times):
     fork = multiprocessing.get_context("fork")
     both = fork.Value("i", 0)
-    takers = [fork.Process(target=take, args=(tmp_path, times // 3, both)) for _ in range(3)]
+    takers = [
+        fork.Process(target=take, args=(tmp_path, times // 3, both)) for _ in range(3)
+    ]
     for taker in takers:
         taker.start()
     for taker in takers:
@@ -291,23 +339,40 @@ def test_never_two_hold_the_lock(tmp_path, times):
 def test_names_of_a_stranger_do_not_steer_the_terminal(folder, capsys):
     names = "images/left/\x1b]0;owned\x07.png", "images/left/\u202egnp.png"
     shutil.copytree(folder / "scans", sound := folder / "\x1b[31msound")
-    assert main(["check", str(sound)]) == 0 and "\\x1b[31msound: nothing" in capsys.readouterr().out
+    assert (
+        main(["check", str(sound)]) == 0
+        and "\\x1b[31msound: nothing" in capsys.readouterr().out
+    )
     for name in names:
         shutil.copytree(folder / "scans", path := folder / f"\x1b[31m{names.index(name)}")
         replaced("images.csv", "images/left/0001.png", name)(path)
         assert main(["check", str(path)]) == 1
         told = capsys.readouterr()
         assert (told.out + told.err).replace("\n", "").isprintable()
-        assert "must be printable" in told.out and ascii(name)[1:-1] in told.out and "\\x1b[31m" in told.out
+        assert (
+            "must be printable" in told.out
+            and ascii(name)[1:-1] in told.out
+            and "\\x1b[31m" in told.out
+        )
 
 
 def test_check_finds_what_two_writers_or_hands_do_to_tables(folder):
     with (folder / "scans" / "edges.csv").open("a") as table:
         table.write("left,images/left/0001.png,ab,1,2,20,9\n")
     told = "\n".join(validate(folder / "scans"))
-    assert "edges.csv line 4: left, images/left/0001.png, ab stands in line 2 already; remove one" in told
-    replaced("images.csv", "\n2", "\nnoon")(folder / "telegrams")  # of the placement that was not finished
+    assert (
+        "edges.csv line 4: left, images/left/0001.png, ab stands in line 2 already; remove one"
+        in told
+    )
+    replaced("images.csv", "\n2", "\nnoon")(
+        folder / "telegrams"
+    )  # of the placement that was not finished
     replaced("lrf/index.csv", "\n1.5", "\n0.5")(folder / "telegrams")
     told = "\n".join(validate(folder / "telegrams"))
-    assert re.search("images.csv line 3: t_s is 'noon.*': a number of seconds is needed", told)
-    assert re.search(r"index.csv line 3: t_s runs back from 1 to 0.5: two writers at once\? Record the", told)
+    assert re.search(
+        "images.csv line 3: t_s is 'noon.*': a number of seconds is needed", told
+    )
+    assert re.search(
+        r"index.csv line 3: t_s runs back from 1 to 0.5: two writers at once\? Record the",
+        told,
+    )

@@ -15,7 +15,9 @@ from lrfcal_lib.report import report
 from lrfcal_lib.session.read import validate
 
 IMAGE = '"><img src=x onerror="window.pwned=1">'
-HOSTILE = f"{IMAGE}</title></script></pre></textarea><script>window.pwned=1</script>&lt;b&gt;"
+HOSTILE = (
+    f"{IMAGE}</title></script></pre></textarea><script>window.pwned=1</script>&lt;b&gt;"
+)
 # every text of session.json by its place; whether it is refused, or else what a report shows
 TEXTS = {
     "schema": "refused", "name": "refused", "licence": "shown", "source": "shown", "board.name": "shown",
@@ -36,15 +38,30 @@ notebook.verdict(everything, texts)
 notebook.finding("all", everything, everything, everything)
 notebook.save(plt.figure(), "empty", everything)
 """
-ENDS = ('notebook.table(df, "texts", caption=everything)', "df", "texts", "raise ValueError(everything)")
+ENDS = (
+    'notebook.table(df, "texts", caption=everything)',
+    "df",
+    "texts",
+    "raise ValueError(everything)",
+)
 
 
 def texts_of(value, place=()):
     """Every text in an object of JSON, by its place."""
     if isinstance(value, str):
         return {".".join(place): value}
-    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return {name: text for key, part in pairs for name, text in texts_of(part, (*place, str(key))).items()}
+    pairs = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
+    return {
+        name: text
+        for key, part in pairs
+        for name, text in texts_of(part, (*place, str(key))).items()
+    }
 
 
 def replace(folder, old, new):
@@ -70,7 +87,11 @@ def test_a_text_is_refused_or_accepted_as_it_is(folder, place):
     text = texts_of(json.loads((folder / "session.json").read_text()))[place]
     replace(folder, text, text + HOSTILE)
     problems = validate(folder)
-    assert problems == [] if TEXTS[place] == "shown" else problems[0].startswith(str(folder / "session.json"))
+    assert (
+        problems == []
+        if TEXTS[place] == "shown"
+        else problems[0].startswith(str(folder / "session.json"))
+    )
 
 
 def test_no_text_is_missing_above():
@@ -85,7 +106,9 @@ def hostile(tmp_path_factory):
     for text in {found[place] for place, what in TEXTS.items() if what == "shown"}:
         replace(folder, text, text + HOSTILE)
     rename_image(folder, f"{IMAGE}.jpg")
-    return folder, [found[place] + HOSTILE for place, what in TEXTS.items() if what == "shown"] + [f"{IMAGE}.jpg"]
+    return folder, [
+        found[place] + HOSTILE for place, what in TEXTS.items() if what == "shown"
+    ] + [f"{IMAGE}.jpg"]
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +130,9 @@ def seen(page):
 def test_nothing_runs_in_a_report_and_all_of_it_can_be_read(hostile, page, tmp_path):
     folder, texts = hostile
     shown = write_notebook(tmp_path / "00_show.ipynb", SHOW, *ENDS)
-    runs = report.make_report(folder, tmp_path / "out", notebooks=[shown, *ROOT.glob("notebooks/01_*.ipynb")])
+    runs = report.make_report(
+        folder, tmp_path / "out", notebooks=[shown, *ROOT.glob("notebooks/01_*.ipynb")]
+    )
     assert [bool(run.error) for run in runs] == [True, False], runs[1].error
     pages = sorted((tmp_path / "out").glob("*.html"))
     assert [file.name[:5] for file in pages] == ["00_sh", "01_in", "index"]
@@ -119,11 +144,25 @@ def test_nothing_runs_in_a_report_and_all_of_it_can_be_read(hostile, page, tmp_p
 
 
 def test_nothing_runs_in_the_panel(page):
-    light, task = Light(HOSTILE, "warn", HOSTILE), SimpleNamespace(title=HOSTILE, guidance=HOSTILE)
+    light = Light(HOSTILE, "warn", HOSTILE)
+    task = SimpleNamespace(title=HOSTILE, guidance=HOSTILE)
     vector = ((0.0,) * 3,) * 4
-    result = SimpleNamespace(answer="no", sentences=(f"a: {HOSTILE}", HOSTILE), file=HOSTILE, poses={HOSTILE: vector})
-    said = [panel.HTML.title(HOSTILE), panel.HTML.soft(HOSTILE), panel.HTML.state("busy", HOSTILE)]
-    said += [panel.HTML.error(HOSTILE, HOSTILE), panel.HTML.notes([HOSTILE]), panel.HTML.lights(HOSTILE, [light])]
+    result = SimpleNamespace(
+        answer="no",
+        sentences=(f"a: {HOSTILE}", HOSTILE),
+        file=HOSTILE,
+        poses={HOSTILE: vector},
+    )
+    said = [
+        panel.HTML.title(HOSTILE),
+        panel.HTML.soft(HOSTILE),
+        panel.HTML.state("busy", HOSTILE),
+    ]
+    said += [
+        panel.HTML.error(HOSTILE, HOSTILE),
+        panel.HTML.notes([HOSTILE]),
+        panel.HTML.lights(HOSTILE, [light]),
+    ]
     said += [panel.HTML.task(task, True, (1,)), panel.HTML.result(result)]
     page.goto("about:blank")
     page.set_content("".join(f"<div>{part}</div>" for part in said))

@@ -20,7 +20,9 @@ FLOORS = [
     {"evaluate"},
     {"acquire", "report"},
 ]
-FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names} | {"__main__": len(FLOORS)}
+FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names} | {
+    "__main__": len(FLOORS)
+}
 MODULES = sorted(LIBRARY.rglob("*.py"))
 
 
@@ -34,12 +36,17 @@ NAMES = {name_of(path) for path in MODULES}
 
 def imported(path, *, lazily=True):
     """Modules of the library that a file imports; without those that functions import when they are called."""
-    tree, found = ast.parse(path.read_text()), set()
+    tree = ast.parse(path.read_text())
+    found = set()
     for node in ast.walk(tree) if lazily else tree.body:
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names if alias.name.startswith("lrfcal_lib")}
+            found |= {
+                alias.name for alias in node.names if alias.name.startswith("lrfcal_lib")
+            }
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path.name} imports relatively: the direction could not be seen"
+            assert node.level == 0, (
+                f"{path.name} imports relatively: the direction could not be seen"
+            )
             longer = {f"{node.module}.{alias.name}" for alias in node.names} & NAMES
             found |= longer or ({node.module} if node.module in NAMES else set())
     return found
@@ -49,12 +56,16 @@ def imported(path, *, lazily=True):
 def test_imports_point_down(path):
     part = path.relative_to(LIBRARY).with_suffix("").parts[0]
     others = {name.split(".")[1] for name in imported(path) if "." in name} - {part}
-    assert part == "__init__" and not others or part in FLOOR, f"{part} stands on no floor yet"
+    assert part == "__init__" and not others or part in FLOOR, (
+        f"{part} stands on no floor yet"
+    )
     assert not {other for other in others if FLOOR[other] >= FLOOR[part]}
 
 
 def test_no_circle_among_modules():
-    graph = {name_of(path): imported(path, lazily=False) - {name_of(path)} for path in MODULES}
+    graph = {
+        name_of(path): imported(path, lazily=False) - {name_of(path)} for path in MODULES
+    }
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -69,7 +80,10 @@ for name in ("model", "fit", "session", "preprocess", "solvers"):
         importlib.import_module(found.name)
 """
 LIGHT = {  # code, what it must not load
-    "solvers and preprocessing": (WALK, {"open3d", "pandas", "matplotlib", "serial", "IPython", "scipy.stats"}),
+    "solvers and preprocessing": (
+        WALK,
+        {"open3d", "pandas", "matplotlib", "serial", "IPython", "scipy.stats"},
+    ),
     "the package": ("import lrfcal_lib", {"numpy"}),
     "help": ("from lrfcal_lib.__main__ import parser; parser()", {"numpy"}),
 }
@@ -111,8 +125,12 @@ def test_a_part_can_be_had_alone(what):
     done = subprocess.run([sys.executable, "-c", shown], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     loaded = {path for path in MODULES if name_of(path) in done.stdout.split()}
-    loaded = {path for path in loaded if count_nodes(path) > 1}  # a folder's __init__ may hold its docstring only
+    loaded = {
+        path for path in loaded if count_nodes(path) > 1
+    }  # a folder's __init__ may hold its docstring only
     names = {name_of(path) for path in loaded}
-    assert not {name for name in names if name.removeprefix("lrfcal_lib.").startswith(others)}
+    assert not {
+        name for name in names if name.removeprefix("lrfcal_lib.").startswith(others)
+    }
     assert len(loaded) <= modules, sorted(names)
     assert sum(map(count_nodes, loaded)) <= nodes

@@ -39,12 +39,20 @@ def test_small_squares_widen_the_covariance_and_are_named():
         found, covariance, _ = board_pose(pixels, PATTERN, MODEL)
         middle = found.apply(PATTERN.points().mean(axis=0))
         added = intrinsics.scale_covariance(found, pixels, PATTERN)
-        np.testing.assert_allclose(np.sqrt(np.trace(added)), least * np.linalg.norm(middle), rtol=0.05, atol=2e-6)
+        np.testing.assert_allclose(
+            np.sqrt(np.trace(added)), least * np.linalg.norm(middle), rtol=0.05, atol=2e-6
+        )
         assert np.all(np.diag(covariance) > np.diag(added))
-        words = survey.small_squares({"left": {4: BoardView(pixels=pixels), 7: BoardView()}}, PATTERN)
+        words = survey.small_squares(
+            {"left": {4: BoardView(pixels=pixels), 7: BoardView()}}, PATTERN
+        )
         assert ("left" in words) == (side < 9)
-    assert words == {} == survey.small_squares({"left": {4: BoardView(pixels=pixels)}}, None)
-    assert scale_error(square_px(np.full((24, 2), np.nan), (6, 4))) == 0.01  # no two neighbours
+    assert (
+        words == {} == survey.small_squares({"left": {4: BoardView(pixels=pixels)}}, None)
+    )
+    assert (
+        scale_error(square_px(np.full((24, 2), np.nan), (6, 4))) == 0.01
+    )  # no two neighbours
 
 
 def test_intrinsics_without_noise_are_exact():
@@ -53,35 +61,56 @@ def test_intrinsics_without_noise_are_exact():
     model = result.models[0]
     np.testing.assert_allclose(model.parameters, MODEL.parameters, atol=2e-5)
     assert (model.width, model.height) == SIZE and model.rms_px < 1e-5
-    np.testing.assert_allclose(result.poses.as_matrix(), [true.as_matrix() for true in poses], atol=1e-6)
+    np.testing.assert_allclose(
+        result.poses.as_matrix(), [true.as_matrix() for true in poses], atol=1e-6
+    )
 
 
 def test_intrinsics_covariance_tells_the_error():
-    poses, errors = view_poses(8, seed=2), []
+    poses = view_poses(8, seed=2)
+    errors = []
     for seed in range(30):
         model = estimate_intrinsics(pixels_of(poses, 0.2, seed), PATTERN, SIZE).models[0]
-        errors.append((model.parameters - MODEL.parameters)[:8] / np.sqrt(np.diag(model.covariance))[:8])
+        errors.append(
+            (model.parameters - MODEL.parameters)[:8]
+            / np.sqrt(np.diag(model.covariance))[:8]
+        )
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.25
 
 
 def test_third_radial_term_stays_out_unless_the_images_need_it():
     rng = np.random.default_rng(4)
-    poses = [pose_of(0, rng.uniform(-0.4, 0.4, 2), (*rng.uniform(-0.3, 0.3, 2), 0.8)) for _ in range(10)]
-    assert estimate_intrinsics(pixels_of(poses, 0.1), PATTERN, SIZE).models[0].distortion[4] == 0
+    poses = [
+        pose_of(0, rng.uniform(-0.4, 0.4, 2), (*rng.uniform(-0.3, 0.3, 2), 0.8))
+        for _ in range(10)
+    ]
+    assert (
+        estimate_intrinsics(pixels_of(poses, 0.1), PATTERN, SIZE).models[0].distortion[4]
+        == 0
+    )
     bent = MODEL.with_parameters([*MODEL.parameters[:8], 1.5])
     model = estimate_intrinsics(pixels_of(poses, 0.1, model=bent), PATTERN, SIZE).models[0]
-    assert model.distortion[4] == pytest.approx(1.5, abs=4 * np.sqrt(model.covariance[8, 8]))
+    assert model.distortion[4] == pytest.approx(
+        1.5, abs=4 * np.sqrt(model.covariance[8, 8])
+    )
 
 
 def test_waves_of_the_sheet_are_found_and_only_where_there_are_any():
-    points, poses = PATTERN.points(), view_poses(12, seed=5)
+    points = PATTERN.points()
+    poses = view_poses(12, seed=5)
     basis = waves(points)
-    heights = basis @ basis.T @ (0.001 * np.sin(40 * points[:, 0]) * np.cos(25 * points[:, 1]))
+    heights = (
+        basis @ basis.T @ (0.001 * np.sin(40 * points[:, 0]) * np.cos(25 * points[:, 1]))
+    )
     bumpy = pixels_of(poses, 0.02, points=points + heights[:, None] * [0, 0, 1])
     result = estimate_intrinsics(bumpy, PATTERN, SIZE, relief=True)
     np.testing.assert_allclose(result.relief, heights, atol=2e-4)
-    assert abs(result.models[0].fx - MODEL.fx) < 4 * np.sqrt(result.models[0].covariance[0, 0])
-    np.testing.assert_allclose(estimate_relief(bumpy, PATTERN, MODEL).relief, heights, atol=2e-4)
+    assert abs(result.models[0].fx - MODEL.fx) < 4 * np.sqrt(
+        result.models[0].covariance[0, 0]
+    )
+    np.testing.assert_allclose(
+        estimate_relief(bumpy, PATTERN, MODEL).relief, heights, atol=2e-4
+    )
     assert not estimate_relief(pixels_of(poses, 0.05), PATTERN, MODEL).relief.any()
 
 
@@ -100,8 +129,6 @@ PARALLEL = [pose_of(0.3 * i, (0.0, 0.0), (0.02 * i, 0.0, 0.8 + 0.1 * i)) for i i
     "two points 0.00 px apart": lambda: picked_edge("top", np.full((2, 2), 3.0), np.zeros(2)),
     "predicted length is 3 px": lambda: refine_edge(BLANK, MODEL, "top", *np.array([[10, 10], [13, 10], [0, -1]]), 5.0),
 }.items())  # fmt: skip
-
-
 def test_what_does_not_suffice(message, call):
     with pytest.raises(ValueError, match=message):
         call()
@@ -111,14 +138,23 @@ def test_pose_without_noise_is_exact_and_its_covariance_tells_the_error():
     pose = pose_of(0.3)
     got = board_pose(pixels_of([pose])[0], PATTERN, MODEL)[0]
     np.testing.assert_allclose(got.as_matrix(), pose.as_matrix(), atol=1e-8)
-    chi2 = [score(*board_pose(pixels_of([pose], 0.3, s)[0], PATTERN, MODEL)[:2], pose) for s in range(60)]
+    chi2 = [
+        score(*board_pose(pixels_of([pose], 0.3, s)[0], PATTERN, MODEL)[:2], pose)
+        for s in range(60)
+    ]
     assert 0.6 < np.mean(chi2) < 1.4
 
 
 def test_errors_that_agree_between_neighbours_widen_the_covariance():
-    pose, rng, chi2 = pose_of(0.3), np.random.default_rng(1), []
+    pose = pose_of(0.3)
+    rng = np.random.default_rng(1)
+    chi2 = []
     for _ in range(40):
-        coarse = cv2.resize(rng.normal(0, 0.3, (3, 3, 2)), (6, 4), interpolation=cv2.INTER_CUBIC)
+        coarse = cv2.resize(
+            rng.normal(0, 0.3, (3, 3, 2)), (6, 4), interpolation=cv2.INTER_CUBIC
+        )
         noise = coarse.reshape(-1, 2) + rng.normal(0, 0.05, (24, 2))
-        chi2.append(score(*board_pose(pixels_of([pose])[0] + noise, PATTERN, MODEL)[:2], pose))
+        chi2.append(
+            score(*board_pose(pixels_of([pose])[0] + noise, PATTERN, MODEL)[:2], pose)
+        )
     assert np.mean(chi2) < 5

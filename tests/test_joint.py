@@ -50,21 +50,36 @@ def another_platform_stated(obs, found):
 def in_another_order(obs, chance):
     """The same observations, placements and rows shuffled."""
     order = chance.permutation(len(obs.placements))
-    rows = {group: chance.permutation(len(getattr(obs, f"{group}_placement"))) for group in ("face", "beam", "view")}
+    rows = {
+        group: chance.permutation(len(getattr(obs, f"{group}_placement")))
+        for group in ("face", "beam", "view")
+    }
     shuffled = obs.keep(**rows)
-    moved = {f"{group}_placement": np.argsort(order)[getattr(shuffled, f"{group}_placement")] for group in rows}
-    own = {name: getattr(obs, name)[order] for name in ("placements", "direction", "middle")}
+    moved = {
+        f"{group}_placement": np.argsort(order)[getattr(shuffled, f"{group}_placement")]
+        for group in rows
+    }
+    own = {
+        name: getattr(obs, name)[order] for name in ("placements", "direction", "middle")
+    }
     return replace(shuffled, **moved, **own)
 
 
 @MOUNTS
 def test_the_order_of_placements_and_rows_changes_nothing(mount):
     obs, *_ = draw(rng(), 8, mount=mount)
-    found, other = (solve_joint(each, noise="estimate") for each in (obs, in_another_order(obs, rng(1))))
-    assert np.all(np.abs(found.solution.parameters - other.solution.parameters) < 0.01 * found.solution.sigma)
+    found, other = (
+        solve_joint(each, noise="estimate") for each in (obs, in_another_order(obs, rng(1)))
+    )
+    assert np.all(
+        np.abs(found.solution.parameters - other.solution.parameters)
+        < 0.01 * found.solution.sigma
+    )
     np.testing.assert_allclose(other.solution.sigma, found.solution.sigma, rtol=1e-3)
     for number, T in found.boards.items():
-        assert apart(other.boards[number], T) < SAME and np.isclose(found.misfit[number], other.misfit[number], rtol=1e-2)
+        assert apart(other.boards[number], T) < SAME and np.isclose(
+            found.misfit[number], other.misfit[number], rtol=1e-2
+        )
 
 
 @MOUNTS
@@ -76,10 +91,17 @@ def test_what_only_turns_the_frame_of_the_platform_changes_nothing_else(change, 
     changed, frame = change(obs, found)
     other = solve_joint(changed)
     assert max(axis_difference(found.axis, other.axis)) < SAME
-    assert np.isclose(found.solution.cost_history[-1], other.solution.cost_history[-1], rtol=1e-6)
-    assert change is not another_platform_stated or apart(other.T_head_lrf, frame * found.T_head_lrf) < SAME
+    assert np.isclose(
+        found.solution.cost_history[-1], other.solution.cost_history[-1], rtol=1e-6
+    )
+    assert (
+        change is not another_platform_stated
+        or apart(other.T_head_lrf, frame * found.T_head_lrf) < SAME
+    )
     for name, T in found.transforms.items():
-        assert apart(other.transforms[name], T if mount == "head" else T * frame.inv()) < SAME
+        assert (
+            apart(other.transforms[name], T if mount == "head" else T * frame.inv()) < SAME
+        )
     for number, T in found.boards.items():
         assert apart(other.boards[number], frame * T) < SAME
         assert np.isclose(found.misfit[number], other.misfit[number], rtol=1e-2)
@@ -100,7 +122,11 @@ def test_exact_observations_give_the_truth():
 def test_scale_of_the_pitch_is_recovered(mount):
     obs, truth, _ = draw(rng(), 12, mount=mount, stretch=0.03)
     found = solve_joint(obs, sensor=(*PLAIN, "pitch_scale"))
-    assert abs(found.sensor["pitch_scale"] - 0.03) < 4 * found.covariance("pitch_scale")[0, 0] ** 0.5 < 0.05
+    assert (
+        abs(found.sensor["pitch_scale"] - 0.03)
+        < 4 * found.covariance("pitch_scale")[0, 0] ** 0.5
+        < 0.05
+    )
     assert np.abs(scores(found, truth)).max() < 4.5
 
 
@@ -108,15 +134,24 @@ def with_recorded_pitch(obs, recorded):
     """Observations whose pitch is another function of the true one and the placement."""
     keys = [f"{group}_pitch" for group in ("face", "beam", "view")]
     places = [getattr(obs, key.replace("pitch", "placement")) for key in keys]
-    return replace(obs, **{key: recorded(getattr(obs, key), place) for key, place in zip(keys, places, strict=True)})
+    return replace(
+        obs,
+        **{
+            key: recorded(getattr(obs, key), place)
+            for key, place in zip(keys, places, strict=True)
+        },
+    )
 
 
 def test_pitch_errors_of_sweeps_are_recovered():
     """Sweeps whose recorded pitch is off by a degree and stretched by some per cent."""
     obs, truth, _ = draw(rng(), 12, mount="platform")
-    off, stretch = rng(7).normal(0, np.radians(1.0), 12), rng(8).normal(0, 0.02, 12)
+    off = rng(7).normal(0, np.radians(1.0), 12)
+    stretch = rng(8).normal(0, 0.02, 12)
     middle = obs.middle
-    spoilt = with_recorded_pitch(obs, lambda true, p: middle[p] + (true - middle[p] - off[p]) / (1 + stretch[p]))
+    spoilt = with_recorded_pitch(
+        obs, lambda true, p: middle[p] + (true - middle[p] - off[p]) / (1 + stretch[p])
+    )
     found = solve_joint(spoilt, sweep="offset_stretch", sweep_sigma=(np.radians(1.0), 0.02))
     plain = solve_joint(spoilt)
     sweeps = np.array([found.sweeps[n] for n in obs.placements])
@@ -129,30 +164,45 @@ def test_pitch_errors_of_sweeps_are_recovered():
 
 
 def test_the_direction_of_the_sweep_is_recovered():
-    lag, sensor = np.radians(0.4), (*PLAIN, "pitch_by_direction")
+    lag = np.radians(0.4)
+    sensor = (*PLAIN, "pitch_by_direction")
     obs, truth, _ = draw(rng(), 12, mount="platform")
-    found = solve_joint(with_recorded_pitch(obs, lambda true, p: true - lag * obs.direction[p]), sensor=sensor)
+    found = solve_joint(
+        with_recorded_pitch(obs, lambda true, p: true - lag * obs.direction[p]),
+        sensor=sensor,
+    )
     sigma = found.covariance("pitch_by_direction")[0, 0] ** 0.5
     assert abs(found.sensor["pitch_by_direction"] - lag) < 4.5 * sigma < lag
-    with pytest.raises(DegenerateGeometry, match="do not determine the pitch offset by sweep direction"):
+    with pytest.raises(
+        DegenerateGeometry, match="do not determine the pitch offset by sweep direction"
+    ):
         solve_joint(draw(rng(), 8)[0], sensor=sensor)  # cameras on the head lag alike
 
 
 def misses_of(state, obs):
     """Whitened residuals of ranges and images, from the chain of transforms as one would write it down."""
-    T_head_lrf, boards = pose_transform(state.head), pose_transform(state.boards)
-    lifted = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(obs.face_pitch, [1, 0, 0])))
+    T_head_lrf = pose_transform(state.head)
+    boards = pose_transform(state.boards)
+    lifted = RigidTransform.from_rotation(
+        Rotation.from_rotvec(np.outer(obs.face_pitch, [1, 0, 0]))
+    )
     ray = polar_to_points(1.0, obs.face_bearing)
     T_board_lrf = boards[obs.face_placement].inv() * lifted * T_head_lrf
-    start, way = T_board_lrf.apply(0 * ray), T_board_lrf.rotation.apply(ray)
+    start = T_board_lrf.apply(0 * ray)
+    way = T_board_lrf.rotation.apply(ray)
     ranges = (-start[:, 2] / way[:, 2] + state.sensor[0] - obs.face_range) / obs.face_sigma
     cameras = pose_transform(state.cameras)[obs.view_camera] * RigidTransform.identity()
     if obs.mounts[0] == "head":
-        lifted = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(obs.view_pitch, [1, 0, 0])))
+        lifted = RigidTransform.from_rotation(
+            Rotation.from_rotvec(np.outer(obs.view_pitch, [1, 0, 0]))
+        )
         cameras = cameras * (lifted * T_head_lrf).inv()
-    predicted, measured = cameras * boards[obs.view_placement], RigidTransform.from_matrix(obs.view_pose)
+    predicted = cameras * boards[obs.view_placement]
+    measured = RigidTransform.from_matrix(obs.view_pose)
     turn = (predicted.rotation * measured.rotation.inv()).as_rotvec()
-    images = np.concatenate([turn, predicted.translation - measured.translation], axis=1)[..., None]
+    images = np.concatenate([turn, predicted.translation - measured.translation], axis=1)[
+        ..., None
+    ]
     white = np.linalg.solve(np.linalg.cholesky(obs.view_covariance), images)
     return np.concatenate([ranges, white.ravel()])
 
@@ -163,22 +213,34 @@ def test_scipy_finds_the_same_rig(mount):
     obs, truth, _ = draw(rng(), 6, mount=mount)
     obs = none(obs, "beam").keep(face=np.arange(len(obs.face_range)) % 3 == 0)
     found = solve_joint(obs, start=truth, sensor=("range_offset",), axis=mount == "head")
-    unknowns, options = found.unknowns, dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
+    unknowns = found.unknowns
+    options = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
 
     def moved(x):
-        return move_state(truth, (x[: unknowns.shared], x[unknowns.shared :].reshape(6, -1)), unknowns)
+        return move_state(
+            truth, (x[: unknowns.shared], x[unknowns.shared :].reshape(6, -1)), unknowns
+        )
 
-    theirs = least_squares(lambda x: misses_of(moved(x), obs), np.zeros(unknowns.shared + 6 * unknowns.own), **options)
+    theirs = least_squares(
+        lambda x: misses_of(moved(x), obs),
+        np.zeros(unknowns.shared + 6 * unknowns.own),
+        **options,
+    )
     assert found.solution.cost_history[-1] == pytest.approx(theirs.cost, rel=1e-6)
     away = state_errors(in_stated_gauge(moved(theirs.x), obs), found.state, unknowns)
     assert np.abs(away / found.solution.sigma).max() < 1e-3
-    covariance = np.linalg.inv(theirs.jac.T @ theirs.jac)[: unknowns.shared, : unknowns.shared]
-    np.testing.assert_allclose(found.solution.sigma, np.sqrt(np.diag(covariance)), rtol=0.01)
+    covariance = np.linalg.inv(theirs.jac.T @ theirs.jac)[
+        : unknowns.shared, : unknowns.shared
+    ]
+    np.testing.assert_allclose(
+        found.solution.sigma, np.sqrt(np.diag(covariance)), rtol=0.01
+    )
 
 
 def test_the_bound_is_the_variance_of_the_score():
     """Over 200 draws at the truth; chance alone leaves 2 %. What placements own is eliminated."""
-    unknowns, squares = Unknowns(2, 3), []
+    unknowns = Unknowns(2, 3)
+    squares = []
     for seed in range(200):
         obs, truth, _ = draw(rng(seed), 3, floor=LEAST_STEP, pitch_step=np.radians(2.0))
         blocks = named_blocks(truth, gather(obs), unknowns)
@@ -194,7 +256,9 @@ def test_no_camera_leaves_the_platform_step():
     obs, truth, _ = draw(rng(), 20, seen=())
     found = solve_joint(obs, required=False)
     assert found.transforms == {} and np.abs(scores(found, truth)).max() < 5
-    assert np.degrees(found.solution.sigma[0]) > 0.2, "the small board hardly shows the axis"
+    assert np.degrees(found.solution.sigma[0]) > 0.2, (
+        "the small board hardly shows the axis"
+    )
 
 
 def test_single_shots_do_not_show_the_axis():
@@ -204,8 +268,14 @@ def test_single_shots_do_not_show_the_axis():
         solve_joint(obs, sensor=PLAIN[:2])
     found = solve_joint(obs, required=False, sensor=PLAIN[:2])
     assert sum("axis" in words for words in found.unobservable) == 4
-    assert not np.any(found.solution.sigma[:4] < 0.5)  # what the data do not show has no small sigma
-    cameras = [i for i, name in enumerate(found.solution.names) if name.startswith(("left", "right"))]
+    assert not np.any(
+        found.solution.sigma[:4] < 0.5
+    )  # what the data do not show has no small sigma
+    cameras = [
+        i
+        for i, name in enumerate(found.solution.names)
+        if name.startswith(("left", "right"))
+    ]
     assert np.abs(scores(found, truth)[cameras]).max() < 4.5
 
 
@@ -213,9 +283,12 @@ def test_single_shots_do_not_show_the_axis():
     ("beam", "edge bias", ("range_offset",)),
     ("face", "range offset", PLAIN[1:]),  # from a start value
 ])  # fmt: skip
-def test_what_shows_an_error_of_the_sensor_is_named_where_it_is_missing(gone, words, sensor):
+def test_what_shows_an_error_of_the_sensor_is_named_where_it_is_missing(
+    gone, words, sensor
+):
     obs, truth, _ = draw(rng(), 12)
-    bare, start = none(obs, gone), replace(truth, sensor=np.array([0.0, 0.0, np.log(0.2), 0.0, 0.0]))
+    bare = none(obs, gone)
+    start = replace(truth, sensor=np.array([0.0, 0.0, np.log(0.2), 0.0, 0.0]))
     options = {"start": start} if gone == "face" else {}
     with pytest.raises(DegenerateGeometry, match=words):
         solve_joint(bare, **options)
@@ -236,7 +309,10 @@ def test_any_start_gives_the_same_answer(mount):
     turned = Rotation.from_rotvec(np.radians(60) * turn / np.linalg.norm(turn))
     wrong = RigidTransform.from_components(0.5 * away / np.linalg.norm(away), turned)
     found = solve_joint(obs, wrong * pose_transform(truth.head))
-    assert np.all(np.abs(found.solution.parameters - best.solution.parameters) < 0.01 * best.solution.sigma)
+    assert np.all(
+        np.abs(found.solution.parameters - best.solution.parameters)
+        < 0.01 * best.solution.sigma
+    )
 
 
 # errors

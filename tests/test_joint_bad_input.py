@@ -25,9 +25,17 @@ def parallel_boards(rng, count, spin=True):
     """Boards that all lean the same way, at different places and turned within their plane."""
     poses = []
     for _ in range(count):
-        turn = FACING * Rotation.from_rotvec([0.2, 0.1, 0]) * Rotation.from_rotvec([0, 0, spin * rng.uniform(0, 6.28)])
-        centre = np.array([rng.uniform(-0.35, 0.35), 1.0, rng.uniform(-0.1, 0.1)]) * rng.uniform(1, 2.5)
-        poses.append(RigidTransform.from_components(centre - turn.apply([0.105, 0.127, 0.0]), turn))
+        turn = (
+            FACING
+            * Rotation.from_rotvec([0.2, 0.1, 0])
+            * Rotation.from_rotvec([0, 0, spin * rng.uniform(0, 6.28)])
+        )
+        centre = np.array(
+            [rng.uniform(-0.35, 0.35), 1.0, rng.uniform(-0.1, 0.1)]
+        ) * rng.uniform(1, 2.5)
+        poses.append(
+            RigidTransform.from_components(centre - turn.apply([0.105, 0.127, 0.0]), turn)
+        )
     return poses
 
 
@@ -44,7 +52,9 @@ def mislabelled(obs, share, rng):
     return replace(obs, view_placement=number[obs.view_placement])
 
 
-@pytest.mark.parametrize(("mount", "lean"), [("head", parallel_boards), ("platform", one_pose)])
+@pytest.mark.parametrize(
+    ("mount", "lean"), [("head", parallel_boards), ("platform", one_pose)]
+)
 def test_parallel_boards_are_named(mount, lean):
     obs, *_ = draw(rng(), mount=mount, lean=lean)
     with pytest.raises(DegenerateGeometry, match="tilt the board in both directions"):
@@ -55,10 +65,16 @@ def test_parallel_boards_are_named(mount, lean):
 def test_some_mislabelled_placements_are_left_out_by_name(mount, share):
     obs, truth, _ = draw(rng(), 20, mount=mount)
     wrong = mislabelled(obs, share, rng())
-    moved = np.unique(obs.placements[obs.view_placement[obs.view_placement != wrong.view_placement]])
+    moved = np.unique(
+        obs.placements[obs.view_placement[obs.view_placement != wrong.view_placement]]
+    )
     found = solve_joint(wrong)
-    assert set(found.excluded_placements) == set(moved.tolist()) and len(found.excluded) == len(moved)
-    assert all("off where its image puts the board; left out" in str(one) for one in found.excluded)
+    assert set(found.excluded_placements) == set(moved.tolist()) and len(
+        found.excluded
+    ) == len(moved)
+    assert all(
+        "off where its image puts the board; left out" in str(one) for one in found.excluded
+    )
     assert worst(found, truth) < 4.5
 
 
@@ -102,7 +118,9 @@ def test_contradictory_noise_is_repaired_from_the_data(kind, factor, mount):
 def test_contradictory_noise_is_said_when_it_is_kept(kind, factor, words):
     obs, *_ = draw(rng())
     found = solve_joint(mis_stated(obs, kind, factor), required=False)
-    assert any(words in warning and "noise='estimate'" in warning for warning in found.warnings)
+    assert any(
+        words in warning and "noise='estimate'" in warning for warning in found.warnings
+    )
 
 
 @MOUNTS
@@ -110,7 +128,9 @@ def test_sound_recordings_need_no_warning(mount):
     """Cameras on the base hardly show the axis of a small board's sweep, which may be said; nothing else."""
     for seed in range(2):
         found = solve_joint(draw(rng(seed), 12, mount=mount, pitch_step=np.radians(0.5))[0])
-        assert all(mount == "platform" and "weakly known" in words for words in found.warnings)
+        assert all(
+            mount == "platform" and "weakly known" in words for words in found.warnings
+        )
 
 
 def mis_stated(obs, kind, factor):
@@ -122,24 +142,46 @@ def mis_stated(obs, kind, factor):
 @pytest.mark.parametrize("count", [1, 2])
 def test_too_few_placements_are_named(count):
     obs, *_ = draw(rng(), count)
-    with pytest.raises(DegenerateGeometry, match=f"{count} placements .* at least 3 needed"):
+    with pytest.raises(
+        DegenerateGeometry, match=f"{count} placements .* at least 3 needed"
+    ):
         solve_joint(obs)
 
 
 @MOUNTS
 def test_a_placement_that_no_image_shows_is_left_out_by_name(mount):
     obs, truth, _ = draw(rng(), mount=mount)
-    found = solve_joint(obs.keep(view=obs.view_placement != 4, beam=obs.beam_placement != 4))
+    found = solve_joint(
+        obs.keep(view=obs.view_placement != 4, beam=obs.beam_placement != 4)
+    )
     (lost,) = found.excluded
-    assert lost.placement == 5 and "no image shows the board and scans cross 0 edges" in str(lost)
-    assert 5 not in found.observations.placements and worst(found, replace_boards(truth, 4)) < 4.5
-    with pytest.raises(DegenerateGeometry, match="placement 1: no image .*placement 10: no image"):
-        solve_joint(obs.keep(view=np.zeros(len(obs.view_pitch), bool), beam=obs.beam_edge == 0).with_cameras([]))
+    assert (
+        lost.placement == 5
+        and "no image shows the board and scans cross 0 edges" in str(lost)
+    )
+    assert (
+        5 not in found.observations.placements
+        and worst(found, replace_boards(truth, 4)) < 4.5
+    )
+    with pytest.raises(
+        DegenerateGeometry, match="placement 1: no image .*placement 10: no image"
+    ):
+        solve_joint(
+            obs.keep(
+                view=np.zeros(len(obs.view_pitch), bool), beam=obs.beam_edge == 0
+            ).with_cameras([])
+        )
 
 
 def replace_boards(truth, out):
     """The truth without one placement."""
-    return replace(truth, **{key: np.delete(getattr(truth, key), out, axis=0) for key in ("boards", "sweeps", "sides")})
+    return replace(
+        truth,
+        **{
+            key: np.delete(getattr(truth, key), out, axis=0)
+            for key in ("boards", "sweeps", "sides")
+        },
+    )
 
 
 @pytest.mark.parametrize(("mount", "number"), [("head", 0), ("platform", -1)])
@@ -149,7 +191,10 @@ def test_one_wrong_image_of_several_costs_the_image_not_the_placement(mount, num
     pose = obs.view_pose.copy()
     pose[wrong] = pose[other]
     found = solve_joint(replace(obs, view_pose=pose), noise="estimate")
-    assert len(found.boards) == 10 and len(found.observations.view_pitch) == len(obs.view_pitch) - 1
+    assert (
+        len(found.boards) == 10
+        and len(found.observations.view_pitch) == len(obs.view_pitch) - 1
+    )
     (words,) = map(str, found.excluded)
     assert "placement 3: image of " in words and "the image is left out" in words
     assert worst(found, truth) < 4.5
@@ -159,7 +204,8 @@ def test_one_wrong_image_of_several_costs_the_image_not_the_placement(mount, num
 def test_an_image_that_is_off_within_the_boards_plane_is_left_out(mount, shift):
     """No range tells; held, it would raise the noise level of all images thirty times."""
     obs, truth, _ = draw(rng(), mount=mount)
-    pose, row = obs.view_pose.copy(), np.flatnonzero(obs.view_placement == 2)[1]
+    pose = obs.view_pose.copy()
+    row = np.flatnonzero(obs.view_placement == 2)[1]
     pose[row, :3, 3] += shift * pose[row, :3, 0]
     found = solve_joint(replace(obs, view_pose=pose), noise="estimate")
     (words,) = map(str, found.excluded)
@@ -170,14 +216,20 @@ def test_an_image_that_is_off_within_the_boards_plane_is_left_out(mount, shift):
 def test_an_edge_bias_that_only_what_is_usual_bounds_leaves_cameras_that_planes_fix():
     obs, _, rig = draw(rng())
     found = solve_joint(obs.keep(beam=~obs.beam_hit), required=False)
-    assert found.unobservable == () and found.solution.sigma[found.columns("edge_log_odds")] > 2
+    assert (
+        found.unobservable == ()
+        and found.solution.sigma[found.columns("edge_log_odds")] > 2
+    )
     sigma = projection_sigma(chain_of(found, "left"), rig.model, 1.5, (4, 3))
     assert root_mean_square(sigma) < 20
 
 
 @pytest.mark.parametrize(
     "settings",
-    [{"spot": (0.004, 0.0)}, pytest.param({"spot": (0.012, 0.0044), "softness": 0.05}, marks=campaign)],
+    [
+        {"spot": (0.004, 0.0)},
+        pytest.param({"spot": (0.012, 0.0044), "softness": 0.05}, marks=campaign),
+    ],
 )
 def test_sigma_is_honest_where_beams_are_wider_apart_than_readings_flip(settings):
     """Mean normalised squared error of axis and cameras; chance alone exceeds 1.38 once in a thousand."""
@@ -192,8 +244,17 @@ def test_sigma_is_honest_where_beams_are_wider_apart_than_readings_flip(settings
 
 @MOUNTS
 def test_a_scale_of_the_pitch_that_nothing_shows_stays_within_what_is_usual(mount):
-    obs, *_ = draw(rng(), mount=mount, see_span=np.radians(0.5), pitch_step=np.radians(0.25), see_images=1)
+    obs, *_ = draw(
+        rng(),
+        mount=mount,
+        see_span=np.radians(0.5),
+        pitch_step=np.radians(0.25),
+        see_images=1,
+    )
     sensor = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
     found = solve_joint(obs, sensor=sensor, required=False)
     assert not any("scale of the pitch" in words for words in found.unobservable)
-    assert abs(found.sensor["pitch_scale"]) < 0.15 and found.solution.sigma[found.columns("pitch_scale")] < 0.051
+    assert (
+        abs(found.sensor["pitch_scale"]) < 0.15
+        and found.solution.sigma[found.columns("pitch_scale")] < 0.051
+    )

@@ -32,7 +32,10 @@ def test_the_session_asks_for_its_unknowns(joint):
 
     Also with one image a placement, and with cameras on the base.
     """
-    seen = observe_joint(joint.prepared, {name: found[:1] for name, found in all_views(joint.prepared).items()})
+    seen = observe_joint(
+        joint.prepared,
+        {name: found[:1] for name, found in all_views(joint.prepared).items()},
+    )
     for settings in (joint.settings, pipeline.joint_settings(joint.prepared, seen)):
         assert "pitch_scale" in settings["sensor"] and "sweep" not in settings
         assert settings["prior"].sigma_offset == joint.prepared.session.platform_sigma[1]
@@ -49,37 +52,59 @@ def test_corrections_undo_what_the_estimate_found(joint):
     """A point measured too far by the range offset comes back; a placement that took no part gets the scale only."""
     solution = joint.solution
     p = np.array([[0.3, 1.8, 0.0], [-0.2, 1.1, 0.0]])
-    away = p * (1 + solution.sensor["range_offset"] / np.linalg.norm(p, axis=1, keepdims=True))
+    away = p * (
+        1 + solution.sensor["range_offset"] / np.linalg.norm(p, axis=1, keepdims=True)
+    )
     pitch = solution.corrections.pitch(99, np.array([0.1, -0.2]))
     np.testing.assert_allclose(solution.corrections.points(away), p, atol=2e-5)
-    np.testing.assert_allclose(pitch, np.array([0.1, -0.2]) * (1 + solution.sensor["pitch_scale"]))
+    np.testing.assert_allclose(
+        pitch, np.array([0.1, -0.2]) * (1 + solution.sensor["pitch_scale"])
+    )
 
 
 def test_it_is_handed_over_with_its_platform_and_sensor(quick):
     assert pipeline.handed_over(quick) == "joint"
     record = calibration_record(quick, "joint")
-    np.testing.assert_allclose(record["platform"]["matrix"], quick.joint.solution.T_head_lrf.as_matrix())
+    np.testing.assert_allclose(
+        record["platform"]["matrix"], quick.joint.solution.T_head_lrf.as_matrix()
+    )
     assert set(record["cameras"]) == set(quick.joint.observations.cameras)
-    assert record["sensor"]["range_offset"]["sigma"] > 0 and record["sensor"]["excluded"] == []
-    assert record["verdict"]["answer"] == "with care" and record["verdict"]["expected_error_at_m"]["2"]["cloud_mm"] > 0
-    edges = [camera["edge_rms_px"] for camera in record["cameras"].values()]  # the same figure as in the report
+    assert (
+        record["sensor"]["range_offset"]["sigma"] > 0 and record["sensor"]["excluded"] == []
+    )
+    assert (
+        record["verdict"]["answer"] == "with care"
+        and record["verdict"]["expected_error_at_m"]["2"]["cloud_mm"] > 0
+    )
+    edges = [
+        camera["edge_rms_px"] for camera in record["cameras"].values()
+    ]  # the same figure as in the report
     assert min(edges) <= joint_tables.joint_fit(quick.joint)["edge_rms_px"] <= max(edges)
     assert "sensor" not in calibration_record(quick, "line")
 
 
 def test_a_cloud_is_coloured_by_what_is_handed_over(quick):
-    default, joint, line = (clouds.color_cloud(quick, *method).points for method in ((), ("joint",), ("line",)))
+    default, joint, line = (
+        clouds.color_cloud(quick, *method).points for method in ((), ("joint",), ("line",))
+    )
     np.testing.assert_array_equal(default, joint)
     assert np.linalg.norm(joint - line, axis=1).min() > 0
     nothing = replace(quick, joint=None, solutions={})
-    with pytest.raises(ValueError, match="no camera was calibrated that could colour a cloud"):
+    with pytest.raises(
+        ValueError, match="no camera was calibrated that could colour a cloud"
+    ):
         clouds.color_cloud(nothing)
 
 
 @campaign
 def test_what_did_not_converge_is_not_handed_over(quick):
-    bad = replace(quick.joint.solution, solution=replace(quick.joint.solution.solution, converged=False))
-    assert pipeline.handed_over(replace(quick, joint=replace(quick.joint, solution=bad))) in ("line", "zhang_pless")
+    bad = replace(
+        quick.joint.solution,
+        solution=replace(quick.joint.solution.solution, converged=False),
+    )
+    assert pipeline.handed_over(
+        replace(quick, joint=replace(quick.joint, solution=bad))
+    ) in ("line", "zhang_pless")
 
 
 def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_board(joint):
@@ -90,7 +115,9 @@ def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_bo
     assert (own.loc["combined"].error_mm / own.loc["combined"].sigma_mm).abs().max() < 3.5
     assert own.sigma_mm.notna().all() and set(own.loc["combined"].ends) <= {"image", "scan"}
     larger = replace(joint.prepared.board, corners=joint.prepared.board.corners * 1.1)
-    other = combined.combined_outlines(replace(joint, prepared=replace(joint.prepared, board=larger)))
+    other = combined.combined_outlines(
+        replace(joint, prepared=replace(joint.prepared, board=larger))
+    )
     same = combined.combined_outlines(joint)
     for placement, (board, _) in same.items():
         for name, length in board.lengths.items():
@@ -101,7 +128,10 @@ def other_session(quick, **changes):
     """The calibration of a session whose images are not as they were."""
     session = quick.prepared.session
     records = tuple(replace(record, **changes) for record in session.image_records)
-    return replace(quick, prepared=replace(quick.prepared, session=replace(session, image_records=records)))
+    return replace(
+        quick,
+        prepared=replace(quick.prepared, session=replace(session, image_records=records)),
+    )
 
 
 BAD = {
@@ -128,17 +158,27 @@ def test_what_cannot_colour_a_cloud_is_refused(quick, case):
 
 def test_lengths_between_features_know_how_good_they_are(quick):
     """Two halves of one face are no distance apart across it, and half a board along it."""
-    cloud, solution, offs = clouds.color_cloud(quick, "joint"), quick.joint.solution, []
+    cloud = clouds.color_cloud(quick, "joint")
+    solution = quick.joint.solution
+    offs = []
     for placement in np.unique(cloud.placement):
         rows = np.flatnonzero(cloud.placement == placement)
         x = cloud.points[rows, 0]
-        left, right = rows[x < np.median(x)], rows[x >= np.median(x)]
+        left = rows[x < np.median(x)]
+        right = rows[x >= np.median(x)]
         planes = [scenes.fit_feature(cloud, half, solution) for half in (left, right)]
-        length, sigma = scenes.length_between(scenes.fit_feature(cloud, rows, solution), planes[0])
+        length, sigma = scenes.length_between(
+            scenes.fit_feature(cloud, rows, solution), planes[0]
+        )
         offs.append(length / sigma)
-        points = [scenes.fit_feature(cloud, half, solution, plane=False) for half in (left, right)]
+        points = [
+            scenes.fit_feature(cloud, half, solution, plane=False) for half in (left, right)
+        ]
         length, sigma = scenes.length_between(*points)
-        assert length == pytest.approx(np.linalg.norm(points[1].centre - points[0].centre)) and 0 < sigma < 0.01
+        assert (
+            length == pytest.approx(np.linalg.norm(points[1].centre - points[0].centre))
+            and 0 < sigma < 0.01
+        )
         length, sigma = scenes.length_between(points[0], planes[1])
         assert length < 5 * sigma
     assert 0.1 < np.sqrt(np.mean(np.square(offs))) < 3
@@ -149,7 +189,10 @@ def test_lengths_between_features_know_how_good_they_are(quick):
 def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(quick):
     """Without a usable placement the joint estimate has a problem in words; what was there stays."""
     kind = ProblemKind.NO_BOARD
-    problems = [Problem(Stage.SCANS, kind, "a dog ran through", placement) for placement in quick.prepared.scans]
+    problems = [
+        Problem(Stage.SCANS, kind, "a dog ran through", placement)
+        for placement in quick.prepared.scans
+    ]
     lost = pipeline.joint_or_problem(replace(quick.prepared, problems=tuple(problems)))
     again = pipeline.with_joint(replace(quick, joint=None), lost)
     assert again.joint is None and "no placement" in again.problem("joint").words

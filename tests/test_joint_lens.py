@@ -14,11 +14,15 @@ from lrfcal_lib.solvers.joint import solve_again, solve_joint
 from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 
 CORNERS = np.array([[0.05 * i, 0.05 * j, 0.0] for i in range(5) for j in range(4)])
-MODEL = CameraModel(1280, 960, 900.0, 905.0, 641.0, 478.0, np.array([-0.2, 0.08, 0.001, -0.001, 0.0]))
+MODEL = CameraModel(
+    1280, 960, 900.0, 905.0, 641.0, 478.0, np.array([-0.2, 0.08, 0.001, -0.001, 0.0])
+)
 
 
 def a_pose():
-    return RigidTransform.from_components([-0.1, 0.05, 1.4], Rotation.from_rotvec([0.3, -0.4, 0.2]))
+    return RigidTransform.from_components(
+        [-0.1, 0.05, 1.4], Rotation.from_rotvec([0.3, -0.4, 0.2])
+    )
 
 
 @pytest.mark.parametrize(("index", "step"), [(0, 2.0), (2, 1.0), (3, -1.0), (4, 0.01)])
@@ -29,7 +33,15 @@ def test_pose_moves_as_predicted(index, step):
     values[index] += step
     other = CameraModel(1280, 960, *values[:4], values[4:])
     start = cv2.Rodrigues(T.rotation.as_matrix())[0], T.translation[:, None].copy()
-    _, w, t = cv2.solvePnP(CORNERS, pixels, other.matrix, other.distortion, *start, True, cv2.SOLVEPNP_ITERATIVE)
+    _, w, t = cv2.solvePnP(
+        CORNERS,
+        pixels,
+        other.matrix,
+        other.distortion,
+        *start,
+        True,
+        cv2.SOLVEPNP_ITERATIVE,
+    )
     turn = (Rotation.from_rotvec(w[:, 0]) * T.rotation.inv()).as_rotvec()
     moved = np.r_[turn, t[:, 0] - T.translation]
     predicted = pose_by_intrinsics(T, CORNERS, MODEL)[:, index] * step
@@ -49,19 +61,29 @@ def test_a_known_error_moves_the_estimate_as_the_covariance_says(mount):
     known = solve_joint(obs)
     told = solve_again(replace(obs, view_lens=lens, lens_covariance=spread), known)
     mine = (obs.view_camera == 0)[:, None]
-    turned = move_pose(np.stack([pose_array(pose) for pose in poses]), mine * (lens @ error))
+    turned = move_pose(
+        np.stack([pose_array(pose) for pose in poses]), mine * (lens @ error)
+    )
     view_pose = obs.view_pose.copy()
     view_pose[:, :3] = turned
     moved = solve_again(replace(obs, view_pose=view_pose), known)
     name = obs.cameras[0]
-    one, two = known.transforms[name], moved.transforms[name]
-    change = np.r_[(two.rotation * one.rotation.inv()).as_rotvec(), two.translation - one.translation]
+    one = known.transforms[name]
+    two = moved.transforms[name]
+    change = np.r_[
+        (two.rotation * one.rotation.inv()).as_rotvec(), two.translation - one.translation
+    ]
     columns = known.columns(f"{name}_")
     predicted = np.sqrt(np.diag(told.lens))[columns]
     large = predicted > 0.03 * known.solution.sigma[columns]
     assert large.any()
     np.testing.assert_allclose(np.abs(change[large]), predicted[large], rtol=0.15)
-    change = (moved.residuals("view") - known.residuals("view"))[..., None]  # what no unknown takes up
+    change = (moved.residuals("view") - known.residuals("view"))[
+        ..., None
+    ]  # what no unknown takes up
     square = np.sum(np.swapaxes(change, 1, 2) @ np.linalg.inv(obs.view_covariance) @ change)
     left = 6 * (len(change) - len(obs.placements))
-    assert told.lens_scale == pytest.approx(np.sqrt(square / left), rel=0.1) and told.lens_scale > 0.05
+    assert (
+        told.lens_scale == pytest.approx(np.sqrt(square / left), rel=0.1)
+        and told.lens_scale > 0.05
+    )

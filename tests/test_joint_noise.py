@@ -22,7 +22,9 @@ def levels(count, **settings):
     found = []
     for seed in range(count):
         obs, _, _ = draw(rng(seed), 12, pitch_step=FINE, **settings)
-        found.append(solve_joint(obs, noise="estimate", sides=True, lapse=0.01, required=False).noise)
+        found.append(
+            solve_joint(obs, noise="estimate", sides=True, lapse=0.01, required=False).noise
+        )
     return found
 
 
@@ -47,14 +49,23 @@ def test_sides_that_beams_hardly_show_do_not_pull_their_scale_down(true, start):
     """Two of three say nothing, as bright boards do at the rim of the spot; the third tells the scale."""
     own = rng(2)
     known = np.tile([400.0, 0.01, 0.01], (200, 1))
-    y = true * own.standard_t(3, known.shape) + own.standard_normal(known.shape) / np.sqrt(known)
+    y = true * own.standard_t(3, known.shape) + own.standard_normal(known.shape) / np.sqrt(
+        known
+    )
     used = {"used": np.ones(known.shape, bool), "edge": np.tile(np.arange(3), (200, 1))}
     level = start
     for _ in range(10):
         x, prior = most_likely(y, known, level)
         hessian = np.zeros((200, 9, 9))
-        hessian[:, range(9), range(9)] = np.concatenate([np.ones((200, 6)), known + prior], axis=1)
-        level = side_level(x, SimpleNamespace(levels=Levels(side_sigma=level), beam=used), hessian, np.zeros((200, 9)))
+        hessian[:, range(9), range(9)] = np.concatenate(
+            [np.ones((200, 6)), known + prior], axis=1
+        )
+        level = side_level(
+            x,
+            SimpleNamespace(levels=Levels(side_sigma=level), beam=used),
+            hessian,
+            np.zeros((200, 9)),
+        )
     assert level == pytest.approx(true, rel=0.15)
 
 
@@ -76,4 +87,6 @@ def test_beams_that_all_contradict_their_edges_still_have_a_share():
     cost = np.full(block.cost.shape, 4.0)
     own = np.zeros((6, *[block.jacobian.shape[-1] - found.unknowns.shared] * 2))
     contradicted = replace(block, residuals=np.sqrt(2 * cost), cost=cost)
-    assert 0 < beam_share(found.state, data, contradicted, found.unknowns.shared, own) < 0.01
+    assert (
+        0 < beam_share(found.state, data, contradicted, found.unknowns.shared, own) < 0.01
+    )

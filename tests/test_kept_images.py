@@ -25,4 +25,6 @@ def test_an_image_is_decoded_once_and_kept_where_the_board_is():
     np.testing.assert_array_equal(image[board], picture[board])
     assert np.any(image != picture)  # the rest is not kept
     other = survey.Shot(record("left", "b.png", 4), BoardView())
-    assert other.image(lambda r: reads.append(r) or picture) is picture and reads == [other.record]
+    assert other.image(lambda r: reads.append(r) or picture) is picture and reads == [
+        other.record
+    ]

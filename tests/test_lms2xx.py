@@ -7,7 +7,12 @@ import pytest
 from telegrams import encode_scan
 
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import MODES, decode_scan, encode_telegram, split_stream
+from lrfcal_lib.session.lms2xx_codec import (
+    MODES,
+    decode_scan,
+    encode_telegram,
+    split_stream,
+)
 
 F7 = "00 00 70 00 00 0{} 01 00 00 02 02" + " 00" * 21 + " 02 00"
 TO_DEVICE = [  # verified against the listing and real devices; without start, address and length
@@ -37,7 +42,10 @@ def whole(text, address):
 
 
 SENT = [whole(text, 0) for text in TO_DEVICE]
-REPLIES = [bytes.fromhex("02 81 03 00 A0 00 10 36 1A"), *(whole(text, 0x80) for text in FROM_DEVICE)]
+REPLIES = [
+    bytes.fromhex("02 81 03 00 A0 00 10 36 1A"),
+    *(whole(text, 0x80) for text in FROM_DEVICE),
+]
 A0 = bytes.fromhex("02 80 03 00 A0 00 10 16 0A")
 
 
@@ -59,16 +67,48 @@ def test_telegrams_are_the_verified_bytes(raw):
 REFUSED = [
     (codec.parse_telegram, b"", "begins with 02.*got none"),
     (codec.parse_telegram, A0 + b"\0", "states 9 bytes, got 10"),
-    (codec.parse_telegram, A0[:5] + b"\x01" + A0[6:], "CRC 0A16 sent, .* computed.*ask again"),
+    (
+        codec.parse_telegram,
+        A0[:5] + b"\x01" + A0[6:],
+        "CRC 0A16 sent, .* computed.*ask again",
+    ),
     (decode_scan, A0, "code A0 is no scan"),
-    (decode_scan, encode_telegram(0xB0, b"\x05\0\1\1", status=0x10), "do not fit the number of values 05 00"),
-    (decode_scan, encode_telegram(0xB0, b"\x01\x80\1\1", status=0x10), "do not fit"),  # unit reserved
+    (
+        decode_scan,
+        encode_telegram(0xB0, b"\x05\0\1\1", status=0x10),
+        "do not fit the number of values 05 00",
+    ),
+    (
+        decode_scan,
+        encode_telegram(0xB0, b"\x01\x80\1\1", status=0x10),
+        "do not fit",
+    ),  # unit reserved
     (codec.parse_status, A0, "code A0 is not the reply B1"),
-    (codec.parse_status, encode_telegram(0xB1, bytes(100), status=16), "100 bytes of data, needs 123"),
-    (codec.parse_configuration, encode_telegram(0xF4, bytes(6), status=16), "6 bytes of data, needs 7"),
-    (lambda block: codec.Configuration(block).unit, b"\0\0\0\0\0\0\7", "unit 7 is neither 0"),
-    (lambda values: codec.scan_quarters(*values), (100,), "101, 181, 201, 361, 401 values, got 100"),
-    (lambda values: codec.scan_quarters(*values), (181, 1), "partial scan 1 has 180 values, got 181"),
+    (
+        codec.parse_status,
+        encode_telegram(0xB1, bytes(100), status=16),
+        "100 bytes of data, needs 123",
+    ),
+    (
+        codec.parse_configuration,
+        encode_telegram(0xF4, bytes(6), status=16),
+        "6 bytes of data, needs 7",
+    ),
+    (
+        lambda block: codec.Configuration(block).unit,
+        b"\0\0\0\0\0\0\7",
+        "unit 7 is neither 0",
+    ),
+    (
+        lambda values: codec.scan_quarters(*values),
+        (100,),
+        "101, 181, 201, 361, 401 values, got 100",
+    ),
+    (
+        lambda values: codec.scan_quarters(*values),
+        (181, 1),
+        "partial scan 1 has 180 values, got 181",
+    ),
 ]
 
 
@@ -85,7 +125,11 @@ def test_the_two_scans_of_the_fact_sheet():
     first, second = (raw for raw in REPLIES if raw[4] == 0xB0)
     scan = decode_scan(first)
     np.testing.assert_allclose(scan.ranges, [[4.0, np.inf, np.nan]])
-    assert [codec.REASONS[r] for r in scan.reasons[0]] == ["valid", "larger than maximum", "not valid"]
+    assert [codec.REASONS[r] for r in scan.reasons[0]] == [
+        "valid",
+        "larger than maximum",
+        "not valid",
+    ]
     assert (scan.unit, scan.partial.tolist()) == ("cm", [-1])
     assert scan.scan_index.tolist() == scan.telegram_index.tolist() == [-1]
     scan = decode_scan(second)
@@ -104,7 +148,9 @@ def test_special_values_of_every_mode(mode):
     for flags in (0, (1 << (16 - bits)) - 1):
         scan = decode_scan(codec.encode_words(words | np.uint16(flags << bits)), mode)
         assert scan.reasons[0].tolist() == list(stated.values())
-        expected = [np.inf if r == 6 else np.nan if r else (top - 9) / 1000 for r in stated.values()]
+        expected = [
+            np.inf if r == 6 else np.nan if r else (top - 9) / 1000 for r in stated.values()
+        ]
         np.testing.assert_allclose(scan.ranges[0], expected)
 
 
@@ -116,14 +162,18 @@ def test_any_scan_survives_both_ways(mode, unit, partial, indices):
     rng = np.random.default_rng(mode)
     for count in rng.integers(0, 402, 5):
         words = random_words(rng, count)
-        raw = codec.encode_words(words, unit=unit, partial=partial, indices=indices, status=0x51, address=0x85)
+        raw = codec.encode_words(
+            words, unit=unit, partial=partial, indices=indices, status=0x51, address=0x85
+        )
         scan = decode_scan(raw, mode)
         assert (scan.unit, scan.mode, scan.partial[0]) == (unit, mode, partial)
         assert (raw[-3], raw[1]) == (0x51, 0x85)
         assert (scan.scan_index[0], scan.telegram_index[0]) == (indices or (-1, -1))
         np.testing.assert_array_equal(scan.words[0], words)
         known = scan.reasons[0] < 7
-        values = codec.encode_values(scan.ranges[0, known], unit=unit, mode=mode, reasons=scan.reasons[0, known])
+        values = codec.encode_values(
+            scan.ranges[0, known], unit=unit, mode=mode, reasons=scan.reasons[0, known]
+        )
         np.testing.assert_array_equal(values, words[known] & MODES[mode].top)
 
 
@@ -146,7 +196,11 @@ def test_an_unfinished_telegram_is_kept_for_later(cut):
 @pytest.fixture(scope="module")
 def captures(real_data):
     """Telegrams of a real LMS200: direction, bytes, whether the recorder found the CRC right."""
-    lines = [line for file in sorted((real_data / "lms200_captures").glob("*.jsonl")) for line in file.open()]
+    lines = [
+        line
+        for file in sorted((real_data / "lms200_captures").glob("*.jsonl"))
+        for line in file.open()
+    ]
     found = [json.loads(line) for line in lines]
     return [(one["dir"], bytes.fromhex(one["hex"]), one["crc_ok"]) for one in found]
 
@@ -157,12 +211,22 @@ def test_real_scans_decode_and_encode_to_the_same_bytes(captures):
     stream = split_stream(data)
     (scans,) = codec.decode_scans(data, stream.offset, stream.length, mode=4)
     assert scans.ranges.shape == (316, 361) and len(stream.rejected) == 0
-    counts = zip(*(found.tolist() for found in np.unique(scans.reasons, return_counts=True)), strict=True)
+    counts = zip(
+        *(found.tolist() for found in np.unique(scans.reasons, return_counts=True)),
+        strict=True,
+    )
     told = {codec.REASONS[reason]: count for reason, count in counts}
     assert told == {"valid": 112476, "not valid": 956, "noise": 622, "overflow": 22}
-    assert np.isnan(scans.ranges).sum() == 956 + 622 + 22 and {raw[-3] for raw in raws} == {0x10, 0x11}
-    words = codec.encode_values(scans.ranges, mode=4, reasons=scans.reasons) | scans.words & np.uint16(0xC000)
-    assert [codec.encode_words(w, status=raw[-3]) for w, raw in zip(words, raws, strict=True)] == raws
+    assert np.isnan(scans.ranges).sum() == 956 + 622 + 22 and {raw[-3] for raw in raws} == {
+        0x10,
+        0x11,
+    }
+    words = codec.encode_values(
+        scans.ranges, mode=4, reasons=scans.reasons
+    ) | scans.words & np.uint16(0xC000)
+    assert [
+        codec.encode_words(w, status=raw[-3]) for w, raw in zip(words, raws, strict=True)
+    ] == raws
 
 
 def test_a_real_device_describes_itself(captures):

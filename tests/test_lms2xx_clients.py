@@ -14,7 +14,12 @@ import numpy as np
 import pytest
 from virtual import INDEXED, Source, lms
 
-from lrfcal_lib.session.lms2xx_codec import Configuration, crc16, encode_telegram, parse_telegram
+from lrfcal_lib.session.lms2xx_codec import (
+    Configuration,
+    crc16,
+    encode_telegram,
+    parse_telegram,
+)
 
 BAUD = {9600: "20 42", 19200: "20 41", 38400: "20 40", 500000: "20 48"}
 STOP = "20 25"
@@ -62,7 +67,9 @@ class Client:
         head += self.read(2)
         body = self.read(int.from_bytes(head[2:], "little"))
         checksum = self.read(2)
-        sound = len(checksum) == 2 and crc16(head + body) == int.from_bytes(checksum, "little")
+        sound = len(checksum) == 2 and crc16(head + body) == int.from_bytes(
+            checksum, "little"
+        )
         return head + body + checksum if sound else None
 
 
@@ -96,9 +103,9 @@ class Toolbox(Client):
             self.port.write(bytes([byte]))
             self.host.sleep(55e-6)
         expected = bytes.fromhex(DONE[int(payload[:2], 16)])
-        while (reply := self.receive(1.0 if payload in BAUD.values() else limit_s))[4] != expected[
-            0
-        ]:
+        while (reply := self.receive(1.0 if payload in BAUD.values() else limit_s))[
+            4
+        ] != expected[0]:
             pass
         assert reply[4:].startswith(expected), payload
 
@@ -116,14 +123,17 @@ class Toolbox(Client):
             if isinstance(step, str):
                 self.ask(step)
             else:
-                scans += [self.receive(15.0 if "20 26 05" in steps else 1.0) for _ in range(step)]
+                scans += [
+                    self.receive(15.0 if "20 26 05" in steps else 1.0) for _ in range(step)
+                ]
         self.set_rate(9600)
         return scans
 
 
 def writing(**changes):
     """What `config` sends for a change of the configuration, one after the other."""
-    steps, configuration = [], MILLIMETRES
+    steps = []
+    configuration = MILLIMETRES
     for name, value in changes.items():
         configuration = configuration.changed(**{name: value})
         steps += [PASSWORD, "77" + configuration.block.hex(), STOP, STATUS]
@@ -134,13 +144,19 @@ FINE = "3B 64 00 19 00"  # 100 deg in steps of 0.25 deg
 USUAL = "3B B4 00 32 00"
 PROGRAMS = {  # steps, and number of values of their scans
     "simple": (["20 24", 10, STOP], [361] * 10),
-    "set variant": ([FINE, "20 24", 10, STOP, USUAL, "20 24", 10, STOP], [401] * 10 + [361] * 10),
+    "set variant": (
+        [FINE, "20 24", 10, STOP, USUAL, "20 24", 10, STOP],
+        [401] * 10 + [361] * 10,
+    ),
     "config": (writing(unit="cm", measuring_mode=4, realtime_indices=True), []),
     "indices": (["20 24", 10, STOP], [361] * 10),
     "partial scan": ([FINE, "20 2A", 12, STOP], [181, 180, 180, 180] * 3),
     "mean values": (["20 26 05", 10, STOP], [361] * 10),
     "subrange": (["20 27 01 00 0A 00", 10, STOP], [10] * 10),
-    "stream": ([], []),  # of range and reflectivity: it sees that this is no LMS Fast, and ends
+    "stream": (
+        [],
+        [],
+    ),  # of range and reflectivity: it sees that this is no LMS Fast, and ends
 }
 HEADS = {0xB0: 0, 0xB6: 1, 0xB7: 4}  # bytes before the number of values
 
@@ -165,12 +181,16 @@ def test_programs_of_the_toolbox_run_to_their_end(name, rate):
     device = lms(configuration=INDEXED if indexed else MILLIMETRES)
     scans = [values_of(raw) for raw in Toolbox(device).run(steps, rate)]
     assert [len(values) for _, values, _ in scans] == counts
-    told = list(device.scans)[: len(scans)] if name != "set variant" else sent_twenty(device)
+    told = (
+        list(device.scans)[: len(scans)] if name != "set variant" else sent_twenty(device)
+    )
     for (partial, values, indices), record in zip(scans, told, strict=True):
         assert values.tolist() == record.words[: len(values)].tolist() and partial == max(
             record.partial, 0
         )
-        assert indices == (bytes([record.turn % 256, record.telegram_index]) if indexed else b"")
+        assert indices == (
+            bytes([record.turn % 256, record.telegram_index]) if indexed else b""
+        )
     # nothing was asked twice, and the device is left as it was found
     asked = [step for step in steps if isinstance(step, str)]
     order = [BAUD[rate], *SYNC, *asked, BAUD[9600]]
@@ -199,7 +219,9 @@ def test_a_mean_is_that_of_its_scans_and_one_without_a_range_leaves_none():
         *(Source().scan(turn + 2 * k, quarters, None) for k in range(5)), strict=True
     )
     ranged = np.all(np.array(reasons) == 0, axis=0)
-    assert values[ranged].tolist() == np.rint(np.mean(ranges, axis=0)[ranged] * 100).tolist()
+    assert (
+        values[ranged].tolist() == np.rint(np.mean(ranges, axis=0)[ranged] * 100).tolist()
+    )
     assert ranged.any() and (values[~ranged] > 8182).all() and not ranged.all()
 
 
@@ -329,12 +351,18 @@ def test_the_recorded_bytes_of_a_python_client_are_acknowledged_and_answered_in_
         asked = client.host.now()
         assert client.read(1) == b"\x06" and client.host.now() < asked + 0.25
         reply = client.rest_of(client.read(2))
-        assert reply[4:].startswith(bytes.fromhex(begin)) and client.host.now() < asked + 1.5
+        assert (
+            reply[4:].startswith(bytes.fromhex(begin)) and client.host.now() < asked + 1.5
+        )
         if sent.startswith("02 00 02 00 20 40"):
             client.port.baudrate = 38400
     heads = [client.rest_of(client.read(2))[4:7] for _ in range(20)]
-    assert set(heads) == {bytes.fromhex("B0 69 41")}  # 361 values, millimetres, as in 892 real scans
-    assert device.memory.flash_writes == 1 and device.memory.configuration.measuring_mode == 4
+    assert set(heads) == {
+        bytes.fromhex("B0 69 41")
+    }  # 361 values, millimetres, as in 892 real scans
+    assert (
+        device.memory.flash_writes == 1 and device.memory.configuration.measuring_mode == 4
+    )
     every = np.diff([record.time_s for record in list(device.scans)[:20]])
     np.testing.assert_allclose(every, 8 * 2 / 75.08, atol=1e-6)  # 213 ms, as recorded
 

@@ -19,7 +19,12 @@ from lrfcal_lib.session.lms2xx_codec import Configuration, encode_telegram
 
 def emulated(**options):
     """A device on a virtual host, at 38400 Bd with indices unless told otherwise."""
-    return lms_on(**({"baudrate": 38400, "configuration": INDEXED, "seed": 1, "boot_s": 0.5} | options))
+    return lms_on(
+        **(
+            {"baudrate": 38400, "configuration": INDEXED, "seed": 1, "boot_s": 0.5}
+            | options
+        )
+    )
 
 
 def opened(device, **options):
@@ -38,8 +43,14 @@ def record_of(device, reading):
     return [by_telegram[raw] for raw in reading.telegrams]
 
 
-LMS211 = {"model": "LMS211;302063;X01.27 ", "variant": (100, 50), "baudrates": (9600, 19200, 38400)}
-NO_RANGES = [{"configuration": Configuration().changed(measuring_mode=mode)} for mode in (0x0F, 0x3F)]
+LMS211 = {
+    "model": "LMS211;302063;X01.27 ",
+    "variant": (100, 50),
+    "baudrates": (9600, 19200, 38400),
+}
+NO_RANGES = [
+    {"configuration": Configuration().changed(measuring_mode=mode)} for mode in (0x0F, 0x3F)
+]
 
 
 @pytest.mark.parametrize(("habits", "options", "error", "message"), [
@@ -52,9 +63,9 @@ NO_RANGES = [{"configuration": Configuration().changed(measuring_mode=mode)} for
     (NO_RANGES[1], {}, WrongDevice, "in measuring mode 3F, .*state measuring_mode, 0 to 6"),
     (LMS211, {"baudrate": 500000}, Refused, r"declines 500000 Bd \(A0 02\)"),
 ])  # fmt: skip
-
-
-def test_what_cannot_be_opened_is_said_and_nothing_is_changed(habits, options, error, message):
+def test_what_cannot_be_opened_is_said_and_nothing_is_changed(
+    habits, options, error, message
+):
     device = emulated(**habits)
     with pytest.raises(error, match=message):
         opened(device, **options)
@@ -71,13 +82,21 @@ def test_a_measuring_mode_without_ranges_is_changed_at_opening():
 def test_what_the_device_declines_is_said(monkeypatch):
     device = emulated(**LMS211)
     with opened(device, password=b"WRONG_PW") as lms:
-        with pytest.raises(Refused, match=r"declines the password of the installation mode \(A0 01\)"):
+        with pytest.raises(
+            Refused, match=r"declines the password of the installation mode \(A0 01\)"
+        ):
             lms.configure(unit="cm")
-        with pytest.raises(Refused, match="LMS211-302063 has no variant 180/0.5; it keeps 100 deg in steps of 0"):
+        with pytest.raises(
+            Refused,
+            match="LMS211-302063 has no variant 180/0.5; it keeps 100 deg in steps of 0",
+        ):
             lms.set_variant(180, 0.5)
         assert lms.baudrate == 38400 and len(lms.request().ranges) == 201
     monkeypatch.setattr(device.memory, "write_configuration", lambda data: False)
-    with opened(device) as lms, pytest.raises(Refused, match="does not take the configuration 00 00"):
+    with (
+        opened(device) as lms,
+        pytest.raises(Refused, match="does not take the configuration 00 00"),
+    ):
         lms.configure(unit="cm")
     assert device.memory.mode == 0x25
 
@@ -98,7 +117,11 @@ def test_the_device_is_found_at_any_rate_whatever_it_was_doing(past, rate):
     assert device.streaming == (past in ("stream", "interlaced"))
     bench.port.close()
     with opened(device) as lms:
-        assert (lms.type, lms.status.firmware, lms.variant) == ("LMS221-302063", "X01.27", (180, 0.5))
+        assert (lms.type, lms.status.firmware, lms.variant) == (
+            "LMS221-302063",
+            "X01.27",
+            (180, 0.5),
+        )
         assert (lms.baudrate, device.streaming, device.memory.mode) == (rate, False, 0x25)
 
 
@@ -119,10 +142,19 @@ def test_only_what_differs_is_set():
         assert not {0x77, 0x3B} & set(commands(device)) and device.memory.flash_writes == 0
         block = device.memory.configuration.block
         assert lms.configure(unit="mm", measuring_mode=4, realtime_indices=True)
-        assert not lms.configure(unit="mm", measuring_mode=4) and device.memory.flash_writes == 1
+        assert (
+            not lms.configure(unit="mm", measuring_mode=4)
+            and device.memory.flash_writes == 1
+        )
         now = device.memory.configuration
-        assert (now.unit, now.measuring_mode, now.realtime_indices) == ("mm", 4, True) and now == lms.configuration
-        assert now.changed(unit="cm", measuring_mode=0, realtime_indices=False).block == block
+        assert (now.unit, now.measuring_mode, now.realtime_indices) == (
+            "mm",
+            4,
+            True,
+        ) and now == lms.configuration
+        assert (
+            now.changed(unit="cm", measuring_mode=0, realtime_indices=False).block == block
+        )
         assert device.memory.mode == 0x25
         assert lms.set_variant(100, 1) and not lms.set_variant(100, 1)
         assert lms.variant == (100, 1) and len(lms.request().ranges) == 101
@@ -134,7 +166,8 @@ def test_only_what_differs_is_set():
 
 def test_a_rate_that_does_not_come_through_is_given_up():
     device = emulated()
-    through, hear = device.port.put, device.hear
+    through = device.port.put
+    hear = device.hear
     device.port.put = lambda data: None if device.baudrate == 500000 else through(data)
 
     def deaf(data):
@@ -144,7 +177,10 @@ def test_a_rate_that_does_not_come_through_is_given_up():
             hear(data)
 
     device.hear = deaf
-    with pytest.raises(NoReply, match="nothing comes through at 500000 Bd, which needs RS-422.*; 38400 Bd now"):
+    with pytest.raises(
+        NoReply,
+        match="nothing comes through at 500000 Bd, which needs RS-422.*; 38400 Bd now",
+    ):
         opened(device, baudrate=500000)
     with opened(device) as lms:
         assert lms.baudrate == 38400 and len(lms.request().ranges) == 361
@@ -162,12 +198,20 @@ def test_scans_on_request_are_those_of_the_device(rate, variant):
         for _ in range(3):
             reading = lms.request()
             (truth,) = record_of(device, reading)
-            np.testing.assert_allclose(np.degrees(reading.bearings), np.arange(90 - angle / 2, 90.1 + angle / 2, step))
+            np.testing.assert_allclose(
+                np.degrees(reading.bearings),
+                np.arange(90 - angle / 2, 90.1 + angle / 2, step),
+            )
             np.testing.assert_allclose(reading.beam_times_s, truth.beam_times_s, atol=1e-4)
             assert reading.time_s == reading.beam_times_s[0]
-            assert (reading.scan_index, reading.telegram_index) == (truth.turn % 256, truth.telegram_index)
+            assert (reading.scan_index, reading.telegram_index) == (
+                truth.turn % 256,
+                truth.telegram_index,
+            )
             valid = reading.reasons == 0
-            np.testing.assert_array_equal(np.rint(reading.ranges[valid] * 1000), truth.words[valid])
+            np.testing.assert_array_equal(
+                np.rint(reading.ranges[valid] * 1000), truth.words[valid]
+            )
 
 
 def test_calls_at_the_wrong_time_say_so():
@@ -197,7 +241,9 @@ def test_a_request_declined_thrice_is_refused_and_once_is_not(fault):
     with opened(device) as lms:
         before = device.host.now()
         device.faults.inject(fault, 2)
-        assert lms.request() and device.host.now() - before > 2 * 0.03  # not asked again at once
+        assert (
+            lms.request() and device.host.now() - before > 2 * 0.03
+        )  # not asked again at once
         device.faults.inject(fault, 3)
         with pytest.raises(Refused, match="refuses command 30"):
             lms.request()
@@ -208,14 +254,14 @@ def test_a_request_declined_thrice_is_refused_and_once_is_not(fault):
     (lambda lms: lms.request(), 4.5), (lambda lms: lms.request(timeout=0.1), 0.2),
     (lambda lms: lms.set_variant(100, 1), 5.2), (lambda lms: lms.configure(unit="cm"), 2.6),
 ])  # fmt: skip
-
-
 def test_a_silent_device_is_given_up_in_time(call, limit_s):
     device = emulated()
     with opened(device) as lms:
         device.faults.inject("deaf", seconds=1000)
         begin = device.host.now()
-        with pytest.raises(NoReply, match="no reply to command .* at 38400 Bd; is the device on"):
+        with pytest.raises(
+            NoReply, match="no reply to command .* at 38400 Bd; is the device on"
+        ):
             call(lms)
         assert device.host.now() - begin < limit_s
 
@@ -245,7 +291,11 @@ def test_a_stream_comes_back_by_itself_with_the_same_settings(fault):
             device.hear(encode_telegram(0x31))
         after = device.host.time() + 0.1
         (reading,) = lms.take(1, after=after, timeout=10)
-        assert len(reading.ranges) == 201 and record_of(device, reading) and lms.counts["reconnects"] == 1
+        assert (
+            len(reading.ranges) == 201
+            and record_of(device, reading)
+            and lms.counts["reconnects"] == 1
+        )
         assert device.baudrate == 500000 and device.memory.flash_writes == 0
     assert not device.streaming
 
@@ -255,8 +305,13 @@ def test_a_stream_that_does_not_end_is_said(monkeypatch):
     with opened(device) as lms:
         lms.start()
         with monkeypatch.context() as patch:
-            patch.setattr(device, "set_mode", lambda data, at: device.answer(at, 0xA0, b"\0"))
-            with pytest.raises(Refused, match="confirms to stop streaming and goes on; switch it off and on"):
+            patch.setattr(
+                device, "set_mode", lambda data, at: device.answer(at, 0xA0, b"\0")
+            )
+            with pytest.raises(
+                Refused,
+                match="confirms to stop streaming and goes on; switch it off and on",
+            ):
                 lms.stop()
 
 
@@ -269,6 +324,8 @@ def test_on_a_pseudo_terminal(tmp_path):
         with LMS2xx(device.path, baudrate=500000, find_s=60) as lms:
             assert len(lms.request(timeout=60).ranges) == 361
             lms.start()
-            numbers = [record_of(device, reading)[0].number for reading in lms.take(10, timeout=60)]
+            numbers = [
+                record_of(device, reading)[0].number for reading in lms.take(10, timeout=60)
+            ]
             lms.stop()
     assert np.all(np.diff(numbers) > 0) and device.error is None and not device.streaming

@@ -13,9 +13,26 @@ from lrfcal_lib.drivers.port import DeviceError
 from lrfcal_lib.session.lms2xx_codec import decode_scan
 
 BOOT_S = 0.5
-RECOVERY_S, CALL_S = 3.0, 12.0  # longest: until all works again, and of any call
-LONG = {"unplug", "reboot", "rate", "deaf", "echo"}  # they last for a while, so there are fewer of them
-ON_REQUESTS = {"request_drop", "request_flip", "deaf", "echo", "nak", "no_ack", "refused", "reboot", "rate"}
+RECOVERY_S = 3.0
+CALL_S = 12.0  # longest: until all works again, and of any call
+LONG = {
+    "unplug",
+    "reboot",
+    "rate",
+    "deaf",
+    "echo",
+}  # they last for a while, so there are fewer of them
+ON_REQUESTS = {
+    "request_drop",
+    "request_flip",
+    "deaf",
+    "echo",
+    "nak",
+    "no_ack",
+    "refused",
+    "reboot",
+    "rate",
+}
 
 
 class Campaign:
@@ -28,13 +45,17 @@ class Campaign:
 
     def run(self, times):
         """All kinds of faults in random order, long ones half as often: those of a stream, then those of requests."""
-        kinds = self.rng.permutation([kind for kind in LMS for _ in range(times // 2 if kind in LONG else times)])
+        kinds = self.rng.permutation(
+            [kind for kind in LMS for _ in range(times // 2 if kind in LONG else times)]
+        )
         with LMS2xx(self.device.path, host=self.host) as self.lms:
             self.lms.start()
             for kind in [kind for kind in kinds if kind not in ON_REQUESTS]:
                 before = self.faults.counts[kind]
                 self.inject(kind)
-                self.host.wait(lambda kind=kind, before=before: self.faults.counts[kind] > before)
+                self.host.wait(
+                    lambda kind=kind, before=before: self.faults.counts[kind] > before
+                )
                 self.over(kind)
                 self.recovers(kind, self.fresh)
             self.survive(self.lms.stop)
@@ -62,7 +83,8 @@ class Campaign:
 
     def some_call(self):
         """Any of the calls of a quiet device."""
-        angle, unit = int(self.rng.choice([100, 180])), str(self.rng.choice(["cm", "mm"]))
+        angle = int(self.rng.choice([100, 180]))
+        unit = str(self.rng.choice(["cm", "mm"]))
         calls = [self.request, self.request, lambda: (self.lms.start(), self.lms.stop()),
                  lambda: self.lms.set_variant(angle, 0.5), lambda: self.lms.configure(unit=unit)]  # fmt: skip
         return calls[self.rng.integers(len(calls))]
@@ -92,7 +114,9 @@ class Campaign:
         return min(same, key=lambda record: abs(record.time_s - reading.time_s))
 
 
-@pytest.mark.parametrize(("number", "times"), [(0, 8), *(pytest.param(n, 20, marks=campaign) for n in (1, 2, 3))])
+@pytest.mark.parametrize(
+    ("number", "times"), [(0, 8), *(pytest.param(n, 20, marks=campaign) for n in (1, 2, 3))]
+)
 def test_faults_are_recovered_from_and_no_wrong_scan_is_accepted(number, times):
     """Every scan is one that the device made, at its time, and none came twice."""
     one = Campaign(number)
@@ -101,7 +125,9 @@ def test_faults_are_recovered_from_and_no_wrong_scan_is_accepted(number, times):
     found = [one.made(reading) for reading in one.readings]
     assert np.all(np.diff([record.number for record in found]) > 0)
     for reading, record in zip(one.readings, found, strict=True):
-        assert abs(reading.time_s - record.time_s) < 0.6  # below the delay that the fault 'delay' makes
+        assert (
+            abs(reading.time_s - record.time_s) < 0.6
+        )  # below the delay that the fault 'delay' makes
         unit = {"cm": 0.01, "mm": 0.001}[decode_scan(record.telegram).unit]
         valid = reading.reasons == 0
         np.testing.assert_allclose(reading.ranges[valid], record.words[valid] * unit)

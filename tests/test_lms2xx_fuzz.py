@@ -15,11 +15,36 @@ PARSERS = {0xB0: codec.decode_scan, 0xB1: codec.parse_status, 0xBA: codec.parse_
 
 def seeds(rng):
     """Sound telegrams of every kind."""
-    scans = [encode_scan(rng.uniform(0, 9, n), indices=i) for n in (0, 3, 20) for i in (None, (1, 2))]
-    scans += [encode_scan(rng.uniform(0, 9, 9), partial=p, unit=u) for p in range(4) for u in ("cm", "mm")]
-    sizes = {0xA0: 1, 0xB1: 152, 0xB2: 6, 0xBA: 21, 0xBB: 5, 0xF4: 34, 0xF7: 35, 0x90: 21, 0x92: 0}
-    replies = [encode_telegram(code, rng.bytes(size), status=0x10) for code, size in sizes.items()]
-    return [*scans, *replies, encode_telegram(0x20, b"\x25"), encode_telegram(0x77, bytes(34))]
+    scans = [
+        encode_scan(rng.uniform(0, 9, n), indices=i)
+        for n in (0, 3, 20)
+        for i in (None, (1, 2))
+    ]
+    scans += [
+        encode_scan(rng.uniform(0, 9, 9), partial=p, unit=u)
+        for p in range(4)
+        for u in ("cm", "mm")
+    ]
+    sizes = {
+        0xA0: 1,
+        0xB1: 152,
+        0xB2: 6,
+        0xBA: 21,
+        0xBB: 5,
+        0xF4: 34,
+        0xF7: 35,
+        0x90: 21,
+        0x92: 0,
+    }
+    replies = [
+        encode_telegram(code, rng.bytes(size), status=0x10) for code, size in sizes.items()
+    ]
+    return [
+        *scans,
+        *replies,
+        encode_telegram(0x20, b"\x25"),
+        encode_telegram(0x77, bytes(34)),
+    ]
 
 
 def damaged(rng, seed, count):
@@ -35,14 +60,17 @@ def damaged(rng, seed, count):
 def test_fuzz_streams():
     """Strings side by side."""
     rng = np.random.default_rng(20091001)
-    every, found = seeds(rng), 0
+    every = seeds(rng)
+    found = 0
     for seed in every:
         data = b"".join(damaged(rng, seed, STRINGS // 2 // len(every)))
         stream = codec.split_stream(data, replies=bool(seed[1]))
         assert len(stream.offset) == len(stream.length) and stream.pending <= len(data)
         assert np.all(stream.offset[1:] >= stream.offset[:-1] + stream.length[:-1])
         assert stream.length.sum() <= stream.pending
-        for group in codec.decode_scans(data, stream.offset, stream.length, int(rng.choice(list(MODES)))):
+        for group in codec.decode_scans(
+            data, stream.offset, stream.length, int(rng.choice(list(MODES)))
+        ):
             assert group.words.shape == group.ranges.shape == group.reasons.shape
         found += len(stream.offset)
     assert found > 0.02 * STRINGS  # those that were not hit
@@ -51,7 +79,8 @@ def test_fuzz_streams():
 def test_fuzz_contents():
     """One string after the other, most of them with a checksum that is sound again."""
     rng = np.random.default_rng(20091001)
-    every, values = seeds(rng), 0
+    every = seeds(rng)
+    values = 0
     for seed in every:
         parse = PARSERS.get(seed[4], codec.parse_telegram)
         for raw in damaged(rng, seed, STRINGS // 2 // len(every)):
@@ -60,5 +89,7 @@ def test_fuzz_contents():
             with suppress(codec.TelegramError):
                 scan = parse(raw)
                 values += 1
-                assert parse is not codec.decode_scan or np.all(np.isfinite(scan.ranges) == (scan.reasons == 0))
+                assert parse is not codec.decode_scan or np.all(
+                    np.isfinite(scan.ranges) == (scan.reasons == 0)
+                )
     assert 0.1 * STRINGS < values < 0.45 * STRINGS

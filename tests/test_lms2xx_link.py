@@ -36,7 +36,10 @@ def test_bytes_are_paced_at_500000_baud_only(rate, writes):
 
 def test_nobody_there_and_somebody_else_are_told_apart():
     far = Far()
-    with pytest.raises(NoReply, match="19200, 500000 Bd, address 5: check power.*address, .*crossed.*RS-422"):
+    with pytest.raises(
+        NoReply,
+        match="19200, 500000 Bd, address 5: check power.*address, .*crossed.*RS-422",
+    ):
         LMS2xx(far.path, host=far.host, find_s=1.2, address=5)
     assert far.host.now() < 2.5
 
@@ -45,5 +48,8 @@ def test_nobody_there_and_somebody_else_are_told_apart():
         far.at(instant + 0.05, talk)
 
     talk(far.host.now())
-    with pytest.raises(WrongDevice, match=r"bytes arrive, but no telegram of an LMS2xx at .* Bd, address 0 \(any\)"):
+    with pytest.raises(
+        WrongDevice,
+        match=r"bytes arrive, but no telegram of an LMS2xx at .* Bd, address 0 \(any\)",
+    ):
         LMS2xx(far.path, host=far.host, find_s=1.2)

@@ -30,14 +30,21 @@ def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate,
     truth = {record.telegram: record for record in device.scans}
     truth = [truth[reading.telegrams[0]] for reading in readings]
     assert np.all(np.diff([record.number for record in truth]) == 1)
-    assert [reading.scan_index for reading in readings] == [record.turn % 256 for record in truth]
+    assert [reading.scan_index for reading in readings] == [
+        record.turn % 256 for record in truth
+    ]
     assert counts["stale"] == counts["reconnects"] == 0
     # a telegram that takes longer than a scan keeps those in between from being sent; they are counted by the index
-    period, turns = TABLE[rate][[*VARIANTS].index(variant)], 100 // variant[1]
+    period = TABLE[rate][[*VARIANTS].index(variant)]
+    turns = 100 // variant[1]
     assert set(np.diff([record.turn for record in truth])) == {period * turns}
-    assert interval_s(VARIANTS[variant], rate, turns * MIRROR_TURN) == pytest.approx(period * turns * MIRROR_TURN)
+    assert interval_s(VARIANTS[variant], rate, turns * MIRROR_TURN) == pytest.approx(
+        period * turns * MIRROR_TURN
+    )
     assert counts["dropped"] == (len(readings) - 1) * (period - 1)
-    assert [r.time_s for r in readings] == pytest.approx([record.time_s for record in truth], abs=5e-4)
+    assert [r.time_s for r in readings] == pytest.approx(
+        [record.time_s for record in truth], abs=5e-4
+    )
 
 
 def test_interlaced_scans_carry_the_instants_of_the_mirror():
@@ -47,13 +54,16 @@ def test_interlaced_scans_carry_the_instants_of_the_mirror():
         readings = driver.take(20)
         driver.stop()
     begun = {record.telegram: record.time_s for record in device.scans}
-    assert [r.time_s for r in readings] == pytest.approx([begun[r.telegrams[0]] for r in readings], abs=5e-4)
+    assert [r.time_s for r in readings] == pytest.approx(
+        [begun[r.telegrams[0]] for r in readings], abs=5e-4
+    )
     assert all(len(r.ranges) == 721 for r in readings) and driver.variant == (100, 0.25)
 
 
 def read_late(device, rng):
     """Bytes of a device get to the host at once for 5 to 120 ms of the line, as a busy machine reads them."""
-    held, put = [], device.port.put
+    held = []
+    put = device.port.put
 
     def hand_over(instant):
         put(b"".join(held))
@@ -78,24 +88,39 @@ def test_no_set_of_interlaced_scans_is_lost_where_its_parts_are_read_late(indexe
 
 
 def test_late_arrivals_do_not_shift_scans():
-    rng, clock = np.random.default_rng(1), ScanClock()
+    rng = np.random.default_rng(1)
+    clock = ScanClock()
     turns = np.cumsum(rng.integers(1, 40, 400))  # over many rounds of the index
     late = np.where(rng.random(400) < 0.2, rng.exponential(0.05, 400), 0)
     late[0] = 0
-    instants, steps = zip(*map(clock.place, (turns % 256).tolist(), 100.0 + turns * MIRROR_TURN + late), strict=True)
+    instants, steps = zip(
+        *map(clock.place, (turns % 256).tolist(), 100.0 + turns * MIRROR_TURN + late),
+        strict=True,
+    )
     off = np.array(instants) - 100.0 - turns * MIRROR_TURN
-    assert np.median(off) == pytest.approx(0, abs=1e-9) and np.abs(off).max() < 0.01 < late.max()
+    assert (
+        np.median(off) == pytest.approx(0, abs=1e-9)
+        and np.abs(off).max() < 0.01 < late.max()
+    )
     assert list(steps[1:]) == np.diff(turns).tolist()
 
 
 def interlaced(partials, indexed, skipped=()):
     """Readings that telegrams of interlaced scans complete; ranges tell where they belong."""
-    configuration, counts = INDEXED.changed(realtime_indices=indexed), {"dropped": 0, "stale": 0}
-    one, made = Assembler((100, 0.25), configuration, 500000, True, counts, ScanClock()), {}
+    configuration = INDEXED.changed(realtime_indices=indexed)
+    counts = {"dropped": 0, "stale": 0}
+    one = Assembler((100, 0.25), configuration, 500000, True, counts, ScanClock())
+    made = {}
     for k, partial in enumerate(partials):
         ranges = 1 + (4 * np.arange(181 - (partial > 0)) + partial) / 1000
-        raw = encode_scan(ranges, partial=partial, indices=(k % 256, k % 256) if indexed else None)
-        reading = None if k in skipped else one.feed(raw, 9 + k * MIRROR_TURN + transfer_s(len(raw), 500000))
+        raw = encode_scan(
+            ranges, partial=partial, indices=(k % 256, k % 256) if indexed else None
+        )
+        reading = (
+            None
+            if k in skipped
+            else one.feed(raw, 9 + k * MIRROR_TURN + transfer_s(len(raw), 500000))
+        )
         made |= {k: reading} if reading else {}
     return made
 
@@ -107,8 +132,6 @@ FOUR = [2, 3, 4, 5, 8, 9, 10, 11]  # 0 and 1 of one set and 2 and 3 of the next 
     *((indexed, [part], [3, 11]) for indexed in (True, False) for part in (4, 5, 6, 7)),
     (True, FOUR, []), (False, FOUR, [7]),
 ])  # fmt: skip
-
-
 def test_sets_with_a_missing_part_are_no_scan(indexed, missing, made):
     """Without indices four that are missing in a row are not seen."""
     found = interlaced([0, 1, 2, 3] * 3, indexed, missing)

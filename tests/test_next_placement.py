@@ -15,7 +15,8 @@ NOWHERE = (0.0, 0.01)  # bearings, radians
 @pytest.fixture(scope="module")
 def good():
     rng = np.random.default_rng(1)
-    rig, poses = bench(rng), board_poses(rng, 8)
+    rig = bench(rng)
+    poses = board_poses(rng, 8)
     return rig, poses, solve(rig, poses, rng)
 
 
@@ -35,14 +36,20 @@ def test_the_suggested_placement_brings_what_it_promises(good, suggested):
         return 1 - np.linalg.norm([*after.values()]) / np.linalg.norm([*before.values()])
 
     gain = with_board(suggested.T_platform_board, 5)
-    assert gain > 0.8 * suggested.gain and 1 - gain == pytest.approx(1 - suggested.gain, rel=0.2)
+    assert gain > 0.8 * suggested.gain and 1 - gain == pytest.approx(
+        1 - suggested.gain, rel=0.2
+    )
     blind = [with_board(pose, 6) for pose in board_poses(np.random.default_rng(7), 5)]
-    assert gain > 1.2 * np.median(blind) and suggested.gain > 1.5 * suggested.median_gain > 0
+    assert (
+        gain > 1.2 * np.median(blind) and suggested.gain > 1.5 * suggested.median_gain > 0
+    )
 
 
 def test_suggestions_refuse_bad_input(good):
     rig, _, solution = good
-    with pytest.raises(DegenerateGeometry, match="none of .* board poses lies wholly in the view"):
+    with pytest.raises(
+        DegenerateGeometry, match="none of .* board poses lies wholly in the view"
+    ):
         suggest_placement(solution, models_of(rig), field_of_view=NOWHERE)
     last = verdict(solution, models_of(rig), field_of_view=NOWHERE).sentences()[-1]
     assert last.startswith("No placement can be suggested: none of")

@@ -4,7 +4,11 @@ import pytest
 from notebook_runs import WITH_SESSION, check_tables, run_plainly
 from shared import campaign, stages
 
-LATER = "02", "04", "07"  # as the shipped session's do; estimates of 05 and 06, falsified as well
+LATER = (
+    "02",
+    "04",
+    "07",
+)  # as the shipped session's do; estimates of 05 and 06, falsified as well
 
 
 @pytest.mark.parametrize(

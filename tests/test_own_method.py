@@ -26,27 +26,44 @@ def angles_to_sight(pose, obs):
     depth = np.linalg.norm(q, axis=-1, keepdims=True)
     residuals = np.sum(sight * q / depth, axis=-1)
     by_point = sight / depth - residuals[:, None] * q / depth**2
-    jacobian = np.concatenate([np.cross(turned, by_point), by_point], axis=-1)  # by [w, v], see lrfcal_lib
-    return Block(residuals, jacobian, np.full(len(residuals), 1e3))  # noise of a milliradian
+    jacobian = np.concatenate(
+        [np.cross(turned, by_point), by_point], axis=-1
+    )  # by [w, v], see lrfcal_lib
+    return Block(
+        residuals, jacobian, np.full(len(residuals), 1e3)
+    )  # noise of a milliradian
 
 
-ROW = Method(variant="half_step", uses="crossing", fewest=6, label="angles to sight", residual=angles_to_sight)
+ROW = Method(
+    variant="half_step",
+    uses="crossing",
+    fewest=6,
+    label="angles to sight",
+    residual=angles_to_sight,
+)
 
 
 def test_a_residual_and_a_row_are_a_method(monkeypatch):
     monkeypatch.setitem(METHODS, "angles", ROW)
     rig, obs = camera_case(1, noise=1.0)
-    observations = {("left", variant): obs for variant in ("half_step", "last_beam", "one_scan")}
+    observations = {
+        ("left", variant): obs for variant in ("half_step", "last_beam", "one_scan")
+    }
     solutions, problems = calibrate_cameras(observations)
     table = method_comparison(observations, solutions).set_index("method")
     assert list(table.index) == list(METHODS) and problems == []
-    assert table.loc["angles", "left_out_edge_rms_px"] < 1.5 * table.loc["line", "left_out_edge_rms_px"]
+    assert (
+        table.loc["angles", "left_out_edge_rms_px"]
+        < 1.5 * table.loc["line", "left_out_edge_rms_px"]
+    )
     error = solutions["left", "angles"].transform * rig.T_camera_lrf.inv()
     assert error.rotation.magnitude() < 0.02 and np.linalg.norm(error.translation) < 0.03
     assert notebook.in_words("angles") == "angles to sight"
 
 
-def test_a_row_is_found_whenever_it_is_added_and_the_cache_keeps_nothing_of_it(monkeypatch, tmp_path):
+def test_a_row_is_found_whenever_it_is_added_and_the_cache_keeps_nothing_of_it(
+    monkeypatch, tmp_path
+):
     """As in a notebook of `make lab`, whose residual is changed and run again."""
     monkeypatch.setenv(cache.VARIABLE, str(stages()))
     session = open_session(QUICK)
@@ -58,5 +75,3 @@ def test_a_row_is_found_whenever_it_is_added_and_the_cache_keeps_nothing_of_it(m
     assert pipeline.calibrate(session).solutions["left", "angles"] == "changed"
     with pytest.raises(ValueError, match="unknown method 'circles': use one of .*angles"):
         pipeline.calibrate(session, ["circles"])
-
-

@@ -18,12 +18,15 @@ from lrfcal_lib.drivers.rig_file import RigFileError
 from lrfcal_lib.session.read import open_session
 
 WAIT_S = 120  # guards against hanging
+
+
 @pytest.fixture
 def fake(monkeypatch, tmp_path):
     """Makes a rig file, to whose plan keywords go, and the fake rig that opens for it."""
 
     def fake(board=None, **plan):
-        data, path = rig_data(**plan), tmp_path / "rig.json"
+        data = rig_data(**plan)
+        path = tmp_path / "rig.json"
         data["board"]["corners_m"][1] = board or data["board"]["corners_m"][1]
         path.write_text(json.dumps(data))
         rig = make_rig(data)
@@ -59,7 +62,8 @@ def test_stop_ends_a_capture_and_nothing_of_it_counts(connected):
             threads.append(in_background(connected.stop))
             connected.stopped.wait(WAIT_S)
 
-    threads, head = [], connected.rig.head
+    threads = []
+    head = connected.rig.head
     with pytest.raises(Interrupted, match="placement 1 does not count"):
         connected.capture(stop_at_third)
     threads[0].join(WAIT_S)
@@ -71,8 +75,11 @@ def test_stop_ends_a_capture_and_nothing_of_it_counts(connected):
 
 def test_one_thing_at_a_time(connected, monkeypatch):
     monkeypatch.setattr(collector, "WAIT_S", 0.05)
-    begun, go_on = threading.Event(), threading.Event()
-    thread = in_background(lambda: connected.capture(lambda *_: (begun.set(), go_on.wait(WAIT_S))))
+    begun = threading.Event()
+    go_on = threading.Event()
+    thread = in_background(
+        lambda: connected.capture(lambda *_: (begun.set(), go_on.wait(WAIT_S)))
+    )
     assert begun.wait(WAIT_S)
     with pytest.raises(Busy, match="wait until it is done, or press stop"):
         connected.move_to(0.1)
@@ -100,7 +107,11 @@ def test_what_cannot_be_done_yet_or_any_more(connected):
 
 def test_advice_where_nothing_is_determined_yet(monkeypatch):
     monkeypatch.setattr(collector, "prepare", lambda session: session)
-    monkeypatch.setattr(collector, "calibrate_jointly", raising(collector.DegenerateGeometry("one placement only")))
+    monkeypatch.setattr(
+        collector,
+        "calibrate_jointly",
+        raising(collector.DegenerateGeometry("one placement only")),
+    )
     assert collector.advise(None) == "not determined yet: one placement only"
 
 
@@ -109,8 +120,6 @@ def test_advice_where_nothing_is_determined_yet(monkeypatch):
     ("missing.json", RigFileError, "No such file.*emulate"),
     ("rig.json", PortError, "head: .*fake_head"),
 ])  # fmt: skip
-
-
 def test_a_rig_or_port_that_is_not_there(rig, error, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.json").write_text(json.dumps(rig_data(cameras=())))
@@ -139,7 +148,12 @@ def pressed(panel, name):
 def test_buttons_that_the_browser_does_not_press(panel):
     """Connect, capture, calibrate and close are pressed in test_panel_browser."""
     parts = panel.parts
-    assert parts.capture.disabled and parts.close.disabled and not parts.connect.disabled and not parts.stop.disabled
+    assert (
+        parts.capture.disabled
+        and parts.close.disabled
+        and not parts.connect.disabled
+        and not parts.stop.disabled
+    )
     pressed(panel, "connect")
     assert not parts.capture.disabled and parts.calibrate.disabled
     pressed(panel, "capture")
@@ -166,7 +180,9 @@ PLACES = {  # LRFCAL_RECORDINGS, what the field says, and where the recording go
 
 
 @pytest.mark.parametrize("case", PLACES)
-def test_a_recording_goes_to_a_folder_that_is_shown_in_full_and_stays(fake, case, tmp_path, monkeypatch):
+def test_a_recording_goes_to_a_folder_that_is_shown_in_full_and_stays(
+    fake, case, tmp_path, monkeypatch
+):
     folder, field, expected = PLACES[case]
     home = tmp_path / "home"
     home.mkdir()
@@ -179,9 +195,15 @@ def test_a_recording_goes_to_a_folder_that_is_shown_in_full_and_stays(fake, case
             made.parts.session.value = field
         assert re.fullmatch(f"{home}/{expected}", str(made.session))
         shown = re.sub("<[^>]+>", "", made.parts.places.value)
-        assert f"the recording goes to {made.session}" in shown and f"the rig file is {home}/../rig.json" in shown
+        assert (
+            f"the recording goes to {made.session}" in shown
+            and f"the rig file is {home}/../rig.json" in shown
+        )
         pressed(made, "connect")
-        assert made.parts.session.value == str(made.session) and made.parts.rig.value == f"{home}/../rig.json"
+        assert (
+            made.parts.session.value == str(made.session)
+            and made.parts.rig.value == f"{home}/../rig.json"
+        )
         pressed(made, "capture")
     assert open_session(made.session).placements == (1,)
 
@@ -195,27 +217,41 @@ def test_errors_appear_in_the_panel(panel, tmp_path):
         panel.connect()
     panel.parts.rig.value = str(tmp_path / "rig.json")
     assert pressed(panel, "connect").error.value == ""
-    panel.collector.rig.head.fail = OutOfRange("pitch 80 deg is beyond the head's limits: ask for less")
+    panel.collector.rig.head.fail = OutOfRange(
+        "pitch 80 deg is beyond the head's limits: ask for less"
+    )
     assert "ask for less" in pressed(panel, "go").error.value
     panel.collector.rig.head.fail = None
     pressed(panel, "capture")
     refused = pressed(panel, "calibrate").result.value
-    assert "cannot be trusted" in refused and "no image can be used" in refused and "ready" in parts.state.value
+    assert (
+        "cannot be trusted" in refused
+        and "no image can be used" in refused
+        and "ready" in parts.state.value
+    )
 
 
 def test_a_lost_camera_is_said_until_it_is_back(panel):
     panel.connect()
-    camera, parts = panel.collector.rig.cameras["left"], panel.parts
-    newest, camera.newest = camera.newest, raising(LineLost("camera left is lost: its plug"))
+    camera = panel.collector.rig.cameras["left"]
+    parts = panel.parts
+    newest, camera.newest = (
+        camera.newest,
+        raising(LineLost("camera left is lost: its plug")),
+    )
     until(lambda: "camera left is lost: its plug" in parts.trouble.value)
     assert "left" not in panel.collector.view.frames
     with pytest.raises(LineLost, match="its plug"):
         panel.collector.capture()
     camera.newest = newest
-    until(lambda: parts.trouble.value.strip() == "" and "left" in panel.collector.view.frames)
+    until(
+        lambda: parts.trouble.value.strip() == "" and "left" in panel.collector.view.frames
+    )
 
 
-def test_what_nobody_expects_and_what_drivers_report_is_said_too(panel, monkeypatch, caplog):
+def test_what_nobody_expects_and_what_drivers_report_is_said_too(
+    panel, monkeypatch, caplog
+):
     panel.connect()
     monkeypatch.setattr(panel.collector, "move_to", lambda pitch: 1 / 0)
     with pytest.raises(ZeroDivisionError):

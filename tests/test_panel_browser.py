@@ -19,7 +19,8 @@ from test_saving import option
 NOTEBOOK = next((Path(__file__).resolve().parents[1] / "notebooks").glob("09_*.ipynb"))
 # dash, which Open3D brings, has JupyterLab ask whether it should be built anew: no dialog in the way
 QUIET = "--ServerApp.tornado_settings={'page_config_data': {'buildCheck': False, 'buildAvailable': False}}"
-START_S, ACTION_S = 180, 240  # guards against hanging
+START_S = 180
+ACTION_S = 240  # guards against hanging
 SCREEN = {"width": 1280, "height": 900}  # of a small laptop
 
 
@@ -37,20 +38,31 @@ def panel_only(folder):
 @pytest.fixture
 def lab(tmp_path):
     """Address of a JupyterLab with the panel's notebook, its token included."""
-    work, log, token = tmp_path / "work", tmp_path / "log", secrets.token_hex(16)
+    work = tmp_path / "work"
+    log = tmp_path / "log"
+    token = secrets.token_hex(16)
     work.mkdir()
     panel_only(work)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{probe.getsockname()[1]}"
-    environment = os.environ | {f"JUPYTER_{kind}_DIR": str(tmp_path / kind.lower()) for kind in ("CONFIG", "RUNTIME")}
-    environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JUPYTER_TOKEN": token}
+    environment = os.environ | {
+        f"JUPYTER_{kind}_DIR": str(tmp_path / kind.lower())
+        for kind in ("CONFIG", "RUNTIME")
+    }
+    environment |= {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "JUPYTER_TOKEN": token,
+    }
     command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ip=127.0.0.1",
                f"--port={address.rpartition(':')[2]}", "--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}",
                QUIET, option()]  # fmt: skip
 
     def call(path, **options):
-        request = urllib.request.Request(address + path, headers={"Authorization": f"token {token}"}, **options)
+        request = urllib.request.Request(
+            address + path, headers={"Authorization": f"token {token}"}, **options
+        )
         return urllib.request.urlopen(request, timeout=20).read()
 
     def responds():
@@ -61,9 +73,13 @@ def lab(tmp_path):
         server = subprocess.Popen(command, env=environment, stdout=stream, stderr=stream)
         try:
             until(lambda: server.poll() is not None or responds(), START_S)
-            assert server.poll() is None, f"JupyterLab does not start:\n{log.read_text()[-3000:]}"
+            assert server.poll() is None, (
+                f"JupyterLab does not start:\n{log.read_text()[-3000:]}"
+            )
             yield f"{address}/doc/tree/{NOTEBOOK.name}?token={token}"
-            for kernel in json.loads(call("/api/kernels")):  # by itself: the panel's rig is closed, its head stopped
+            for kernel in json.loads(
+                call("/api/kernels")
+            ):  # by itself: the panel's rig is closed, its head stopped
                 call(f"/api/kernels/{kernel['id']}", method="DELETE")
         finally:
             server.terminate()
@@ -102,7 +118,9 @@ def changed(page, name, before):
 def press(page, name, text):
     """Press a button and wait until the panel says something, or that something failed."""
     page.click(f"button.lrfcal-{name}:enabled")
-    page.wait_for_selector(f".lrfcal-panel :text('{text}'), .lrfcal-error:has-text('failed')")
+    page.wait_for_selector(
+        f".lrfcal-panel :text('{text}'), .lrfcal-error:has-text('failed')"
+    )
     failed = page.locator(".lrfcal-error:has-text('failed')")
     assert failed.count() == 0, failed.first.inner_text()
 
@@ -119,7 +137,9 @@ ELSEWHERE = """folder => {
 def on_screen(page, *names):
     """Whether buttons are on screen, all at once."""
     boxes = [page.locator(f"button.lrfcal-{name}").bounding_box() for name in names]
-    inside = [box["y"] >= 0 and box["y"] + box["height"] <= SCREEN["height"] for box in boxes]
+    inside = [
+        box["y"] >= 0 and box["y"] + box["height"] <= SCREEN["height"] for box in boxes
+    ]
     return all(inside) and all(box["x"] + box["width"] <= SCREEN["width"] for box in boxes)
 
 
@@ -155,8 +175,11 @@ def test_buttons_record_and_calibrate(page, count, tmp_path):
         page.locator(".lrfcal-panel").screenshot(path=os.environ["LRFCAL_SCREENSHOT"])
     press(page, "close", "not connected")
     file = tmp_path / "work" / NOTEBOOK.name
-    before, saved = file.read_bytes(), file.stat().st_mtime_ns
+    before = file.read_bytes()
+    saved = file.stat().st_mtime_ns
     page.keyboard.press("Control+S")
     until(lambda: file.stat().st_mtime_ns != saved)
     assert file.read_bytes() == before, "the notebook was run, and is as it was"
-    assert sorted(path.name for path in folder.parent.iterdir())[0] == "monday", "the recording stays"
+    assert sorted(path.name for path in folder.parent.iterdir())[0] == "monday", (
+        "the recording stays"
+    )

@@ -26,16 +26,23 @@ from lrfcal_lib.preprocess.pattern_in_image import (
 
 
 # squares along the pixel grid are the hard case of the sector-based detector (and no limit on real prints)
-@pytest.mark.parametrize(("roll", "negative", "limit"), [(0.0, False, 0.1), (-1.2, False, 0.05), (-1.2, True, 0.1)])
+@pytest.mark.parametrize(
+    ("roll", "negative", "limit"),
+    [(0.0, False, 0.1), (-1.2, False, 0.05), (-1.2, True, 0.1)],
+)
 def test_corners_are_found_at_subpixel_level(roll, negative, limit):
     """Also of white squares on a dark board."""
     pose = pose_of(roll)
     picture = 255 - render(pose) if negative else render(pose)
-    off = up_to_a_turn(find_pattern(picture), on_board(pose, PATTERN.points()[:, :2], project))
+    off = up_to_a_turn(
+        find_pattern(picture), on_board(pose, PATTERN.points()[:, :2], project)
+    )
     assert np.sqrt(np.mean(off**2)) < limit
 
 
-@pytest.mark.parametrize(("side", "rim"), [(6.5, 0.65), (9.5, 1.0), (10.5, 0.65)])  # pixels, squares
+@pytest.mark.parametrize(
+    ("side", "rim"), [(6.5, 0.65), (9.5, 1.0), (10.5, 0.65)]
+)  # pixels, squares
 def test_small_squares_have_the_right_scale(side, rim):
     """Also where the outermost squares are cut: no window may reach over the rim of the pattern."""
     pattern = Chessboard(7, 5, 0.05)
@@ -43,23 +50,30 @@ def test_small_squares_have_the_right_scale(side, rim):
     sheet = replace(SHEET, corners=corners, pattern=pattern)
     scales = []
     for seed, pose in enumerate(view_poses(6, seed=3)):
-        far = RigidTransform.from_components([0.01 * seed, -0.07, MODEL.fx * pattern.square / side], pose.rotation)
+        far = RigidTransform.from_components(
+            [0.01 * seed, -0.07, MODEL.fx * pattern.square / side], pose.rotation
+        )
         exact = on_board(far, pattern.points()[:, :2], project)
         picture = render(far, sheet, seed=seed, rim=rim)
         off = up_to_a_turn(find_pattern(picture, pattern), exact)
         spread = exact - exact.mean(axis=0)
         scales.append(np.sum(off * spread) / np.sum(spread**2))
-    assert abs(np.median(scales)) < 0.0003  # a corner that the detector puts elsewhere is left out later
+    assert (
+        abs(np.median(scales)) < 0.0003
+    )  # a corner that the detector puts elsewhere is left out later
 
 
 def test_large_images_are_searched_small_and_refined_as_they_are(monkeypatch):
-    pose, looked_at = pose_of(-1.2), []
+    pose = pose_of(-1.2)
+    looked_at = []
     small = render(pose, noise=0.0)
     exact = on_board(pose, PATTERN.points()[:, :2], project)
 
     def watched(ask):
         """The same detector, which notes how large the pictures are."""
-        return lambda picture, *rest, **options: looked_at.append(picture.size) or ask(picture, *rest, **options)
+        return lambda picture, *rest, **options: (
+            looked_at.append(picture.size) or ask(picture, *rest, **options)
+        )
 
     for name in ("findChessboardCorners", "findChessboardCornersSB"):
         monkeypatch.setattr(cv2, name, watched(getattr(cv2, name)))
@@ -77,7 +91,8 @@ def test_large_images_are_searched_small_and_refined_as_they_are(monkeypatch):
 
 def test_corners_run_clockwise_also_in_a_mirrored_image():
     found = find_pattern(render(pose_of())[:, ::-1].copy()).reshape(4, 6, 2)
-    x, y = found[0, -1] - found[0, 0], found[-1, 0] - found[0, 0]
+    x = found[0, -1] - found[0, 0]
+    y = found[-1, 0] - found[0, 0]
     assert x[0] * y[1] - x[1] * y[0] > 0
 
 
@@ -86,10 +101,10 @@ def test_corners_run_clockwise_also_in_a_mirrored_image():
     *[(shape, np.uint8, "must be uint8") for shape in ((4, 4, 3, 1), (0, 0))],
     ((4, 4), float, "must be uint8"),
 ])  # fmt: skip
-
-
 def test_no_pattern_and_no_image(shape, kind, message):  # OpenCV refuses narrow ones
-    with pytest.raises(PatternNotFound if "corners" in message else ValueError, match=message):
+    with pytest.raises(
+        PatternNotFound if "corners" in message else ValueError, match=message
+    ):
         find_pattern(np.full(shape, 90, kind))
 
 
@@ -99,7 +114,9 @@ def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(roll):
     whole = find_pattern(picture)
     for beyond in (-5, 3, 45):
         try:
-            found = find_pattern(np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond]))
+            found = find_pattern(
+                np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond])
+            )
         except PatternNotFound:
             assert beyond < 30  # where all squares are seen it is found
         else:

@@ -45,7 +45,9 @@ ANGLES = [
     (30.0, "80 E8 B4", "80 E8 B6", "80 E8 C2", "80 E8 C4"),
     (0.01, "8C 9F 77", "8C 9F 79", "8C 9F 85", "8C 9F 87"),
 ]
-STOP, MOTION, QUERY = encode_frame(1), encode_frame(1, 0, UP, 0, 0x20), encode_extended(1, pelco_d.QUERY_TILT)
+STOP = encode_frame(1)
+MOTION = encode_frame(1, 0, UP, 0, 0x20)
+QUERY = encode_extended(1, pelco_d.QUERY_TILT)
 LEVEL = bytes.fromhex("FF 01 00 5B 00 00 5C")
 PAN_45 = bytes.fromhex("FF 01 00 59 11 94 FF")
 
@@ -71,7 +73,9 @@ def test_angles(degrees, set_pan, set_tilt, pan, tilt):
 
 def test_every_tilt_survives():
     elevations = [pelco_d.decode_tilt(value) for value in range(36000)]
-    assert [pelco_d.encode_tilt(elevation) for elevation in elevations] == list(range(36000))
+    assert [pelco_d.encode_tilt(elevation) for elevation in elevations] == list(
+        range(36000)
+    )
     assert min(elevations) == pytest.approx(-math.pi) and max(elevations) < math.pi
     assert pelco_d.encode_tilt(2 * math.pi + 0.5) == pelco_d.encode_tilt(0.5)
 
@@ -80,7 +84,12 @@ def test_every_tilt_survives():
 
 
 def test_commands_between_garbage():
-    frames = [MOTION, encode_frame(255), encode_extended(1, 0x59, 4500), encode_frame(255, data1=255)]
+    frames = [
+        MOTION,
+        encode_frame(255),
+        encode_extended(1, 0x59, 4500),
+        encode_frame(255, data1=255),
+    ]
     data = b"\xff\xff\x00".join([b"\x12", *frames]) + STOP[:5]
     found, pending = split_frames(data)
     assert list(found) == [split_frames(raw)[0][0] for raw in frames]
@@ -107,28 +116,47 @@ def test_what_is_a_reply_to_what_was_sent(data, sent, found):
         assert ((again.tilts, again.acknowledged), again.echoed) == (found, len(echo))
 
 
-@pytest.mark.parametrize("command", [STOP, MOTION, encode_extended(1, pelco_d.SET_TILT, 0x11EE)])
+@pytest.mark.parametrize(
+    "command", [STOP, MOTION, encode_extended(1, pelco_d.SET_TILT, 0x11EE)]
+)
 def test_a_piece_of_the_own_frame_is_no_reply(command):
     """The last one ends in its opcode, so that its beginning looks like a confirmation."""
     for count in range(1, 8):
         for piece in (command[:count], command[-count:]):
             received = split_replies(piece, command)
-            assert received.echoed + received.skipped == count and not (received.tilts or received.acknowledged)
+            assert received.echoed + received.skipped == count and not (
+                received.tilts or received.acknowledged
+            )
 
 
 def test_fuzz():
     """Random bytes, and frames and replies in which a byte is another one, behind others."""
-    rng, found = np.random.default_rng(0), 0
-    seeds = [STOP, QUERY, LEVEL, PAN_45, QUERY + LEVEL, bytes.fromhex("00 59 00 64 BD"), STOP[:4], b"\xff" * 9]
+    rng = np.random.default_rng(0)
+    found = 0
+    seeds = [
+        STOP,
+        QUERY,
+        LEVEL,
+        PAN_45,
+        QUERY + LEVEL,
+        bytes.fromhex("00 59 00 64 BD"),
+        STOP[:4],
+        b"\xff" * 9,
+    ]
     for row in range(STRINGS):
-        data, sent = rng.bytes(int(rng.integers(25))), (STOP, QUERY, MOTION)[row % 3]
+        data = rng.bytes(int(rng.integers(25)))
+        sent = (STOP, QUERY, MOTION)[row % 3]
         if row % 2:
             seed = seeds[row // 2 % len(seeds)]
             at = int(rng.integers(2 * len(seed)))
             data = data[:4] + seed[:at] + data[5:6] * (at < len(seed)) + seed[at + 1 :]
         received = split_replies(data, sent)
         used = received.echoed + received.skipped + 5 * len(received.tilts)
-        assert used == len(data) or used < len(data) and (received.tilts or received.acknowledged)
+        assert (
+            used == len(data)
+            or used < len(data)
+            and (received.tilts or received.acknowledged)
+        )
         frames, pending = split_frames(data)
         assert 7 * len(frames) <= pending <= len(data)
         found += len(frames) + len(received.tilts) + received.acknowledged

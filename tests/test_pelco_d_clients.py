@@ -10,7 +10,8 @@ import math
 import pytest
 from virtual import head
 
-PAN, TILT = "FF 01 00 51 00 00 52", "FF 01 00 53 00 00 54"
+PAN = "FF 01 00 51 00 00 52"
+TILT = "FF 01 00 53 00 00 54"
 STOP = "FF 01 00 00 00 00 01"
 REPLY_S = 0.35
 
@@ -30,7 +31,8 @@ class Client:
         """The value of the reply with an opcode, None where it does not come in time."""
         self.port.reset_input_buffer()
         self.send(frame)
-        end, data = self.host.now() + REPLY_S, b""
+        end = self.host.now() + REPLY_S
+        data = b""
         while self.host.now() < end:
             data += self.port.read(64)
             at = data.find(bytes([0xFF, 1, 0, opcode]))
@@ -44,7 +46,9 @@ class Client:
         return math.degrees(self.device.pitch())
 
 
-@pytest.mark.parametrize("habits", [{}, {"echo": True}, {"confirms": True}, {"baudrate": 9600}])
+@pytest.mark.parametrize(
+    "habits", [{}, {"echo": True}, {"confirms": True}, {"baudrate": 9600}]
+)
 def test_peltrack_reads_pan_and_tilt(habits):
     client = Client(**habits)
     assert client.query(PAN, 0x59) == 0 and client.query(TILT, 0x5B) == 0

@@ -17,9 +17,14 @@ BOARD = triangle_board()
 def side(edge, n=20, shift=0.0, turn_deg=0.0):
     """Board-frame points on an edge, moved outwards and turned about its middle."""
     i = BOARD.edges.index(edge)
-    a, b = BOARD.corners[i], BOARD.corners[(i + 1) % len(BOARD.edges)]
+    a = BOARD.corners[i]
+    b = BOARD.corners[(i + 1) % len(BOARD.edges)]
     turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()[:2, :2]
-    points = (a + b) / 2 + np.linspace(-0.4, 0.4, n)[:, None] * (turn @ (b - a)) + shift * BOARD.lines()[i, :2]
+    points = (
+        (a + b) / 2
+        + np.linspace(-0.4, 0.4, n)[:, None] * (turn @ (b - a))
+        + shift * BOARD.lines()[i, :2]
+    )
     return np.column_stack([points, np.zeros(n)])
 
 
@@ -31,16 +36,31 @@ def test_sides_are_named_after_the_nearest_edge():
 
 
 def test_far_and_crooked_sides_stay_unnamed_with_a_reason():
-    names, dropped = nearest_edges(BOARD, {0: side("ab", turn_deg=5), 1: side("bc", shift=0.2)})
+    names, dropped = nearest_edges(
+        BOARD, {0: side("ab", turn_deg=5), 1: side("bc", shift=0.2)}
+    )
     assert names == {} and [dropped[number].edge for number in (0, 1)] == ["ab", "bc"]
-    assert "turned by 5.0 deg" in dropped[0].words and "200 mm from the edge 'bc'" in dropped[1].words
+    assert (
+        "turned by 5.0 deg" in dropped[0].words
+        and "200 mm from the edge 'bc'" in dropped[1].words
+    )
 
 
 def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
     parts = {"last_beam": {1: "a", 2: "b"}, "half_step": {1: "a", 2: "b"}}
-    ready = Prepared(None, None, {1: "a", 2: "b"}, parts, parts, names={1: {}, 2: {}}, views={"left": {1: "v", 2: "v"}})
+    ready = Prepared(
+        None,
+        None,
+        {1: "a", 2: "b"},
+        parts,
+        parts,
+        names={1: {}, 2: {}},
+        views={"left": {1: "v", 2: "v"}},
+    )
     whole = Problem(Stage.SIDES, ProblemKind.OTHER_PLANE, "off", placement=2)
-    part = Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, "a side, not a placement", placement=1)
+    part = Problem(
+        Stage.SIDES, ProblemKind.OTHER_SIDE, "a side, not a placement", placement=1
+    )
     ready = replace(ready, problems=(whole, part))
     left = pipeline.without(ready)
     assert list(left.scans) == list(left.names) == list(left.edges["half_step"]) == [1]

@@ -23,24 +23,33 @@ from lrfcal_lib.solvers.planes import (
     plane_sets,
 )
 
-OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
+OFF = RigidTransform.from_components(
+    [0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03])
+)
 
 
 def test_correlated_weighting_equals_the_full_covariance():
     """Chi-square from four numbers a placement is that of all points with the board error common to them."""
     rig, obs = camera_case(6, noise=1.0)
-    sets, pose = plane_sets(obs), pose_array(rig.T_camera_lrf)
+    sets = plane_sets(obs)
+    pose = pose_array(rig.T_camera_lrf)
     triangles, offset, rest = correct_and_compress(sets, pose)
     whitener = board_whitener(pose, triangles, sets.boards, sets.board_covariance)
-    r = plane_block(pose, triangles, sets.boards, None, None, offset).residuals.reshape(12, 4)
+    r = plane_block(pose, triangles, sets.boards, None, None, offset).residuals.reshape(
+        12, 4
+    )
     compressed = np.sum((whitener @ r[..., None]) ** 2) + rest
     expected = 0.0
     for g in range(12):
-        n, q = sets.boards[g][:, 2], sets.points[g] @ pose[:, :3].T + pose[:, 3]
+        n = sets.boards[g][:, 2]
+        q = sets.points[g] @ pose[:, :3].T + pose[:, 3]
         lever = q - sets.boards[g][:, 3]
         distance = lever @ n
         slope = np.column_stack([np.cross(n, lever), np.tile(-n, (len(q), 1))])
-        variance = np.sum((sets.covariance[g] @ (pose[:, :3].T @ n)) * (pose[:, :3].T @ n), axis=1) + SIGMA_FLOOR**2
+        variance = (
+            np.sum((sets.covariance[g] @ (pose[:, :3].T @ n)) * (pose[:, :3].T @ n), axis=1)
+            + SIGMA_FLOOR**2
+        )
         C = np.diag(variance) + slope @ sets.board_covariance[g] @ slope.T
         expected += distance @ np.linalg.solve(C, distance)
     assert compressed == pytest.approx(expected, rel=1e-3)
@@ -48,7 +57,9 @@ def test_correlated_weighting_equals_the_full_covariance():
 
 def test_joint_refinement_repairs_the_intrinsics():
     rig, obs = camera_case(13, count=25, noise=0.3, sigma_px=0.05)
-    wrong = rig.model.with_parameters(rig.model.parameters + [8, -6, 5, -4, 0.02, -0.02, 0, 0, 0])
+    wrong = rig.model.with_parameters(
+        rig.model.parameters + [8, -6, 5, -4, 0.02, -0.02, 0, 0, 0]
+    )
     found = solve_camera(replace(obs, model=wrong), "zhang_pless_joint")
     assert found.converged and found.names[6:8] == ("fx", "fy")
     error = np.abs(found.model.parameters - rig.model.parameters)
@@ -59,7 +70,9 @@ def test_joint_refinement_repairs_the_intrinsics():
 
 def test_joint_refinement_bears_errors_common_to_a_placement():
     """Boards that bend by some millimetres must not bend the intrinsics."""
-    rig, obs = camera_case(20, count=20, noise=1.0, sigma_px=0.1, source="platform", face=400)
+    rig, obs = camera_case(
+        20, count=20, noise=1.0, sigma_px=0.1, source="platform", face=400
+    )
     rng = np.random.default_rng(21)
     shift = rng.normal(0, 0.008, 21)[obs.plane_placement]
     along = obs.plane_points / np.linalg.norm(obs.plane_points, axis=1, keepdims=True)
@@ -68,7 +81,9 @@ def test_joint_refinement_bears_errors_common_to_a_placement():
     own = plane_residuals_m(bent, found.transform, found.board_poses)
     assert found.board_poses.shape == (20, 4, 4) and np.sqrt(np.mean(own**2)) < 0.013
     error = np.abs(found.model.parameters - rig.model.parameters)
-    assert (error < 3 * np.sqrt(np.diag(found.model.covariance))).all(), "and they know of it"
+    assert (error < 3 * np.sqrt(np.diag(found.model.covariance))).all(), (
+        "and they know of it"
+    )
 
 
 def test_joint_refinement_needs_a_pattern():
@@ -81,7 +96,10 @@ def test_joint_refinement_needs_a_pattern():
 @pytest.mark.parametrize("source", ["lrf", "platform"])
 def test_parallel_boards_are_refused(method, source):
     rig, obs = camera_case(17, spread=1e-4, source=source)
-    with pytest.raises(DegenerateGeometry, match="all 12 boards are parallel: the rotation about their normal"):
+    with pytest.raises(
+        DegenerateGeometry,
+        match="all 12 boards are parallel: the rotation about their normal",
+    ):
         solve_camera(obs, method, rig.T_camera_lrf)
 
 
@@ -90,21 +108,33 @@ def test_boards_turned_about_one_axis_are_refused():
     rig = random_rig(rng)
     poses = random_board_poses(rng, 8, rig, spread=1e-6)
     poses = [
-        RigidTransform.from_components(p.translation, Rotation.from_rotvec([0, a, 0]) * p.rotation)
+        RigidTransform.from_components(
+            p.translation, Rotation.from_rotvec([0, a, 0]) * p.rotation
+        )
         for p, a in zip(poses, np.linspace(-0.6, 0.6, 8), strict=True)
     ]
     obs = camera_observations(rng, rig, poses, source="platform")
-    with pytest.raises(DegenerateGeometry, match=r"turn about one axis only: the translation along \(.*1.00.*\)"):
+    with pytest.raises(
+        DegenerateGeometry,
+        match=r"turn about one axis only: the translation along \(.*1.00.*\)",
+    ):
         solve_camera(obs, "zhang_pless")
 
 
-@pytest.mark.parametrize(("method", "source"), [("zhang_pless", "lrf"), ("zhang_pless", "platform"), ("line", "lrf")])
+@pytest.mark.parametrize(
+    ("method", "source"),
+    [("zhang_pless", "lrf"), ("zhang_pless", "platform"), ("line", "lrf")],
+)
 def test_any_start_value_reaches_the_best_minimum(method, source):
     rng, (_, obs) = np.random.default_rng(5), camera_case(6, 20, source=source, noise=1.0)
     best = solve_camera(obs, method).transform
     for turn in Rotation.random(6, rng=rng):
-        far = RigidTransform.from_components(best.translation + rng.normal(0, 0.5, 3), turn * best.rotation)
-        assert transform_difference(solve_camera(obs, method, far).transform, best)[0] < 1e-6
+        far = RigidTransform.from_components(
+            best.translation + rng.normal(0, 0.5, 3), turn * best.rotation
+        )
+        assert (
+            transform_difference(solve_camera(obs, method, far).transform, best)[0] < 1e-6
+        )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -113,7 +143,13 @@ def test_three_single_lines_have_the_truth_among_eight_poses(seed):
     sets = plane_sets(obs.select(obs.placements[:3]))
     found = plane_start.three_planes(compress(sets, 1.0), sets.boards)
     assert found.shape == (8, 3, 4)
-    assert min(max(transform_difference(pose_transform(pose), rig.T_camera_lrf)) for pose in found) < 1e-7
+    assert (
+        min(
+            max(transform_difference(pose_transform(pose), rig.T_camera_lrf))
+            for pose in found
+        )
+        < 1e-7
+    )
 
 
 def test_a_second_minimum_is_handed_back_beside_the_best():

@@ -28,9 +28,12 @@ def scan():
     ranges = np.full((6, 41), 3.0)
     ranges[1:5, 10:30], ranges[0, 0] = 2.0, np.nan
     pitch = np.radians([5.0, 4.0, 3.0, 2.0, 1.0, 0.0])
-    sweep, mask = Sweep(4, ranges, np.radians(np.arange(70.0, 111.0)), pitch, np.full(6, np.nan)), ranges < 2.5
+    sweep = Sweep(4, ranges, np.radians(np.arange(70.0, 111.0)), pitch, np.full(6, np.nan))
+    mask = ranges < 2.5
     on_board = np.where(mask, ranges, np.nan)
-    return SimpleNamespace(placement=4, sweep=sweep, mask=mask, filtered=on_board, fitted=on_board + 0.001)
+    return SimpleNamespace(
+        placement=4, sweep=sweep, mask=mask, filtered=on_board, fitted=on_board + 0.001
+    )
 
 
 def labels(ax):
@@ -57,12 +60,18 @@ def test_range_image_is_seen_from_behind_the_sensor(ax, scan):
 
 @pytest.mark.parametrize(("end", "bearing"), [(1, 99.5), (-1, 79.5)])
 def test_edge_of_line_marks_the_crossing_of_its_end(ax, scan, end, bearing):
-    points = 2.0 * np.array([[np.cos(np.radians(b)), np.sin(np.radians(b)), 0.0] for b in (79.5, 99.5)])
-    found = SimpleNamespace(variant="half_step", points=points, line=np.array([2, 2]), end=np.array([-1, 1]))
+    points = 2.0 * np.array(
+        [[np.cos(np.radians(b)), np.sin(np.radians(b)), 0.0] for b in (79.5, 99.5)]
+    )
+    found = SimpleNamespace(
+        variant="half_step", points=points, line=np.array([2, 2]), end=np.array([-1, 1])
+    )
     recording.edge_of_line(ax, scan, 2, end, edges=[found])
     (mark,) = [line for line in ax.lines if line.get_label() == "half step"]
     assert mark.get_xdata()[0] == pytest.approx(bearing)
-    with pytest.raises(ValueError, match="no beam of scan line 0 is on the board of placement 4"):
+    with pytest.raises(
+        ValueError, match="no beam of scan line 0 is on the board of placement 4"
+    ):
         recording.edge_of_line(ax, scan, 0)
     with pytest.raises(ValueError, match="plane must be one of xz, yz, xy, got 'zz'"):
         recording.projection(ax, {}, "zz")
@@ -74,13 +83,21 @@ IDENTITY = RigidTransform.identity()
 def test_measured_edges_lie_on_the_rendered_corners(ax):
     T = np.eye(4)
     T[:3, 3] = 0.05, 0.05, 2.0
-    corners = {"ab": np.array([0.0, 0.0]), "bc": np.array([0.3, 0.0]), "ca": np.array([0.0, 0.4])}
+    corners = {
+        "ab": np.array([0.0, 0.0]),
+        "bc": np.array([0.3, 0.0]),
+        "ca": np.array([0.0, 0.4]),
+    }
     measured = MeasuredBoard(T, {}, corners, {"bc": 0.499})
-    rig.measured_edges(ax, measured, {"ab": 0.3, "bc": 0.5, "ca": 0.4}, IDENTITY, (100, 120), 150)
+    rig.measured_edges(
+        ax, measured, {"ab": 0.3, "bc": 0.5, "ca": 0.4}, IDENTITY, (100, 120), 150
+    )
     cloud = [measured.corner_point("bc"), measured.corner_point("ca")]
     picture = rig.render(cloud, np.zeros((2, 3)), IDENTITY, (100, 120), 150, splat=0)
     drawn = np.rint(ax.lines[0].get_xydata()).astype(int)
-    assert (picture[drawn[:, 1], drawn[:, 0]] == 0).all() and texts(ax.texts) == ["BC 499.0 mm\ntrue 500.0 mm"]
+    assert (picture[drawn[:, 1], drawn[:, 0]] == 0).all() and texts(ax.texts) == [
+        "BC 499.0 mm\ntrue 500.0 mm"
+    ]
 
 
 @pytest.mark.parametrize("eye", [[0, 0, 1], [0, 0, 5]])
@@ -95,7 +112,10 @@ FAULTS = {
     "small": ({"xlabel": "x [m]", "title": "t"}, "'tiny' is 5.0 pt in the report"),
     "cut off": ({"xlabel": "x [m]", "title": "far too long " * 20}, "is cut off"),
     "overlap": ({"xlabel": "x [m]", "title": "t", "xticks": [0.5, 0.501]}, "lies over"),
-    "scales": ({"xlabel": "x [m]", "ylabel": "y [m]", "title": "t"}, "x [m] and y [m] are drawn at different scales"),
+    "scales": (
+        {"xlabel": "x [m]", "ylabel": "y [m]", "title": "t"},
+        "x [m] and y [m] are drawn at different scales",
+    ),
     "none": ({"xlabel": "x [m]", "title": "t"}, ""),
 }
 

@@ -26,12 +26,16 @@ def wire():
 
 
 def test_ports_that_cannot_be_opened_say_what_to_do(wire, tmp_path, monkeypatch):
-    with pytest.raises(PortError, match=r"there is no port .*nowhere: check cable and power; present are "):
+    with pytest.raises(
+        PortError, match=r"there is no port .*nowhere: check cable and power; present are "
+    ):
         open_port(tmp_path / "nowhere", 9600, timeout=0)
     with pytest.raises(PortError, match="/dev/null is no serial line"):
         open_port("/dev/null", 9600, timeout=0)
     held = open_port(wire[1], 9600, timeout=0)
-    with pytest.raises(PortError, match=rf"busy, held by .*process {os.getpid()}\): close that program"):
+    with pytest.raises(
+        PortError, match=rf"busy, held by .*process {os.getpid()}\): close that program"
+    ):
         open_port(wire[1], 9600, timeout=0)
     held.close()
 
@@ -39,11 +43,15 @@ def test_ports_that_cannot_be_opened_say_what_to_do(wire, tmp_path, monkeypatch)
         raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
 
     monkeypatch.setattr(port.serial, "Serial", forbidden)
-    with pytest.raises(PortError, match="no permission for /dev/ttyUSB0: run 'sudo usermod -aG dialout"):
+    with pytest.raises(
+        PortError, match="no permission for /dev/ttyUSB0: run 'sudo usermod -aG dialout"
+    ):
         open_port("/dev/ttyUSB0", 9600, timeout=0)
 
 
-def test_a_rate_that_the_line_does_not_take_is_refused_and_the_old_one_stays(wire, monkeypatch):
+def test_a_rate_that_the_line_does_not_take_is_refused_and_the_old_one_stays(
+    wire, monkeypatch
+):
     with open_port(wire[1], 19200, timeout=0) as port:
         for rate in (9600, 38400, 500000, 19200):
             set_rate(port, rate)
@@ -52,7 +60,9 @@ def test_a_rate_that_the_line_does_not_take_is_refused_and_the_old_one_stays(wir
         with pytest.raises(PortError, match="cannot do -1 Bd"):
             set_rate(port, -1)
         real = termios.tcgetattr
-        monkeypatch.setattr(termios, "tcgetattr", lambda fd: [*real(fd)[:4], 13, 13, real(fd)[6]])
+        monkeypatch.setattr(
+            termios, "tcgetattr", lambda fd: [*real(fd)[:4], 13, 13, real(fd)[6]]
+        )
         with pytest.raises(PortError, match="does not take 500000 Bd.*RS-422 interface"):
             set_rate(port, 500000)
         assert port.baudrate == 19200

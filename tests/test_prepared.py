@@ -24,16 +24,25 @@ def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
     problems = prepared.prepare_images(prepared.Prepared(None, SHEET, {}, {}, {})).problems
     (problem,) = problems
     assert problem.kind == ProblemKind.SMALL_SQUARES and problem.camera == "left"
-    assert "placements 4), 7.0 px at least" in problem.words and str(problem).startswith("camera 'left': squares")
+    assert "placements 4), 7.0 px at least" in problem.words and str(problem).startswith(
+        "camera 'left': squares"
+    )
 
 
 @pytest.mark.parametrize(("side", "named"), [(7.0, True), (12.0, False)])
-def test_where_all_cameras_contradict_a_scan_small_squares_are_a_cause(monkeypatch, side, named):
-    views = {c: {4: BoardView(c, placement=4, pixels=pixels_of_squares(side))} for c in ("left", "right")}
+def test_where_all_cameras_contradict_a_scan_small_squares_are_a_cause(
+    monkeypatch, side, named
+):
+    views = {
+        c: {4: BoardView(c, placement=4, pixels=pixels_of_squares(side))}
+        for c in ("left", "right")
+    }
     data = SimpleNamespace(placements=np.array([4]), select=lambda inliers: None)
     monkeypatch.setattr(naming, "observe", lambda prepared, camera: data)
     monkeypatch.setattr(naming, "find_outlying_placements", lambda obs: ([], {4: 0.02}))
-    monkeypatch.setattr(naming, "solve_camera", lambda obs, method: SimpleNamespace(transform=None))
+    monkeypatch.setattr(
+        naming, "solve_camera", lambda obs, method: SimpleNamespace(transform=None)
+    )
     (problem,) = naming.rough_poses(SimpleNamespace(views=views, board=SHEET))[1]
     assert problem.placement == 4 and "another surface" in problem.words
     assert ("or the images: squares below 9 px" in problem.words) == named

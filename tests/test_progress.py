@@ -26,6 +26,9 @@ def test_a_line_is_due_now_and_then():
     assert told == [False, True, False, True, False, True, False]
 
 
-@pytest.mark.parametrize(("seconds", "words"), [(0.4, "0 s"), (99.0, "99 s"), (100.0, "2 min"), (3600.0, "60 min")])
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.4, "0 s"), (99.0, "99 s"), (100.0, "2 min"), (3600.0, "60 min")],
+)
 def test_durations_in_words(seconds, words):
     assert duration(seconds) == words

@@ -34,13 +34,23 @@ def blocks(kind, page=README):
 
 
 def test_notebooks_methods_functions_and_files_are_all_there():
-    assert [p.name for p in (ROOT / "notebooks").glob("*.ipynb") if f"(notebooks/{p.name})" not in README] == []
+    assert [
+        p.name
+        for p in (ROOT / "notebooks").glob("*.ipynb")
+        if f"(notebooks/{p.name})" not in README
+    ] == []
     assert [method for method in METHODS if f"| `{method}` |" not in METHODS_PAGE] == []
     links = re.findall(r"\]\(([^)#:]+)\)", README + CONTRIBUTING)
     pages = README + CONTRIBUTING + METHODS_PAGE + RIG_PAGE
     files = re.findall(r"`((?:lrfcal_lib|tests|data|notebooks)/[\w/.]+)`", pages)
-    assert len(files) > 4 and [name for name in [*links, *files] if not (ROOT / name).exists()] == []
-    assert "reports/readme.jpg" in links and (ROOT / "reports" / "readme.jpg").stat().st_size < 200_000
+    assert (
+        len(files) > 4
+        and [name for name in [*links, *files] if not (ROOT / name).exists()] == []
+    )
+    assert (
+        "reports/readme.jpg" in links
+        and (ROOT / "reports" / "readme.jpg").stat().st_size < 200_000
+    )
     names = re.findall(r"^\| `([a-z_.]+)\.([a-z_]+)\(", METHODS_PAGE, re.M)
     assert len(names) == 10
     for module, function in names:
@@ -50,31 +60,55 @@ def test_notebooks_methods_functions_and_files_are_all_there():
 def commands():
     """Every command of README, CONTRIBUTING and the workflow, a list of words each."""
     lines = "\n".join([*blocks("sh"), re.sub(r"- run: |run: ", "", WORKFLOW)]).splitlines()
-    lines += re.findall(r"`((?:make|\.venv/bin/python|python -m) [^`]+)`", README + CONTRIBUTING)
+    lines += re.findall(
+        r"`((?:make|\.venv/bin/python|python -m) [^`]+)`", README + CONTRIBUTING
+    )
     parts = [part.strip() for line in lines for part in re.split("&&|;", line)]
-    return [shlex.split(part) for part in parts if re.match(r"make |\.venv/bin/python|python -m ", part)]
+    return [
+        shlex.split(part)
+        for part in parts
+        if re.match(r"make |\.venv/bin/python|python -m ", part)
+    ]
 
 
 def test_every_command_is_understood():
     assert len(commands()) > 14
     for words in commands():
         if words[0] == "make":
-            asked = ["make", "-n", *(word for word in words[1:] if word not in ("-C", "lrfcal"))]
+            asked = [
+                "make",
+                "-n",
+                *(word for word in words[1:] if word not in ("-C", "lrfcal")),
+            ]
             done = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True)
             assert done.returncode == 0, (words, done.stderr)
         else:
             assert words[1:3] == ["-m", "lrfcal_lib"]
             known, rest = command_line.parser().parse_known_args(words[3:])
-            assert not rest or known.verb == "emulate" and rest == ["sim_quick", "--rig-file", "emulated.json"]
+            assert (
+                not rest
+                or known.verb == "emulate"
+                and rest == ["sim_quick", "--rig-file", "emulated.json"]
+            )
 
 
 def test_the_clone_line_gives_a_checkout_that_checks_its_session(tmp_path):
     git("rev-parse")
-    line = blocks("sh")[0].splitlines()[0].replace("ADDRESS_OF_THIS_REPOSITORY", f"--quiet {shlex.quote(str(ROOT))}")
-    check = next(words for words in commands() if "check" in words and "data/sim_quick" in words)
+    line = (
+        blocks("sh")[0]
+        .splitlines()[0]
+        .replace("ADDRESS_OF_THIS_REPOSITORY", f"--quiet {shlex.quote(str(ROOT))}")
+    )
+    check = next(
+        words for words in commands() if "check" in words and "data/sim_quick" in words
+    )
     line += f" && {shlex.join([sys.executable, *check[1:]])}"
-    done = subprocess.run(["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True)
-    assert done.stdout.startswith("data/sim_quick: nothing to complain about\n"), done.stderr
+    done = subprocess.run(
+        ["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.stdout.startswith("data/sim_quick: nothing to complain about\n"), (
+        done.stderr
+    )
     assert done.returncode == 0
 
 
@@ -84,7 +118,9 @@ def test_the_example_projects_a_scan_line_into_the_image(monkeypatch):
     exec(*blocks("python"), names := {})
     u, v = names["pixels"][np.isfinite(names["pixels"]).all(axis=1)].T
     inside = (u > 0) & (u < names["lens"].width - 1)
-    assert inside.sum() > 100 and np.all((v[inside] > 0) & (v[inside] < names["lens"].height - 1))
+    assert inside.sum() > 100 and np.all(
+        (v[inside] > 0) & (v[inside] < names["lens"].height - 1)
+    )
     assert np.ptp(v[inside]) < 60 < np.ptp(u[inside]), "a scan line is nearly level"
 
 
@@ -104,7 +140,11 @@ def printed(value, as_printed):
 
 
 def test_a_number_is_compared_to_its_printed_digit():
-    assert printed(0.0449, "0.04") == "0.04" and printed(0.0451, "0.04") == "0.05" and printed(12.5, "13") == "12"
+    assert (
+        printed(0.0449, "0.04") == "0.04"
+        and printed(0.0451, "0.04") == "0.05"
+        and printed(12.5, "13") == "12"
+    )
 
 
 ROWS = {
@@ -118,7 +158,12 @@ ROWS = {
 @pytest.mark.parametrize("row", ROWS)
 def test_errors_of_methods_are_those_of_the_stored_tables(row):
     errors = ["rotation_error_deg", "translation_error_mm"]
-    worst = golden("sim_lms221", "method_comparison").groupby("method")[errors].max().loc[ROWS[row]]
+    worst = (
+        golden("sim_lms221", "method_comparison")
+        .groupby("method")[errors]
+        .max()
+        .loc[ROWS[row]]
+    )
     for cell, value, unit in zip(cells(row), worst, ["deg", "mm"], strict=True):
         number, stated = cell.split(" ")
         assert (number, stated) == (printed(value, number), unit)
@@ -127,18 +172,29 @@ def test_errors_of_methods_are_those_of_the_stored_tables(row):
 def test_random_halves_are_those_of_the_stored_tables():
     halves = golden("lms400_zed", "random_halves")
     text = " ".join(README.split())
-    names = ["rotation_deg", "translation_mm", "predicted_rotation_deg", "predicted_translation_mm"]
+    names = [
+        "rotation_deg",
+        "translation_mm",
+        "predicted_rotation_deg",
+        "predicted_translation_mm",
+    ]
     found = re.search(
-        r"differ by ([\d.]+) deg and ([\d.]+) mm .* (\d+) pairs .* predicts ([\d.]+) deg and ([\d.]+) mm", text
+        r"differ by ([\d.]+) deg and ([\d.]+) mm .* (\d+) pairs .* predicts ([\d.]+) deg and ([\d.]+) mm",
+        text,
     ).groups()
     numbers = [*found[:2], *found[3:]]
-    assert numbers == [printed(np.sqrt(np.mean(halves[n] ** 2)), k) for n, k in zip(names, numbers, strict=True)]
+    assert numbers == [
+        printed(np.sqrt(np.mean(halves[n] ** 2)), k)
+        for n, k in zip(names, numbers, strict=True)
+    ]
     assert int(found[2]) == halves.pair.nunique()
 
 
 def edge_errors(session, variant, ends=None):
     """Absolute errors of the board's edges, by placement and edge."""
-    table = golden(session, "edge_lengths").query("source == @session and variant == @variant")
+    table = golden(session, "edge_lengths").query(
+        "source == @session and variant == @variant"
+    )
     table = table[(table.ends == ends) if ends else table.error_mm.notna()]
     return table.set_index(["placement", "edge"]).error_mm.abs()
 
@@ -149,24 +205,37 @@ def test_edge_lengths_are_those_of_the_stored_tables():
         combined = edge_errors(session, "combined")
         rows = {
             "like the paper: last beams of scan lines": last_beam,
-            "the same edges, half a step further out": edge_errors(session, "half_step", "scan")[last_beam.index],
-            "the same edges, by the cloud's plane and the images (`combined`)": combined[last_beam.index],
+            "the same edges, half a step further out": edge_errors(
+                session, "half_step", "scan"
+            )[last_beam.index],
+            "the same edges, by the cloud's plane and the images (`combined`)": combined[
+                last_beam.index
+            ],
             "all edges, `combined`": combined,
         }
         for row, errors in rows.items():
-            number, count = re.fullmatch(r"([\d.]+) mm(?: \((\d+) edges\))?", cells(row)[column]).groups()
+            number, count = re.fullmatch(
+                r"([\d.]+) mm(?: \((\d+) edges\))?", cells(row)[column]
+            ).groups()
             assert number == printed(errors.mean(), number), (session, row)
             assert count is None or int(count) == len(errors) == errors.notna().sum()
 
 
 def test_shares_within_intervals_and_the_papers_figure_are_those_of_the_stored_tables():
     summary = {
-        s: golden(s, "edge_summary").set_index(["source", "variant", "ends"]) for s in ("sim_lms221", "lms400_zed")
+        s: golden(s, "edge_summary").set_index(["source", "variant", "ends"])
+        for s in ("sim_lms221", "lms400_zed")
     }
     shares = re.search(r"(\d+) % \(simulated\) and (\d+) % \(real\)", README).groups()
-    within = [table.loc[name, "combined", "image"].within_90_percent for name, table in summary.items()]
+    within = [
+        table.loc[name, "combined", "image"].within_90_percent
+        for name, table in summary.items()
+    ]
     assert [*shares] == [f"{share:.0f}" for share in within]
-    assert f"error of {summary['sim_lms221'].loc['paper'].squeeze().mean_abs_error_mm:.2f} mm" in README
+    assert (
+        f"error of {summary['sim_lms221'].loc['paper'].squeeze().mean_abs_error_mm:.2f} mm"
+        in README
+    )
 
 
 MODELS = {
@@ -177,8 +246,16 @@ MODELS = {
 
 def test_every_key_of_a_rig_file_stands_there_with_its_default():
     stated = dict(re.findall(r"^\| `([\w.\[\]]+)` \| ([^|]+) \| [^|]+ \|$", RIG_PAGE, re.M))
-    fields = {prefix + name: field for prefix, model in MODELS.items() for name, field in model.model_fields.items()}
-    fields = {name: field for name, field in fields.items() if name not in ("lrf", "head", "cameras")}
+    fields = {
+        prefix + name: field
+        for prefix, model in MODELS.items()
+        for name, field in model.model_fields.items()
+    }
+    fields = {
+        name: field
+        for name, field in fields.items()
+        if name not in ("lrf", "head", "cameras")
+    }
     assert stated.keys() == fields.keys()
     inner = inspect.signature(LMS2xx).parameters | inspect.signature(Camera).parameters
     for name, field in fields.items():
@@ -188,10 +265,14 @@ def test_every_key_of_a_rig_file_stands_there_with_its_default():
             assert json.loads(stated[name]) == json.loads(json.dumps(field.default)), name
         elif re.match(r"[\d\[\"]|SICK", stated[name]):  # a default of the driver's own
             default = inner[name.rpartition(".")[2]].default
-            assert stated[name] == (default.decode() if isinstance(default, bytes) else f"{default:g}"), name
+            assert stated[name] == (
+                default.decode() if isinstance(default, bytes) else f"{default:g}"
+            ), name
 
 
 def test_the_rig_file_shown_is_complete():
     (example,) = blocks("json", RIG_PAGE)
     rig = rig_file.rig_of(json.loads(example))
-    assert len(rig.plan.to_do()) == 20 and rig.devices.cameras.keys() == rig.cameras.keys() == {"left"}
+    assert len(
+        rig.plan.to_do()
+    ) == 20 and rig.devices.cameras.keys() == rig.cameras.keys() == {"left"}

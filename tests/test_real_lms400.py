@@ -38,10 +38,18 @@ def test_the_tables_keep_their_promises(name, rows, limits):
 def test_half_a_step_outwards_is_better_than_the_last_beam():
     by_method = stored("method_comparison").groupby("method").left_out_edge_rms_px.mean()
     assert by_method["line"] < by_method["line_last_beam"]
-    lengths = stored("edge_summary").query("ends == 'scan'").set_index(["source", "variant"])
-    assert (lengths.loc["lms400_zed"].drop("combined").n >= 30).all()  # whose ends are mostly those of images
+    lengths = (
+        stored("edge_summary").query("ends == 'scan'").set_index(["source", "variant"])
+    )
+    assert (
+        lengths.loc["lms400_zed"].drop("combined").n >= 30
+    ).all()  # whose ends are mostly those of images
     error = lengths.mean_abs_error_mm
-    assert error["lms400_zed", "half_step"] < error["lms400_zed", "last_beam"] < error["paper", "last_beam"]
+    assert (
+        error["lms400_zed", "half_step"]
+        < error["lms400_zed", "last_beam"]
+        < error["paper", "last_beam"]
+    )
     assert error["paper", "last_beam"] == pytest.approx(8.841, abs=0.001)
 
 
@@ -52,21 +60,31 @@ def test_random_halves_agree_as_their_sigma_says():
     """
     middle = stored("random_halves").median(numeric_only=True)
     assert middle.rotation_deg < 0.5 and middle.translation_mm < 12
-    usual = 0.89  # median of the length of a normal 3-vector, relative to its root mean square
+    usual = (
+        0.89  # median of the length of a normal 3-vector, relative to its root mean square
+    )
     for unit in ("rotation_deg", "translation_mm"):
         assert 1 / 1.6 < middle[unit] / (usual * middle[f"predicted_{unit}"]) < 1.6
 
 
 def test_axis_and_cameras_are_close_to_the_authors(lms400):
     """The cameras roughly: the frames differ by the height of the axis and by what each method makes of the pitch."""
-    angle, offset = axis_difference(*(axis_of(lms400.platform.transform(name)) for name in ("combined", "stated")))
+    angle, offset = axis_difference(
+        *(axis_of(lms400.platform.transform(name)) for name in ("combined", "stated"))
+    )
     assert angle < np.deg2rad(1.5) and offset < 0.03
     axes = lms400.platform.axes
-    data, its = axes["line_3d"].parameters, axes["line_3d"].covariance
-    stated, known = axes["stated"].parameters, axes["stated"].covariance
+    data = axes["line_3d"].parameters
+    its = axes["line_3d"].covariance
+    stated = axes["stated"].parameters
+    known = axes["stated"].covariance
     assert (np.abs(data - stated) < 3 * np.sqrt(np.diag(its + known))).all()
-    authors = from_json(TransformStated, lms400.prepared.session.reference["T_left_platform"]).made()
-    angle, shift = transform_difference(lms400.solutions["left", "zhang_pless"].transform, authors)
+    authors = from_json(
+        TransformStated, lms400.prepared.session.reference["T_left_platform"]
+    ).made()
+    angle, shift = transform_difference(
+        lms400.solutions["left", "zhang_pless"].transform, authors
+    )
     assert np.rad2deg(angle) < 2.0 and shift < 0.05
 
 
@@ -75,20 +93,35 @@ def test_the_cloud_is_coloured_and_borders_of_the_chessboard_lie_on_the_known_gr
 
     A border is where the grey of the points within 15 mm of a side of a square is split best.
     """
-    ready, pattern, off = lms400.prepared, lms400.prepared.board.pattern, []
+    ready = lms400.prepared
+    pattern = lms400.prepared.board.pattern
+    off = []
     scans = {p: ready.scans[p] for p in (1, 6, 11, 16)}
-    cloud = clouds.color_cloud(replace(lms400, prepared=replace(ready, scans=scans)), "joint")
+    cloud = clouds.color_cloud(
+        replace(lms400, prepared=replace(ready, scans=scans)), "joint"
+    )
     assert cloud.seen.mean() > 0.9
     for placement in scans:
         part = cloud.rows((cloud.placement == placement) & cloud.seen)
-        x = lms400.joint.solution.boards[placement].inv().apply(part.points)[:, :2] - pattern.origin
-        at, grey, moves = x / pattern.square, part.colors.mean(axis=1), np.linspace(-0.012, 0.012, 49)
+        x = (
+            lms400.joint.solution.boards[placement].inv().apply(part.points)[:, :2]
+            - pattern.origin
+        )
+        at = x / pattern.square
+        grey = part.colors.mean(axis=1)
+        moves = np.linspace(-0.012, 0.012, 49)
         grey = np.clip(grey, *np.quantile(grey, [0.1, 0.9]))
         for axis, count in enumerate((pattern.columns, pattern.rows)):
-            for line, square in np.ndindex(count, (pattern.rows, pattern.columns)[axis] - 1):
+            for line, square in np.ndindex(
+                count, (pattern.rows, pattern.columns)[axis] - 1
+            ):
                 away = x[:, axis] - line * pattern.square
-                near = (np.abs(away) < 0.015) & (np.abs(at[:, 1 - axis] - square - 0.5) < 0.4)
+                near = (np.abs(away) < 0.015) & (
+                    np.abs(at[:, 1 - axis] - square - 0.5) < 0.4
+                )
                 sides = np.sign(away[near] - moves[:, None])
-                off.append(moves[np.argmax(np.abs(sides @ (grey[near] - np.median(grey[near]))))])
+                off.append(
+                    moves[np.argmax(np.abs(sides @ (grey[near] - np.median(grey[near]))))]
+                )
     off = 1000 * np.abs(off)
     assert len(off) > 300 and np.median(off) < 1.5 and np.mean(off < 3) > 0.9

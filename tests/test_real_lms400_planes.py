@@ -20,10 +20,18 @@ def published(folder, side):
     text = (folder / f"Calib_Results_{side}.m").read_text()
 
     def numbers(name):
-        return np.array(re.search(rf"^{name}\s*= \[([^\]]*)\]", text, re.M).group(1).replace(";", " ").split(), float)
+        return np.array(
+            re.search(rf"^{name}\s*= \[([^\]]*)\]", text, re.M)
+            .group(1)
+            .replace(";", " ")
+            .split(),
+            float,
+        )
 
     poses = [
-        RigidTransform.from_components(numbers(f"Tc_{i}") / 1000, Rotation.from_rotvec(numbers(f"omc_{i}")))
+        RigidTransform.from_components(
+            numbers(f"Tc_{i}") / 1000, Rotation.from_rotvec(numbers(f"omc_{i}"))
+        )
         for i in range(1, 21)
     ]
     return CameraModel(1280, 720, *numbers("fc"), *numbers("cc"), numbers("kc")), poses
@@ -31,7 +39,8 @@ def published(folder, side):
 
 @pytest.fixture(scope="module")
 def cameras(real_data):
-    parts, found = [], {}
+    parts = []
+    found = {}
     for placement in range(1, 21):
         raw = np.load(real_data / "lms400_zed" / "raw" / f"pose_{placement:02d}.npz")
         points = polar_to_points(raw["range_m"], np.pi / 2 - np.radians(raw["bearing_deg"]))
@@ -55,9 +64,19 @@ def cameras(real_data):
 
 
 def test_zhang_pless_reaches_the_reference(cameras):
-    found = {side: solve_camera(obs, "zhang_pless", weighted=False).transform for side, obs in cameras.items()}
-    rms = {side: 1000 * np.sqrt(np.mean(plane_residuals_m(obs, found[side]) ** 2)) for side, obs in cameras.items()}
-    assert rms["left"] == pytest.approx(6.90, abs=0.01) and rms["right"] == pytest.approx(7.05, abs=0.01)
+    found = {
+        side: solve_camera(obs, "zhang_pless", weighted=False).transform
+        for side, obs in cameras.items()
+    }
+    rms = {
+        side: 1000 * np.sqrt(np.mean(plane_residuals_m(obs, found[side]) ** 2))
+        for side, obs in cameras.items()
+    }
+    assert rms["left"] == pytest.approx(6.90, abs=0.01) and rms["right"] == pytest.approx(
+        7.05, abs=0.01
+    )
     stereo = found["right"] * found["left"].inv()
     assert 1000 * np.linalg.norm(stereo.translation) == pytest.approx(117.76, abs=0.02)
-    np.testing.assert_allclose(np.degrees(stereo.rotation.as_rotvec()), [0.529, 0.330, -0.014], atol=2e-3)
+    np.testing.assert_allclose(
+        np.degrees(stereo.rotation.as_rotvec()), [0.529, 0.330, -0.014], atol=2e-3
+    )

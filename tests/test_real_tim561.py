@@ -13,11 +13,16 @@ from lrfcal_lib.solvers import solve_camera
 @pytest.fixture(scope="module")
 def obs(real_data):
     folder = real_data / "tim561_lines"
-    points, lines = [], []
+    points = []
+    lines = []
     for frame in range(23):
-        ends = scipy.io.loadmat(folder / "image_data" / f"calibrationImage{frame:04d}.mat")["imgLines"]
+        ends = scipy.io.loadmat(folder / "image_data" / f"calibrationImage{frame:04d}.mat")[
+            "imgLines"
+        ]
         hits = scipy.io.loadmat(folder / "scan_data" / f"scan{frame}.mat")["scanPoints"]
-        for n in range(3):  # column n belongs to row 4 - n (both from 1); x, 0, z turns into our x, y, 0
+        for n in range(
+            3
+        ):  # column n belongs to row 4 - n (both from 1); x, 0, z turns into our x, y, 0
             points.append([hits[0, n], hits[2, n], 0.0])
             lines.append(line_through(ends[2 - n, :2], ends[2 - n, 2:]))
     return CameraObservations(

@@ -16,7 +16,9 @@ def obs(real_data):
     scans = [np.asarray(scan, float).T / 1000 for scan in demo["Points"].ravel()]
     poses = np.moveaxis(demo["Planes"].astype(float), 2, 0).copy()
     poses[:, :3, 3] /= 1000
-    points = np.concatenate([np.column_stack([scan, np.zeros(len(scan))]) for scan in scans])
+    points = np.concatenate(
+        [np.column_stack([scan, np.zeros(len(scan))]) for scan in scans]
+    )
     return CameraObservations(
         CameraModel(640, 480, 500.0, 500.0, 320.0, 240.0),
         plane_points=points,
@@ -47,4 +49,6 @@ def test_nine_inliers_give_the_reference(obs):
     inliers = obs.select([1, 2, 4, 6, 7, 8, 10, 11, 12])
     found = solve_camera(inliers, "zhang_pless")
     assert rms_mm(inliers, found) == pytest.approx(5.7558, abs=1e-3)
-    np.testing.assert_allclose(1000 * found.transform.translation, [1470.28, 434.34, 118.20], atol=0.05)
+    np.testing.assert_allclose(
+        1000 * found.transform.translation, [1470.28, 434.34, 118.20], atol=0.05
+    )

@@ -34,10 +34,18 @@ def write(rig, path, count=None, **options):
 def contents(path, number, session=None):
     """Telegrams and images of a placement with all that the tables say about them, byte for byte."""
     session = session or open_session(path)
-    data, rows = (path / "lrf" / "telegrams.bin").read_bytes(), (path / "lrf" / "index.csv").read_text().splitlines()
+    data = (path / "lrf" / "telegrams.bin").read_bytes()
+    rows = (path / "lrf" / "index.csv").read_text().splitlines()
     rows = [row.split(",") for row in rows[1:]]
-    telegrams = [(data[int(r[1]) : int(r[1]) + int(r[2])], float(r[4])) for r in rows if r[3] == str(number)]
-    images = [(r.camera, r.pitch, r.purpose, session.read_image(r).tobytes()) for r in session.images(placement=number)]
+    telegrams = [
+        (data[int(r[1]) : int(r[1]) + int(r[2])], float(r[4]))
+        for r in rows
+        if r[3] == str(number)
+    ]
+    images = [
+        (r.camera, r.pitch, r.purpose, session.read_image(r).tobytes())
+        for r in session.images(placement=number)
+    ]
     return telegrams, images
 
 
@@ -61,7 +69,10 @@ def complete(rig, path):
 
 def listed(*firsts, cameras=("left",)):
     """A rig file with placements that differ in their pitch, three stops each."""
-    plans = [{"number": n, "pitch_deg": [p, p + 2, 1], "image_pitch_deg": [p]} for n, p in enumerate(firsts, 1)]
+    plans = [
+        {"number": n, "pitch_deg": [p, p + 2, 1], "image_pitch_deg": [p]}
+        for n, p in enumerate(firsts, 1)
+    ]
     return rig_data(cameras, placements=plans)
 
 
@@ -89,9 +100,16 @@ def rig():
 def test_a_session_holds_what_the_devices_gave(path, cameras):
     complete(make_rig(listed(-4, 0, 4, cameras=cameras)), path)
     session = open_session(path)
-    assert session.placements == (1, 2, 3) and "stop-and-go" in session.reference["recording"]
+    assert (
+        session.placements == (1, 2, 3) and "stop-and-go" in session.reference["recording"]
+    )
     assert not session.continuous
-    assert session.telegrams.report()["outcomes"] == {"scan": 9, "other": 1, "wrong CRC": 0, "truncated": 0}
+    assert session.telegrams.report()["outcomes"] == {
+        "scan": 9,
+        "other": 1,
+        "wrong CRC": 0,
+        "truncated": 0,
+    }
 
 
 @pytest.mark.parametrize("feedback", [True, False])
@@ -101,17 +119,36 @@ def test_the_platform_log_tells_commanded_and_measured_pitch(path, feedback):
     assert header == ["t_s", "commanded_deg", "measured_deg"]
     assert [float(r[1]) for r in told] == pytest.approx([-4, -3, -2])
     assert [r[2] for r in told] == ([r[1] for r in told] if feedback else ["", "", ""])
-    assert open_session(path).reference["pitch"].startswith("told by the head" if feedback else "dead reckoning")
+    assert (
+        open_session(path)
+        .reference["pitch"]
+        .startswith("told by the head" if feedback else "dead reckoning")
+    )
 
 
 def test_a_continuous_sweep_is_written_with_its_track_and_a_scene_as_one(path):
-    rig = make_rig(rig_data(mode="continuous", pitch_deg=[-4, 8, 1], placements=[{"number": 1, "board": False}]))
+    rig = make_rig(
+        rig_data(
+            mode="continuous",
+            pitch_deg=[-4, 8, 1],
+            placements=[{"number": 1, "board": False}],
+        )
+    )
     write(rig, path).finish()
     assert open_session(path).continuous
-    sweep, scenes = open_session(path).sweep(1), open_session(path).scene_placements
-    assert len(sweep.pitch) > 5 and np.all(np.diff(sweep.pitch) >= 0) and np.ptp(np.degrees(sweep.pitch)) > 10
+    sweep = open_session(path).sweep(1)
+    scenes = open_session(path).scene_placements
+    assert (
+        len(sweep.pitch) > 5
+        and np.all(np.diff(sweep.pitch) >= 0)
+        and np.ptp(np.degrees(sweep.pitch)) > 10
+    )
     told = rows(path, "platform.csv")[1:]
-    assert all(float(row[1]) == 8 for row in told[2:]) and len(told) == 2 + len(rig.head.track) and scenes == (1,)
+    assert (
+        all(float(row[1]) == 8 for row in told[2:])
+        and len(told) == 2 + len(rig.head.track)
+        and scenes == (1,)
+    )
 
 
 # ---------------------------------------------------------------------------------------- interrupted and gone on
@@ -133,14 +170,20 @@ def test_the_placement_that_was_running_is_no_part_of_the_session(path, rig, eve
     broken_off(rig, path, events)
     assert rig.head.stops == 1
     session = open_session(path)
-    assert session.placements == (1,) and {r.placement for r in session.image_records} == {1}
-    assert any("placement 2: its recording was not finished" in text for text in session.problems)
+    assert session.placements == (1,) and {r.placement for r in session.image_records} == {
+        1
+    }
+    assert any(
+        "placement 2: its recording was not finished" in text for text in session.problems
+    )
     assert contents(path, 1) == expected(rig, 1)
     complete(rig, path)
 
 
 def test_placements_can_be_recorded_again_and_a_finished_session_goes_on(path, rig):
-    recording = broken_off(rig, path, 4)  # as a panel after a fault, with the same recording
+    recording = broken_off(
+        rig, path, 4
+    )  # as a panel after a fault, with the same recording
     list(recording.run(recording.to_do()[0]))
     assert recording.finished == (1,)
     list(recording.run(recording.to_do()[0]))
@@ -163,8 +206,6 @@ def test_a_row_that_was_cut_off_does_no_harm(path, rig, file):
     (("rig", "lrf", "sigma_range_m"), 0.02, r"rig\.lrf\.sigma_range_m is 0\.01, not 0\.02, unlike the rig now"),
     (("board", "corners_m", 1), [0.5, 0], "board.corners_m"),
 ])  # fmt: skip
-
-
 def test_only_the_same_rig_goes_on(path, rig, way, value, message):
     write(rig, path, count=1)
     other, (part, key, at) = listed(-4, 0, 4), way
@@ -185,7 +226,9 @@ def test_a_session_is_never_written_over(path, rig):
 
 
 def test_placements_are_begun_and_finished_one_by_one(path, rig):
-    recorder = SessionRecorder(path, rig.stated.board, rig.stated.lrf, rig.stated.cameras.values())
+    recorder = SessionRecorder(
+        path, rig.stated.board, rig.stated.lrf, rig.stated.cameras.values()
+    )
     with pytest.raises(SessionError, match="placement 1 was not begun"):
         recorder.add_telegrams(1, [telegram(0.0)], 0.0)
     recorder.begin_placement(1)
@@ -202,11 +245,15 @@ def test_placements_are_begun_and_finished_one_by_one(path, rig):
 @pytest.mark.parametrize("kills", [8, pytest.param(25, marks=campaign)])
 def test_kill_9_loses_nothing_that_was_finished(path, tmp_path, monkeypatch, kills):
     data = listed(*np.linspace(-50, 40, 60).round(1).tolist(), cameras=("left", "right"))
-    rig, told, unfinished = make_rig(data), tmp_path / "told", 0
+    rig = make_rig(data)
+    told = tmp_path / "told"
+    unfinished = 0
     for writes in np.random.default_rng(5).integers(80, size=kills).tolist():
         if not (child := os.fork()):
             try:
-                with at_write(monkeypatch, writes, lambda: os.kill(os.getpid(), signal.SIGKILL)):
+                with at_write(
+                    monkeypatch, writes, lambda: os.kill(os.getpid(), signal.SIGKILL)
+                ):
                     recording = Recording(rig, path, resume=True)
                     for placement in recording.to_do():
                         list(recording.run(placement))
@@ -226,11 +273,16 @@ def test_kill_9_loses_nothing_that_was_finished(path, tmp_path, monkeypatch, kil
 
 
 @pytest.mark.parametrize("free", range(0, 26, 3))
-def test_a_full_disk_stops_the_head_and_keeps_what_is_finished(path, rig, monkeypatch, free):
+def test_a_full_disk_stops_the_head_and_keeps_what_is_finished(
+    path, rig, monkeypatch, free
+):
     write(rig, path, count=1)
     recording = Recording(rig, path, resume=True)
     with at_write(monkeypatch, free, disk_full):
-        with pytest.raises(RecordingError, match="No space left.*free some space; placements 1.*--resume goes on"):
+        with pytest.raises(
+            RecordingError,
+            match="No space left.*free some space; placements 1.*--resume goes on",
+        ):
             while True:
                 list(recording.run(recording.to_do()[0]))
     recording.close()
@@ -240,10 +292,15 @@ def test_a_full_disk_stops_the_head_and_keeps_what_is_finished(path, rig, monkey
 
 
 def test_a_disk_that_is_full_at_once(path, rig, monkeypatch):
-    with at_write(monkeypatch, 0, disk_full), pytest.raises(RecordingError, match="free some space; then record again"):
+    with (
+        at_write(monkeypatch, 0, disk_full),
+        pytest.raises(RecordingError, match="free some space; then record again"),
+    ):
         Recording(rig, path)
     complete(rig, path)
-    with pytest.raises(RecordingError, match=r"cannot be written \(Not a directory\): check the disk"):
+    with pytest.raises(
+        RecordingError, match=r"cannot be written \(Not a directory\): check the disk"
+    ):
         Recording(rig, path / "session.json" / "t")
 
 
@@ -255,7 +312,8 @@ def answered(monkeypatch):
     """Stands in for `input`: gives answers one after the other, raises those that are errors; what was asked."""
 
     def answered(*texts):
-        asked, left = [], [*texts, EOFError()]
+        asked = []
+        left = [*texts, EOFError()]
 
         def ask(text):
             asked.append(text)
@@ -294,14 +352,27 @@ def close_rig():
     return make_rig(data)
 
 
-def test_images_for_the_intrinsics_are_repeated_until_they_show_the_pattern(answered, path, close_rig):
-    shown = [PATTERN, np.zeros_like(PATTERN), PATTERN, PATTERN]  # one is bad, one is of the placement
+def test_images_for_the_intrinsics_are_repeated_until_they_show_the_pattern(
+    answered, path, close_rig
+):
+    shown = [
+        PATTERN,
+        np.zeros_like(PATTERN),
+        PATTERN,
+        PATTERN,
+    ]  # one is bad, one is of the placement
     close_rig.cameras["left"].show = lambda pitch, name: shown.pop(0)
     asked = answered("", "", "", "")
     record_session(close_rig, path)
     session = open_session(path)
-    assert len(session.images(purpose="intrinsics")) == 2 and all(r.placement == -1 for r in session.images()[:2])
-    assert [text[15:26] for text in asked[:3]] == ["view 1 of 2", "view 2 of 2", "view 2 of 2"] and not shown
+    assert len(session.images(purpose="intrinsics")) == 2 and all(
+        r.placement == -1 for r in session.images()[:2]
+    )
+    assert [text[15:26] for text in asked[:3]] == [
+        "view 1 of 2",
+        "view 2 of 2",
+        "view 2 of 2",
+    ] and not shown
 
 
 # -------------------------------------------------------------------------------------------------- command line
@@ -343,9 +414,14 @@ def test_a_recording_into_a_file_tells_how_far_it_is(run, rig, monkeypatch):
     assert lines[0].endswith("rig.json: opening the devices")
     begun = lines.index("placement 2 (2 of 3): board, pitch 0.00 to 2.00 deg")
     assert re.fullmatch(r"  stop 1 of 3, \+0\.00 deg, 0 scans, 0 images", lines[begun + 1])
-    assert re.fullmatch(r"  stop 2 of 3, \+1\.00 deg, 1 scans, 1 images, about \d+ s left", lines[begun + 4])
+    assert re.fullmatch(
+        r"  stop 2 of 3, \+1\.00 deg, 1 scans, 1 images, about \d+ s left", lines[begun + 4]
+    )
     left = [line for line in lines if "left: about" in line]
-    assert [line[:24] for line in left] == ["  2 of 3 placements left", "  1 of 3 placements left"]
+    assert [line[:24] for line in left] == [
+        "  2 of 3 placements left",
+        "  1 of 3 placements left",
+    ]
 
 
 def test_a_recording_of_scenes_is_not_told_to_calibrate(run, rig):
@@ -374,8 +450,12 @@ ENDS = [  # at which scan of three placements of three stops what happens; exit 
 
 
 @pytest.mark.parametrize(("scan", "end", "code", "said"), ENDS)
-def test_what_ends_a_recording_is_one_line_and_another_goes_on(run, rig, path, scan, end, code, said, request):
-    as_found = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup, which may run these tests, ignores it
+def test_what_ends_a_recording_is_one_line_and_another_goes_on(
+    run, rig, path, scan, end, code, said, request
+):
+    as_found = signal.signal(
+        signal.SIGHUP, signal.SIG_DFL
+    )  # nohup, which may run these tests, ignores it
     request.addfinalizer(lambda: signal.signal(signal.SIGHUP, as_found))
     port.guard(rig.head)  # signals become an exit
     rig.head.emergency_stop = rig.head.stop
@@ -388,17 +468,26 @@ def test_what_ends_a_recording_is_one_line_and_another_goes_on(run, rig, path, s
     complete(rig, path)
 
 
-@pytest.mark.parametrize("removed", ["", "session.json", "lrf", "lrf/index.csv", "lrf/telegrams.bin"])
+@pytest.mark.parametrize(
+    "removed", ["", "session.json", "lrf", "lrf/index.csv", "lrf/telegrams.bin"]
+)
 @pytest.mark.parametrize("scan", [5, 9])
-def test_a_session_removed_amid_a_recording_is_not_called_safe(run, rig, path, removed, scan):
+def test_a_session_removed_amid_a_recording_is_not_called_safe(
+    run, rig, path, removed, scan
+):
     """While the second or the last placement is recorded."""
     target = path / removed
-    at_scan(rig, scan, lambda: shutil.rmtree(target) if target.is_dir() else target.unlink())
+    at_scan(
+        rig, scan, lambda: shutil.rmtree(target) if target.is_dir() else target.unlink()
+    )
     code, out, err = run("", "", "")
     if removed == "session.json":  # written anew, with all that it stated
         assert validate(path) == [] and code == 0
     else:
-        assert code == 2 and "was removed or damaged while it was recorded: record again" in err
+        assert (
+            code == 2
+            and "was removed or damaged while it was recorded: record again" in err
+        )
         assert "are safe" not in out + err
 
 
@@ -408,7 +497,11 @@ def test_what_cannot_be_recorded_is_exit_code_2(tmp_path, path, capsys):
     (tmp_path / "rig.json").write_text(json.dumps(data))
     assert command_line.main(["record", str(tmp_path / "rig.json"), str(path)]) == 2
     text = capsys.readouterr().err
-    assert "error: head: there is no port /dev/no_such_port" in text and text.count("\n") == 1 and not path.exists()
+    assert (
+        "error: head: there is no port /dev/no_such_port" in text
+        and text.count("\n") == 1
+        and not path.exists()
+    )
     with pytest.raises(SystemExit):
         command_line.main(["record", "rig.json", "s", "--placements", "0"])
     assert "1 or more are needed" in capsys.readouterr().err

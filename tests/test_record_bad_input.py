@@ -27,7 +27,9 @@ def rig():
     setup, placements = practice_setup()
     low = float(np.mean(placements[0].sweep))
     short = [replace(placements[0], sweep=(low, low + np.radians(4.0)), image_pitch=(low,))]
-    setup = replace(setup, rig=scaled(replace(setup.rig, cameras=setup.rig.cameras[:1]), 64))
+    setup = replace(
+        setup, rig=scaled(replace(setup.rig, cameras=setup.rig.cameras[:1]), 64)
+    )
     head = {"baudrate": 38400, "go_speed": 60.0}
     with EmulatedRig(setup, placements=short, head_options=head, rest_s=0.1) as rig:
         yield rig
@@ -44,10 +46,24 @@ class Program:
 
     def __init__(self, folder, data, rig, *options):
         (folder / "rig.json").write_text(json.dumps(data))
-        call = [sys.executable, "-m", "lrfcal_lib", "record", str(folder / "rig.json"), str(folder / "s"), *options]
-        pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        call = [
+            sys.executable,
+            "-m",
+            "lrfcal_lib",
+            "record",
+            str(folder / "rig.json"),
+            str(folder / "s"),
+            *options,
+        ]
+        pipes = {
+            "stdin": subprocess.DEVNULL,
+            "stdout": subprocess.PIPE,
+            "stderr": subprocess.PIPE,
+        }
         self.session, self.rig = folder / "s", rig
-        self.run = subprocess.Popen(call, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}, **pipes)
+        self.run = subprocess.Popen(
+            call, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}, **pipes
+        )
 
     def moves(self):
         """Whether the head was at two stops."""

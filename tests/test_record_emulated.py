@@ -33,8 +33,12 @@ def small_setup():
     camera = replace(rig.cameras[0], exposure=replace(rig.cameras[0].exposure, samples=2))
     setup = replace(quick, rig=replace(rig, cameras=(camera,)), pairs=2, distances=(1.3, 1.7), step=STEP,
                     intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
-    found = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES), np.radians(1.0))
-    return setup, [replace(p, image_pitch=p.image_pitch[len(p.image_pitch) // 2 :][:1]) for p in found]
+    found = pairs(
+        setup.rig, setup.pairs, setup.distances, random(setup, PLACES), np.radians(1.0)
+    )
+    return setup, [
+        replace(p, image_pitch=p.image_pitch[len(p.image_pitch) // 2 :][:1]) for p in found
+    ]
 
 
 def state_intrinsics(data, setup):
@@ -68,29 +72,40 @@ class Still:
 @pytest.fixture(scope="module")
 def recorded_session(setup, tmp_path_factory):
     """What `record` makes of the emulated devices."""
-    folder, host = tmp_path_factory.mktemp("recorded"), VirtualHost()
+    folder = tmp_path_factory.mktemp("recorded")
+    host = VirtualHost()
     with EmulatedRig(
         setup[0], placements=setup[1], host=host, rest_s=0.0,
         head_options={"baudrate": 9600, "go_speed": 20.0},
     ) as emulated:  # fmt: skip
         data = state_intrinsics(emulated.rig_file(), setup[0])
-        data["devices"]["head"] |= {"settle_s": 0.25, "poll_s": 0.05, "gap_s": 0.025}  # the head wobbles for 0.2 s
+        data["devices"]["head"] |= {
+            "settle_s": 0.25,
+            "poll_s": 0.05,
+            "gap_s": 0.025,
+        }  # the head wobbles for 0.2 s
         (folder / "rig.json").write_text(json.dumps(data))
         stated = read_rig_file(folder / "rig.json")
         with Rig.open(stated, host=host, camera=lambda name: Still(emulated, name)) as rig:
-            record_session(rig, folder / "s")  # nobody is asked for anything: the board moves by itself
+            record_session(
+                rig, folder / "s"
+            )  # nobody is asked for anything: the board moves by itself
     return open_session(folder / "s")
 
 
 def test_the_recording_calibrates_to_the_truth_within_what_it_says(recorded_session, setup):
     """A few coarse sweeps tell little, but not nothing: a wide covariance would hide a wrong pose."""
-    rig, solution = setup[0].rig, calibrate_jointly(prepare(recorded_session)).solution
-    found, truth = solution.camera("left"), rig.cameras[0].mounting
+    rig = setup[0].rig
+    solution = calibrate_jointly(prepare(recorded_session)).solution
+    found = solution.camera("left")
+    truth = rig.cameras[0].mounting
     turn = (truth.rotation * found.transform.rotation.inv()).as_rotvec()
     miss = np.concatenate([turn, truth.translation - found.transform.translation])
     assert nees(miss, found.trusted[:6, :6]) < chi2.ppf(0.999, 6)
     assert np.linalg.norm(miss[:3]) < np.radians(2) and np.linalg.norm(miss[3:]) < 0.06
-    axis, true = (chart_parameters(pose_array(head)) for head in (solution.T_head_lrf, rig.T_head_lrf))
+    axis, true = (
+        chart_parameters(pose_array(head)) for head in (solution.T_head_lrf, rig.T_head_lrf)
+    )
     assert nees(axis - true, solution.covariance("axis_", "offset_")) < chi2.ppf(0.999, 4)
 
 

@@ -25,7 +25,9 @@ from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.report import notebook, report
 from lrfcal_lib.session.write import SessionWriter
 
-KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
+KERNEL = {
+    "kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}
+}
 GOOD = """
 import matplotlib.pyplot as plt
 import pandas as pd
@@ -58,14 +60,19 @@ print("x" * 300)
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """A recording of one flat wall."""
-    path, about = tmp_path_factory.mktemp("sessions") / "wall", {"licence": "CC0", "source": "a test"}
-    with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, simulated=True, **about) as writer:
+    path = tmp_path_factory.mktemp("sessions") / "wall"
+    about = {"licence": "CC0", "source": "a test"}
+    with SessionWriter(
+        path, triangle_board(), LRF, CAMERAS, HEAD, simulated=True, **about
+    ) as writer:
         writer.add_sweep(1, *wall())
     return path
 
 
 def write_notebook(path, *cells):
-    title = nbformat.v4.new_markdown_cell("# A wall\n\n> Walls are **flat**.\n\nReads: a session. Writes: nothing.")
+    title = nbformat.v4.new_markdown_cell(
+        "# A wall\n\n> Walls are **flat**.\n\nReads: a session. Writes: nothing."
+    )
     codes = [nbformat.v4.new_code_cell(cell.strip()) for cell in cells]
     nbformat.write(nbformat.v4.new_notebook(cells=[title, *codes], metadata=KERNEL), path)
     return path
@@ -81,7 +88,9 @@ def finished(session, tmp_path_factory):
     cells.cells += [nbformat.v4.new_markdown_cell("Of $t_y$ and\n\n$$\\mathbf y = \\left(a + b\\right) \\tag{3}$$"),
                     nbformat.v4.new_code_cell(JUDGED)]  # fmt: skip
     nbformat.write(cells, good)
-    bad = write_notebook(folder / "01_bad.ipynb", GOOD, early, "raise ValueError('board 7 is <missing>')")
+    bad = write_notebook(
+        folder / "01_bad.ipynb", GOOD, early, "raise ValueError('board 7 is <missing>')"
+    )
     out = tmp_path_factory.mktemp("reports") / "wall"
     (out / "figures").mkdir(parents=True)
     (out / "figures" / "stale.png").write_bytes(b"old")
@@ -91,27 +100,54 @@ def finished(session, tmp_path_factory):
 
 def test_a_failing_notebook_is_told_and_the_rest_delivered(finished):
     out, (good, bad) = finished
-    assert good.error == "" and "ValueError" in bad.error and "board 7 is <missing>" in bad.error
+    assert (
+        good.error == ""
+        and "ValueError" in bad.error
+        and "board 7 is <missing>" in bad.error
+    )
     assert "\x1b" not in bad.error, "no colours of a terminal"
     assert (out / "01_bad.html").is_file()
     page = (out / "index.html").read_text()
     assert "01_bad failed" in page and "board 7 is &lt;missing&gt;" in page
     page = (out / "00_good.html").read_text()
-    assert "Walls are" in page and "data:image/png;base64," in page and 'href="index.html"' in page
+    assert (
+        "Walls are" in page
+        and "data:image/png;base64," in page
+        and 'href="index.html"' in page
+    )
     assert page.count('<details class="code"><summary>') == 3, "code is folded, and there"
     assert re.sub("<[^>]+>", "", page).count("fig, ax = plt.subplots()") == 1
     assert 'rel="next" href="01_bad.html"' in page and 'rel="prev"' not in page
-    assert '<mi mathvariant="bold">y</mi>' in page and "<span>(3)</span>" in page and "$" not in page
+    assert (
+        '<mi mathvariant="bold">y</mi>' in page
+        and "<span>(3)</span>" in page
+        and "$" not in page
+    )
 
 
 def test_index_states_what_was_found_and_needs_no_other_file(finished, session):
     page = (finished[0] / "index.html").read_text()
     digest = report.hashlib.sha256((session / "session.json").read_bytes()).hexdigest()
-    told = ["A wall", "Walls are flat.", "2.0 m", "Mean range", "<b>Figure 0.1.</b> One scan line &lt;of many&gt;."]
-    told += [digest, np.__version__, "<b>Table 0.1.</b> Errors", '<td data-label="method">lines, half step</td>']
-    told += [f'<td class="number" data-label="error [mm]">{cell}</td>' for cell in ("-2.0", "–")]
+    told = [
+        "A wall",
+        "Walls are flat.",
+        "2.0 m",
+        "Mean range",
+        "<b>Figure 0.1.</b> One scan line &lt;of many&gt;.",
+    ]
+    told += [
+        digest,
+        np.__version__,
+        "<b>Table 0.1.</b> Errors",
+        '<td data-label="method">lines, half step</td>',
+    ]
+    told += [
+        f'<td class="number" data-label="error [mm]">{cell}</td>' for cell in ("-2.0", "–")
+    ]
     assert [words for words in told if words not in page] == []
-    assert "found before the failure" in page, "a notebook that fails has told what it found until then"
+    assert "found before the failure" in page, (
+        "a notebook that fails has told what it found until then"
+    )
     assert set(re.findall(r'<img [^>]*src="(.{22})', page)) == {"data:image/png;base64,"}
     assert "<script" not in page and "<link" not in page
 
@@ -142,40 +178,69 @@ OVER = """() => {
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
     """Pages of the notebooks as they are stored."""
-    folder, names = tmp_path_factory.mktemp("stored"), sorted((ROOT / "notebooks").glob("*.ipynb"))
-    runs = [report.Run(path.stem, path.stem, "", 0.0, "", nbformat.read(path, 4)) for path in names]
-    found = {run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs}
+    folder = tmp_path_factory.mktemp("stored")
+    names = sorted((ROOT / "notebooks").glob("*.ipynb"))
+    runs = [
+        report.Run(path.stem, path.stem, "", 0.0, "", nbformat.read(path, 4))
+        for path in names
+    ]
+    found = {
+        run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []}
+        for run in runs
+    }
     report.write_pages(folder, report.open_session(report.SHIPPED), runs, found, 0.0)
     return folder
 
 
 @pytest.mark.parametrize("width", [1280, pytest.param(400, marks=campaign)])
 def test_nothing_is_cut_off_and_nothing_fetched(finished, stored, browser, width):
-    view, said = browser.new_page(viewport={"width": width, "height": 800}), []
+    view = browser.new_page(viewport={"width": width, "height": 800})
+    said = []
     view.set_default_timeout(120_000)  # a busy machine takes its time
     view.on("console", lambda message: said.append(message.text))
     view.on("pageerror", lambda error: said.append(str(error)))
-    view.on("request", lambda request: request.url.startswith(("file:", "data:")) or said.append(request.url))
+    view.on(
+        "request",
+        lambda request: (
+            request.url.startswith(("file:", "data:")) or said.append(request.url)
+        ),
+    )
     pages = [*finished[0].glob("*.html"), *stored.glob("*.html")]
     assert len(pages) == 14
     for file in pages:
         view.goto(file.as_uri())
         assert view.evaluate(OVER) == [], file.name
-        assert not re.search(r"\$|\\\\(frac|mathbf|tag)", view.inner_text("body").replace("$HOME", "")), file.name
+        assert not re.search(
+            r"\$|\\\\(frac|mathbf|tag)", view.inner_text("body").replace("$HOME", "")
+        ), file.name
     assert said == []
     view.goto((finished[0] / "index.html").as_uri())
     numbers = view.locator(".numbers b").last.bounding_box()
-    assert width == 400 or numbers["y"] + numbers["height"] < 800, "the numbers are on the first screen"
+    assert width == 400 or numbers["y"] + numbers["height"] < 800, (
+        "the numbers are on the first screen"
+    )
     view.close()
 
 
-def test_tables_and_findings_are_kept_as_data_and_only_what_a_report_wrote_is_removed(finished):
+def test_tables_and_findings_are_kept_as_data_and_only_what_a_report_wrote_is_removed(
+    finished,
+):
     out, _ = finished
-    assert (out / "tables" / "errors.csv").read_text() == "method,error_mm\njoint,-2\nline,\n"
-    found = [(f["notebook"], f["key"], f["value"]) for f in json.loads((out / "findings.json").read_text())]
-    assert found == [("00_good", "mean_range", 2.0), ("01_bad", "early", "found before the failure")]
+    assert (
+        out / "tables" / "errors.csv"
+    ).read_text() == "method,error_mm\njoint,-2\nline,\n"
+    found = [
+        (f["notebook"], f["key"], f["value"])
+        for f in json.loads((out / "findings.json").read_text())
+    ]
+    assert found == [
+        ("00_good", "mean_range", 2.0),
+        ("01_bad", "early", "found before the failure"),
+    ]
     assert not (out / "parts").exists() and not (out / "figures" / "stale.png").exists()
-    assert (out / "figures" / "ranges.png").is_file() and (out / "notes.txt").read_text() == "mine"
+    assert (out / "figures" / "ranges.png").is_file() and (
+        out / "notes.txt"
+    ).read_text() == "mine"
 
 
 @pytest.fixture
@@ -229,7 +294,10 @@ def test_an_ended_report_leaves_the_old_one(session, tmp_path, line, number):
         said = process.communicate(timeout=120)[1]
     assert len(unfinished) == 1, "what another report is writing is left alone"
     assert process.returncode == ENDS[number] and "Traceback" not in said
-    assert number == signal.SIGKILL or f"stopped by {number.name}; an earlier report stays as it was" in said
+    assert (
+        number == signal.SIGKILL
+        or f"stopped by {number.name}; an earlier report stays as it was" in said
+    )
     assert {file.name: file.read_bytes() for file in out.glob("*.*")} == before
     assert len(parts(out.parent)) == (number == signal.SIGKILL)
 
@@ -237,10 +305,20 @@ def test_an_ended_report_leaves_the_old_one(session, tmp_path, line, number):
 def test_a_folder_that_cannot_be_written_is_named(session, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert report.main([session], tmp_path / "file" / "out") == 2
-    assert re.search(r"file/out: cannot write the report .*--out names another folder", capsys.readouterr().err)
+    assert re.search(
+        r"file/out: cannot write the report .*--out names another folder",
+        capsys.readouterr().err,
+    )
 
 
-NAMES = ['a "b c', "cost$5", "$(shell echo ran >&2)", "$(PYTHON)", "`echo ran >&2`", "${HOME}"]
+NAMES = [
+    'a "b c',
+    "cost$5",
+    "$(shell echo ran >&2)",
+    "$(PYTHON)",
+    "`echo ran >&2`",
+    "${HOME}",
+]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -249,7 +327,9 @@ def test_make_takes_any_name_of_a_session(name, how):
     command = ["make", "-s", "-o", "setup", "report", "RUN=printf '<%s>'"]
     command += [f"SESSION={name}"] if how == "argument" else []
     own = {**os.environ, "SESSION": name} if how == "environment" else None
-    shown = subprocess.run(command, cwd=report.ROOT, env=own, capture_output=True, text=True, check=True)
+    shown = subprocess.run(
+        command, cwd=report.ROOT, env=own, capture_output=True, text=True, check=True
+    )
     assert shown.stdout == f"<-m><lrfcal_lib><report><{name}>" and shown.stderr == ""
 
 
@@ -281,7 +361,9 @@ def test_a_report_that_is_replaced_is_never_missing(tmp_path, looks):
     for writer in writers:
         writer.join()
     assert there == looks and [writer.exitcode for writer in writers] == [0, 0]
-    found = sorted(str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file())
+    found = sorted(
+        str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file()
+    )
     assert found == ["wall/index.html", "wall/notes.txt", "wall/tables/errors.csv"]
     assert (out / "notes.txt").read_text() == "old"
 
@@ -305,11 +387,17 @@ def test_where_folders_cannot_be_exchanged_they_are_renamed(tmp_path, monkeypatc
         monkeypatch.setattr(Path, "replace", stopped)
         with pytest.raises(KeyboardInterrupt), report.in_place_of(out) as new:
             (new / "index.html").write_text("new")
-        assert sorted(tmp_path.rglob("*")) == before and (out / "index.html").read_text() == "old"
+        assert (
+            sorted(tmp_path.rglob("*")) == before
+            and (out / "index.html").read_text() == "old"
+        )
     else:
         with report.in_place_of(out) as new:
             (new / "index.html").write_text("new")
-        assert {file.name: file.read_text() for file in out.glob("*.*")} == {"index.html": "new", "notes.txt": "old"}
+        assert {file.name: file.read_text() for file in out.glob("*.*")} == {
+            "index.html": "new",
+            "notes.txt": "old",
+        }
         assert list(tmp_path.iterdir()) == [out]
 
 
@@ -333,7 +421,9 @@ def test_main_returns_what_a_shell_needs(session, tmp_path, monkeypatch, capsys)
     assert "nowhere" in capsys.readouterr().err
 
 
-def test_storing_keeps_outputs_of_simulations_only_and_nothing_of_what_fails(session, tmp_path):
+def test_storing_keeps_outputs_of_simulations_only_and_nothing_of_what_fails(
+    session, tmp_path
+):
     cells = "import os  # for notebook.start()", "print(os.environ['LRFCAL_SESSION'][-4:])"
     path = write_notebook(tmp_path / "00_x.ipynb", *cells)
     assert report.store(path, session) == ""
@@ -343,7 +433,9 @@ def test_storing_keeps_outputs_of_simulations_only_and_nothing_of_what_fails(ses
     index.write_text(index.read_text().replace('"simulated": true', '"simulated": false'))
     assert report.store(path, recording) == ""
     cells = [cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in cells] == [1, 2] and not any(cell.outputs for cell in cells)
+    assert [cell.execution_count for cell in cells] == [1, 2] and not any(
+        cell.outputs for cell in cells
+    )
     before = write_notebook(path, "1 / 0").read_bytes()
     assert "ZeroDivisionError" in report.store(path, None) and path.read_bytes() == before
 

@@ -56,14 +56,18 @@ def test_a_head_that_tells_nothing_and_does_not_move_ends_the_sweep(mode):
     rig = make_rig(rig_data(mode=mode, pitch_deg=[-10, 30, 1]), feedback=False)
     scan = rig.lrf._scan
     rig.lrf._scan = lambda instant: replace(scan(instant), ranges=np.full(BEAMS, 2.0))
-    with pytest.raises(NoReply, match="the head did not move: .*address 1 and 2400 Bd at /dev/fake_head"):
+    with pytest.raises(
+        NoReply, match="the head did not move: .*address 1 and 2400 Bd at /dev/fake_head"
+    ):
         events_of(rig)
     assert rig.head.stops and len(rig.lrf.readings) > 8
     rig.lrf._scan = scan
     assert events_of(rig)
 
 
-@pytest.mark.parametrize("error", [DeviceError("gone"), KeyboardInterrupt(), ZeroDivisionError(), None])
+@pytest.mark.parametrize(
+    "error", [DeviceError("gone"), KeyboardInterrupt(), ZeroDivisionError(), None]
+)
 @pytest.mark.parametrize("mode", ["stop-and-go", "continuous"])
 def test_whatever_goes_wrong_the_head_and_the_scans_stop(mode, error):
     """Also where the recording is broken off."""
@@ -93,7 +97,12 @@ def sweep_of(rig):
     readings = [r for e in events if isinstance(e, Scanned) for r in e.readings]
     pitch = np.concatenate([e.pitch for e in events if isinstance(e, Scanned)])
     rig.head.sweep = rig.head.sweep_done
-    return events, readings, pitch, np.array([rig.head.true(np.mean(r.beam_times_s)) for r in readings])
+    return (
+        events,
+        readings,
+        pitch,
+        np.array([rig.head.true(np.mean(r.beam_times_s)) for r in readings]),
+    )
 
 
 @pytest.mark.parametrize("heads", [{}, {"silent_moving": True}, {"feedback": False}])
@@ -103,7 +112,9 @@ def test_scans_of_a_sweep_have_the_pitch_of_their_instant(heads):
     np.testing.assert_allclose(pitch, true, atol=math.radians(0.001))
     times = [r.time_s for r in readings]
     assert len(readings) > 40 and times == sorted(set(times))
-    assert [type(e) for e in events[:3]] == [Moved, Photographed, Moved] and isinstance(events[-1], Tracked)
+    assert [type(e) for e in events[:3]] == [Moved, Photographed, Moved] and isinstance(
+        events[-1], Tracked
+    )
     assert np.ptp(pitch) > math.radians(38)
 
 
@@ -127,10 +138,11 @@ def test_a_sweep_without_scans_is_given_up(monkeypatch):
     ({"LMS2xx": ValueError("an LMS2xx has 9600 Bd, got 300")}, RigFileError, r"rig\.json: lrf: an LMS2xx has 9600 Bd"),
     ({"size": (16, 12)}, RigFileError, r"camera 'left': it gives 16 x 12 .*rig\.cameras\.left states 32 x 24"),
 ])  # fmt: skip
-
-
-def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, options, error, message):
-    rig, made = make_rig(), []
+def test_a_device_that_cannot_be_opened_closes_the_others(
+    monkeypatch, options, error, message
+):
+    rig = make_rig()
+    made = []
     rig.cameras["left"].size = options.get("size", SIZE)
 
     def make(driver, fake, *_, **__):
@@ -140,7 +152,11 @@ def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, options, 
         fake.close = lambda: made.remove(driver)
         return fake
 
-    for driver, fake in (("PanTilt", rig.head), ("LMS2xx", rig.lrf), ("Camera", rig.cameras["left"])):
+    for driver, fake in (
+        ("PanTilt", rig.head),
+        ("LMS2xx", rig.lrf),
+        ("Camera", rig.cameras["left"]),
+    ):
         monkeypatch.setattr(rig_module, driver, partial(make, driver, fake))
     with pytest.raises(error, match=message):
         Rig.open(rig_of(rig_data()))
@@ -177,7 +193,11 @@ def test_only_204_of_a_control_counts_and_its_answer_is_not_read(case):
         thread.start()
         address = f"http://127.0.0.1:{listener.getsockname()[1]}/token"
         rig = make_rig(changed("devices.control", address))
-        with contextlib.nullcontext() if message is None else pytest.raises(DeviceError, match=message):
+        with (
+            contextlib.nullcontext()
+            if message is None
+            else pytest.raises(DeviceError, match=message)
+        ):
             assert rig.move_board(3) is True
         thread.join()
     assert sum(sent) < ENDLESS
@@ -185,11 +205,22 @@ def test_only_204_of_a_control_counts_and_its_answer_is_not_read(case):
 
 def test_what_the_device_says_about_itself_counts():
     rig = make_rig()
-    rig.lrf.variant, rig.lrf.configuration = (180.0, 0.5), Configuration().changed(unit="cm")
+    rig.lrf.variant, rig.lrf.configuration = (
+        (180.0, 0.5),
+        Configuration().changed(unit="cm"),
+    )
     info = rig.lrf_info
     np.testing.assert_allclose(np.degrees(info.field_of_view), [0, 180])
-    assert math.degrees(info.bearing_step) == pytest.approx(0.5) and info.range_resolution == 0.01
-    for mode, unit, longest in ((0, "cm", 81.82), (0, "mm", 8.182), (4, "mm", 16.374), (6, "mm", 32.758)):
+    assert (
+        math.degrees(info.bearing_step) == pytest.approx(0.5)
+        and info.range_resolution == 0.01
+    )
+    for mode, unit, longest in (
+        (0, "cm", 81.82),
+        (0, "mm", 8.182),
+        (4, "mm", 16.374),
+        (6, "mm", 32.758),
+    ):
         rig.lrf.configuration = Configuration().changed(unit=unit, measuring_mode=mode)
         assert rig.lrf_info.max_range == pytest.approx(longest)
     rig = make_rig(changed("devices.lrf.interlaced", True))

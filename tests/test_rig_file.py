@@ -50,7 +50,14 @@ def test_a_wrong_rig_file_is_refused(tmp_path, message):
         read(tmp_path, changed(*WRONG[message]))
 
 
-NO_JSON = (b"[" * 100_000, b'{"x": ' * 100_000, b"\xff", b'{"x": ' + b"9" * 5000 + b"}", b"", b"{")
+NO_JSON = (
+    b"[" * 100_000,
+    b'{"x": ' * 100_000,
+    b"\xff",
+    b'{"x": ' + b"9" * 5000 + b"}",
+    b"",
+    b"{",
+)
 NO_FILES = (os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero"))
 
 
@@ -60,8 +67,6 @@ NO_FILES = (os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero"))
     *((lambda path, text=text: path.write_bytes(text), "not JSON") for text in NO_JSON),
     *((make, "no file, or one of more than") for make in NO_FILES),
 ])  # fmt: skip
-
-
 def test_no_rig_file(tmp_path, made, message):
     path = tmp_path / "rig.json"
     made(path)
@@ -75,11 +80,15 @@ def test_interlaced_scans_need_a_head_at_rest(tmp_path):
         stated.with_mode("continuous")
 
 
-@pytest.mark.parametrize(("step", "stops"), [(0.1, 151), (0.3, 51), (1, 16), (2.5, 7), (7, 4), (100, 2)])
+@pytest.mark.parametrize(
+    ("step", "stops"), [(0.1, 151), (0.3, 51), (1, 16), (2.5, 7), (7, 4), (100, 2)]
+)
 def test_sweeps_meet_their_ends_and_do_not_exceed_their_step(step, stops):
     odd, even = Plan(pitch_deg=(-10, 5, step), count=2).to_do()
     np.testing.assert_allclose(np.degrees(odd.pitch[[0, -1]]), [-10, 5])
-    assert np.diff(odd.pitch).max() <= math.radians(step) + 1e-12 and len(odd.pitch) == stops
+    assert (
+        np.diff(odd.pitch).max() <= math.radians(step) + 1e-12 and len(odd.pitch) == stops
+    )
     assert np.ptp(np.diff(odd.pitch)) < 1e-12
     np.testing.assert_array_equal(even.pitch, odd.pitch[::-1])
     assert (odd.direction, even.direction) == (1, -1)

@@ -27,4 +27,6 @@ def test_a_mean_with_these_weights_is_nearly_as_good_as_the_plain_one():
 
 def test_what_lies_far_off_counts_nothing():
     misses = np.array([0.0, 1.0, robust.TUKEY, 100.0, np.nan])
-    np.testing.assert_allclose(robust.biweight(misses, 1.0), [1.0, 0.911, 0.0, 0.0, np.nan], atol=1e-3)
+    np.testing.assert_allclose(
+        robust.biweight(misses, 1.0), [1.0, 0.911, 0.0, 0.0, np.nan], atol=1e-3
+    )

@@ -20,18 +20,31 @@ RUNS = {  # what comes before, and the environment; libraries that are there alr
 
 @campaign
 def test_two_runs_side_by_side_give_the_same_bytes(tmp_path):
-    base = {key: value for key, value in os.environ.items() if key not in THREADS} | {"PYTHONPATH": str(ROOT)}
+    base = {key: value for key, value in os.environ.items() if key not in THREADS} | {
+        "PYTHONPATH": str(ROOT)
+    }
     processes = []
     for name, (before, environment) in RUNS.items():
         session = shutil.copytree(QUICK, tmp_path / f"session {name}" / QUICK.name)
         if name == "all":
             (session / "truth.json").unlink()
         (folder := tmp_path / name).mkdir()
-        command = [sys.executable, "-c", CALIBRATE.format(before), "calibrate", str(session)]
-        run = subprocess.Popen(command, cwd=folder, env=base | environment, stdout=subprocess.DEVNULL)
+        command = [
+            sys.executable,
+            "-c",
+            CALIBRATE.format(before),
+            "calibrate",
+            str(session),
+        ]
+        run = subprocess.Popen(
+            command, cwd=folder, env=base | environment, stdout=subprocess.DEVNULL
+        )
         processes.append(run)
     assert [process.wait() for process in processes] == [0, 0]
-    written = [{file.name: file.read_bytes() for file in (tmp_path / name).rglob("*.*")} for name in RUNS]
+    written = [
+        {file.name: file.read_bytes() for file in (tmp_path / name).rglob("*.*")}
+        for name in RUNS
+    ]
     assert {"calibration.json", "cloud.ply"} <= set(written[0])
     for files in written:
         files["calibration.json"] = json.loads(files["calibration.json"])

@@ -16,7 +16,13 @@ from lrfcal_lib.report.saving import RECORDING, Contents
 
 def option():
     """How `make lab` tells JupyterLab to save, a word of its command line."""
-    shown = subprocess.run(["make", "-n", "-o", "setup", "lab"], cwd=ROOT, capture_output=True, text=True, check=True)
+    shown = subprocess.run(
+        ["make", "-n", "-o", "setup", "lab"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     (found,) = [word for word in shown.stdout.split() if "contents_manager_class" in word]
     return found
 
@@ -24,12 +30,18 @@ def option():
 def after_running(notebook):
     """The notebook as JupyterLab saves it when its cells have been run: other outputs, counts and metadata."""
     notebook = json.loads(json.dumps(notebook))
-    shown = {"output_type": "stream", "name": "stdout", "text": "safe on the disk: /home/me/lrfcal_sessions\n"}
+    shown = {
+        "output_type": "stream",
+        "name": "stdout",
+        "text": "safe on the disk: /home/me/lrfcal_sessions\n",
+    }
     for count, cell in enumerate(notebook["cells"]):
         if cell["cell_type"] == "code":
             cell |= {"outputs": [copy.deepcopy(shown)], "execution_count": 40 + count}
             cell["metadata"]["execution"] = {"iopub.status.busy": "2026-01-01"}
-    notebook["metadata"]["widgets"] = {"application/vnd.jupyter.widget-state+json": {"state": {}}}
+    notebook["metadata"]["widgets"] = {
+        "application/vnd.jupyter.widget-state+json": {"state": {}}
+    }
     notebook["metadata"]["language_info"]["version"] = "3.11.7"
     return notebook
 
@@ -54,7 +66,10 @@ def saved(tmp_path):
 def test_running_the_notebook_that_records_leaves_its_file_as_it_is(saved):
     before, after = saved(RECORDING, after_running)
     assert after == before
-    assert option().endswith("=lrfcal_lib.report.saving.Contents") and Contents.__module__ == "lrfcal_lib.report.saving"
+    assert (
+        option().endswith("=lrfcal_lib.report.saving.Contents")
+        and Contents.__module__ == "lrfcal_lib.report.saving"
+    )
 
 
 def test_a_cell_that_was_changed_is_saved_without_outputs(saved):

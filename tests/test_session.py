@@ -19,10 +19,33 @@ from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError
 from lrfcal_lib.session.write import SessionWriter, finish
 
 BEARINGS = np.radians(np.arange(60.0, 121.0))
-LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), np.radians(1.0), 0.005, np.radians(0.01), 0.001, 8.0)
-HEAD = RigidTransform.from_components([0.01, 0.02, -0.03], Rotation.from_rotvec([0.1, -0.2, 0.3]))
-MODEL = CameraModel(32, 24, 30.0, 31.0, 15.5, 11.5, np.array([0.1, -0.02, 0.001, 0.002, 0.003]), np.eye(9), 0.25)
-CAMERAS = (CameraInfo("left", "head", 32, 24, MODEL, HEAD), CameraInfo("right", "platform", 32, 24))
+LRF = LrfInfo(
+    "made up",
+    (BEARINGS[0], BEARINGS[-1]),
+    np.radians(1.0),
+    0.005,
+    np.radians(0.01),
+    0.001,
+    8.0,
+)
+HEAD = RigidTransform.from_components(
+    [0.01, 0.02, -0.03], Rotation.from_rotvec([0.1, -0.2, 0.3])
+)
+MODEL = CameraModel(
+    32,
+    24,
+    30.0,
+    31.0,
+    15.5,
+    11.5,
+    np.array([0.1, -0.02, 0.001, 0.002, 0.003]),
+    np.eye(9),
+    0.25,
+)
+CAMERAS = (
+    CameraInfo("left", "head", 32, 24, MODEL, HEAD),
+    CameraInfo("right", "platform", 32, 24),
+)
 
 CHESSBOARD = {"kind": "chessboard", "columns": 8, "rows": 6, "square_m": 0.1}
 
@@ -40,11 +63,14 @@ def wall(lines=3, distance=2.0):
 @pytest.fixture(scope="module")
 def written_once(tmp_path_factory):
     """Two sweeps and five images, all of them different."""
-    path, about = tmp_path_factory.mktemp("sessions") / "trip", {"licence": "CC0", "source": "a test"}
+    path = tmp_path_factory.mktemp("sessions") / "trip"
+    about = {"licence": "CC0", "source": "a test"}
     with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, **about) as writer:
         writer.add_sweep(1, *wall())
         second = wall(distance=2.5)
-        writer.add_sweep(2, *second, time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS))))
+        writer.add_sweep(
+            2, *second, time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS)))
+        )
         for seed, camera in ((1, "left"), (11, "right")):
             writer.add_image(camera, pixels(seed), 1, pitch=0.1)
             writer.add_image(camera, pixels(seed + 1), 2, time_s=3.5)
@@ -62,7 +88,11 @@ def edit_scans(path, **changes):
     file = path / "lrf" / "scans.npz"
     with np.load(file) as archive:
         there = dict(archive)
-    np.savez(file, **there | {key: new(there[key]) if callable(new) else new for key, new in changes.items()})
+    np.savez(
+        file,
+        **there
+        | {key: new(there[key]) if callable(new) else new for key, new in changes.items()},
+    )
 
 
 def same(a, b):
@@ -74,15 +104,25 @@ def same(a, b):
 
 def test_what_is_written_is_read(path):
     session = open_session(path)
-    assert (session.name, session.licence, session.source, session.simulated) == ("trip", "CC0", "a test", False)
+    assert (session.name, session.licence, session.source, session.simulated) == (
+        "trip",
+        "CC0",
+        "a test",
+        False,
+    )
     assert session.placements == (1, 2) and session.problems == () and session.picks == ()
     assert validate(path) == []
     assert session.lrf.field_of_view == pytest.approx(LRF.field_of_view, abs=1e-12)
-    assert session.lrf.bearing_step == pytest.approx(LRF.bearing_step, abs=1e-12) and session.lrf.max_range == 8.0
+    assert (
+        session.lrf.bearing_step == pytest.approx(LRF.bearing_step, abs=1e-12)
+        and session.lrf.max_range == 8.0
+    )
     np.testing.assert_array_equal(session.board.corners, triangle_board().corners)
     same(session.T_head_lrf, HEAD)
     same(session.cameras["left"].guess, HEAD)
-    np.testing.assert_array_equal(session.cameras["left"].model.parameters, MODEL.parameters)
+    np.testing.assert_array_equal(
+        session.cameras["left"].model.parameters, MODEL.parameters
+    )
     assert session.cameras["right"].model is None and session.cameras["right"].guess is None
 
 
@@ -115,13 +155,18 @@ def test_picks_override_by_camera_file_and_edge(path):
 
 def test_an_interrupted_recording_is_said_and_can_be_finished(tmp_path):
     path = tmp_path / "s"
-    with pytest.raises(RuntimeError, match="power"), SessionWriter(path, triangle_board(), LRF, CAMERAS) as writer:
+    with (
+        pytest.raises(RuntimeError, match="power"),
+        SessionWriter(path, triangle_board(), LRF, CAMERAS) as writer,
+    ):
         writer.add_sweep(4, *wall())
         writer.add_image("left", pixels(), 4)
         raise RuntimeError("power cut")
     with (path / "images.csv").open("a") as table:
         table.write(",left,images/left/00")
-    with pytest.raises(SessionError, match=r"interrupted; lrfcal_lib\.session\.write\.finish"):
+    with pytest.raises(
+        SessionError, match=r"interrupted; lrfcal_lib\.session\.write\.finish"
+    ):
         open_session(path)
     finish(path)
     session = open_session(path)
@@ -133,7 +178,9 @@ def test_finish_needs_sweeps(path):
     with pytest.raises(SessionError, match="no sweep to finish"):
         finish(path)
     (path / "images").mkdir(exist_ok=True)
-    with pytest.raises(SessionError, match="lrf is missing; is this the folder of a session"):
+    with pytest.raises(
+        SessionError, match="lrf is missing; is this the folder of a session"
+    ):
         finish(path / "images")
 
 
@@ -161,10 +208,15 @@ def test_a_placement_without_data_is_listed_and_spoils_nothing(path):
 
 
 def test_scan_lines_that_cannot_be_used_are_listed(path):
-    edit_scans(path, ranges=lambda ranges: np.where(np.arange(6)[:, None] > 2, np.nan, ranges))
+    edit_scans(
+        path, ranges=lambda ranges: np.where(np.arange(6)[:, None] > 2, np.nan, ranges)
+    )
     assert validate(path) == ["placement 2: no scan line with a range"]
     edit_scans(path, placement=np.array([1, 1, 7, 7, 7, 7]))
-    assert "placement 7: in the scan lines but not in session.json, ignored" in open_session(path).problems
+    assert (
+        "placement 7: in the scan lines but not in session.json, ignored"
+        in open_session(path).problems
+    )
 
 
 # ---------------------------------------------------------------------------------------------- session.json
@@ -176,24 +228,72 @@ CHANGES = [  # place in session.json, what stands there instead ("gone": nothing
     ("name", "../up", "name is '../up': this becomes a file name"),
     ("placements", [1, 1], r"placements is \[1, 1\]: placements are different numbers"),
     ("placements", [1, "o"], "placements.1 is 'o': a valid integer"),
-    ("rig.platform.T_head_lrf.translation_m", [0, 0, 157], "translation_m.2 is 157: less than .* 10 .*millimetres"),
+    (
+        "rig.platform.T_head_lrf.translation_m",
+        [0, 0, 157],
+        "translation_m.2 is 157: less than .* 10 .*millimetres",
+    ),
     ("board.corners_m", [[0, 0], [315, 0], [0, 380]], "board is 380 m large: millimetres"),
-    ("board.corners_m", [[0, 0], [1, 0]], "corners_m must be one corner for each of 3 edges, got 2"),
+    (
+        "board.corners_m",
+        [[0, 0], [1, 0]],
+        "corners_m must be one corner for each of 3 edges, got 2",
+    ),
     ("board.edges", ["ab", "ab", "ca"], "the edges need different names"),
     ("board.edges", ["ab", "ca"], "board.edges is .*at least 3 items"),
-    ("board.edges", ["$x$", "ab", "ca"], "board.edges.0 is .*names of edges stand in figures"),
-    ("board.features", ["ab", "xy"], "features must be two different edges of ab, bc, ca, .*; got 'ab', 'xy'"),
-    ("board.features", ["", ""], "two different edges of ab, bc, ca, at a right angle; got none"),
-    ("board.features", ["ab", "ab"], "two different edges of ab, bc, ca, at a right angle; got 'ab', 'ab'"),
+    (
+        "board.edges",
+        ["$x$", "ab", "ca"],
+        "board.edges.0 is .*names of edges stand in figures",
+    ),
+    (
+        "board.features",
+        ["ab", "xy"],
+        "features must be two different edges of ab, bc, ca, .*; got 'ab', 'xy'",
+    ),
+    (
+        "board.features",
+        ["", ""],
+        "two different edges of ab, bc, ca, at a right angle; got none",
+    ),
+    (
+        "board.features",
+        ["ab", "ab"],
+        "two different edges of ab, bc, ca, at a right angle; got 'ab', 'ab'",
+    ),
     ("board.pattern", CHESSBOARD | {"square_m": 77.5}, "square_m is 77.5: .*millimetres"),
-    ("board.pattern", CHESSBOARD | {"columns": 1}, "pattern.columns is 1: greater than or equal to 3"),
+    (
+        "board.pattern",
+        CHESSBOARD | {"columns": 1},
+        "pattern.columns is 1: greater than or equal to 3",
+    ),
     ("board.pattern", CHESSBOARD | {"columns": 500}, "up to 1000 inner corners in all"),
-    ("board.pattern", CHESSBOARD | {"kind": "dots"}, "pattern.kind is 'dots': 'chessboard' is needed"),
-    ("rig.cameras.left.mount", "wall", "left.mount is 'wall': 'head' or 'platform' is needed"),
+    (
+        "board.pattern",
+        CHESSBOARD | {"kind": "dots"},
+        "pattern.kind is 'dots': 'chessboard' is needed",
+    ),
+    (
+        "rig.cameras.left.mount",
+        "wall",
+        "left.mount is 'wall': 'head' or 'platform' is needed",
+    ),
     ("rig.cameras.left.width", 0, "left.width is 0: greater than or equal to 1"),
-    ("rig.cameras.left.intrinsics.fx", -1, "left.intrinsics.fx is -1: greater than 0 is needed"),
-    ("rig.cameras.left.intrinsics.covariance", [0.0], r"covariance.0 is 0\.0: a valid tuple"),
-    ("rig.lrf.field_of_view_deg", [120, 60], r"field_of_view_deg is \[120, 60\]: two ascending"),
+    (
+        "rig.cameras.left.intrinsics.fx",
+        -1,
+        "left.intrinsics.fx is -1: greater than 0 is needed",
+    ),
+    (
+        "rig.cameras.left.intrinsics.covariance",
+        [0.0],
+        r"covariance.0 is 0\.0: a valid tuple",
+    ),
+    (
+        "rig.lrf.field_of_view_deg",
+        [120, 60],
+        r"field_of_view_deg is \[120, 60\]: two ascending",
+    ),
     ("rig.lrf.sigma_range_m", 5, "sigma_range_m is 5: .*millimetres"),
     ("rig.lrf.sigma_range_m", math.nan, "sigma_range_m is nan: a finite number is needed"),
 ]
@@ -261,27 +361,47 @@ def pick(row):
     return written("edges.csv", f"camera,file,edge,u1,v1,u2,v2\n{row}\n".encode())
 
 
-SCANS, IMAGES, OUT = "lrf/scans.npz", "images.csv", "must stay inside the session's folder, got "
+SCANS = "lrf/scans.npz"
+IMAGES = "images.csv"
+OUT = "must stay inside the session's folder, got "
 DAMAGE = [
     (gone("session.json"), r"session\.json: No such file"),
     (written("session.json", b""), "not JSON"),
     (written("session.json", b"[1]"), "holds a list"),
     (gone(SCANS), r"scans\.npz: no such file"),
     (written(SCANS, b""), "cannot be read.*truncated"),
-    (written(SCANS, lambda data: data[: int(0.98 * len(data))]), "cannot be read.*truncated"),
-    (written(SCANS, lambda data: data[:100] + bytes(60) + data[160:]), r"scans\.npz: cannot be read"),
-    (lambda path: np.savez(path / SCANS, ranges=np.ones((2, 61)), bearings=BEARINGS), "key 'placement' is missing"),
+    (
+        written(SCANS, lambda data: data[: int(0.98 * len(data))]),
+        "cannot be read.*truncated",
+    ),
+    (
+        written(SCANS, lambda data: data[:100] + bytes(60) + data[160:]),
+        r"scans\.npz: cannot be read",
+    ),
+    (
+        lambda path: np.savez(path / SCANS, ranges=np.ones((2, 61)), bearings=BEARINGS),
+        "key 'placement' is missing",
+    ),
     (arrays(pitch=np.array([{}] * 6)), "cannot be read.*without pickles"),
-    (arrays(ranges=np.full((6, 61), 2000.0)), r"scans\.npz: the median range is .* m: millimetres"),
+    (
+        arrays(ranges=np.full((6, 61), 2000.0)),
+        r"scans\.npz: the median range is .* m: millimetres",
+    ),
     (arrays(ranges=np.full((6, 61), np.nan)), r"all NaN\): nothing was recorded"),
-    (arrays(ranges=np.r_[[[-1.0] * 61], np.ones((5, 61))]), "negative ranges are no measurements"),
+    (
+        arrays(ranges=np.r_[[[-1.0] * 61], np.ones((5, 61))]),
+        "negative ranges are no measurements",
+    ),
     (arrays(ranges=np.ones(61)), "ranges must be scan lines x beams"),
     (arrays(bearings=np.arange(60.0, 121.0)), "a bearing is 120 rad: degrees"),
     (arrays(pitch=np.linspace(-20.0, 20.0, 6)), "a pitch is 20 rad: degrees"),
     (arrays(pitch=np.r_[np.full(3, np.nan), 0, 0, 0]), "3 values of pitch are not finite"),
     (arrays(bearings=BEARINGS[::-1]), "bearings must ascend"),
     (arrays(time_s=np.zeros(2)), r"time_s has shape \(2,\)"),
-    (lambda path: (path / SCANS).rename(path / "lrf" / "telegrams.bin"), r"index\.csv: No such file.*needs this file"),
+    (
+        lambda path: (path / SCANS).rename(path / "lrf" / "telegrams.bin"),
+        r"index\.csv: No such file.*needs this file",
+    ),
     (cell("file", "../trip/session.json"), OUT + "'../trip/session.json'"),
     (cell("file", "/etc/passwd"), OUT + "'/etc/passwd'"),
     (cell("file", "..\\x.png"), OUT + r"'\.\.\\"),
@@ -290,18 +410,39 @@ DAMAGE = [
     (cell("camera", "up"), "no camera 'up' in session.json, which has left, right"),
     (cell("purpose", "fun"), "purpose is one of intrinsics, board, scene, got 'fun'"),
     (cell("placement", "12"), "placement 12 is not in session.json"),
-    (cell("placement", "1.5"), "images.csv line 2: placement is '1.5': a whole number is needed"),
-    (written_by_pandas(index=True), "columns must be t_s, .*; got a first column without a name: .*index=False in"),
+    (
+        cell("placement", "1.5"),
+        "images.csv line 2: placement is '1.5': a whole number is needed",
+    ),
+    (
+        written_by_pandas(index=True),
+        "columns must be t_s, .*; got a first column without a name: .*index=False in",
+    ),
     (cell("pitch_deg", "up"), "line 2: could not convert string to float: 'up'"),
-    (written("images/left/0002.png", cv2.imencode(".png", pixels()[:20])[1]), r"0002\.png: 32 x 20 pixels, but camera"),
+    (
+        written("images/left/0002.png", cv2.imencode(".png", pixels()[:20])[1]),
+        r"0002\.png: 32 x 20 pixels, but camera",
+    ),
     (gone(IMAGES), r"images\.csv: No such file"),
     (written(IMAGES, b""), "got an empty file"),
     (written(IMAGES, b"\xff\xfe"), "not a CSV file in UTF-8"),
-    (written(IMAGES, lambda data: data.replace(b"_deg", b"")), r"columns must be t_s, .*; got t_s, .*, pitch, purpose"),
-    (written(IMAGES, lambda data: data + b",left,images"), "line 7: 3 values for 6 columns; truncated"),
-    (pick("left,images/left/0009.png,ab,1,2,20,3"), "no 'images/left/0009.png' of camera 'left'"),
+    (
+        written(IMAGES, lambda data: data.replace(b"_deg", b"")),
+        r"columns must be t_s, .*; got t_s, .*, pitch, purpose",
+    ),
+    (
+        written(IMAGES, lambda data: data + b",left,images"),
+        "line 7: 3 values for 6 columns; truncated",
+    ),
+    (
+        pick("left,images/left/0009.png,ab,1,2,20,3"),
+        "no 'images/left/0009.png' of camera 'left'",
+    ),
     (pick("left,../0001.png,ab,1,2,20,3"), OUT),
-    (pick("left,images/left/0001.png,top,1,2,20,3"), "edge is one of ab, bc, ca, got 'top'"),
+    (
+        pick("left,images/left/0001.png,top,1,2,20,3"),
+        "edge is one of ab, bc, ca, got 'top'",
+    ),
     (pick("left,images/left/0001.png,ab,1,2,2,3"), "too close for a direction"),
     (pick("left,images/left/0001.png,ab,1,2,nan,3"), "u1, v1, u2, v2 must be 4 finite"),
 ]
@@ -331,10 +472,22 @@ def test_an_image_that_cannot_be_decoded_is_found_by_validate(path):
 
 RANGES, _, PITCH = wall()
 REFUSED = [
-    ("add_sweep", (2, 1000 * RANGES, BEARINGS, PITCH), "placement 2: the median range .*millimetres"),
+    (
+        "add_sweep",
+        (2, 1000 * RANGES, BEARINGS, PITCH),
+        "placement 2: the median range .*millimetres",
+    ),
     ("add_sweep", (2, RANGES, BEARINGS + 0.1, PITCH), "one grid a session"),
-    ("add_image", ("up", pixels()), "camera 'up', purpose 'board': cameras are left, right"),
-    ("add_image", ("left", pixels()[:, 1:]), "31 x 24 pixels, but camera 'left' has 32 x 24"),
+    (
+        "add_image",
+        ("up", pixels()),
+        "camera 'up', purpose 'board': cameras are left, right",
+    ),
+    (
+        "add_image",
+        ("left", pixels()[:, 1:]),
+        "31 x 24 pixels, but camera 'left' has 32 x 24",
+    ),
 ]
 
 

@@ -16,7 +16,14 @@ from lrfcal_lib.session.lms2xx_codec import MODES
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate import record
 from lrfcal_lib.simulate.beam import LMS221
-from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, load_setup, pairs
+from lrfcal_lib.simulate.rig import (
+    SETUPS,
+    Platform,
+    check_size,
+    held_close,
+    load_setup,
+    pairs,
+)
 from lrfcal_lib.simulate.scene import Exposure, Imager, World
 
 FULL = load_setup("sim_quick")
@@ -32,11 +39,20 @@ def tiny():
     """Two placements and a camera of few pixels, nothing else."""
     small = scaled(FULL.rig, 160)
     rig = replace(small, cameras=small.cameras[:1], beam=replace(small.beam, rings=1))
-    return replace(FULL, rig=rig, pairs=1, step=np.radians(1.0), intrinsics_views=0, room_sweep=(), room_images=())
+    return replace(
+        FULL,
+        rig=rig,
+        pairs=1,
+        step=np.radians(1.0),
+        intrinsics_views=0,
+        room_sweep=(),
+        room_images=(),
+    )
 
 
 def test_backlash_depends_on_the_direction():
-    platform, rng = Platform(backlash=0.002, stretch=0.01, encoder_step=0.001), np.random.default_rng(0)
+    platform = Platform(backlash=0.002, stretch=0.01, encoder_step=0.001)
+    rng = np.random.default_rng(0)
     commanded = np.array([-0.1, 0.0, 0.2])
     (up, measured), (down, _) = (platform.stop(commanded, way, rng) for way in (1, -1))
     np.testing.assert_allclose(down - up, 0.002)
@@ -47,32 +63,53 @@ def test_backlash_depends_on_the_direction():
 def test_a_sweep_and_an_image_are_rebuilt(session):
     """To the byte on one kind of processor; on another the last bit of a sine moves roundings and photon counts."""
     placement = record.placements_of(FULL)[3]
-    made, shipped = record.sweep_of(FULL, placement), session.sweep(4).ranges
+    made = record.sweep_of(FULL, placement)
+    shipped = session.sweep(4).ranges
     made = np.where(made > MODES[0].largest, np.nan, made * 0.001)
     np.testing.assert_array_equal(np.isnan(made), np.isnan(shipped))
     off = np.nan_to_num(np.abs(made - shipped))
     assert off.max() < 0.0011 and np.mean(off > 0) < 1e-3
-    shots = [s for s in record.shots_of(FULL, [placement]) if s.placement == 4 and s.camera == 0]
+    shots = [
+        s for s in record.shots_of(FULL, [placement]) if s.placement == 4 and s.camera == 0
+    ]
     shipped = [r.file.read_bytes() for r in session.images("left", 4)]
     for pair in zip(record.photograph(FULL, shots[0]), shipped, strict=True):
-        one, two = (cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).astype(float) for content in pair)
-        assert np.abs(one - two).mean() < 2.0 and np.abs(cv2.blur(one - two, (15, 15))).max() < 4.0
+        one, two = (
+            cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).astype(float)
+            for content in pair
+        )
+        assert (
+            np.abs(one - two).mean() < 2.0
+            and np.abs(cv2.blur(one - two, (15, 15))).max() < 4.0
+        )
 
 
 @pytest.mark.parametrize("name", SETUPS)
 def test_the_data_card_has_the_sums_of_all_files(name):
-    sums = dict(line.split("  ")[::-1] for line in (DATA / "SHA256SUMS").read_text().splitlines())
+    sums = dict(
+        line.split("  ")[::-1] for line in (DATA / "SHA256SUMS").read_text().splitlines()
+    )
     files = [file for file in (DATA / name).rglob("*") if file.is_file()]
-    made = {file.relative_to(DATA).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-    assert made == {file: value for file, value in sums.items() if file.startswith(f"{name}/")}
-    assert sum(f.stat().st_size for f in files) < {"sim_lms221": 40e6, "sim_quick": 3e6}[name]
+    made = {
+        file.relative_to(DATA).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in files
+    }
+    assert made == {
+        file: value for file, value in sums.items() if file.startswith(f"{name}/")
+    }
+    assert (
+        sum(f.stat().st_size for f in files) < {"sim_lms221": 40e6, "sim_quick": 3e6}[name]
+    )
 
 
 def test_an_existing_folder_is_left_alone(tmp_path, tiny, capsys):
     (tmp_path / "s").mkdir()
     with pytest.raises(ValueError, match="exists already"):
         record.simulate(tmp_path / "s", tiny)
-    assert main(["simulate", "sim_quick", str(tmp_path / "s")]) == 1 and "exists already" in capsys.readouterr().err
+    assert (
+        main(["simulate", "sim_quick", str(tmp_path / "s")]) == 1
+        and "exists already" in capsys.readouterr().err
+    )
     assert list((tmp_path / "s").iterdir()) == []
 
 
@@ -102,8 +139,6 @@ def test_a_full_disk_leaves_nothing(tmp_path, tiny, monkeypatch, free):
     (FULL, {"intrinsics_views": -1}, "Setup\nintrinsics_views\n.* greater than or equal to 0 "),
     (FULL, {"room_sweep": (0.0, 1.0)}, "Setup\nroom_sweep"),
 ])  # fmt: skip
-
-
 def test_impossible_settings(given, change, message):
     with pytest.raises(ValueError, match=message):
         replace(given, **change)
@@ -114,13 +149,25 @@ def lens(width, *distortion):
 
 
 def test_what_cannot_be_simulated(tmp_path, tiny):
-    rng, plain, large = np.random.default_rng(0), triangle_board(), triangle_board(0.9, 1.0)
-    camera, huge = tiny.rig.cameras[0], replace(tiny.rig, board=triangle_board(3.0, 4.0))
+    rng = np.random.default_rng(0)
+    plain = triangle_board()
+    large = triangle_board(0.9, 1.0)
+    camera = tiny.rig.cameras[0]
+    huge = replace(tiny.rig, board=triangle_board(3.0, 4.0))
     for refused, message in (
-        (lambda: Platform().stop(np.radians([-10, 80]), 1, rng), "pitch -10.0 to 80.0 deg is asked for"),
+        (
+            lambda: Platform().stop(np.radians([-10, 80]), 1, rng),
+            "pitch -10.0 to 80.0 deg is asked for",
+        ),
         (lambda: pairs(tiny.rig, 0, (1.0, 2.0), rng), "0 pairs"),
-        (lambda: held_close(replace(tiny.rig, board=plain), camera, 3, rng), "has no pattern"),
-        (lambda: check_size(replace(tiny.rig, board=large), 1.3), "but camera 'left' sees 39 deg"),
+        (
+            lambda: held_close(replace(tiny.rig, board=plain), camera, 3, rng),
+            "has no pattern",
+        ),
+        (
+            lambda: check_size(replace(tiny.rig, board=large), 1.3),
+            "but camera 'left' sees 39 deg",
+        ),
         (lambda: record.step_angles(0, 1, 0.0), "a pitch step must be positive, got 0.0"),
         (lambda: World([]), "at least one thing"),
         (lambda: lens(512, -0.9, 0.0, 0.0, 0.0, 0.0), "folds the image"),

@@ -29,7 +29,9 @@ def test_every_package_is_pinned_with_its_sums_once_and_direct_ones_say_why():
 
 def test_pip_takes_no_file_without_a_listed_sum():
     lines = (ROOT / ".ci" / "setup").read_text().splitlines()
-    installs = [line for line in lines if re.search(r"pip[_ ]install ", line) and '"$@"' not in line]
+    installs = [
+        line for line in lines if re.search(r"pip[_ ]install ", line) and '"$@"' not in line
+    ]
     own = [line for line in installs if line.endswith(" -e .")]
     assert len(own) == 1 and len(installs) == 3
     assert all("--require-hashes" in line for line in installs if line not in own)
@@ -37,9 +39,14 @@ def test_pip_takes_no_file_without_a_listed_sum():
 
 @pytest.mark.parametrize("job", WORKFLOW["jobs"])
 def test_the_workflow_runs_fixed_actions_without_rights(job):
-    assert WORKFLOW["permissions"] == {"contents": "read"} and "permissions" not in WORKFLOW["jobs"][job]
+    assert (
+        WORKFLOW["permissions"] == {"contents": "read"}
+        and "permissions" not in WORKFLOW["jobs"][job]
+    )
     actions = [step for step in WORKFLOW["jobs"][job]["steps"] if "uses" in step]
-    assert actions and all(re.fullmatch(r"actions/[\w-]+@[0-9a-f]{40}", step["uses"]) for step in actions)
+    assert actions and all(
+        re.fullmatch(r"actions/[\w-]+@[0-9a-f]{40}", step["uses"]) for step in actions
+    )
     assert actions[0]["with"] == {"persist-credentials": False}
 
 
@@ -47,7 +54,10 @@ def test_the_workflow_runs_what_takes_long_once_a_week():
     assert WORKFLOW[True]["schedule"]  # YAML reads "on" so
     runs = " ".join(step.get("run", "") for step in WORKFLOW["jobs"]["long"]["steps"])
     targets = WORKFLOW["jobs"]["long"]["strategy"]["matrix"]["command"]
-    assert targets == ["make campaign", "make fuzz", ".ci/recordings"] and "${{ matrix.command }}" in runs
+    assert (
+        targets == ["make campaign", "make fuzz", ".ci/recordings"]
+        and "${{ matrix.command }}" in runs
+    )
 
 
 def test_what_the_package_needs_is_pinned():
@@ -62,7 +72,9 @@ def test_what_the_package_needs_is_pinned():
 
 def git(*arguments):
     """Lines that git prints; skips the test where there is no checkout."""
-    done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True)
+    done = subprocess.run(
+        ["git", "-C", str(ROOT), *arguments], capture_output=True, text=True
+    )
     if done.returncode:
         pytest.skip("no git checkout")
     return done.stdout.splitlines()
@@ -94,8 +106,14 @@ def run_setup(tmp_path):
     def run(missing="", **commands):
         for name, script in commands.items():
             write_command(tmp_path / "bin" / name, script)
-        environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "HOME": str(tmp_path), "MISSING": missing}
-        return subprocess.run(".ci/setup", cwd=tmp_path, env=environment, capture_output=True, text=True)
+        environment = {
+            "PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin",
+            "HOME": str(tmp_path),
+            "MISSING": missing,
+        }
+        return subprocess.run(
+            ".ci/setup", cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
 
     return run
 
@@ -103,7 +121,10 @@ def run_setup(tmp_path):
 def test_setup_keeps_the_environment_until_environment_txt_changes(run_setup, tmp_path):
     calls = tmp_path / "calls"
     assert run_setup().returncode == 0
-    assert calls.read_text().count("-m venv") == 1 and "-r environment.txt" in calls.read_text()
+    assert (
+        calls.read_text().count("-m venv") == 1
+        and "-r environment.txt" in calls.read_text()
+    )
     calls.write_text("")
     assert run_setup().returncode == 0
     assert "venv" not in calls.read_text() and "pip" not in calls.read_text()
@@ -119,12 +140,36 @@ PIP_SAYS = f"""{FAKE_PYTHON}
 case "$*" in *environment.txt*) echo "%s" >&2; exit 1 ;; esac"""
 OFFLINE = "WARNING: connection broken by 'NewConnectionError'\nERROR: No matching distribution found for numba"
 TOLD = {
-    "offline": ({"python3": PIP_SAYS % OFFLINE}, 1, "packages cannot be fetched: is there a network? Connect"),
-    "pip fails": ({"python3": PIP_SAYS % "ERROR: numba needs another Python"}, 1, "numba needs another Python"),
-    "read-only": ({"touch": "exit 1"}, 1, "{} cannot be written: copy the repository to a folder"),
-    "old python": ({"python3": OLD}, 1, "Python 3.11 or newer is needed, Python 3.9.2 was found"),
-    "no venv": ({"python3": NO_VENV, "id": "echo 1000"}, 1, "sudo apt-get install -y python3.12-venv"),
-    "no libraries": ({"missing": "libusb-1.0-0", "id": "echo 1000"}, 0, "sudo apt-get install -y libusb-1.0-0"),
+    "offline": (
+        {"python3": PIP_SAYS % OFFLINE},
+        1,
+        "packages cannot be fetched: is there a network? Connect",
+    ),
+    "pip fails": (
+        {"python3": PIP_SAYS % "ERROR: numba needs another Python"},
+        1,
+        "numba needs another Python",
+    ),
+    "read-only": (
+        {"touch": "exit 1"},
+        1,
+        "{} cannot be written: copy the repository to a folder",
+    ),
+    "old python": (
+        {"python3": OLD},
+        1,
+        "Python 3.11 or newer is needed, Python 3.9.2 was found",
+    ),
+    "no venv": (
+        {"python3": NO_VENV, "id": "echo 1000"},
+        1,
+        "sudo apt-get install -y python3.12-venv",
+    ),
+    "no libraries": (
+        {"missing": "libusb-1.0-0", "id": "echo 1000"},
+        0,
+        "sudo apt-get install -y libusb-1.0-0",
+    ),
 }
 
 

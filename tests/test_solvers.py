@@ -21,23 +21,35 @@ from lrfcal_lib.model.geometry import (
 from lrfcal_lib.solvers import METHODS, best_method, solve_camera, starting_transform
 from lrfcal_lib.solvers.lines import distance_block, point_block
 
-OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
-RESIDUALS = {"line": line_block, "wasielewski_strauss": distance_block, "bauermann": point_block}
+OFF = RigidTransform.from_components(
+    [0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03])
+)
+RESIDUALS = {
+    "line": line_block,
+    "wasielewski_strauss": distance_block,
+    "bauermann": point_block,
+}
 
 
 def increment(found, truth):
     """Error as [w, v]."""
     turn = found.rotation * truth.rotation.inv()
-    return np.concatenate([turn.as_rotvec(), found.translation - truth.translation], axis=-1)
+    return np.concatenate(
+        [turn.as_rotvec(), found.translation - truth.translation], axis=-1
+    )
 
 
 def miss(found, rig):
     """Rotation (radians) and translation error (metres) of a solution or a transform."""
-    return np.array(transform_difference(getattr(found, "transform", found), rig.T_camera_lrf))
+    return np.array(
+        transform_difference(getattr(found, "transform", found), rig.T_camera_lrf)
+    )
 
 
 def rows_of(obs, prefix, rows):
-    return replace(obs, **{f: getattr(obs, f)[rows] for f in vars(obs) if f.startswith(prefix)})
+    return replace(
+        obs, **{f: getattr(obs, f)[rows] for f in vars(obs) if f.startswith(prefix)}
+    )
 
 
 def test_the_example_of_plain_arrays_runs():
@@ -52,15 +64,23 @@ def test_every_method_recovers_exact_data(name, source):
     found = solve_camera(obs, name)
     assert (miss(found, rig) < 1e-9).all()
     assert found.converged and found.unobservable == ()
-    assert found.covariance.shape == (len(found.names),) * 2 and np.isfinite(found.covariance).all()
+    assert (
+        found.covariance.shape == (len(found.names),) * 2
+        and np.isfinite(found.covariance).all()
+    )
 
 
-@pytest.mark.parametrize("field", ["crossing_points", "crossing_covariance", "plane_points", "scene_points"])
+@pytest.mark.parametrize(
+    "field", ["crossing_points", "crossing_covariance", "plane_points", "scene_points"]
+)
 def test_values_that_are_not_finite_are_refused(field):
     _, obs = camera_case(3)
     values = getattr(obs, field).copy()
     values[2].flat[1] = np.inf
-    with pytest.raises(ValueError, match=f"{field} of camera 'left' holds 1 values that are not finite, .* row 2"):
+    with pytest.raises(
+        ValueError,
+        match=f"{field} of camera 'left' holds 1 values that are not finite, .* row 2",
+    ):
         replace(obs, **{field: values})
 
 
@@ -76,14 +96,24 @@ def test_every_method_refuses_one_placement_only(name):
 @pytest.mark.parametrize(
     ("name", "prefix", "count", "words"),
     [
-        *((name, "crossing_", n, f"{n} crossings of scan lines with edges, at least {n + 1} needed")
-          for name, n in (("line", 5), ("wasielewski_strauss", 5))),
+        *(
+            (
+                name,
+                "crossing_",
+                n,
+                f"{n} crossings of scan lines with edges, at least {n + 1} needed",
+            )
+            for name, n in (("line", 5), ("wasielewski_strauss", 5))
+        ),
         ("bauermann", "scene_", 2, "2 scene points, at least 3 needed"),
-        ("lines", "scene_", 2, "unknown method 'lines': use one of line_printed, line_last_beam, line,"),
+        (
+            "lines",
+            "scene_",
+            2,
+            "unknown method 'lines': use one of line_printed, line_last_beam, line,",
+        ),
     ],
 )
-
-
 def test_too_few_rows_and_unknown_methods_are_refused(name, prefix, count, words):
     with pytest.raises(ValueError, match=words):
         solve_camera(rows_of(camera_case(6)[1], prefix, slice(count)), name)
@@ -117,7 +147,9 @@ def test_the_default_is_the_method_that_errs_less_on_placements_left_out(case):
     obs = change(obs)
     found = solve_camera(obs)
     assert found.method == best
-    np.testing.assert_array_equal(pose_array(found.transform), pose_array(solve_camera(obs, best).transform))
+    np.testing.assert_array_equal(
+        pose_array(found.transform), pose_array(solve_camera(obs, best).transform)
+    )
     if case != "too few to leave one out":
         assert best_method({"left": obs}, {("left", best): found}) == best
 
@@ -126,7 +158,9 @@ def test_without_a_method_that_determines_the_pose_or_for_many_trials_there_is_n
     _, obs = camera_case(7)
     with pytest.raises(DegenerateGeometry, match="at least 3 needed"):
         solve_camera(obs.select([]))
-    with pytest.raises(ValueError, match="many trials at once: name the method, one of line_printed"):
+    with pytest.raises(
+        ValueError, match="many trials at once: name the method, one of line_printed"
+    ):
         solve_camera(replace(obs, crossing_points=np.stack([obs.crossing_points] * 2)))
     assert best_method({"left": obs}, {}) is None
 
@@ -134,9 +168,13 @@ def test_without_a_method_that_determines_the_pose_or_for_many_trials_there_is_n
 @pytest.mark.parametrize("name", METHODS)
 def test_errors_agree_with_the_covariance(name):
     rig, obs = camera_case(5, 12)
-    rng, scores, poses = np.random.default_rng(6), [], [RigidTransform.from_matrix(m) for m in obs.board_poses]
+    rng = np.random.default_rng(6)
+    scores = []
+    poses = [RigidTransform.from_matrix(m) for m in obs.board_poses]
     for _ in range(10):
-        found = solve_camera(camera_observations(rng, rig, poses, noise=1.0), name, rig.T_camera_lrf)
+        found = solve_camera(
+            camera_observations(rng, rig, poses, noise=1.0), name, rig.T_camera_lrf
+        )
         e = increment(found.transform, rig.T_camera_lrf)
         known = found.trusted if name == "zhang_pless_printed" else found.covariance
         scores.append(e @ np.linalg.solve(known[:6, :6], e) / 6)
@@ -146,14 +184,20 @@ def test_errors_agree_with_the_covariance(name):
 
 @pytest.mark.parametrize(
     ("name", "weighted"),
-    [("line", True), ("line", False), ("wasielewski_strauss", True), ("wasielewski_strauss", False), ("planes", False),
-     ("bauermann", True), ("bauermann", False)],
+    [
+        ("line", True),
+        ("line", False),
+        ("wasielewski_strauss", True),
+        ("wasielewski_strauss", False),
+        ("planes", False),
+        ("bauermann", True),
+        ("bauermann", False),
+    ],
 )
-
-
 def test_scipy_agrees(name, weighted):
     rig, obs = camera_case(10, noise=1.0, source="platform" if name == "planes" else "lrf")
-    start, options = pose_array(rig.T_camera_lrf), dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
+    start = pose_array(rig.T_camera_lrf)
+    options = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
 
     def residuals(d):
         pose = move_pose(start, d)
@@ -163,8 +207,15 @@ def test_scipy_agrees(name, weighted):
         return block.white if weighted else block.residuals
 
     theirs = scipy.optimize.least_squares(residuals, np.zeros(6), **options)
-    ours = solve_camera(obs, "zhang_pless" if name == "planes" else name, rig.T_camera_lrf, weighted=weighted)
-    np.testing.assert_allclose(pose_array(ours.transform), move_pose(start, theirs.x), atol=2e-6)
+    ours = solve_camera(
+        obs,
+        "zhang_pless" if name == "planes" else name,
+        rig.T_camera_lrf,
+        weighted=weighted,
+    )
+    np.testing.assert_allclose(
+        pose_array(ours.transform), move_pose(start, theirs.x), atol=2e-6
+    )
     assert not weighted or ours.chi2 / 2 == pytest.approx(theirs.cost, rel=1e-9)
     counts = {"planes": len(obs.plane_points), "bauermann": 2 * len(obs.scene_points)}
     assert ours.n_observations == counts.get(name, len(obs.crossing_points))
@@ -179,50 +230,75 @@ BATCHED = {  # methods that solve many trials at once, and the points that diffe
 @pytest.mark.parametrize("name", BATCHED)
 def test_many_trials_at_once_are_the_trials_one_by_one(name):
     rig, obs = camera_case(11, noise=1.0)
-    rng, field = np.random.default_rng(12), f"{BATCHED[name]}_points"
+    rng = np.random.default_rng(12)
+    field = f"{BATCHED[name]}_points"
     points = getattr(obs, field) + rng.normal(0, 0.002, (4, *getattr(obs, field).shape))
-    boards, covariance = (np.stack([x] * 4) for x in (obs.board_poses, obs.board_covariance))
-    more = {"board_poses": boards, "board_covariance": covariance} if BATCHED[name] == "plane" else {}
+    boards, covariance = (
+        np.stack([x] * 4) for x in (obs.board_poses, obs.board_covariance)
+    )
+    more = (
+        {"board_poses": boards, "board_covariance": covariance}
+        if BATCHED[name] == "plane"
+        else {}
+    )
     if BATCHED[name] == "plane":
         more["plane_covariance"] = np.stack([obs.plane_covariance] * 4)
     many = solve_camera(replace(obs, **{field: points}, **more), name, rig.T_camera_lrf)
     assert many.converged.shape == (4,) and many.converged.all()
     for i, one in enumerate(points):
-        alone = solve_camera(replace(obs, **{field: one}), name, rig.T_camera_lrf, search=False)
-        np.testing.assert_allclose(pose_array(many.transform[i]), pose_array(alone.transform), atol=1e-9)
-        np.testing.assert_allclose(many.covariance[i], alone.covariance, rtol=1e-6, atol=1e-15)
+        alone = solve_camera(
+            replace(obs, **{field: one}), name, rig.T_camera_lrf, search=False
+        )
+        np.testing.assert_allclose(
+            pose_array(many.transform[i]), pose_array(alone.transform), atol=1e-9
+        )
+        np.testing.assert_allclose(
+            many.covariance[i], alone.covariance, rtol=1e-6, atol=1e-15
+        )
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_the_frame_of_the_source_does_not_matter(name):
     """Scanner coordinates turned and shifted by T: the pose is the old one times the inverse of T."""
     rig, obs = camera_case(13, noise=1.0)
-    T = RigidTransform.from_components([0.3, -0.2, 0.1], Rotation.from_rotvec([0.2, -0.4, 0.3]))
-    R, moved = T.rotation.as_matrix(), {}
+    T = RigidTransform.from_components(
+        [0.3, -0.2, 0.1], Rotation.from_rotvec([0.2, -0.4, 0.3])
+    )
+    R = T.rotation.as_matrix()
+    moved = {}
     for group in ("crossing", "plane", "scene"):
         moved[f"{group}_points"] = T.apply(getattr(obs, f"{group}_points"))
         moved[f"{group}_covariance"] = R @ getattr(obs, f"{group}_covariance") @ R.T
     start = rig.T_camera_lrf * OFF
     before = solve_camera(obs, name, start, search=False)
     after = solve_camera(replace(obs, **moved), name, start * T.inv(), search=False)
-    np.testing.assert_allclose(pose_array(after.transform), pose_array(before.transform * T.inv()), atol=2e-8)
+    np.testing.assert_allclose(
+        pose_array(after.transform), pose_array(before.transform * T.inv()), atol=2e-8
+    )
     assert np.sum(after.chi2) == pytest.approx(np.sum(before.chi2), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_the_order_of_the_rows_does_not_matter(name):
     rig, obs = camera_case(14, noise=1.0)
-    rng, shuffled = np.random.default_rng(15), obs
+    rng = np.random.default_rng(15)
+    shuffled = obs
     for prefix in ("crossing_", "plane_", "scene_"):
         order = rng.permutation(len(getattr(obs, f"{prefix}placement")))
         shuffled = rows_of(shuffled, prefix, order)
     order = rng.permutation(len(obs.placements))
     of_boards = ("placements", "board_poses", "board_covariance", "pattern_pixels")
-    shuffled = replace(shuffled, **{field: getattr(obs, field)[order] for field in of_boards})
+    shuffled = replace(
+        shuffled, **{field: getattr(obs, field)[order] for field in of_boards}
+    )
     start = rig.T_camera_lrf * OFF
     one, other = (solve_camera(each, name, start, search=False) for each in (obs, shuffled))
-    np.testing.assert_allclose(pose_array(other.transform), pose_array(one.transform), atol=1e-8)
-    np.testing.assert_allclose(other.covariance_placements, one.covariance_placements, rtol=1e-4, atol=1e-14)
+    np.testing.assert_allclose(
+        pose_array(other.transform), pose_array(one.transform), atol=1e-8
+    )
+    np.testing.assert_allclose(
+        other.covariance_placements, one.covariance_placements, rtol=1e-4, atol=1e-14
+    )
 
 
 def test_robust_loss_resists_wrong_edges():
@@ -230,7 +306,9 @@ def test_robust_loss_resists_wrong_edges():
     lines = obs.crossing_lines.copy()
     lines[::10, 2] += 60.0
     spoiled = replace(obs, crossing_lines=lines)
-    plain, robust = (miss(solve_camera(spoiled, "line", loss=loss), rig)[1] for loss in (None, "cauchy"))
+    plain, robust = (
+        miss(solve_camera(spoiled, "line", loss=loss), rig)[1] for loss in (None, "cauchy")
+    )
     assert robust < 0.03 and robust < 0.5 * plain
 
 
@@ -254,4 +332,8 @@ def test_points_on_one_line_leave_a_rotation_open():
     points = np.linspace([0.0, 1.5, -0.2], [0.2, 1.5, 0.3], 12)
     q = rig.T_camera_lrf.apply(points) @ rig.model.matrix.T
     with pytest.raises(DegenerateGeometry, match="do not determine rotation about"):
-        solve_camera(replace(obs, scene_points=points, scene_pixels=q[:, :2] / q[:, 2:]), "bauermann", rig.T_camera_lrf)
+        solve_camera(
+            replace(obs, scene_points=points, scene_pixels=q[:, :2] / q[:, 2:]),
+            "bauermann",
+            rig.T_camera_lrf,
+        )

@@ -27,10 +27,15 @@ def test_whitened_views_are_those_of_the_whole_covariance(mount):
             whole[rows, rows] += data.view["covariance"][i, a] * data.levels.view_scale**2
             for b in np.flatnonzero(data.view["pitch"][i] == data.view["pitch"][i, a]):
                 whole[rows, 6 * b : 6 * b + 6] += 0.3**2 * np.outer(g[a], g[b])
-        np.testing.assert_allclose(block.white[i] @ block.white[i], r_squared(block.residuals[i], whole), rtol=1e-6)
+        np.testing.assert_allclose(
+            block.white[i] @ block.white[i], r_squared(block.residuals[i], whole), rtol=1e-6
+        )
         J = block.jacobian[i]
         np.testing.assert_allclose(
-            block.white_jacobian[i].T @ block.white_jacobian[i], J.T @ np.linalg.solve(whole, J), rtol=1e-5, atol=1e-3
+            block.white_jacobian[i].T @ block.white_jacobian[i],
+            J.T @ np.linalg.solve(whole, J),
+            rtol=1e-5,
+            atol=1e-3,
         )
     assert np.any(g) == (mount == "head")
 
@@ -42,9 +47,12 @@ def r_squared(r, covariance):
 @pytest.mark.parametrize("images", [2, 3])
 def test_the_error_of_the_pitch_at_stops_is_found(images):
     """Also from two stops a placement: what the board itself takes up of both errors is no sign of small ones."""
-    levels, scales = [], []
+    levels = []
+    scales = []
     for seed in range(6):
-        obs, _, _ = draw(rng(seed), 12, floor=LEAST_STEP, sigma_stop=STOP, see_images=images)
+        obs, _, _ = draw(
+            rng(seed), 12, floor=LEAST_STEP, sigma_stop=STOP, see_images=images
+        )
         noise = solve_joint(obs, noise="estimate").noise
         levels.append(noise["sigma_pitch"])
         scales.append(noise["view_scale"])
@@ -58,5 +66,7 @@ def test_one_image_a_placement_does_not_show_its_noise_to_be_small(cameras):
     scales = []
     for seed in range(4):
         obs, _, _ = draw(rng(seed), 12, cameras=cameras, floor=LEAST_STEP, see_images=1)
-        scales.append(solve_joint(obs, noise="estimate", required=False).noise["view_scale"])
+        scales.append(
+            solve_joint(obs, noise="estimate", required=False).noise["view_scale"]
+        )
     assert 0.6 < np.mean(scales) < 1.6

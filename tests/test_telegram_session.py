@@ -19,7 +19,9 @@ from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import LrfInfo, SessionError
 from lrfcal_lib.session.write import SessionWriter, finish
 
-LRF = LrfInfo("made up", (np.radians(40), np.radians(140)), np.radians(0.25), 0.01, max_range=32.0)
+LRF = LrfInfo(
+    "made up", (np.radians(40), np.radians(140)), np.radians(0.25), 0.01, max_range=32.0
+)
 PITCH = np.radians([-0.5, -0.25, 0.0, 0.25])
 
 
@@ -43,19 +45,27 @@ def record(path, *batches, lrf=LRF, first=None):
 
 
 def scans(ranges, mode=6, flags=0, **options):
-    return [encode_words(encode_values(line, mode=mode) | np.uint16(flags << 13), **options) for line in ranges]
+    return [
+        encode_words(encode_values(line, mode=mode) | np.uint16(flags << 13), **options)
+        for line in ranges
+    ]
 
 
 @pytest.fixture
 def path(tmp_path):
-    first, second = room(), room(seed=1)
-    return record(tmp_path / "trip", (1, scans(first), PITCH, [1.0, 2, 3, 4]), (2, scans(second), 0.1))
+    first = room()
+    second = room(seed=1)
+    return record(
+        tmp_path / "trip", (1, scans(first), PITCH, [1.0, 2, 3, 4]), (2, scans(second), 0.1)
+    )
 
 
 @pytest.fixture
 def recorded(tmp_path):
     """Records batches and opens the session."""
-    return lambda *batches, **options: open_session(record(tmp_path / "s", *batches, **options))
+    return lambda *batches, **options: open_session(
+        record(tmp_path / "s", *batches, **options)
+    )
 
 
 def telegrams(path):
@@ -65,7 +75,9 @@ def telegrams(path):
 def interlaced(dense, number=None):
     """The four telegrams of a line of 721 beams; `number` is the telegram index of the first."""
     indices = [None] * 4 if number is None else [(0, number + k) for k in range(4)]
-    return [encode_scan(dense[k::4], mode=6, partial=k, indices=indices[k]) for k in range(4)]
+    return [
+        encode_scan(dense[k::4], mode=6, partial=k, indices=indices[k]) for k in range(4)
+    ]
 
 
 # ---------------------------------------------------------------------------------------------- round trips
@@ -74,7 +86,8 @@ def interlaced(dense, number=None):
 def test_sweeps_are_what_the_device_measured(path):
     session = open_session(path)
     assert session.problems == () and validate(path) == [] and session.placements == (1, 2)
-    first, second = session.sweep(1), session.sweep(2)
+    first = session.sweep(1)
+    second = session.sweep(2)
     expected = room()
     expected[0, 5] = np.nan
     np.testing.assert_allclose(first.ranges, expected, rtol=0, atol=1e-12)
@@ -84,7 +97,9 @@ def test_sweeps_are_what_the_device_measured(path):
     np.testing.assert_allclose(second.pitch, 0.1)
 
 
-@pytest.mark.parametrize("values, first, step", [(101, 40, 1), (201, 40, 0.5), (181, 0, 1), (361, 0, 0.5)])
+@pytest.mark.parametrize(
+    "values, first, step", [(101, 40, 1), (201, 40, 0.5), (181, 0, 1), (361, 0, 0.5)]
+)
 def test_the_field_of_view_is_that_of_the_telegrams(recorded, values, first, step):
     session = recorded((1, scans(room(beams=values)), PITCH))
     bearings = np.degrees(session.sweep(1).bearings)
@@ -102,14 +117,23 @@ def test_a_lost_part_stays_empty_and_is_not_filled_from_another_turn(recorded):
     a[3:6] = 5.0
     sent = interlaced(a, 100)[:2] + interlaced(b, 104)[2:] + interlaced(c, 254)
     sweep = recorded((1, sent, 0.0)).sweep(1)
-    found = [{int(k) for k in np.arange(721)[np.isfinite(line)] % 4} for line in sweep.ranges]
+    found = [
+        {int(k) for k in np.arange(721)[np.isfinite(line)] % 4} for line in sweep.ranges
+    ]
     assert found == [{0, 1}, {2, 3}, {0, 1, 2, 3}]
 
 
 def test_the_measuring_mode_follows_the_device(recorded):
-    far, near = np.full((1, 361), 20.0), np.full((1, 361), 7.5)
-    session = recorded((1, scans(far), 0.0), (-1, [configuration(0)]), (2, scans(near, mode=0, flags=5), 0.0))
-    np.testing.assert_allclose([session.sweep(1).ranges, session.sweep(2).ranges], [far, near])
+    far = np.full((1, 361), 20.0)
+    near = np.full((1, 361), 7.5)
+    session = recorded(
+        (1, scans(far), 0.0),
+        (-1, [configuration(0)]),
+        (2, scans(near, mode=0, flags=5), 0.0),
+    )
+    np.testing.assert_allclose(
+        [session.sweep(1).ranges, session.sweep(2).ranges], [far, near]
+    )
 
 
 def test_without_configuration_the_factory_mode_is_assumed_and_told(recorded):
@@ -117,15 +141,23 @@ def test_without_configuration_the_factory_mode_is_assumed_and_told(recorded):
     session = recorded((1, scans(near, mode=0, flags=1), 0.0), first=scans(near, mode=0)[0])
     np.testing.assert_allclose(session.sweep(1).ranges, near)
     (problem,) = session.problems
-    assert "telegrams.bin: no status or configuration telegram: measuring mode 00 (factory) assumed" in problem
+    assert (
+        "telegrams.bin: no status or configuration telegram: measuring mode 00 (factory) assumed"
+        in problem
+    )
 
 
 def test_other_telegrams_and_scans_of_no_placement_are_ignored(recorded):
     a0, short_f4 = (encode_telegram(code, b"\0", status=0x10) for code in (0xA0, 0xF4))
-    session = recorded((-1, [a0, short_f4]), (-1, scans(room(1, 361))), (1, [*scans(room()), a0], 0.0))
+    session = recorded(
+        (-1, [a0, short_f4]), (-1, scans(room(1, 361))), (1, [*scans(room()), a0], 0.0)
+    )
     assert session.sweep(1).ranges.shape == (4, 401)
     (problem,) = session.problems
-    assert "line 4, offset 51, length 9: reply F4 has 1 bytes of data, needs 7; ignored" in problem
+    assert (
+        "line 4, offset 51, length 9: reply F4 has 1 bytes of data, needs 7; ignored"
+        in problem
+    )
 
 
 # --------------------------------------------------------------------------------------------------- damage
@@ -137,9 +169,17 @@ def test_wrong_crcs_are_left_out_counted_and_named(path):
     data[42 + 4 * 812] = 3  # no start byte
     telegrams(path).write_bytes(data + bytes(9))  # as after a crash between data and index
     session = open_session(path)
-    assert session.sweep(1).ranges.shape == (3, 401) and session.sweep(2).ranges.shape == (3, 401)
+    assert session.sweep(1).ranges.shape == (3, 401) and session.sweep(2).ranges.shape == (
+        3,
+        401,
+    )
     assert session.telegrams.report()["wrong_crc_offsets"] == (854, 3290)
-    assert session.telegrams.report()["outcomes"] == {"scan": 6, "other": 1, "wrong CRC": 2, "truncated": 0}
+    assert session.telegrams.report()["outcomes"] == {
+        "scan": 6,
+        "other": 1,
+        "wrong CRC": 2,
+        "truncated": 0,
+    }
     wrong, behind = session.problems
     assert "2 of 9 telegrams have a wrong CRC, left out, at 854, 3290" in wrong
     assert "9 bytes after the last telegram in index.csv are not used" in behind
@@ -150,8 +190,14 @@ def test_a_truncated_last_telegram_is_left_out_and_told(path, cut):
     data = telegrams(path).read_bytes()
     telegrams(path).write_bytes(data[:-cut])
     session = open_session(path)
-    assert len(session.sweep(2).ranges) == 3 and session.telegrams.report()["outcomes"]["truncated"] == 1
-    assert any(f"at {len(data) - 812}, is cut off after {812 - cut} bytes" in text for text in session.problems)
+    assert (
+        len(session.sweep(2).ranges) == 3
+        and session.telegrams.report()["outcomes"]["truncated"] == 1
+    )
+    assert any(
+        f"at {len(data) - 812}, is cut off after {812 - cut} bytes" in text
+        for text in session.problems
+    )
 
 
 def test_a_row_cut_off_by_a_crash_is_left_out_until_finish_removes_it(path):
@@ -208,18 +254,45 @@ def test_an_index_that_pandas_wrote_is_the_same(path):
 
 HALF = np.ones((4, 361))
 DAMAGE = [
-    (cell(3, 1, "853"), r"index\.csv: line 4, offset 853, length 812: .*one after the other; restore"),
-    (cell(2, 2, "6"), r"index\.csv: line 3, offset 42, length 6: telegrams of 7 to 65541 bytes"),
-    (cell(2, 4, ""), r"index\.csv: line 3, offset 42, length 812, placement 1: pitch_deg is missing"),
+    (
+        cell(3, 1, "853"),
+        r"index\.csv: line 4, offset 853, length 812: .*one after the other; restore",
+    ),
+    (
+        cell(2, 2, "6"),
+        r"index\.csv: line 3, offset 42, length 6: telegrams of 7 to 65541 bytes",
+    ),
+    (
+        cell(2, 4, ""),
+        r"index\.csv: line 3, offset 42, length 812, placement 1: pitch_deg is missing",
+    ),
     (cell(2, 1, "x"), r"index\.csv: line 3: offset is 'x': a whole number is needed"),
-    (cell(3, 3, "1.5"), r"index\.csv: line 4: placement is '1\.5': a whole number is needed"),
+    (
+        cell(3, 3, "1.5"),
+        r"index\.csv: line 4: placement is '1\.5': a whole number is needed",
+    ),
     (no_rows, r"index\.csv: no telegram in the index, 6538 bytes"),
     (cell(2, 4, "400"), r"a pitch is .* rad: degrees"),
-    (data(lambda raw: raw[:2000]), "line 5, offset 1666, .* telegrams.bin has 2000 bytes: restore it, or remove"),
-    (data(lambda raw: b"\x06" + raw), "9 of 9 telegrams have a wrong CRC.*not of one recording"),
-    (again((1, scans(room()), 0.0), (2, scans(HALF), 0.0)), "scans of 361, 401 values are mixed"),
-    (again((1, scans(room(beams=50)), 0.0)), r"telegrams\.bin: a whole scan has .* values, got 50"),
-    (again((1, scans(HALF), 0.0), first=configuration(0x3F)), r"telegrams\.bin: measuring mode 0x3f is none of"),
+    (
+        data(lambda raw: raw[:2000]),
+        "line 5, offset 1666, .* telegrams.bin has 2000 bytes: restore it, or remove",
+    ),
+    (
+        data(lambda raw: b"\x06" + raw),
+        "9 of 9 telegrams have a wrong CRC.*not of one recording",
+    ),
+    (
+        again((1, scans(room()), 0.0), (2, scans(HALF), 0.0)),
+        "scans of 361, 401 values are mixed",
+    ),
+    (
+        again((1, scans(room(beams=50)), 0.0)),
+        r"telegrams\.bin: a whole scan has .* values, got 50",
+    ),
+    (
+        again((1, scans(HALF), 0.0), first=configuration(0x3F)),
+        r"telegrams\.bin: measuring mode 0x3f is none of",
+    ),
     (again((-1, scans(room()), 0.0)), "no telegram with a scan belongs to a placement"),
 ]
 
@@ -237,9 +310,13 @@ def test_the_writer_refuses_what_it_could_not_read_again(tmp_path):
         with pytest.raises(SessionError, match="a pitch is 30: finite radians"):
             writer.add_telegrams(1, scans(room(1)), 30.0)
         writer.add_telegrams(1, scans(room(1)), 0.0)
-        with pytest.raises(SessionError, match="records telegrams: add_telegrams, or begin another"):
+        with pytest.raises(
+            SessionError, match="records telegrams: add_telegrams, or begin another"
+        ):
             writer.add_sweep(2, *line)
     with SessionWriter(tmp_path / "t", triangle_board(), LRF) as writer:
         writer.add_sweep(1, *line)
-        with pytest.raises(SessionError, match="has scan lines: add_sweep, or begin another"):
+        with pytest.raises(
+            SessionError, match="has scan lines: add_sweep, or begin another"
+        ):
             writer.add_telegrams(1, scans(room(1)), 0.0)

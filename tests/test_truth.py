@@ -28,7 +28,9 @@ def test_damaged_truth_is_named(tmp_path):
 def test_the_true_calibration_has_no_error():
     truth = read_truth(open_session(QUICK))
     for camera, transform in truth.cameras.items():
-        errors = camera_errors(SimpleNamespace(transform=transform, trusted=np.eye(6)), truth, camera)
+        errors = camera_errors(
+            SimpleNamespace(transform=transform, trusted=np.eye(6)), truth, camera
+        )
         assert max(errors.values()) < 1e-6
     assert max(axis_errors(truth.T_head_lrf, truth)) < 1e-6
 
@@ -38,8 +40,13 @@ def test_a_pull_is_the_error_over_its_standard_deviation():
     (camera, transform), *_ = truth.cameras.items()
     off = RigidTransform.from_translation([0.006, 0.0, 0.0]) * transform
     covariance = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 4e-6, 4e-6])
-    errors = camera_errors(SimpleNamespace(transform=off, trusted=covariance), truth, camera)
-    assert errors["translation_pull"] == pytest.approx(6 / 3) and errors["rotation_pull"] < 1e-6
+    errors = camera_errors(
+        SimpleNamespace(transform=off, trusted=covariance), truth, camera
+    )
+    assert (
+        errors["translation_pull"] == pytest.approx(6 / 3)
+        and errors["rotation_pull"] < 1e-6
+    )
 
 
 def test_only_evaluate_reads_the_truth():
@@ -53,8 +60,14 @@ def test_points_on_the_true_edges_are_straight_about_the_true_axis(quick):
     observations = platform_observations(quick.prepared)
     truth = read_truth(quick.prepared.session)
     moved = on_true_edges(observations, truth)
-    assert 0 < np.linalg.norm(moved.edge_points - observations.edge_points, axis=1).max() < 0.06
+    assert (
+        0
+        < np.linalg.norm(moved.edge_points - observations.edge_points, axis=1).max()
+        < 0.06
+    )
     for placement, number in {*zip(moved.edge_placement, moved.edge_number, strict=True)}:
         rows = (moved.edge_placement == placement) & (moved.edge_number == number)
-        points = geometry.lrf_to_platform(moved.edge_points[rows], moved.edge_pitch[rows], truth.T_head_lrf)
+        points = geometry.lrf_to_platform(
+            moved.edge_points[rows], moved.edge_pitch[rows], truth.T_head_lrf
+        )
         assert geometry.fit_line(points)[2] < 1e-8

@@ -13,8 +13,12 @@ from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.kinematics import SourceFrame
 from lrfcal_lib.simulate.draw import ShotSetup
 
-HEAD = RigidTransform.from_components([0.0, 0.03, -0.05], Rotation.from_rotvec([0.0, 0.02, -0.03]))
-TURN = Rotation.from_rotvec([0.02, -0.03, 0.01]) * Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+HEAD = RigidTransform.from_components(
+    [0.0, 0.03, -0.05], Rotation.from_rotvec([0.0, 0.02, -0.03])
+)
+TURN = Rotation.from_rotvec([0.02, -0.03, 0.01]) * Rotation.from_matrix(
+    [[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]
+)
 CAMERA = RigidTransform.from_components([0.1, 0.1, -0.05], TURN)
 MODEL = ShotSetup().model
 
@@ -22,26 +26,36 @@ MODEL = ShotSetup().model
 def random_chain(mount, rng, camera=CAMERA, size=1e-3):
     mix = size * rng.normal(size=(13, 13)) / 3
     pose = None if camera is None else geometry.pose_array(camera)
-    return Chain(geometry.pose_array(HEAD), pose, mount == "head", (mix @ mix.T,), np.zeros((0, 13)))
+    return Chain(
+        geometry.pose_array(HEAD), pose, mount == "head", (mix @ mix.T,), np.zeros((0, 13))
+    )
 
 
 def moved_points(chain, bearing, pitch, distance, change, image_pitch):
     """The chain carried out with the library's transforms, all links changed by `change` (13,)."""
-    head = geometry.pose_transform(geometry.move_pose(chain.head, np.insert(change[:4], [0, 2], 0.0)))
+    head = geometry.pose_transform(
+        geometry.move_pose(chain.head, np.insert(change[:4], [0, 2], 0.0))
+    )
     scale = lambda angle: angle * (1 + change[11]) + change[12]  # noqa: E731
     p = geometry.polar_to_points(distance - change[10], bearing)
     frame = SourceFrame(head, "head" if chain.on_head else "platform", scale(image_pitch))
     source = frame.apply(p, scale(pitch))
     if chain.camera is None:
         return source
-    return geometry.pose_transform(geometry.move_pose(chain.camera, change[4:10])).apply(source)
+    return geometry.pose_transform(geometry.move_pose(chain.camera, change[4:10])).apply(
+        source
+    )
 
 
 def test_beams_to_inverts_the_platform():
     """Points that no scan reaches have no beam."""
     rng = np.random.default_rng(1)
-    bearing, pitch, distance = rng.uniform(0.6, 2.5, 50), rng.uniform(-0.8, 0.8, 50), rng.uniform(0.5, 5, 50)
-    points = geometry.lrf_to_platform(geometry.polar_to_points(distance, bearing), pitch, HEAD)
+    bearing = rng.uniform(0.6, 2.5, 50)
+    pitch = rng.uniform(-0.8, 0.8, 50)
+    distance = rng.uniform(0.5, 5, 50)
+    points = geometry.lrf_to_platform(
+        geometry.polar_to_points(distance, bearing), pitch, HEAD
+    )
     assert np.allclose(beams_to(points, HEAD), [bearing, pitch, distance], atol=1e-9)
     tilted = RigidTransform.from_rotation(Rotation.from_rotvec([0, 0.3, 0]))
     assert np.isnan(beams_to([3.0, 0.1, 0.0], tilted)[1])
@@ -49,7 +63,9 @@ def test_beams_to_inverts_the_platform():
 
 def scatter(chain, ends):
     """Root mean square scatter of the ends of beams over calibrations drawn from the chain's covariance."""
-    changes = np.random.default_rng(2).multivariate_normal(np.zeros(13), chain.covariances[0], 1500)
+    changes = np.random.default_rng(2).multivariate_normal(
+        np.zeros(13), chain.covariances[0], 1500
+    )
     return np.sqrt(np.sum(np.var([ends(change) for change in changes], axis=0), axis=-1))
 
 
@@ -69,13 +85,18 @@ def test_projection_sigma_is_what_perturbed_calibrations_show(mount, image_pitch
 
 def test_point_sigma_is_what_perturbed_calibrations_show():
     chain = random_chain("head", np.random.default_rng(4), None)
-    bearings, pitches = np.array([1.2, 1.9]), np.array([-0.2, 0.1, 0.3])
+    bearings = np.array([1.2, 1.9])
+    pitches = np.array([-0.2, 0.1, 0.3])
     sigma, _ = point_sigma(chain, bearings, pitches, 2.0, reference=0.1)
     b, p = (a.ravel() for a in np.meshgrid(bearings, pitches))
     moved = scatter(chain, lambda change: moved_points(chain, b, p, 2.0, change, 0.1))
     assert np.allclose(sigma.ravel(), moved, rtol=0.07)
     of_axis = np.arange(13) < 4
-    only_axis = replace(chain, covariances=(chain.covariances[0] * np.outer(of_axis, of_axis),))
+    only_axis = replace(
+        chain, covariances=(chain.covariances[0] * np.outer(of_axis, of_axis),)
+    )
     sigma = point_sigma(only_axis, bearings, pitches, 2.0, reference=0.1)[0][0]
-    assert np.allclose(sigma[1], 0, atol=1e-12)  # measured at the reference: the axis cancels
+    assert np.allclose(
+        sigma[1], 0, atol=1e-12
+    )  # measured at the reference: the axis cancels
     assert (sigma[[0, 2]] > 1e-5).all()

@@ -26,7 +26,12 @@ def lrf(model="SICK LMS400", **options):
 ])  # fmt: skip
 def test_what_the_maker_admits_is_stated_or_known_of_the_model(stated, admitted):
     assert lrf(**stated).admitted_offset == admitted
-    assert from_json(LrfInfo, json.loads(json.dumps(lrf_to_json(lrf(**stated))))).admitted_offset == admitted
+    assert (
+        from_json(
+            LrfInfo, json.loads(json.dumps(lrf_to_json(lrf(**stated))))
+        ).admitted_offset
+        == admitted
+    )
 
 
 @campaign
@@ -37,7 +42,9 @@ def test_an_edge_stated_wrong_is_named_by_a_whole_session(length, tmp_path):
     stated["board"]["corners_m"][1][0] = length
     (folder / "session.json").write_text(json.dumps(stated))
     reasons = verdict.judge(pipeline.calibrate(open_session(folder)), suggest=False).reasons
-    assert any(reason.kind == "outline" and "edge 'bc'" in reason.words for reason in reasons)
+    assert any(
+        reason.kind == "outline" and "edge 'bc'" in reason.words for reason in reasons
+    )
 
 
 def test_errors_beyond_all_bounds_are_not_numbers():
@@ -45,7 +52,9 @@ def test_errors_beyond_all_bounds_are_not_numbers():
     assert verdict.bounded(12.0) == 12.0
 
 
-@pytest.mark.parametrize(("session", "warned"), [("sim_quick", True), ("sim_lms221", False)])
+@pytest.mark.parametrize(
+    ("session", "warned"), [("sim_quick", True), ("sim_lms221", False)]
+)
 def test_check_warns_of_few_placements(session, warned, capsys):
     assert __main__.main(["check", str(DATA / session)]) == 0
     count = len(open_session(DATA / session).board_placements)

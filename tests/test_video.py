@@ -54,9 +54,15 @@ class MjpegServer:
 
     def show(self, number):
         """Send an image, or bytes that are none."""
-        data = number if isinstance(number, bytes) else cv2.imencode(".jpg", numbered(number))[1].tobytes()
+        data = (
+            number
+            if isinstance(number, bytes)
+            else cv2.imencode(".jpg", numbered(number))[1].tobytes()
+        )
         length = f"Content-Length: {len(data)}\r\n" if self.lengths else ""
-        self.last = f"--frame\r\nContent-Type: image/jpeg\r\n{length}\r\n".encode() + data + b"\r\n"
+        self.last = (
+            f"--frame\r\nContent-Type: image/jpeg\r\n{length}\r\n".encode() + data + b"\r\n"
+        )
         for link in self.links:
             with suppress(OSError):  # gone
                 link.sendall(self.last)
@@ -96,12 +102,18 @@ def camera(server):
 # ----------------------------------------------------------------------------------------------------- streams
 
 
-@pytest.mark.parametrize("server", [True, False], ids=["lengths", "no lengths"], indirect=True)
+@pytest.mark.parametrize(
+    "server", [True, False], ids=["lengths", "no lengths"], indirect=True
+)
 def test_newest_frame_of_a_stream(server, camera):
     indices = []
     for number in range(1, 5):
         asked, frame = shown(server, camera, number)
-        assert number_of(frame) == number and frame.image.shape == (48, 64, 3) and frame.image.dtype == np.uint8
+        assert (
+            number_of(frame) == number
+            and frame.image.shape == (48, 64, 3)
+            and frame.image.dtype == np.uint8
+        )
         assert asked < frame.time_s <= time.time()
         indices.append(frame.index)
     assert indices == sorted(set(indices)) and not camera.lost
@@ -116,7 +128,9 @@ def test_stream_lost_and_found(server, camera, caplog, capfd):
     before = camera.newest()
     server.stop()
     until(lambda: camera.lost)
-    with pytest.raises(PortError, match="gives no video"):  # what the camera tries again and again
+    with pytest.raises(
+        PortError, match="gives no video"
+    ):  # what the camera tries again and again
         video.open_source(server.url, 1.0)
     assert capfd.readouterr() == ("", "")  # FFmpeg and OpenCV write there
     for after in (None, time.time() + 0.5):
@@ -125,7 +139,9 @@ def test_stream_lost_and_found(server, camera, caplog, capfd):
     server.start()
     found = camera.newest(timeout=WAIT_S)
     assert found.time_s > before.time_s and found.index > before.index and not camera.lost
-    assert [record.message for record in caplog.records if "is back" in record.message] == ["camera left is back"]
+    assert [record.message for record in caplog.records if "is back" in record.message] == [
+        "camera left is back"
+    ]
 
 
 @pytest.mark.parametrize("sent", [b"", b"abc"], ids=["silent", "damaged"])
@@ -142,7 +158,10 @@ def test_stream_that_is_silent_for_too_long(server):
     with Camera(server.url, name="left", silence_s=0.5) as camera:
         camera.newest(timeout=WAIT_S)
         until(lambda: camera.lost)
-        assert camera.newest(timeout=WAIT_S).image.shape == (48, 64, 3) and len(server.requests) > 1
+        assert (
+            camera.newest(timeout=WAIT_S).image.shape == (48, 64, 3)
+            and len(server.requests) > 1
+        )
 
 
 def test_frames_that_piled_up_are_known(server):
@@ -161,7 +180,9 @@ def test_frames_that_piled_up_are_known(server):
     assert "Authorization: Basic dXNlcjpwYXNzIHdvcmQ=" in server.requests[0]
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1:port", "127.0.0.1:99999", "[::1", "", "a" * 70, "x y", ":80", None])
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1:port", "127.0.0.1:99999", "[::1", "", "a" * 70, "x y", ":80", None]
+)
 def test_a_url_that_nobody_serves(server, host):
     url = f"http://{host}/left.mjpg" if host is not None else server.url
     server.stop()
@@ -174,7 +195,9 @@ def test_a_url_that_nobody_serves(server, host):
 
 @pytest.mark.parametrize("pattern", ["", "*.png", "000[123].*", "video.avi"])
 def test_recorded_images_in_the_order_of_their_names(tmp_path, pattern):
-    writer = cv2.VideoWriter(str(tmp_path / "video.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
+    writer = cv2.VideoWriter(
+        str(tmp_path / "video.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48)
+    )
     for number in (1, 2, 3):
         cv2.imwrite(str(tmp_path / f"{4 - number:04d}.png"), numbered(4 - number))
         writer.write(numbered(number))
@@ -183,7 +206,11 @@ def test_recorded_images_in_the_order_of_their_names(tmp_path, pattern):
     with Camera(tmp_path / pattern if pattern else tmp_path, name="right") as camera:
         assert camera.size == (64, 48)
         frames = [camera.newest(after=time.time()) for _ in range(3)]
-        assert [(number_of(frame), frame.index) for frame in frames] == [(1, 0), (2, 1), (3, 2)]
+        assert [(number_of(frame), frame.index) for frame in frames] == [
+            (1, 0),
+            (2, 1),
+            (3, 2),
+        ]
         assert frames[0].time_s <= frames[1].time_s <= frames[2].time_s and not camera.lost
         with pytest.raises(LineLost, match="at the end of its 3 "):
             camera.newest()
@@ -193,8 +220,6 @@ def test_recorded_images_in_the_order_of_their_names(tmp_path, pattern):
     ("none.avi", "there is no video"), ("text.avi", "is no video"), ("none.png", "there are no images in"),
     ("empty", "there are no images in"), ("x*.png", "there are no images in"), ("bad.png", "bad.png is no image"),
 ])  # fmt: skip
-
-
 def test_bad_files(tmp_path, name, what):
     (tmp_path / "text.avi").write_text("no video")
     (tmp_path / "bad.png").write_text("no image")
@@ -209,7 +234,11 @@ def test_bad_files(tmp_path, name, what):
 class Device:
     """A V4L2 device of 640 x 480 in place of cv2.VideoCapture; `fixed` keys keep their values."""
 
-    there, opens, allowed, fixed, made = True, True, True, set(), 0
+    there = True
+    opens = True
+    allowed = True
+    fixed = set()
+    made = 0
 
     def __init__(self, path, backend):
         assert backend == cv2.CAP_V4L2
@@ -244,7 +273,11 @@ def device(monkeypatch):
 
 
 def test_device_without_exposure_control_and_with_its_own_size(device, caplog):
-    device.fixed = {cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FRAME_WIDTH}
+    device.fixed = {
+        cv2.CAP_PROP_EXPOSURE,
+        cv2.CAP_PROP_AUTO_EXPOSURE,
+        cv2.CAP_PROP_FRAME_WIDTH,
+    }
     with Camera("0", name="left", size=(1024, 480), exposure=0.005) as camera:
         assert camera.size == (640, 480) and len(caplog.records) == 1
         camera.newest(timeout=WAIT_S)
@@ -256,8 +289,6 @@ def test_device_without_exposure_control_and_with_its_own_size(device, caplog):
     (0, {"allowed": False}, "no permission for /dev/video0: run 'sudo usermod -aG video"),
     (0, {"there": False}, "there is no camera /dev/video0: check its plug; present are"),
 ])  # fmt: skip
-
-
 def test_devices_that_cannot_be_opened(device, source, habit, what):
     for name, value in habit.items():
         setattr(device, name, value)

@@ -24,7 +24,9 @@ def seen(rig, poses, rng, **settings):
 
 
 def solved(obs, rig, poses):
-    return solve_joint(obs, start=joint_truth(obs, rig.T_head_lrf, rig.cameras, poses), required=False)
+    return solve_joint(
+        obs, start=joint_truth(obs, rig.T_head_lrf, rig.cameras, poses), required=False
+    )
 
 
 def solve(rig, poses, rng, **settings):
@@ -38,17 +40,27 @@ def models_of(rig):
 @pytest.fixture(scope="module")
 def good():
     rng = np.random.default_rng(1)
-    rig, poses = bench(rng), board_poses(rng, 8)
+    rig = bench(rng)
+    poses = board_poses(rng, 8)
     return rig, poses, solve(rig, poses, rng)
 
 
 def test_a_good_recording_is_trusted(good):
     rig, _, solution = good
     found = verdict(solution, models_of(rig))
-    words, errors = found.sentences(), found.errors[2.0]
-    assert found.answer == "yes" and found.reasons == () and words[0] == "This calibration can be trusted."
-    assert [w.split(":")[0] for w in words[1:4]] == [f"Expected error at {d} m" for d in (1, 2, 5)]
-    assert "in the image of 'right'" in words[2] and words[-1].startswith("Record next: board")
+    words = found.sentences()
+    errors = found.errors[2.0]
+    assert (
+        found.answer == "yes"
+        and found.reasons == ()
+        and words[0] == "This calibration can be trusted."
+    )
+    assert [w.split(":")[0] for w in words[1:4]] == [
+        f"Expected error at {d} m" for d in (1, 2, 5)
+    ]
+    assert "in the image of 'right'" in words[2] and words[-1].startswith(
+        "Record next: board"
+    )
     assert set(errors.pixels) == {"left", "right"}
     assert set(errors.record()) == {"cloud_mm", "left_px", "right_px"}
     assert 0.1 < errors.pixels["left"] < 3 and 0.1 < errors.cloud_mm < 10
@@ -56,8 +68,13 @@ def test_a_good_recording_is_trusted(good):
 
 def parallel(poses):
     """The boards where they are, all turned like the first but for a spin in their planes."""
-    turns = poses[0].rotation * Rotation.from_rotvec(np.outer(np.arange(len(poses)), [0, 0, 0.7]))
-    return [RigidTransform.from_components(p.translation, turn) for p, turn in zip(poses, turns, strict=True)]
+    turns = poses[0].rotation * Rotation.from_rotvec(
+        np.outer(np.arange(len(poses)), [0, 0, 0.7])
+    )
+    return [
+        RigidTransform.from_components(p.translation, turn)
+        for p, turn in zip(poses, turns, strict=True)
+    ]
 
 
 WEAK = {
@@ -79,10 +96,19 @@ def test_weak_recordings_are_named(good, kind):
     solution = solve(rig, chosen(poses), np.random.default_rng(4), **settings)
     found = verdict(solution, models_of(rig), suggest=kind == "pitch")
     reasons = {reason.kind: reason for reason in found.reasons}
-    assert reasons[kind].answer == answer and words in reasons[kind].words and words in found.sentences()[0]
-    assert found.answer == ("no" if "no" in [reason.answer for reason in found.reasons] else "with care")
+    assert (
+        reasons[kind].answer == answer
+        and words in reasons[kind].words
+        and words in found.sentences()[0]
+    )
+    assert found.answer == (
+        "no" if "no" in [reason.answer for reason in found.reasons] else "with care"
+    )
     if kind == "pitch":
-        assert "the recorded pitch ranges over 1.0 deg only within a placement" in found.sentences()[0]
+        assert (
+            "the recorded pitch ranges over 1.0 deg only within a placement"
+            in found.sentences()[0]
+        )
         assert found.errors[2.0].cloud_mm > 10 and found.suggestion.gain > 0.5
 
 
@@ -93,19 +119,31 @@ def test_a_camera_that_never_sees_the_board(good):
     with pytest.raises(DegenerateGeometry, match="camera 'right': it never sees the board"):
         solve_joint(obs)
     found = verdict(solve_joint(obs, required=False), models_of(rig), suggest=False)
-    assert found.sentences()[0].startswith("Use this calibration with care: camera 'right': it never sees the board")
+    assert found.sentences()[0].startswith(
+        "Use this calibration with care: camera 'right': it never sees the board"
+    )
     assert set(found.errors[2.0].pixels) == {"left"}
 
 
 def test_a_motion_that_nothing_determines(good):
     rig, poses, _ = good
     obs = seen(rig, poses, np.random.default_rng(3))
-    first = obs.view_placement == 0  # the right camera sees the first board only, which no scan hits
-    obs = obs.keep(view=first == (obs.view_camera == 1), beam=obs.beam_placement != 0, face=obs.face_placement != 0)
+    first = (
+        obs.view_placement == 0
+    )  # the right camera sees the first board only, which no scan hits
+    obs = obs.keep(
+        view=first == (obs.view_camera == 1),
+        beam=obs.beam_placement != 0,
+        face=obs.face_placement != 0,
+    )
     solution = solved(obs, rig, poses)
     found = verdict(solution, models_of(rig), suggest=False)
-    assert found.sentences()[0].startswith("This calibration cannot be trusted: the data do not determine")
-    assert np.isinf(found.errors[2.0].pixels["right"]) and np.isfinite(found.errors[2.0].pixels["left"])
+    assert found.sentences()[0].startswith(
+        "This calibration cannot be trusted: the data do not determine"
+    )
+    assert np.isinf(found.errors[2.0].pixels["right"]) and np.isfinite(
+        found.errors[2.0].pixels["left"]
+    )
     assert "no bound in the image of 'right'" in found.sentences()[2]
     assert not np.isnan(solution.solution.sigma).any(), "rounding errors are no information"
     assert any("right" in words for words in solution.unobservable), solution.unobservable
@@ -113,7 +151,11 @@ def test_a_motion_that_nothing_determines(good):
 
 def test_misfit_model_error_and_noise_are_named(good):
     solution = good[2]
-    inner = replace(solution.solution, covariance_placements=25 * solution.solution.covariance, converged=False)
+    inner = replace(
+        solution.solution,
+        covariance_placements=25 * solution.solution.covariance,
+        converged=False,
+    )
     left_out = Problem(Stage.JOINT, ProblemKind.CONTRADICTS, "left out", 9)
     bad = replace(
         solution, misfit=solution.misfit | {3: 30.0}, excluded=(left_out,), solution=inner,
@@ -122,32 +164,51 @@ def test_misfit_model_error_and_noise_are_named(good):
     words = {r.kind: r.words for r in diagnose(bad)}
     assert words["misfit"].startswith("placements fit much worse than the others: 3 (5.")
     assert words["warning"] == "the data ask for the scale of the pitch"
-    assert words["excluded"] == "placement 9: left out" and "has not converged" in words["convergence"]
+    assert (
+        words["excluded"] == "placement 9: left out"
+        and "has not converged" in words["convergence"]
+    )
     assert "5.0 times more than noise explains" in words["model error"]
     assert words["noise"] == "residuals are larger than the stated noise (ranges 2.6 times)"
     absurd = bad.with_levels(face_scale=1.0, view_scale=11.0, face_share=0.05)
     found = {r.kind: r for r in diagnose(absurd)}
-    assert found["noise"].answer == "no" and found["dependent"].words.startswith("only 5 % of the errors of ranges")
-    blurred = {r.kind: r for r in diagnose(replace(absurd, lens_scale=4.0))}  # intrinsics are as uncertain
-    assert blurred["noise"].answer == "with care" and "images of 'right' 2.7 times" in blurred["noise"].words
+    assert found["noise"].answer == "no" and found["dependent"].words.startswith(
+        "only 5 % of the errors of ranges"
+    )
+    blurred = {
+        r.kind: r for r in diagnose(replace(absurd, lens_scale=4.0))
+    }  # intrinsics are as uncertain
+    assert (
+        blurred["noise"].answer == "with care"
+        and "images of 'right' 2.7 times" in blurred["noise"].words
+    )
 
 
 def test_large_errors_forbid_trust(good):
     rig, _, solution = good
-    wide = replace(solution, solution=replace(solution.solution, covariance=4e4 * solution.solution.covariance))
+    wide = replace(
+        solution,
+        solution=replace(solution.solution, covariance=4e4 * solution.solution.covariance),
+    )
     found = verdict(wide, models_of(rig), suggest=False)
     assert found.answer == "no" and "the expected error at 2 m is" in found.sentences()[0]
 
 
 @pytest.mark.parametrize(
     ("dropped", "named", "words"),
-    [(16, 0, "16 of 16 scans (12 mm off, turned by 8.0 deg)"), (9, 7, "9 of 16"), (8, 8, None), (2, 0, None)],
+    [
+        (16, 0, "16 of 16 scans (12 mm off, turned by 8.0 deg)"),
+        (9, 7, "9 of 16"),
+        (8, 8, None),
+        (2, 0, None),
+    ],
 )
 def test_an_edge_that_lies_elsewhere_in_most_scans_is_a_reason(dropped, named, words):
     turned = DroppedSide("bc", 0.012, np.radians(8.0))
     prepared = SimpleNamespace(
         board=triangle_board(),
-        names={p: {0: "ab", 1: "bc"} for p in range(named)} | {p: {0: "ab"} for p in range(100, 100 + dropped)},
+        names={p: {0: "ab", 1: "bc"} for p in range(named)}
+        | {p: {0: "ab"} for p in range(100, 100 + dropped)},
         dropped={p: {1: turned} for p in range(100, 100 + dropped)},
     )
     reasons = list(sides_elsewhere(prepared))

@@ -32,7 +32,10 @@ def test_a_loop_is_shared_in_order(two, tmp_path):
 
     with side_by_side():
         assert spread(work, range(10)) == list(range(10))
-        assert spread(lambda i: spread(lambda k: k + i, range(3)), range(2)) == [[0, 1, 2], [1, 2, 3]]
+        assert spread(lambda i: spread(lambda k: k + i, range(3)), range(2)) == [
+            [0, 1, 2],
+            [1, 2, 3],
+        ]
         assert spread(abs, []) == [] and spread(abs, [-1]) == [1]
 
 
@@ -45,7 +48,10 @@ def getpid_of(item):
     return os.getpid()
 
 
-@pytest.mark.parametrize("make", [partial(ProcessPoolExecutor, 2, get_context("spawn")), partial(ThreadPoolExecutor, 2)])
+@pytest.mark.parametrize(
+    "make",
+    [partial(ProcessPoolExecutor, 2, get_context("spawn")), partial(ThreadPoolExecutor, 2)],
+)
 def test_an_executor_of_the_caller_does_the_work_and_is_left_alone(make):
     with make() as executor:
         with side_by_side(executor):
@@ -62,7 +68,9 @@ def test_a_process_with_threads_is_not_forked(two, monkeypatch):
     monkeypatch.setattr(workers.threading, "active_count", lambda: 2)
     with side_by_side():
         assert spread(partial(process_of, here=os.getpid()), range(3)) == [(1, False)] * 3
-        assert spread(lambda item: os.getpid(), range(3)) == [os.getpid()] * 3, "it cannot be told to others"
+        assert spread(lambda item: os.getpid(), range(3)) == [os.getpid()] * 3, (
+            "it cannot be told to others"
+        )
 
 
 def end_elsewhere(item, here):

@@ -20,8 +20,12 @@ from lrfcal_lib.session.stated import (
 from lrfcal_lib.session.write import SessionWriter
 from lrfcal_lib.simulate.draw import AHEAD
 
-MODEL = CameraModel(480, 360, 500.0, 499.0, 241.0, 178.0, np.array([-0.12, 0.04, 0.001, -0.0005, 0.0]))
-HEAD = RigidTransform.from_components([0.0, 0.012, 0.055], Rotation.from_rotvec([0.3, 0.8, -1.0], degrees=True))
+MODEL = CameraModel(
+    480, 360, 500.0, 499.0, 241.0, 178.0, np.array([-0.12, 0.04, 0.001, -0.0005, 0.0])
+)
+HEAD = RigidTransform.from_components(
+    [0.0, 0.012, 0.055], Rotation.from_rotvec([0.3, 0.8, -1.0], degrees=True)
+)
 STATED = RigidTransform.from_translation([0.0, 0.0, 0.05])
 
 
@@ -37,8 +41,10 @@ CAMERAS = {
 }
 FACING = Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
 BEARINGS = np.radians(np.arange(40.0, 140.1, 0.5))
-SIGMA_RANGE, SAMPLES = 0.004, 2  # m; rays a pixel along u and v
-WALL, CUT = 2.6, (0.30, 0.22)  # m ahead; half the size of what is kept of a wall, m
+SIGMA_RANGE = 0.004
+SAMPLES = 2  # m; rays a pixel along u and v
+WALL = 2.6
+CUT = (0.30, 0.22)  # m ahead; half the size of what is kept of a wall, m
 
 
 def rectangle(shift=0.0, columns=9, rows=5, square=0.036, size=(0.46, 0.34)):
@@ -46,7 +52,13 @@ def rectangle(shift=0.0, columns=9, rows=5, square=0.036, size=(0.46, 0.34)):
     origin = (np.array(size) - np.array([columns - 1, rows - 1]) * square) / 2 + shift
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size
     names = ("top", "right", "bottom", "left")
-    return Board("plate", names, corners, Chessboard(columns, rows, square, tuple(origin)), ("top", "left"))
+    return Board(
+        "plate",
+        names,
+        corners,
+        Chessboard(columns, rows, square, tuple(origin)),
+        ("top", "left"),
+    )
 
 
 def record(
@@ -75,13 +87,26 @@ def record(
     purpose : str
         Of the images: 'scene' where nobody is to look for the board.
     """
-    rng, pitch = np.random.default_rng(seed), np.radians(np.arange(-14, 14.1, 1.0) if pitch_deg is None else pitch_deg)
+    rng = np.random.default_rng(seed)
+    pitch = np.radians(np.arange(-14, 14.1, 1.0) if pitch_deg is None else pitch_deg)
     info = LrfInfo("pinpoint", (BEARINGS[0], BEARINGS[-1]), np.radians(0.5), SIGMA_RANGE)
     infos = [CameraInfo(name, "head", MODEL.width, MODEL.height, MODEL) for name in cameras]
-    stated = Board(board.name, board.edges, None, board.pattern, board.features) if on_wall else board
-    truth = {"simulated": True, "T_head_lrf": transform_to_json(HEAD), "board": board_to_json(board), "boards": {}}
+    stated = (
+        Board(board.name, board.edges, None, board.pattern, board.features)
+        if on_wall
+        else board
+    )
+    truth = {
+        "simulated": True,
+        "T_head_lrf": transform_to_json(HEAD),
+        "board": board_to_json(board),
+        "boards": {},
+    }
     lens = model_to_json(MODEL)
-    truth["cameras"] = {n: {"T_camera_lrf": transform_to_json(CAMERAS[n]), "intrinsics": lens} for n in cameras}
+    truth["cameras"] = {
+        n: {"T_camera_lrf": transform_to_json(CAMERAS[n]), "intrinsics": lens}
+        for n in cameras
+    }
     truth |= {"images": {}, "sweeps": {}, "lrf": {}}
     own = {"platform_sigma": (0.03, 0.02), "simulated": True}
     with SessionWriter(path, stated, info, infos, platform, **own) as writer:
@@ -89,14 +114,25 @@ def record(
             pose = _pose(board, rng, number, on_wall, still)
             truth["boards"][number] = {"T_platform_board": transform_to_json(pose)}
             truth["sweeps"][number] = {"pitch_rad": pitch.tolist()}
-            writer.add_sweep(number, _scan(pose, board, pitch, on_wall, rng), BEARINGS, pitch)
+            writer.add_sweep(
+                number, _scan(pose, board, pitch, on_wall, rng), BEARINGS, pitch
+            )
             for name in cameras:
                 for at in np.radians(image_pitch_deg):
                     back = RigidTransform.from_rotation(Rotation.from_rotvec([-at, 0, 0]))
                     seen = CAMERAS[name] * HEAD.inv() * back * pose
-                    writer.add_image(name, _image(seen, board, on_wall, rng), number, pitch=float(at), purpose=purpose)
+                    writer.add_image(
+                        name,
+                        _image(seen, board, on_wall, rng),
+                        number,
+                        pitch=float(at),
+                        purpose=purpose,
+                    )
                     file = f"images/{name}/{writer.shots[name]:04d}.png"
-                    truth["images"][file] = {"pitch_rad": float(at), "T_camera_board": transform_to_json(seen)}
+                    truth["images"][file] = {
+                        "pitch_rad": float(at),
+                        "T_camera_board": transform_to_json(seen),
+                    }
     (path / "truth.json").write_text(json.dumps(truth))
     return path
 
@@ -105,10 +141,14 @@ def _pose(board, rng, number, on_wall, still):
     """The board a metre ahead, turned another way at every placement; a sheet on a wall hangs nearly upright."""
     roll = rng.uniform(-8, 8) if on_wall else 50.0 * number + rng.uniform(-10, 10)
     tilt = rng.uniform(-28, 28, 2)
-    turn = FACING * Rotation.from_euler("YXZ", [*tilt * ("turn" not in still), roll], degrees=True)
+    turn = FACING * Rotation.from_euler(
+        "YXZ", [*tilt * ("turn" not in still), roll], degrees=True
+    )
     at = rng.uniform([-0.08, 0.95, -0.05], [0.08, 1.35, 0.05])
     at = np.array([0.0, 1.1, 0.0]) if "place" in still else at
-    return RigidTransform.from_components(at - turn.apply([*board.corners.mean(axis=0), 0.0]), turn)
+    return RigidTransform.from_components(
+        at - turn.apply([*board.corners.mean(axis=0), 0.0]), turn
+    )
 
 
 def _scan(pose, board, pitch, on_wall, rng):
@@ -119,10 +159,14 @@ def _scan(pose, board, pitch, on_wall, rng):
     normal = pose.rotation.apply([0, 0, 1])
     reach = (pose.translation - origin) @ normal / (ray @ normal)
     hit = pose.inv().apply((origin + reach[..., None] * ray).reshape(-1, 3))[:, :2]
-    inside = np.all(hit @ board.lines()[:, :2].T + board.lines()[:, 2] < 0, axis=1).reshape(up.shape)
+    inside = np.all(hit @ board.lines()[:, :2].T + board.lines()[:, 2] < 0, axis=1).reshape(
+        up.shape
+    )
     behind = np.nan if on_wall else (WALL - origin[..., 1]) / ray[..., 1]
     if on_wall:  # clouds are cut to the neighbourhood of the sheet by hand
-        inside = (np.abs(hit - board.corners.mean(axis=0)) < CUT).all(axis=1).reshape(up.shape)
+        inside = (
+            (np.abs(hit - board.corners.mean(axis=0)) < CUT).all(axis=1).reshape(up.shape)
+        )
     ranges = np.where(inside & (reach > 0), reach, behind)
     ranges = ranges + rng.normal(0, SIGMA_RANGE, ranges.shape)
     return np.where((ranges > 0.2) & (ranges < 6), ranges, np.nan)
@@ -130,17 +174,29 @@ def _scan(pose, board, pitch, on_wall, rng):
 
 @lru_cache(maxsize=1)
 def _rays():
-    u, v = (((np.arange(n * SAMPLES) + 0.5) / SAMPLES - 0.5) for n in (MODEL.width, MODEL.height))
-    rays = (undistort(np.stack(np.meshgrid(u, v), axis=-1), MODEL) - [MODEL.cx, MODEL.cy]) / [MODEL.fx, MODEL.fy]
+    u, v = (
+        ((np.arange(n * SAMPLES) + 0.5) / SAMPLES - 0.5)
+        for n in (MODEL.width, MODEL.height)
+    )
+    rays = (
+        undistort(np.stack(np.meshgrid(u, v), axis=-1), MODEL) - [MODEL.cx, MODEL.cy]
+    ) / [MODEL.fx, MODEL.fy]
     return rays.reshape(MODEL.height, SAMPLES, MODEL.width, SAMPLES, 2)
 
 
 def _image(T_camera_board, board, on_wall, rng):
     """A chessboard on a dark board before a grey wall, or on a wall as white as its paper."""
     image = np.full((MODEL.height, MODEL.width), 225.0 if on_wall else 160.0)
-    uv = project(T_camera_board.apply(np.column_stack([board.corners, np.zeros(len(board.corners))])), MODEL)
+    uv = project(
+        T_camera_board.apply(
+            np.column_stack([board.corners, np.zeros(len(board.corners))])
+        ),
+        MODEL,
+    )
     bounds = uv.min(axis=0) - 3, uv.max(axis=0) + 4
-    low, high = (np.clip(bound, 0, [MODEL.width, MODEL.height]).astype(int) for bound in bounds)
+    low, high = (
+        np.clip(bound, 0, [MODEL.width, MODEL.height]).astype(int) for bound in bounds
+    )
     part = np.s_[low[1] : high[1], low[0] : high[0]]
     back = np.linalg.inv(T_camera_board.as_matrix()[:3, [0, 1, 3]])
     x, y, w = np.moveaxis(_rays()[part[0], :, part[1]] @ back[:, :2].T + back[:, 2], -1, 0)
@@ -151,12 +207,17 @@ def _image(T_camera_board, board, on_wall, rng):
 
 def _face(x, y, board, ground, on_wall):
     """Grey values in the plane of the board."""
-    inside = np.all([a * x + b * y + c < 0 for a, b, c in board.lines()], axis=0) & (not on_wall)
+    inside = np.all([a * x + b * y + c < 0 for a, b, c in board.lines()], axis=0) & (
+        not on_wall
+    )
     p = board.pattern
     if p is None:
         return np.where(inside, 70.0, ground)
-    u, v = (x - p.origin[0]) / p.square, (y - p.origin[1]) / p.square
+    u = (x - p.origin[0]) / p.square
+    v = (y - p.origin[1]) / p.square
     squares = (u >= -1) & (v >= -1) & (u < p.columns) & (v < p.rows)
     paper = (u > -1.25) & (v > -1.25) & (u < p.columns + 0.25) & (v < p.rows + 0.25)
     face = np.where(inside, np.where(paper, 225.0, 70.0), ground)
-    return np.where(squares, np.where((np.floor(u) + np.floor(v)) % 2 == 0, 25.0, 225.0), face)
+    return np.where(
+        squares, np.where((np.floor(u) + np.floor(v)) % 2 == 0, 25.0, 225.0), face
+    )

@@ -44,10 +44,19 @@ from lrfcal_lib.simulate.scene import Imager
 
 SAMPLES = 3  # rays across a pixel and down a pixel, where the board is
 COARSE = 4  # pixels between the rays to what is behind the board
-BLUR, NOISE = 0.7, 1.5  # of lens and sensor: pixels, grey levels
-INK, PAPER = 0.07, 0.75  # reflectivity
-SPOTS = {"LMS221": (0.016, 0.0119), "LMS200": (0.012, 0.0044), "narrow": (0.008, 0.002)}  # m at the window, rad
-NOT_SHOWN = ("edge_log_odds", "edge_log_softness")  # of these a session of files has no truth
+BLUR = 0.7
+NOISE = 1.5  # of lens and sensor: pixels, grey levels
+INK = 0.07
+PAPER = 0.75  # reflectivity
+SPOTS = {
+    "LMS221": (0.016, 0.0119),
+    "LMS200": (0.012, 0.0044),
+    "narrow": (0.008, 0.002),
+}  # m at the window, rad
+NOT_SHOWN = (
+    "edge_log_odds",
+    "edge_log_softness",
+)  # of these a session of files has no truth
 
 
 @dataclass(frozen=True)
@@ -64,7 +73,9 @@ class Variation:
     least_share: float = 0.25
     pulse: float = 1.0  # m
     placements: int = 14  # even
-    stop_noise: float = 0.0  # standard deviation of where the head stops about what it says, rad
+    stop_noise: float = (
+        0.0  # standard deviation of where the head stops about what it says, rad
+    )
     stretch: float = 0.0
     backlash: float = 0.0  # rad
     systematic: float = 0.0  # m
@@ -109,7 +120,11 @@ class BaseRig(Rig):
     """Cameras fixed to the base, their `mounting` being ``T_camera_platform``."""
 
     def camera_pose(self, camera, pitch):
-        still = RigidTransform.identity() if np.ndim(pitch) == 0 else RigidTransform.identity(len(pitch))
+        still = (
+            RigidTransform.identity()
+            if np.ndim(pitch) == 0
+            else RigidTransform.identity(len(pitch))
+        )
         return camera.mounting * still
 
 
@@ -117,17 +132,25 @@ def rig_of(v):
     """A Rig with mounting errors of some degrees and centimetres, and a board whose squares have the size asked for."""
     rng = np.random.default_rng([v.seed, 1])
     head = RigidTransform.from_components(
-        [0.0, *rng.normal(0, 0.03, 2)], Rotation.from_rotvec([0.0, *rng.normal(0, 1.0, 2)], degrees=True)
+        [0.0, *rng.normal(0, 0.03, 2)],
+        Rotation.from_rotvec([0.0, *rng.normal(0, 1.0, 2)], degrees=True),
     )
     focal = rng.uniform(520, 620)
     cameras = []
     for i, name in enumerate(("left", "right")):
-        turn = Rotation.from_rotvec(rng.normal(0, 1.5, 3) + [-2.0, 1.5 - 3 * i, 0.0], degrees=True) * AHEAD
+        turn = (
+            Rotation.from_rotvec(
+                rng.normal(0, 1.5, 3) + [-2.0, 1.5 - 3 * i, 0.0], degrees=True
+            )
+            * AHEAD
+        )
         centre = np.array([0.24 * i - 0.12, 0.03, 0.12]) + rng.normal(0, 0.01, 3)
         lens = np.array([rng.uniform(-0.2, -0.05), 0.04, *rng.normal(0, 5e-4, 2), 0.0])
         middle = np.array([320.0, 240.0]) + rng.normal(0, 6, 2)
         mounting = RigidTransform.from_components(-turn.apply(centre), turn)
-        model = CameraModel(640, 480, focal, focal * rng.uniform(0.998, 1.002), *middle, lens)
+        model = CameraModel(
+            640, 480, focal, focal * rng.uniform(0.998, 1.002), *middle, lens
+        )
         cameras.append(RigCamera(name, model, mounting, None))
     spot, divergence = SPOTS[v.spot]
     beam = replace(
@@ -137,22 +160,31 @@ def rig_of(v):
     platform = Platform(backlash=v.backlash, stretch=v.stretch)
     board = _board(v, v.square_px * np.mean(v.distances) / focal)
     kind = BaseRig if v.mount == "platform" else Rig
-    return kind(beam, platform, head, RigidTransform.identity(), tuple(cameras), board, ring=1.0)
+    return kind(
+        beam, platform, head, RigidTransform.identity(), tuple(cameras), board, ring=1.0
+    )
 
 
 def _board(v, square):
     """The paper's triangle or a plate, with as many squares as fit."""
     if v.triangle:
         count = int((0.19 - 0.02) / square)
-        columns, rows = max(count - 1, 4), max(count, 5)
-        return triangle_board(pattern=Chessboard(columns, rows, square, (0.012 + square, 0.012 + square)))
+        columns = max(count - 1, 4)
+        rows = max(count, 5)
+        return triangle_board(
+            pattern=Chessboard(columns, rows, square, (0.012 + square, 0.012 + square))
+        )
     size = np.array([0.48, 0.36])
     columns, rows = np.floor((size - 0.03) / square).astype(int) - 1
-    rows -= (columns + rows + 1) % 2  # a pattern that is even both ways looks the same upside down
+    rows -= (
+        columns + rows + 1
+    ) % 2  # a pattern that is even both ways looks the same upside down
     origin = (size - np.array([columns - 1, rows - 1]) * square) / 2
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size
     pattern = Chessboard(int(columns), int(rows), float(square), tuple(origin))
-    return Board("plate", ("top", "right", "bottom", "left"), corners, pattern, ("top", "left"))
+    return Board(
+        "plate", ("top", "right", "bottom", "left"), corners, pattern, ("top", "left")
+    )
 
 
 @numba.njit(cache=True)
@@ -166,21 +198,34 @@ def _cast(origin, direction, T, lines, pattern, tones, sheets):
     reflectivity for the LRF and for cameras.
     """
     n = len(direction)
-    distance, value, cosine = np.full(n, np.inf), np.zeros(n), np.ones(n)
-    column, step = 5 + int(tones[3]), 1 if len(origin) > 1 else 0
+    distance = np.full(n, np.inf)
+    value = np.zeros(n)
+    cosine = np.ones(n)
+    column = 5 + int(tones[3])
+    step = 1 if len(origin) > 1 else 0
     for i in range(n):
-        ox, oy, oz = origin[i * step, 0], origin[i * step, 1], origin[i * step, 2]
-        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        ox = origin[i * step, 0]
+        oy = origin[i * step, 1]
+        oz = origin[i * step, 2]
+        dx = direction[i, 0]
+        dy = direction[i, 1]
+        dz = direction[i, 2]
         along = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
-        r = (T[0, 2] * (T[0, 3] - ox) + T[1, 2] * (T[1, 3] - oy) + T[2, 2] * (T[2, 3] - oz)) / along
-        px, py, pz = ox + r * dx - T[0, 3], oy + r * dy - T[1, 3], oz + r * dz - T[2, 3]
+        r = (
+            T[0, 2] * (T[0, 3] - ox) + T[1, 2] * (T[1, 3] - oy) + T[2, 2] * (T[2, 3] - oz)
+        ) / along
+        px = ox + r * dx - T[0, 3]
+        py = oy + r * dy - T[1, 3]
+        pz = oz + r * dz - T[2, 3]
         x = T[0, 0] * px + T[1, 0] * py + T[2, 0] * pz
         y = T[0, 1] * px + T[1, 1] * py + T[2, 1] * pz
         inside = r > 0.05
         for k in range(len(lines)):
             inside = inside and lines[k, 0] * x + lines[k, 1] * y + lines[k, 2] < 0
         if inside:
-            u, w, ring = (x - pattern[0]) / pattern[2], (y - pattern[1]) / pattern[2], pattern[5]
+            u = (x - pattern[0]) / pattern[2]
+            w = (y - pattern[1]) / pattern[2]
+            ring = pattern[5]
             on = -ring < u < pattern[3] - 1 + ring and -ring < w < pattern[4] - 1 + ring
             other = on and (int(np.floor(u)) + int(np.floor(w))) % 2 == int(tones[4])
             distance[i], cosine[i] = r, abs(along)
@@ -189,7 +234,8 @@ def _cast(origin, direction, T, lines, pattern, tones, sheets):
         for k in range(len(sheets)):
             r = (sheets[k, 0] - oy) / dy
             if 0.05 < r < distance[i]:
-                x, z = ox + r * dx, oz + r * dz
+                x = ox + r * dx
+                z = oz + r * dz
                 if sheets[k, 1] < x < sheets[k, 2] and sheets[k, 3] < z < sheets[k, 4]:
                     distance[i], value[i], cosine[i] = r, sheets[k, column], abs(dy)
     return distance, value, cosine
@@ -198,16 +244,22 @@ def _cast(origin, direction, T, lines, pattern, tones, sheets):
 def _scene(v, rig, T_platform_board, rng):
     """What a ray may meet, for the LRF or for a camera: the settings of `_cast` by 'lrf' and 'camera'."""
     pattern = rig.board.pattern
-    settings = np.array([*pattern.origin, pattern.square, pattern.columns, pattern.rows, rig.ring])
+    settings = np.array(
+        [*pattern.origin, pattern.square, pattern.columns, pattern.rows, rig.ring]
+    )
     far = T_platform_board.apply(rig.board.points())[:, 1].max()
-    ground = rng.uniform(0.15, 0.35) if v.white else rng.uniform(0.4, 0.7)  # cameras have to see the board before it
+    ground = (
+        rng.uniform(0.15, 0.35) if v.white else rng.uniform(0.4, 0.7)
+    )  # cameras have to see the board before it
     sheets = [[far + rng.uniform(0.5, 2.5), -6, 6, -4, 4, rng.uniform(0.1, 0.9), ground]]
     for _ in range(v.sheets):
         x, z = rng.uniform([-1.2, -0.8], [1.2, 0.8])
         wide, high = rng.uniform(0.1, 0.8, 2)
         tone = np.clip(ground + rng.uniform(-0.1, 0.1), 0.1, 0.8)
         away = far + rng.uniform(0.2, 1.5)
-        sheets.append([away, x - wide, x + wide, z - high, z + high, rng.uniform(0.05, 0.9), tone])
+        sheets.append(
+            [away, x - wide, x + wide, z - high, z + high, rng.uniform(0.05, 0.9), tone]
+        )
     if v.stand:
         x, _, z = T_platform_board.apply([*rig.board.corners.mean(axis=0), 0.0])
         sheets.append([far + 0.06, x - 0.012, x + 0.012, -1.2, z, 0.4, 0.4])
@@ -216,13 +268,20 @@ def _scene(v, rig, T_platform_board, rng):
     shade = 0.55 + 0.45 * abs(T_platform_board.rotation.as_matrix()[:, 2] @ lamp)
     known = pose_array(T_platform_board), rig.board.lines(), settings
     # of a Chessboard the square diagonally before the first corner is light
-    tones = {"lrf": [face, squares, 1.0, 0, v.white], "camera": [face, squares, shade, 1, v.white]}
-    return {name: (*known, np.array(value, float), np.array(sheets, float)) for name, value in tones.items()}
+    tones = {
+        "lrf": [face, squares, 1.0, 0, v.white],
+        "camera": [face, squares, shade, 1, v.white],
+    }
+    return {
+        name: (*known, np.array(value, float), np.array(sheets, float))
+        for name, value in tones.items()
+    }
 
 
 def _scan(v, rig, scene, pitch, rng):
     """Ranges (L, B) at the true pitch of every line, metres, NaN without an echo."""
-    beam, bearings = rig.beam, rig.beam.bearings()
+    beam = rig.beam
+    bearings = rig.beam.bearings()
     disc = spot_pattern(beam.rings)
     up, bearing = (part.ravel() for part in np.meshgrid(pitch, bearings, indexing="ij"))
     across = np.stack([-np.sin(bearing), np.cos(bearing), 0 * bearing], axis=-1)
@@ -231,20 +290,29 @@ def _scan(v, rig, scene, pitch, rng):
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     start = beam.spot_exit / 2 * shift
     origin = lrf_to_platform(start.reshape(-1, 3), np.repeat(up, len(disc)), rig.T_head_lrf)
-    end = lrf_to_platform((start + ray).reshape(-1, 3), np.repeat(up, len(disc)), rig.T_head_lrf)
+    end = lrf_to_platform(
+        (start + ray).reshape(-1, 3), np.repeat(up, len(disc)), rig.T_head_lrf
+    )
     distance, value, cosine = _cast(origin, end - origin, *scene["lrf"])
     weight = np.exp(-2 * np.sum(disc**2, axis=1)) if v.gaussian else np.ones(len(disc))
     hit = np.isfinite(distance)
-    energy = np.where(hit, value * cosine / np.where(hit, distance, 1.0) ** 2, 0.0).reshape(-1, len(disc))
-    reading, total = echo(beam, distance.reshape(-1, len(disc)), energy * weight / weight.sum())
-    ranges, reasons = measured(beam, Readings(reading, total, np.zeros(len(reading), bool)), rng)
+    energy = np.where(hit, value * cosine / np.where(hit, distance, 1.0) ** 2, 0.0).reshape(
+        -1, len(disc)
+    )
+    reading, total = echo(
+        beam, distance.reshape(-1, len(disc)), energy * weight / weight.sum()
+    )
+    ranges, reasons = measured(
+        beam, Readings(reading, total, np.zeros(len(reading), bool)), rng
+    )
     ranges = np.where(reasons == 0, np.round(ranges / beam.unit) * beam.unit, np.nan)
     return ranges.reshape(len(pitch), len(bearings))
 
 
 def _photo(imager, scene, T_camera_platform, rng):
     """A picture as bytes of a JPEG file."""
-    model, back = imager.model, T_camera_platform.inv()
+    model = imager.model
+    back = T_camera_platform.inv()
     T, lines, _, _, _ = scene["camera"]
     R = back.rotation.as_matrix().T
     light = cv2.resize(
@@ -255,14 +323,21 @@ def _photo(imager, scene, T_camera_platform, rng):
     if rows.stop > rows.start and columns.stop > columns.start:
         f = (np.arange(SAMPLES) + 0.5) / SAMPLES
         grid = imager.grid[rows.start : rows.stop + 1, columns.start : columns.stop + 1]
-        down, side = f[:, None, None], f[None, :, None]
+        down = f[:, None, None]
+        side = f[None, :, None]
         top = grid[:-1, None, :-1, None] * (1 - side) + grid[:-1, None, 1:, None] * side
         low = grid[1:, None, :-1, None] * (1 - side) + grid[1:, None, 1:, None] * side
-        rays = top * (1 - down[:, None]) + low * down[:, None]  # (rows, SAMPLES, columns, SAMPLES, 2)
+        rays = (
+            top * (1 - down[:, None]) + low * down[:, None]
+        )  # (rows, SAMPLES, columns, SAMPLES, 2)
         light[rows, columns] = _light(rays, R, back.translation, scene).mean(axis=(1, 3))
     level = 250.0 * cv2.GaussianBlur(light, (0, 0), BLUR)
-    grey = np.clip(np.rint(level + rng.normal(0, NOISE, level.shape)), 0, 255).astype(np.uint8)
-    return cv2.imencode(".jpg", np.repeat(grey[..., None], 3, axis=2), [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    grey = np.clip(np.rint(level + rng.normal(0, NOISE, level.shape)), 0, 255).astype(
+        np.uint8
+    )
+    return cv2.imencode(
+        ".jpg", np.repeat(grey[..., None], 3, axis=2), [cv2.IMWRITE_JPEG_QUALITY, 95]
+    )[1].tobytes()
 
 
 def _light(rays, R, centre, scene):
@@ -284,7 +359,9 @@ def _where(imager, T, lines, R, centre):
     found = []
     for axis, size in enumerate((imager.model.height, imager.model.width)):
         index = np.flatnonzero(met.any(axis=1 - axis)) * COARSE
-        found.append(slice(max(index[0] - 3 * COARSE, 0), min(index[-1] + 4 * COARSE, size)))
+        found.append(
+            slice(max(index[0] - 3 * COARSE, 0), min(index[-1] + 4 * COARSE, size))
+        )
     return found
 
 
@@ -293,14 +370,22 @@ def record(path, seed, **given):
     v = vary(seed, **given)
     rig = rig_of(v)
     rng = np.random.default_rng([v.seed, 2])
-    placements = pairs(rig, v.placements // 2, v.distances, np.random.default_rng([v.seed, 3]))
+    placements = pairs(
+        rig, v.placements // 2, v.distances, np.random.default_rng([v.seed, 3])
+    )
     lrf = LrfInfo(
         f"{rig.beam.name} (varied)", tuple(rig.beam.bearings()[[0, -1]]), np.radians(v.resolution / 100), v.sigma_range,
         range_resolution=rig.beam.unit, spot_exit=rig.beam.spot_exit, spot_divergence=rig.beam.divergence,
         systematic_error=0.035,
     )  # fmt: skip
     infos = [
-        CameraInfo(c.name, v.mount, c.model.width, c.model.height, c.model if v.exact_lens else None)
+        CameraInfo(
+            c.name,
+            v.mount,
+            c.model.width,
+            c.model.height,
+            c.model if v.exact_lens else None,
+        )
         for c in rig.cameras
     ]
     frame = "T_camera_lrf" if v.mount == "head" else "T_camera_platform"
@@ -327,18 +412,31 @@ def _close_views(v, rig, imagers, writer, truth, rng):
         pose = rig.camera_pose(camera, 0.0)
         for T_camera_board in held_close(rig, camera, 16, rng):
             scene = _scene(v, rig, pose.inv() * T_camera_board, rng)
-            _image(writer, truth, camera, imagers, scene, pose, T_camera_board, rng, purpose="intrinsics")
+            _image(
+                writer,
+                truth,
+                camera,
+                imagers,
+                scene,
+                pose,
+                T_camera_board,
+                rng,
+                purpose="intrinsics",
+            )
 
 
 def _placement(v, rig, imagers, placement, writer, truth, rng):
     """Images at their stops, then the sweep."""
-    board, number = placement.T_platform_board, placement.number
+    board = placement.T_platform_board
+    number = placement.number
     truth["boards"][number] = {"T_platform_board": transform_to_json(board)}
     scene = _scene(v, rig, board, rng)
 
     def stops(commanded):
         """True pitch at rest."""
-        head = (1 + v.stretch) * np.asarray(commanded) - placement.direction * v.backlash / 2
+        head = (1 + v.stretch) * np.asarray(
+            commanded
+        ) - placement.direction * v.backlash / 2
         return head + v.stop_noise * rng.standard_normal(head.shape)
 
     commanded = placement.image_pitch if v.mount == "head" else placement.image_pitch[:1]
@@ -348,17 +446,27 @@ def _placement(v, rig, imagers, placement, writer, truth, rng):
             own = {"placement": number, "pitch": float(recorded), "true": float(true)}
             _image(writer, truth, camera, imagers, scene, pose, pose * board, rng, **own)
     low, high = sorted(placement.sweep)
-    pitch = np.arange(np.floor(low / v.step), np.ceil(high / v.step) + 1)[:: placement.direction] * v.step
+    pitch = (
+        np.arange(np.floor(low / v.step), np.ceil(high / v.step) + 1)[
+            :: placement.direction
+        ]
+        * v.step
+    )
     true = stops(pitch)
     truth["sweeps"][number] = {"pitch_rad": true.tolist()}
     writer.add_sweep(number, _scan(v, rig, scene, true, rng), rig.beam.bearings(), pitch)
 
 
-def _image(writer, truth, camera, imagers, scene, pose, T_camera_board, rng, true=0.0, **own):
+def _image(
+    writer, truth, camera, imagers, scene, pose, T_camera_board, rng, true=0.0, **own
+):
     """One picture of a session, and what only the simulator knows of it."""
     writer.add_image(camera.name, _photo(imagers[camera.name], scene, pose, rng), **own)
     file = f"images/{camera.name}/{writer.shots[camera.name]:04d}.jpg"
-    truth["images"][file] = {"pitch_rad": true, "T_camera_board": transform_to_json(T_camera_board)}
+    truth["images"][file] = {
+        "pitch_rad": true,
+        "T_camera_board": transform_to_json(T_camera_board),
+    }
 
 
 def drawn(seed):
@@ -420,21 +528,34 @@ def judged(path):
     verdict = judge(calibration, suggest=False)
     words = tuple(reason.words for reason in verdict.reasons)
     if calibration.joint is None or not calibration.joint.solution.converged:
-        return Outcome((), np.zeros(0), np.zeros((0, 0)), np.zeros(0), verdict.answer, words, {}, calibration)
+        return Outcome(
+            (),
+            np.zeros(0),
+            np.zeros((0, 0)),
+            np.zeros(0),
+            verdict.answer,
+            words,
+            {},
+            calibration,
+        )
     joint = pipeline.leave_out(calibration.joint)
     found = joint.solution
     v = json.loads((path / "truth.json").read_text())["variation"]
     numbers = found.observations.placements.tolist()
     boards = [truth.boards[number] for number in numbers]
     known = {"range_offset": v["systematic"], "pitch_scale": v["stretch"]}
-    state = joint_truth(found.observations, truth.T_head_lrf, truth.cameras, boards, **known)
+    state = joint_truth(
+        found.observations, truth.T_head_lrf, truth.cameras, boards, **known
+    )
     shown = [i for i, name in enumerate(found.solution.names) if name not in NOT_SHOWN]
     errors = state_errors(found.state, state, found.unknowns)[shown]
     covariance = found.solution.trusted[np.ix_(shown, shown)]
     names = tuple(np.array(found.solution.names)[shown])
     lengths = _length_scores(joint, truth.board)
     calibration = replace(calibration, joint=joint)
-    return Outcome(names, errors, covariance, lengths, verdict.answer, words, found.noise, calibration)
+    return Outcome(
+        names, errors, covariance, lengths, verdict.answer, words, found.noise, calibration
+    )
 
 
 def _length_scores(joint, board):

@@ -32,7 +32,11 @@ class VirtualHost:
 
     def __init__(self):
         self.devices, self.ports, self._now, self._waiting = [], {}, 0.0, []
-        self.event, self.lock, self.thread = partial(_Event, self), partial(_Lock, self), partial(_Thread, self)
+        self.event, self.lock, self.thread = (
+            partial(_Event, self),
+            partial(_Lock, self),
+            partial(_Thread, self),
+        )
         self.terminal = Memory
 
     def now(self):
@@ -58,7 +62,9 @@ class VirtualHost:
         """As :func:`port.open_port`."""
         if str(path) not in self.ports:
             present = ", ".join(sorted(self.ports)) or "none"
-            raise PortError(f"there is no port {path}: check cable and power; present are {present}")
+            raise PortError(
+                f"there is no port {path}: check cable and power; present are {present}"
+            )
         return self.ports[str(path)](baudrate, timeout)
 
     @staticmethod
@@ -71,8 +77,14 @@ class VirtualHost:
         self._waiting += [] if me is None else [me]
         if not self._waiting:
             return None
-        while (next_one := next((one for one in self._waiting if one.over(self._now)), None)) is None:
-            due = min([one.end for one in self._waiting] + [device.due() for device in self.devices], default=math.inf)
+        while (
+            next_one := next((one for one in self._waiting if one.over(self._now)), None)
+        ) is None:
+            due = min(
+                [one.end for one in self._waiting]
+                + [device.due() for device in self.devices],
+                default=math.inf,
+            )
             if math.isinf(due):
                 raise RuntimeError("all threads wait for what will never happen")
             self._now = max(self._now, due)
@@ -90,7 +102,12 @@ class _Waiting:
     """A thread that waits for a condition or the end of its time."""
 
     def __init__(self, holds, end):
-        self.holds, self.end, self.found, self.turn = holds, end, None, threading.Semaphore(0)
+        self.holds, self.end, self.found, self.turn = (
+            holds,
+            end,
+            None,
+            threading.Semaphore(0),
+        )
 
     def over(self, now):
         self.found = self.holds()
@@ -112,7 +129,9 @@ class _Lock:
 
     def acquire(self, timeout=-1):
         me = threading.get_ident()
-        if not self._host.wait(lambda: self._owner in (None, me), None if timeout < 0 else timeout):
+        if not self._host.wait(
+            lambda: self._owner in (None, me), None if timeout < 0 else timeout
+        ):
             return False
         self._owner, self._depth = me, self._depth + 1
         return True
@@ -160,7 +179,12 @@ class Memory:
     """
 
     def __init__(self, device):
-        self.port, self.device, self.machine, self.wake = device.path, device, device.host, device.advance
+        self.port, self.device, self.machine, self.wake = (
+            device.path,
+            device,
+            device.host,
+            device.advance,
+        )
         self.open, self.lost, self.data = False, False, b""
 
     there = property(lambda self: self.port in self.machine.ports)
@@ -188,7 +212,9 @@ class Memory:
 
     def _opened(self, baudrate, timeout):
         if self.open:
-            raise PortError(f"the port {self.port} is busy, held by another program: close that program")
+            raise PortError(
+                f"the port {self.port} is busy, held by another program: close that program"
+            )
         self.baudrate, self.timeout, self.open, self.data = baudrate, timeout, True, b""
         return self
 
@@ -229,7 +255,9 @@ class Source:
 
 def lms(source=None, host=None, **options):
     """An emulated LMS2xx on a virtual host of its own, with its port."""
-    return FaultyLms(source or Source(), path="lrf", host=host or VirtualHost(), **options).start()
+    return FaultyLms(
+        source or Source(), path="lrf", host=host or VirtualHost(), **options
+    ).start()
 
 
 def head(host=None, **options):
@@ -242,7 +270,10 @@ class Bench:
 
     def __init__(self, device, rate=None):
         self.device, self.rate, self.machine, self.out = device, rate, device.host, []
-        self.port, put = self.machine.port(device.path, rate or device.baudrate, timeout=0), device.port.put
+        self.port, put = (
+            self.machine.port(device.path, rate or device.baudrate, timeout=0),
+            device.port.put,
+        )
 
         def noted(data):
             self.out += [(self.now, byte) for byte in data]

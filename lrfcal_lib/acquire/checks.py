@@ -20,7 +20,9 @@ from lrfcal_lib.session.stated import LrfInfo, SessionError
 
 STATES = ("ok", "warn", "bad")
 FEWEST_CROSSINGS = 6  # of a side, below which a straight line says little about it
-PARALLEL = np.cos(np.radians(20))  # two sides that include less give one constraint, not two
+PARALLEL = np.cos(
+    np.radians(20)
+)  # two sides that include less give one constraint, not two
 FEWEST_LINES = 8  # scan lines on the board
 LEAST_SCENE = 0.2  # share of the beams of a scene that come back
 BLURRED_PX = 3.5  # rise of a chessboard's edges from 10 to 90 %; 2 to 3 in a sharp image
@@ -92,7 +94,9 @@ def check_placement(
 
 def _check_scene(sweep):
     share = np.isfinite(sweep.ranges).mean()
-    text = f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
+    text = (
+        f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
+    )
     if share > LEAST_SCENE:
         return Light("scan", "ok", text)
     return Light("scan", "warn", text)
@@ -122,7 +126,9 @@ def check_repetition(session: Session, placement: int) -> list[Light]:
     """
     faults = repeated_images(session) + repeated_scans(session)
     return [
-        Light("recording", "bad", fault.words) for fault in faults if placement in fault.placements
+        Light("recording", "bad", fault.words)
+        for fault in faults
+        if placement in fault.placements
     ]
 
 
@@ -179,7 +185,9 @@ def _check_sides(scan):
     if not good:
         text = "no straight side: turn the board so that scan lines cross its edges"
         return Light("edges", "bad", text)
-    each = [f"{side.n_points} crossings at {np.degrees(side.angle):.0f} deg" for side in good]
+    each = [
+        f"{side.n_points} crossings at {np.degrees(side.angle):.0f} deg" for side in good
+    ]
     text = f"{len(good)} sides: {', '.join(each)}"
     ways = np.array([np.subtract(*side.ends) for side in good])
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -188,7 +196,9 @@ def _check_sides(scan):
     return Light("edges", "warn", f"{text}; turn the board to show another side")
 
 
-def check_image(image: np.ndarray, board: Board, model: Any = None, name: str = "image") -> Light:
+def check_image(
+    image: np.ndarray, board: Board, model: Any = None, name: str = "image"
+) -> Light:
     """The Light of an image of the board.
 
     Parameters
@@ -213,7 +223,9 @@ def check_image(image: np.ndarray, board: Board, model: Any = None, name: str = 
             text = f"{text}; {DARKNESS}"
         return Light(name, "bad", text)
     scale = math.ceil(LEAST_SQUARE_PX / np.linalg.norm(corners[1] - corners[0]))
-    large = cv2.resize(grey(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
+    large = cv2.resize(
+        grey(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR
+    )
     enlarged = (scale * corners + (scale - 1) / 2).astype(np.float32)
     size = (pattern.columns, pattern.rows)
     (rise, dark, white, _), _ = cv2.estimateChessboardSharpness(large, size, enlarged)

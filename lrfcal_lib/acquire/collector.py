@@ -54,7 +54,10 @@ class Task:
     title: str
     guidance: str  # where to put the board
     placement: Placement | None = None
-    close: tuple[str, int] = ("", 0)  # without a placement: camera of a close view, its number
+    close: tuple[str, int] = (
+        "",
+        0,
+    )  # without a placement: camera of a close view, its number
 
 
 def next_task(recording: Recording, advice: str = "") -> Task | None:
@@ -82,7 +85,9 @@ def next_task(recording: Recording, advice: str = "") -> Task | None:
     left = recording.to_do()
     if not left and not plan.placements:  # nothing is listed: one more can always be had
         more = plan.to_do(max(recording.finished) + 1)
-        left = [placement for placement in more if placement.number not in recording.finished]
+        left = [
+            placement for placement in more if placement.number not in recording.finished
+        ]
     if not left:
         return None
     placement = left[0]
@@ -172,7 +177,9 @@ def advise(session: Session) -> str:
         solution = calibrate_jointly(prepared).solution
     except DegenerateGeometry as error:
         return f"not determined yet: {error}"
-    judged = verdict(solution, prepared.models, field_of_view=prepared.session.lrf.field_of_view)
+    judged = verdict(
+        solution, prepared.models, field_of_view=prepared.session.lrf.field_of_view
+    )
     if judged.answer == YES:
         return ""
     if judged.suggestion:
@@ -429,7 +436,9 @@ class Collector(Closed):
             rig.move_board(number)
             self._record(placement, progress)
         progress(1.0, "checking what was recorded")
-        scenes = {placement.number for placement in recording.plan if placement.purpose == "scene"}
+        scenes = {
+            placement.number for placement in recording.plan if placement.purpose == "scene"
+        }
         adviser = None  # while every other placement helps
         if len({*self.finished} - scenes) >= ADVICE_FROM:
             adviser = self._advise
@@ -517,7 +526,9 @@ def _stated(rig, stack):
         return rig_of(data(), Path(f"emulated {devices.setup.name}"))
     if not Path(rig).suffix and not Path(rig).exists():
         known = ", ".join(PRACTICE_RIGS)
-        raise RigFileError(f"there is no rig file or emulated rig '{rig}'; emulated are {known}")
+        raise RigFileError(
+            f"there is no rig file or emulated rig '{rig}'; emulated are {known}"
+        )
     return read_rig_file(rig)
 
 

@@ -31,7 +31,15 @@ LOOK_S = 0.3  # between looks at the rig
 NOTES = 4  # lines of what drivers report
 FOLLOWS = "three placements and more; the recording can go on afterwards"
 PLAIN = "The data collection panel: it appears here while this notebook runs in JupyterLab."
-BUTTONS = ("connect", "close", "stop", "go", "capture", "again", "calibrate")  # methods of Panel
+BUTTONS = (
+    "connect",
+    "close",
+    "stop",
+    "go",
+    "capture",
+    "again",
+    "calibrate",
+)  # methods of Panel
 HERE = Path(__file__).parent
 STYLE = f"<style>\n{HERE.joinpath('panel.css').read_text()}</style>"
 
@@ -122,9 +130,19 @@ class Parts:
         head = card(w.HTML(HTML.title("Head")), self.pitch, self.slider, row(self.go))
         task = card(self.task, self.progress, self.doing)
         lights = card(self.lights, grow=2, basis="420px")
-        result = card(w.HTML(HTML.title("Result")), row(self.calibrate), self.result, basis="auto")
+        result = card(
+            w.HTML(HTML.title("Result")), row(self.calibrate), self.result, basis="auto"
+        )
         below = [self.views, row(head, task, lights), result, self.notes]
-        parts = [w.HTML(STYLE), self.top, fields, self.places, self.error, self.trouble, *below]
+        parts = [
+            w.HTML(STYLE),
+            self.top,
+            fields,
+            self.places,
+            self.error,
+            self.trouble,
+            *below,
+        ]
         self.root = named("panel", w.VBox(parts, layout=w.Layout(grid_gap="10px")))
 
     def _make_fields(self, rig, session):
@@ -138,7 +156,10 @@ class Parts:
             layout=w.Layout(flex="1 1 260px"),
         )
         self.session = w.Text(
-            value=session, description="session", style=style, layout=w.Layout(flex="2 1 320px")
+            value=session,
+            description="session",
+            style=style,
+            layout=w.Layout(flex="2 1 320px"),
         )
         self.slider = w.FloatSlider(
             min=-60,
@@ -157,7 +178,11 @@ class Parts:
 
     def _make_buttons(self):
         self.connect = button(
-            "connect", "Connect", "open all devices and the session", style="primary", icon="plug"
+            "connect",
+            "Connect",
+            "open all devices and the session",
+            style="primary",
+            icon="plug",
         )
         self.close = button(
             "close", "Close", "finish the session and close all devices", icon="power-off"
@@ -180,7 +205,10 @@ class Parts:
             width="140px",
         )
         self.again = button(
-            "again", "Again", "take the last placement back, to record it again", icon="undo"
+            "again",
+            "Again",
+            "take the last placement back, to record it again",
+            icon="undo",
         )
         self.calibrate = button(
             "calibrate",
@@ -232,7 +260,9 @@ class Notes(logging.Handler):
 
     def emit(self, record):
         """Show the newest lines."""
-        self.lines = [*self.lines, f"{time.strftime('%H:%M:%S')} {record.getMessage()}"][-NOTES:]
+        self.lines = [*self.lines, f"{time.strftime('%H:%M:%S')} {record.getMessage()}"][
+            -NOTES:
+        ]
         self.part.value = HTML.notes(self.lines)
 
 
@@ -320,7 +350,9 @@ class Panel(Closed):
             parts.show_pictures(rig.cameras)
             self._begin_sweep(collector.task())
             self._quit.clear()
-            self._live = threading.Thread(target=self._keep_looking, name="panel view", daemon=True)
+            self._live = threading.Thread(
+                target=self._keep_looking, name="panel view", daemon=True
+            )
             self._live.start()
 
     def close(self) -> None:
@@ -417,7 +449,9 @@ class Panel(Closed):
         parts.state.value = HTML.state("ready" if collector.connected else "off")
         parts.task.value = HTML.title("Next placement") + HTML.soft("connect a rig first")
         if collector.connected:
-            parts.task.value = HTML.task(collector.task(), collector.emulated, collector.finished)
+            parts.task.value = HTML.task(
+                collector.task(), collector.emulated, collector.finished
+            )
         parts.enable(collector.connected, False, bool(collector.finished))
 
     def _show_progress(self, share, text):

@@ -66,7 +66,9 @@ def scan_picture(
         return np.rint((origin + [scale, -scale] * points) * 2**SHIFT).astype(int)
 
     image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    cv2.fillPoly(image, [pixels(np.vstack([np.zeros(2), border]))], SECTOR, cv2.LINE_AA, SHIFT)
+    cv2.fillPoly(
+        image, [pixels(np.vstack([np.zeros(2), border]))], SECTOR, cv2.LINE_AA, SHIFT
+    )
     for share in np.linspace(0, 1, RINGS + 1)[1:]:
         ring = pixels(share * border)
         cv2.polylines(image, [ring], False, CIRCLE, 1, cv2.LINE_AA, SHIFT)
@@ -118,7 +120,9 @@ def sweep_picture(
 
     shades = _shades(np.array(list(rows.values())))
     bearing = np.linspace(*across, RIGHT - LEFT)
-    beam = np.rint(np.interp(bearing, np.degrees(bearings), np.arange(len(bearings)))).astype(int)
+    beam = np.rint(
+        np.interp(bearing, np.degrees(bearings), np.arange(len(bearings)))
+    ).astype(int)
     at = np.linspace(*down, BOTTOM - TOP)
     away = np.abs(at[:, None] - np.degrees(list(rows)))
     covered = away.min(axis=1) <= half + (high - low) / len(at)

@@ -128,7 +128,9 @@ class Recording(Closed):
 
     def to_do(self) -> list[Placement]:
         """The placements of the plan that are not finished, in order."""
-        return [placement for placement in self.plan if placement.number not in self.finished]
+        return [
+            placement for placement in self.plan if placement.number not in self.finished
+        ]
 
     def close_views_to_do(self) -> list[tuple[str, int]]:
         """Images of the board held close still to be taken: camera, number of the view from 0."""
@@ -185,7 +187,9 @@ class Recording(Closed):
             self.write(photo)
         return light
 
-    def check(self, number: int, advice: Callable[[Session], str] | None = None) -> list[Light]:
+    def check(
+        self, number: int, advice: Callable[[Session], str] | None = None
+    ) -> list[Light]:
         """Lights of a finished placement.
 
         Parameters
@@ -283,7 +287,9 @@ class Recording(Closed):
                 )
             elif isinstance(event, Tracked):
                 track = [
-                    (t, event.commanded, pitch) for t, pitch, measured in event.track if measured
+                    (t, event.commanded, pitch)
+                    for t, pitch, measured in event.track
+                    if measured
                 ]
                 writer.add_platform(track)
 
@@ -482,7 +488,10 @@ def _placements(recording):
             show(light, light.name)
         if left := len(todo) - 1:
             expected = duration(left * sum(recorded) / len(recorded))
-            print(f"  {left} of {of} placements left: about {expected} of recording", flush=True)
+            print(
+                f"  {left} of {of} placements left: about {expected} of recording",
+                flush=True,
+            )
 
 
 def _ask_for_board(placement, before):
@@ -532,7 +541,13 @@ def main(
         print(f"{rig_file}: opening the devices", flush=True)
         with Rig.open(stated) as rig:
             recording = record_session(rig, path, resume=resume, count=count)
-    except (DeviceError, RecordingError, ValueError, KeyboardInterrupt, SystemExit) as error:
+    except (
+        DeviceError,
+        RecordingError,
+        ValueError,
+        KeyboardInterrupt,
+        SystemExit,
+    ) as error:
         text = f"error: {error}"
         code = FAILED
         if isinstance(error, KeyboardInterrupt):
@@ -556,7 +571,9 @@ def next_step(recording: Recording) -> str:
     recording
         Finished.
     """
-    boards = {placement.number for placement in recording.plan if placement.purpose == "board"}
+    boards = {
+        placement.number for placement in recording.plan if placement.purpose == "board"
+    }
     if boards & set(recording.finished):
         return f"'python -m lrfcal_lib calibrate {recording.path}' calibrates the rig"
     return (

@@ -174,7 +174,9 @@ def calibrate_cameras(
         for method in METHODS if methods is None else methods:
             variant = row_of(method).variant
             try:
-                solutions[camera, method] = solve_camera(observations[camera, variant], method)
+                solutions[camera, method] = solve_camera(
+                    observations[camera, variant], method
+                )
             except DegenerateGeometry as error:
                 problems.append(_no_result(Stage.CAMERAS, method, str(error), camera))
     return solutions, problems
@@ -198,7 +200,8 @@ def combine(estimated: KnownAxis, stated: KnownAxis) -> KnownAxis:
     axis = axis_from_chart(stated.parameters + change)
     # turn about the axis, shift along it
     unobservable = (
-        stated.T_head_lrf * geometry.head_from_axis(geometry.axis_of(stated.T_head_lrf)).inv()
+        stated.T_head_lrf
+        * geometry.head_from_axis(geometry.axis_of(stated.T_head_lrf)).inv()
     )
     return KnownAxis(unobservable * geometry.head_from_axis(axis), prior - gain @ prior)
 

@@ -93,13 +93,17 @@ def join(clouds: Iterable[Cloud]) -> Cloud:
     Cloud
     """
     clouds = list(clouds)
-    columns = {name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in ROWS}
+    columns = {
+        name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in ROWS
+    }
     return Cloud(**columns, removed=sum(cloud.removed for cloud in clouds))
 
 
 def point_type(columns: dict[str, tuple[str, str]]) -> np.dtype:
     """How a file with columns such as :data:`COLUMNS` holds one point."""
-    return np.dtype([(key, kind, (len(names.split()),)) for key, (kind, names) in columns.items()])
+    return np.dtype(
+        [(key, kind, (len(names.split()),)) for key, (kind, names) in columns.items()]
+    )
 
 
 def write_ply(

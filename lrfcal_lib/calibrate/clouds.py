@@ -15,7 +15,9 @@ from lrfcal_lib.session.read import Session
 MARGIN = 20  # scan lines and beams about a board that are worked on with it
 
 
-def color_cloud(calibration: Calibration, method: str | None = None, scene: bool = False) -> Cloud:
+def color_cloud(
+    calibration: Calibration, method: str | None = None, scene: bool = False
+) -> Cloud:
     """Sweeps of a session as one coloured cloud in the platform frame.
 
     Parameters

@@ -21,8 +21,12 @@ COMPILED = {
 }
 TILE = 1024  # points
 LEAST_COSINE = 0.1  # of incidence
-STEEPEST = math.sqrt(1 - LEAST_COSINE**2) / LEAST_COSINE  # slant of a surface that is coloured
-DARK = 6.0  # levels: below and above these a brightness is clipped, and next to nothing worth
+STEEPEST = (
+    math.sqrt(1 - LEAST_COSINE**2) / LEAST_COSINE
+)  # slant of a surface that is coloured
+DARK = (
+    6.0  # levels: below and above these a brightness is clipped, and next to nothing worth
+)
 BRIGHT = 248.0
 CLIPPED = 1e-3  # weight of such a colour
 
@@ -206,7 +210,9 @@ def _tone(image, u, v, tone):
     brightest = 0.0
     for j in range(3):
         above = (1 - f) * image[row, column, 2 - j] + f * image[row, column + 1, 2 - j]
-        below = (1 - f) * image[row + 1, column, 2 - j] + f * image[row + 1, column + 1, 2 - j]
+        below = (1 - f) * image[row + 1, column, 2 - j] + f * image[
+            row + 1, column + 1, 2 - j
+        ]
         tone[j] = (1 - g) * above + g * below
         brightest = max(brightest, tone[j])
     return brightest

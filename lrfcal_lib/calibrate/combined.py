@@ -31,13 +31,17 @@ from lrfcal_lib.solvers import joint_model, joint_residuals
 FEWEST_CELLS = 8  # beams about a side that no image shows
 # information roots of a side of which nothing is known: ten metres and a radian are far
 FAR = (10.0, 1.0)
-STILL = 1e5  # information roots of what moves board and sides together, which changes no length
+STILL = (
+    1e5  # information roots of what moves board and sides together, which changes no length
+)
 ALONG = np.linspace(0.0, 1.0, 9)  # places along the stretch of an image edge
 SCALE_ROUNDS = 4  # of weighing image edges by how well they fit
 LEAST_SCALE = 0.1
 UNKNOWN = 1e6  # variance of what nothing determines
 KNOWN = 1e-18  # variance of what is held
-WIDEST = 0.1  # share of its length by which an edge may be uncertain and still count as measured
+WIDEST = (
+    0.1  # share of its length by which an edge may be uncertain and still count as measured
+)
 ITERATIONS = 30
 TOLERANCE = 0.02  # sigma
 
@@ -114,7 +118,9 @@ def combined_outlines(
         span no plane or show no edge are missing.
     """
     prepared = joint.prepared
-    views = {camera: list(of_camera.values()) for camera, of_camera in prepared.views.items()}
+    views = {
+        camera: list(of_camera.values()) for camera, of_camera in prepared.views.items()
+    }
     observations = observe_joint(prepared, views)
     states = {}
     cases = {}
@@ -249,7 +255,9 @@ def edges_in_cloud(solution, prepared, placement, face):
             first, last = edge.ends - np.outer(edge.ends @ a + edge.line[2], a)
             uv = first + ALONG[:, None] * (last - first)
             x, y = ((uv - [lens.cx, lens.cy]) / [lens.fx, lens.fy]).T
-            sight = T_platform_camera.rotation.apply(np.column_stack([x, y, np.ones(len(x))]))
+            sight = T_platform_camera.rotation.apply(
+                np.column_stack([x, y, np.ones(len(x))])
+            )
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
     return {name: np.concatenate(points) for name, points in sides.items()}
@@ -361,7 +369,9 @@ def image_block(state, case, scale):
     off = joint_residuals.view_block(state.joint, case.data, case.unknowns).residuals
     poses = geometry.move_pose(view["pose"][..., :3, :], off.reshape(1, -1, 6))
     # with the poses as they are predicted: derivatives of [w, v] of every T_camera_board
-    as_predicted = view | {"pose": np.concatenate([poses, view["pose"][..., 3:, :]], axis=-2)}
+    as_predicted = view | {
+        "pose": np.concatenate([poses, view["pose"][..., 3:, :]], axis=-2)
+    }
     data = replace(case.data, view=as_predicted)
     J = joint_residuals.view_block(state.joint, data, case.unknowns).jacobian
     by_all = J.reshape(-1, 6, J.shape[-1])

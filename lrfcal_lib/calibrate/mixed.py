@@ -163,7 +163,9 @@ class _Planes:
         mean = (sums[:, 0, 1:] / number[:, None]).T
         scatter = np.moveaxis(sums[:, 1:, 1:], 0, -1) - number * mean[:, None] * mean
         # a single line has no slope across
-        (xx, xy, xr), (_, yy, yr), (*_, rr) = scatter + np.diag([1e-6, 1e-6, 0.0])[..., None]
+        (xx, xy, xr), (_, yy, yr), (*_, rr) = (
+            scatter + np.diag([1e-6, 1e-6, 0.0])[..., None]
+        )
         area = xx * yy - xy**2
         slope = np.stack([yy * xr - xy * yr, xx * yr - xy * xr]) / area
         x, y = np.array(at) - mean[:2]
@@ -189,7 +191,9 @@ class _Planes:
             _Window(tuple(small), (0, 1), 10.0, 1.0, 0.9),
         ]
         sound = np.zeros(len(readings), bool)
-        middle_first = sorted(product((-1, 0, 1), repeat=2), key=lambda place: place != (0, 0))
+        middle_first = sorted(
+            product((-1, 0, 1), repeat=2), key=lambda place: place != (0, 0)
+        )
         for window, place in product(windows, middle_first):
             rest = np.flatnonzero(~sound)
             sound[rest] = self._holds(window, place, readings[rest], [i[rest] for i in at])

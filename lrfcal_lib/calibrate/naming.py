@@ -55,7 +55,9 @@ def name_sides(
             sides = _sides_on_board(prepared, camera, placement, T_board_source)
             names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
             for why in dropped[placement].values():
-                problems.append(Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement))
+                problems.append(
+                    Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement)
+                )
     return names, dropped, problems
 
 
@@ -89,7 +91,9 @@ def rough_poses(prepared: Prepared) -> tuple[dict[str, RigidTransform], list[Pro
             inliers, outlying = find_outlying_placements(observations)
             solution = solve_camera(observations.select(inliers), "zhang_pless")
         except DegenerateGeometry as error:
-            problems.append(Problem(Stage.SIDES, ProblemKind.NO_POSE, str(error), camera=camera))
+            problems.append(
+                Problem(Stage.SIDES, ProblemKind.NO_POSE, str(error), camera=camera)
+            )
             continue
         rough[camera] = solution.transform
         for placement in observations.placements.tolist():
@@ -109,12 +113,12 @@ def _disagreement(prepared, placement, misses):
         return f"camera {wrong[0]}: {off} scan"
     causes = "another surface, mixed readings"
     views = {
-        c: {placement: seen[placement]} for c, seen in prepared.views.items() if placement in seen
+        c: {placement: seen[placement]}
+        for c, seen in prepared.views.items()
+        if placement in seen
     }
     if small_squares(views, prepared.board.pattern):
-        causes += (
-            f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be biased"
-        )
+        causes += f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be biased"
     return f"scan: {off} board in the images of all {len(misses)} cameras ({causes})"
 
 

@@ -122,7 +122,9 @@ def observe_all(
     return observations
 
 
-def platform_observations(prepared: Prepared, variant: str = "half_step") -> PlatformObservations:
+def platform_observations(
+    prepared: Prepared, variant: str = "half_step"
+) -> PlatformObservations:
     """Two perpendicular sides and the face of the board in every sweep; no cameras are needed.
 
     Of each sweep the longest pair of perpendicular sides; a sweep with only one side gives that
@@ -162,7 +164,9 @@ def platform_observations(prepared: Prepared, variant: str = "half_step") -> Pla
     return PlatformObservations(**stack("edge_", sides), **stack("face_", faces))
 
 
-def observe_joint(prepared: Prepared, views: dict[str, list[BoardView]]) -> JointObservations:
+def observe_joint(
+    prepared: Prepared, views: dict[str, list[BoardView]]
+) -> JointObservations:
     """Everything that the joint estimate uses of a session, of the placements that are not left
     out.
 
@@ -294,7 +298,9 @@ def _corners(prepared, camera, variant, T_head_lrf, outlines) -> Iterator[dict]:
         if view is None or not swept:
             continue
         if (placement, variant) not in outlines:  # the same for all cameras
-            outlines[placement, variant] = outline_of(prepared, placement, variant, T_head_lrf)[0]
+            outlines[placement, variant] = outline_of(
+                prepared, placement, variant, T_head_lrf
+            )[0]
         board: MeasuredBoard = outlines[placement, variant]
         for before, name in pairwise(around):
             edge = view.edge(name)
@@ -339,7 +345,9 @@ def _feature_sides(along, swept):
         if abs(one[1].direction @ other[1].direction) < RIGHT_ANGLE:
             pairs.append((one, other))
     features = pairs or [(one,) for one in sides]
-    return max(features, key=lambda it: np.prod([side.length for _, side in it]), default=())
+    return max(
+        features, key=lambda it: np.prod([side.length for _, side in it]), default=()
+    )
 
 
 def _ranges(scans):
@@ -360,7 +368,9 @@ def _beams(prepared, scans):
     along = prepared.edges["half_step"]
     swept = prepared.swept["half_step"]
     for row, (placement, scan) in enumerate(scans.items()):
-        cells = edge_cells(scan, along[placement], swept.get(placement), prepared.session.lrf)
+        cells = edge_cells(
+            scan, along[placement], swept.get(placement), prepared.session.lrf
+        )
         for side, name in prepared.names.get(placement, {}).items():
             about = cells[thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE)]
             yield {
@@ -393,5 +403,9 @@ def _views(prepared, views, placements):
                 "pose": [view.T_camera_board.as_matrix()],
                 "covariance": [view.covariance],
                 "placement": [placements.index(view.placement)],
-                "lens": [pose_by_intrinsics(view.T_camera_board, visible, prepared.models[camera])],
+                "lens": [
+                    pose_by_intrinsics(
+                        view.T_camera_board, visible, prepared.models[camera]
+                    )
+                ],
             }

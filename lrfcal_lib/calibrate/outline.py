@@ -41,7 +41,10 @@ class MeasuredBoard:
 
     def corner_point(self, name: str) -> np.ndarray:
         """The corner where an edge starts, shape (3,), in the frame of the cloud."""
-        return self.T_platform_plane[:3, 3] + self.T_platform_plane[:3, :2] @ self.corners[name]
+        return (
+            self.T_platform_plane[:3, 3]
+            + self.T_platform_plane[:3, :2] @ self.corners[name]
+        )
 
 
 def outline_of(
@@ -140,7 +143,10 @@ def plane_frame(points: np.ndarray) -> np.ndarray:
 
 
 def sized(
-    lines: dict[str, np.ndarray], middle: np.ndarray, covariance: np.ndarray, edges: tuple[str, ...]
+    lines: dict[str, np.ndarray],
+    middle: np.ndarray,
+    covariance: np.ndarray,
+    edges: tuple[str, ...],
 ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, float]]:
     """Corners and lengths of an outline, and how well the lengths are known.
 

@@ -90,7 +90,12 @@ class JointCalibration:
         """
         solution = solution or self.solution
         return observe(
-            self.prepared, camera, "half_step", solution.T_head_lrf, solution.corrections, **options
+            self.prepared,
+            camera,
+            "half_step",
+            solution.T_head_lrf,
+            solution.corrections,
+            **options,
         )
 
 
@@ -288,9 +293,14 @@ def tilt_axis(prepared: Prepared) -> PlatformCalibration:
     """
     session = prepared.session
     variants = ("last_beam", "half_step")
-    observations = {variant: platform_observations(prepared, variant) for variant in variants}
+    observations = {
+        variant: platform_observations(prepared, variant) for variant in variants
+    }
     return calibrate_platform(
-        observations, session.T_head_lrf, session.platform_sigma, prepared.pitch_noise.offset
+        observations,
+        session.T_head_lrf,
+        session.platform_sigma,
+        prepared.pitch_noise.offset,
     )
 
 
@@ -313,11 +323,15 @@ def joint_settings(prepared: Prepared, observations: JointObservations) -> dict:
     """
     session = prepared.session
     noise = prepared.pitch_noise
-    sweeps = bool(largest_range(observations.face_pitch, observations.face_placement) > LEAST_SWEEP)
+    sweeps = bool(
+        largest_range(observations.face_pitch, observations.face_placement) > LEAST_SWEEP
+    )
     sensor = ["range_offset", "edge_log_odds", "edge_log_softness"]
     if sweeps:  # a wrong scale that is held at zero goes into the axis
         sensor.append("pitch_scale")
-    sides = np.unique([observations.beam_placement, observations.beam_edge], axis=1).shape[1]
+    sides = np.unique([observations.beam_placement, observations.beam_edge], axis=1).shape[
+        1
+    ]
     settings = {
         "sensor": tuple(sensor),
         "noise": "estimate",
@@ -345,7 +359,9 @@ def largest_range(values: np.ndarray, groups: np.ndarray) -> float:
     float
         0 where there are none.
     """
-    return max((np.ptp(values[groups == group]) for group in np.unique(groups)), default=0.0)
+    return max(
+        (np.ptp(values[groups == group]) for group in np.unique(groups)), default=0.0
+    )
 
 
 @cached

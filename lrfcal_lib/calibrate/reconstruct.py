@@ -19,11 +19,15 @@ from lrfcal_lib.session.stated import LrfInfo
 
 GREY = 128  # colour of points that no camera sees
 BLOCK = 1 << 18  # points worked on at once
-KEPT = 4 * BLOCK  # points of a sweep whose blocks are made once: they are gone through twice
+KEPT = (
+    4 * BLOCK
+)  # points of a sweep whose blocks are made once: they are gone through twice
 WINDOW = 4  # beams and scan lines on either side of a point that make its normal
 MARGIN = 4 * WINDOW  # scan lines about a block that its normals and mixed pixels need
 GAIN_POINTS = 30_000  # that compare the exposures of images
-SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # places of a matrix in its upper half
+SYMMETRIC = np.array(
+    [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+)  # places of a matrix in its upper half
 BEHIND = 5.0  # sigma: between the farthest and the nearest of a few points of a wall
 
 
@@ -70,7 +74,9 @@ def reconstruct(
         mask = np.isfinite(sweep.ranges)
     steps = (_pitch_step(sweep), lrf.bearing_step)
     painter = Painter(views, max(steps), BEHIND * lrf.sigma_range)
-    blocks: Iterable[_Block] = _Blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous)
+    blocks: Iterable[_Block] = _Blocks(
+        sweep, steps, T_head_lrf, corrections, lrf, continuous
+    )
     if sweep.ranges.size <= KEPT:
         blocks = list(blocks)
     points = []

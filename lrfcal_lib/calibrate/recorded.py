@@ -82,7 +82,9 @@ def source_of(
     if mount == "head":
         recorded = prepared.views[camera][placement].pitch
         image_pitch = float(corrections.pitch(placement, recorded))
-    return RecordedSource(placement, SourceFrame(T_head_lrf, mount, image_pitch), corrections)
+    return RecordedSource(
+        placement, SourceFrame(T_head_lrf, mount, image_pitch), corrections
+    )
 
 
 def in_platform(
@@ -92,7 +94,9 @@ def in_platform(
     return RecordedSource(placement, SourceFrame(T_head_lrf, "platform"), corrections)
 
 
-def platform_of(prepared: Prepared, T_head_lrf: RigidTransform | None = None) -> RigidTransform:
+def platform_of(
+    prepared: Prepared, T_head_lrf: RigidTransform | None = None
+) -> RigidTransform:
     """The platform to use.
 
     Parameters

@@ -81,7 +81,9 @@ class PanTilt(port.Closed):
             remedy = "check the adapter and its power"
             raise NoReply(f"{line.path} does not echo what is sent: {remedy}")
         if settings.echo is False and line.echoed:
-            LOG.warning("%s echoes what is sent, against what is stated: it is removed", line.path)
+            LOG.warning(
+                "%s echoes what is sent, against what is stated: it is removed", line.path
+            )
         if self.has_feedback:
             return
         if settings.feedback is True:
@@ -118,7 +120,9 @@ class PanTilt(port.Closed):
         try:
             self.stop()
         except DeviceError as error:
-            LOG.error("the head could not be stopped (%s): cut its power if it moves", error)
+            LOG.error(
+                "the head could not be stopped (%s): cut its power if it moves", error
+            )
         finally:
             port.release(self)
             self._line = None
@@ -290,7 +294,9 @@ class PanTilt(port.Closed):
         """
         step = self.settings.tilt_speed if speed is None else speed
         if step not in range(FASTEST + 1):
-            raise ValueError(f"speed is {speed!r}: it is a byte from 0, very slow, to {FASTEST}")
+            raise ValueError(
+                f"speed is {speed!r}: it is a byte from 0, very slow, to {FASTEST}"
+            )
         self._begin(stop_at)
 
         def run():

@@ -34,8 +34,12 @@ AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
 KEPT = 256  # scans that can be asked for by their instant
 LEAST_QUIET_S = 0.6  # of a stream, before it is taken for silent
-RECOVERY_S = 8.0  # one attempt to find a lost device; there are more until the stream is stopped
-REPLY_S = 0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
+RECOVERY_S = (
+    8.0  # one attempt to find a lost device; there are more until the stream is stopped
+)
+REPLY_S = (
+    0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
+)
 LOOK_S = 0.2  # between looks whether the reader thread lives
 COUNTS = ("dropped", "stale", "reconnects")
 
@@ -163,7 +167,11 @@ class LMS2xx(Closed):
         """
         host = self._host
         self._link = Link(
-            self.port, first, address=self._address, interrupted=self._interrupted, host=host
+            self.port,
+            first,
+            address=self._address,
+            interrupted=self._interrupted,
+            host=host,
         )
         self._clock = ScanClock()
         self._link.deadline = deadline
@@ -325,7 +333,9 @@ class LMS2xx(Closed):
         wanted = (float(fov_deg), float(resolution_deg))
         if wanted not in VARIANTS:
             known = ", ".join(f"{fov:g}/{step:g}" for fov, step in VARIANTS)
-            raise ValueError(f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}")
+            raise ValueError(
+                f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}"
+            )
         self._read_status()
         differs = self.variant != wanted
         if differs:
@@ -394,7 +404,9 @@ class LMS2xx(Closed):
     def _write(self, wanted):
         """Write a configuration in installation mode, and read it back."""
         try:
-            self._mode(INSTALLATION + self._password, "the password of the installation mode")
+            self._mode(
+                INSTALLATION + self._password, "the password of the installation mode"
+            )
             self._opened().ask(wire.CONFIGURE, wanted.block)
         except NoReply as error:
             # the reply may be lost and the flash written: read it, do not write again
@@ -404,7 +416,9 @@ class LMS2xx(Closed):
         self._read_configuration()
         if self.configuration.block != wanted.block:
             block = wanted.block.hex(" ")
-            raise Refused(f"{self.port}: the device does not take the configuration {block}")
+            raise Refused(
+                f"{self.port}: the device does not take the configuration {block}"
+            )
 
     # ---------------------------------------------------------------------------------------------
     # scans
@@ -551,7 +565,9 @@ class LMS2xx(Closed):
             If the device does not stream.
         """
         if self._thread is None:
-            raise DeviceError(f"{self.port}: the device does not stream; call start() first")
+            raise DeviceError(
+                f"{self.port}: the device does not stream; call start() first"
+            )
         host = self._host
         if timeout is None:
             timeout = 2 + 2 * (count + 2) * self._assembler.interval_s

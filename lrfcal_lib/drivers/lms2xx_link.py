@@ -5,7 +5,15 @@ import math
 import os
 from typing import NamedTuple
 
-from lrfcal_lib.drivers.port import REAL, Host, NoReply, PortError, Refused, WrongDevice, line_lost
+from lrfcal_lib.drivers.port import (
+    REAL,
+    Host,
+    NoReply,
+    PortError,
+    Refused,
+    WrongDevice,
+    line_lost,
+)
 from lrfcal_lib.session import lms2xx_codec as codec
 
 ACK = 0x06
@@ -21,7 +29,12 @@ CONFIGURE = 0x77
 POWER_ON = 0x90
 NOT_UNDERSTOOD = 0x92
 ON_REQUEST = b"\x25"  # data of MODE
-RATES = {38400: 0x40, 9600: 0x42, 19200: 0x41, 500000: 0x48}  # and the data of MODE that sets them
+RATES = {
+    38400: 0x40,
+    9600: 0x42,
+    19200: 0x41,
+    500000: 0x48,
+}  # and the data of MODE that sets them
 FASTEST = 500000  # Bd
 PACE_S = 75e-6  # from byte to byte at 500 kBd: 20 us for the byte, then at least 55 us
 READ_S = 0.02  # a read returns after this time at the latest
@@ -199,7 +212,9 @@ class Link:
         self._rest = data[stream.pending :]
         arrivals = []
         end = 0
-        for begin, length in zip(stream.offset.tolist(), stream.length.tolist(), strict=True):
+        for begin, length in zip(
+            stream.offset.tolist(), stream.length.tolist(), strict=True
+        ):
             self._stray = None
             end = begin + length
             arrived = now - (len(data) - end) * 10 / self.baudrate
@@ -265,7 +280,10 @@ class Link:
             if self.acknowledged:
                 patience = again_s
             if self.declined:
-                return None, "it finds the checksum wrong (NAK); the line damages what is sent"
+                return (
+                    None,
+                    "it finds the checksum wrong (NAK); the line damages what is sent",
+                )
             waited = now - begin
             if waited > patience and (self.silent_s > SILENCE_S or waited > 2 * again_s):
                 break
@@ -334,7 +352,11 @@ class Link:
             codes = [arrival.code for arrival in self.receive()]
             if MODE | 0x80 in codes:
                 return True
-            if codes or self.declined or (self.acknowledged and self.silent_s > 3 * SILENCE_S):
+            if (
+                codes
+                or self.declined
+                or (self.acknowledged and self.silent_s > 3 * SILENCE_S)
+            ):
                 until = begin + STOPPING_S
         return False
 

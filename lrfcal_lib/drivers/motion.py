@@ -7,24 +7,39 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.pelco_d import DOWN, SET_TILT, UP, HeadLine, encode_extended, encode_frame
+from lrfcal_lib.drivers.pelco_d import (
+    DOWN,
+    SET_TILT,
+    UP,
+    HeadLine,
+    encode_extended,
+    encode_frame,
+)
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, Refused
 
 LOG = logging.getLogger(__name__)
 ASSUMED = 4.0, 4.0  # deg/s up and down, as of heads of constant speed
-ARRIVAL = math.radians(0.5)  # a move that ends this near has arrived; its settled pitch counts
+ARRIVAL = math.radians(
+    0.5
+)  # a move that ends this near has arrived; its settled pitch counts
 STALLED = 5  # settle times at rest elsewhere: the head does not get to where it was sent
 BURSTS = 25  # of up and down, to reach one pitch
 FIRST_BURST_S = 0.1  # of a head whose speed is unknown
 GROWTH = 4  # of bursts while the speed is being learnt
-SHORT_OF = 0.9  # part of the way that a burst is to make, so that the last come from one side
+SHORT_OF = (
+    0.9  # part of the way that a burst is to make, so that the last come from one side
+)
 SURPRISE = math.radians(3)  # from dead reckoning: then a reading is not believed at once
 LEAST_S = 1e-4  # of a wait worth its while
-MISSES = 3  # queries without a reply, after which a head that is swept is not asked any more
+MISSES = (
+    3  # queries without a reply, after which a head that is swept is not asked any more
+)
 WRONG_WAY = math.radians(2)  # that a sweep may seem to go
 OTHER_WAY = "the head moves the other way: set invert to the contrary"
 STOPPED = "the head was stopped before it arrived"
-UNKNOWN = "where the head stands is unknown since its line was lost: look, and call set_pitch"
+UNKNOWN = (
+    "where the head stands is unknown since its line was lost: look, and call set_pitch"
+)
 INTERRUPTED = (
     "the head's line was lost, and the head stopped when it came back: move or sweep again; where "
     "it tells nothing look where it stands, and call set_pitch"
@@ -172,7 +187,9 @@ class Motion:
         else:
             self._misses = 0
             self.rows.append(
-                TrackPoint(date - (now - reading.instant), reading.pitch, True, reading.reckoned)
+                TrackPoint(
+                    date - (now - reading.instant), reading.pitch, True, reading.reckoned
+                )
             )
 
     # ------------------------------------------------------------------------------------------
@@ -318,7 +335,9 @@ class Motion:
             self.pause(self.settings.poll_s)
         if resting is None:
             remedy = "check its power and the wires"
-            raise NoReply(f"the head at {self.line.path} stopped telling its tilt: {remedy}")
+            raise NoReply(
+                f"the head at {self.line.path} stopped telling its tilt: {remedy}"
+            )
         raise Refused(
             f"the head does not come to rest, {math.degrees(resting):.2f} deg by now: give it more "
             "time, a higher tolerance_deg, or look whether it can get there"
@@ -380,7 +399,9 @@ class Motion:
             slowest = steps[-1]
             if abs(error) <= max(ARRIVAL, shortest[slowest]):
                 return pitch
-            step = next((step for step in steps if abs(error) >= 2 * shortest[step]), slowest)
+            step = next(
+                (step for step in steps if abs(error) >= 2 * shortest[step]), slowest
+            )
             took = self.run(pitch + SHORT_OF * error, step, GROWTH * self._longest)
             before = pitch
             pitch = self.settle(deadline)
@@ -446,7 +467,9 @@ class Motion:
             if measured:
                 swept = abs(measured[-1].pitch - measured[0].pitch)
                 if swept >= 10 * self._tolerance:
-                    self.learn(way, step, swept / (measured[-1].time_s - measured[0].time_s))
+                    self.learn(
+                        way, step, swept / (measured[-1].time_s - measured[0].time_s)
+                    )
 
         try:
             self.run(goal, step, look=look)
@@ -488,4 +511,6 @@ def drawn_to_readings(rows: Sequence[TrackPoint]) -> list[tuple[float, float, bo
             stretch = (rows[last].pitch - start) / reckoned
             for i in range(first + 1, last):
                 pitches[i] = start + stretch * (rows[i].pitch - start)
-    return [(row.time_s, pitch, row.measured) for row, pitch in zip(rows, pitches, strict=True)]
+    return [
+        (row.time_s, pitch, row.measured) for row, pitch in zip(rows, pitches, strict=True)
+    ]

@@ -21,8 +21,12 @@ SET_TILT = 0x4D
 QUERY_TILT = 0x53
 TILT = 0x5B  # its reply
 TURN = 36000  # hundredths of a degree
-READ_S = 0.02  # longest wait for single bytes, so that no read overshoots a deadline by more
-MOST = 512  # bytes looked at after a frame: a head sends up to 18, the rest is another device
+READ_S = (
+    0.02  # longest wait for single bytes, so that no read overshoots a deadline by more
+)
+MOST = (
+    512  # bytes looked at after a frame: a head sends up to 18, the rest is another device
+)
 AGAIN_S = 0.05  # between looks for a port that vanished
 
 
@@ -319,7 +323,9 @@ class HeadLine:
                     self.opened().write(self._stop)
                     self.host.sleep(self.wire_s() + self.settings.gap_s)
         except Exception as error:  # on the way out nothing else can be done
-            LOG.error("the head could not be stopped (%s): cut its power if it moves", error)
+            LOG.error(
+                "the head could not be stopped (%s): cut its power if it moves", error
+            )
         finally:
             if held:
                 self.lock.release()
@@ -349,7 +355,9 @@ class HeadLine:
                 if not (again and vanished):
                     raise
                 return self._exchange(frame, wait_s)
-            self._free = max(self.host.now(), self._sent + self.wire_s()) + self.settings.gap_s
+            self._free = (
+                max(self.host.now(), self._sent + self.wire_s()) + self.settings.gap_s
+            )
             self.frames += 1
             self.echoed += received.echoed
             self.skipped += received.skipped
@@ -377,7 +385,9 @@ class HeadLine:
             deadline = self.host.now() + self.settings.reconnect_s
             while self._port is None:
                 try:
-                    self._port = self.host.port(self.path, self.settings.baudrate, timeout=READ_S)
+                    self._port = self.host.port(
+                        self.path, self.settings.baudrate, timeout=READ_S
+                    )
                 except PortError as error:
                     if self.host.now() >= deadline:
                         raise LineLost(f"the head's line is lost: {error}") from error

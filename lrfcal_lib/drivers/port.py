@@ -80,18 +80,24 @@ def open_port(path: str | os.PathLike, baudrate: int, *, timeout: float) -> seri
     """
     path = os.fspath(path)
     try:
-        port = serial.Serial(path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True)
+        port = serial.Serial(
+            path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True
+        )
     except (OSError, ValueError, termios.error) as error:
         number = getattr(error, "errno", None)
         reason = f"{path} is no serial line ({error}): name the port of the device"
         if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
             present = ", ".join(sorted(port.device for port in comports())) or "none"
-            reason = f"there is no port {path}: check cable and power; present are {present}"
+            reason = (
+                f"there is no port {path}: check cable and power; present are {present}"
+            )
         elif number in (errno.EACCES, errno.EPERM):
             remedy = "run 'sudo usermod -aG dialout $USER', then log in again"
             reason = f"no permission for {path}: {remedy}"
         elif number in (errno.EBUSY, errno.EAGAIN):
-            reason = f"the port {path} is busy, held by {_holders(path)}: close that program"
+            reason = (
+                f"the port {path} is busy, held by {_holders(path)}: close that program"
+            )
         raise PortError(reason) from error
     try:
         set_rate(port, baudrate)
@@ -161,7 +167,9 @@ def line_lost(path: str | os.PathLike) -> Iterator[None]:
     try:
         yield
     except (OSError, termios.error) as error:
-        raise LineLost(f"the line {path} is lost ({error}): check plug and power") from error
+        raise LineLost(
+            f"the line {path} is lost ({error}): check plug and power"
+        ) from error
 
 
 class Host:

@@ -121,7 +121,11 @@ class Rig(Closed):
 
     @classmethod
     def open(
-        cls, stated: RigFile, *, host: Host = REAL, camera: Callable[[str], Camera] | None = None
+        cls,
+        stated: RigFile,
+        *,
+        host: Host = REAL,
+        camera: Callable[[str], Camera] | None = None,
     ) -> "Rig":
         """Open all devices and set the laser range finder as the rig file asks.
 
@@ -355,7 +359,9 @@ class Rig(Closed):
             yield moved
             if pitch not in alone:
                 readings = tuple(self._scans(moved.time_s, interlaced))
-                yield Scanned(placement.number, readings, np.full(len(readings), moved.pitch))
+                yield Scanned(
+                    placement.number, readings, np.full(len(readings), moved.pitch)
+                )
             if any(abs(pitch - image) < SAME_STOP for image in images):
                 yield from self._photograph(self.cameras, moved, placement.purpose)
         self.lrf.stop()
@@ -392,7 +398,9 @@ class Rig(Closed):
 
     def _move(self, placement, pitch, number, of):
         reached = self.head.move_to(pitch)
-        return Moved(placement, self.clock(), pitch, reached, self.head.has_feedback, number, of)
+        return Moved(
+            placement, self.clock(), pitch, reached, self.head.has_feedback, number, of
+        )
 
     def _photograph(self, cameras, moved, purpose):
         for name in cameras:
@@ -422,7 +430,9 @@ class Rig(Closed):
                 remedy = "check the line of the laser range finder"
                 raise NoReply(f"no scan for {GAP_S:g} s of the sweep: {remedy}")
             # what is not measured may change until the next reading
-            sure = [point for point in self.head.track if point[2] or not self.head.has_feedback]
+            sure = [
+                point for point in self.head.track if point[2] or not self.head.has_feedback
+            ]
             readings, pitch, held = placed(held + fresh, sure)
             if readings:
                 share = np.clip((pitch[-1] - first) / (last - first), 0, 1)

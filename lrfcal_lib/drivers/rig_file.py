@@ -22,7 +22,13 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.drivers.pelco_d import FASTEST
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionStated, parse_session, refused
+from lrfcal_lib.session.stated import (
+    CameraInfo,
+    LrfInfo,
+    SessionStated,
+    parse_session,
+    refused,
+)
 
 MOST_STOPS = 5000
 FINEST_DEG = 1e-3
@@ -100,8 +106,12 @@ def stops_of(sweep: tuple[float, float, float]) -> np.ndarray:
 
 
 Text = Annotated[StrictStr, refused(no_text, "a text is needed")]
-Source = Annotated[Any, refused(no_source, "a text, or a whole number from 0 to 255 is needed")]
-Rate = Annotated[Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)]
+Source = Annotated[
+    Any, refused(no_source, "a text, or a whole number from 0 to 255 is needed")
+]
+Rate = Annotated[
+    Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)
+]
 Password = Annotated[
     Text,
     AfterValidator(str.encode),
@@ -140,7 +150,9 @@ class Stated(BaseModel, frozen=True):
             return data
         for key in data:
             if key not in cls.model_fields:
-                raise ValueError(f"{key} is not known; known are {', '.join(cls.model_fields)}")
+                raise ValueError(
+                    f"{key} is not known; known are {', '.join(cls.model_fields)}"
+                )
         return {key: value for key, value in data.items() if value is not None}
 
 
@@ -178,22 +190,30 @@ class HeadSettings(Stated):
     echo: Perhaps = "auto"
     # Asking for more is an error. The protocol knows no limits; typical heads tilt by -90 to 90.
     pitch_limits_deg: Limits = (-60.0, 60.0)
-    position_zero_deg: number(-360, 360, "deg") = 0.0  # elevation that the head tells at pitch 0
+    position_zero_deg: number(-360, 360, "deg") = (
+        0.0  # elevation that the head tells at pitch 0
+    )
     # It hangs upside down or counts the other way: its "up" lowers the view.
     invert: StrictBool = False
     tilt_speed: whole(0, FASTEST) = 0x20  # speed byte, 0 is very slow
     # At `tilt_speed`, both ways or (up, down). Not stated: 4 is assumed, as of constant-speed
     # heads, until it was learnt, and the log says so.
     degrees_per_second: Speeds = None
-    start_pitch_deg: Angle = 0.0  # where a head without feedback stands at first: levelled by hand
+    start_pitch_deg: Angle = (
+        0.0  # where a head without feedback stands at first: levelled by hand
+    )
     # Readings that differ by less are the same: cheap encoders jitter.
     tolerance_deg: number(1e-4, 45, "deg") = 0.1
     settle_s: Seconds = 0.3  # the head rests when its readings stay the same for this long
     poll_s: Seconds = 0.1  # between queries while it moves
     reply_s: number(1e-3, 10, "s") = 0.35  # until a reply begins; 1 is needed by slow heads
-    gap_s: number(0, 10, "s") = 0.05  # silence between frames, and time for an acknowledgement
+    gap_s: number(0, 10, "s") = (
+        0.05  # silence between frames, and time for an acknowledgement
+    )
     retries: whole(0, 20) = 3  # queries repeated when no reply came
-    repeat_s: number(1e-3, 60, "s") = None  # below 1 for heads that stop by themselves without
+    repeat_s: number(1e-3, 60, "s") = (
+        None  # below 1 for heads that stop by themselves without
+    )
     reconnect_s: number(0, 3600, "s") = 3.0  # that a call waits for a vanished port
 
     def elevation(self, pitch: float) -> float:
@@ -348,7 +368,9 @@ class Plan(Stated):
             purpose = "scene"
             if entry.board:
                 purpose = "board"
-            placements.append(Placement(number, stops, tuple(map(math.radians, images)), purpose))
+            placements.append(
+                Placement(number, stops, tuple(map(math.radians, images)), purpose)
+            )
         return placements
 
 
@@ -433,7 +455,9 @@ def read_rig_file(path: str | os.PathLike) -> RigFile:
         raise RigFileError(f"{path}: {error.strerror}; {hint}") from error
     if not usable:
         remedy = "name a rig file"
-        raise RigFileError(f"{path}: no file, or one of more than {MOST_BYTES} bytes: {remedy}")
+        raise RigFileError(
+            f"{path}: no file, or one of more than {MOST_BYTES} bytes: {remedy}"
+        )
     try:
         data = json.loads(content)
     except (ValueError, RecursionError) as error:

@@ -109,7 +109,9 @@ class Camera(Closed):
         self._read_back(exposure)
         self._thread = None
         if self._remedy:
-            self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
+            self._thread = threading.Thread(
+                target=self._grab, name=f"camera {name}", daemon=True
+            )
             self._thread.start()
 
     def newest(self, after: float | None = None, timeout: float = 5.0) -> Frame:
@@ -150,7 +152,9 @@ class Camera(Closed):
                 return frame
         if self.lost:
             raise LineLost(f"camera {self.name} is lost: {self._remedy}")
-        raise NoReply(f"camera {self.name} gave no new frame in {timeout:g} s: {self._remedy}")
+        raise NoReply(
+            f"camera {self.name} gave no new frame in {timeout:g} s: {self._remedy}"
+        )
 
     def close(self) -> None:
         """Close the source; a second call does nothing."""
@@ -180,7 +184,9 @@ class Camera(Closed):
     def _open(self):
         self._capture = open_source(self._path, self._silence_s)
         self._before = REAL.time()
-        self._taken = {key for key, value in self._wanted.items() if self._capture.set(key, value)}
+        self._taken = {
+            key for key, value in self._wanted.items() if self._capture.set(key, value)
+        }
 
     def _read_back(self, exposure):
         """The size that it gives; an exposure that is not as asked for is logged."""
@@ -224,7 +230,9 @@ class Camera(Closed):
             now = REAL.time()
             instant = now
             if not getattr(self._capture, "waited", True):
-                instant = self._before  # it may have come at any time since the frame before
+                instant = (
+                    self._before
+                )  # it may have come at any time since the frame before
             self._keep(instant)
             self._before = now
         self._release()
@@ -324,7 +332,9 @@ def _open_device(path):
     if not os.access(path, os.R_OK | os.W_OK):
         remedy = "run 'sudo usermod -aG video $USER', then log in again"
         raise PortError(f"no permission for {path}: {remedy}")
-    busy = f"{path} gives no video: close other programs that use it, or name another device"
+    busy = (
+        f"{path} gives no video: close other programs that use it, or name another device"
+    )
     return _opened(busy, path, cv2.CAP_V4L2)
 
 
@@ -421,7 +431,9 @@ class MjpegStream(Images):
         except ValueError as error:  # names that no host can have
             raise OSError(f"no address of a stream: {error}") from error
         kind = self._answer.headers.get("Content-Type", "")
-        self.multipart = self._answer.status == 200 and kind.lower().startswith("multipart/")
+        self.multipart = self._answer.status == 200 and kind.lower().startswith(
+            "multipart/"
+        )
         self.release = self._answer.close
 
     def grab(self) -> bool:
@@ -442,7 +454,9 @@ class MjpegStream(Images):
                 image = self._buffer[begin:end]
                 self._buffer = self._buffer[end:]
                 return image
-            if self._answer.closed or len(self._buffer) > LONGEST:  # at its end or after a silence
+            if (
+                self._answer.closed or len(self._buffer) > LONGEST
+            ):  # at its end or after a silence
                 return None
             try:
                 self.waited |= not select.select([self._answer], [], [], 0)[0]
@@ -473,9 +487,13 @@ class Files(Images):
         names = glob.glob(path)
         if os.path.isdir(path):
             names = [os.path.join(path, name) for name in os.listdir(path)]
-        files = [Path(name) for name in sorted(names) if Path(name).suffix.lower() in IMAGES]
+        files = [
+            Path(name) for name in sorted(names) if Path(name).suffix.lower() in IMAGES
+        ]
         if not files:
-            raise PortError(f"there are no images in {path}: name a folder or pattern with some")
+            raise PortError(
+                f"there are no images in {path}: name a folder or pattern with some"
+            )
         self._left = iter(files)
 
     def take(self) -> bytes | None:

@@ -333,7 +333,11 @@ class EmulatedHead(SerialDevice):
 
     def _set_tilt(self, value, at):
         """Move to an elevation; a second such move is lost while the first is under way."""
-        if self.habits.feedback != "full" or value >= pelco_d.TURN or at < self.absolute_until:
+        if (
+            self.habits.feedback != "full"
+            or value >= pelco_d.TURN
+            or at < self.absolute_until
+        ):
             return
         head = self.head
         speed = math.radians(self.habits.go_speed)

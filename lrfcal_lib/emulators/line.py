@@ -98,7 +98,9 @@ class SerialDevice(ABC):
     __enter__ = start
     __exit__ = close
 
-    def at(self, instant: float, action: Callable[[float], None], tag: str | None = None) -> None:
+    def at(
+        self, instant: float, action: Callable[[float], None], tag: str | None = None
+    ) -> None:
         """Plan something.
 
         Parameters
@@ -128,7 +130,9 @@ class SerialDevice(ABC):
         self.cancel(SENDING)
         self.busy_until = 0.0
 
-    def write(self, data: bytes, at: float, then: Callable[[float], None] | None = None) -> None:
+    def write(
+        self, data: bytes, at: float, then: Callable[[float], None] | None = None
+    ) -> None:
         """Send bytes after those given before.
 
         Parameters
@@ -238,7 +242,9 @@ class Terminal(threading.Thread):
                 if self.there:
                     self._listen()
                 self._device.advance()
-        except Exception as error:  # a device that dies must say so: a look at `error` shows it
+        except (
+            Exception
+        ) as error:  # a device that dies must say so: a look at `error` shows it
             self._device.error = error
             raise
         finally:

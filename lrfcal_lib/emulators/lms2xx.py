@@ -42,7 +42,9 @@ ACK_S = 0.003  # from the last byte of a request to ACK or NAK; the manual allow
 REPLY_S = 0.065  # to the first byte of a reply, as measured on a real device
 WRITE_S = 0.107  # the same where flash is written (measured: 0x77)
 RESET_S = 0.010
-STOP_S = 0.52  # most that a change of mode takes longer while streaming (measured: 71 to 588 ms)
+STOP_S = (
+    0.52  # most that a change of mode takes longer while streaming (measured: 71 to 588 ms)
+)
 GAP_S = 0.006  # a host that pauses longer within a telegram is not heard
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 # A stream that lags so far leaves scans out, as no host can know how late they are.
@@ -158,7 +160,9 @@ class EmulatedLms(SerialDevice):
         raw = self._buffer + data
         stream = codec.split_stream(raw, replies=False)
         self._buffer = raw[stream.pending :]
-        for offset, length in zip(stream.offset.tolist(), stream.length.tolist(), strict=True):
+        for offset, length in zip(
+            stream.offset.tolist(), stream.length.tolist(), strict=True
+        ):
             self.heard(raw[offset : offset + length], at)
         if len(stream.rejected) and not len(stream.offset):
             self.heard(raw[stream.rejected[0] :], at, sound=False)
@@ -220,9 +224,13 @@ class EmulatedLms(SerialDevice):
                 self.answer(at, 0xB2)
             case 0x3A, _:
                 self.answer(at, 0xBA, memory.model.encode())
-            case 0x3B, data if len(data) == 4:  # nothing is streamed while the variant changes
+            case 0x3B, data if (
+                len(data) == 4
+            ):  # nothing is streamed while the variant changes
                 taken = memory.set_variant(tuple(np.frombuffer(data, "<u2").tolist()))
-                self.answer(at, 0xBB, bytes([taken]) + words_of(memory.variant), delay=WRITE_S)
+                self.answer(
+                    at, 0xBB, bytes([taken]) + words_of(memory.variant), delay=WRITE_S
+                )
             case 0x74, _:
                 self.answer(at, 0xF4, memory.configuration.block)
             case 0x77, data if 32 <= len(data) <= 34 and memory.mode == INSTALLATION:
@@ -247,7 +255,9 @@ class EmulatedLms(SerialDevice):
         parameters = data[1:]
         if mode in BAUD_COMMAND and not parameters:
             self._set_rate(BAUD_COMMAND[mode], at)
-        elif mode == INSTALLATION and len(parameters) == 8 and parameters != memory.password:
+        elif (
+            mode == INSTALLATION and len(parameters) == 8 and parameters != memory.password
+        ):
             self.answer(at, 0xA0, WRONG)
         elif (selection := selection_of(mode, parameters)) is None:
             self.answer(at, 0x92)
@@ -311,7 +321,9 @@ class EmulatedLms(SerialDevice):
             self._turn = self._turn_of(at, self._turns, math.ceil)
             self._plan()
 
-    def reply(self, raw: bytes, at: float, then: Callable[[float], None] | None = None) -> None:
+    def reply(
+        self, raw: bytes, at: float, then: Callable[[float], None] | None = None
+    ) -> None:
         """Send a reply; at 500000 Bd at most 508 bytes leave in one turn of the mirror.
 
         Parameters
@@ -390,18 +402,24 @@ class EmulatedLms(SerialDevice):
         def ahead(_):
             """Cast the scan, or those of a mean, and send it at its end."""
             quarters = codec.scan_quarters(values, partial)
-            after = np.arange(values) % turns + quarters / 1440  # turns since the first began
+            after = (
+                np.arange(values) % turns + quarters / 1440
+            )  # turns since the first began
             times = self._zero + (turn + after) * MIRROR_TURN
             cast = []
             for later in range(0, turns * scans, turns):
-                cast.append(self.source.scan(turn + later, quarters, times + later * MIRROR_TURN))
+                cast.append(
+                    self.source.scan(turn + later, quarters, times + later * MIRROR_TURN)
+                )
             ranges, reasons = map(np.array, zip(*cast, strict=True))
             configuration = memory.configuration
             words = codec.encode_values(
                 ranges.mean(axis=0),
                 unit=configuration.unit,
                 mode=ENCODED[configuration.measuring_mode],
-                reasons=reasons.max(axis=0),  # of a mean, too: one scan without a range leaves none
+                reasons=reasons.max(
+                    axis=0
+                ),  # of a mean, too: one scan without a range leaves none
             )
             times += self.host.time() - self.host.now()
             scan = ScanRecord(-1, turn, -1, float(times[0]), times, partial, words, b"")
@@ -428,7 +446,9 @@ class EmulatedLms(SerialDevice):
         """
         raw = self._telegram(scan)
         index = self.telegrams % 256
-        self.scans.append(replace(scan, number=self._number, telegram_index=index, telegram=raw))
+        self.scans.append(
+            replace(scan, number=self._number, telegram_index=index, telegram=raw)
+        )
         self.telegrams += 1
         self._number += 1
         self.reply(raw, at, then)
@@ -474,7 +494,9 @@ class EmulatedLms(SerialDevice):
             self._partial = 0
             self._turn = self._turn_of(self.host.now(), turns, math.ceil)
         partial = -1
-        if self.memory.mode == INTERLACED:  # which there are depends on the resolution that is set
+        if (
+            self.memory.mode == INTERLACED
+        ):  # which there are depends on the resolution that is set
             partial = self._partial * self.memory.variant[1] % 100 // 25
             self._partial += 1
         self._measure(self._turn, partial, self._next, "stream")

@@ -103,7 +103,9 @@ class Memory:
         bool
             Whether its values are possible.
         """
-        block = bytes(block) + self.configuration.block[len(block) : codec.CONFIGURATION_BYTES]
+        block = (
+            bytes(block) + self.configuration.block[len(block) : codec.CONFIGURATION_BYTES]
+        )
         if block[5] not in ENCODED or block[6] >= len(UNITS):
             return False
         self.configuration = Configuration(block)

@@ -77,7 +77,8 @@ class EmulatedRig:
         self.pan_tilt = EmulatedHead(head, path=path, host=host, seed=seed, **options)
         self.camera_server = CameraServer(self.world, seed=seed, rest_s=rest_s)
         self.camera_urls = {
-            name: f"{self.camera_server.url}/{name}.mjpg" for name in self.camera_server.cameras
+            name: f"{self.camera_server.url}/{name}.mjpg"
+            for name in self.camera_server.cameras
         }
         self._parts = self.lrf, self.pan_tilt, self.camera_server
         for part in self._parts:
@@ -183,7 +184,9 @@ def practice_setup() -> tuple[Setup, list[Placement]]:
     rig = scaled(quick.rig, SMALL)
     rig = replace(
         rig,
-        cameras=tuple(replace(c, exposure=replace(c.exposure, samples=2)) for c in rig.cameras),
+        cameras=tuple(
+            replace(c, exposure=replace(c.exposure, samples=2)) for c in rig.cameras
+        ),
         platform=replace(rig.platform, settle=0.0),
     )
     setup = replace(
@@ -198,7 +201,9 @@ def practice_setup() -> tuple[Setup, list[Placement]]:
         room_images=(),
     )
     placements = []
-    for placement in pairs(rig, setup.pairs, setup.distances, random(setup, PLACES), MARGIN):
+    for placement in pairs(
+        rig, setup.pairs, setup.distances, random(setup, PLACES), MARGIN
+    ):
         images = placement.image_pitch
         placements.append(replace(placement, image_pitch=(images[0], images[-1])))
     return setup, placements
@@ -243,12 +248,18 @@ def quick_file(rig: EmulatedRig) -> dict:
     data = rig.rig_file()
     data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}
     for camera in rig.setup.rig.cameras:
-        data["rig"]["cameras"][camera.name]["intrinsics"] = stated.model_to_json(camera.model)
+        data["rig"]["cameras"][camera.name]["intrinsics"] = stated.model_to_json(
+            camera.model
+        )
     return data
 
 
 def main(
-    name: str, rig_file: str | os.PathLike | None = None, *, seed: int = 0, feedback: str = "full"
+    name: str,
+    rig_file: str | os.PathLike | None = None,
+    *,
+    seed: int = 0,
+    feedback: str = "full",
 ) -> int:
     """Emulate a set-up until Ctrl-C, SIGTERM or SIGHUP.
 
@@ -319,10 +330,14 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
         stream = file.open("x")
     except FileExistsError:
         remedy = "name another file with --rig-file, or remove this one first"
-        raise ValueError(f"{file}: exists already, and is not written over: {remedy}") from None
+        raise ValueError(
+            f"{file}: exists already, and is not written over: {remedy}"
+        ) from None
     except OSError as error:
         remedy = "name a file in a folder that exists and can be written with --rig-file"
-        raise ValueError(f"{file}: cannot be written ({error.strerror}): {remedy}") from error
+        raise ValueError(
+            f"{file}: cannot be written ({error.strerror}): {remedy}"
+        ) from error
     try:
         with stream:
             stream.write(text)
@@ -336,7 +351,10 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
         yield
     finally:
         with contextlib.suppress(OSError):  # somebody removed it
-            if os.path.samestat(file.lstat(), written) and file.read_bytes() == text.encode():
+            if (
+                os.path.samestat(file.lstat(), written)
+                and file.read_bytes() == text.encode()
+            ):
                 file.unlink()
             else:
                 print(f"{file}: was changed, so it stays; its devices are gone", flush=True)

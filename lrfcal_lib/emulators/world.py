@@ -130,7 +130,10 @@ class EmulatedWorld:
 
     def _set(self, place):
         # in one go, as a scan may be cast meanwhile
-        self.current = place, world_of(self.setup, place.T_platform_board, stand=place.stand)
+        self.current = (
+            place,
+            world_of(self.setup, place.T_platform_board, stand=place.stand),
+        )
 
     def scan(
         self, turn: int, quarters: np.ndarray, times: np.ndarray
@@ -162,7 +165,9 @@ class EmulatedWorld:
         if self._still is None or key is None or self._still_key != key:
             self._still_key = key
             bearings = np.radians(quarters / 4)
-            self._still = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
+            self._still = lrf.ideal_readings(
+                rig.beam, world, bearings, pitch, rig.T_head_lrf
+            )
         return lrf.measured(rig.beam, self._still, self._rng)
 
 
@@ -239,7 +244,9 @@ class CameraServer:
         with self._lock:
             self._images.clear()
 
-    def image(self, name: str, timeout: float = 1.0) -> tuple[tuple, bytes] | tuple[None, None]:
+    def image(
+        self, name: str, timeout: float = 1.0
+    ) -> tuple[tuple, bytes] | tuple[None, None]:
         """The image of the rig as it stands now.
 
         Parameters
@@ -323,7 +330,9 @@ class _Handler(BaseHTTPRequestHandler):
                 case [_, "close", camera, view]:
                     world.hold_close(camera, int(view))
                 case _:
-                    return self.send_error(404, "there are place/NUMBER and close/CAMERA/VIEW")
+                    return self.send_error(
+                        404, "there are place/NUMBER and close/CAMERA/VIEW"
+                    )
         except ValueError as error:
             return self.send_error(400, str(error))
         self.send_response(204)
@@ -339,7 +348,9 @@ class _Handler(BaseHTTPRequestHandler):
             while not server.quit.is_set():
                 _, data = server.image(name)
                 if data is None:
-                    self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves
+                    self.wfile.write(
+                        b"\r\n"
+                    )  # a blank line: the camera lives, its head moves
                 else:
                     length = f"Content-Length: {len(data)}\r\n\r\n".encode()
                     head = b"--frame\r\nContent-Type: image/jpeg\r\n" + length

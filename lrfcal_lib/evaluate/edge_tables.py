@@ -107,7 +107,9 @@ def edge_lengths(
     rows = []
     for variant, placement in product(measured, prepared.session.board_placements):
         board, weak = measured[variant].get(placement, (None, frozenset()))
-        views = [views[placement] for views in prepared.views.values() if placement in views]
+        views = [
+            views[placement] for views in prepared.views.values() if placement in views
+        ]
         for name, true in known.items():
             if all(view.edge(name) is None for view in views):
                 continue

@@ -31,7 +31,17 @@ AXIS_PARAMETERS = [
     "offset_in_scan_plane_m",
     "offset_across_scan_plane_m",
 ]
-LENS_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # as OpenCV calls them
+LENS_PARAMETERS = (
+    "fx",
+    "fy",
+    "cx",
+    "cy",
+    "k1",
+    "k2",
+    "p1",
+    "p2",
+    "k3",
+)  # as OpenCV calls them
 # of a PCD file, as its readers call them
 PCD_COLUMNS = COLUMNS | {
     "normals": ("<f4", "normal_x normal_y normal_z"),
@@ -123,7 +133,9 @@ def _camera(calibration, camera, method, solution):
     return {
         "maps": f"{obs.source} to {obs.camera}",
         **_transform(solution.transform),
-        "sigma": dict(zip(solution.names[:6], solution.trusted_sigma[:6].tolist(), strict=True)),
+        "sigma": dict(
+            zip(solution.names[:6], solution.trusted_sigma[:6].tolist(), strict=True)
+        ),
         "covariance": solution.trusted[:6, :6].tolist(),
         "intrinsics": {"width": model.width, "height": model.height, **lens},
         "converged": bool(solution.converged),

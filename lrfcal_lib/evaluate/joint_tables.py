@@ -281,7 +281,9 @@ def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:
     rows = []
     if joint.settings["axis"]:
         turn, shift = axis_errors(solution.T_head_lrf, truth)
-        rows.append(_error_row("tilt axis", turn, shift, solution.covariance("axis_", "offset_")))
+        rows.append(
+            _error_row("tilt axis", turn, shift, solution.covariance("axis_", "offset_"))
+        )
     for camera in solution.transforms:
         errors = camera_errors(solution.camera(camera), truth, camera)
         turn = errors["rotation_error_deg"]

@@ -76,7 +76,15 @@ class Trials:
 
 
 def joint_truth(
-    obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0, softness=0.1, pitch_scale=0.0
+    obs,
+    T_head_lrf,
+    cameras,
+    boards,
+    *,
+    range_offset=0.0,
+    bias=0.0,
+    softness=0.1,
+    pitch_scale=0.0,
 ):
     """The truth behind drawn JointObservations, as a JointState in the joint estimate's gauge.
 
@@ -97,7 +105,9 @@ def joint_truth(
         The head turns ``1 + pitch_scale`` times as far as recorded.
     """
     poses = np.array([pose_array(cameras[name]) for name in obs.cameras]).reshape(-1, 3, 4)
-    sensor = np.array([range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0])
+    sensor = np.array(
+        [range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0]
+    )
     count = len(boards)
     boards = np.stack([pose_array(T) for T in boards])
     own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges)))
@@ -133,7 +143,9 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
             failed[int(seed)] = str(error)
             continue
         if names and names != joint.solution.names:
-            raise ValueError(f"seed {seed} estimates {joint.solution.names}, earlier ones {names}")
+            raise ValueError(
+                f"seed {seed} estimates {joint.solution.names}, earlier ones {names}"
+            )
         names = joint.solution.names
         errors = state_errors(joint.state, truth, joint.unknowns)
         limit = bound(obs, truth, joint.unknowns)
@@ -141,7 +153,9 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
     if not rows:
         last = list(failed.values())[-1] if failed else "no seed given"
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
-    seeds, errors, covariances, bounds = (np.array(column) for column in zip(*rows, strict=True))
+    seeds, errors, covariances, bounds = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
     return Trials(names, seeds, errors, covariances, bounds, failed)
 
 
@@ -158,7 +172,9 @@ def state_errors(state: JointState, truth: JointState, unknowns: Unknowns) -> np
     true = np.concatenate([truth.head[None], truth.cameras])
     poses = pose_errors(estimated, true)
     sensor = state.sensor - truth.sensor
-    return np.concatenate([poses[0, AXIS_COLUMNS], poses[1:].ravel(), sensor])[unknowns.mask]
+    return np.concatenate([poses[0, AXIS_COLUMNS], poses[1:].ravel(), sensor])[
+        unknowns.mask
+    ]
 
 
 def pose_errors(poses, true):
@@ -314,7 +330,9 @@ def _judge(trials, index, factor):
         "coverage": np.mean(np.abs(e) < half_width),
         "nees": np.mean(np.vecdot(e, normalised)) / len(index),
     }
-    row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(chi2.ppf(LIMITS, free) / free)
+    row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(
+        chi2.ppf(LIMITS, free) / free
+    )
     row["coverage_low"], row["coverage_high"] = binom.ppf(LIMITS, seen, INTERVAL) / seen
     row["nees_low"], row["nees_high"] = chi2.ppf(LIMITS, e.size) / e.size
     return row
@@ -325,7 +343,9 @@ def _freedom(C):
     return np.trace(C) ** 2 / np.sum(C * C)
 
 
-def observations(shots: dict, setup: ShotSetup, last_beam: bool = False) -> CameraObservations:
+def observations(
+    shots: dict, setup: ShotSetup, last_beam: bool = False
+) -> CameraObservations:
     """Drawn shots as the preprocessing makes CameraObservations of a scan line, trials first.
 
     Parameters
@@ -427,7 +447,9 @@ def shots_table(shots: dict, setup: ShotSetup, rng: np.random.Generator) -> pd.D
     T0 = RigidTransform.from_components(near.translation + shift, turn * near.rotation)
     half = observations(shots, setup)
     solutions = {
-        "line_last_beam": solve_camera(observations(shots, setup, last_beam=True), "line", T0),
+        "line_last_beam": solve_camera(
+            observations(shots, setup, last_beam=True), "line", T0
+        ),
         "line": solve_camera(half, "line", T0),
         "zhang_pless": solve_camera(half, "zhang_pless", T0),
     }
@@ -437,7 +459,9 @@ def shots_table(shots: dict, setup: ShotSetup, rng: np.random.Generator) -> pd.D
         normalised = np.linalg.solve(solution.covariance, error[..., None])[..., 0]
         row = {
             "method": method,
-            "rotation_median_deg": np.degrees(np.median(np.linalg.norm(error[:, :3], axis=1))),
+            "rotation_median_deg": np.degrees(
+                np.median(np.linalg.norm(error[:, :3], axis=1))
+            ),
             "translation_median_mm": 1000 * np.median(np.linalg.norm(error[:, 3:], axis=1)),
             "nees": np.mean(np.vecdot(error, normalised)) / 6,
         }

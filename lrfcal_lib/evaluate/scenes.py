@@ -11,7 +11,14 @@ from lrfcal_lib.calibrate.clouds import views_of
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.evaluate.truth import read_truth
-from lrfcal_lib.judge.uncertainty import COLUMNS, Chain, carried, chain_of, range_noise, spread
+from lrfcal_lib.judge.uncertainty import (
+    COLUMNS,
+    Chain,
+    carried,
+    chain_of,
+    range_noise,
+    spread,
+)
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, tilt
 from lrfcal_lib.model.kinematics import AS_RECORDED
 from lrfcal_lib.solvers.joint_solution import JointSolution
@@ -175,7 +182,9 @@ def fit_feature(
         of_centre = variance / count * np.outer(normal, normal)
         along = axes[:, 1:]
         tilted = variance / count * (along / size[1:]) @ along.T
-    return Feature(part.points.mean(axis=0), normal, of_centre, tilted, R @ J.mean(axis=0), chain)
+    return Feature(
+        part.points.mean(axis=0), normal, of_centre, tilted, R @ J.mean(axis=0), chain
+    )
 
 
 def length_between(first: Feature, second: Feature) -> tuple[float, float]:

@@ -99,7 +99,9 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
         basis=basis,
         fixed=tuple(fixed),
     )
-    return StereoReference((first, second), adjusted.mounting[1], adjusted.mounting_covariance[0])
+    return StereoReference(
+        (first, second), adjusted.mounting[1], adjusted.mounting_covariance[0]
+    )
 
 
 def stereo_check(solutions: dict, reference: StereoReference) -> pd.DataFrame:
@@ -122,7 +124,9 @@ def stereo_check(solutions: dict, reference: StereoReference) -> pd.DataFrame:
     for method in (*METHODS, "joint"):
         if not all((camera, method) in solutions for camera in reference.cameras):
             continue
-        first, second = (solutions[camera, method].transform for camera in reference.cameras)
+        first, second = (
+            solutions[camera, method].transform for camera in reference.cameras
+        )
         between = second * first.inv()
         turn, shift = transform_difference(between, reference.T_second_first)
         length = np.linalg.norm(between.translation)

@@ -242,7 +242,9 @@ def camera_calibration_table(solutions: dict[tuple[str, str], Solution]) -> pd.D
     DataFrame
         Columns camera, method, parameter, unit, value, sigma (`Solution.trusted`).
     """
-    parameters = {key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()}
+    parameters = {
+        key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()
+    }
     return _parameter_table(["camera", "method"], parameters)
 
 
@@ -409,7 +411,9 @@ def pitch_models_table(errors: PitchErrors) -> pd.DataFrame:
     for model in errors.models.values():
         rms_mm = 1000 * model.plane_rms
         rows.append((model.name, model.n_parameters, rms_mm, model.F, model.p_value))
-    return pd.DataFrame(rows, columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"])
+    return pd.DataFrame(
+        rows, columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"]
+    )
 
 
 def pitch_errors_table(errors: PitchErrors) -> pd.DataFrame:

@@ -11,7 +11,13 @@ from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import TransformStated, board_from_json, from_json, naming, read_json
+from lrfcal_lib.session.stated import (
+    TransformStated,
+    board_from_json,
+    from_json,
+    naming,
+    read_json,
+)
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,9 @@ def camera_errors(solution: Solution, truth: Truth | None, camera: str) -> dict[
     """
     if truth is None:
         return {}
-    angle, distance = geometry.transform_difference(solution.transform, truth.cameras[camera])
+    angle, distance = geometry.transform_difference(
+        solution.transform, truth.cameras[camera]
+    )
     turn_sigma, shift_sigma = sigmas(solution.trusted[:6, :6])
     return {
         "rotation_error_deg": np.rad2deg(angle),

@@ -47,7 +47,9 @@ def prior_terms(head: np.ndarray, prior: PlatformPrior) -> tuple[np.ndarray, np.
         Radians and metres.
     jacobian : ndarray, shape (4, 4)
     """
-    reference = geometry.pose_array(geometry.head_from_axis(geometry.axis_of(prior.T_head_lrf)))
+    reference = geometry.pose_array(
+        geometry.head_from_axis(geometry.axis_of(prior.T_head_lrf))
+    )
     turn = reference[:, :3] @ head[:, :3].T
     along = turn[:, 0]
     arm = np.array([0.0, head[1, 3], head[2, 3]])

@@ -44,9 +44,14 @@ def gauss_newton(
     for _ in range(STEPS):
         r = residuals(x)
         sides = [(move(x, d), move(x, -d)) for d in SMALL * np.eye(size)]
-        J = np.stack([(residuals(a) - residuals(b)) / (2 * SMALL) for a, b in sides], axis=1)
+        J = np.stack(
+            [(residuals(a) - residuals(b)) / (2 * SMALL) for a, b in sides], axis=1
+        )
         step = np.linalg.lstsq(J, -r)[0]
-        while np.sum(residuals(move(x, step)) ** 2) > np.sum(r**2) and np.abs(step).max() > stop:
+        while (
+            np.sum(residuals(move(x, step)) ** 2) > np.sum(r**2)
+            and np.abs(step).max() > stop
+        ):
             step = step / 2
         path.append([np.sum(r**2) / 2, *step])
         x = move(x, step)

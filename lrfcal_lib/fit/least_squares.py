@@ -21,7 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from lrfcal_lib.fit.covariance import covariance_of, name_words, null_space, placement_covariance
+from lrfcal_lib.fit.covariance import (
+    covariance_of,
+    name_words,
+    null_space,
+    placement_covariance,
+)
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
@@ -30,8 +35,12 @@ OWN_RANK = 1e-13  # the same of what a placement owns
 FIRST_DAMPING = 1e-7  # of the normal equations' diagonal
 LEAST_DAMPING = 1e-12
 MOST_DAMPING = 1e14
-SMALL_DAMPING = 10.0  # a step with more is short because it is held, not because it has arrived
-LARGE_CHI2 = 0.001  # chance alone exceeds chi-square so seldom where the stated noise is right
+SMALL_DAMPING = (
+    10.0  # a step with more is short because it is held, not because it has arrived
+)
+LARGE_CHI2 = (
+    0.001  # chance alone exceeds chi-square so seldom where the stated noise is right
+)
 
 
 @dataclass(frozen=True)
@@ -105,7 +114,8 @@ def medians(values: np.ndarray, used: np.ndarray) -> np.ndarray:
     count = used.sum(axis=-1, keepdims=True)
     ordered = np.sort(np.where(used, values, np.inf), axis=-1)
     low, high = (
-        np.take_along_axis(ordered, np.maximum(n // 2, 0), axis=-1) for n in (count - 1, count)
+        np.take_along_axis(ordered, np.maximum(n // 2, 0), axis=-1)
+        for n in (count - 1, count)
     )
     return np.where(count > 0, 0.5 * low + 0.5 * high, 0.0)[..., 0]
 
@@ -271,7 +281,9 @@ def _step(hessian, gradient, damping, shared):
         reduced, right, back = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
         step = common, -(back[..., shared] + back[..., :shared] @ common)
-        whole = np.concatenate([np.broadcast_to(common, (len(back), shared)), step[1]], axis=-1)
+        whole = np.concatenate(
+            [np.broadcast_to(common, (len(back), shared)), step[1]], axis=-1
+        )
     length = np.vecdot(whole, (hessian @ whole[..., None])[..., 0])
     promised = -np.vecdot(whole, gradient) - 0.5 * length
     if shared is None:
@@ -362,7 +374,9 @@ def _next_damping(damping, gain, accepted):
     """
     kept = np.where(gain > 0.8, 0.1, 1.0) * damping
     worse = np.maximum(np.where(accepted, 4.0, 10.0) * damping, 1e-4)
-    return np.clip(np.where(accepted & (gain > 0.5), kept, worse), LEAST_DAMPING, MOST_DAMPING)
+    return np.clip(
+        np.where(accepted & (gain > 0.5), kept, worse), LEAST_DAMPING, MOST_DAMPING
+    )
 
 
 def minimise_in_rounds(
@@ -444,7 +458,9 @@ class Question:
         motions = tuple(words(direction) for direction in directions)
         if self.required and motions:
             open_motions = "; ".join(motions)
-            raise DegenerateGeometry(f"{self.method}: the data do not determine {open_motions}")
+            raise DegenerateGeometry(
+                f"{self.method}: the data do not determine {open_motions}"
+            )
         return motions
 
 
@@ -477,7 +493,9 @@ def solve(
     ValueError
         When residuals at the start are not finite.
     """
-    steps = {name: asked.pop(name) for name in ("max_iterations", "tolerance") if name in asked}
+    steps = {
+        name: asked.pop(name) for name in ("max_iterations", "tolerance") if name in asked
+    }
     question = Question(**asked)
     last = [None, None]
 
@@ -515,7 +533,9 @@ def _by_placement(r, J, weights, groups, shared):
     weighted = weights[..., None] * J
     if groups is not None:  # rows of a placement together, padded with what counts nothing
         rows = np.arange(r.shape[-1])
-        placement = np.repeat(np.unique(groups, return_inverse=True)[1], len(rows) // len(groups))
+        placement = np.repeat(
+            np.unique(groups, return_inverse=True)[1], len(rows) // len(groups)
+        )
         together = pad({"row": rows, "placement": placement}, placement.max() + 1)
         index = together["row"]
         r = r[..., index]
@@ -541,7 +561,9 @@ def _solution(question, minimum, blocks, weights, shared):
     if question.scales is not None:
         scales = np.asarray(question.scales)
     motions = question.open_motions(hessian, scales)
-    chi2 = np.sum(weights * r**2, axis=-1 if shared is None else (-2, -1)) + question.chi2_rest
+    chi2 = (
+        np.sum(weights * r**2, axis=-1 if shared is None else (-2, -1)) + question.chi2_rest
+    )
     freedom = question.freedom
     if freedom is None:
         own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)

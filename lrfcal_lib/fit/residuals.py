@@ -9,7 +9,13 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import CameraModel, line_distance, line_through, project, undistort
+from lrfcal_lib.model.camera import (
+    CameraModel,
+    line_distance,
+    line_through,
+    project,
+    undistort,
+)
 from lrfcal_lib.model.geometry import (
     cross,
     gradient_by_pose,
@@ -75,10 +81,14 @@ def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     noise = moved_noise(pose, gradients, obs.crossing_covariance)
     variance = np.vecdot(gradients, noise) + obs.crossing_line_sigma**2
     correction = noise_correction(rotated, moved, gradients, noise, residuals / variance)
-    return Block(residuals, jacobian, 1 / np.sqrt(variance), corrected=jacobian - correction)
+    return Block(
+        residuals, jacobian, 1 / np.sqrt(variance), corrected=jacobian - correction
+    )
 
 
-def sight_block(pose: np.ndarray, points: np.ndarray, normals: np.ndarray, sigma: float) -> Block:
+def sight_block(
+    pose: np.ndarray, points: np.ndarray, normals: np.ndarray, sigma: float
+) -> Block:
     """Distances of points from planes through the camera centre, metres.
 
     Parameters
@@ -146,7 +156,8 @@ def edge_residuals_px(
         foot = uv - line_distance(uv, lines)[:, None] * lines[:, :2]
         along = lines[:, [1, 0]] * [10.0, -10.0]
         rays = (
-            np.column_stack([foot + side * along, np.ones(len(foot))]) @ to_rays for side in (-1, 1)
+            np.column_stack([foot + side * along, np.ones(len(foot))]) @ to_rays
+            for side in (-1, 1)
         )
         moved = line_through(*(undistort(project(ray, obs.model), model) for ray in rays))
         moved *= np.sign(np.sum(moved[:, :2] * lines[:, :2], axis=1))[:, None]
@@ -155,7 +166,9 @@ def edge_residuals_px(
 
 
 def plane_residuals_m(
-    obs: CameraObservations, transform: RigidTransform, board_poses: np.ndarray | None = None
+    obs: CameraObservations,
+    transform: RigidTransform,
+    board_poses: np.ndarray | None = None,
 ) -> np.ndarray:
     """Signed distances of the board-face points from the planes the camera sees.
 
@@ -235,7 +248,9 @@ def noise_correction(
     return factor[..., None] * np.concatenate([by_turn, by_shift], axis=-1)
 
 
-def moved_noise(pose: np.ndarray, gradient: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def moved_noise(
+    pose: np.ndarray, gradient: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
     """``R C R^T a``: where the noise of points pulls scalars of the moved points.
 
     Parameters

@@ -7,7 +7,9 @@ import numpy as np
 
 from lrfcal_lib.fit.least_squares import Block
 
-SAME_STOP = np.radians(0.001)  # of recorded pitch angles: platforms record steps of 0.01 deg or so
+SAME_STOP = np.radians(
+    0.001
+)  # of recorded pitch angles: platforms record steps of 0.01 deg or so
 
 
 def same_stop(pitch: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -25,7 +25,9 @@ STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
 MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement, whatever it does
-PREFERRED = 2.0  # so many are exceeded by chance once in 20 times; enough where it does harm:
+PREFERRED = (
+    2.0  # so many are exceeded by chance once in 20 times; enough where it does harm:
+)
 MOVED = 2.0  # standard deviations by which what is handed over would move
 HELD = 0.001  # metres, of a range offset that is asked whether bearings may stand for it
 INSTEAD = 6.0  # standard deviations beyond which they do
@@ -383,7 +385,9 @@ def far_axis(joint):
     sigma = np.hypot(session.platform_sigma, np.sqrt(variance))
     if np.all(apart <= FAR * sigma):
         return []
-    words = f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
+    words = (
+        f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
+    )
     return [Far(words, apart[0])]
 
 
@@ -405,11 +409,15 @@ def far_cameras(joint):
     for camera, transform in joint.solution.transforms.items():
         if camera not in guesses:
             continue
-        apart = {name: transform_difference(transform, guess) for name, guess in guesses.items()}
+        apart = {
+            name: transform_difference(transform, guess) for name, guess in guesses.items()
+        }
         turn, shift = apart[camera]
         nearest = min(apart, key=lambda name: apart[name][0] * LEVER + apart[name][1])
         if turn > FAR_TURN or shift > FAR_SHIFT:
-            words = f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {CHECK}"
+            words = (
+                f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {CHECK}"
+            )
             far.append(Far(words, turn))
         elif nearest != camera:
             words = (

@@ -19,7 +19,9 @@ from lrfcal_lib.solvers.joint_solution import JointSolution
 
 POSE = 6  # numbers of a camera's pose
 BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong
-LEVEL = 0.001  # false alarms a recording, over all cameras and places that a step might be at
+LEVEL = (
+    0.001  # false alarms a recording, over all cameras and places that a step might be at
+)
 LEAST_SIZE = 0.5  # pixels; edges and corners of a board are off by less at one placement
 ASKED = 4.0  # standard deviations: a change of the image scale that is none of chance
 STEP = 1e-4  # of the numeric derivative by the image scale
@@ -130,13 +132,17 @@ def camera_changes(
         solution, change = parted
         cameras.append(camera)
         changes.append(change)
-        if change.zoomed:  # two poses do not make up for that: what is left looks like more steps
+        if (
+            change.zoomed
+        ):  # two poses do not make up for that: what is left looks like more steps
             return changes
     # what is hopeless also with two poses of a camera has another cause
     return changes if explains(solution) else []
 
 
-def large_changes(obs: JointObservations, prepared: Prepared, settings: dict) -> list[CameraChange]:
+def large_changes(
+    obs: JointObservations, prepared: Prepared, settings: dict
+) -> list[CameraChange]:
     """Cameras that changed by so much that no estimate with one pose of each is possible.
 
     What one camera contradicts, the others and the scans agree about: its poses are seen from
@@ -179,7 +185,10 @@ def explains(solution: JointSolution) -> bool:
     solution
     """
     noise = solution.noise
-    return solution.converged and max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
+    return (
+        solution.converged
+        and max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
+    )
 
 
 def with_change(obs, step, camera, prepared, settings):
@@ -292,7 +301,9 @@ def with_two_poses(obs, step, name):
         view_camera=camera,
         cameras=(*obs.cameras, name),
         mounts=(*obs.mounts, obs.mounts[step.camera]),
-        lens_covariance=np.concatenate([obs.lens_covariance, obs.lens_covariance[[step.camera]]]),
+        lens_covariance=np.concatenate(
+            [obs.lens_covariance, obs.lens_covariance[[step.camera]]]
+        ),
     )
 
 
@@ -317,7 +328,10 @@ def change_between(solution, first, later, camera, prepared):
     rows = np.unique(obs.view_placement[views])
     earlier = np.unique(obs.view_placement[obs.view_camera == obs.cameras.index(first)])
     after = int(obs.placements[rows[0]])
-    growths = [growth_by_depth(solution, index), growth_of_focal_length(prepared, camera, after)]
+    growths = [
+        growth_by_depth(solution, index),
+        growth_of_focal_length(prepared, camera, after),
+    ]
     zoom, zoom_sigma = max(growths, key=lambda growth: abs(growth[0]) / growth[1])
     return CameraChange(
         camera=camera,
@@ -352,13 +366,17 @@ def growth_of_focal_length(prepared, camera, placement):
         views = [
             view
             for number, view in prepared.views[camera].items()
-            if (number >= placement) is later and view.pixels is not None and not view.reason
+            if (number >= placement) is later
+            and view.pixels is not None
+            and not view.reason
         ]
         if len(views) < FEWEST_VIEWS:
             return unknown
         pixels = np.array([[view.pixels for view in views]])
         poses = RigidTransform.concatenate([view.T_camera_board for view in views])
-        lens = adjust_robust(pixels, points, [model], poses, fixed=ALL_BUT_FOCAL_LENGTH).models[0]
+        lens = adjust_robust(
+            pixels, points, [model], poses, fixed=ALL_BUT_FOCAL_LENGTH
+        ).models[0]
         lengths.append(np.mean([lens.fx / model.fx, lens.fy / model.fy]))
         spreads.append(lens.covariance[:2, :2].mean() / model.fx**2)
     return float(lengths[1] / lengths[0] - 1), float(np.sqrt(sum(spreads)))

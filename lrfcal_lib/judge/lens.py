@@ -12,10 +12,10 @@ LENS_CORNERS = 20  # corners of the chessboard in a part, at least
 LENS_MISS = 0.15  # pixels that corners of a part may miss by alike
 OFF_MIDDLE = 0.2  # of the image's size
 WIDE = np.radians(80.0)  # across an image, by the focal length: five numbers hardly hold it
-REMEDY = "state intrinsics of this image size, or take sharp images with the chessboard all over"
-REMEDY_WIDE = (
-    "use a lens below 110 deg, crop or undistort the images first, state intrinsics of this size"
+REMEDY = (
+    "state intrinsics of this image size, or take sharp images with the chessboard all over"
 )
+REMEDY_WIDE = "use a lens below 110 deg, crop or undistort the images first, state intrinsics of this size"
 
 
 def lens_findings(prepared: Prepared) -> list[Finding]:
@@ -39,7 +39,9 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
         if not views:
             continue
         faults = []
-        miss = common_miss(views, raised_points(prepared.board.pattern, prepared.relief), model)
+        miss = common_miss(
+            views, raised_points(prepared.board.pattern, prepared.relief), model
+        )
         if miss > LENS_MISS:
             faults.append(f"all corners of the chessboard miss by {miss:.2f} px alike")
         reach = reach_of_fold(model)
@@ -96,7 +98,9 @@ def reach_of_fold(model: CameraModel) -> float:
     r = np.sqrt(fold(model))
     if not np.isfinite(r):
         return np.inf
-    far = np.maximum([model.cx, model.cy], [model.width - model.cx, model.height - model.cy])
+    far = np.maximum(
+        [model.cx, model.cy], [model.width - model.cx, model.height - model.cy]
+    )
     corner = np.linalg.norm(far / [model.fx, model.fy])
     k1, k2, _, _, k5 = model.distortion
     return float(r * (1 + lens_terms(r, 0.0, k1, k2, 0.0, 0.0, k5)[0]) / corner)

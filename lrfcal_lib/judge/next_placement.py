@@ -27,13 +27,25 @@ PLACES = (
     (1.0, 1.5, 2.0, 2.5, 3.0),  # metres from the LRF
     (-20, -10, 0, 10, 20),  # degrees to the left
     (-12, 0, 12),  # degrees up
-    (0, 60, 120, 180, 240, 300),  # degrees in the board's plane, anticlockwise as the rig sees it
+    (
+        0,
+        60,
+        120,
+        180,
+        240,
+        300,
+    ),  # degrees in the board's plane, anticlockwise as the rig sees it
     range(len(LEANS)),
 )
 FIELD_OF_VIEW = (np.radians(40), np.radians(140))  # bearings, of the paper's LMS 200
-PITCH_LIMITS = (np.radians(-30), np.radians(30))  # of a head that is asked to look at a board
+PITCH_LIMITS = (
+    np.radians(-30),
+    np.radians(30),
+)  # of a head that is asked to look at a board
 LATTICE = np.linspace(*PITCH_LIMITS, 41)  # pitch angles that images are tried at
-IMAGES = 3  # of each camera on the head, spread over the pitch angles at which all see the board
+IMAGES = (
+    3  # of each camera on the head, spread over the pitch angles at which all see the board
+)
 MARGIN = 0.04  # of the image, that a board keeps from its border, distortion included
 STEEPEST = np.radians(60.0)  # incidence of beams and of lines of sight
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
@@ -66,7 +78,9 @@ class Suggestion:
         distance, bearing, elevation, turn, lean = self.place
         parts = [f"board {distance:.1f} m ahead"]
         if bearing:
-            parts.append(f"{abs(bearing):.0f} deg to the {by_sign(bearing, 'left', 'right')}")
+            parts.append(
+                f"{abs(bearing):.0f} deg to the {by_sign(bearing, 'left', 'right')}"
+            )
         if elevation:
             parts.append(f"{abs(elevation):.0f} deg {by_sign(elevation, 'up', 'down')}")
         if turn:
@@ -176,7 +190,9 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
     for camera in solution.transforms:
         columns[camera] = solution.columns(f"{camera}_")
     return {
-        name: np.sqrt(variance[..., index].sum(axis=-1)) for name, index in columns.items() if index
+        name: np.sqrt(variance[..., index].sum(axis=-1))
+        for name, index in columns.items()
+        if index
     }
 
 
@@ -251,7 +267,9 @@ def candidate_information(boards, pitches, solution, models):
     share the errors of the one scan.
     """
     obs = solution.observations
-    beams = beams_to(geometry.apply_pose(boards, points_of_face(solution)), solution.T_head_lrf)
+    beams = beams_to(
+        geometry.apply_pose(boards, points_of_face(solution)), solution.T_head_lrf
+    )
     images = [pitches if mount == "head" else pitches[:, :1] for mount in obs.mounts]
     count = sum(at.shape[1] for at in images)
     by_scan = np.sqrt(count) * scan_sigma(solution, boards)[:, None]

@@ -35,7 +35,9 @@ EXPLAINING = (
     "numbers",
 )  # kinds that everything else which looks wrong follows from
 SEVERE_PX = 5.0  # a camera that moves images by more is two cameras
-BETTER = 3.0  # times nearer to the boards in the images, with what was recorded read otherwise
+BETTER = (
+    3.0  # times nearer to the boards in the images, with what was recorded read otherwise
+)
 MISREAD = 0.005  # metres; what is misread lies off by more than that
 GOOD = 0.05  # metres; boards and scans that belong together lie nearer than that
 AS_GOOD = 2.0  # times the miss of the best reading: another one that may be meant as well
@@ -47,7 +49,9 @@ POSE = 6  # numbers of a camera's pose
 HALF = 0.6745  # standard deviations of normal noise that half of all values stay below
 LEAST_MISS = 0.001  # metres; paper is no flatter
 MOST_LOST = 8  # placements; where more are left out, something else is wrong
-BESIDE = 0.15  # metres between the middles of a board in a scan, which may be cut, and in images
+BESIDE = (
+    0.15  # metres between the middles of a board in a scan, which may be cut, and in images
+)
 
 
 @dataclass(frozen=True)
@@ -194,7 +198,9 @@ def explained(faults: list[Fault]) -> bool:
 
 def hopeless(joint):
     """Whether a JointCalibration (or None) explains so little that something may be misread."""
-    return joint is None or not explains(joint.solution) or bool(joint.solution.unobservable)
+    return (
+        joint is None or not explains(joint.solution) or bool(joint.solution.unobservable)
+    )
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:
@@ -286,8 +292,12 @@ def plane_observations(prepared, camera, reading):
         for placement, view in prepared.views[camera].items()
         if view.T_camera_board is not None
     }
-    poses = np.array([view.T_camera_board.as_matrix() for view in views.values()]).reshape(-1, 4, 4)
-    if reading.mirrored:  # the mirror image of a chessboard is one: normal and place are mirrored
+    poses = np.array([view.T_camera_board.as_matrix() for view in views.values()]).reshape(
+        -1, 4, 4
+    )
+    if (
+        reading.mirrored
+    ):  # the mirror image of a chessboard is one: normal and place are mirrored
         mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
         poses = mirror @ poses @ mirror
 
@@ -320,7 +330,9 @@ def shows_boards(session, reading):
         with suppress(BoardNotFound, SessionError):
             sweep = session.sweep(placement)
             sweep = replace(
-                sweep, ranges=reading.ranges * sweep.ranges, pitch=reading.pitch * sweep.pitch
+                sweep,
+                ranges=reading.ranges * sweep.ranges,
+                pitch=reading.pitch * sweep.pitch,
             )
             find_board(sweep, session.board, session.T_head_lrf, session.lrf)
             found += 1
@@ -340,7 +352,9 @@ def _mirrored_camera(camera, stated, found):
 def _misread(prepared, fitting, stated):
     """The Fault of a recording that fits with some Readings (BoardMisses of each), likely first."""
     best = min(map(_worst, fitting.values()))
-    likely = [reading for reading, misses in fitting.items() if _worst(misses) < AS_GOOD * best]
+    likely = [
+        reading for reading, misses in fitting.items() if _worst(misses) < AS_GOOD * best
+    ]
     # a mirrored cloud fits mirrored images: only where the cameras are said to be can tell
     likely.sort(key=lambda r: (_far_from_guess(prepared, fitting[r]), _worst(fitting[r])))
     causes = "; or ".join(reading.words for reading in likely)
@@ -379,7 +393,9 @@ def faults_of_changes(changes, cameras):
         )
         severe = change.size_px > SEVERE_PX
         concerned = (change.after,)
-        found.append(Fault(kind, f"{words}; {remedy}", severe, False, change.camera, concerned))
+        found.append(
+            Fault(kind, f"{words}; {remedy}", severe, False, change.camera, concerned)
+        )
     return found
 
 
@@ -418,7 +434,9 @@ def exchanged_placements(calibration):
     for placement in lost[:MOST_LOST]:
         with suppress(BoardNotFound, SessionError):
             sweep = session.sweep(placement)
-            scans[placement] = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
+            scans[placement] = find_board(
+                sweep, session.board, session.T_head_lrf, session.lrf
+            )
 
     found = []
     strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]

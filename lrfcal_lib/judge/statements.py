@@ -24,7 +24,9 @@ SIZES = (Kind.SQUARES, Kind.RANGES)  # an error of them is one of all distances
 LARGE_SIZE = 0.02  # error of a size that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
 RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
-NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be weighed"
+NOT_WEIGHED = (
+    "whether session.json states sizes, step and spot rightly could not be weighed"
+)
 # statements that are falsified on purpose, as relative errors of alternatives
 LIES = {
     "as recorded": {},
@@ -63,7 +65,9 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
         why = f"no single error explains why ranges fit {level:.0f} times worse than stated"
         findings.append(Finding(NO, Kind.NOT_WEIGHED, f"{NOT_WEIGHED}: {why}"))
     sizes = [abs(doubt.value) for doubt in doubts if doubt.kind in SIZES]
-    range_doubt = max(sizes, default=0.0) * float(np.median(solution.observations.face_range))
+    range_doubt = max(sizes, default=0.0) * float(
+        np.median(solution.observations.face_range)
+    )
     beyond = []
     if instead not in doubts:
         beyond = list(beyond_admitted(joint))

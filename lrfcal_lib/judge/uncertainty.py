@@ -155,7 +155,9 @@ def projection_sigma(
         determined, NaN where no scan reaches.
     """
     away = np.reshape(distances, (-1, 1, 1))
-    bearing, pitch = beams_of_pixels(chain, model, pixel_grid(model, grid), away, image_pitch)
+    bearing, pitch = beams_of_pixels(
+        chain, model, pixel_grid(model, grid), away, image_pitch
+    )
     points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
     P, *_ = project_jacobians(points, model)
     offset, stretch = chain.sweep_sigma
@@ -262,7 +264,9 @@ def carried(
     bearing, pitch, distance = np.broadcast_arrays(bearing, pitch, distance)
     R = chain.head[:, :3]
     t = chain.head[:, 3]
-    back = float(chain.on_head)  # 1: points go back through the axis to the head at the image
+    back = float(
+        chain.on_head
+    )  # 1: points go back through the axis to the head at the image
     turn = pitch - back * image_pitch
     beam = polar_to_points(1.0, bearing) @ R.T
     p_head = distance[..., None] * beam

@@ -143,7 +143,9 @@ class Verdict:
             "answer": self.answer,
             "reasons": [vars(reason) for reason in self.reasons],
             "notes": self.notes,
-            "expected_error_at_m": {f"{d:g}": error.record() for d, error in self.errors.items()},
+            "expected_error_at_m": {
+                f"{d:g}": error.record() for d, error in self.errors.items()
+            },
         }
 
     def sentences(self) -> list[str]:
@@ -166,7 +168,9 @@ class Verdict:
                 f"Errors of the pitch of single sweeps contribute {brief(self.sweep_mm)} mm to the "
                 f"error of the cloud at {WORKING:g} m."
             )
-        sentences.append(self.suggestion.sentence() if self.suggestion else self.no_suggestion)
+        sentences.append(
+            self.suggestion.sentence() if self.suggestion else self.no_suggestion
+        )
         return [sentence for sentence in sentences if sentence]
 
     def because(self, findings: list[Finding]) -> "Verdict":
@@ -176,7 +180,9 @@ class Verdict:
         return replace(self, answer=answer, reasons=tuple(reasons))
 
 
-def judge(calibration: Calibration, method: str | None = None, *, suggest: bool = True) -> Verdict:
+def judge(
+    calibration: Calibration, method: str | None = None, *, suggest: bool = True
+) -> Verdict:
     """Judge what a calibration hands over, by itself and by what became of the recording.
 
     Parameters
@@ -213,7 +219,11 @@ def judge(calibration: Calibration, method: str | None = None, *, suggest: bool 
     if method == "joint" and joint is not None:
         field = prepared.session.lrf.field_of_view
         judged = verdict(
-            joint.solution, prepared.models, suggest=suggest, doubt=doubt, field_of_view=field
+            joint.solution,
+            prepared.models,
+            suggest=suggest,
+            doubt=doubt,
+            field_of_view=field,
         )
     else:
         judged = _without_joint(calibration, method, doubt)
@@ -262,7 +272,9 @@ def verdict(
         Bearings that the LRF measures, radians.
     """
     cameras = {camera: chain_of(solution, camera) for camera in solution.transforms}
-    pitch = np.concatenate([solution.observations.face_pitch, solution.observations.beam_pitch])
+    pitch = np.concatenate(
+        [solution.observations.face_pitch, solution.observations.beam_pitch]
+    )
     ways = Ways(chain_of(solution), cameras, pitch)
     judged = _expected(ways.doubted(doubt), models, range_noise(solution))
     judged = judged.because(diagnose(solution))
@@ -386,7 +398,8 @@ def _without_joint(calibration, method, doubt):
     judged = _expected(ways.doubted(doubt), prepared.models, noise)
     findings = [_not_joint(calibration)]
     fewest = min(
-        len(calibration.observations[camera, "half_step"].all_placements) for camera in solved
+        len(calibration.observations[camera, "half_step"].all_placements)
+        for camera in solved
     )
     if fewest < FEW:
         words = f"{fewest} placements only, {FEW} or more are needed"
@@ -415,11 +428,15 @@ def _not_joint(calibration):
     at_once = calibration.problem("joint")
     why = "another method was asked for" if at_once is None else at_once.words
     if joint is not None:
-        bad = [finding.words for finding in diagnose(joint.solution) if finding.answer == NO]
+        bad = [
+            finding.words for finding in diagnose(joint.solution) if finding.answer == NO
+        ]
         why = "; ".join(bad) or why
         if joint.solution.converged:
             answer = CARE
-    return Finding(answer, Kind.HANDED_OVER, f"the joint estimate is not handed over ({why})")
+    return Finding(
+        answer, Kind.HANDED_OVER, f"the joint estimate is not handed over ({why})"
+    )
 
 
 def _ways_of_platform(calibration, solved):

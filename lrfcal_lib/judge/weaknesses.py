@@ -20,7 +20,9 @@ FEW = 6
 PARALLEL = np.radians(6.0)  # normals of the boards about their mean
 SAME_DISTANCE = 0.12  # range of the distances, relative to their median
 SMALL_PITCH = np.radians(3.0)  # range of the recorded pitch
-SMALL_IMAGE_PITCH = np.radians(2.0)  # range within a placement of images of a camera on the head
+SMALL_IMAGE_PITCH = np.radians(
+    2.0
+)  # range within a placement of images of a camera on the head
 MISFIT = 4.0  # normalised squared residual, relative to the median placement's
 MODEL_ERROR = 2.5  # scatter over placements, in standard deviations of the noise
 # residuals in units of the stated noise: worth a word, and not that noise at all
@@ -74,7 +76,9 @@ def weak_placements(solution) -> Iterator[Finding]:
     """The number of placements."""
     count = len(solution.boards)
     if count < FEW:
-        words = f"{count} placements only, {FEW} or more are needed to see errors of the model"
+        words = (
+            f"{count} placements only, {FEW} or more are needed to see errors of the model"
+        )
         yield Finding(no_if(count < FEWEST), Kind.PLACEMENTS, words)
 
 
@@ -99,7 +103,9 @@ def weak_pitch(solution) -> Iterator[Finding]:
             "is hardly determined"
         )
         yield Finding(NO, Kind.PITCH, words)
-    elif len(image_pitch) and largest_range(image_pitch, image_placement) < SMALL_IMAGE_PITCH:
+    elif (
+        len(image_pitch) and largest_range(image_pitch, image_placement) < SMALL_IMAGE_PITCH
+    ):
         words = (
             "every placement has its images at one pitch: the tilt axis rests on the scans of "
             "small boards"
@@ -221,7 +227,9 @@ def sides_elsewhere(prepared: Prepared) -> Iterator[Finding]:
     elsewhere = [side for sides in prepared.dropped.values() for side in sides.values()]
     for edge in prepared.board.edges:
         dropped = [side for side in elsewhere if side.edge == edge]
-        crossed = len(dropped) + sum(edge in names.values() for names in prepared.names.values())
+        crossed = len(dropped) + sum(
+            edge in names.values() for names in prepared.names.values()
+        )
         if len(dropped) >= FEWEST and len(dropped) > MOST * crossed:
             turn = np.degrees(np.median([side.turn for side in dropped]))
             off = 1000 * np.median([side.distance for side in dropped])
@@ -283,7 +291,9 @@ class LeftOut:
     @property
     def words(self) -> str:
         """The placements that are left out, counted, with their reasons."""
-        why = ", ".join(f"{placement} ({words})" for placement, words in self.placements.items())
+        why = ", ".join(
+            f"{placement} ({words})" for placement, words in self.placements.items()
+        )
         return f"{len(self.placements)} of {self.recorded} placements are left out: {why}"
 
     @property
@@ -296,7 +306,9 @@ class LeftOut:
             notes.append(f"{self.words}.")
         if self.parts:
             parts = "; ".join(self.parts)
-            notes.append(f"Parts left out beside whole placements: {len(self.parts)} ({parts}).")
+            notes.append(
+                f"Parts left out beside whole placements: {len(self.parts)} ({parts})."
+            )
         return " ".join(notes)
 
 
@@ -318,13 +330,17 @@ def left_out(calibration: Calibration, method: str) -> LeftOut:
         solution = calibration.joint.solution
         used = set(solution.boards)
         excluded = solution.excluded_placements
-        images = [str(problem) for problem in solution.excluded if problem.camera is not None]
+        images = [
+            str(problem) for problem in solution.excluded if problem.camera is not None
+        ]
     placements = {}
     for number in table.index:
         if number not in used:
             stated = excluded.get(number) or prepared.left_out.get(number)
             placements[number] = stated or table.reason[number] or "no edge"
-    parts = [str(problem) for problem in prepared.problems if problem.kind not in LEAVES_OUT]
+    parts = [
+        str(problem) for problem in prepared.problems if problem.kind not in LEAVES_OUT
+    ]
     lost = LeftOut(len(table), placements, parts)
     if lost.many:  # otherwise a finding says it
         return replace(lost, parts=parts + images)

@@ -30,7 +30,9 @@ class Chessboard:
     def points(self):
         """Inner corners row by row in the board frame, shape (rows * columns, 3), metres."""
         y, x = np.mgrid[: self.rows, : self.columns] * self.square
-        return np.stack([x + self.origin[0], y + self.origin[1], 0.0 * x], axis=-1).reshape(-1, 3)
+        return np.stack([x + self.origin[0], y + self.origin[1], 0.0 * x], axis=-1).reshape(
+            -1, 3
+        )
 
     def outline(self) -> np.ndarray:
         """Corners of the printed squares together, shape (4, 2), metres."""
@@ -130,7 +132,10 @@ def corners_of_lines(lines: ArrayLike) -> np.ndarray:
 
 
 def triangle_board(
-    ab: float = 0.315, ac: float = 0.380, name: str = "triangle", pattern: Chessboard | None = None
+    ab: float = 0.315,
+    ac: float = 0.380,
+    name: str = "triangle",
+    pattern: Chessboard | None = None,
 ) -> Board:
     """The paper's board: a triangle with its right angle A in the origin, B on +x and C on +y.
 

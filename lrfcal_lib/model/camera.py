@@ -67,9 +67,13 @@ class CameraModel:
         covariance : ndarray, shape (9, 9), optional
         rms_px : float, optional
         """
-        matrix: dict[str, Any] = dict(zip(INTRINSIC_NAMES[:4], map(float, values[:4]), strict=True))
+        matrix: dict[str, Any] = dict(
+            zip(INTRINSIC_NAMES[:4], map(float, values[:4]), strict=True)
+        )
         distortion = np.asarray(values[4:9], float)
-        return replace(self, **matrix, distortion=distortion, covariance=covariance, rms_px=rms_px)
+        return replace(
+            self, **matrix, distortion=distortion, covariance=covariance, rms_px=rms_px
+        )
 
 
 def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
@@ -208,7 +212,9 @@ def project(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     return distorted * [model.fx, model.fy] + [model.cx, model.cy]
 
 
-def project_jacobians(p_camera: ArrayLike, model: CameraModel) -> tuple[np.ndarray, np.ndarray]:
+def project_jacobians(
+    p_camera: ArrayLike, model: CameraModel
+) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of :func:`project` at points in front of the camera.
 
     Parameters
@@ -231,7 +237,9 @@ def project_jacobians(p_camera: ArrayLike, model: CameraModel) -> tuple[np.ndarr
     still = np.zeros(3)
     flat = p_camera.reshape(-1, 1, 3)
     J = cv2.projectPoints(flat, still, still, model.matrix, model.distortion)[1]
-    J = J.reshape(*shape, -1)  # by rotation (3), translation (3), focal lengths, centre, lens
+    J = J.reshape(
+        *shape, -1
+    )  # by rotation (3), translation (3), focal lengths, centre, lens
     return J[..., 3:6], J[..., 6:15]
 
 
@@ -253,7 +261,9 @@ def undistort(uv: ArrayLike, model: CameraModel) -> np.ndarray:
         return uv.copy()
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
     flat = np.ascontiguousarray(uv.reshape(-1, 1, 2))
-    out = cv2.undistortPoints(flat, model.matrix, model.distortion, None, None, model.matrix, stop)
+    out = cv2.undistortPoints(
+        flat, model.matrix, model.distortion, None, None, model.matrix, stop
+    )
     return out.reshape(uv.shape)
 
 

@@ -26,7 +26,11 @@ def point_set(
 
 
 def line_set(
-    positions: ArrayLike, point: ArrayLike, direction: np.ndarray, distance: float, tolerance: float
+    positions: ArrayLike,
+    point: ArrayLike,
+    direction: np.ndarray,
+    distance: float,
+    tolerance: float,
 ) -> np.ndarray:
     """Which positions a line with one hit point at a measured distance allows: a cylinder, figure
     3 (b).
@@ -43,12 +47,18 @@ def line_set(
     -------
     ndarray of bool, shape (...)
     """
-    away = np.linalg.norm(np.cross(np.asarray(positions, float) - point, direction), axis=-1)
+    away = np.linalg.norm(
+        np.cross(np.asarray(positions, float) - point, direction), axis=-1
+    )
     return away <= distance + tolerance
 
 
 def plane_set(
-    positions: ArrayLike, point: ArrayLike, normal: ArrayLike, distance: float, tolerance: float
+    positions: ArrayLike,
+    point: ArrayLike,
+    normal: ArrayLike,
+    distance: float,
+    tolerance: float,
 ) -> np.ndarray:
     """Which positions a plane with one hit point at a measured distance allows: a slab, figure
     3 (c).
@@ -79,7 +89,9 @@ def shell_volume(distance: float, tolerance: float) -> float:
     tolerance : float
         Half its thickness, metres.
     """
-    return 4 / 3 * np.pi * ((distance + tolerance) ** 3 - max(distance - tolerance, 0.0) ** 3)
+    return (
+        4 / 3 * np.pi * ((distance + tolerance) ** 3 - max(distance - tolerance, 0.0) ** 3)
+    )
 
 
 def crossing_volume(radius: float, angle: ArrayLike) -> np.ndarray:

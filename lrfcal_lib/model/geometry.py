@@ -69,7 +69,9 @@ def polar_to_points(ranges: ArrayLike, bearings: ArrayLike) -> np.ndarray:
     ndarray, shape (..., 3)
         ``p_lrf``, metres; NaN rows where the range is NaN.
     """
-    ranges, bearings = np.broadcast_arrays(np.asarray(ranges, float), np.asarray(bearings, float))
+    ranges, bearings = np.broadcast_arrays(
+        np.asarray(ranges, float), np.asarray(bearings, float)
+    )
     x = ranges * np.cos(bearings)
     y = ranges * np.sin(bearings)
     return np.stack([x, y, 0.0 * ranges], axis=-1)
@@ -125,7 +127,9 @@ def tilt(points: ArrayLike, pitch: ArrayLike) -> np.ndarray:
     return np.stack([x + 0 * cosine, cosine * y - sine * z, sine * y + cosine * z], axis=-1)
 
 
-def lrf_to_platform(p_lrf: ArrayLike, pitch: ArrayLike, T_head_lrf: RigidTransform) -> np.ndarray:
+def lrf_to_platform(
+    p_lrf: ArrayLike, pitch: ArrayLike, T_head_lrf: RigidTransform
+) -> np.ndarray:
     """Points of scans in the fixed platform frame, ``p_platform = Rx(pitch) (R p_lrf + t)``,
     equation (6).
 
@@ -429,7 +433,9 @@ def log_rotation(R: np.ndarray) -> np.ndarray:
     w = np.stack([x, y, z], axis=-1) * turn[..., None]
     near_half_turn = twice_cosine < -1.8  # the sine says little there
     if near_half_turn.any():
-        w[near_half_turn] = Rotation.from_matrix(R[near_half_turn], assume_valid=True).as_rotvec()
+        w[near_half_turn] = Rotation.from_matrix(
+            R[near_half_turn], assume_valid=True
+        ).as_rotvec()
     return w
 
 

@@ -10,7 +10,9 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
 LENS = 9  # intrinsics of a camera, see CameraModel.parameters
-ROUGH_NOISE = 1e-4 * np.eye(3)  # a centimetre every way, for points whose covariance is not told
+ROUGH_NOISE = 1e-4 * np.eye(
+    3
+)  # a centimetre every way, for points whose covariance is not told
 
 
 def thin(rows: np.ndarray, count: int) -> np.ndarray:

@@ -91,13 +91,20 @@ def rig_lines(
     size
         Of a frame's axes, metres.
     """
-    lines = {"tilt axis": (COLORS["platform"], np.outer([-4 * size, 4 * size], [1.0, 0.0, 0.0]))}
+    lines = {
+        "tilt axis": (COLORS["platform"], np.outer([-4 * size, 4 * size], [1.0, 0.0, 0.0]))
+    }
     frames = {"lrf": T_head_lrf} | {name: T.inv() for name, (T, _) in cameras.items()}
     for letter, axis, color in zip("xyz", np.eye(3), AXES_RGB, strict=True):
-        arrows = [np.vstack([T.apply([0 * axis, size * axis]), GAP]) for T in frames.values()]
+        arrows = [
+            np.vstack([T.apply([0 * axis, size * axis]), GAP]) for T in frames.values()
+        ]
         lines[f"{letter} of {', '.join(frames)}"] = (color, np.vstack(arrows))
     for name, (T, model) in cameras.items():
-        lines[f"view of {name}"] = (color_of(name), T.inv().apply(_frustum(model, 3 * size)))
+        lines[f"view of {name}"] = (
+            color_of(name),
+            T.inv().apply(_frustum(model, 3 * size)),
+        )
     if boards:
         outlines = [np.vstack([closed(corners), GAP]) for corners in boards.values()]
         lines["boards"] = (COLORS["fit"], np.vstack(outlines))

@@ -23,7 +23,16 @@ COLORS = {
     "outlier": "#cc2222",
     "platform": "#666666",
 }
-SERIES = ("#0072b2", "#d55e00", "#009e73", "#b5378a", "#e69f00", "#56b4e9", "#7a5c3e", "#222222")
+SERIES = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#b5378a",
+    "#e69f00",
+    "#56b4e9",
+    "#7a5c3e",
+    "#222222",
+)
 AXES_RGB = ("#d62728", "#2ca02c", "#1f5fd6")  # x, y, z of every frame
 PLANES = {"xz": (0, 2), "yz": (1, 2), "xy": (0, 1)}
 BESIDE = 14  # beams shown on either side of the end of a board
@@ -111,7 +120,9 @@ def _outlined(ax, bearing, height, mask):
         on = bearing[mask[0]]
         ax.plot(on, np.repeat(height, len(on)), ".", color="white", markersize=2)
     else:
-        ax.contour(bearing, height, mask.astype(float), levels=[0.5], colors="white", linewidths=1)
+        ax.contour(
+            bearing, height, mask.astype(float), levels=[0.5], colors="white", linewidths=1
+        )
 
 
 def scan_line(
@@ -189,7 +200,9 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
         markersize=3,
         label="filtered",
     )
-    ax.plot(bearing[board], fitted[board], color=COLORS["fit"], label="line fitted to the board")
+    ax.plot(
+        bearing[board], fitted[board], color=COLORS["fit"], label="line fitted to the board"
+    )
     for index, crossed in enumerate(edges):
         style = ("--", "-", ":")[index % 3]
         label = crossed.variant.replace("_", " ")
@@ -285,7 +298,9 @@ def picture(ax: Axes, image: np.ndarray) -> None:
     ax.set_axis_off()
 
 
-def board_view(ax: Axes, image: np.ndarray, view, model: CameraModel, margin: float = 60) -> None:
+def board_view(
+    ax: Axes, image: np.ndarray, view, model: CameraModel, margin: float = 60
+) -> None:
     """An image with what was found of the board in it, cut to the board.
 
     The title names edges that were not used.
@@ -305,9 +320,16 @@ def board_view(ax: Axes, image: np.ndarray, view, model: CameraModel, margin: fl
     color = color_of(view.camera)
     drawn = []
     if view.pixels is not None:
-        ax.plot(*view.pixels.T, "+", color=COLORS["filtered"], markersize=4, markeredgewidth=0.8)
+        ax.plot(
+            *view.pixels.T, "+", color=COLORS["filtered"], markersize=4, markeredgewidth=0.8
+        )
         drawn.append(view.pixels)
-    box = {"facecolor": color, "edgecolor": "none", "boxstyle": "round,pad=0.2", "alpha": 0.85}
+    box = {
+        "facecolor": color,
+        "edgecolor": "none",
+        "boxstyle": "round,pad=0.2",
+        "alpha": 0.85,
+    }
     for edge in view.edges:
         stretch = stretch_in_image(edge, model)
         middle = stretch.mean(axis=0)

@@ -22,7 +22,9 @@ WORST = 4.0  # times the median: a placement that fits so badly is an outlier
 
 def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
     """Ticks and labels of an axis of placements; the zero of what is drawn over them."""
-    ax.set(xlabel="placement", ylabel=label, xticks=np.arange(len(names)), xticklabels=names)
+    ax.set(
+        xlabel="placement", ylabel=label, xticks=np.arange(len(names)), xticklabels=names
+    )
     ax.grid(False, axis="x")
     _zero(ax.axhline)
 
@@ -70,7 +72,11 @@ def residual_strips(
 
 
 def pitch_offsets(
-    ax: Axes, placement: Sequence[int], offset: ArrayLike, sigma: ArrayLike, direction: ArrayLike
+    ax: Axes,
+    placement: Sequence[int],
+    offset: ArrayLike,
+    sigma: ArrayLike,
+    direction: ArrayLike,
 ) -> None:
     """Pitch offset of each sweep, coloured by direction.
 
@@ -86,7 +92,11 @@ def pitch_offsets(
     """
     offset = np.degrees(offset)
     sigma = np.degrees(sigma)
-    kinds = {1: (SERIES[0], "upwards"), -1: (SERIES[1], "downwards"), 0: (COLORS["raw"], "unknown")}
+    kinds = {
+        1: (SERIES[0], "upwards"),
+        -1: (SERIES[1], "downwards"),
+        0: (COLORS["raw"], "unknown"),
+    }
     for sign, (color, label) in kinds.items():
         rows = np.flatnonzero(np.equal(direction, sign))
         if rows.size:
@@ -118,7 +128,9 @@ def parameter_comparison(
     for row, (method, value) in enumerate(values.items()):
         sigma = sigmas[method] if np.isfinite(sigmas[method]) else None
         color = series(row)
-        ax.errorbar(value, row, xerr=sigma, fmt="o", color=color, capsize=2.5, markersize=4.5)
+        ax.errorbar(
+            value, row, xerr=sigma, fmt="o", color=color, capsize=2.5, markersize=4.5
+        )
     rows_of(ax, values)
     ax.set_xlabel(label)
 
@@ -164,7 +176,9 @@ def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
     height = 0.8 / len(cameras)
     for i, camera in enumerate(cameras):
         part = values.loc[methods, camera]
-        ax.barh(rows + i * height, part, 0.95 * height, label=camera, color=color_of(camera, i))
+        ax.barh(
+            rows + i * height, part, 0.95 * height, label=camera, color=color_of(camera, i)
+        )
     middle = height * (len(cameras) - 1) / 2
     ax.set(yticks=rows + middle, yticklabels=methods, xlabel=label)
     ax.set_ylim(len(methods) - 0.5 * height, -height)
@@ -264,7 +278,9 @@ def residuals_by_region(
             color=color_of(name),
         )
         unit = float(f"{longest / 2:.1g}")
-        ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S", coordinates="axes")
+        ax.quiverkey(
+            drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S", coordinates="axes"
+        )
         title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
     ax.set(xlim=(0, model.width), ylim=(model.height, 0), aspect="equal")
     ax.set(xlabel="u [px]", ylabel="v [px]", title=title)

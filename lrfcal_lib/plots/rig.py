@@ -17,7 +17,9 @@ Vector = Sequence[float] | np.ndarray
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
-def frames(ax: Axes3D, transforms: Mapping[str, RigidTransform], length: float = 0.1) -> None:
+def frames(
+    ax: Axes3D, transforms: Mapping[str, RigidTransform], length: float = 0.1
+) -> None:
     """Coordinate frames in space: x red, y green, z blue.
 
     Parameters
@@ -46,7 +48,9 @@ def polygon(ax: Axes3D, corners: np.ndarray, color: str = COLORS["truth"]) -> No
         Shape (n, 3), metres.
     color
     """
-    ax.add_collection3d(Poly3DCollection([corners], facecolors=color, edgecolors=color, alpha=0.15))
+    ax.add_collection3d(
+        Poly3DCollection([corners], facecolors=color, edgecolors=color, alpha=0.15)
+    )
     ax.plot(*closed(corners).T, color=color, linewidth=1.2)
 
 
@@ -215,13 +219,17 @@ def render(
         v, u = (uv + [du - splat, dv - splat]).T[::-1]
         inside = np.flatnonzero((u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0]))
         layer = np.full(size, -1)
-        layer[v[inside], u[inside]] = inside  # of equal pixels the last one, the nearest, stays
+        layer[v[inside], u[inside]] = (
+            inside  # of equal pixels the last one, the nearest, stays
+        )
         winner = np.maximum(winner, layer)
     white = np.full((1, 3), 255, np.uint8)
     return np.vstack([colors[order], white])[winner]  # the last row where no point is
 
 
-def pixels(seen: np.ndarray, size: tuple[int, int], focal: float | None = None) -> np.ndarray:
+def pixels(
+    seen: np.ndarray, size: tuple[int, int], focal: float | None = None
+) -> np.ndarray:
     """Where points stand in a picture of :func:`render`.
 
     Parameters

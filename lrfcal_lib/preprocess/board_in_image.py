@@ -240,7 +240,9 @@ def mirrored_pose(pose: RigidTransform, pattern: Chessboard) -> RigidTransform:
     at = pose.apply(middle)
     sight = at / np.linalg.norm(at)
     mirror = np.eye(3) - 2 * np.outer(sight, sight)
-    rotation = Rotation.from_matrix(mirror @ pose.rotation.as_matrix() @ np.diag([1.0, 1.0, -1.0]))
+    rotation = Rotation.from_matrix(
+        mirror @ pose.rotation.as_matrix() @ np.diag([1.0, 1.0, -1.0])
+    )
     return RigidTransform.from_components(at - rotation.apply(middle), rotation)
 
 
@@ -270,7 +272,9 @@ def _view_pattern(view, image, board, model, picks, lines, relief):
         reach = np.clip(scale * WINDOW, LEAST_REACH_PX, MOST_REACH_PX)
         prior = max(scale * PREDICTION_SIGMA, 1.0)
         try:
-            edges.append(refine_edge(image, model, name, uv[0], uv[1], uv[2] - inner, reach, prior))
+            edges.append(
+                refine_edge(image, model, name, uv[0], uv[1], uv[2] - inner, reach, prior)
+            )
         except EdgeNotSeen as error:
             rejected.append((name, str(error)))
     return replace(view, edges=tuple(edges), rejected=tuple(rejected))
@@ -290,7 +294,9 @@ def _view_plain(view, image, board, model, picks):
         agree = True
         for edge in found.edges:
             if edge.name in ends:
-                agree &= np.abs(line_distance(ends[edge.name], edge.line)).max() < SAME_NAMES_PX
+                agree &= (
+                    np.abs(line_distance(ends[edge.name], edge.line)).max() < SAME_NAMES_PX
+                )
                 edge = picked_edge(edge.name, ends[edge.name], inner)
             edges.append(edge)
         if agree:
@@ -316,5 +322,7 @@ def _sides(image, board, model, ends):
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         inset = OUTLINE_INSET * (b - a)
         outward = (a + b) / 2 - middle
-        sides.append(refine_edge(image, model, "", a + inset, b - inset, outward, SEARCH_PX))
+        sides.append(
+            refine_edge(image, model, "", a + inset, b - inset, outward, SEARCH_PX)
+        )
     return sides

@@ -145,7 +145,9 @@ def find_board(
     )
 
 
-def median_filter(ranges: np.ndarray, mask: np.ndarray, width: int = MEDIAN_WIDTH) -> np.ndarray:
+def median_filter(
+    ranges: np.ndarray, mask: np.ndarray, width: int = MEDIAN_WIDTH
+) -> np.ndarray:
     """Running median along the scan lines; step (ii) of the paper's preprocessing.
 
     Near an end or a hole only the beams that exist count.
@@ -280,7 +282,9 @@ def count_jump_points(scan: BoardScan) -> tuple[int, int]:
     """
     jumps = jump_points(scan.sweep.ranges, scan.fitted, scan.sigma_range)
     filtered = median_filter(scan.sweep.ranges, scan.mask | jumps)
-    return scan.n_jump_points, int(jump_points(filtered, scan.fitted, scan.sigma_range).sum())
+    return scan.n_jump_points, int(
+        jump_points(filtered, scan.fitted, scan.sigma_range).sum()
+    )
 
 
 def face_points(

@@ -49,7 +49,9 @@ class Bundle:
     def ends(self) -> np.ndarray:
         """Where the unknowns of each kind end, in the order of the attributes: (4,)."""
         mounts = POSE * (len(self.mounting) - 1)
-        return np.cumsum([self.lenses.size, mounts, POSE * len(self.poses), len(self.shape)])
+        return np.cumsum(
+            [self.lenses.size, mounts, POSE * len(self.poses), len(self.shape)]
+        )
 
     def moved(self, step: np.ndarray) -> "Bundle":
         """After a step (n,) of all unknowns; poses move by ``[w, v]``."""
@@ -62,7 +64,9 @@ class Bundle:
             shape=self.shape + shape,
         )
 
-    def predict(self, points: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def predict(
+        self, points: np.ndarray, basis: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Pixels of the corners of a sheet, and their derivatives by all unknowns.
 
         Parameters
@@ -99,7 +103,9 @@ class Bundle:
             J[..., LENS * i : LENS * (i + 1)] = by_lens
             if i > 0:
                 start = lens_end + POSE * (i - 1)
-                J[..., start : start + POSE] = gradient_by_pose(mounted[..., None, :], by_point)
+                J[..., start : start + POSE] = gradient_by_pose(
+                    mounted[..., None, :], by_point
+                )
             for view in range(len(self.poses)):
                 start = mount_end + POSE * view
                 J[view, ..., start : start + POSE] = by_pose[view]
@@ -256,11 +262,15 @@ def adjust_robust(pixels, points, models, poses, mounting=None, **options) -> Ad
         distance = np.linalg.norm(misses, axis=-1)
         sigma = max(np.nanmedian(distance) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX)
         before = used
-        used = np.broadcast_to((distance <= OUTLIER_SIGMAS * sigma)[..., None], pixels.shape)
+        used = np.broadcast_to(
+            (distance <= OUTLIER_SIGMAS * sigma)[..., None], pixels.shape
+        )
         if np.array_equal(used, before):
             break
         kept = np.where(used, pixels, np.nan)
-        result = adjust(kept, points, result.models, result.poses, result.mounting, **options)
+        result = adjust(
+            kept, points, result.models, result.poses, result.mounting, **options
+        )
     return result
 
 
@@ -305,7 +315,9 @@ def _adjustment(bundle, block, visible, free, models, basis):
     residuals = np.where(visible, -block.residuals.reshape(visible.shape), np.nan)
     adjusted = []
     spreads = blocks(0, lens_end, LENS)
-    for model, lens, spread, misses in zip(models, bundle.lenses, spreads, residuals, strict=True):
+    for model, lens, spread, misses in zip(
+        models, bundle.lenses, spreads, residuals, strict=True
+    ):
         rms = float(np.sqrt(2 * np.nanmean(misses**2)))  # of distances, as OpenCV counts it
         adjusted.append(model.with_parameters(lens, spread, rms))
     penalty = free.sum() * np.log(count)

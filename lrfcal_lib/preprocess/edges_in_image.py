@@ -288,7 +288,9 @@ def _line_in_strip(strip, visible, across, half_width, prior_px):
     fit = _fit_line(column, place, at - slope * (count - 1) / 2, slope)
     support = len(np.unique(fit.columns)) / visible
     if support < LEAST_SUPPORT or len(fit.columns) < LEAST_PROFILES:
-        raise EdgeNotSeen(f"no clear edge: {100 * support:.0f}% of the profiles agree on a line")
+        raise EdgeNotSeen(
+            f"no clear edge: {100 * support:.0f}% of the profiles agree on a line"
+        )
     return fit
 
 

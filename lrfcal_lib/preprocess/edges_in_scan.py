@@ -177,7 +177,9 @@ def crossings(
     warp_sigma = 0.0
     if not across:
         shift, warp_sigma = _warp(scan, ends)
-    elif len(scan.sweep.pitch) > 1:  # the pitch is read in steps, it may seem to stand still
+    elif (
+        len(scan.sweep.pitch) > 1
+    ):  # the pitch is read in steps, it may seem to stand still
         gap = np.copysign(np.maximum(np.abs(gap), median_step(scan.sweep.pitch)), gap)
 
     def at(angle):

@@ -53,7 +53,9 @@ def estimate_intrinsics(
         stays unobservable).
     """
     if len(pixels) < FEWEST_VIEWS:
-        raise ValueError(f"intrinsics need at least three views of the pattern, got {len(pixels)}")
+        raise ValueError(
+            f"intrinsics need at least three views of the pattern, got {len(pixels)}"
+        )
     points = pattern.points()
     views = np.asarray(pixels, float)
     model, poses = _rough(views, points, size)
@@ -89,14 +91,20 @@ def estimate_relief(pixels, pattern: Chessboard, model: CameraModel) -> Adjustme
     -------
     Adjustment
     """
-    poses = RigidTransform.concatenate([board_pose(view, pattern, model)[0] for view in pixels])
+    poses = RigidTransform.concatenate(
+        [board_pose(view, pattern, model)[0] for view in pixels]
+    )
     corners = np.asarray(pixels, float)[None]
     points = pattern.points()
-    wavy = adjust_robust(corners, points, [model], poses, basis=waves(points), intrinsics=False)
+    wavy = adjust_robust(
+        corners, points, [model], poses, basis=waves(points), intrinsics=False
+    )
     return better(wavy, corners, points, intrinsics=False)
 
 
-def first_pose(points: np.ndarray, pixels: np.ndarray, model: CameraModel) -> RigidTransform:
+def first_pose(
+    points: np.ndarray, pixels: np.ndarray, model: CameraModel
+) -> RigidTransform:
     """Pose by OpenCV's solver, good enough to start from.
 
     Parameters
@@ -188,7 +196,9 @@ def board_pose(
     pose = result.poses[0]
     factor = max(1.0, SIGMA_FLOOR_PX / result.sigma_px) ** 2
     factor *= _alike_factor(residuals.reshape(pattern.rows, pattern.columns, 2))
-    covariance = result.pose_covariance[0] * factor + scale_covariance(pose, pixels, pattern)
+    covariance = result.pose_covariance[0] * factor + scale_covariance(
+        pose, pixels, pattern
+    )
     return pose, covariance, np.isfinite(residuals).all(axis=1)
 
 

@@ -8,7 +8,9 @@ from lrfcal_lib.preprocess.outline_in_images import FARTHEST
 from lrfcal_lib.preprocess.pattern_in_image import square_axes
 
 ALONG = 1.0  # beyond the farthest distance at which edges are looked for, squares
-NEARER = 2.0  # times as large as the largest square of the pattern: what is nearer to the camera
+NEARER = (
+    2.0  # times as large as the largest square of the pattern: what is nearer to the camera
+)
 ROOM_PX = 60  # edges are looked for 40 px beside their prediction
 
 
@@ -27,7 +29,9 @@ class Part:
     def image(self) -> np.ndarray:
         """The image, black where nothing of the board can be."""
         height, width = self.pixels.shape[:2]
-        image = np.zeros(self.shape, np.uint8)  # the system gives memory where it is written to
+        image = np.zeros(
+            self.shape, np.uint8
+        )  # the system gives memory where it is written to
         image[self.top : self.top + height, self.left : self.left + width] = self.pixels
         return image
 

@@ -103,7 +103,9 @@ def edge_votes(
     shares = []
     for normal in SIDE_NORMALS:
         along = np.abs(normal[::-1])
-        s = np.arange(-pattern.square, size @ along + pattern.square, APART * STEP * pattern.square)
+        s = np.arange(
+            -pattern.square, size @ along + pattern.square, APART * STEP * pattern.square
+        )
         corner = np.asarray(pattern.origin) + np.maximum(normal, 0) * size
         xy = corner + s[None, :, None] * along + distances[:, None, None] * normal
         strip = sample(image, model, on_board(xy, pose, model))
@@ -233,7 +235,9 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     lines_of_views = []
     for view in usable:
         model = models[view.camera]
-        lines_of_views.append({edge.name: board_line(view, edge, model) for edge in view.edges})
+        lines_of_views.append(
+            {edge.name: board_line(view, edge, model) for edge in view.edges}
+        )
     lines = [
         np.array([of_view[name] for of_view in lines_of_views if name in of_view])
         for name in board.edges

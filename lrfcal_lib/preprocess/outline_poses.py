@@ -158,6 +158,10 @@ def _starts(flat, corners, model):
     if len(flat) == 3:
         solved = cv2.solveP3P(flat, corners, model.matrix, None, cv2.SOLVEPNP_P3P)
     else:
-        solved = cv2.solvePnPGeneric(flat, corners, model.matrix, None, flags=cv2.SOLVEPNP_IPPE)
+        solved = cv2.solvePnPGeneric(
+            flat, corners, model.matrix, None, flags=cv2.SOLVEPNP_IPPE
+        )
     for turn, shift in zip(solved[1], solved[2], strict=True):
-        yield RigidTransform.from_components(shift.ravel(), Rotation.from_rotvec(turn.ravel()))
+        yield RigidTransform.from_components(
+            shift.ravel(), Rotation.from_rotvec(turn.ravel())
+        )

@@ -326,7 +326,9 @@ def symmetric_points(picture, points, size, reach, look):
 def interpolated(picture, places, order=1):
     """A picture, or its splines of an order, at places (..., 2), pixels."""
     rows_first = np.moveaxis(places, -1, 0)[::-1]
-    return map_coordinates(picture, rows_first, order=order, prefilter=False, mode="nearest")
+    return map_coordinates(
+        picture, rows_first, order=order, prefilter=False, mode="nearest"
+    )
 
 
 def square_axes(corners, size):

@@ -160,7 +160,9 @@ class Prepared:
         """
         view = self.views[camera][placement]
         records = self.session.images(camera, placement=placement)
-        return view, self.session.read_image(next(r for r in records if r.file.name == view.file))
+        return view, self.session.read_image(
+            next(r for r in records if r.file.name == view.file)
+        )
 
 
 @cached
@@ -200,7 +202,9 @@ def _crossed(session, placement):
         sweep = session.sweep(placement)
         scan = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
     except SessionError:
-        return Problem(Stage.SCANS, ProblemKind.NO_BOARD, "no range in any scan line", placement)
+        return Problem(
+            Stage.SCANS, ProblemKind.NO_BOARD, "no range in any scan line", placement
+        )
     except BoardNotFound as error:
         return Problem(Stage.SCANS, ProblemKind.NO_BOARD, str(error), placement)
     along, sides = crossings(scan)
@@ -239,7 +243,9 @@ def prepare_images(prepared: Prepared) -> Prepared:
         words = f"faces of the board only: {surveyed.unseen}"
         problems.append(Problem(Stage.IMAGES, ProblemKind.NO_OUTLINE, words))
     for camera, words in small_squares(views, surveyed.board.pattern).items():
-        problems.append(Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera))
+        problems.append(
+            Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera)
+        )
     return replace(
         prepared,
         models=surveyed.models,

@@ -4,7 +4,9 @@ import numpy as np
 
 FEWEST_POINTS = 5  # of a run
 MOST_RUNS = 4  # on one hand of a board
-LEAST_TURN = np.radians(8)  # between neighbouring sides that end scan lines on the same hand
+LEAST_TURN = np.radians(
+    8
+)  # between neighbouring sides that end scan lines on the same hand
 LONGEST_GAP = 5  # steps, or a tenth of the run
 TRIALS = 300
 REFINE_ROUNDS = 2

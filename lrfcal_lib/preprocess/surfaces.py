@@ -21,7 +21,9 @@ STEEPEST = np.tan(np.radians(80))
 # metres; what noise and dark print change between neighbouring beams of one face
 DEPTH_NOISE = 0.03
 PLANE_NOISE = 0.02  # metres; noise and warp of a board about its plane
-LONGEST_HOLE = 0.15  # metres; a gap without returns that does not end a surface (print, gloss)
+LONGEST_HOLE = (
+    0.15  # metres; a gap without returns that does not end a surface (print, gloss)
+)
 # metres; the farthest from its plane that a return of a noisy device still counts
 LARGEST_NOISE = 0.04
 SAME_PITCH = 1e-4  # radians: scan lines at one pitch
@@ -179,7 +181,9 @@ def planar_surface(
                 fits = LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest
                 fault = ""
             if not fits or fault:
-                rejected.append(f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m{fault}")
+                rejected.append(
+                    f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m{fault}"
+                )
             elif reach < best_reach:
                 best = part
                 best_reach = reach

@@ -117,7 +117,11 @@ def views_of(session: Session, *, one_per_placement: bool = False) -> Survey:
     Survey
     """
     return survey(
-        [record for record in session.images() if record.purpose in ("board", "intrinsics")],
+        [
+            record
+            for record in session.images()
+            if record.purpose in ("board", "intrinsics")
+        ],
         session.read_image,
         session.board,
         {name: info.model for name, info in session.cameras.items()},
@@ -126,7 +130,9 @@ def views_of(session: Session, *, one_per_placement: bool = False) -> Survey:
     )
 
 
-def survey(records, read, board: Board, models, picks=(), *, one_per_placement=False) -> Survey:
+def survey(
+    records, read, board: Board, models, picks=(), *, one_per_placement=False
+) -> Survey:
     """Find the board in all images of several cameras.
 
     Parameters
@@ -162,7 +168,9 @@ def survey(records, read, board: Board, models, picks=(), *, one_per_placement=F
         return _survey_plain(groups, look, board, models)
 
     shots = _find_corners(groups, read, board)
-    flat = spread(lambda camera: models[camera] or _intrinsics(camera, shots, board, read), models)
+    flat = spread(
+        lambda camera: models[camera] or _intrinsics(camera, shots, board, read), models
+    )
     rough = dict(zip(models, flat, strict=True))
     ordered = _ordered(shots, read, board, rough)
     refined, relief = _with_relief(ordered.shots, board, models, rough)
@@ -259,7 +267,11 @@ def small_squares(views, pattern) -> dict[str, str]:
         return words
     size = (pattern.columns, pattern.rows)
     for camera, of_camera in views.items():
-        sides = {p: square_px(v.pixels, size) for p, v in of_camera.items() if v.pixels is not None}
+        sides = {
+            p: square_px(v.pixels, size)
+            for p, v in of_camera.items()
+            if v.pixels is not None
+        }
         small = {p: side for p, side in sides.items() if side < SMALL_SQUARE_PX}
         if not small:
             continue
@@ -282,13 +294,17 @@ def _marks(picks, board):
                 f"{pick.file}: picked edge '{pick.edge}' is not one of the board's edges "
                 f"{board.edges}"
             )
-        marks.setdefault((pick.camera, pick.file), {})[pick.edge] = np.asarray(pick.ends, float)
+        marks.setdefault((pick.camera, pick.file), {})[pick.edge] = np.asarray(
+            pick.ends, float
+        )
     return marks
 
 
 def _view(record):
     """The view of an image in which nothing was looked for yet."""
-    return BoardView(record.camera, PurePath(record.file).name, record.placement, record.pitch)
+    return BoardView(
+        record.camera, PurePath(record.file).name, record.placement, record.pitch
+    )
 
 
 def _look(shot, models, *, read, board, marks, lines=None, relief=None):
@@ -307,7 +323,9 @@ def _look(shot, models, *, read, board, marks, lines=None, relief=None):
 
 def _views(shots, look, **options):
     """The views of shots, those that show the corners of the pattern with pose and edges."""
-    return spread(lambda shot: shot.view if shot.view.reason else look(shot, **options), shots)
+    return spread(
+        lambda shot: shot.view if shot.view.reason else look(shot, **options), shots
+    )
 
 
 def _corners(view, image, finder):
@@ -325,8 +343,12 @@ def _by_camera(cameras, views):
 def _choices(records, camera, one_per_placement):
     """Records of one camera, in lists of those of which one is to be used, the best first."""
     groups = {}
-    for number, record in enumerate(record for record in records if record.camera == camera):
-        alone = not one_per_placement or record.placement < 0 or record.purpose == "intrinsics"
+    for number, record in enumerate(
+        record for record in records if record.camera == camera
+    ):
+        alone = (
+            not one_per_placement or record.placement < 0 or record.purpose == "intrinsics"
+        )
         key = (number, None) if alone else (None, record.placement)
         groups.setdefault(key, []).append(record)
     for group in groups.values():
@@ -378,7 +400,9 @@ def _find_corners(groups, read, board):
         part = part_around(image, view.pixels, board)
         return Shot(record, view, part if part.pixels.nbytes <= room else None)
 
-    shots = [_first(group, begin) for group in groups[:1]]  # tells the finder what to look for
+    shots = [
+        _first(group, begin) for group in groups[:1]
+    ]  # tells the finder what to look for
     return shots + spread(lambda group: _first(group, begin), groups[1:])
 
 
@@ -397,7 +421,9 @@ def _for_intrinsics(shots, camera):
     if not meant:
         return others
     meant = [meant[i] for i in spread_views(meant, VIEWS_FOR_INTRINSICS)]
-    return meant + [others[i] for i in spread_views(others, VIEWS_FOR_INTRINSICS - len(meant))]
+    return meant + [
+        others[i] for i in spread_views(others, VIEWS_FOR_INTRINSICS - len(meant))
+    ]
 
 
 def _intrinsics(camera, shots, board, read):
@@ -408,7 +434,9 @@ def _intrinsics(camera, shots, board, read):
             size = read(shot.record).shape[1::-1]
             break
     try:
-        return estimate_intrinsics(_for_intrinsics(shots, camera), board.pattern, size).models[0]
+        return estimate_intrinsics(
+            _for_intrinsics(shots, camera), board.pattern, size
+        ).models[0]
     except ValueError as error:
         raise DegenerateGeometry(f"camera '{camera}': {error}") from error
 
@@ -556,5 +584,7 @@ def _turned_alike(views):
         stacks.append(poses.rotation)
     placements = [view.placement for view in posed]
     together = alike(stacks, placements, [view.camera for view in posed])
-    chosen = iter([same[order[0]] for same, order in zip(turned, together.order, strict=True)])
+    chosen = iter(
+        [same[order[0]] for same, order in zip(turned, together.order, strict=True)]
+    )
     return [view if view.T_camera_board is None else next(chosen) for view in views]

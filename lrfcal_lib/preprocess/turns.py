@@ -80,7 +80,9 @@ def alike(rotations, placements, cameras) -> Alike:
         leader[i] = i if alone else leaders.setdefault(placement, i)
     turn_of_camera = {}
     for camera in dict.fromkeys(cameras):
-        turn_of_camera[camera] = _between(rotations, placements, cameras, cameras[0], camera)
+        turn_of_camera[camera] = _between(
+            rotations, placements, cameras, cameras[0], camera
+        )
     order = []
     for i, j in enumerate(leader):
         turn = turn_of_camera[cameras[i]] * turn_of_camera[cameras[j]].inv()

@@ -52,7 +52,10 @@ def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
         print(*judge(calibration).sentences(), sep="\n")
         return UNTRUSTED
     folder = Path(out or Path("reports") / Path(path).resolve().name)
-    tasks = [*cloud_tasks(folder, calibration, method), partial(_judged, calibration, method)]
+    tasks = [
+        *cloud_tasks(folder, calibration, method),
+        partial(_judged, calibration, method),
+    ]
     *written, (judged, record) = spread(operator.call, tasks)
     file = folder / "calibration.json"
     write_calibration(file, record)  # last: where it stands, the clouds do

@@ -57,7 +57,9 @@ def set_up() -> None:
     # the same pixels must give the same bytes: no version of matplotlib in the PNG
     if get_ipython() is not None:
         kwargs = {"bbox_inches": None, "metadata": {"Software": None}}
-        get_ipython().run_line_magic("config", f"InlineBackend.print_figure_kwargs = {kwargs}")
+        get_ipython().run_line_magic(
+            "config", f"InlineBackend.print_figure_kwargs = {kwargs}"
+        )
         while _only_start in get_ipython().input_transformers_cleanup:
             get_ipython().input_transformers_cleanup.remove(_only_start)
     for kind in _found.values():
@@ -111,12 +113,16 @@ def save(fig: Figure, name: str, caption: str, *, main: bool = True) -> None:
             display(fig)
     if get_ipython() is not None:
         display(
-            HTML(f'<p id="figure-{name}" style="color:#555;max-width:48em">{escape(caption)}</p>')
+            HTML(
+                f'<p id="figure-{name}" style="color:#555;max-width:48em">{escape(caption)}</p>'
+            )
         )
     plt.close(fig)
 
 
-def table(df: pd.DataFrame, name: str, digits: int | dict[str, int] = 3, caption: str = "") -> HTML:
+def table(
+    df: pd.DataFrame, name: str, digits: int | dict[str, int] = 3, caption: str = ""
+) -> HTML:
     """A table to show, its columns and methods in words, kept as ``tables/<name>.csv`` in a report
     run.
 
@@ -138,7 +144,9 @@ def table(df: pd.DataFrame, name: str, digits: int | dict[str, int] = 3, caption
     """
     places = digits if isinstance(digits, dict) else dict.fromkeys(df.columns, digits)
     # none shows a minus before a zero
-    shapes = {c: f"{{:z.{places.get(c, 3)}f}}" for c in df.columns if df[c].dtype.kind == "f"}
+    shapes = {
+        c: f"{{:z.{places.get(c, 3)}f}}" for c in df.columns if df[c].dtype.kind == "f"
+    }
     shapes |= {c: "{:.2g}" for c in shapes if c == "p_value"}  # a small chance is not none
     if path := report_file(f"tables/{name}.csv"):
         df.to_csv(path, index=False, float_format="%.9g")
@@ -146,7 +154,8 @@ def table(df: pd.DataFrame, name: str, digits: int | dict[str, int] = 3, caption
     for column in shown.columns[[kind.kind not in "biuf" for kind in shown.dtypes]]:
         words = str if column == "source" else in_words  # a session is called as it is
         shown[column] = [
-            v if v is None or isinstance(v, Number) else escape(words(v)) for v in shown[column]
+            v if v is None or isinstance(v, Number) else escape(words(v))
+            for v in shown[column]
         ]
     styler = shown.style.format(shapes, na_rep="–").format_index(
         lambda c: escape(in_words(c, True)), axis=1
@@ -187,7 +196,13 @@ def in_words(text: object, column: bool = False) -> Any:
 
 
 def finding(
-    key: str, value: float | str, text: str, unit: str = "", digits: int = 3, *, main: bool = True
+    key: str,
+    value: float | str,
+    text: str,
+    unit: str = "",
+    digits: int = 3,
+    *,
+    main: bool = True,
 ) -> None:
     """Print a key result, and put it in ``findings.json`` and on the first page of the report.
 
@@ -214,7 +229,14 @@ def finding(
     elif isinstance(known, float):
         shown = f"{known:z.{digits}f}"
     shown = f"{shown} {unit}".strip()
-    entry = {"key": key, "value": known, "unit": unit, "text": text, "shown": shown, "main": main}
+    entry = {
+        "key": key,
+        "value": known,
+        "unit": unit,
+        "text": text,
+        "shown": shown,
+        "main": main,
+    }
     _record("findings", key, entry)
     print(f"{text}: {shown}")
 
@@ -231,8 +253,12 @@ def verdict(title: str, sentences: Sequence[str], record: dict | None = None) ->
         Of a :class:`lrfcal_lib.judge.verdict.Verdict`: its answer and expected errors stand in
         front.
     """
-    sentences = [f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences]
-    _record("verdicts", "verdict", {"title": title, "sentences": sentences, "record": record})
+    sentences = [
+        f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences
+    ]
+    _record(
+        "verdicts", "verdict", {"title": title, "sentences": sentences, "record": record}
+    )
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 

@@ -66,7 +66,9 @@ def formula(latex: str, display: bool = False) -> str:
         parts[-1] += ElementTree.tostring(node, "unicode")
         if node.tag == "mspace" and float(node.get("width").removesuffix("em")) >= 1:
             parts.append("")
-    return " ".join(f'<math displaystyle="true"><mrow>{part}</mrow></math>' for part in parts)
+    return " ".join(
+        f'<math displaystyle="true"><mrow>{part}</mrow></math>' for part in parts
+    )
 
 
 def render(
@@ -90,14 +92,17 @@ def render(
         for n, entry in enumerate(found["figures"], start=1)
     }
     tables = {
-        e["name"]: _table(e, f"Table {number}.{n}") for n, e in enumerate(found["tables"], start=1)
+        e["name"]: _table(e, f"Table {number}.{n}")
+        for n, e in enumerate(found["tables"], start=1)
     }
     body = []
     color = Highlight2HTML(pygments_lexer="ipython3")
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             renderer = Renderer(
-                escape=False, attachments=cell.get("attachments", {}), exclude_anchor_links=True
+                escape=False,
+                attachments=cell.get("attachments", {}),
+                exclude_anchor_links=True,
             )
             text = turned(MarkdownWithMath(renderer=renderer).render(cell.source))
             body.append(re.sub(r'(href="\d\d_\w+)\.ipynb"', r'\1.html"', text))

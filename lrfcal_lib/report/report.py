@@ -36,7 +36,15 @@ from lrfcal_lib.session.write import RECORDINGS
 
 NOTEBOOKS = ROOT / "notebooks"
 NUMBERED = "[0-9][0-9]_*.ipynb"
-PACKAGES = ("lrfcal", "numpy", "scipy", "opencv-python-headless", "open3d", "pandas", "matplotlib")
+PACKAGES = (
+    "lrfcal",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "open3d",
+    "pandas",
+    "matplotlib",
+)
 OWN_FILES = (  # folders, files to link to, the page itself
     "figures",
     "tables",
@@ -53,7 +61,12 @@ OWN_FILES = (  # folders, files to link to, the page itself
 BESIDE = ("Expected error", "In the image of")
 AT_WORKING_FOLDER = -100  # AT_FDCWD, see renameat2(2)
 EXCHANGE = 2  # RENAME_EXCHANGE of Linux
-PICTURES = ("scene", "cloud", "clouds_of_boards", "frames")  # of the first screen, the best first
+PICTURES = (
+    "scene",
+    "cloud",
+    "clouds_of_boards",
+    "frames",
+)  # of the first screen, the best first
 PART = ".report-"  # begins the names of folders in which a report is being written
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
@@ -116,19 +129,27 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     paths = sorted(NOTEBOOKS.glob(NUMBERED) if notebooks is None else map(Path, notebooks))
     # a fresh cache: a report stands for its session
     with in_place_of(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:
-        environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
+        environment = {
+            "LRFCAL_SESSION": str(session_path),
+            "LRFCAL_REPORT": str(new),
+            CACHE: cache,
+        }
         # what notebook 09 records with the emulated rig goes with the report's cache
         environment[RECORDINGS] = cache
         runs = _execute_all(paths, environment, jobs)
         found = {
-            run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs
+            run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []}
+            for run in runs
         }
         found |= {
-            part.stem: json.loads(part.read_text()) for part in (new / "parts").glob("*.json")
+            part.stem: json.loads(part.read_text())
+            for part in (new / "parts").glob("*.json")
         }
         shutil.rmtree(new / "parts")
         findings = [
-            {"notebook": run.name, **entry} for run in runs for entry in found[run.name]["findings"]
+            {"notebook": run.name, **entry}
+            for run in runs
+            for entry in found[run.name]["findings"]
         ]
         (new / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
         write_pages(new, session, runs, found, time.monotonic() - begin)
@@ -152,7 +173,9 @@ def execute(path, environment):
     client = NotebookClient(notebook, timeout=CELL_SECONDS, resources=place, **options)
     _CLIENTS.add(client)
     try:
-        client.execute(env={**os.environ, "MPLBACKEND": "", **environment})  # that of notebooks
+        client.execute(
+            env={**os.environ, "MPLBACKEND": "", **environment}
+        )  # that of notebooks
     except (CellExecutionError, CellTimeoutError, DeadKernelError) as problem:
         # no colours of a terminal
         error = re.sub(r"\x1b\[[0-9;]*m", "", str(problem)) or type(problem).__name__
@@ -175,7 +198,9 @@ def store(path, session_path, cache=""):
     """
     environment = {} if session_path is None else {"LRFCAL_SESSION": str(session_path)}
     with TemporaryDirectory(prefix="lrfcal-") as recordings:
-        notebook, error = execute(path, environment | {CACHE: cache, RECORDINGS: recordings})
+        notebook, error = execute(
+            path, environment | {CACHE: cache, RECORDINGS: recordings}
+        )
     if error:
         return error
     codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -185,7 +210,11 @@ def store(path, session_path, cache=""):
     ):
         for cell in codes:
             cell.outputs = []
-    kernel = {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"}
+    kernel = {
+        "display_name": "Python 3 (ipykernel)",
+        "language": "python",
+        "name": "python3",
+    }
     notebook.metadata = nbformat.from_dict(
         {"kernelspec": kernel, "language_info": {"name": "python"}}
     )
@@ -200,11 +229,16 @@ def main(sessions=(), out=None, jobs=2, stored=False):
     0, 1 if a notebook failed, 2 without a sound session, 128 + a signal that ended it.
     """
     # nohup ignores SIGHUP
-    before = [(n, signal.signal(n, _stop)) for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
+    before = [
+        (n, signal.signal(n, _stop))
+        for n in ENDING
+        if signal.getsignal(n) != signal.SIG_IGN
+    ]
     try:
         sessions = [Path(path) for path in sessions] or [SHIPPED]
         return max(
-            _store_all(session) if stored else _report(session, out, jobs) for session in sessions
+            _store_all(session) if stored else _report(session, out, jobs)
+            for session in sessions
         )
     except SessionError as problem:
         print(f"lrfcal: {problem}", file=sys.stderr)
@@ -263,7 +297,9 @@ def in_place_of(out):
     """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=PART, dir=out.parent, ignore_cleanup_errors=True) as box:
+        with TemporaryDirectory(
+            prefix=PART, dir=out.parent, ignore_cleanup_errors=True
+        ) as box:
             (new := Path(box) / "report").mkdir()
             (new / "parts").mkdir()
             yield new
@@ -373,7 +409,9 @@ def _run(path, environment):
 
 def _beginning(notebook):
     """First heading and first paragraph of a notebook, '' where there is none."""
-    text = "\n\n".join(cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown")
+    text = "\n\n".join(
+        cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown"
+    )
     blocks = [block.strip() for block in re.split(r"\n\s*\n", text) if block.strip()]
     headings = [block for block in blocks if block.startswith("#")]
     paragraphs = [block for block in blocks if not block.startswith("#")]
@@ -400,11 +438,19 @@ def write_pages(out, session, runs, found, seconds):
     numbers = {run.name: run.name[:2].removeprefix("0") for run in runs}
     drawn = {}  # figures and tables of each notebook, as HTML
     for before, run, after in zip([None, *runs], runs, [*runs[1:], None], strict=False):
-        body, *drawn[run.name] = page.render(run.notebook, found[run.name], numbers[run.name], out)
+        body, *drawn[run.name] = page.render(
+            run.notebook, found[run.name], numbers[run.name], out
+        )
         file = out / f"{run.name}.html"
         around = {"before": before, "after": after}
         _write_page(
-            jinja, file, "notebook.html.jinja", session=session, run=run, body=body, **around
+            jinja,
+            file,
+            "notebook.html.jinja",
+            session=session,
+            run=run,
+            body=body,
+            **around,
         )
 
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
@@ -434,9 +480,13 @@ def write_pages(out, session, runs, found, seconds):
 def _templates():
     """The templates of pages, in which methods are called by their labels."""
     loader = FileSystemLoader(Path(__file__).parent)
-    jinja = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader)
+    jinja = Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader
+    )
     quoted = r"(?<=')\w+(?=')"  # methods named in sentences
-    jinja.filters["words"] = lambda text: re.sub(quoted, lambda m: label_of(m[0]), label_of(text))
+    jinja.filters["words"] = lambda text: re.sub(
+        quoted, lambda m: label_of(m[0]), label_of(text)
+    )
     return jinja
 
 
@@ -525,6 +575,12 @@ def _provenance(session):
         commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip()
     except FileNotFoundError:
         commit = ""
-    pairs = {"session.json (SHA-256)": digest, "date": date.today().isoformat(), "commit": commit}
-    pairs |= {"Python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+    pairs = {
+        "session.json (SHA-256)": digest,
+        "date": date.today().isoformat(),
+        "commit": commit,
+    }
+    pairs |= {"Python": platform.python_version()} | {
+        name: version(name) for name in PACKAGES
+    }
     return [(name, value) for name, value in pairs.items() if value]

@@ -54,13 +54,17 @@ def cached(stage):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         _refuse_shared(folder)
         session = getattr(getattr(of, "prepared", of), "session", of)
-        key = hashlib.sha256(pickle.dumps((stage.__qualname__, of, args, sorted(options.items()))))
+        key = hashlib.sha256(
+            pickle.dumps((stage.__qualname__, of, args, sorted(options.items())))
+        )
         for file in (Path(record.file) for record in session.image_records):
             key.update(file.read_bytes() if file.is_file() else b"missing")
         key.update(library())
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
-            with opened(file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT) as lock:
+            with opened(
+                file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT
+            ) as lock:
                 # of two notebooks at the same time the second waits
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 if not file.is_file():
@@ -97,7 +101,9 @@ def _refuse_others(place, status):
 @lru_cache
 def library():
     """What stands for this library and those it works out its results with."""
-    digest = hashlib.sha256("".join(module.__version__ for module in (np, scipy, cv2)).encode())
+    digest = hashlib.sha256(
+        "".join(module.__version__ for module in (np, scipy, cv2)).encode()
+    )
     for file in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(file.read_bytes())
     return digest.digest()

@@ -10,10 +10,10 @@ from lrfcal_lib.session import stated
 from lrfcal_lib.session.telegrams import other_than_stated
 
 MANY = 0.2  # share of a camera's images: where more are wrong nothing can rest on them
-WHITE = 0.995  # quantile of the grey levels that the brightest surface of an image has at least
-DARK = (
-    30  # grey levels of 255; a white square of a chessboard has more in every image that is of use
+WHITE = (
+    0.995  # quantile of the grey levels that the brightest surface of an image has at least
 )
+DARK = 30  # grey levels of 255; a white square of a chessboard has more in every image that is of use
 BEYOND = 0.001  # share of ranges beyond the largest one: single readings may be mirrors or the sun
 SHOWN = 3  # examples in a sentence
 
@@ -102,7 +102,9 @@ def _repeated(session, first_camera, camera, pairs):
         "rows from images.csv"
     )
     severe = len(pairs) > MANY * count
-    return Fault("repeated image", words, severe, camera=camera, placements=tuple(placements))
+    return Fault(
+        "repeated image", words, severe, camera=camera, placements=tuple(placements)
+    )
 
 
 def repeated_scans(session) -> list[Fault]:
@@ -112,7 +114,9 @@ def repeated_scans(session) -> list[Fault]:
     for number in session.placements:
         ranges = session.scans["ranges"][placement == number]
         if np.isfinite(ranges).any():
-            same_ranges[ranges.shape, hashlib.blake2b(ranges.tobytes()).digest()].append(number)
+            same_ranges[ranges.shape, hashlib.blake2b(ranges.tobytes()).digest()].append(
+                number
+            )
 
     found = []
     for ((lines, _), _), numbers in same_ranges.items():
@@ -148,7 +152,9 @@ def bearings_beyond(session) -> list[Fault]:
     lrf = session.lrf
     bearings = session.scans["bearings"]
     if session.telegrams is not None:
-        return [Fault("field of view", words) for words in other_than_stated(session.scans, lrf)]
+        return [
+            Fault("field of view", words) for words in other_than_stated(session.scans, lrf)
+        ]
     if len(bearings) < 2:
         return []
     step = (bearings[-1] - bearings[0]) / (len(bearings) - 1)
@@ -185,11 +191,15 @@ def other_clocks(session) -> list[Fault]:
     numbers = np.array(list(ends))
     for camera in session.cameras:
         records = [
-            r for r in session.images(camera) if r.placement in ends and np.isfinite(r.time_s)
+            r
+            for r in session.images(camera)
+            if r.placement in ends and np.isfinite(r.time_s)
         ]
         away = []
         for record in records:
-            outside = np.maximum(np.maximum(first - record.time_s, record.time_s - last), 0.0)
+            outside = np.maximum(
+                np.maximum(first - record.time_s, record.time_s - last), 0.0
+            )
             own = numbers == record.placement
             if outside[own][0] > outside[~own].min():
                 begin, end = ends[record.placement]
@@ -240,7 +250,9 @@ def dark_images(session) -> list[Fault]:
         looked_at = records[:: max(len(records) // SHOWN, 1)][:SHOWN]
         dark = [record for record in looked_at if dark_image(session.read_image(record))]
         if len(dark) > len(looked_at) / 2:
-            found.append(too_dark(session, dark, f"{len(dark)} of {len(looked_at)} looked at"))
+            found.append(
+                too_dark(session, dark, f"{len(dark)} of {len(looked_at)} looked at")
+            )
     return found
 
 

@@ -161,7 +161,9 @@ def read_bytes(
         with opened(file, within, most=most) as stream:
             data = stream.read(most + 1)
     except OSError as error:
-        raise SessionError(f"{file}: {error.strerror}; the session needs this file") from error
+        raise SessionError(
+            f"{file}: {error.strerror}; the session needs this file"
+        ) from error
     if len(data) > most:  # files of the system do not tell their size
         raise SessionError(f"{file}: more than {most / 1e6:.0f} MB; {SPLIT}")
     return data

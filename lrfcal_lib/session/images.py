@@ -7,7 +7,11 @@ from lrfcal_lib.session.stated import CameraInfo, SessionError
 
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
-FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # second bytes of the markers of frame headers
+FRAMES = {*range(0xC0, 0xD0)} - {
+    0xC4,
+    0xC8,
+    0xCC,
+}  # second bytes of the markers of frame headers
 # markers, which do not occur within coded pixels
 SCAN = b"\xff\xda"
 REMARK = b"\xff\xe1"
@@ -38,7 +42,10 @@ def image_size(file: str | PathLike, data: bytes) -> tuple[int, int]:
             size = struct.unpack(">II", data[16:24])
         end = b"IEND"
     elif data.startswith(JPEG):
-        limits = ((SCAN, MOST_SCANS, "scans"), (REMARK, MOST_SEGMENTS, "segments of remarks"))
+        limits = (
+            (SCAN, MOST_SCANS, "scans"),
+            (REMARK, MOST_SEGMENTS, "segments of remarks"),
+        )
         for mark, most, things in limits:
             count = data.count(mark)
             if count > most:
@@ -73,7 +80,10 @@ def _jpeg_size(data):
 
 
 def check_image_size(
-    file: str | PathLike, data: bytes, camera: CameraInfo, size: tuple[int, int] | None = None
+    file: str | PathLike,
+    data: bytes,
+    camera: CameraInfo,
+    size: tuple[int, int] | None = None,
 ) -> None:
     """Refuse an image of another size than its camera's.
 

@@ -62,9 +62,7 @@ T_LEFT_CLOUD = RigidTransform.from_components(
         [[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]]
     ),
 )
-SOURCE = (
-    "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
-)
+SOURCE = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
 NOTE = (
     "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, their bearing b "
     "is 90 deg - ours. "
@@ -72,8 +70,19 @@ NOTE = (
 )
 # radians of pitch between points of two scan lines; rounding to a micrometre makes less than 1e-5
 LINE_JUMP = 1e-4
-LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from what was recovered
-KEYS = {"fc": 2, "cc": 2, "kc": 5, "fc_error": 2, "cc_error": 2, "kc_error": 5, "nx": 1, "ny": 1}
+LARGEST_MISS = (
+    1e-5  # metres between published points and those rebuilt from what was recovered
+)
+KEYS = {
+    "fc": 2,
+    "cc": 2,
+    "kc": 5,
+    "fc_error": 2,
+    "cc_error": 2,
+    "kc_error": 5,
+    "nx": 1,
+    "ny": 1,
+}
 
 
 @dataclass(frozen=True)
@@ -227,22 +236,30 @@ def recover_polar(points: np.ndarray, name: str | PathLike = "points") -> Recove
     across = p_platform[:, 0] - x
     along = S - ahead
     ranges = np.round(np.hypot(across, along) / COUNT) * COUNT
-    steps = np.round(np.degrees(np.arctan2(along, across)) / STEP_DEG)  # 0.1 deg, so no .5 to round
+    steps = np.round(
+        np.degrees(np.arctan2(along, across)) / STEP_DEG
+    )  # 0.1 deg, so no .5 to round
     bearing = np.radians(steps * STEP_DEG)
     # Once more with the exact range and bearing: now the pitch carries the rounding of the
     # published points only.
     S = ranges * np.sin(bearing) + ahead
-    pitch = np.arctan2(p_platform[:, 2], p_platform[:, 1]) + np.arctan2(S, offset) - np.pi / 2
+    pitch = (
+        np.arctan2(p_platform[:, 2], p_platform[:, 1]) + np.arctan2(S, offset) - np.pi / 2
+    )
     restarts = np.diff(steps) >= 0
     jumps = np.abs(np.diff(pitch)) > LINE_JUMP
     line = np.cumsum(np.r_[True, restarts | jumps]) - 1
     pitch = np.bincount(line, pitch) / np.bincount(line)
 
-    rebuilt = lrf_to_platform(polar_to_points(ranges, bearing), pitch[line], LASERSETERO_HEAD)
+    rebuilt = lrf_to_platform(
+        polar_to_points(ranges, bearing), pitch[line], LASERSETERO_HEAD
+    )
     miss = float(np.linalg.norm(rebuilt - p_platform, axis=1).max())
     if not miss <= LARGEST_MISS:
         limit = f"more than {1000 * LARGEST_MISS:g} mm; not points of this rig?"
-        raise SessionError(f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, {limit}")
+        raise SessionError(
+            f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, {limit}"
+        )
     if steps.min() < FIRST or steps.max() > LAST:
         reach = f"{STEP_DEG * steps.min():.1f} .. {STEP_DEG * steps.max():.1f} deg"
         raise SessionError(f"{name}: bearings reach {reach}, the LMS400 sees 55 .. 125 deg")
@@ -267,7 +284,11 @@ def read_pcd(file: str | PathLike) -> np.ndarray:
     """
     head, _, body = source_text(file).partition("DATA ascii")
     count = re.search(r"^POINTS (.*)$", head, re.MULTILINE)
-    if not body or not count or not re.search(r"^FIELDS\s+x\s+y\s+z\s*$", head, re.MULTILINE):
+    if (
+        not body
+        or not count
+        or not re.search(r"^FIELDS\s+x\s+y\s+z\s*$", head, re.MULTILINE)
+    ):
         raise SessionError(f"{file}: expected an ASCII PCD file with the fields x y z")
     with reading(file, "{}; damaged?"):
         points = np.array(body.split(), dtype=float)
@@ -287,7 +308,9 @@ def read_bouguet(file: str | PathLike) -> BouguetCamera:
     ``T_camera_board`` by image number is in metres, not millimetres.
     """
     assigned = re.findall(
-        r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE
+        r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;",
+        source_text(file),
+        re.MULTILINE,
     )
     with naming(file):
         values = {}

@@ -53,7 +53,9 @@ BEYOND = REASONS.index("larger than maximum")
 # index: how far a value is below the largest one its bits can hold
 REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND], np.uint8)
 # the other way
-BELOW_TOP = np.array([np.argmax(REASON_BELOW_TOP == reason) for reason in range(1 + BEYOND)])
+BELOW_TOP = np.array(
+    [np.argmax(REASON_BELOW_TOP == reason) for reason in range(1 + BEYOND)]
+)
 
 
 @dataclass(frozen=True)
@@ -281,7 +283,9 @@ def _decoded(data, rows, at, head, indexed, mode):
     for first in range(0, len(at), CHUNK):
         chunk = slice(first, first + CHUNK)
         words[chunk] = cut(data, at[chunk], 2 * values).view("<u2")
-        np.multiply(words[chunk] & np.uint16(MODES[mode].top), METRES[unit], out=ranges[chunk])
+        np.multiply(
+            words[chunk] & np.uint16(MODES[mode].top), METRES[unit], out=ranges[chunk]
+        )
         special, reasons = special_values(words[chunk], mode)
         ranges[chunk][special] = np.where(reasons == BEYOND, np.inf, np.nan)
     partial = np.where(head >> 13 & 1, head >> 11 & 3, -1)
@@ -430,7 +434,9 @@ def reply_data(raw, code, shortest):
     """
     telegram = parse_telegram(raw)
     if telegram.code != code:
-        raise TelegramError(f"code {telegram.code:02X} is not the reply {code:02X} asked for")
+        raise TelegramError(
+            f"code {telegram.code:02X} is not the reply {code:02X} asked for"
+        )
     if len(telegram.data) < shortest:
         raise TelegramError(
             f"reply {code:02X} has {len(telegram.data)} bytes of data, needs {shortest}"

@@ -30,7 +30,9 @@ def alone(path: str | os.PathLike) -> Iterator[None]:
     file = Path(path) / LOCK
     with ExitStack() as stack:
         stream = stack.enter_context(_locked(file, path))
-        while not _still_there(file, stream):  # its holder removed the file after we had opened it
+        while not _still_there(
+            file, stream
+        ):  # its holder removed the file after we had opened it
             stack.close()
             stream = stack.enter_context(_locked(file, path))
         stream.truncate()

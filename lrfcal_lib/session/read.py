@@ -43,8 +43,13 @@ DROPPED = "dropped"  # purpose of an image of a placement that was recorded agai
 ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
 ENTRY = b"PK\1\2"  # begins each line of an archive's table of contents
 MOST_ENTRIES = 100  # of an archive; a session's has the six arrays
-PACKED = (ZIP_STORED, ZIP_DEFLATED)  # as numpy packs; bzip2 and LZMA are not unpacked in steps
-LONGEST_HEADER = 10_000  # bytes before the values of an array; numpy refuses more, once it has them
+PACKED = (
+    ZIP_STORED,
+    ZIP_DEFLATED,
+)  # as numpy packs; bzip2 and LZMA are not unpacked in steps
+LONGEST_HEADER = (
+    10_000  # bytes before the values of an array; numpy refuses more, once it has them
+)
 # metres; no pitching 2D scanner sees half of its scene farther away than that
 LONGEST_MEDIAN_RANGE = 200.0
 
@@ -122,7 +127,9 @@ def _check_entries(file, stream):
     entries = sum(part.count(ENTRY) for part in parts)
     if entries > MOST_ENTRIES:
         remedy = f"write it again with the arrays {short(ARRAYS)} only"
-        raise SessionError(f"{file}: holds {entries} files, more than {MOST_ENTRIES}; {remedy}")
+        raise SessionError(
+            f"{file}: holds {entries} files, more than {MOST_ENTRIES}; {remedy}"
+        )
 
 
 def _read_arrays(file, archive):
@@ -135,11 +142,17 @@ def _read_arrays(file, archive):
             continue
         if archive.getinfo(name).compress_type not in PACKED:
             remedy = "write it again with numpy.savez_compressed"
-            raise SessionError(f"{file}: {key} is packed in another way than numpy does; {remedy}")
+            raise SessionError(
+                f"{file}: {key} is packed in another way than numpy does; {remedy}"
+            )
         with archive.open(name) as member:
             beginning = BytesIO(member.read(LONGEST_HEADER))
         old = np.lib.format.read_magic(beginning) == (1, 0)
-        header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
+        header = (
+            np.lib.format.read_array_header_1_0
+            if old
+            else np.lib.format.read_array_header_2_0
+        )
         shape, _, kind = header(beginning)
         if kind.kind not in "fiub" or kind.itemsize > 8:
             words = f"it holds {kind}, not numbers; write it without pickles"
@@ -187,7 +200,9 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             raise ValueError(
                 f"{key} has shape {scans[key].shape}, the ranges {ranges.shape} ask for {shape}"
             )
-    scans = {key: np.asarray(scans[key], int if key == "placement" else float) for key in shapes}
+    scans = {
+        key: np.asarray(scans[key], int if key == "placement" else float) for key in shapes
+    }
     seen = ranges[np.isfinite(ranges)]
     if seen.size == 0:
         raise ValueError(f"no range in {lines} scan lines (all NaN): nothing was recorded")
@@ -203,7 +218,9 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         ("pitch", scans["pitch"], np.pi),
     ):
         if not np.isfinite(angles).all():
-            raise ValueError(f"{np.sum(~np.isfinite(angles))} values of {name} are not finite")
+            raise ValueError(
+                f"{np.sum(~np.isfinite(angles))} values of {name} are not finite"
+            )
         if np.abs(angles).max(initial=0) > limit + 1e-6:
             raise ValueError(
                 f"a {name} is {np.abs(angles).max():g} rad: degrees? Convert to radians"
@@ -226,7 +243,9 @@ def missing_parts(placements, scans, records, cameras, unfinished=None):
         if placement not in scanned:
             problems.append(f"placement {placement}: no scan line with a range")
     for placement in unfinished:
-        again = "its recording was not finished, ignored; 'record --resume' records it again"
+        again = (
+            "its recording was not finished, ignored; 'record --resume' records it again"
+        )
         problems.append(f"placement {placement}: {again}")
     for placement in sorted(scanned - {*placements, *unfinished}):
         unknown = "in the scan lines but not in session.json, ignored"
@@ -251,7 +270,9 @@ def inside(path, name, where):
         or ".." in windows.parts
         or not posix.parts
     ):
-        raise SessionError(f"{path}: {where} must stay inside the session's folder, got '{name}'")
+        raise SessionError(
+            f"{path}: {where} must stay inside the session's folder, got '{name}'"
+        )
     if not name.isprintable():
         raise SessionError(f"{path}: {where} must be printable, got '{name}': rename it")
     return path / name
@@ -280,7 +301,9 @@ def read_images(path, facts, unfinished=None):
                     f"no camera '{row['camera']}' in session.json, which has {short(cameras)}"
                 )
             if row["purpose"] not in PURPOSES:
-                raise ValueError(f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'")
+                raise ValueError(
+                    f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'"
+                )
             placement = whole_number(row["placement"], "placement")
             if placement not in (*facts["placements"], -1):
                 raise ValueError(f"placement {placement} is not in session.json")
@@ -292,10 +315,17 @@ def read_images(path, facts, unfinished=None):
                 raise ValueError(f"'{row['file']}' {already}")
             out.append(
                 ImageRecord(
-                    row["camera"], target, placement, math.radians(pitch), time, row["purpose"]
+                    row["camera"],
+                    target,
+                    placement,
+                    math.radians(pitch),
+                    time,
+                    row["purpose"],
                 )
             )
-            check_image_size(target, stated.read_bytes(target, path), cameras[row["camera"]])
+            check_image_size(
+                target, stated.read_bytes(target, path), cameras[row["camera"]]
+            )
     return tuple(out)
 
 
@@ -312,7 +342,9 @@ def read_edges(path, facts, records):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
             if (row["camera"], target) not in known:
-                raise ValueError(f"images.csv has no '{row['file']}' of camera '{row['camera']}'")
+                raise ValueError(
+                    f"images.csv has no '{row['file']}' of camera '{row['camera']}'"
+                )
             if row["edge"] not in edges:
                 raise ValueError(f"edge is one of {short(edges)}, got '{row['edge']}'")
             ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
@@ -465,7 +497,10 @@ class Session:
         """
         records = []
         for record in self.image_records:
-            if camera not in (None, record.camera) or placement not in (None, record.placement):
+            if camera not in (None, record.camera) or placement not in (
+                None,
+                record.placement,
+            ):
                 continue
             if purpose in (None, record.purpose):
                 records.append(record)
@@ -492,7 +527,8 @@ class Session:
         data = stated.read_bytes(record.file, self.path)
         check_image_size(record.file, data, camera)
         with reading(
-            record.file, "cannot be decoded; remove its row from images.csv or restore the file"
+            record.file,
+            "cannot be decoded; remove its row from images.csv or restore the file",
         ):
             image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
             height, width = image.shape[:2]  # there is none of an image that is None
@@ -502,7 +538,9 @@ class Session:
     @property
     def scene_placements(self) -> tuple[int, ...]:
         """Placements that show a scene to be rebuilt, by the purpose of their images."""
-        return tuple(p for p in self.placements if self.images(placement=p, purpose="scene"))
+        return tuple(
+            p for p in self.placements if self.images(placement=p, purpose="scene")
+        )
 
     @property
     def board_placements(self) -> tuple[int, ...]:
@@ -556,8 +594,12 @@ def open_session(path: str | os.PathLike) -> Session:
     scans, log = read_scans(path)
     records = read_images(path, facts, unfinished)
     picks = read_edges(path, facts, records)
-    problems = missing_parts(facts["placements"], scans, records, facts["cameras"], unfinished)
-    problems += () if log is None else (*log.problems, *other_than_stated(scans, facts["lrf"]))
+    problems = missing_parts(
+        facts["placements"], scans, records, facts["cameras"], unfinished
+    )
+    problems += (
+        () if log is None else (*log.problems, *other_than_stated(scans, facts["lrf"]))
+    )
     found = {
         "image_records": records,
         "picks": picks,
@@ -627,7 +669,9 @@ def _times_back(file, rows, group):
             continue
         try:
             time = float(row["t_s"])
-        except ValueError:  # of a placement that was not finished: no other reader looks at it
+        except (
+            ValueError
+        ):  # of a placement that was not finished: no other reader looks at it
             yield f"{file} line {line}: t_s is {row['t_s']!r}: a number of seconds is needed"
             continue
         values = tuple(row[key] for key in group)

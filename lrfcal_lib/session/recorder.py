@@ -99,7 +99,9 @@ class SessionRecorder(SessionWriter):
         """State that the placement begun last is complete; from now on it is part of the
         session.
         """
-        self._state(placements=sorted([*self.finished, *self.data["unfinished"]]), unfinished=[])
+        self._state(
+            placements=sorted([*self.finished, *self.data["unfinished"]]), unfinished=[]
+        )
 
     def drop_placement(self, placement: int) -> None:
         """Take a placement, finished or not, out of the session; its number can be recorded again.
@@ -117,7 +119,9 @@ class SessionRecorder(SessionWriter):
             raise SessionError(
                 f"{self.path}: no placement {placement} to drop; recorded: {short(self.finished)}"
             )
-        self._state(placements=[p for p in self.finished if p != placement], unfinished=[placement])
+        self._state(
+            placements=[p for p in self.finished if p != placement], unfinished=[placement]
+        )
         self._mark_dropped(placement)
         self._state(unfinished=[])
 
@@ -169,7 +173,9 @@ class SessionRecorder(SessionWriter):
 
     def _mark_dropped(self, placement):
         self._mark_rows("lrf/index.csv", INDEX_COLUMNS, placement, {"placement": ""})
-        self._mark_rows("images.csv", read.IMAGE_COLUMNS, placement, {"purpose": read.DROPPED})
+        self._mark_rows(
+            "images.csv", read.IMAGE_COLUMNS, placement, {"purpose": read.DROPPED}
+        )
 
     def _mark_rows(self, name, columns, placement, mark):
         """Write other values into the rows of a placement in a table, if there is one."""

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import pydantic
 from numpy.typing import ArrayLike
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFloat, PlainSerializer
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    FiniteFloat,
+    PlainSerializer,
+)
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
@@ -76,7 +83,9 @@ SYSTEMATIC_ERROR = {
 # centimetres: so many standard deviations or steps of a range; the sheets above admit 2 to 4.2, and
 # 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
-ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobody stated the spot
+ASSUMED_SPOT_RADIUS = (
+    0.005  # metres; only the unit of the edge bias where nobody stated the spot
+)
 
 
 def in_words(error):
@@ -96,7 +105,9 @@ def in_words(error):
         if kind in ("model_type", "dataclass_type")
         else first["msg"].removeprefix("Input should be ")
     )
-    large = kind.startswith("less_than") and re.search(r"_m\b", where)  # the key tells the unit
+    large = kind.startswith("less_than") and re.search(
+        r"_m\b", where
+    )  # the key tells the unit
     return f"{found}: {needed} is needed" + f"; {MILLIMETRES}" * bool(large)
 
 
@@ -139,15 +150,20 @@ NOT_PLAIN = "this becomes a file name: letters, digits, '_', '-' and '.' only"
 TWICE = "placements are different numbers"
 NOT_SHOWN = "names of edges stand in figures: no line ends, no '$' (a formula)"
 Name = Annotated[
-    str, refused(lambda name: not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name), NOT_PLAIN)
+    str,
+    refused(lambda name: not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name), NOT_PLAIN),
 ]
-EdgeName = Annotated[str, refused(lambda name: "$" in name or not name.isprintable(), NOT_SHOWN)]
+EdgeName = Annotated[
+    str, refused(lambda name: "$" in name or not name.isprintable(), NOT_SHOWN)
+]
 Whole = Annotated[int, Field(ge=0, le=1_000_000)]
 Inner = Annotated[int, Field(ge=3, le=MOST_CORNERS)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Length = Annotated[FiniteFloat, Field(gt=0, le=1)]
 Angle = Annotated[
-    FiniteFloat, AfterValidator(math.radians), PlainSerializer(lambda a: round(math.degrees(a), 9))
+    FiniteFloat,
+    AfterValidator(math.radians),
+    PlainSerializer(lambda a: round(math.degrees(a), 9)),
 ]
 Step = Annotated[Angle, Field(gt=0)]  # radians here, degrees in the file
 Pair, Triple, Lens, Row = (tuple[(FiniteFloat,) * n] for n in (2, 3, 5, 9))
@@ -254,9 +270,7 @@ class BoardStated(BaseModel):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
             given = "none" if not any(self.features) else short(map(repr, self.features))
-            needed = (
-                f"features must be two different edges of {short(self.edges)}, at a right angle"
-            )
+            needed = f"features must be two different edges of {short(self.edges)}, at a right angle"
             raise ValueError(f"{needed}; got {given}")
         if corners is not None and len(corners) != len(self.edges):
             raise ValueError(
@@ -363,7 +377,9 @@ class LrfInfo:
     range_resolution: Annotated[FiniteFloat, Field(alias="range_resolution_m")] = 0.001
     max_range: Annotated[Endless, Field(alias="max_range_m")] = math.inf
     systematic_error: Annotated[Positive | None, Field(alias="systematic_error_m")] = None
-    spot_exit: Annotated[FiniteFloat | None, Field(alias="spot_exit_m", gt=0, le=0.2)] = None
+    spot_exit: Annotated[FiniteFloat | None, Field(alias="spot_exit_m", gt=0, le=0.2)] = (
+        None
+    )
     spot_divergence: Annotated[
         FiniteFloat | None, Field(alias="spot_divergence_rad", ge=0, lt=0.2)
     ] = None
@@ -373,7 +389,9 @@ class LrfInfo:
         """The largest range offset that the maker admits, metres: stated, or known, or assumed."""
         known = [value for name, value in SYSTEMATIC_ERROR.items() if name in self.model]
         if not known or self.range_resolution > 0.005:
-            known = [ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)]
+            known = [
+                ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)
+            ]
         return self.systematic_error or known[0]
 
     def spot_radius(self, distance: ArrayLike) -> np.ndarray:
@@ -386,7 +404,9 @@ class LrfInfo:
         """
         if self.spot_exit is None:
             return np.full(np.shape(distance), ASSUMED_SPOT_RADIUS)
-        return (self.spot_exit + (self.spot_divergence or 0.0) * np.asarray(distance, float)) / 2
+        return (
+            self.spot_exit + (self.spot_divergence or 0.0) * np.asarray(distance, float)
+        ) / 2
 
 
 def lrf_to_json(lrf: LrfInfo) -> dict:
@@ -512,7 +532,9 @@ class SessionStated(BaseModel):
     board: StatedBoard
     rig: RigStated
     placements: Annotated[
-        tuple[Whole, ...], Field(fail_fast=True), refused(lambda p: len(set(p)) < len(p), TWICE)
+        tuple[Whole, ...],
+        Field(fail_fast=True),
+        refused(lambda p: len(set(p)) < len(p), TWICE),
     ]
     reference: dict = {}
     unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None

@@ -35,7 +35,9 @@ def read_table(
         cut = torn and not text.endswith("\n")
         lines = (text.rpartition("\n")[0] if cut else text).splitlines()
         if len(lines) > MOST_ROWS:
-            raise SessionError(f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}")
+            raise SessionError(
+                f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}"
+            )
         rows = list(csv.reader(lines))
     if not rows or tuple(rows[0]) != columns:
         got = ", ".join(rows[0]) if rows else "an empty file"

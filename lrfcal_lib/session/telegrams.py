@@ -62,7 +62,9 @@ class TelegramLog:
         return {
             "telegrams": len(self.offset),
             "outcomes": dict(zip(OUTCOMES, outcomes, strict=True)),
-            "values": dict(zip(codec.REASONS, self.values.sum(axis=0).tolist(), strict=True)),
+            "values": dict(
+                zip(codec.REASONS, self.values.sum(axis=0).tolist(), strict=True)
+            ),
             "wrong_crc_offsets": tuple(self.offset[self.outcome == WRONG].tolist()),
         }
 
@@ -133,14 +135,18 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     outcome[sound] = OTHER
     if len(sound) < len(whole) / 2:
         bad = f"{len(whole) - len(sound)} of {len(whole)} telegrams have a wrong CRC in {file.name}"
-        raise SessionError(f"{path}: {bad}; the two files are not of one recording, restore both")
+        raise SessionError(
+            f"{path}: {bad}; the two files are not of one recording, restore both"
+        )
 
     with naming(file):
         mode, notes = _modes(data, index, sound)
         groups = []
         for number in np.unique(mode):
             rows = sound[mode == number]
-            groups += codec.decode_scans(data, index.offset, index.length, int(number), rows)
+            groups += codec.decode_scans(
+                data, index.offset, index.length, int(number), rows
+            )
         scans = _lines(groups, index)
 
     values = np.zeros((len(outcome), len(codec.REASONS)), int)
@@ -163,7 +169,10 @@ def _index(rows):
     """The Index in rows of index.csv."""
     numbers = {}
     for key in ("offset", "length", "placement"):
-        cells = [whole_number(row[key], f"line {n}: {key}") for n, row in enumerate(rows, start=2)]
+        cells = [
+            whole_number(row[key], f"line {n}: {key}")
+            for n, row in enumerate(rows, start=2)
+        ]
         numbers[key] = np.array(cells, int)
     time_s = np.array([float(row["t_s"] or "nan") for row in rows])
     pitch_deg = np.array([float(row["pitch_deg"] or "nan") for row in rows])
@@ -212,7 +221,9 @@ def _modes(data, index, rows):
     """Measuring mode at each row: that of the last telegram that states it, before it the first.
     Also notes.
     """
-    parse = dict.fromkeys((codec.CONFIGURATION, codec.CONFIGURED), codec.parse_configuration)
+    parse = dict.fromkeys(
+        (codec.CONFIGURATION, codec.CONFIGURED), codec.parse_configuration
+    )
     parse[codec.STATUS] = codec.parse_status
     codes = data[index.offset[rows] + 4]
     telling = []
@@ -324,6 +335,8 @@ def other_than_stated(scans: dict[str, np.ndarray], lrf: LrfInfo) -> tuple[str, 
     stated = (*np.degrees(lrf.field_of_view), math.degrees(lrf.bearing_step))
     if np.abs(np.subtract(seen, stated)).max() <= stated[2] / 2:
         return ()
-    texts = ["{:g} to {:g} deg in steps of {:g} deg".format(*values) for values in (seen, stated)]
+    texts = [
+        "{:g} to {:g} deg in steps of {:g} deg".format(*values) for values in (seen, stated)
+    ]
     remedy = "the telegrams count; correct field_of_view_deg and bearing_step_deg"
     return (f"the telegrams cover {texts[0]}, session.json states {texts[1]}: {remedy}",)

@@ -125,7 +125,11 @@ def _setting(variable, value):
 def _pool(count, context, loop=()):
     """Processes that end with this one, however it ends, and at once where anything is raised."""
     ours, theirs = context.Pipe()
-    with ours, theirs, ProcessPoolExecutor(count, context, _begin, (ours, theirs, loop)) as pool:
+    with (
+        ours,
+        theirs,
+        ProcessPoolExecutor(count, context, _begin, (ours, theirs, loop)) as pool,
+    ):
         try:
             yield pool
         except BaseException:

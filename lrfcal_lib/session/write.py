@@ -98,7 +98,9 @@ class SessionWriter:
             "rig": {
                 "lrf": stated.lrf_to_json(lrf),
                 "platform": stated.platform_to_json(T_head_lrf, platform_sigma, continuous),
-                "cameras": {n: stated.camera_to_json(info) for n, info in self.cameras.items()},
+                "cameras": {
+                    n: stated.camera_to_json(info) for n, info in self.cameras.items()
+                },
             },
             "placements": [],
             "reference": reference,
@@ -252,7 +254,9 @@ class SessionWriter:
                     f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed"
                 )
             if self.parts:
-                raise ValueError("the session has scan lines: add_sweep, or begin another one")
+                raise ValueError(
+                    "the session has scan lines: add_sweep, or begin another one"
+                )
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
         offset = append_file(self.telegrams, b"".join(telegrams), self.path)
@@ -260,7 +264,9 @@ class SessionWriter:
         number = number_cell(placement)
         rows = []
         pitch_deg = np.degrees(pitch)
-        for begin, length, at, angle in zip(offsets, lengths, time_s, pitch_deg, strict=True):
+        for begin, length, at, angle in zip(
+            offsets, lengths, time_s, pitch_deg, strict=True
+        ):
             rows.append([cell(at), begin, length, number, cell(angle)])
         self._append_rows("lrf/index.csv", rows)
 
@@ -297,7 +303,9 @@ class SessionWriter:
         """
         if camera not in self.cameras or purpose not in read.PURPOSES:
             known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
-            raise SessionError(f"{self.path}: camera '{camera}', purpose '{purpose}': {known}")
+            raise SessionError(
+                f"{self.path}: camera '{camera}', purpose '{purpose}': {known}"
+            )
         what: str | os.PathLike = f"camera '{camera}'"
         if isinstance(image, np.ndarray):
             content = cv2.imencode(".png", image)[1].tobytes()

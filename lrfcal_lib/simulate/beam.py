@@ -13,7 +13,9 @@ from lrfcal_lib.session.lms2xx_codec import MODES, REASONS, encode_values
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.scene import World, need
 
-NOT_VALID, DAZZLED, WEAK = (REASONS.index(words) for words in ("not valid", "dazzled", "noise"))
+NOT_VALID, DAZZLED, WEAK = (
+    REASONS.index(words) for words in ("not valid", "dazzled", "noise")
+)
 # deg, 1/100 deg: of telegram 0x3B
 VARIANTS = ((100, 25), (100, 50), (100, 100), (180, 50), (180, 100))
 UNITS = {0.001: "mm", 0.01: "cm"}  # by metres a count
@@ -140,7 +142,9 @@ def spot_pattern(rings: int) -> np.ndarray:
     return np.repeat(radius, count)[:, None] * unit
 
 
-def echo(beam: Beam, distance: np.ndarray, energy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def echo(
+    beam: Beam, distance: np.ndarray, energy: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Readings out of sub-rays.
 
     Surfaces within one pulse length of the nearest one blend into its reading, weighted by energy
@@ -221,7 +225,9 @@ def ideal_readings(
     """
     origins, directions = _sub_rays(beam, bearings)
     rotation = T_head_lrf.rotation.as_matrix().T
-    origins = tilt(origins @ rotation + T_head_lrf.translation, pitch[:, None]).reshape(-1, 3)
+    origins = tilt(origins @ rotation + T_head_lrf.translation, pitch[:, None]).reshape(
+        -1, 3
+    )
     directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
     hits = world.cast(origins, directions)
     seen = hits.face >= 0
@@ -310,6 +316,8 @@ def scan(
     for start in range(0, len(bearings), step):
         rows = slice(start, start + step)
         parts.append(ideal_readings(beam, world, bearings[rows], pitch[rows], T_head_lrf))
-    ideal = Readings(*(np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True)))
+    ideal = Readings(
+        *(np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True))
+    )
     ranges, reasons = measured(beam, ideal, rng)
     return encode_values(ranges, unit=beam.unit_name, reasons=reasons)

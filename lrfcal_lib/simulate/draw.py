@@ -75,7 +75,9 @@ class ShotSetup(Devices):
     """What single shots are drawn from: devices like the paper's, and distances in metres."""
 
     board: Board = field(
-        default_factory=lambda: triangle_board(pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885)))
+        default_factory=lambda: triangle_board(
+            pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))
+        )
     )
     softness: float = 0.03
     # standard deviation of `bias` from edge to edge of every placement: uneven backgrounds
@@ -235,7 +237,8 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     # near to an edge across the scan lines, and along them
     changes = (np.diff(hit, axis=axis, append=hit.take([-1], axis)) for axis in (0, 1))
     across, along = (
-        maximum_filter1d(c, 2 * REACH, axis, mode="constant") for axis, c in enumerate(changes)
+        maximum_filter1d(c, 2 * REACH, axis, mode="constant")
+        for axis, c in enumerate(changes)
     )
     second = np.sort(distances, axis=-1)[..., -2]
     alone = second <= -2 * radius  # elsewhere two edges cut the spot
@@ -368,7 +371,9 @@ def _shots(setup, rng, T_camera_lrf):
 
     boards, covariance = _seen_poses(setup, true, rng, 1.0)
     noisy = ranges + setup.sigma_range * rng.standard_normal(ranges.shape)
-    homography = setup.model.matrix @ true[..., [0, 1, 3]]  # from the board's plane to pixels
+    homography = (
+        setup.model.matrix @ true[..., [0, 1, 3]]
+    )  # from the board's plane to pixels
     lines = board.lines()[edges] @ np.linalg.inv(homography)  # normals out of the board
     lines /= np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
     lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)

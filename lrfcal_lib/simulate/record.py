@@ -16,7 +16,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.kinematics import MIRROR_TURN
-from lrfcal_lib.session.lms2xx_codec import Configuration, encode_configuration, encode_words
+from lrfcal_lib.session.lms2xx_codec import (
+    Configuration,
+    encode_configuration,
+    encode_words,
+)
 from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.session.write import SessionWriter, write_file
@@ -36,7 +40,9 @@ RECORDING = (
     "stop-and-go: the head rests at every pitch step, one scan line and the images are taken at "
     "rest"
 )
-SWEEP, STOPS, PHOTO, _, VIEWS = range(5)  # streams of random numbers; rig.PLACES is one more
+SWEEP, STOPS, PHOTO, _, VIEWS = range(
+    5
+)  # streams of random numbers; rig.PLACES is one more
 # s from the end of a scan to the last byte of its telegram at 500 kBd, 812 bytes
 REPLY_TIME = 0.0016 + 0.016
 
@@ -64,7 +70,9 @@ class Shots(NamedTuple):
     key: tuple
 
 
-def world_of(setup: Setup, T_platform_board: RigidTransform | None, stand: bool = True) -> World:
+def world_of(
+    setup: Setup, T_platform_board: RigidTransform | None, stand: bool = True
+) -> World:
     """The room with the board in it.
 
     Parameters
@@ -135,7 +143,9 @@ def close_views(setup: Setup, number: int) -> list[RigidTransform]:
     still = rig.camera_pose(camera, 0.0).inv()
     return [
         still * pose
-        for pose in held_close(rig, camera, setup.intrinsics_views, random(setup, VIEWS, number))
+        for pose in held_close(
+            rig, camera, setup.intrinsics_views, random(setup, VIEWS, number)
+        )
     ]
 
 
@@ -151,7 +161,10 @@ def shots_of(setup, placements):
         pose = placement.T_platform_board
         purpose = "scene" if placement.T_platform_board is None else "board"
         for number, camera in enumerate(rig.cameras):
-            poses = [rig.camera_pose(camera, pitch) for pitch in stops_of(setup, placement)[0].true]
+            poses = [
+                rig.camera_pose(camera, pitch)
+                for pitch in stops_of(setup, placement)[0].true
+            ]
             out.append(
                 Shots(
                     number,
@@ -204,7 +217,9 @@ def simulate(path: str | os.PathLike, setup: Setup, workers: int = 1) -> None:
         draft.rename(path)
     except OSError as error:
         full = (
-            "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
+            "; free some space"
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+            else ""
         )
         raise ValueError(
             f"{path}: cannot be written ({error.strerror}){full}; nothing was kept"
@@ -220,7 +235,9 @@ def _record(folder, name, setup, workers):
     placements = placements_of(setup)
     for placement in placements:
         rig.platform.check(np.array(placement.sweep))
-    boards = {p.number: p.T_platform_board for p in placements if p.T_platform_board is not None}
+    boards = {
+        p.number: p.T_platform_board for p in placements if p.T_platform_board is not None
+    }
     reference = {
         "recording": RECORDING,
         "scene_placements": [p.number for p in placements if p.number not in boards],
@@ -231,7 +248,8 @@ def _record(folder, name, setup, workers):
         "seed": setup.seed,
         **rig.truth(),
         "boards": {
-            number: {"T_platform_board": transform_to_json(pose)} for number, pose in boards.items()
+            number: {"T_platform_board": transform_to_json(pose)}
+            for number, pose in boards.items()
         },
         "lrf": asdict(rig.beam),
         "platform": asdict(rig.platform),
@@ -253,7 +271,9 @@ def _record(folder, name, setup, workers):
     ) as writer:
         log = _add_placements(writer, setup, placements, truth, workers)
     write_file(
-        folder / "platform.csv", "\n".join([",".join(PLATFORM_COLUMNS), *log]) + "\n", folder
+        folder / "platform.csv",
+        "\n".join([",".join(PLATFORM_COLUMNS), *log]) + "\n",
+        folder,
     )
     write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
 
@@ -319,6 +339,8 @@ def _add_images(writer, setup, shots, files, truth, stops=None, times=None):
             )
             known = {"pitch_rad": true}
             if shot.T_platform_board is not None:
-                known["T_camera_board"] = transform_to_json(shot.poses[i] * shot.T_platform_board)
+                known["T_camera_board"] = transform_to_json(
+                    shot.poses[i] * shot.T_platform_board
+                )
             file = f"images/{name}/{writer.shots[name]:04d}.jpg"
             truth["images"][file] = known

@@ -23,12 +23,19 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import AHEAD, apply_pose, pose_array, tilt
-from lrfcal_lib.session.stated import CameraInfo, board_to_json, model_to_json, transform_to_json
+from lrfcal_lib.session.stated import (
+    CameraInfo,
+    board_to_json,
+    model_to_json,
+    transform_to_json,
+)
 from lrfcal_lib.simulate.beam import LMS221, Beam
 from lrfcal_lib.simulate.scene import Exposure, need
 
 MOST_TRIES = 4000
-PITCH_GRID = np.radians(np.arange(-30.0, 30.1, 0.5))  # pitch angles at which an image may be taken
+PITCH_GRID = np.radians(
+    np.arange(-30.0, 30.1, 0.5)
+)  # pitch angles at which an image may be taken
 OUTSIDE = np.radians(2.0)  # a sweep begins and ends this far outside the board
 LEAST_SPAN = np.radians(4.0)  # of the pitch angles at which all cameras see the board
 CLOSE = (0.22, 0.45)  # metres from the camera to a board that is held close
@@ -315,7 +322,9 @@ class Placement:
     number: int
     # None for a sweep of the room, with a laid table near the rig
     T_platform_board: RigidTransform | None
-    sweep: tuple[float, float]  # pitch commands of the first and the last scan line, radians
+    sweep: tuple[
+        float, float
+    ]  # pitch commands of the first and the last scan line, radians
     # pitch commands of the images in the order in which they are taken, radians
     image_pitch: tuple[float, ...]
 
@@ -397,7 +406,9 @@ def pairs(
     out = []
     shuffled = rng.permutation(np.linspace(*distances, count))
     for i, distance in enumerate(shuffled):
-        turn = -135.0 + 90.0 * (i % 4)  # which way the right angle points: up, left, down, right
+        turn = -135.0 + 90.0 * (
+            i % 4
+        )  # which way the right angle points: up, left, down, right
         for _ in range(MOST_TRIES):
             poses = _pair(rig, distance, turn, rng)
             spans = [_spans(rig, pose, margin) for pose in poses]
@@ -504,11 +515,15 @@ def held_close(
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])
             turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
             place = z * np.array([(u - m.cx) / m.fx, (v - m.cy) / m.fy, 1.0])
-            pose = RigidTransform.from_components(place - turn.apply(points.mean(axis=0)), turn)
+            pose = RigidTransform.from_components(
+                place - turn.apply(points.mean(axis=0)), turn
+            )
             if rig.shows(camera, pose, points, margin=18.0):
                 break
         else:
             where = f"the image of camera '{camera.name}'"
-            raise ValueError(f"the pattern of board '{rig.board.name}' does not fit into {where}")
+            raise ValueError(
+                f"the pattern of board '{rig.board.name}' does not fit into {where}"
+            )
         out.append(pose)
     return out

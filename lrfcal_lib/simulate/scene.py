@@ -115,7 +115,9 @@ def lathe(radius, height, sides=48):
 
 def cylinder(radius, height, sides=48, top=None):
     """A closed cylinder about z from z = 0 upwards; `top` is the upper radius of a cone."""
-    return lathe([0, radius, radius if top is None else top, 0], [0, 0, height, height], sides)
+    return lathe(
+        [0, radius, radius if top is None else top, 0], [0, 0, height, height], sides
+    )
 
 
 def sphere(radius):
@@ -146,7 +148,9 @@ def curtain(width, height, depth, folds):
     return grid_surface(np.stack(np.broadcast_arrays(width * s, wave, z), axis=-1))
 
 
-SHAPES = {f.__name__: f for f in (polygon, rectangle, box, lathe, cylinder, sphere, rod, curtain)}
+SHAPES = {
+    f.__name__: f for f in (polygon, rectangle, box, lathe, cylinder, sphere, rod, curtain)
+}
 
 
 def value_noise(points, cell):
@@ -187,7 +191,9 @@ def plain(
     """
     if not rough:
         return np.broadcast_to(np.asarray(color, float), points.shape)
-    return np.asarray(color, float) * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
+    return (
+        np.asarray(color, float) * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
+    )
 
 
 def wood(points, color, cell=(0.5, 0.03, 0.03)):
@@ -296,7 +302,8 @@ def chessboard(points, board, dark, light, ring=0.5):
 
 
 TEXTURES = {
-    f.__name__: f for f in (plain, wood, planks, stripes, tiles, printed_page, poster, book_spines)
+    f.__name__: f
+    for f in (plain, wood, planks, stripes, tiles, printed_page, poster, book_spines)
 }
 
 
@@ -311,7 +318,9 @@ class Thing:
     pose: RigidTransform = RigidTransform.identity()  # T_platform_thing
     # diffuse reflectivity at the LRF's wavelength (905 nm); None takes the red albedo
     infrared: float | None = None
-    dazzles: bool = False  # the LRF is dazzled when its spot meets it (a lamp, the sun in a window)
+    dazzles: bool = (
+        False  # the LRF is dazzled when its spot meets it (a lamp, the sun in a window)
+    )
     glow: float = 0.0  # light it gives off by itself, in units of full albedo
 
 
@@ -364,7 +373,9 @@ class World:
         numbers = np.arange(len(self.things))
         self.thing_of = np.repeat(numbers, [len(mesh) for mesh in meshes])[whole]
         self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(vertices.astype(np.float32), faces[whole].astype(np.uint32))
+        self._scene.add_triangles(
+            vertices.astype(np.float32), faces[whole].astype(np.uint32)
+        )
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """Follow rays to the first surface.
@@ -418,7 +429,9 @@ class World:
         out[ask] = self.albedo(points[ask], thing[ask])[:, 0]
         return out
 
-    def radiance(self, origins: np.ndarray, directions: np.ndarray, hits: Hits) -> np.ndarray:
+    def radiance(
+        self, origins: np.ndarray, directions: np.ndarray, hits: Hits
+    ) -> np.ndarray:
         """Light that comes back along rays, linear.
 
         Lambert's law for every point light, each casting hard shadows, over an even background
@@ -441,12 +454,16 @@ class World:
         normal = self.normals[hits.face[seen]]
         normal *= -np.sign(np.einsum("ni,ni->n", normal, directions[seen]))[:, None]
         light = np.full(len(points), self.lights.ambient)
-        for position, strength in zip(self.lights.positions, self.lights.strengths, strict=True):
+        for position, strength in zip(
+            self.lights.positions, self.lights.strengths, strict=True
+        ):
             way = position - points
             squared = np.einsum("ni,ni->n", way, way)
             share = np.einsum("ni,ni->n", normal, way) / (squared * np.sqrt(squared))
             ask = share > 1e-3
-            off = points[ask] + 2e-3 * normal[ask]  # metres, so that no surface shades itself
+            off = (
+                points[ask] + 2e-3 * normal[ask]
+            )  # metres, so that no surface shades itself
             rays = np.concatenate([off, 0.999 * way[ask]], axis=1, dtype=np.float32)
             dark = self._scene.test_occlusions(_tensor(rays), 0.0, 1.0).numpy()
             light[ask] += strength * (share[ask] * ~dark)
@@ -469,7 +486,9 @@ def furnished(*parts: str) -> list[Thing]:
         angles = [row.pop("turn", 0.0), row.pop("tip", 0.0)]
         turned = Rotation.from_euler("ZX", angles, degrees=True)
         pose = RigidTransform.from_components(row.pop("at", [0.0, 0.0, 0.0]), turned)
-        things.append(Thing(SHAPES[shape](*sizes), (TEXTURES[texture], *settings), pose, **row))
+        things.append(
+            Thing(SHAPES[shape](*sizes), (TEXTURES[texture], *settings), pose, **row)
+        )
     return things
 
 
@@ -486,7 +505,9 @@ def furnished_room(*more: Thing) -> World:
         "small things",
     )
     lamps = ROOM["lights"]
-    lights = Lights(np.array(lamps["positions"]), np.array(lamps["strengths"]), lamps["ambient"])
+    lights = Lights(
+        np.array(lamps["positions"]), np.array(lamps["strengths"]), lamps["ambient"]
+    )
     return World([*furnished(*parts), *more], lights)
 
 
@@ -503,7 +524,9 @@ def board_on_stand(board, T_platform_board, ring):
     for turn in np.radians([80, 200, 320]):
         foot = [head[0] + 0.38 * np.cos(turn), head[1] + 0.38 * np.sin(turn), FLOOR]
         rods.append((knee, foot, 0.010))
-    sheet = Thing(polygon(board.corners), (chessboard, board, 0.07, 0.75, ring), T_platform_board)
+    sheet = Thing(
+        polygon(board.corners), (chessboard, board, 0.07, 0.75, ring), T_platform_board
+    )
     return [sheet, *(Thing(rod(*each), (plain, (0.4, 0.41, 0.43))) for each in rods)]
 
 
@@ -522,8 +545,12 @@ class Exposure:
     # variance in grey levels squared is read_noise^2 + shot_noise * level
     read_noise: NonNegativeFloat = 0.8
     shot_noise: NonNegativeFloat = 0.008
-    vignetting: NonNegativeFloat = 0.15  # loss of light in the corners of the image, a share
-    samples: PositiveInt = 3  # rays across a pixel and down a pixel, where the pixel is not plain
+    vignetting: NonNegativeFloat = (
+        0.15  # loss of light in the corners of the image, a share
+    )
+    samples: PositiveInt = (
+        3  # rays across a pixel and down a pixel, where the pixel is not plain
+    )
 
 
 class Imager:
@@ -543,8 +570,14 @@ class Imager:
         self.exposure = exposure or Exposure()
         v, u = np.mgrid[: model.height + 1, : model.width + 1] - 0.5
         corners = np.stack([u, v], axis=-1)
-        self.grid = (undistort(corners, model) - [model.cx, model.cy]) / [model.fx, model.fy]
-        again = distort(self.grid, model.distortion) * [model.fx, model.fy] + [model.cx, model.cy]
+        self.grid = (undistort(corners, model) - [model.cx, model.cy]) / [
+            model.fx,
+            model.fy,
+        ]
+        again = distort(self.grid, model.distortion) * [model.fx, model.fy] + [
+            model.cx,
+            model.cy,
+        ]
         miss = np.abs(again - corners).max()
         lens = f"lens {model.distortion} folds the image (off by {miss:.3g} px)"
         need(miss < 1e-3, f"{lens}: weaken the distortion")
@@ -570,7 +603,9 @@ class Imager:
         e = self.exposure
         m = self.model
         light = self.light(world, T_camera_platform, rng)
-        light = gaussian_filter(light, (e.blur_px, e.blur_px, 0), mode="nearest", truncate=5.0)
+        light = gaussian_filter(
+            light, (e.blur_px, e.blur_px, 0), mode="nearest", truncate=5.0
+        )
         v, u = np.mgrid[: m.height, : m.width]
         squared = (u - m.cx) ** 2 + (v - m.cy) ** 2
         radius = squared / (m.width**2 + m.height**2) * 4

@@ -16,8 +16,12 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers import lines, plane_start, planes
 
-ACCEPTED = 0.999  # a good placement is accepted with this probability, were the errors normal
-NUMBERS = 2  # a plane's distance and the slope of the scan: neighbouring points err together
+ACCEPTED = (
+    0.999  # a good placement is accepted with this probability, were the errors normal
+)
+NUMBERS = (
+    2  # a plane's distance and the slope of the scan: neighbouring points err together
+)
 OUTLIER_ROUNDS = 11  # placements come and go no more after a few
 
 
@@ -133,11 +137,22 @@ METHODS = {
     ),
 }
 SHIPPED = MappingProxyType(dict(METHODS))  # without rows that others put there later
-CANDIDATES = ("zhang_pless", "line")  # the better one is handed over where no joint estimate is
+CANDIDATES = (
+    "zhang_pless",
+    "line",
+)  # the better one is handed over where no joint estimate is
 STARTS = {
-    "crossing": (plane_start.start_from_planes, lines.start_from_lines, lines.start_from_scene),
+    "crossing": (
+        plane_start.start_from_planes,
+        lines.start_from_lines,
+        lines.start_from_scene,
+    ),
     "plane": (plane_start.start_from_planes,),
-    "scene": (plane_start.start_from_planes, lines.start_from_scene, lines.start_from_lines),
+    "scene": (
+        plane_start.start_from_planes,
+        lines.start_from_scene,
+        lines.start_from_lines,
+    ),
 }
 
 
@@ -249,7 +264,9 @@ def solve_camera(
 def _solve_best(obs, T0, **options):
     """The better one of the candidates that determine the pose."""
     if obs.crossing_points.ndim > 2:
-        raise ValueError(f"many trials at once: name the method, one of {', '.join(METHODS)}")
+        raise ValueError(
+            f"many trials at once: name the method, one of {', '.join(METHODS)}"
+        )
     solutions = {}
     problems = []
     for method in CANDIDATES:

@@ -43,12 +43,19 @@ from lrfcal_lib.solvers.joint_search import best_start, coarse
 from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words, warnings_of
 
 # what counts as a change by one, beside rad and m
-SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
+SCALES = {
+    "range_offset": 1.0,
+    "edge_log_odds": 10.0,
+    "edge_log_softness": 10.0,
+    "pitch_scale": 1.0,
+}
 FIRST_STEPS = 60
 NOISE_ROUNDS = 10
 ROUND_STEPS = 10
 LAST_STEP = 1e-4  # standard deviations: a shorter step ends the whole
-UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
+UNSEEN = (
+    0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
+)
 
 
 @dataclass(frozen=True, kw_only=True)

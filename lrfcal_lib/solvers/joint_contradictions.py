@@ -25,7 +25,9 @@ BOARD = 6  # numbers of a pose
 
 def of_placement(obs, row, kind, why):
     """The Problem of a placement (index)."""
-    return Problem(Stage.JOINT, kind, f"{why}; left out", placement=int(obs.placements[row]))
+    return Problem(
+        Stage.JOINT, kind, f"{why}; left out", placement=int(obs.placements[row])
+    )
 
 
 def of_image(obs, row, why):
@@ -104,7 +106,9 @@ def face_misses(state, data, boards, placement):
     (n,).
     """
     x = face_points(state, data)[placement] - boards[:, None, :, 3]
-    return medians(np.abs(np.vecdot(x, boards[:, None, :, 2])), data.face["used"][placement])
+    return medians(
+        np.abs(np.vecdot(x, boards[:, None, :, 2])), data.face["used"][placement]
+    )
 
 
 def without(obs, state, views, placements):
@@ -142,7 +146,9 @@ def without_contradictions(obs, state, data):
     return *without(obs, replace(state, boards=moved), single, out), left_out
 
 
-def misfits(blocks: dict[str, Block], data: JointData, groups=("face", "view")) -> np.ndarray:
+def misfits(
+    blocks: dict[str, Block], data: JointData, groups=("face", "view")
+) -> np.ndarray:
     """Normalised mean squared residual of ranges and views of each placement.
 
     1 is what the noise explains, (p,).

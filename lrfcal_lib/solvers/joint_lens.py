@@ -39,7 +39,9 @@ def pose_by_intrinsics(
     turned = T_camera_board.rotation.apply(corners)
     by_point, by_lens = project_jacobians(turned + T_camera_board.translation, model)
     by_pose = np.concatenate([np.cross(turned[:, None, :], by_point), by_point], axis=-1)
-    return -np.linalg.lstsq(by_pose.reshape(-1, 6), by_lens.reshape(-1, LENS), rcond=None)[0]
+    return -np.linalg.lstsq(by_pose.reshape(-1, 6), by_lens.reshape(-1, LENS), rcond=None)[
+        0
+    ]
 
 
 class LensShare(NamedTuple):
@@ -73,7 +75,9 @@ def lens_share(
     J = block.white_jacobian
     J_own = J[..., c:]
     camera = data.view["camera"]
-    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(camera))["lens"]
+    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(camera))[
+        "lens"
+    ]
     by_lens = among_cameras(lens, camera, len(obs.cameras))
     shift = block.whitened(by_lens.reshape(*J.shape[:2], -1))
     spread = block_diag(*obs.lens_covariance)
@@ -86,7 +90,9 @@ def lens_share(
     square = np.sum(left @ spread * left)
     level = data.levels.view_scale**2
     taken = np.sum((J_own @ own) * J_own) + np.sum((reduced @ finite) * reduced)
-    square *= level / max(6 * len(obs.view_camera) - taken, 1.0)  # rows that are left to show it
+    square *= level / max(
+        6 * len(obs.view_camera) - taken, 1.0
+    )  # rows that are left to show it
     share = np.clip(level - 1, 0, square) / level
     counted = share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite
     return LensShare(gain @ spread @ gain.T, counted, float(np.sqrt(square)))

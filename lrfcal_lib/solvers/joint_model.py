@@ -15,7 +15,13 @@ from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import move_pose
 from lrfcal_lib.model.observations import JointObservations
 
-SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "pitch_by_direction")
+SENSOR = (
+    "range_offset",
+    "edge_log_odds",
+    "edge_log_softness",
+    "pitch_scale",
+    "pitch_by_direction",
+)
 SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
 LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the odds
 SOFTEST = np.log([1e-3, 10.0])  # spot radii, limits of the softness
@@ -83,7 +89,11 @@ class Unknowns:
         """
         widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras * self.poses}
         widths |= {name: int(name in self.sensor) for name in SENSOR}
-        widths |= {"board": 6, "sweep": SWEEPS[self.sweep], "sides": self.edges * self.sides}
+        widths |= {
+            "board": 6,
+            "sweep": SWEEPS[self.sweep],
+            "sides": self.edges * self.sides,
+        }
         columns = {}
         end = 0
         for name, width in widths.items():
@@ -185,7 +195,9 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
     view["whitener"] = np.where(padding, 0.0, np.linalg.inv(np.linalg.cholesky(covariance)))
     view["pose"] = np.where(padding, np.eye(4), view["pose"])
     on_head = np.array([mount == "head" for mount in obs.mounts], bool)
-    return JointData(face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, levels)
+    return JointData(
+        face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, levels
+    )
 
 
 def move_state(state: JointState, step: tuple, unknowns: Unknowns) -> JointState:

@@ -6,7 +6,12 @@ import numpy as np
 
 from lrfcal_lib.fit.least_squares import OWN_RANK, eliminate, linearise
 from lrfcal_lib.solvers.joint_model import SWEEPS, JointData, JointState, Levels, Unknowns
-from lrfcal_lib.solvers.joint_residuals import SIDE_FREEDOM, edge_distance, named_blocks, rays
+from lrfcal_lib.solvers.joint_residuals import (
+    SIDE_FREEDOM,
+    edge_distance,
+    named_blocks,
+    rays,
+)
 
 PARTS = 3  # of a board in x and y, and of an edge
 PLANE = 3  # numbers of a plane, that a placement's own pose takes up
@@ -44,7 +49,9 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
         scale = float(np.clip(levels.view_scale * factor, *SCALE_LIMITS))
         levels = replace(levels, view_scale=scale, sigma_pitch=sigma)
     if unknowns.sides and "beam" in blocks:
-        levels = replace(levels, side_sigma=side_level(state.sides, data, own, gradient[:, c:]))
+        levels = replace(
+            levels, side_sigma=side_level(state.sides, data, own, gradient[:, c:])
+        )
     number = SWEEPS[unknowns.sweep]
     if number:
         variance = np.diagonal(spread, axis1=1, axis2=2)[:, 6 : 6 + number]
@@ -218,7 +225,9 @@ def judged(block, factor, others, rows, shared):
     inner = np.linalg.inv(whole[:, c:, c:])
     every = np.broadcast_to(np.eye(c), (len(own), c, c))
     spread = np.concatenate([every, -back[..., :c]], axis=1)
-    taken = np.sum(inner * hessian[:, c:, c:]) + np.sum((spread @ inverse) * (hessian @ spread))
+    taken = np.sum(inner * hessian[:, c:, c:]) + np.sum(
+        (spread @ inverse) * (hessian @ spread)
+    )
     freedom = np.linalg.slogdet(whole[:, c:, c:])[1].sum() + np.linalg.slogdet(total)[1]
     cost = half_square / f2 + 0.5 * (
         np.vecdot(moved, right).sum() + rows * np.log(f2) + block.log_determinant + freedom

@@ -32,13 +32,17 @@ USUAL = {
 }
 SIDE_FREEDOM = 3.0  # of Student's t: most backgrounds are alike, some are dark
 GRAZING = 1e-9  # cosine of the incidence below which a beam is taken not to be parallel to a board
-LEAST_ROOT = 1e-7  # root information of a beam, beside that at its edge: below, it says nothing
+LEAST_ROOT = (
+    1e-7  # root information of a beam, beside that at its edge: below, it says nothing
+)
 ROUGH_STEP = 1e-2  # standard deviations: a shorter step ends a round
 MOST_STEPS = 300
 SMALL_TURN = 1e-4  # radians; below, the series of the rotation vector's derivative is exact
 
 
-def named_blocks(state: JointState, data: JointData, unknowns: Unknowns) -> dict[str, Block]:
+def named_blocks(
+    state: JointState, data: JointData, unknowns: Unknowns
+) -> dict[str, Block]:
     """Residuals by name: face (metres), beam (likelihoods), view (radians and metres), sweep,
     side, `USUAL`, prior.
     """
@@ -110,7 +114,9 @@ def rays(state, data, group):
     """The Rays of a group."""
     pitch, by_parts = true_pitch(state, data, group["pitch"])
     in_head = group["ray"] @ state.head[:, :3].T
-    return Rays(tilt(state.head[:, 3], pitch), tilt(in_head, pitch), in_head, pitch, by_parts)
+    return Rays(
+        tilt(state.head[:, 3], pitch), tilt(in_head, pitch), in_head, pitch, by_parts
+    )
 
 
 def ray_columns(by_o, by_d, ray):
@@ -190,7 +196,8 @@ def edge_distance(state, data, group, ray):
     each = np.stack([-data.lines[:, 2:] * normal, normal @ turn, normal])
     each = each @ np.swapaxes(state.boards[:, None, :, :3], -1, -2)
     point, along, outwards = (
-        part[np.arange(len(part))[:, None], group["edge"]] for part in np.moveaxis(each, 1, 0)
+        part[np.arange(len(part))[:, None], group["edge"]]
+        for part in np.moveaxis(each, 1, 0)
     )
     away = ray.origin - point - state.boards[:, None, :, 3]
     m = cross(ray.direction, along)
@@ -200,7 +207,9 @@ def edge_distance(state, data, group, ray):
     distance = np.vecdot(across, away)
     g = (away * sign - distance[..., None] * m / length) / length
     by_direction = cross(along, g)
-    return EdgeDistance(distance, across, by_direction, cross(g, ray.direction), point, along)
+    return EdgeDistance(
+        distance, across, by_direction, cross(g, ray.direction), point, along
+    )
 
 
 def beam_block(state, data, unknowns):
@@ -231,7 +240,9 @@ def beam_block(state, data, unknowns):
     root = np.sqrt(information)
     alive = root * sigma > LEAST_ROOT
     residuals = np.divide(score, root, out=np.zeros_like(score), where=alive)
-    return Block(residuals, (root * alive)[..., None] * J, np.sqrt(share), cost=cost * share)
+    return Block(
+        residuals, (root * alive)[..., None] * J, np.sqrt(share), cost=cost * share
+    )
 
 
 def view_block(state, data, unknowns):
@@ -350,7 +361,9 @@ def prior_block(state, data, unknowns):
     jacobian = np.zeros((p, 4, unknowns.shared + unknowns.own))
     jacobian[..., :4] = root[:, None] * J
     cost = 0.125 * (PRIOR_FREEDOM + 4) * np.log1p(square / PRIOR_FREEDOM) / p
-    return Block(np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=np.full((p, 4), cost))
+    return Block(
+        np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=np.full((p, 4), cost)
+    )
 
 
 def usual_block(state, unknowns, name):

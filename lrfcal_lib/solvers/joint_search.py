@@ -25,7 +25,9 @@ from lrfcal_lib.solvers.joint_model import JointState, Levels, Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import minimum
 from lrfcal_lib.solvers.joint_start import start_states, state_of
 
-GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
+GOOD_START = (
+    0.7  # mean half squared residual; a start value this good is not searched further
+)
 ROUGH_MISS = 0.08  # metres, of a start value's boards from where images put them
 
 
@@ -53,7 +55,10 @@ class Start:
 
 
 def best_start(
-    obs: JointObservations, unknowns: Unknowns, levels: Levels, T0: RigidTransform | None = None
+    obs: JointObservations,
+    unknowns: Unknowns,
+    levels: Levels,
+    T0: RigidTransform | None = None,
 ) -> Start:
     """The most promising start value.
 

@@ -172,7 +172,9 @@ class JointSolution:
     @property
     def sweeps(self) -> dict[int, np.ndarray]:
         """Offset (rad) and stretch of the recorded pitch of each sweep, by placement."""
-        return dict(zip(self.observations.placements.tolist(), self.state.sweeps, strict=True))
+        return dict(
+            zip(self.observations.placements.tolist(), self.state.sweeps, strict=True)
+        )
 
     @property
     def sweep_sigma(self) -> tuple[float, float]:
@@ -206,7 +208,9 @@ class JointSolution:
     @property
     def sigma(self) -> dict[str, float]:
         """Standard deviations to rely on of the shared unknowns, by name."""
-        return dict(zip(self.solution.names, self.solution.trusted_sigma.tolist(), strict=True))
+        return dict(
+            zip(self.solution.names, self.solution.trusted_sigma.tolist(), strict=True)
+        )
 
     @property
     def edge_bias(self) -> float:
@@ -296,7 +300,9 @@ class JointSolution:
         """Rows of a group in the order of the observations, shape (p, n, k) -> (m, k)."""
         placement = getattr(self.observations, f"{group}_placement")
         rows = np.zeros((len(placement), padded.shape[-1]))
-        rows[np.argsort(placement, kind="stable")] = padded[getattr(self.data, group)["used"]]
+        rows[np.argsort(placement, kind="stable")] = padded[
+            getattr(self.data, group)["used"]
+        ]
         return rows
 
     def with_levels(self, **changed) -> "JointSolution":
@@ -339,7 +345,9 @@ class JointSolution:
 
         By increments ``[w, v]`` of ``T_platform_board``, with everything else known.
         """
-        of_scans = [self.blocks[group] for group in ("face", "beam") if group in self.blocks]
+        of_scans = [
+            self.blocks[group] for group in ("face", "beam") if group in self.blocks
+        ]
         board = self.unknowns.columns["board"]
         return linearise(of_scans).hessian[:, board, board]
 
@@ -347,7 +355,9 @@ class JointSolution:
         return f"JointSolution({len(self.boards)} placements, {self.solution!r})"
 
 
-def joint_words(direction: np.ndarray, names: tuple[str, ...], cameras: tuple[str, ...]) -> str:
+def joint_words(
+    direction: np.ndarray, names: tuple[str, ...], cameras: tuple[str, ...]
+) -> str:
     """A direction of the shared unknowns in words."""
     direction = np.asarray(direction) / np.max(np.abs(direction))
     large = np.abs(direction) > NAMED
@@ -356,7 +366,9 @@ def joint_words(direction: np.ndarray, names: tuple[str, ...], cameras: tuple[st
         index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
         if large[index].any():
             words.append(geometry.motion_words(direction[index], camera))
-    words += [WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS]
+    words += [
+        WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS
+    ]
     return " with ".join(words)
 
 
@@ -395,7 +407,11 @@ def _scatter(solution):
     """
     if "face" in solution.blocks:
         z = solution.blocks["face"].white[solution.data.face["used"]]
-        yield "ranges", "face_sigma", np.sqrt(np.mean(z**2) / solution.data.levels.face_share)
+        yield (
+            "ranges",
+            "face_sigma",
+            np.sqrt(np.mean(z**2) / solution.data.levels.face_share),
+        )
     if "view" in solution.blocks:
         camera = solution.data.view["camera"]
         z = solution.blocks["view"].white.reshape(camera.shape + (6,))

@@ -201,7 +201,9 @@ def board_from_scan(obs, placement, head):
     origin = lrf_to_platform(np.zeros((1, 3)), obs.face_pitch[face][:1], head)[0]
     centre = p.mean(axis=0)
     normal = np.linalg.svd(p - centre, full_matrices=False)[2][2]
-    normal = normal * (-np.sign(normal @ (centre - origin)))  # the printed side faces the rig
+    normal = normal * (
+        -np.sign(normal @ (centre - origin))
+    )  # the printed side faces the rig
     level = np.cross([0.0, 0.0, 1.0], normal)
     axes = np.stack([level, np.cross(normal, level), normal])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -233,4 +235,6 @@ def _turn_in_plane(obs, placement, head, axes, centre):
     c, s = np.linalg.lstsq(A, -line[:, 2], rcond=None)[0][:2]
     R = np.array([[c, -s], [s, c]]) / np.hypot(c, s)
     normals = line[:, :2] @ R.T
-    return R, np.linalg.lstsq(normals, np.sum(normals * x, axis=1) + line[:, 2], rcond=None)[0]
+    return R, np.linalg.lstsq(
+        normals, np.sum(normals * x, axis=1) + line[:, 2], rcond=None
+    )[0]

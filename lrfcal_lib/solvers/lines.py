@@ -47,14 +47,18 @@ def distance_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     moved = rotated + pose[..., None, :, 3]
     depth = moved[..., 2]
     noise = moved_noise(pose, normals, obs.crossing_covariance)
-    line_variance = (obs.crossing_line_sigma / length) ** 2  # of the sight's direction, radians
+    line_variance = (
+        obs.crossing_line_sigma / length
+    ) ** 2  # of the sight's direction, radians
     variance = np.vecdot(noise, normals) + line_variance * depth**2
     factor = plain.residuals / variance
     depth_by_pose = gradient_by_pose(rotated, np.broadcast_to([0.0, 0.0, 1.0], moved.shape))
     correction = noise_correction(rotated, moved, normals, noise, factor, pinhole=False)
     correction = correction + (factor * line_variance * depth)[..., None] * depth_by_pose
     corrected = plain.jacobian - correction
-    return Block(plain.residuals, plain.jacobian, 1.0 / np.sqrt(variance), corrected=corrected)
+    return Block(
+        plain.residuals, plain.jacobian, 1.0 / np.sqrt(variance), corrected=corrected
+    )
 
 
 def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
@@ -78,7 +82,9 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     one = np.ones(errors.shape[:-1])
     gradients = [by_point[..., 0, :], by_point[..., 1, :]]  # of u and of v
     rows = [gradient_by_pose(rotated, gradient) for gradient in gradients]
-    corrections = [noise_correction(rotated, moved, gradient, shift, one) for gradient in gradients]
+    corrections = [
+        noise_correction(rotated, moved, gradient, shift, one) for gradient in gradients
+    ]
     jacobian = np.stack(rows, axis=-2)
     corrected = jacobian - np.stack(corrections, axis=-2)
     shape = errors.shape[:-2] + (-1,)
@@ -135,7 +141,9 @@ def estimate_pose(
     problem: Callable[[np.ndarray], Block] = partial(residual, obs=obs)
     earlier: list[np.ndarray] = []
     if not weighted:
-        problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
+        problem, pose, earlier = minimise_in_rounds(
+            equal_weights, pose, move_pose, 2, **options
+        )
     placements = obs.group(uses)["placement"]
     unknowns = pose_unknowns(method, obs.camera)
     return solve(
@@ -147,7 +155,9 @@ def _variances(block):
     """Variance of every residual, from its whitener."""
     if block.whitener.ndim == block.residuals.ndim:
         return block.whitener**-2.0
-    return np.sum(np.linalg.inv(block.whitener) ** 2, axis=-1).reshape(block.residuals.shape)
+    return np.sum(np.linalg.inv(block.whitener) ** 2, axis=-1).reshape(
+        block.residuals.shape
+    )
 
 
 def start_from_lines(obs: CameraObservations) -> RigidTransform:
@@ -188,6 +198,8 @@ def _start_from_sights(points, lines, obs):
             f"camera '{obs.camera}': no pose puts the {len(points)} points in front of the camera"
         )
     poses = poses[ahead]
-    angle = np.abs(sight_block(poses, points, normals, 1.0).residuals) / np.abs(depth[ahead])
+    angle = np.abs(sight_block(poses, points, normals, 1.0).residuals) / np.abs(
+        depth[ahead]
+    )
     best = np.sort(angle, axis=1)[:, : max(6, int(AGREEING * len(points)))]
     return pose_transform(poses[np.argmin(np.sum(best**2, axis=1))])

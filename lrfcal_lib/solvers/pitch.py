@@ -126,7 +126,9 @@ class _Rows(NamedTuple):
 
 
 def estimate_pitch_errors(
-    cameras: dict[str, CameraObservations], direction: dict[int, int], middle: dict[int, float]
+    cameras: dict[str, CameraObservations],
+    direction: dict[int, int],
+    middle: dict[int, float],
 ) -> PitchErrors:
     """Estimate errors of the recorded pitch together with the cameras' poses, in nested models.
 

@@ -9,7 +9,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.least_squares import minimise
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR
-from lrfcal_lib.model.geometry import apply_pose, move_pose, pose_transform, transform_difference
+from lrfcal_lib.model.geometry import (
+    apply_pose,
+    move_pose,
+    pose_transform,
+    transform_difference,
+)
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.planes import (
     check_normals,
@@ -24,7 +29,9 @@ MINIMAL = 40  # of them by the minimal solution, which has eight poses each
 SAME_TURN = np.radians(10.0)  # poses nearer to each other than this are one minimum
 MOST_APART = 6  # minima to choose from
 ROUGH_SIGMA = 0.005  # metres, of a point from its plane, for the search
-CAPPED = 16.0  # times the usual square: a larger miss (four standard deviations) fits no minimum
+CAPPED = (
+    16.0  # times the usual square: a larger miss (four standard deviations) fits no minimum
+)
 NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
 SEEN = 0.8  # of the placements: a few may be wrong
 ROTATIONS = 200  # random ones, beside the 24 of a cube
@@ -78,7 +85,9 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     def evaluate(pose):
         return plane_block(pose, triangles / ROUGH_SIGMA, sets.boards, None, sets.number)
 
-    rough = partial(minimise, evaluate, retract=move_pose, max_iterations=12, tolerance=0.01)
+    rough = partial(
+        minimise, evaluate, retract=move_pose, max_iterations=12, tolerance=0.01
+    )
     robust = rough(state=best, loss="cauchy", scale="auto").state
     plain = rough(state=robust).state
     minima = np.concatenate([robust, plain, best])

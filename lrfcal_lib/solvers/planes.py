@@ -28,7 +28,9 @@ from lrfcal_lib.model.observations import CameraObservations
 
 ROUNDS = 5  # of new weights; the last change is far below the noise
 LEAST_SPREAD = 0.02  # of the boards' normals some way, about radians
-TILT_LEVER = 0.3  # metres, about half a board: turns an offset into the tilt that bends as much
+TILT_LEVER = (
+    0.3  # metres, about half a board: turns an offset into the tilt that bends as much
+)
 LENS = len(INTRINSIC_NAMES)
 LENS_SCALES = (1e3, 1e3, 1e3, 1e3, 10.0, 10.0, 10.0, 10.0, 100.0)
 FEWEST_CORNERS = 4  # of the pattern, for intrinsics
@@ -53,7 +55,14 @@ class PlaneSets(NamedTuple):
 
 
 def estimate_from_planes(
-    residual, obs: CameraObservations, pose: np.ndarray, *, method, uses, weighted=True, **options
+    residual,
+    obs: CameraObservations,
+    pose: np.ndarray,
+    *,
+    method,
+    uses,
+    weighted=True,
+    **options,
 ) -> Solution:
     """The pose of a camera from the board's planes (Zhang and Pless).
 
@@ -127,7 +136,9 @@ def plane_sets(obs: CameraObservations) -> PlaneSets:
     knows.
     """
     obs.require("plane", 3)
-    placements, rows, _ = np.intersect1d(obs.placements, obs.plane_placement, return_indices=True)
+    placements, rows, _ = np.intersect1d(
+        obs.placements, obs.plane_placement, return_indices=True
+    )
     mine = np.flatnonzero(np.isin(obs.plane_placement, placements))
     where = np.searchsorted(placements, obs.plane_placement[mine])
     padded = pad({"row": mine, "placement": where}, len(placements), width=4)
@@ -301,9 +312,13 @@ def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> lis
     by_point, by_lens = project_jacobians(corners, camera)
     visible = np.isfinite(obs.pattern_pixels)
     errors = np.where(visible, project(corners, camera) - obs.pattern_pixels, 0.0)
-    rows = [gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)]  # of u and of v
+    rows = [
+        gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)
+    ]  # of u and of v
     by_board = np.stack(rows, axis=-2)
-    jacobian = np.concatenate([np.zeros_like(by_board), by_lens[..., :lens], by_board], axis=-1)
+    jacobian = np.concatenate(
+        [np.zeros_like(by_board), by_lens[..., :lens], by_board], axis=-1
+    )
     p = len(boards)
     weights = visible.reshape(p, -1) / obs.pattern_sigma_px
     jacobian = jacobian.reshape(p, -1, jacobian.shape[-1])
@@ -311,7 +326,14 @@ def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> lis
 
 
 def estimate_with_lens(
-    residual, obs: CameraObservations, pose: np.ndarray, *, method, uses, lens=LENS, **options
+    residual,
+    obs: CameraObservations,
+    pose: np.ndarray,
+    *,
+    method,
+    uses,
+    lens=LENS,
+    **options,
 ) -> Solution:
     """Pose, intrinsics and board poses together: pattern reprojection plus point-plane distances.
 
@@ -346,7 +368,9 @@ def estimate_with_lens(
             f"camera '{obs.camera}': {len(obs.pattern_points)} pattern corners, a joint "
             "refinement needs a printed pattern"
         )
-    solution = estimate_from_planes(plane_block, obs, pose, method=method, uses=uses, **options)
+    solution = estimate_from_planes(
+        plane_block, obs, pose, method=method, uses=uses, **options
+    )
     error = plane_error(obs, solution)
     numbers = int(np.sum(plane_sets(obs).number) + visible.sum())
     state = (pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3])

@@ -120,7 +120,9 @@ def solve_platform(
         p = len(boards.placements)
         state = geometry.pose_array(gauge), boards.poses, np.zeros((p, 2))
         solution = solve(
-            partial(platform_blocks, edge=boards.edge, face=boards.face, sigma_pitch=sigma_pitch),
+            partial(
+                platform_blocks, edge=boards.edge, face=boards.face, sigma_pitch=sigma_pitch
+            ),
             state,
             move_platform,
             names=AXIS_NAMES,
@@ -139,7 +141,11 @@ def solve_platform(
         earlier = [solution.cost_history]
     _, _, bends = solution.state
     return PlatformSolution(
-        solution, boards.placements, skew=bends[:, 0], gap=bends[:, 1], skipped=boards.skipped
+        solution,
+        boards.placements,
+        skew=bends[:, 0],
+        gap=bends[:, 1],
+        skipped=boards.skipped,
     )
 
 
@@ -193,7 +199,9 @@ def prepare_boards(obs: PlatformObservations, T_head_lrf: RigidTransform) -> Boa
     face["second"] = np.zeros(len(p_face))
     placements = np.array(list(boards))
     poses = np.array(list(boards.values()))
-    return Boards(placements, poses, _padded(edge, placements), _padded(face, placements), skipped)
+    return Boards(
+        placements, poses, _padded(edge, placements), _padded(face, placements), skipped
+    )
 
 
 def _padded(group, placements):
@@ -260,7 +268,9 @@ def distances(state, group):
     face, too.
     """
     head, boards, bends = state
-    b, J, by_point, by_pitch = board_coordinates(head, boards, group["points"], group["pitch"])
+    b, J, by_point, by_pitch = board_coordinates(
+        head, boards, group["points"], group["pitch"]
+    )
     second = group["second"]
     cosine = second * np.cos(bends[:, :1])
     sine = second * np.sin(bends[:, :1])
