@@ -14,9 +14,8 @@ import pytest
 from shared import FOLDER, QUICK, ROOT, chromium, shared_folder, stages
 
 matplotlib.use("Agg")
-sys.modules["rfc3987_syntax"] = (
-    None  # a grammar of internet addresses, which nbformat would load: 3 s a process
-)
+# a grammar of internet addresses, which nbformat would load: 3 s a process
+sys.modules["rfc3987_syntax"] = None
 
 
 def pytest_configure(config):

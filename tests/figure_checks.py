@@ -15,9 +15,8 @@ from mpl_toolkits.mplot3d.art3d import Text3D
 from lrfcal_lib.report import notebook
 
 REPORT_WIDTH = 10.8
-SMALLEST = (
-    8.0  # inches at which a report shows a wide figure: 68 rem less the margins; points
-)
+# inches at which a report shows a wide figure: 68 rem less the margins; points
+SMALLEST = 8.0
 COUNTS = {"iteration", "placement", "placements", "scan line"}
 COUNTS |= {"chi-square per degree of freedom", "probability density"}  # have no unit
 SLACK = 1.0  # pixels

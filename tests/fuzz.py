@@ -337,9 +337,8 @@ def damage(rng, path):
     if not files:
         return
     file = any_of(rng, *files)
-    if (
-        file.suffix in (".png", ".jpg") and rng.random() < 0.6
-    ):  # small tables and statements matter as much
+    if file.suffix in (".png", ".jpg") and rng.random() < 0.6:
+        # small tables and statements matter as much
         file = any_of(rng, *files)
     kinds = {
         ".json": text,

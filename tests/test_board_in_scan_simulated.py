@@ -14,9 +14,8 @@ from lrfcal_lib.session.read import open_session
 PLACEMENTS = [("sim_quick", n) for n in range(1, 5)] + [
     ("sim_lms221", n) for n in range(1, 25)
 ]
-WIDEST = (
-    0.025  # metres; half a spot at 3 m, by which an edge before nothing lies farther out
-)
+# metres; half a spot at 3 m, by which an edge before nothing lies farther out
+WIDEST = 0.025
 
 
 @lru_cache

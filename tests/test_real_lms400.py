@@ -60,9 +60,8 @@ def test_random_halves_agree_as_their_sigma_says():
     """
     middle = stored("random_halves").median(numeric_only=True)
     assert middle.rotation_deg < 0.5 and middle.translation_mm < 12
-    usual = (
-        0.89  # median of the length of a normal 3-vector, relative to its root mean square
-    )
+    # median of the length of a normal 3-vector, relative to its root mean square
+    usual = 0.89
     for unit in ("rotation_deg", "translation_mm"):
         assert 1 / 1.6 < middle[unit] / (usual * middle[f"predicted_{unit}"]) < 1.6
 

@@ -73,9 +73,8 @@ class Variation:
     least_share: float = 0.25
     pulse: float = 1.0  # m
     placements: int = 14  # even
-    stop_noise: float = (
-        0.0  # standard deviation of where the head stops about what it says, rad
-    )
+    # standard deviation of where the head stops about what it says, rad
+    stop_noise: float = 0.0
     stretch: float = 0.0
     backlash: float = 0.0  # rad
     systematic: float = 0.0  # m

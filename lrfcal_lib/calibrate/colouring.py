@@ -24,9 +24,8 @@ LEAST_COSINE = 0.1  # of incidence
 STEEPEST = (
     math.sqrt(1 - LEAST_COSINE**2) / LEAST_COSINE
 )  # slant of a surface that is coloured
-DARK = (
-    6.0  # levels: below and above these a brightness is clipped, and next to nothing worth
-)
+# levels: below and above these a brightness is clipped, and next to nothing worth
+DARK = 6.0
 BRIGHT = 248.0
 CLIPPED = 1e-3  # weight of such a colour
 

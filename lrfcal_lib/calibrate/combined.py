@@ -31,17 +31,15 @@ from lrfcal_lib.solvers import joint_model, joint_residuals
 FEWEST_CELLS = 8  # beams about a side that no image shows
 # information roots of a side of which nothing is known: ten metres and a radian are far
 FAR = (10.0, 1.0)
-STILL = (
-    1e5  # information roots of what moves board and sides together, which changes no length
-)
+# information roots of what moves board and sides together, which changes no length
+STILL = 1e5
 ALONG = np.linspace(0.0, 1.0, 9)  # places along the stretch of an image edge
 SCALE_ROUNDS = 4  # of weighing image edges by how well they fit
 LEAST_SCALE = 0.1
 UNKNOWN = 1e6  # variance of what nothing determines
 KNOWN = 1e-18  # variance of what is held
-WIDEST = (
-    0.1  # share of its length by which an edge may be uncertain and still count as measured
-)
+# share of its length by which an edge may be uncertain and still count as measured
+WIDEST = 0.1
 ITERATIONS = 30
 TOLERANCE = 0.02  # sigma
 

@@ -118,7 +118,8 @@ def _disagreement(prepared, placement, misses):
         if placement in seen
     }
     if small_squares(views, prepared.board.pattern):
-        causes += f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be biased"
+        small = f"squares below {SMALL_SQUARE_PX:.0f} px"
+        causes += f"; or the images: {small}, whose distance may be biased"
     return f"scan: {off} board in the images of all {len(misses)} cameras ({causes})"
 
 

@@ -34,12 +34,10 @@ AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
 KEPT = 256  # scans that can be asked for by their instant
 LEAST_QUIET_S = 0.6  # of a stream, before it is taken for silent
-RECOVERY_S = (
-    8.0  # one attempt to find a lost device; there are more until the stream is stopped
-)
-REPLY_S = (
-    0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
-)
+# one attempt to find a lost device; there are more until the stream is stopped
+RECOVERY_S = 8.0
+# the manual allows 60 ms until a scan begins to be sent; a machine may be busy
+REPLY_S = 0.4
 LOOK_S = 0.2  # between looks whether the reader thread lives
 COUNTS = ("dropped", "stale", "reconnects")
 
@@ -73,9 +71,7 @@ class LMS2xx(Closed):
     ----------
     type : str
         Model and order number.
-    status : DeviceStatus
-        As read last.
-    configuration : Configuration
+    status, configuration : DeviceStatus, Configuration
         As read last.
     counts : dict of str to int
         'dropped': scans that the mirror made between two that came (needs real-time indices), most
@@ -156,9 +152,6 @@ class LMS2xx(Closed):
     def baudrate(self) -> int:
         """Of both ends of the line."""
         return self._opened().baudrate
-
-    # ---------------------------------------------------------------------------------------------
-    # connecting
 
     def _connect(self, first, end, deadline=math.inf):
         """Open the port and leave the device quiet, with everything about it read.
@@ -271,9 +264,6 @@ class LMS2xx(Closed):
         self._link.deadline = math.inf
         self.counts["reconnects"] += 1
         LOG.warning("%s: the device is back at %d Bd", self.port, rate)
-
-    # ---------------------------------------------------------------------------------------------
-    # settings
 
     @property
     def variant(self) -> tuple[float, float]:
@@ -419,9 +409,6 @@ class LMS2xx(Closed):
             raise Refused(
                 f"{self.port}: the device does not take the configuration {block}"
             )
-
-    # ---------------------------------------------------------------------------------------------
-    # scans
 
     def request(self, timeout: float | None = None) -> Reading:
         """One scan.

@@ -19,9 +19,8 @@ VARIANTS = (
     (180, 0.5),
 )  # of whole scans, deg
 PARTIAL = 181  # values of the first of four interlaced scans; the others have one less
-WINDOW_S = (
-    2.0  # arrivals in the last so many seconds tell the host's clock from the device's
-)
+# arrivals in the last so many seconds tell the host's clock from the device's
+WINDOW_S = 2.0
 OFF_S = 1.2  # how far a scan may arrive off its expected instant
 JITTER_S = 0.05  # larger corrections of the clock leave scans out, smaller ones are spread
 LEAST_S = MIRROR_TURN / 100  # between two instants told; far less than between two scans

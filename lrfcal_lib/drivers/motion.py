@@ -26,14 +26,12 @@ STALLED = 5  # settle times at rest elsewhere: the head does not get to where it
 BURSTS = 25  # of up and down, to reach one pitch
 FIRST_BURST_S = 0.1  # of a head whose speed is unknown
 GROWTH = 4  # of bursts while the speed is being learnt
-SHORT_OF = (
-    0.9  # part of the way that a burst is to make, so that the last come from one side
-)
+# part of the way that a burst is to make, so that the last come from one side
+SHORT_OF = 0.9
 SURPRISE = math.radians(3)  # from dead reckoning: then a reading is not believed at once
 LEAST_S = 1e-4  # of a wait worth its while
-MISSES = (
-    3  # queries without a reply, after which a head that is swept is not asked any more
-)
+# queries without a reply, after which a head that is swept is not asked any more
+MISSES = 3
 WRONG_WAY = math.radians(2)  # that a sweep may seem to go
 OTHER_WAY = "the head moves the other way: set invert to the contrary"
 STOPPED = "the head was stopped before it arrived"
@@ -106,9 +104,8 @@ class Motion:
         if settings.absolute is False:
             self._obeys = False
         self._dead: set[int] = set()  # speed bytes at which the head does not move
-        self._going: tuple | None = (
-            None  # way (1 up, -1 down), speed byte and instant of the motion
-        )
+        # way (1 up, -1 down), speed byte and instant of the motion
+        self._going: tuple | None = None
         self._frame = b""
         self._repeated = 0.0
         self._pitch: float | None = None

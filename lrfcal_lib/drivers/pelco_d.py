@@ -21,12 +21,10 @@ SET_TILT = 0x4D
 QUERY_TILT = 0x53
 TILT = 0x5B  # its reply
 TURN = 36000  # hundredths of a degree
-READ_S = (
-    0.02  # longest wait for single bytes, so that no read overshoots a deadline by more
-)
-MOST = (
-    512  # bytes looked at after a frame: a head sends up to 18, the rest is another device
-)
+# longest wait for single bytes, so that no read overshoots a deadline by more
+READ_S = 0.02
+# bytes looked at after a frame: a head sends up to 18, the rest is another device
+MOST = 512
 AGAIN_S = 0.05  # between looks for a port that vanished
 
 

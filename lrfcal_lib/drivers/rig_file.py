@@ -190,30 +190,26 @@ class HeadSettings(Stated):
     echo: Perhaps = "auto"
     # Asking for more is an error. The protocol knows no limits; typical heads tilt by -90 to 90.
     pitch_limits_deg: Limits = (-60.0, 60.0)
-    position_zero_deg: number(-360, 360, "deg") = (
-        0.0  # elevation that the head tells at pitch 0
-    )
+    # elevation that the head tells at pitch 0
+    position_zero_deg: number(-360, 360, "deg") = 0.0
     # It hangs upside down or counts the other way: its "up" lowers the view.
     invert: StrictBool = False
     tilt_speed: whole(0, FASTEST) = 0x20  # speed byte, 0 is very slow
     # At `tilt_speed`, both ways or (up, down). Not stated: 4 is assumed, as of constant-speed
     # heads, until it was learnt, and the log says so.
     degrees_per_second: Speeds = None
-    start_pitch_deg: Angle = (
-        0.0  # where a head without feedback stands at first: levelled by hand
-    )
+    # where a head without feedback stands at first: levelled by hand
+    start_pitch_deg: Angle = 0.0
     # Readings that differ by less are the same: cheap encoders jitter.
     tolerance_deg: number(1e-4, 45, "deg") = 0.1
     settle_s: Seconds = 0.3  # the head rests when its readings stay the same for this long
     poll_s: Seconds = 0.1  # between queries while it moves
     reply_s: number(1e-3, 10, "s") = 0.35  # until a reply begins; 1 is needed by slow heads
-    gap_s: number(0, 10, "s") = (
-        0.05  # silence between frames, and time for an acknowledgement
-    )
+    # silence between frames, and time for an acknowledgement
+    gap_s: number(0, 10, "s") = 0.05
     retries: whole(0, 20) = 3  # queries repeated when no reply came
-    repeat_s: number(1e-3, 60, "s") = (
-        None  # below 1 for heads that stop by themselves without
-    )
+    # below 1 for heads that stop by themselves without
+    repeat_s: number(1e-3, 60, "s") = None
     reconnect_s: number(0, 3600, "s") = 3.0  # that a call waits for a vanished port
 
     def elevation(self, pitch: float) -> float:

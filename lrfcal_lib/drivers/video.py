@@ -454,9 +454,8 @@ class MjpegStream(Images):
                 image = self._buffer[begin:end]
                 self._buffer = self._buffer[end:]
                 return image
-            if (
-                self._answer.closed or len(self._buffer) > LONGEST
-            ):  # at its end or after a silence
+            if self._answer.closed or len(self._buffer) > LONGEST:
+                # at its end or after a silence
                 return None
             try:
                 self.waited |= not select.select([self._answer], [], [], 0)[0]

@@ -42,9 +42,8 @@ ACK_S = 0.003  # from the last byte of a request to ACK or NAK; the manual allow
 REPLY_S = 0.065  # to the first byte of a reply, as measured on a real device
 WRITE_S = 0.107  # the same where flash is written (measured: 0x77)
 RESET_S = 0.010
-STOP_S = (
-    0.52  # most that a change of mode takes longer while streaming (measured: 71 to 588 ms)
-)
+# most that a change of mode takes longer while streaming (measured: 71 to 588 ms)
+STOP_S = 0.52
 GAP_S = 0.006  # a host that pauses longer within a telegram is not heard
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 # A stream that lags so far leaves scans out, as no host can know how late they are.
@@ -494,9 +493,8 @@ class EmulatedLms(SerialDevice):
             self._partial = 0
             self._turn = self._turn_of(self.host.now(), turns, math.ceil)
         partial = -1
-        if (
-            self.memory.mode == INTERLACED
-        ):  # which there are depends on the resolution that is set
+        if self.memory.mode == INTERLACED:
+            # which there are depends on the resolution that is set
             partial = self._partial * self.memory.variant[1] % 100 // 25
             self._partial += 1
         self._measure(self._turn, partial, self._next, "stream")

@@ -6,9 +6,8 @@ import numpy as np
 
 # eigenvalues of scaled normal equations below this share of the largest are rounding errors
 RANK = 1e-13
-PARTAKES = (
-    0.05  # share of a direction's largest component from which an unknown takes part in it
-)
+# share of a direction's largest component from which an unknown takes part in it
+PARTAKES = 0.05
 ZERO = 1e-5  # a component of a direction below is a rounding error
 FEWEST = 3  # placements whose scatter tells anything
 

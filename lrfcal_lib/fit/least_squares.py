@@ -27,6 +27,7 @@ from lrfcal_lib.fit.covariance import (
     null_space,
     placement_covariance,
 )
+from lrfcal_lib.fit.padding import medians, pad
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
@@ -35,12 +36,10 @@ OWN_RANK = 1e-13  # the same of what a placement owns
 FIRST_DAMPING = 1e-7  # of the normal equations' diagonal
 LEAST_DAMPING = 1e-12
 MOST_DAMPING = 1e14
-SMALL_DAMPING = (
-    10.0  # a step with more is short because it is held, not because it has arrived
-)
-LARGE_CHI2 = (
-    0.001  # chance alone exceeds chi-square so seldom where the stated noise is right
-)
+# a step with more is short because it is held, not because it has arrived
+SMALL_DAMPING = 10.0
+# chance alone exceeds chi-square so seldom where the stated noise is right
+LARGE_CHI2 = 0.001
 
 
 @dataclass(frozen=True)
@@ -96,28 +95,6 @@ class Block:
     def white_jacobian(self):
         """Whitened Jacobian, the corrected one where there is one."""
         return self.whitened(self.jacobian if self.corrected is None else self.corrected)
-
-
-def medians(values: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Medians of the used values of every row; many times as fast as np.nanmedian.
-
-    Parameters
-    ----------
-    values : ndarray, shape (..., n)
-    used : ndarray of bool, shape (..., n)
-
-    Returns
-    -------
-    ndarray, shape (...)
-        0 where there are none.
-    """
-    count = used.sum(axis=-1, keepdims=True)
-    ordered = np.sort(np.where(used, values, np.inf), axis=-1)
-    low, high = (
-        np.take_along_axis(ordered, np.maximum(n // 2, 0), axis=-1)
-        for n in (count - 1, count)
-    )
-    return np.where(count > 0, 0.5 * low + 0.5 * high, 0.0)[..., 0]
 
 
 def _weigh(block, loss, scale, axes):
@@ -590,31 +567,3 @@ def _solution(question, minimum, blocks, weights, shared):
         inflation=inflation,
         n_placements=hessians.shape[-3],
     )
-
-
-def pad(group: dict[str, np.ndarray], count: int, width: int = 1) -> dict[str, np.ndarray]:
-    """Arrays sorted by placement into rectangles, zeros behind the rows of each.
-
-    Parameters
-    ----------
-    group : dict of str to ndarray, shapes (m, ...)
-        With `placement`, indices below `count`.
-    count : int
-        Number of placements.
-    width : int
-        Of the rectangles, at least.
-
-    Returns
-    -------
-    dict of str to ndarray, shapes (count, n, ...)
-        Without `placement`; `used` marks what is no padding. Rows of a placement keep their order.
-    """
-    order = np.argsort(group["placement"], kind="stable")
-    number = np.bincount(group["placement"], minlength=count)
-    used = np.arange(number.max(initial=width)) < number[:, None]
-    out = {"used": used}
-    for key, value in group.items():
-        if key != "placement":
-            out[key] = np.zeros(used.shape + value.shape[1:], value.dtype)
-            out[key][used] = value[order]
-    return out

@@ -5,9 +5,8 @@ One rule for every fit that does not go through :func:`lrfcal_lib.fit.least_squa
 
 import numpy as np
 
-NORMAL = (
-    1.4826  # standard deviation of a normal variable over the median of its absolute value
-)
+# standard deviation of a normal variable over the median of its absolute value
+NORMAL = 1.4826
 # standard deviations; a fit with these weights is 95 % as good as least squares for normal errors
 TUKEY = 4.685
 

@@ -25,9 +25,8 @@ STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
 MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement, whatever it does
-PREFERRED = (
-    2.0  # so many are exceeded by chance once in 20 times; enough where it does harm:
-)
+# so many are exceeded by chance once in 20 times; enough where it does harm:
+PREFERRED = 2.0
 MOVED = 2.0  # standard deviations by which what is handed over would move
 HELD = 0.001  # metres, of a range offset that is asked whether bearings may stand for it
 INSTEAD = 6.0  # standard deviations beyond which they do

@@ -19,9 +19,8 @@ from lrfcal_lib.solvers.joint_solution import JointSolution
 
 POSE = 6  # numbers of a camera's pose
 BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong
-LEVEL = (
-    0.001  # false alarms a recording, over all cameras and places that a step might be at
-)
+# false alarms a recording, over all cameras and places that a step might be at
+LEVEL = 0.001
 LEAST_SIZE = 0.5  # pixels; edges and corners of a board are off by less at one placement
 ASKED = 4.0  # standard deviations: a change of the image scale that is none of chance
 STEP = 1e-4  # of the numeric derivative by the image scale
@@ -132,9 +131,8 @@ def camera_changes(
         solution, change = parted
         cameras.append(camera)
         changes.append(change)
-        if (
-            change.zoomed
-        ):  # two poses do not make up for that: what is left looks like more steps
+        if change.zoomed:
+            # two poses do not make up for that: what is left looks like more steps
             return changes
     # what is hopeless also with two poses of a camera has another cause
     return changes if explains(solution) else []

@@ -15,7 +15,10 @@ WIDE = np.radians(80.0)  # across an image, by the focal length: five numbers ha
 REMEDY = (
     "state intrinsics of this image size, or take sharp images with the chessboard all over"
 )
-REMEDY_WIDE = "use a lens below 110 deg, crop or undistort the images first, state intrinsics of this size"
+REMEDY_WIDE = (
+    "use a lens below 110 deg, crop or undistort the images first, "
+    "state intrinsics of this size"
+)
 
 
 def lens_findings(prepared: Prepared) -> list[Finding]:

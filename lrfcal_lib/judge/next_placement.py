@@ -43,9 +43,8 @@ PITCH_LIMITS = (
     np.radians(30),
 )  # of a head that is asked to look at a board
 LATTICE = np.linspace(*PITCH_LIMITS, 41)  # pitch angles that images are tried at
-IMAGES = (
-    3  # of each camera on the head, spread over the pitch angles at which all see the board
-)
+# of each camera on the head, spread over the pitch angles at which all see the board
+IMAGES = 3
 MARGIN = 0.04  # of the image, that a board keeps from its border, distortion included
 STEEPEST = np.radians(60.0)  # incidence of beams and of lines of sight
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance

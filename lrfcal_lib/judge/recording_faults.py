@@ -35,9 +35,8 @@ EXPLAINING = (
     "numbers",
 )  # kinds that everything else which looks wrong follows from
 SEVERE_PX = 5.0  # a camera that moves images by more is two cameras
-BETTER = (
-    3.0  # times nearer to the boards in the images, with what was recorded read otherwise
-)
+# times nearer to the boards in the images, with what was recorded read otherwise
+BETTER = 3.0
 MISREAD = 0.005  # metres; what is misread lies off by more than that
 GOOD = 0.05  # metres; boards and scans that belong together lie nearer than that
 AS_GOOD = 2.0  # times the miss of the best reading: another one that may be meant as well
@@ -49,9 +48,8 @@ POSE = 6  # numbers of a camera's pose
 HALF = 0.6745  # standard deviations of normal noise that half of all values stay below
 LEAST_MISS = 0.001  # metres; paper is no flatter
 MOST_LOST = 8  # placements; where more are left out, something else is wrong
-BESIDE = (
-    0.15  # metres between the middles of a board in a scan, which may be cut, and in images
-)
+# metres between the middles of a board in a scan, which may be cut, and in images
+BESIDE = 0.15
 
 
 @dataclass(frozen=True)
@@ -295,9 +293,8 @@ def plane_observations(prepared, camera, reading):
     poses = np.array([view.T_camera_board.as_matrix() for view in views.values()]).reshape(
         -1, 4, 4
     )
-    if (
-        reading.mirrored
-    ):  # the mirror image of a chessboard is one: normal and place are mirrored
+    if reading.mirrored:
+        # the mirror image of a chessboard is one: normal and place are mirrored
         mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
         poses = mirror @ poses @ mirror
 

@@ -3,6 +3,7 @@ report.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -218,13 +219,8 @@ def judge(
 
     if method == "joint" and joint is not None:
         field = prepared.session.lrf.field_of_view
-        judged = verdict(
-            joint.solution,
-            prepared.models,
-            suggest=suggest,
-            doubt=doubt,
-            field_of_view=field,
-        )
+        options: dict[str, Any] = {"suggest": suggest, "doubt": doubt}
+        judged = verdict(joint.solution, prepared.models, field_of_view=field, **options)
     else:
         judged = _without_joint(calibration, method, doubt)
     lost = left_out(calibration, method)
@@ -234,17 +230,23 @@ def judge(
         kept = [reason for reason in judged.reasons if reason.kind != Kind.EXCLUDED]
         judged = replace(judged, reasons=tuple(kept))
     findings += sides_elsewhere(prepared)
+    notes = _notes(calibration, method, lost.note, not contradictions)
+    return replace(judged.because(findings), notes=notes)
+
+
+def _notes(calibration, method, lost, as_stated):
+    """What is handed over, where the cameras are, what was left out, and what is not known."""
     axis = calibration.platform.axis_with(method)
     notes = [f"Handed over: the cameras of the method '{method}' and the axis '{axis}'."]
-    more_notes = []
-    if method == "joint" and joint is not None:
-        notes += places_of_cameras(joint.solution)
-        if not contradictions:
-            admitted = prepared.session.lrf.admitted_offset
-            more_notes.append(step_not_told(joint.solution, admitted))
-        more_notes.append(_scatter_note(len(joint.solution.boards)))
-    notes += [lost.note, *more_notes]
-    return replace(judged.because(findings), notes=tuple(filter(None, notes)))
+    if method != "joint" or calibration.joint is None:
+        return tuple(filter(None, [*notes, lost]))
+    solution = calibration.joint.solution
+    notes += [*places_of_cameras(solution), lost]
+    if as_stated:
+        admitted = calibration.prepared.session.lrf.admitted_offset
+        notes.append(step_not_told(solution, admitted))
+    notes.append(_scatter_note(len(solution.boards)))
+    return tuple(filter(None, notes))
 
 
 def verdict(

@@ -219,9 +219,8 @@ def render(
         v, u = (uv + [du - splat, dv - splat]).T[::-1]
         inside = np.flatnonzero((u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0]))
         layer = np.full(size, -1)
-        layer[v[inside], u[inside]] = (
-            inside  # of equal pixels the last one, the nearest, stays
-        )
+        # of equal pixels the last one, the nearest, stays
+        layer[v[inside], u[inside]] = inside
         winner = np.maximum(winner, layer)
     white = np.full((1, 3), 255, np.uint8)
     return np.vstack([colors[order], white])[winner]  # the last row where no point is

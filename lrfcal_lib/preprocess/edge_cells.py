@@ -61,7 +61,6 @@ def edge_cells(
     board, cosine = plane_range(scan, rays, sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
     radius = lrf.spot_radius(board)
-
     here = board[line, beam]
     behind = beyond(scan, line, beam, step)
     visible = np.isfinite(behind)
@@ -93,8 +92,13 @@ def edge_cells(
         "across": across,
         "step": np.where(across, median_step(sweep.pitch), median_step(sweep.bearings)),
     }
-    names = ",".join(columns)
-    return np.rec.fromarrays([*columns.values()], names=names)[keep]  # type: ignore[call-overload]
+    return _records(columns)[keep]
+
+
+def _records(columns):
+    """Columns by name as a recarray."""
+    arrays = [*columns.values()]
+    return np.rec.fromarrays(arrays, names=",".join(columns))  # type: ignore[call-overload]
 
 
 def _readings(scan, cells, k, board, radius, close):

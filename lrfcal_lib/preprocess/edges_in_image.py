@@ -134,8 +134,7 @@ def refine_edge(
     across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
     on_edge = start + columns[None, :, None] * along
     strip = sample(image, model, on_edge + across[:, None, None] * normal)
-    near = strip[np.abs(across) <= NEAR_PX, :, 0]
-    visible = int(np.isfinite(near).all(axis=0).sum())
+    visible = int(np.isfinite(strip[np.abs(across) <= NEAR_PX, :, 0]).all(axis=0).sum())
     if visible < max(LEAST_PROFILES, LEAST_SHARE * len(columns)):
         share = 100 * visible / len(columns)
         raise EdgeNotSeen(f"cut by the image border: {share:.0f}% of it inside the image")
@@ -145,10 +144,7 @@ def refine_edge(
     off = across[0] + ACROSS_STEP_PX * (fit.offset + fit.slope * seen)
     first, last, centre = start + seen * along + off * normal
     line = outward_line(first, last, normal)
-    to_middle = np.array([[1.0, middle], [0.0, 1.0]])
-    covariance = to_middle @ fit.covariance @ to_middle.T * ACROSS_STEP_PX**2
-    stretch = max(np.ptp(fit.columns), 1)
-    covariance += np.diag([1.0, 12 / stretch**2]) * SYSTEMATIC_PX**2
+    covariance = _about_middle(fit, middle)
     # a slope ds moves the far end outwards; the angle turns the normal from u to v
     turn = -np.sign(along @ [-line[1], line[0]])
     return ImageEdge(
@@ -160,6 +156,14 @@ def refine_edge(
         n_points=len(fit.columns),
         rms_px=fit.rms * ACROSS_STEP_PX,
     )
+
+
+def _about_middle(fit, middle):
+    """Covariance of offset (pixels) and slope about the middle column, systematic part included."""
+    to_middle = np.array([[1.0, middle], [0.0, 1.0]])
+    covariance = to_middle @ fit.covariance @ to_middle.T * ACROSS_STEP_PX**2
+    stretch = max(np.ptp(fit.columns), 1)
+    return covariance + np.diag([1.0, 12 / stretch**2]) * SYSTEMATIC_PX**2
 
 
 def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:

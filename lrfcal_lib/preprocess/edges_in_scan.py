@@ -177,10 +177,10 @@ def crossings(
     warp_sigma = 0.0
     if not across:
         shift, warp_sigma = _warp(scan, ends)
-    elif (
-        len(scan.sweep.pitch) > 1
-    ):  # the pitch is read in steps, it may seem to stand still
+    elif len(scan.sweep.pitch) > 1:
+        # the pitch is read in steps, it may seem to stand still
         gap = np.copysign(np.maximum(np.abs(gap), median_step(scan.sweep.pitch)), gap)
+    order = ends.beam if across else ends.line
 
     def at(angle):
         if across:
@@ -188,10 +188,8 @@ def crossings(
         return _along_lines(scan, ends.line, angle, shift)
 
     middle = at((ends.inner + ends.outer) / 2)
-    last = at(ends.inner)
     here = scan.fitted[ends.line, ends.beam]
     behind = beyond(scan, ends.line, ends.beam, ends.step)
-    order = ends.beam if across else ends.line
     side, every = _group(scan, middle, order, ends.end, behind - here < MIXING, known)
     sigma = np.abs(gap) * UNIFORM
     by_angle = _to_platform(scan, middle.by_angle, middle.pitch)
@@ -200,14 +198,11 @@ def crossings(
     if every:  # scans at one pitch have no sides, and keep all points
         side = np.where(np.isin(side, [s.side for s in sides]), side, -1)
     edges = {}
-    for variant, crossing in (("last_beam", last), ("half_step", middle)):
-        distance = np.linalg.norm(crossing.points, axis=1, keepdims=True)
-        rays = crossing.points / distance
-        noise = _outer(rays * np.hypot(crossing.range_sigma, warp_sigma)[:, None])
+    for variant, crossing in (("last_beam", at(ends.inner)), ("half_step", middle)):
         edges[variant] = ScanEdges(
             variant=variant,
             points=crossing.points,
-            covariance=noise + _outer(crossing.by_angle * sigma[:, None]),
+            covariance=_covariance(crossing, sigma, warp_sigma),
             pitch=crossing.pitch,
             line=ends.line,
             beam=ends.beam,
@@ -218,6 +213,13 @@ def crossings(
             background=background_odds(here, behind),
         )
     return edges, every
+
+
+def _covariance(crossing, sigma, warp_sigma):
+    """Of crossings, metres^2: along their rays, and by the angle at which they lie."""
+    rays = crossing.points / np.linalg.norm(crossing.points, axis=1, keepdims=True)
+    noise = _outer(rays * np.hypot(crossing.range_sigma, warp_sigma)[:, None])
+    return noise + _outer(crossing.by_angle * sigma[:, None])
 
 
 def beyond(scan, line, beam, step):

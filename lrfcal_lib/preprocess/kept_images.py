@@ -8,9 +8,8 @@ from lrfcal_lib.preprocess.outline_in_images import FARTHEST
 from lrfcal_lib.preprocess.pattern_in_image import square_axes
 
 ALONG = 1.0  # beyond the farthest distance at which edges are looked for, squares
-NEARER = (
-    2.0  # times as large as the largest square of the pattern: what is nearer to the camera
-)
+# times as large as the largest square of the pattern: what is nearer to the camera
+NEARER = 2.0
 ROOM_PX = 60  # edges are looked for 40 px beside their prediction
 
 

@@ -21,9 +21,8 @@ STEEPEST = np.tan(np.radians(80))
 # metres; what noise and dark print change between neighbouring beams of one face
 DEPTH_NOISE = 0.03
 PLANE_NOISE = 0.02  # metres; noise and warp of a board about its plane
-LONGEST_HOLE = (
-    0.15  # metres; a gap without returns that does not end a surface (print, gloss)
-)
+# metres; a gap without returns that does not end a surface (print, gloss)
+LONGEST_HOLE = 0.15
 # metres; the farthest from its plane that a return of a noisy device still counts
 LARGEST_NOISE = 0.04
 SAME_PITCH = 1e-4  # radians: scan lines at one pitch
@@ -150,10 +149,7 @@ def planar_surface(
         Says what was seen instead.
     """
     ranges = sweep.ranges
-    if not np.isfinite(ranges).any():
-        raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
-    p_lrf = polar_to_points(ranges, sweep.bearings)
-    points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)
+    points = _in_platform(sweep, T_head_lrf)
     upright = None
     if np.ptp(sweep.pitch) <= SAME_PITCH:
         across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
@@ -170,20 +166,19 @@ def planar_surface(
             reach = float(np.median(ranges[part.mask]))
             grown = 0.0 if lrf is None else float(lrf.spot_radius(reach))
             limits = _size_limits(board, grown)
+            area = 0.0
+            fault = ""
             if upright is None:
                 part = _trimmed(part, points, limits)
                 area, length = plane_size(points[part.mask], part.normal)
                 fits = limits.hold(area, length)
                 fault = _fault(part, sweep, T_head_lrf, points)
             else:
-                area = 0.0
                 length = float(np.ptp(points[part.mask] @ np.cross(part.normal, upright)))
                 fits = LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest
-                fault = ""
             if not fits or fault:
-                rejected.append(
-                    f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m{fault}"
-                )
+                size = f"{area:.2f} m2, {length:.2f} m long"
+                rejected.append(f"{size} at {reach:.2f} m{fault}")
             elif reach < best_reach:
                 best = part
                 best_reach = reach
@@ -191,6 +186,14 @@ def planar_surface(
         words = "; ".join(rejected[:4]) or "no flat surface"
         raise BoardNotFound(f"no flat surface of the board's size; seen: {words}")
     return _grown(best, points)
+
+
+def _in_platform(sweep, T_head_lrf):
+    """All points of a sweep (L, B, 3), metres."""
+    if not np.isfinite(sweep.ranges).any():
+        raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
+    p_lrf = polar_to_points(sweep.ranges, sweep.bearings)
+    return lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)
 
 
 def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:

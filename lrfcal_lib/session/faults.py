@@ -10,10 +10,10 @@ from lrfcal_lib.session import stated
 from lrfcal_lib.session.telegrams import other_than_stated
 
 MANY = 0.2  # share of a camera's images: where more are wrong nothing can rest on them
-WHITE = (
-    0.995  # quantile of the grey levels that the brightest surface of an image has at least
-)
-DARK = 30  # grey levels of 255; a white square of a chessboard has more in every image that is of use
+# quantile of the grey levels that the brightest surface of an image has at least
+WHITE = 0.995
+# grey levels of 255; a white square of a chessboard has more in every image that is of use
+DARK = 30
 BEYOND = 0.001  # share of ranges beyond the largest one: single readings may be mirrors or the sun
 SHOWN = 3  # examples in a sentence
 

@@ -62,7 +62,10 @@ T_LEFT_CLOUD = RigidTransform.from_components(
         [[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]]
     ),
 )
-SOURCE = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
+SOURCE = (
+    "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP "
+    "(github.com/suijingfeng/LaserSeteroCalibration)"
+)
 NOTE = (
     "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, their bearing b "
     "is 90 deg - ours. "
@@ -70,9 +73,8 @@ NOTE = (
 )
 # radians of pitch between points of two scan lines; rounding to a micrometre makes less than 1e-5
 LINE_JUMP = 1e-4
-LARGEST_MISS = (
-    1e-5  # metres between published points and those rebuilt from what was recovered
-)
+# metres between published points and those rebuilt from what was recovered
+LARGEST_MISS = 1e-5
 KEYS = {
     "fc": 2,
     "cc": 2,

@@ -3,11 +3,8 @@
 import math
 import os
 from dataclasses import dataclass, field
-from functools import partial
-from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
-from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import cv2
 import numpy as np
@@ -17,13 +14,13 @@ from lrfcal_lib.model.board import Board
 from lrfcal_lib.session import stated
 from lrfcal_lib.session.faults import dark_image, faults_of_dark, faults_of_files
 from lrfcal_lib.session.images import check_image_size
+from lrfcal_lib.session.scans import read_scans
 from lrfcal_lib.session.shown import printable
 from lrfcal_lib.session.stated import (
     CameraInfo,
     LrfInfo,
     SessionError,
     naming,
-    opened,
     reading,
     short,
 )
@@ -32,7 +29,6 @@ from lrfcal_lib.session.telegrams import (
     INDEX_COLUMNS,
     TelegramLog,
     other_than_stated,
-    read_telegrams,
 )
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
@@ -40,18 +36,6 @@ EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
 PLATFORM_COLUMNS = ("t_s", "commanded_deg", "measured_deg")
 PURPOSES = ("intrinsics", "board", "scene")
 DROPPED = "dropped"  # purpose of an image of a placement that was recorded again, or never finished
-ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
-ENTRY = b"PK\1\2"  # begins each line of an archive's table of contents
-MOST_ENTRIES = 100  # of an archive; a session's has the six arrays
-PACKED = (
-    ZIP_STORED,
-    ZIP_DEFLATED,
-)  # as numpy packs; bzip2 and LZMA are not unpacked in steps
-LONGEST_HEADER = (
-    10_000  # bytes before the values of an array; numpy refuses more, once it has them
-)
-# metres; no pitching 2D scanner sees half of its scene farther away than that
-LONGEST_MEDIAN_RANGE = 200.0
 
 
 @dataclass(frozen=True)
@@ -82,155 +66,6 @@ class EdgePick:
     file: Path
     edge: str
     ends: np.ndarray
-
-
-SOURCES = ("lrf/scans.npz", "lrf/telegrams.bin")
-
-
-def read_scans(path):
-    """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or
-    None).
-    """
-    arrays, telegrams = (path / name for name in SOURCES)
-    if os.path.lexists(arrays):
-        return read_npz(arrays, path), None
-    if os.path.lexists(telegrams):
-        scans, log = read_telegrams(telegrams, path)
-        with naming(telegrams):
-            return check_scans(scans), log
-    if os.path.lexists(path / "lrf") and parts_of(path):
-        remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
-        raise SessionError(f"{path}: the recording was interrupted; {remedy}")
-    raise SessionError(f"{arrays}: no such file; a session needs the scan lines")
-
-
-def parts_of(path):
-    """Files of a session's sweeps in their order, until it is finished."""
-    return sorted(stated.checked(path / "lrf" / "any", path).parent.glob("part_*.npz"))
-
-
-def read_npz(file, within):
-    """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is
-    unpacked.
-    """
-    with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream:
-        _check_entries(file, stream)
-        with ZipFile(stream) as archive:
-            scans = _read_arrays(file, archive)
-    with naming(file):
-        return check_scans(scans)
-
-
-def _check_entries(file, stream):
-    """Refuse an archive with a long table of contents, of which ZipFile makes objects at once."""
-    parts = iter(partial(stream.read, 1_000_000), b"")
-    entries = sum(part.count(ENTRY) for part in parts)
-    if entries > MOST_ENTRIES:
-        remedy = f"write it again with the arrays {short(ARRAYS)} only"
-        raise SessionError(
-            f"{file}: holds {entries} files, more than {MOST_ENTRIES}; {remedy}"
-        )
-
-
-def _read_arrays(file, archive):
-    """The arrays that a session may have, each checked by its header before it is unpacked."""
-    scans = {}
-    values = 0
-    for key in ARRAYS:
-        name = f"{key}.npy"
-        if name not in archive.namelist():
-            continue
-        if archive.getinfo(name).compress_type not in PACKED:
-            remedy = "write it again with numpy.savez_compressed"
-            raise SessionError(
-                f"{file}: {key} is packed in another way than numpy does; {remedy}"
-            )
-        with archive.open(name) as member:
-            beginning = BytesIO(member.read(LONGEST_HEADER))
-        old = np.lib.format.read_magic(beginning) == (1, 0)
-        header = (
-            np.lib.format.read_array_header_1_0
-            if old
-            else np.lib.format.read_array_header_2_0
-        )
-        shape, _, kind = header(beginning)
-        if kind.kind not in "fiub" or kind.itemsize > 8:
-            words = f"it holds {kind}, not numbers; write it without pickles"
-            raise SessionError(f"{file}: {key} cannot be read: {words}")
-        values += abs(math.prod(shape))
-        with naming(file):
-            stated.check_amount(values)
-        with archive.open(name) as member:
-            scans[key] = np.lib.format.read_array(member, allow_pickle=False)
-    return scans
-
-
-def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Scan lines with consistent shapes and credible units.
-
-    Parameters
-    ----------
-    scans
-        By name: ranges (N, B), metres; bearings (B,) and pitch (N,), radians; placement (N,);
-        time_s (N,); intensities (N, B) where there are any.
-
-    Returns
-    -------
-    dict of ndarray
-        The same as floats (placement: integers), zero or infinite ranges NaN.
-
-    Raises
-    ------
-    KeyError, ValueError
-        For a missing array, wrong shapes or units, bearings that do not ascend, no range at all.
-    """
-    ranges = np.asarray(scans["ranges"], float)
-    if ranges.ndim != 2:
-        raise ValueError(f"ranges must be scan lines x beams, got shape {ranges.shape}")
-    lines, beams = ranges.shape
-    shapes: dict[str, tuple[int, ...]] = {
-        "bearings": (beams,),
-        "placement": (lines,),
-        "pitch": (lines,),
-        "time_s": (lines,),
-    }
-    shapes |= {"intensities": (lines, beams)} if "intensities" in scans else {}
-    for key, shape in shapes.items():
-        if scans[key].shape != shape:
-            raise ValueError(
-                f"{key} has shape {scans[key].shape}, the ranges {ranges.shape} ask for {shape}"
-            )
-    scans = {
-        key: np.asarray(scans[key], int if key == "placement" else float) for key in shapes
-    }
-    seen = ranges[np.isfinite(ranges)]
-    if seen.size == 0:
-        raise ValueError(f"no range in {lines} scan lines (all NaN): nothing was recorded")
-    if np.median(seen) > LONGEST_MEDIAN_RANGE:
-        units = "millimetres? Divide by 1000; inches? Multiply by 0.0254"
-        raise ValueError(f"the median range is {np.median(seen):g} m: {units}")
-    if seen.min() < 0:
-        raise ValueError(
-            f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN"
-        )
-    for name, angles, limit in (
-        ("bearing", scans["bearings"], 2 * np.pi),
-        ("pitch", scans["pitch"], np.pi),
-    ):
-        if not np.isfinite(angles).all():
-            raise ValueError(
-                f"{np.sum(~np.isfinite(angles))} values of {name} are not finite"
-            )
-        if np.abs(angles).max(initial=0) > limit + 1e-6:
-            raise ValueError(
-                f"a {name} is {np.abs(angles).max():g} rad: degrees? Convert to radians"
-            )
-    if np.any(np.diff(scans["bearings"]) <= 0):
-        raise ValueError(
-            "bearings must ascend (0 right, pi/2 ahead): turn the columns of the ranges round"
-        )
-    ranges[~(ranges > 0) | np.isinf(ranges)] = np.nan
-    return {**scans, "ranges": ranges}
 
 
 def missing_parts(placements, scans, records, cameras, unfinished=None):

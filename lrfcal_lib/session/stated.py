@@ -83,9 +83,8 @@ SYSTEMATIC_ERROR = {
 # centimetres: so many standard deviations or steps of a range; the sheets above admit 2 to 4.2, and
 # 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
-ASSUMED_SPOT_RADIUS = (
-    0.005  # metres; only the unit of the edge bias where nobody stated the spot
-)
+# metres; only the unit of the edge bias where nobody stated the spot
+ASSUMED_SPOT_RADIUS = 0.005
 
 
 def in_words(error):
@@ -270,7 +269,8 @@ class BoardStated(BaseModel):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
             given = "none" if not any(self.features) else short(map(repr, self.features))
-            needed = f"features must be two different edges of {short(self.edges)}, at a right angle"
+            edges = short(self.edges)
+            needed = f"features must be two different edges of {edges}, at a right angle"
             raise ValueError(f"{needed}; got {given}")
         if corners is not None and len(corners) != len(self.edges):
             raise ValueError(

@@ -19,6 +19,7 @@ from lrfcal_lib.model.board import Board
 from lrfcal_lib.session import read, stated
 from lrfcal_lib.session.images import JPEG, check_image_size
 from lrfcal_lib.session.lock import LOCK, alone
+from lrfcal_lib.session.scans import check_scans, parts_of, read_npz
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, naming, short
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
@@ -211,7 +212,7 @@ class SessionWriter:
         if intensities is not None:
             scans["intensities"] = np.asarray(intensities, float)
         with naming(f"{self.path}: placement {placement}"):
-            scans = read.check_scans(scans)
+            scans = check_scans(scans)
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError(
                     "the bearings differ from those of the sweeps before: one grid a session"
@@ -353,12 +354,12 @@ def complete(path):
     mend_tables(path)
     if os.path.lexists(path / "lrf" / "telegrams.bin"):
         return
-    parts = read.parts_of(path)
+    parts = parts_of(path)
     if not parts:
         raise SessionError(
             f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already"
         )
-    sweeps = [read.read_npz(part, path) for part in parts]
+    sweeps = [read_npz(part, path) for part in parts]
     scans = {}
     for key in sweeps[0]:
         if key != "bearings" and all(key in sweep for sweep in sweeps):

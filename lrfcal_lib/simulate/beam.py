@@ -36,9 +36,8 @@ class Beam:
     # description)
     spot_exit: NonNegativeFloat = 0.016
     divergence: NonNegativeFloat = 0.0119
-    sigma_range: NonNegativeFloat = (
-        0.010  # statistical error, 1 sigma, metres (technical description)
-    )
+    # statistical error, 1 sigma, metres (technical description)
+    sigma_range: NonNegativeFloat = 0.010
     systematic: float = 0.0  # constant error of this one device, metres
     # largest systematic error that the maker admits, by unit, metres
     systematic_bound: tuple[tuple[float, float], ...] = ((0.001, 0.035), (0.01, 0.05))

@@ -270,11 +270,8 @@ def _record(folder, name, setup, workers):
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}",
     ) as writer:
         log = _add_placements(writer, setup, placements, truth, workers)
-    write_file(
-        folder / "platform.csv",
-        "\n".join([",".join(PLATFORM_COLUMNS), *log]) + "\n",
-        folder,
-    )
+    lines = [",".join(PLATFORM_COLUMNS), *log]
+    write_file(folder / "platform.csv", "\n".join(lines) + "\n", folder)
     write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
 
 

@@ -54,9 +54,8 @@ class Platform:
     stretch: Annotated[float, Field(gt=-0.5, lt=0.5)] = (
         0.0  # the head turns 1 + stretch times as far as the platform says
     )
-    latency: NonNegativeFloat = (
-        0.0  # seconds by which the measured pitch is older than its time stamp
-    )
+    # seconds by which the measured pitch is older than its time stamp
+    latency: NonNegativeFloat = 0.0
     # standard deviation of where the head comes to rest about where it should, radians
     noise: NonNegativeFloat = 0.0
     encoder_step: NonNegativeFloat = 0.0  # of the measured pitch, radians; 0 for none

@@ -22,6 +22,17 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, distort, undistort
+from lrfcal_lib.simulate.textures import (
+    book_spines,
+    chessboard,
+    plain,
+    planks,
+    poster,
+    printed_page,
+    stripes,
+    tiles,
+    wood,
+)
 
 FLOOR = -1.1  # metres, below the platform
 SKY = (0.95, 0.98, 1.0)  # light from where there is nothing
@@ -29,8 +40,6 @@ FLAT = 0.03  # difference of light over a block of pixels below which its four c
 BLOCK = 2  # pixels
 Mesh = tuple[np.ndarray, np.ndarray]  # vertices (n, 3), metres, and faces (m, 3)
 BATCH = 1 << 19  # rays that are cast at once
-# random values that textures are made of
-LATTICE = np.random.default_rng(20091001).random((64,) * 3)
 ROOM = json.loads(Path(__file__).with_name("room.json").read_text())
 
 
@@ -153,154 +162,6 @@ SHAPES = {
 }
 
 
-def value_noise(points, cell):
-    """Smooth noise (n,) between 0 and 1, from random values on a lattice of cells, metres."""
-    at = points / cell
-    low = np.floor(at).astype(np.int64)
-    f = at - low
-    f = f * f * (3 - 2 * f)
-    cells = np.stack([low & 63, (low + 1) & 63])  # (2, n, 3)
-    shares = np.stack([1 - f, f])
-    axes = np.arange(3)
-    out = 0.0
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.prod(shares[corner, :, axes], axis=0)
-        out = out + weight * LATTICE[tuple(cells[corner, :, axes])]
-    return out
-
-
-def plain(
-    points: np.ndarray, color: ArrayLike, rough: float = 0.0, cell: float = 0.15
-) -> np.ndarray:
-    """One colour, with a soft variation.
-
-    Parameters
-    ----------
-    points
-        Shape (n, 3), metres.
-    color
-        Albedo, shape (3,).
-    rough
-        Share of the variation.
-    cell
-        Its size, metres.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-    """
-    if not rough:
-        return np.broadcast_to(np.asarray(color, float), points.shape)
-    return (
-        np.asarray(color, float) * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
-    )
-
-
-def wood(points, color, cell=(0.5, 0.03, 0.03)):
-    """Grain along x."""
-    tone = 0.8 + 0.4 * value_noise(points, np.asarray(cell))
-    return np.asarray(color, float) * tone[:, None]
-
-
-def planks(points, color, width=0.18, length=1.4):
-    """A wooden floor: boards along y with dark joints."""
-    across = points[:, 0] / width
-    row = np.floor(across)
-    board = np.floor(points[:, 1] / length + 0.37 * row)
-    tone = LATTICE[row.astype(int) & 63, board.astype(int) & 63, 7]
-    joint = np.abs(across - np.round(across)) * width
-    dark = np.where(joint < 0.002, 0.55, 1.0)
-    return wood(points, color, (0.03, 0.6, 1.0)) * ((0.85 + 0.3 * tone) * dark)[:, None]
-
-
-def stripes(points, first, second, period, axis=0):
-    """Two colours in turn along an axis."""
-    stripe = np.floor(2 * points[:, axis] / period).astype(int)
-    return np.array([first, second], float)[stripe & 1]
-
-
-def tiles(points, color, joint, size):
-    """Square tiles in x and z with joints of 4 mm."""
-    at = points[:, [0, 2]] / size
-    near = np.abs(at - np.round(at)).min(axis=1) * size < 0.002
-    tile = np.asarray(color, float) * (0.94 + 0.12 * value_noise(points, size))[:, None]
-    return np.where(near[:, None], np.asarray(joint, float), tile)
-
-
-def printed_page(points, width, height, heading=0.1, line=0.0055):
-    """White paper in the plane z = 0 about the origin: words as dark bars, heading, picture."""
-    x = points[:, 0] / width + 0.5
-    y = 0.5 - points[:, 1] / height
-    row = np.floor(points[:, 1] / line).astype(int)
-    word = np.floor((points[:, 0] + 0.31 * row * line) / (2.1 * line)).astype(int)
-    ink = LATTICE[row & 63, word & 63, 3] > 0.22
-    ink &= np.mod(points[:, 1] / line, 1.0) < 0.5
-    ink &= between(x, 0.1, 0.9) & between(y, 0.18, 0.93)
-    ink |= (np.abs(y - heading) < 0.025) & between(x, 0.2, 0.8)
-    grey = np.where(ink, 0.12, 0.86)
-    picture = between(x, 0.52, 0.88) & between(y, 0.55, 0.8)
-    grey = np.where(picture, 0.25 + 0.5 * value_noise(points, 0.02), grey)
-    return _grey(grey)
-
-
-def _grey(levels):
-    """Levels (n,) as colours (n, 3)."""
-    return np.repeat(levels[:, None], 3, axis=1)
-
-
-def between(values, low, high):
-    """Which values lie within two limits."""
-    return (values > low) & (values < high)
-
-
-def poster(points, width, height, colors):
-    """A picture: hills under a sky with a sun, in the plane z = 0 about the origin."""
-    sky, sun, far, near = np.asarray(colors, float)
-    x = points[:, 0] / width + 0.5
-    y = points[:, 1] / height + 0.5
-    out = sky * (0.7 + 0.4 * y)[:, None]
-    from_sun = np.hypot(points[:, 0] - 0.2 * width, points[:, 1] - 0.2 * height)
-    far_hills = 0.45 + 0.12 * np.sin(7 * x + 1)
-    near_hills = 0.25 + 0.08 * np.sin(11 * x)
-    margin = (np.abs(x - 0.5) > 0.47) | (np.abs(y - 0.5) > 0.48)
-    out[from_sun < 0.11 * width] = sun
-    out[y < far_hills] = far
-    out[y < near_hills] = near
-    out[margin] = 0.85
-    return out
-
-
-def book_spines(points, seed, pitch=0.035):
-    """Coloured backs of books side by side along x."""
-    rng = np.random.default_rng(seed)
-    tones = rng.uniform(0.1, 0.6, (64, 1))
-    palette = tones * (0.55 + rng.uniform(0.0, 0.6, (64, 3)))
-    at = points[:, 0] / pitch
-    color = palette[np.floor(at).astype(int) & 63]
-    label = between(np.mod(points[:, 2], 0.3), 0.19, 0.225)
-    gap = np.abs(at - np.round(at)) < 0.05
-    color[label] = 0.75
-    color[gap] = 0.04
-    return color
-
-
-def chessboard(points, board, dark, light, ring=0.5):
-    """A dark board with its chessboard, if it has one.
-
-    The square diagonally before the first inner corner is light. The outermost squares are `ring`
-    squares wide: only inner corners count, so that all may be larger.
-    """
-    grey = np.full(len(points), float(dark))
-    pattern = board.pattern
-    if pattern is not None:
-        at = (points[:, :2] - np.asarray(pattern.origin)) / pattern.square
-        last = np.array([pattern.columns, pattern.rows]) - 1
-        inside = np.all((at > -ring) & (at < last + ring), axis=1)
-        even = np.floor(at).astype(int).sum(axis=1) % 2 == 0
-        grey[inside & even] = light
-    return _grey(grey)
-
-
 TEXTURES = {
     f.__name__: f
     for f in (plain, wood, planks, stripes, tiles, printed_page, poster, book_spines)
@@ -318,9 +179,8 @@ class Thing:
     pose: RigidTransform = RigidTransform.identity()  # T_platform_thing
     # diffuse reflectivity at the LRF's wavelength (905 nm); None takes the red albedo
     infrared: float | None = None
-    dazzles: bool = (
-        False  # the LRF is dazzled when its spot meets it (a lamp, the sun in a window)
-    )
+    # the LRF is dazzled when its spot meets it (a lamp, the sun in a window)
+    dazzles: bool = False
     glow: float = 0.0  # light it gives off by itself, in units of full albedo
 
 
@@ -545,12 +405,10 @@ class Exposure:
     # variance in grey levels squared is read_noise^2 + shot_noise * level
     read_noise: NonNegativeFloat = 0.8
     shot_noise: NonNegativeFloat = 0.008
-    vignetting: NonNegativeFloat = (
-        0.15  # loss of light in the corners of the image, a share
-    )
-    samples: PositiveInt = (
-        3  # rays across a pixel and down a pixel, where the pixel is not plain
-    )
+    # loss of light in the corners of the image, a share
+    vignetting: NonNegativeFloat = 0.15
+    # rays across a pixel and down a pixel, where the pixel is not plain
+    samples: PositiveInt = 3
 
 
 class Imager:

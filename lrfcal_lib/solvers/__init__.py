@@ -16,12 +16,10 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers import lines, plane_start, planes
 
-ACCEPTED = (
-    0.999  # a good placement is accepted with this probability, were the errors normal
-)
-NUMBERS = (
-    2  # a plane's distance and the slope of the scan: neighbouring points err together
-)
+# a good placement is accepted with this probability, were the errors normal
+ACCEPTED = 0.999
+# a plane's distance and the slope of the scan: neighbouring points err together
+NUMBERS = 2
 OUTLIER_ROUNDS = 11  # placements come and go no more after a few
 
 

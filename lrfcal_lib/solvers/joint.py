@@ -53,9 +53,8 @@ FIRST_STEPS = 60
 NOISE_ROUNDS = 10
 ROUND_STEPS = 10
 LAST_STEP = 1e-4  # standard deviations: a shorter step ends the whole
-UNSEEN = (
-    0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
-)
+# a direction whose standard deviation exceeds this (rad, m) is called unobservable
+UNSEEN = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)

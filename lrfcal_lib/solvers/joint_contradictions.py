@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from lrfcal_lib.fit.least_squares import Block, medians
+from lrfcal_lib.fit.least_squares import Block
+from lrfcal_lib.fit.padding import medians
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage

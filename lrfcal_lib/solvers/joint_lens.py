@@ -6,7 +6,8 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.least_squares import OWN_RANK, pad
+from lrfcal_lib.fit.least_squares import OWN_RANK
+from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import CameraModel, project_jacobians
 from lrfcal_lib.model.observations import LENS, JointObservations

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from lrfcal_lib.fit.axis_chart import move_head
-from lrfcal_lib.fit.least_squares import pad
+from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import move_pose

@@ -32,9 +32,8 @@ USUAL = {
 }
 SIDE_FREEDOM = 3.0  # of Student's t: most backgrounds are alike, some are dark
 GRAZING = 1e-9  # cosine of the incidence below which a beam is taken not to be parallel to a board
-LEAST_ROOT = (
-    1e-7  # root information of a beam, beside that at its edge: below, it says nothing
-)
+# root information of a beam, beside that at its edge: below, it says nothing
+LEAST_ROOT = 1e-7
 ROUGH_STEP = 1e-2  # standard deviations: a shorter step ends a round
 MOST_STEPS = 300
 SMALL_TURN = 1e-4  # radians; below, the series of the rotation vector's derivative is exact

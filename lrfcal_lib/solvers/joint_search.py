@@ -25,9 +25,8 @@ from lrfcal_lib.solvers.joint_model import JointState, Levels, Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import minimum
 from lrfcal_lib.solvers.joint_start import start_states, state_of
 
-GOOD_START = (
-    0.7  # mean half squared residual; a start value this good is not searched further
-)
+# mean half squared residual; a start value this good is not searched further
+GOOD_START = 0.7
 ROUGH_MISS = 0.08  # metres, of a start value's boards from where images put them
 
 

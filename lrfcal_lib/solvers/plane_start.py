@@ -29,9 +29,8 @@ MINIMAL = 40  # of them by the minimal solution, which has eight poses each
 SAME_TURN = np.radians(10.0)  # poses nearer to each other than this are one minimum
 MOST_APART = 6  # minima to choose from
 ROUGH_SIGMA = 0.005  # metres, of a point from its plane, for the search
-CAPPED = (
-    16.0  # times the usual square: a larger miss (four standard deviations) fits no minimum
-)
+# times the usual square: a larger miss (four standard deviations) fits no minimum
+CAPPED = 16.0
 NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
 SEEN = 0.8  # of the placements: a few may be wrong
 ROTATIONS = 200  # random ones, beside the 24 of a cube

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.fit.least_squares import Block, minimise_in_rounds, pad, solve
+from lrfcal_lib.fit.least_squares import Block, minimise_in_rounds, solve
+from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m, read_pose
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, project, project_jacobians
@@ -28,9 +29,8 @@ from lrfcal_lib.model.observations import CameraObservations
 
 ROUNDS = 5  # of new weights; the last change is far below the noise
 LEAST_SPREAD = 0.02  # of the boards' normals some way, about radians
-TILT_LEVER = (
-    0.3  # metres, about half a board: turns an offset into the tilt that bends as much
-)
+# metres, about half a board: turns an offset into the tilt that bends as much
+TILT_LEVER = 0.3
 LENS = len(INTRINSIC_NAMES)
 LENS_SCALES = (1e3, 1e3, 1e3, 1e3, 10.0, 10.0, 10.0, 10.0, 100.0)
 FEWEST_CORNERS = 4  # of the pattern, for intrinsics

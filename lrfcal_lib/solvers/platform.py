@@ -11,7 +11,8 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS, chart_parameters, move_head
 from lrfcal_lib.fit.covariance import name_words
-from lrfcal_lib.fit.least_squares import Block, pad, solve
+from lrfcal_lib.fit.least_squares import Block, solve
+from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry

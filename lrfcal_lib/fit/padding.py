@@ -1,0 +1,53 @@
+"""Rows of placements as padded rectangles."""
+
+import numpy as np
+
+
+def medians(values: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Medians of the used values of every row; many times as fast as np.nanmedian.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., n)
+    used : ndarray of bool, shape (..., n)
+
+    Returns
+    -------
+    ndarray, shape (...)
+        0 where there are none.
+    """
+    count = used.sum(axis=-1, keepdims=True)
+    ordered = np.sort(np.where(used, values, np.inf), axis=-1)
+    low, high = (
+        np.take_along_axis(ordered, np.maximum(n // 2, 0), axis=-1)
+        for n in (count - 1, count)
+    )
+    return np.where(count > 0, 0.5 * low + 0.5 * high, 0.0)[..., 0]
+
+
+def pad(group: dict[str, np.ndarray], count: int, width: int = 1) -> dict[str, np.ndarray]:
+    """Arrays sorted by placement into rectangles, zeros behind the rows of each.
+
+    Parameters
+    ----------
+    group : dict of str to ndarray, shapes (m, ...)
+        With `placement`, indices below `count`.
+    count : int
+        Number of placements.
+    width : int
+        Of the rectangles, at least.
+
+    Returns
+    -------
+    dict of str to ndarray, shapes (count, n, ...)
+        Without `placement`; `used` marks what is no padding. Rows of a placement keep their order.
+    """
+    order = np.argsort(group["placement"], kind="stable")
+    number = np.bincount(group["placement"], minlength=count)
+    used = np.arange(number.max(initial=width)) < number[:, None]
+    out = {"used": used}
+    for key, value in group.items():
+        if key != "placement":
+            out[key] = np.zeros(used.shape + value.shape[1:], value.dtype)
+            out[key][used] = value[order]
+    return out
