@@ -123,7 +123,7 @@ def _setting(variable, value):
 
 @contextmanager
 def _pool(count, context, loop=()):
-    """Processes that end with this one, however it ends, and at once where anything is raised."""
+    """Processes that end with this one, however it ends, and at once after Ctrl-C."""
     ours, theirs = context.Pipe()
     with (
         ours,
@@ -132,6 +132,9 @@ def _pool(count, context, loop=()):
     ):
         try:
             yield pool
+        except Exception:  # what others are writing they finish, or clean up
+            pool.shutdown(cancel_futures=True)
+            raise
         except BaseException:
             ours.close()
             raise
