@@ -2,7 +2,8 @@
 
 import re
 
-from notebook_runs import NOTEBOOKS, read
+import pandas as pd
+from notebook_runs import GOLDEN, NOTEBOOKS, read
 
 LECTURE = [
     path for path in NOTEBOOKS if path.stem[:2] in ("00", "01", "02", "03", "04", "05")
@@ -21,3 +22,43 @@ def test_every_equation_of_the_paper_stands_once():
         for n in re.findall(r"\\tag\{(\d+)\}", text)
     ]
     assert sorted(tags) == list(range(1, 22))
+
+
+def stored(name):
+    return pd.read_csv(GOLDEN / "sim_lms221" / f"{name}.csv")
+
+
+def test_lines_leave_less_of_a_large_workspace_than_planes():
+    shares = stored("feature_shares").set_index("workspace_radius_m").round(1)
+    expected = {
+        3: (58.6, 42.6),
+        4: (35.0, 34.4),
+        5: (23.0, 28.4),
+        6: (16.2, 24.1),
+        10: (5.9, 14.8),
+    }
+    assert {
+        radius: (row.line_percent, row.plane_percent) for radius, row in shares.iterrows()
+    } == expected
+
+
+def test_the_cost_as_printed_is_not_normalised_and_true_edges_give_the_true_axis():
+    choices = stored("axis_choices").set_index("cost")
+    printed = choices.loc["as printed"]
+    assert (
+        round(printed.axis_direction_error_deg, 1) == 7.1
+        and round(printed.axis_offset_error_mm) == 39
+    )
+    assert choices.loc["(13) normalised"].axis_offset_error_mm > 90
+    assert (
+        choices.loc["and on the true edges"].max() < 50
+        and choices.loc["and on the true edges"][1:].max() < 1e-6
+    )
+
+
+def test_only_the_joint_estimate_states_its_errors_rightly():
+    pulls = stored("method_comparison").groupby("method").translation_pull.max()
+    assert (
+        pulls["joint"] < 1
+        and pulls[["line", "line_last_beam", "zhang_pless_printed"]].min() > 3
+    )
