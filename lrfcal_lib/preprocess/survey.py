@@ -393,6 +393,7 @@ def _find_corners(groups, read, board):
     room = KEPT_BYTES // max(len(groups), 1)
 
     def begin(record):
+        """A shot with its corners, and the part of the image that is looked at again."""
         image = read(record)
         view = _corners(_view(record), image, finder)
         if view.reason:
