@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_weaknesses import models_of, solve
 
-from lrfcal_lib.judge.next_placement import group_sigma, suggest_placement
+from lrfcal_lib.judge.next_placement import Suggestion, group_sigma, suggest_placement
 from lrfcal_lib.judge.verdict import verdict
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.simulate.draw import bench, board_poses
@@ -53,3 +53,11 @@ def test_suggestions_refuse_bad_input(good):
         suggest_placement(solution, models_of(rig), field_of_view=NOWHERE)
     last = verdict(solution, models_of(rig), field_of_view=NOWHERE).sentences()[-1]
     assert last.startswith("No placement can be suggested: none of")
+
+
+def test_a_pitch_is_named_once():
+    place = (1.0, -10, 0, 180, 0)
+    near = Suggestion(None, place, np.radians([-6.1, -6.0, -5.9]), 0.1, 0.0)
+    assert near.words().endswith("; images at pitch -6 deg")
+    far = Suggestion(None, place, np.radians([-10.0, 0.0, 10.0]), 0.1, 0.0)
+    assert far.words().endswith("; images at pitch -10, +0 and +10 deg")

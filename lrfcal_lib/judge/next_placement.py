@@ -86,8 +86,12 @@ class Suggestion:
             parts.append(f"turned by {turn:.0f} deg in its plane")
         words = ", ".join([*parts, list(LEANS)[int(lean)]])
         if len(self.pitches):
-            *most, last = [f"{pitch:+.0f}" for pitch in np.degrees(self.pitches)]
-            words += f"; images at pitch {', '.join(most)} and {last} deg"
+            # a board so near fills the image at one pitch only
+            *most, last = dict.fromkeys(
+                f"{pitch:+.0f}" for pitch in np.degrees(self.pitches)
+            )
+            angles = f"{', '.join(most)} and {last}" if most else last
+            words += f"; images at pitch {angles} deg"
         return words
 
     def sentence(self) -> str:
