@@ -1,0 +1,1 @@
+"""Uses of a calibration: scenes, stations, lengths, and whether it still holds."""
