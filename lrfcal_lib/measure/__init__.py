@@ -1,1 +1,1 @@
-"""Uses of a calibration: scenes, stations, lengths, and whether it still holds."""
+"""A calibrated rig at work: features, lengths and files of what it scanned."""
