@@ -404,20 +404,12 @@ def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) 
 
 
 def show(light: Light, name: str) -> None:
-    """Print what a check found.
-
-    Parameters
-    ----------
-    light
-        Of the check.
-    name
-        What was checked.
-    """
+    """Print what a check found of something with a name."""
     print(f"{MARKS[light.state]}  {name}: {light.text}", flush=True)
 
 
 class Boards:
-    """Recording placements of the board, or what else the plan lists."""
+    """Recording what the plan lists."""
 
     def planned(self, stated: RigFile) -> RigFile:
         """The rig file with what is to be recorded."""
@@ -438,12 +430,13 @@ class Boards:
 
     def next_step(self, recording: Recording) -> str:
         """What can be done with a finished recording, half a sentence."""
-        purposes = {p.number: p.purpose for p in recording.plan}
-        if "board" in {purposes.get(number) for number in recording.finished}:
+        boards = {p.number for p in recording.plan if p.purpose == "board"}
+        if boards & set(recording.finished):
             return f"'python -m lrfcal_lib calibrate {recording.path}' calibrates the rig"
         return (
-            "all of them show scenes, which a calibration of the same rig can colour: 'python -m "
-            f"lrfcal_lib reconstruct {recording.path} --calibration calibration.json'"
+            "all of them show scenes, which a calibration of the same rig can colour ('python -m "
+            f"lrfcal_lib reconstruct {recording.path}'): to calibrate, record placements of the "
+            "board"
         )
 
 
@@ -532,11 +525,11 @@ def _placements(recording, guide):
 
 def ask_before(kind: str, number: int, what: str, before: int | None) -> str:
     """Ask for something to be done before a placement or station: '', 'q' to end, 'r' to repeat."""
-    again = ""
     possible = ["", "q"]
+    again = ""
     if before is not None:
-        again = f", r: {kind} {before} again"
         possible.append("r")
+        again = f", r: {kind} {before} again"
     text = f"{kind} {number}: {what}, then press Enter{again} (q: end here) "
     while (answer := ask(text)) not in possible:
         pass
@@ -563,7 +556,7 @@ def main(
     mode
         Instead of the plan's.
     guide
-        What is recorded; the placements of the plan unless given.
+        As of :func:`record_session`.
 
     Returns
     -------

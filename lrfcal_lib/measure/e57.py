@@ -1,5 +1,6 @@
 """Scans and the images that coloured them in one E57 file (ASTM E2807), for CloudCompare."""
 
+import errno
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -39,6 +40,11 @@ class E57Writer:
         Where nothing stands yet.
     about
         A sentence that every scan carries.
+
+    Raises
+    ------
+    OSError
+        At the end, where it cannot be written.
     """
 
     def __init__(self, path: Path, about: str):
@@ -51,8 +57,14 @@ class E57Writer:
     def __enter__(self):
         return self
 
-    def __exit__(self, *_):
-        self._file.close()
+    def __exit__(self, kind, error, trace):
+        libe57, image_file = self._library()
+        try:
+            image_file.close()
+        except libe57.E57Exception as failed:
+            error = error or failed
+        if isinstance(error, libe57.E57Exception):
+            raise OSError(errno.EIO, f"E57: {error}") from error
 
     @contextmanager
     def scan(
@@ -75,24 +87,7 @@ class E57Writer:
             ``write(cloud)`` appends points in the scan's own frame.
         """
         libe57, image_file = self._library()
-        single = libe57.E57_SINGLE
-        fields = dict.fromkeys(POINT, np.float32) | dict.fromkeys(COLORS, np.uint8)
-        if intensity:
-            fields["intensity"] = np.float32
-        prototype = libe57.StructureNode(image_file)
-        arrays = {}
-        buffers = libe57.VectorSourceDestBuffer()
-        for field, kind in fields.items():
-            node = libe57.FloatNode(image_file, 0.0, single)
-            if field in COLORS:
-                node = libe57.IntegerNode(image_file, 0, 0, 255)
-            prototype.set(field, node)
-            arrays[field] = np.empty(AT_ONCE, kind)
-            buffers.append(
-                libe57.SourceDestBuffer(
-                    image_file, field, arrays[field], AT_ONCE, True, False
-                )
-            )
+        arrays, prototype, buffers = self._columns(intensity)
         scan = self._node(
             {
                 "guid": guid,
@@ -111,7 +106,7 @@ class E57Writer:
         def write(cloud):
             """Hand over blocks that fit into the buffers."""
             for start in range(0, len(cloud.points), AT_ONCE):
-                columns = _columns(cloud.rows(slice(start, start + AT_ONCE)))
+                columns = _values(cloud.rows(slice(start, start + AT_ONCE)))
                 count = len(columns["intensity"])
                 for field, array in arrays.items():
                     array[:count] = columns[field]
@@ -121,6 +116,25 @@ class E57Writer:
             yield write
         finally:
             writer.close()
+
+    def _columns(self, intensity):
+        """Arrays by field, with the library's statement of their types and its view of them."""
+        libe57, image_file = self._library()
+        fields = dict.fromkeys(POINT, np.float32) | dict.fromkeys(COLORS, np.uint8)
+        if intensity:
+            fields["intensity"] = np.float32
+        arrays = {}
+        prototype = libe57.StructureNode(image_file)
+        buffers = libe57.VectorSourceDestBuffer()
+        for field, kind in fields.items():
+            node = libe57.FloatNode(image_file, 0.0, libe57.E57_SINGLE)
+            if field in COLORS:
+                node = libe57.IntegerNode(image_file, 0, 0, 255)
+            prototype.set(field, node)
+            arrays[field] = np.empty(AT_ONCE, kind)
+            view = (image_file, field, arrays[field], AT_ONCE, True, False)
+            buffers.append(libe57.SourceDestBuffer(*view))
+        return arrays, prototype, buffers
 
     def image(
         self, name: str, scan: str, T_file_camera: RigidTransform, view: View
@@ -180,7 +194,7 @@ class E57Writer:
         return libe57.FloatNode(image_file, float(value))
 
 
-def _columns(cloud):
+def _values(cloud):
     """Values of the points by their names in the file."""
     columns = dict(zip(POINT, cloud.points.T, strict=True))
     columns |= dict(zip(COLORS, cloud.colors.T, strict=True))
