@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate.monte_carlo import joint_truth, state_errors
+from lrfcal_lib.model.geometry import polar_to_points, pose_transform
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.simulate.draw import bench, board_poses, observe
 
@@ -64,3 +66,31 @@ def none(obs, *groups):
     return obs.keep(
         **{name: np.zeros(len(getattr(obs, f"{name}_placement")), bool) for name in groups}
     )
+
+
+def misses_of(state, obs):
+    """Whitened residuals of ranges and images, from the chain of transforms as one would write it down."""
+    T_head_lrf = pose_transform(state.head)
+    boards = pose_transform(state.boards)
+    lifted = RigidTransform.from_rotation(
+        Rotation.from_rotvec(np.outer(obs.face_pitch, [1, 0, 0]))
+    )
+    ray = polar_to_points(1.0, obs.face_bearing)
+    T_board_lrf = boards[obs.face_placement].inv() * lifted * T_head_lrf
+    start = T_board_lrf.apply(0 * ray)
+    way = T_board_lrf.rotation.apply(ray)
+    ranges = (-start[:, 2] / way[:, 2] + state.sensor[0] - obs.face_range) / obs.face_sigma
+    cameras = pose_transform(state.cameras)[obs.view_camera] * RigidTransform.identity()
+    if obs.mounts[0] == "head":
+        lifted = RigidTransform.from_rotation(
+            Rotation.from_rotvec(np.outer(obs.view_pitch, [1, 0, 0]))
+        )
+        cameras = cameras * (lifted * T_head_lrf).inv()
+    predicted = cameras * boards[obs.view_placement]
+    measured = RigidTransform.from_matrix(obs.view_pose)
+    turn = (predicted.rotation * measured.rotation.inv()).as_rotvec()
+    images = np.concatenate([turn, predicted.translation - measured.translation], axis=1)[
+        ..., None
+    ]
+    white = np.linalg.solve(np.linalg.cholesky(obs.view_covariance), images)
+    return np.concatenate([ranges, white.ravel()])

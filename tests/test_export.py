@@ -9,7 +9,8 @@ from test_session import CAMERAS, HEAD, LRF, pixels, wall
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.calibrate import clouds
 from lrfcal_lib.calibrate.cloud import write_ply
-from lrfcal_lib.evaluate.export import write_calibration, write_clouds, write_pcd
+from lrfcal_lib.evaluate.export import write_calibration
+from lrfcal_lib.measure.cloud_files import write_clouds, write_pcd
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session

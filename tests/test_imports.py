@@ -17,7 +17,7 @@ FLOORS = [
     {"preprocess", "solvers", "drivers", "simulate"},
     {"calibrate", "emulators"},
     {"judge"},
-    {"evaluate"},
+    {"evaluate", "measure"},
     {"acquire", "report"},
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names} | {

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from joint_draws import MOUNTS, draw, none, rng, scores
+from joint_draws import MOUNTS, draw, misses_of, none, rng, scores
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -14,7 +14,6 @@ from lrfcal_lib.fit.least_squares import eliminate, linearise
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     axis_difference,
-    polar_to_points,
     pose_transform,
     transform_difference,
 )
@@ -177,34 +176,6 @@ def test_the_direction_of_the_sweep_is_recovered():
         DegenerateGeometry, match="do not determine the pitch offset by sweep direction"
     ):
         solve_joint(draw(rng(), 8)[0], sensor=sensor)  # cameras on the head lag alike
-
-
-def misses_of(state, obs):
-    """Whitened residuals of ranges and images, from the chain of transforms as one would write it down."""
-    T_head_lrf = pose_transform(state.head)
-    boards = pose_transform(state.boards)
-    lifted = RigidTransform.from_rotation(
-        Rotation.from_rotvec(np.outer(obs.face_pitch, [1, 0, 0]))
-    )
-    ray = polar_to_points(1.0, obs.face_bearing)
-    T_board_lrf = boards[obs.face_placement].inv() * lifted * T_head_lrf
-    start = T_board_lrf.apply(0 * ray)
-    way = T_board_lrf.rotation.apply(ray)
-    ranges = (-start[:, 2] / way[:, 2] + state.sensor[0] - obs.face_range) / obs.face_sigma
-    cameras = pose_transform(state.cameras)[obs.view_camera] * RigidTransform.identity()
-    if obs.mounts[0] == "head":
-        lifted = RigidTransform.from_rotation(
-            Rotation.from_rotvec(np.outer(obs.view_pitch, [1, 0, 0]))
-        )
-        cameras = cameras * (lifted * T_head_lrf).inv()
-    predicted = cameras * boards[obs.view_placement]
-    measured = RigidTransform.from_matrix(obs.view_pose)
-    turn = (predicted.rotation * measured.rotation.inv()).as_rotvec()
-    images = np.concatenate([turn, predicted.translation - measured.translation], axis=1)[
-        ..., None
-    ]
-    white = np.linalg.solve(np.linalg.cholesky(obs.view_covariance), images)
-    return np.concatenate([ranges, white.ravel()])
 
 
 @MOUNTS

@@ -9,6 +9,7 @@ from joint_draws import MOUNTS, draw, rng, scores, square_per_number
 from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
+from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.judge.uncertainty import chain_of, projection_sigma, root_mean_square
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
@@ -220,7 +221,12 @@ def test_an_edge_bias_that_only_what_is_usual_bounds_leaves_cameras_that_planes_
         found.unobservable == ()
         and found.solution.sigma[found.columns("edge_log_odds")] > 2
     )
-    sigma = projection_sigma(chain_of(found, "left"), rig.model, 1.5, (4, 3))
+    sigma = projection_sigma(
+        chain_of(joint_rig(found, dict.fromkeys(rig.cameras, rig.model)), "left"),
+        rig.model,
+        1.5,
+        (4, 3),
+    )
     assert root_mean_square(sigma) < 20
 
 

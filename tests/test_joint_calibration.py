@@ -8,10 +8,9 @@ from shared import QUICK, campaign
 
 from lrfcal_lib.calibrate import clouds, combined, pipeline
 from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.evaluate import edge_tables, joint_tables, scenes
+from lrfcal_lib.evaluate import edge_tables, joint_tables
 from lrfcal_lib.evaluate.export import calibration_record
 from lrfcal_lib.evaluate.truth import read_truth
-from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.session.read import open_session
@@ -154,36 +153,6 @@ def test_what_cannot_colour_a_cloud_is_refused(quick, case):
     change, method, words = BAD[case]
     with pytest.raises(ValueError, match=words):
         clouds.color_cloud(change(quick), method)
-
-
-def test_lengths_between_features_know_how_good_they_are(quick):
-    """Two halves of one face are no distance apart across it, and half a board along it."""
-    cloud = clouds.color_cloud(quick, "joint")
-    solution = quick.joint.solution
-    offs = []
-    for placement in np.unique(cloud.placement):
-        rows = np.flatnonzero(cloud.placement == placement)
-        x = cloud.points[rows, 0]
-        left = rows[x < np.median(x)]
-        right = rows[x >= np.median(x)]
-        planes = [scenes.fit_feature(cloud, half, solution) for half in (left, right)]
-        length, sigma = scenes.length_between(
-            scenes.fit_feature(cloud, rows, solution), planes[0]
-        )
-        offs.append(length / sigma)
-        points = [
-            scenes.fit_feature(cloud, half, solution, plane=False) for half in (left, right)
-        ]
-        length, sigma = scenes.length_between(*points)
-        assert (
-            length == pytest.approx(np.linalg.norm(points[1].centre - points[0].centre))
-            and 0 < sigma < 0.01
-        )
-        length, sigma = scenes.length_between(points[0], planes[1])
-        assert length < 5 * sigma
-    assert 0.1 < np.sqrt(np.mean(np.square(offs))) < 3
-    with pytest.raises(DegenerateGeometry, match="no point"):
-        scenes.fit_feature(cloud, [], solution)
 
 
 def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(quick):

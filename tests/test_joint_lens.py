@@ -5,13 +5,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from joint_draws import draw
+from joint_draws import MOUNTS, draw, misses_of, none
+from scipy.optimize import approx_fprime
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
 from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
+from lrfcal_lib.solvers.joint_model import move_state
 
 CORNERS = np.array([[0.05 * i, 0.05 * j, 0.0] for i in range(5) for j in range(4)])
 MODEL = CameraModel(
@@ -87,3 +89,42 @@ def test_a_known_error_moves_the_estimate_as_the_covariance_says(mount):
         told.lens_scale == pytest.approx(np.sqrt(square / left), rel=0.1)
         and told.lens_scale > 0.05
     )
+
+
+@MOUNTS
+def test_scipy_carries_the_lens_into_the_poses_alike(mount):
+    """Differences of residuals as one would write them down, solved for all unknowns at once."""
+    obs, truth, rig = draw(np.random.default_rng(7), 6, mount=mount)
+    obs = none(obs, "beam").keep(face=np.arange(len(obs.face_range)) % 3 == 0)
+    poses = [RigidTransform.from_matrix(pose) for pose in obs.view_pose]
+    lens = np.stack([pose_by_intrinsics(pose, CORNERS, rig.model) for pose in poses])
+    pixels = np.diag([2.0, 2.0, 1.0, 1.0, 0.01, 0.01, 0.0, 0.0, 0.0]) ** 2
+    spread = np.stack([pixels] * len(obs.cameras))
+    obs = replace(obs, view_lens=lens, lens_covariance=spread)
+    found = solve_joint(
+        obs, start=truth, sensor=("range_offset",), axis=mount == "head", noise="stated"
+    )
+    unknowns = found.unknowns
+    shared = unknowns.shared
+
+    def residuals(x):
+        step = x[:shared], x[shared:].reshape(6, -1)
+        return misses_of(move_state(found.state, step, unknowns), obs)
+
+    def with_lens(error):
+        moved = replace(obs, view_pose=obs.view_pose.copy())
+        by_view = np.einsum("nij,nj->ni", lens, error.reshape(-1, 9)[obs.view_camera])
+        pose = np.stack([pose_array(pose) for pose in poses])
+        moved.view_pose[:, :3] = move_pose(pose, by_view)
+        return misses_of(found.state, moved)
+
+    J = approx_fprime(np.zeros(shared + 6 * unknowns.own), residuals, 1e-7)
+    by_lens = approx_fprime(np.zeros(9 * len(obs.cameras)), with_lens, 1e-7)
+    gain = -np.linalg.lstsq(J, by_lens)[0][:shared]
+    whole = np.zeros((len(gain.T), len(gain.T)))
+    for number, covariance in enumerate(spread):
+        mine = slice(9 * number, 9 * number + 9)
+        whole[mine, mine] = covariance
+    theirs = gain @ whole @ gain.T
+    size = np.sqrt(np.outer(np.diag(theirs), np.diag(theirs)))
+    np.testing.assert_allclose(found.lens / size, theirs / size, atol=0.01)

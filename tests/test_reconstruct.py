@@ -14,8 +14,8 @@ from lrfcal_lib.calibrate import cloud as clouds
 from lrfcal_lib.calibrate.mixed import mixed
 from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.calibrate.reconstruct import GREY, reconstruct
-from lrfcal_lib.evaluate.export import write_pcd
-from lrfcal_lib.evaluate.scenes import flatness, largest_plane
+from lrfcal_lib.measure.cloud_files import write_pcd
+from lrfcal_lib.measure.features import flatness, largest_plane
 from lrfcal_lib.model.camera import CameraModel, fold, project
 from lrfcal_lib.model.kinematics import AS_RECORDED, MIRROR_TURN
 from lrfcal_lib.session.read import Sweep, open_session

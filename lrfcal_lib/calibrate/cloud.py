@@ -48,7 +48,7 @@ class Cloud:
         As measured (radians, radians, metres; NaN where no intensity was recorded).
     sigma : ndarray, shape (n,)
         Standard deviation across the surface, metres: scatter of the readings about it; see
-        `scenes.with_sigma`.
+        `features.with_sigma`.
     removed : int
         Mixed pixels that were left out.
     """

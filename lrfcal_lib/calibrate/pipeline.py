@@ -23,7 +23,8 @@ from lrfcal_lib.calibrate.observe import (
     observe_joint,
     platform_observations,
 )
-from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig
+from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig, joint_rig
+from lrfcal_lib.calibrate.rig_uncertainty import uncertainty_one_by_one
 from lrfcal_lib.fit.result import PlatformPrior, Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.kinematics import AS_RECORDED
@@ -147,9 +148,12 @@ class Calibration:
         -------
         CalibratedRig
         """
-        corrections = AS_RECORDED
+        session = self.prepared.session
+        axis = self.platform.axes[self.platform.axis_with(method)]
         if self.joint is not None and method == "joint":
-            corrections = self.joint.solution.corrections
+            rig = joint_rig(self.joint.solution, self.prepared.models)
+            return replace(rig, axis=axis, lrf=session.lrf, session=session.name)
+        solved = {}
         cameras = {}
         for (camera, name), solution in self.solutions.items():
             if name == method:
@@ -157,8 +161,27 @@ class Calibration:
                 mount = "platform" if on_base else "head"
                 model = self.prepared.models[camera]
                 cameras[camera] = CalibratedCamera(solution.transform, mount, model)
-        axis = self.platform.axes[self.platform.axis_with(method)]
-        return CalibratedRig(method, axis, corrections, cameras)
+                solved[camera] = solution
+        noise = [scan.sigma_range for scan in self.prepared.scans.values()]
+        uncertainty = uncertainty_one_by_one(
+            axis.covariance,
+            solved,
+            admitted_offset=session.lrf.admitted_offset,
+            sweep_sigma=(
+                self.prepared.pitch_noise.offset,
+                self.prepared.pitch_noise.stretch,
+            ),
+            range_noise=float(np.median(noise)) if noise else session.lrf.sigma_range,
+        )
+        return CalibratedRig(
+            method=method,
+            axis=axis,
+            corrections=AS_RECORDED,
+            cameras=cameras,
+            lrf=session.lrf,
+            uncertainty=uncertainty,
+            session=session.name,
+        )
 
 
 def calibrate(session: Session, methods=None) -> Calibration:

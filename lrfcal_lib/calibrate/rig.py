@@ -2,11 +2,18 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
+from lrfcal_lib.calibrate.rig_uncertainty import RigUncertainty, joint_uncertainty
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.kinematics import Corrections, camera_at
+from lrfcal_lib.session.stated import LrfInfo
+from lrfcal_lib.solvers.joint_solution import JointSolution
+
+# the paper's, for rigs that come without a session
+LMS200 = LrfInfo("LMS 200", (np.radians(40), np.radians(140)), np.radians(0.25), 0.005)
 
 
 @dataclass(frozen=True)
@@ -37,12 +44,29 @@ class CalibratedRig:
     corrections : Corrections
         Of ranges and pitch.
     cameras : dict of str to CalibratedCamera
+    lrf : LrfInfo
+    uncertainty : RigUncertainty or None
+        None where the method does not say how well it knows the rig.
+    session : str
+        Name of the session that it was calibrated with.
+    answer : str
+        Of the verdict, 'yes', 'with care' or 'no'; '' where nobody has judged it.
+    reasons : tuple of str
+        Why it is not 'yes', in words.
+    date : str
+        Of the calibration, ISO 8601; '' where it is of this moment.
     """
 
     method: str
     axis: KnownAxis
     corrections: Corrections
     cameras: dict[str, CalibratedCamera]
+    lrf: LrfInfo = LMS200
+    uncertainty: RigUncertainty | None = None
+    session: str = ""
+    answer: str = ""
+    reasons: tuple[str, ...] = ()
+    date: str = ""
 
     @property
     def T_head_lrf(self) -> RigidTransform:
@@ -53,3 +77,31 @@ class CalibratedRig:
         """``T_camera_platform`` of a camera at a true pitch (radians)."""
         camera = self.cameras[name]
         return camera_at(camera.T_camera, camera.mount, self.T_head_lrf, pitch)
+
+
+def joint_rig(solution: JointSolution, models: dict[str, CameraModel]) -> CalibratedRig:
+    """The rig of a joint estimate that came without a session.
+
+    Parameters
+    ----------
+    solution : JointSolution
+    models : dict of str to CameraModel
+
+    Returns
+    -------
+    CalibratedRig
+    """
+    mounts = dict(
+        zip(solution.observations.cameras, solution.observations.mounts, strict=True)
+    )
+    cameras = {
+        name: CalibratedCamera(T_camera, mounts[name], models[name])
+        for name, T_camera in solution.transforms.items()
+    }
+    return CalibratedRig(
+        method="joint",
+        axis=KnownAxis(solution.T_head_lrf, solution.covariance("axis_", "offset_")),
+        corrections=solution.corrections,
+        cameras=cameras,
+        uncertainty=joint_uncertainty(solution),
+    )

@@ -6,9 +6,11 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.calibrate.rig import joint_rig
+from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import by_sign
-from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of, columns_of
+from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
@@ -278,11 +280,12 @@ def candidate_information(boards, pitches, solution, models):
     by_scan = np.sqrt(count) * scan_sigma(solution, boards)[:, None]
     unknowns = len(solution.solution.names)
     information = np.zeros((len(boards), unknowns, unknowns))
+    rig = joint_rig(solution, models)
     for camera, at in zip(obs.cameras, images, strict=True):
         model = models[camera]
         by_image = image_sigma(solution, camera, model)
-        chain = chain_of(solution, camera)
-        links = columns_of(solution, camera)
+        chain = chain_of(rig, camera)
+        links = columns_of(solution.solution.names, camera)
         unknown = links >= 0
         index = links[unknown]
         for pitch in at.T:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.covariance import null_space
-from lrfcal_lib.fit.least_squares import reduced_hessian
-from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, columns_of
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
@@ -22,11 +21,7 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
     tilt,
 )
-from lrfcal_lib.solvers.joint import SCALES, UNSEEN
-from lrfcal_lib.solvers.joint_solution import JointSolution
 
-# what may be wrong about the way of a beam: radians and metres; metres, a fraction, radians
-COLUMNS = (*AXIS_NAMES, *POSE_NAMES, "range_offset", "pitch_scale", "pitch_by_direction")
 # a motion that moves a point less than this, relative to all others, does not matter to it
 SEEN = 1e-3
 ROUNDS = 12  # of the search for the beam that ends in a pixel
@@ -71,52 +66,39 @@ class Chain:
         return replace(self, covariances=tuple(C + unsure for C in self.covariances))
 
 
-def columns_of(solution: JointSolution, camera: str | None = None) -> np.ndarray:
-    """Where each of `COLUMNS` stands among the shared unknowns, -1 where it was none, (13,)."""
-    names = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
-    place = {name: i for i, name in enumerate(solution.solution.names)}
-    return np.array([place.get(name, -1) for name in names])
-
-
-def chain_of(solution: JointSolution, camera: str | None = None) -> Chain:
-    """The chain of a joint solution to a camera, or to points of the cloud.
+def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
+    """The chain of a calibrated rig to a camera, or to points of the cloud.
 
     Parameters
     ----------
-    solution
+    rig
     camera
         Its name; None for points of the cloud.
+
+    Raises
+    ------
+    ValueError
+        Where nothing says how well the rig is known.
     """
-    estimate = solution.solution
-    index = columns_of(solution, camera)
-    known = index >= 0
+    known = uncertainty_of(rig)
+    index = columns_of(known.names, camera)
+    estimated = index >= 0
     covariances = []
-    for whole in (estimate.covariance, estimate.trusted):
+    for whole in (known.covariance, known.trusted):
         part = whole[np.ix_(index, index)]
         # zero for what is known; what has no bound is among `unseen`
-        estimated = np.outer(known, known) & np.isfinite(part)
-        covariances.append(np.where(estimated, part, 0.0))
-
-    # What stays open beside the links leaves no trace: cameras that planes fix are known, whatever
-    # the edge bias.
-    links = index[known]
-    others = np.setdiff1d(np.arange(len(estimate.names)), links)
-    order = np.concatenate([links, others])
-    scales = np.array([SCALES.get(name, 1.0) for name in estimate.names])[order]
-    whole = solution.information().sum(axis=0)[np.ix_(order, order)]
-    hessian = reduced_hessian((whole * scales[:, None] * scales)[None], len(links))[0]
-    motions = null_space(hessian, np.ones(len(links)), UNSEEN)
-    unseen = np.zeros((len(motions), len(COLUMNS)))
-    unseen[:, known] = motions * scales[: len(links)]
+        bounded = np.outer(estimated, estimated) & np.isfinite(part)
+        covariances.append(np.where(bounded, part, 0.0))
 
     on_head = True
     pose = None
+    unseen = known.unseen_of_cloud
     if camera is not None:
-        number = list(solution.transforms).index(camera)
-        on_head = solution.observations.mounts[number] == "head"
-        pose = pose_array(solution.transforms[camera])
-    head = pose_array(solution.T_head_lrf)
-    return Chain(head, pose, on_head, tuple(covariances), unseen, solution.sweep_sigma)
+        on_head = rig.cameras[camera].mount == "head"
+        pose = pose_array(rig.cameras[camera].T_camera)
+        unseen = known.unseen_of_cameras[camera]
+    head = pose_array(rig.T_head_lrf)
+    return Chain(head, pose, on_head, tuple(covariances), unseen, known.sweep_sigma)
 
 
 def projection_sigma(
@@ -222,16 +204,24 @@ def root_mean_square(sigma: np.ndarray) -> float:
     return float(np.sqrt(np.mean(reached**2))) if reached.size else np.inf
 
 
-def range_noise(solution: JointSolution) -> float:
-    """Standard deviation of one range as the solution found or took it, metres.
+def range_noise(rig: CalibratedRig) -> float:
+    """Standard deviation of one range as the calibration found or took it, metres.
 
     Parameters
     ----------
-    solution
+    rig
     """
-    if not len(solution.observations.face_sigma):
-        return 0.0
-    return float(np.median(solution.observations.face_sigma) * solution.noise["face_scale"])
+    return uncertainty_of(rig).range_noise
+
+
+def uncertainty_of(rig: CalibratedRig) -> RigUncertainty:
+    """How well a rig is known, or a ValueError that nothing says so."""
+    if rig.uncertainty is None:
+        raise ValueError(
+            f"the calibration of '{rig.session}' by '{rig.method}' does not say how well the "
+            "rig is known: calibrate it by 'joint'"
+        )
+    return rig.uncertainty
 
 
 def carried(

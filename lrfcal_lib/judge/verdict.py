@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
+from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.judge.alternatives import places_of_cameras, step_not_told
 from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief, no_if
 from lrfcal_lib.judge.lens import lens_findings
@@ -273,12 +274,13 @@ def verdict(
     field_of_view
         Bearings that the LRF measures, radians.
     """
-    cameras = {camera: chain_of(solution, camera) for camera in solution.transforms}
+    rig = joint_rig(solution, models)
+    cameras = {camera: chain_of(rig, camera) for camera in rig.cameras}
     pitch = np.concatenate(
         [solution.observations.face_pitch, solution.observations.beam_pitch]
     )
-    ways = Ways(chain_of(solution), cameras, pitch)
-    judged = _expected(ways.doubted(doubt), models, range_noise(solution))
+    ways = Ways(chain_of(rig), cameras, pitch)
+    judged = _expected(ways.doubted(doubt), models, range_noise(rig))
     judged = judged.because(diagnose(solution))
     if not suggest:
         return judged

@@ -36,7 +36,8 @@ SERIES = (
 AXES_RGB = ("#d62728", "#2ca02c", "#1f5fd6")  # x, y, z of every frame
 PLANES = {"xz": (0, 2), "yz": (1, 2), "xy": (0, 1)}
 BESIDE = 14  # beams shown on either side of the end of a board
-ABOUT = 6.0  # degrees shown on either side of a board
+ABOUT = 3.0  # degrees shown around a board
+BEYOND = "#d9d9d9"  # ranges outside the limits of several sweeps
 BRIGHT = 150  # grey level: a picture whose brightest hundredth is darker is brightened
 GAIN = 5.0  # by this factor at most
 STRETCH = 61  # points of an edge as the lens bends it
@@ -100,11 +101,14 @@ def range_image(
     if limits is None:
         ax.figure.colorbar(drawn, ax=ax, label="range [m]", shrink=0.9)
     else:
-        drawn.set_clim(*limits)
+        drawn.set(clim=limits, cmap=drawn.cmap.with_extremes(over=BEYOND, under=BEYOND))
 
     shown = np.isfinite(sweep.ranges).any(axis=0)
     if mask is not None and mask.any():
         _outlined(ax, bearing, height[order], mask[order])
+        rows = height[mask.any(axis=1)]
+        rim = [rows.min() - ABOUT, rows.max() + ABOUT]
+        ax.set_ylim(np.clip(rim, height.min(), height.max()))
         board = bearing[mask.any(axis=0)]
         shown &= np.abs(bearing - board.mean()) < np.ptp(board) / 2 + ABOUT
     if shown.any():
@@ -115,14 +119,13 @@ def range_image(
 
 
 def _outlined(ax, bearing, height, mask):
-    """Draw the border of a mask (L, B) over bearing and height in white; of one line its beams."""
+    """Draw the border of a mask (L, B) over bearing and height in red; of one line its beams."""
     if len(mask) == 1:
         on = bearing[mask[0]]
-        ax.plot(on, np.repeat(height, len(on)), ".", color="white", markersize=2)
+        ax.plot(on, np.repeat(height, len(on)), ".", color=COLORS["truth"], markersize=2)
     else:
-        ax.contour(
-            bearing, height, mask.astype(float), levels=[0.5], colors="white", linewidths=1
-        )
+        looks = {"levels": [0.5], "colors": COLORS["outlier"], "linewidths": 1.5}
+        ax.contour(bearing, height, mask.astype(float), **looks)
 
 
 def scan_line(

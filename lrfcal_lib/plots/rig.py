@@ -3,39 +3,18 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.plots.recording import AXES_RGB, CENTRED, COLORS, closed, color_of
+from lrfcal_lib.plots.recording import CENTRED, COLORS, closed
 
 SURFACE = {"color": COLORS["left"], "alpha": 0.15, "linewidth": 0}
 NEAREST = 1e-6  # metres: what is nearer, or behind a camera, is not seen
 PARALLEL = 1e-9  # sine of an angle below which two directions are one
 Vector = Sequence[float] | np.ndarray
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-
-
-def frames(
-    ax: Axes3D, transforms: Mapping[str, RigidTransform], length: float = 0.1
-) -> None:
-    """Coordinate frames in space: x red, y green, z blue.
-
-    Parameters
-    ----------
-    ax
-    transforms
-        From each frame, by name, to the one drawn in.
-    length
-        Of the arrows, metres.
-    """
-    for name, transform in transforms.items():
-        for axis, color in zip(np.eye(3), AXES_RGB, strict=True):
-            arrow = transform.apply([0 * axis, length * axis])
-            ax.plot(*arrow.T, color=color, linewidth=1.8)
-        beside = transform.apply([-0.35 * length] * 3)
-        ax.text(*beside, name, fontsize=8, color=color_of(name, 7), weight="bold")
 
 
 def polygon(ax: Axes3D, corners: np.ndarray, color: str = COLORS["truth"]) -> None:
@@ -52,23 +31,6 @@ def polygon(ax: Axes3D, corners: np.ndarray, color: str = COLORS["truth"]) -> No
         Poly3DCollection([corners], facecolors=color, edgecolors=color, alpha=0.15)
     )
     ax.plot(*closed(corners).T, color=color, linewidth=1.2)
-
-
-def rays(ax: Axes3D, origin: ArrayLike, points: np.ndarray) -> None:
-    """Beams in space.
-
-    Parameters
-    ----------
-    ax
-    origin
-        Shape (3,), or (n, 3), metres.
-    points
-        That they hit, shape (n, 3), metres.
-    """
-    beams = np.stack([np.broadcast_to(origin, points.shape), points], axis=1)
-    color = COLORS["lrf"]
-    ax.add_collection3d(Line3DCollection(beams, colors=color, linewidths=0.4, alpha=0.35))
-    ax.plot(*points.T, ".", color=color, markersize=2.5)
 
 
 def lines(ax: Axes3D, drawn: Mapping[str, tuple[str, np.ndarray]]) -> None:

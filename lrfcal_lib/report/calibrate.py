@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib.calibrate.pipeline import Calibration, calibrate, handed_over
-from lrfcal_lib.evaluate.export import calibration_record, cloud_tasks, write_calibration
+from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.judge.verdict import NO, judge
+from lrfcal_lib.measure.cloud_files import cloud_tasks
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.workers import spread
 

@@ -106,7 +106,7 @@ def render(
                 exclude_anchor_links=True,
             )
             text = turned(MarkdownWithMath(renderer=renderer).render(cell.source))
-            body.append(re.sub(r'(href="\d\d_\w+)\.ipynb"', r'\1.html"', text))
+            body.append(re.sub(r'(href="\d\d_\w+)\.ipynb(#\w+)?"', r'\1.html\2"', text))
         elif cell.cell_type == "code":
             body.append(
                 f'<details class="code"><summary>Code</summary>{color(cell.source)}</details>'

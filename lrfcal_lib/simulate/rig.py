@@ -507,10 +507,12 @@ def held_close(
     for i in range(count):
         row, column = divmod(i, columns)
         pixel = np.array([(column + 0.5) / columns, (row + 0.5) / rows]) * size
-        for attempt in range(MOST_TRIES):
-            inwards = (size / 2 - pixel) * attempt / MOST_TRIES
+        # towards the middle of the image first, then away from the camera
+        for attempt in range(2 * MOST_TRIES):
+            tried = attempt / MOST_TRIES
+            inwards = (size / 2 - pixel) * min(tried, 1.0)
             u, v = pixel + inwards + rng.normal(0, 15, 2)
-            z = rng.uniform(*CLOSE)
+            z = rng.uniform(*CLOSE) * max(tried, 1.0)
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])
             turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
             place = z * np.array([(u - m.cx) / m.fx, (v - m.cy) / m.fy, 1.0])

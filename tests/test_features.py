@@ -1,0 +1,34 @@
+"""Planes, points and lengths of a scanned cloud."""
+
+import numpy as np
+import pytest
+
+from lrfcal_lib.calibrate import clouds
+from lrfcal_lib.measure.features import fit_feature, length_between
+from lrfcal_lib.model.geometry import DegenerateGeometry
+
+
+def test_lengths_between_features_know_how_good_they_are(quick):
+    """Two halves of one face are no distance apart across it, and half a board along it."""
+    cloud = clouds.color_cloud(quick, "joint")
+    rig = quick.rig("joint")
+    offs = []
+    for placement in np.unique(cloud.placement):
+        rows = np.flatnonzero(cloud.placement == placement)
+        x = cloud.points[rows, 0]
+        left = rows[x < np.median(x)]
+        right = rows[x >= np.median(x)]
+        planes = [fit_feature(cloud, half, rig) for half in (left, right)]
+        length, sigma = length_between(fit_feature(cloud, rows, rig), planes[0])
+        offs.append(length / sigma)
+        points = [fit_feature(cloud, half, rig, plane=False) for half in (left, right)]
+        length, sigma = length_between(*points)
+        assert (
+            length == pytest.approx(np.linalg.norm(points[1].centre - points[0].centre))
+            and 0 < sigma < 0.01
+        )
+        length, sigma = length_between(points[0], planes[1])
+        assert length < 5 * sigma
+    assert 0.1 < np.sqrt(np.mean(np.square(offs))) < 3
+    with pytest.raises(DegenerateGeometry, match="no point"):
+        fit_feature(cloud, [], rig)
