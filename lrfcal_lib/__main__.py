@@ -62,8 +62,11 @@ def check(args):
         print("\n".join(problems))
         return 1
     print(f"{printable(args.session)}: nothing to complain about")
-    count = len(open_session(args.session).board_placements)
-    if count < FEW:
+    session = open_session(args.session)
+    count = len(session.board_placements)
+    if count == 0 and session.scene_placements:
+        print("no placement of the board: a scene, for a calibration made elsewhere")
+    elif count < FEW:
         needed = f"{FEW} or more are needed to see errors of the model"
         print(f"warning: {count} placements of the board; {needed}")
     return 0
@@ -132,7 +135,7 @@ def _add_sessions(verbs):
     check.add_argument("session")
 
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
-    simulate.add_argument("setup", help="sim_lms221 or sim_quick, as shipped in data/")
+    simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
     simulate.add_argument("dst", help="folder of the new session")
     simulate.add_argument(
         "--workers", type=int, default=2, help="processes that render images (default 2)"

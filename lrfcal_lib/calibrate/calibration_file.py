@@ -1,6 +1,5 @@
 """``calibration.json``: what is needed to use a calibrated rig, without the session it is of."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -342,42 +341,59 @@ def refuse_untrusted(rig: CalibratedRig, untrusted: bool = False) -> None:
         )
 
 
-def require_same_rig(rig: CalibratedRig, session: Session) -> None:
-    """ValueError where a session cannot have been recorded by a rig.
+def require_same_rig(rig: CalibratedRig, other: Session | CalibratedRig) -> None:
+    """ValueError where a session cannot have been recorded by a calibrated rig, or another
+    calibration is of another rig.
 
-    A session may know fewer cameras than the calibration, or more; those both know are the same.
+    One may know fewer cameras than the other; those both know are the same.
 
     Parameters
     ----------
     rig : CalibratedRig
-    session : Session
+    other : Session or CalibratedRig
     """
-    differences = list(_differences(rig, session))
+    if isinstance(other, CalibratedRig):
+        name = f"the calibration of '{other.session}'"
+        sizes = {key: camera.model for key, camera in other.cameras.items()}
+    else:
+        name = other.name
+        sizes = other.cameras
+    mounts = {key: camera.mount for key, camera in other.cameras.items()}
+    differences = [
+        *_other_cameras(rig, sizes, mounts),
+        *_other_lrf(rig.lrf, other.lrf),
+    ]
     if differences:
         raise ValueError(
-            f"{session.name} was recorded by another rig than the calibration of "
-            f"'{rig.session}': {'; '.join(differences)}"
+            f"{name} is of another rig than the calibration of '{rig.session}': "
+            f"{'; '.join(differences)}"
         )
 
 
-def _differences(rig: CalibratedRig, session: Session) -> Iterable[str]:
-    """What tells a session's rig from a calibrated one, in words."""
+def _other_cameras(rig, sizes, mounts):
+    """What tells the cameras of another rig from a calibrated one's, in words.
+
+    `sizes` has a width and a height by name, `mounts` what a camera is fixed to.
+    """
     known = set(rig.cameras)
-    recorded = set(session.cameras)
-    if recorded and not (known <= recorded or recorded <= known):
-        yield f"its cameras are {sorted(recorded)}, those of the calibration {sorted(known)}"
-    for name in sorted(known & recorded):
-        camera = session.cameras[name]
-        calibrated = rig.cameras[name]
-        size = f"{camera.width} x {camera.height}"
-        lens = f"{calibrated.model.width} x {calibrated.model.height}"
-        if size != lens:
-            yield f"images of '{name}' have {size} pixels, not {lens}"
-        if camera.mount != calibrated.mount:
-            yield f"'{name}' is fixed to the {camera.mount}, not the {calibrated.mount}"
-    step = np.degrees([session.lrf.bearing_step, rig.lrf.bearing_step]).round(6)
-    if step[0] != step[1]:
-        yield f"beams are {step[0]:g} deg apart, not {step[1]:g}"
-    view = np.degrees([session.lrf.field_of_view, rig.lrf.field_of_view]).round(4).tolist()
-    if view[0] != view[1]:
-        yield f"the LRF sees {view[0]} deg, not {view[1]}"
+    other = set(mounts)
+    if other and not (known <= other or other <= known):
+        yield f"its cameras are {sorted(other)}, not {sorted(known)}"
+    for name in sorted(known & other):
+        camera = rig.cameras[name]
+        size = f"{sizes[name].width} x {sizes[name].height}"
+        expected = f"{camera.model.width} x {camera.model.height}"
+        if size != expected:
+            yield f"images of '{name}' have {size} pixels, not {expected}"
+        if mounts[name] != camera.mount:
+            yield f"'{name}' is fixed to the {mounts[name]}, not to the {camera.mount}"
+
+
+def _other_lrf(lrf, other):
+    """What tells another range finder from a calibrated one, in words."""
+    step, expected = np.degrees([other.bearing_step, lrf.bearing_step]).round(6)
+    if step != expected:
+        yield f"its beams are {step:g} deg apart, not {expected:g}"
+    view, expected = np.degrees([other.field_of_view, lrf.field_of_view]).round(4).tolist()
+    if view != expected:
+        yield f"its range finder sees {view} deg, not {expected}"
