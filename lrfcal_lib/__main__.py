@@ -20,6 +20,10 @@ def run(args):
 
             with side_by_side():
                 return calibrate_session(args.session, args.out)
+        case "compare":
+            from lrfcal_lib.report.compare import compare_files
+
+            return compare_files(args.calibrations, args.figure)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
@@ -146,6 +150,17 @@ def _add_sessions(verbs):
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
+
+    compare = verbs.add_parser(
+        "compare", help="say how far calibrations of one rig differ, beside what they claim"
+    )
+    compare.add_argument(
+        "calibrations",
+        nargs="+",
+        metavar="calibration.json",
+        help="two or more, the earliest first; a session is calibrated",
+    )
+    compare.add_argument("--figure", metavar="PNG", help="also draw them")
 
     reconstruct = verbs.add_parser(
         "reconstruct", help="make coloured clouds of a scene with a calibration of its rig"
