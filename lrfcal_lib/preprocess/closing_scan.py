@@ -105,8 +105,9 @@ def closing_of(sweep: Sweep) -> Closing | None:
     last = np.nanmean(closing.ranges, axis=0)
     between = ranges[1:-1] - (ranges[:-2] + ranges[2:]) / 2
     apart = []
+    step = np.median(np.diff(pitch))
     for play in np.linspace(-PLAY, PLAY, STEPS):
-        if pitch[0] <= at + play <= pitch[-1]:
+        if pitch[0] - step <= at + play <= pitch[-1] + step:
             apart.append(_apart(last, _at(at + play, pitch, ranges)))
     if np.isfinite(between).sum() < LEAST or not np.isfinite(apart).any():
         return None
