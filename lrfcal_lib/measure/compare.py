@@ -355,7 +355,7 @@ def cloud_shifts(first: CalibratedRig, second: CalibratedRig) -> Shifts:
     at = np.stack(np.meshgrid(bearings, PITCHES), axis=-1)
     bearing, pitch = np.moveaxis(at, -1, 0)
     ends = []
-    variance = 0.0
+    variance = np.zeros(bearing.shape)
     for rig in (first, second):
         chain = chain_of(rig)
         points, by_link, _ = carried(chain, bearing, *true_beams(rig, pitch, DISTANCE))
