@@ -134,7 +134,7 @@ class Comparison:
 
     def sentence(self) -> str:
         """The answer."""
-        odds = f"honest calibrations differ more in {100 * self.whole.p:.2g} % of cases"
+        odds = f"honest calibrations differ more in {_percent(self.whole.p)} of cases"
         names = f"'{self.first.session}' and '{self.second.session}'"
         if self.within:
             return f"{names} differ within what both claim ({odds})."
@@ -145,6 +145,13 @@ class Comparison:
             f"{names} differ by more than both claim ({odds}){where}: the rig has changed in "
             "between, or one of them errs."
         )
+
+
+def _percent(share):
+    """A share in words."""
+    if share < 1e-4:
+        return "less than 0.01 %"
+    return f"{100 * share:.{0 if share > 0.1 else 2}f} %"
 
 
 def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
