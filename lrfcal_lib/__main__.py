@@ -27,10 +27,13 @@ def run(args):
             simulate(args.dst, load_setup(args.setup), workers=args.workers)
             print(f"{args.dst}: simulated")
         case "record":
-            from lrfcal_lib.acquire.record import main
+            return record(args)
+        case "reconstruct":
+            from lrfcal_lib.report.reconstruct import reconstruct_session
 
-            options = {"resume": args.resume, "count": args.placements, "mode": args.mode}
-            return main(args.rig_file, args.session, **options)
+            return reconstruct_session(
+                args.session, args.calibration, args.out, args.untrusted
+            )
         case "report":
             from lrfcal_lib.report.report import main
 
@@ -59,18 +62,39 @@ def check(args):
         print("\n".join(problems))
         return 1
     print(f"{printable(args.session)}: nothing to complain about")
-    count = len(open_session(args.session).board_placements)
-    if count < FEW:
+    session = open_session(args.session)
+    count = len(session.board_placements)
+    if count == 0 and session.scene_placements:
+        print("no placement of the board: a scene, for a calibration made elsewhere")
+    elif count < FEW:
         needed = f"{FEW} or more are needed to see errors of the model"
         print(f"warning: {count} placements of the board; {needed}")
     return 0
+
+
+def record(args):
+    """Record placements of the board, or stations of a scene."""
+    from lrfcal_lib.acquire.record import main
+
+    options = {"resume": args.resume, "count": args.placements, "mode": args.mode}
+    if args.scene:
+        from lrfcal_lib.acquire.stations import Stations
+        from lrfcal_lib.calibrate.calibration_file import load_calibration
+
+        rig = None
+        if args.calibration is not None:
+            rig = load_calibration(args.calibration)
+        options["guide"] = Stations(args.stations or 1, rig)
+    elif args.stations or args.calibration:
+        raise ValueError("--stations and --calibration are for a scene: add --scene")
+    return main(args.rig_file, args.session, **options)
 
 
 def how_many(text):
     """A number of placements on the command line."""
     value = int(text)
     if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} placements: 1 or more are needed")
+        raise argparse.ArgumentTypeError(f"{value}: 1 or more are needed")
     return value
 
 
@@ -111,7 +135,7 @@ def _add_sessions(verbs):
     check.add_argument("session")
 
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
-    simulate.add_argument("setup", help="sim_lms221 or sim_quick, as shipped in data/")
+    simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
     simulate.add_argument("dst", help="folder of the new session")
     simulate.add_argument(
         "--workers", type=int, default=2, help="processes that render images (default 2)"
@@ -121,6 +145,20 @@ def _add_sessions(verbs):
     calibrate.add_argument("session")
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
+    )
+
+    reconstruct = verbs.add_parser(
+        "reconstruct", help="make coloured clouds of a scene with a calibration of its rig"
+    )
+    reconstruct.add_argument("session", help="as 'record --scene' recorded it")
+    reconstruct.add_argument("--calibration", required=True, help="calibration.json")
+    reconstruct.add_argument(
+        "--out", help="folder of its files (default reports/<session> under this folder)"
+    )
+    reconstruct.add_argument(
+        "--untrusted",
+        action="store_true",
+        help="even if the verdict on the calibration is 'no'; every file says so",
     )
 
 
@@ -144,6 +182,15 @@ def _add_rigs(verbs):
     )
     record.add_argument(
         "--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's"
+    )
+    record.add_argument(
+        "--scene", action="store_true", help="record a scene instead of the plan's boards"
+    )
+    record.add_argument(
+        "--stations", type=how_many, metavar="N", help="of the scene (default 1)"
+    )
+    record.add_argument(
+        "--calibration", help="calibration.json of the rig: plans the images of the scene"
     )
 
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")

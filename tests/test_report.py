@@ -29,6 +29,7 @@ KERNEL = {
     "kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}
 }
 GOOD = """
+import json
 import matplotlib.pyplot as plt
 import pandas as pd
 from lrfcal_lib.report import notebook
@@ -49,7 +50,11 @@ notebook.verdict("Can it be trusted?", said, record)
 notebook.table(pd.DataFrame({"placement": range(3), "used": True}), "placements")
 lengths = {"source": ["wall"] * 4 + ["paper"], "placement": [1, 1, 2, 2, None],
            "error_mm": [1.0, -3.0, 3.0, -5.0, 8.84], "variant": ["half_step"] * 4 + ["last_beam"]}
+lengths["ends"] = ["scan"] * 5
 notebook.table(pd.DataFrame(lengths), "edge_lengths")
+pose = {"maps": "lrf to left", "rotvec_rad": [0.1, 0.2, 0.3], "translation_m": [0.119, 0.0, -0.05]}
+pose["sigma"] = dict(zip(("rx", "ry", "rz", "tx", "ty", "tz"), [0.001] * 6))
+notebook.report_file("calibration.json").write_text(json.dumps({"method": "joint", "cameras": {"left": pose}}))
 wide = pd.DataFrame({f"a_rather_long_heading_{n}_mm": [1234.5678] for n in range(14)})
 display(wide)
 _ = notebook.table(wide, "wide")
@@ -154,10 +159,11 @@ def test_index_states_what_was_found_and_needs_no_other_file(finished, session):
 
 def test_the_first_screen_has_the_verdict_and_its_numbers(finished):
     page = (finished[0] / "index.html").read_text()
-    first = re.sub("<[^>]+>", "", page.split("</header>")[1].split("Contents")[0])
+    first = re.sub("<[^>]+>", "", page.split("</header>")[1].split('id="verdict"')[0])
     first = re.sub(r"\s+", " ", html.unescape(first))
     told = ["This can be trusted.", "Handed over: 'joint estimate'.", "Record next: nothing.", "3.0 ± 1.5 mm",
-            "2.0 mm at 1 m", "1.5 ± 0.8 px", "3.0 ± 1.0 mm", "of 4 edge lengths", "8.84 mm"]  # fmt: skip
+            "2.0 mm at 1 m", "1.5 ± 0.8 px", "3.0 ± 1.0 mm", "of 4 edge lengths", "8.84 mm",
+            "Use this: calibration.json, poses by joint estimate", "11.46 ± 0.06", "119.0 ± 1.0"]  # fmt: skip
     assert [words for words in told if words not in first] == []
     assert "Rest." not in first and "Expected error at 2 m" not in first
     assert "Rest." in page and "Expected error at 2 m" in page, "below"

@@ -114,7 +114,11 @@ def pitch_offsets(
 
 
 def parameter_comparison(
-    ax: Axes, values: Mapping[str, float], sigmas: Mapping[str, float], label: str
+    ax: Axes,
+    values: Mapping[str, float],
+    sigmas: Mapping[str, float],
+    label: str,
+    true: float | None = None,
 ) -> None:
     """One parameter by method.
 
@@ -124,7 +128,11 @@ def parameter_comparison(
     values, sigmas
         By method, and their standard deviations (NaN: no bar), both in the unit of the label.
     label
+    true
+        The true value where it is known: a vertical line.
     """
+    if true is not None:
+        ax.axvline(true, color=COLORS["truth"], linestyle="--", linewidth=1, zorder=0)
     for row, (method, value) in enumerate(values.items()):
         sigma = sigmas[method] if np.isfinite(sigmas[method]) else None
         color = series(row)
@@ -187,7 +195,7 @@ def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
     if mean.notna().any():
         title = f"least: {mean.idxmin()}"
     ax.set_title(title)
-    ax.legend()
+    ax.legend(ncols=len(cameras), loc="lower right", bbox_to_anchor=(1.0, -0.02))
 
 
 def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:

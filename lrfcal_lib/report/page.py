@@ -20,6 +20,7 @@ SHORT = 15  # rows of a table that is shown unfolded
 PIXELS_PER_INCH = 96 / 150  # of a page, by those of a figure's file
 # columns from which a table is turned on screens as narrow
 WIDTHS = ((9, "wide"), (3, "medium"), (0, "narrow"))
+FITTING = 42  # characters of a row that a screen of 400 pixels shows beside each other
 
 
 class Renderer(IPythonRenderer):
@@ -149,10 +150,21 @@ def _figure(folder, entry, label):
         f'<img alt="{caption}" width="{width}" '
         f'src="data:image/png;base64,{base64.b64encode(data).decode()}">'
     )
+    # a box that is ticked by a click on the picture: then the picture fills the window
     return (
-        f'<figure id="{file.stem}"><a href="figures/{file.name}">{picture}</a>'
-        f"<figcaption><b>{label}.</b> {caption}</figcaption></figure>"
+        f'<figure id="{file.stem}"><label class="grows" title="click: larger, or back">'
+        f'<input type="checkbox" aria-label="show larger"><span>{picture}</span></label>'
+        f"<figcaption><b>{label}.</b> {caption} "
+        f'<a class="soft" href="figures/{file.name}">PNG</a></figcaption></figure>'
     )
+
+
+def folded(figure: str) -> str:
+    """A figure folded under its caption, for a page that has more important ones."""
+    caption = re.search("<figcaption>(.*?) <a ", figure, re.DOTALL)
+    if caption is None:
+        return figure
+    return f'<details class="figure"><summary>{caption[1]}</summary>{figure}</details>'
 
 
 def _table(entry, label):
@@ -180,7 +192,8 @@ def turned(text):
         heads = table.thead("th") if table.thead else []
         for head in heads:
             head.string = in_words(head.get_text(), column=True)
-        table.attrs = {"class": next(name for least, name in WIDTHS if len(heads) >= least)}
+        columns = 0 if _fits(table) else len(heads)
+        table.attrs = {"class": next(name for least, name in WIDTHS if columns >= least)}
         for part in table(["th", "td", "tr"]):
             part.attrs = {}
         for row in table.tbody("tr") if table.tbody else ():
@@ -189,3 +202,15 @@ def turned(text):
                 if re.fullmatch(r"[-+]?[\d.]+(e[-+]\d+)?|–|nan", cell.get_text().strip()):
                     head["class"] = cell["class"] = "number"
     return str(soup)
+
+
+def _fits(table):
+    """Whether a narrow screen shows a whole row of a table, its headings broken into words."""
+    rows = [row(["th", "td"]) for row in table("tr")]
+    longest = [0] * max(map(len, rows), default=0)
+    for number, row in enumerate(rows):
+        for column, cell in enumerate(row):
+            text = cell.get_text().strip()
+            words = text.split() if number == 0 else [text]
+            longest[column] = max([longest[column], *map(len, words)])
+    return sum(longest) + 1.5 * len(longest) <= FITTING

@@ -20,13 +20,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import nbformat
-import pandas as pd
 from jinja2 import Environment, FileSystemLoader
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 from tqdm import tqdm
 
-from lrfcal_lib.report import page
+from lrfcal_lib.report import first_screen, page
 from lrfcal_lib.report.notebook import ROOT, SHIPPED, label_of
 from lrfcal_lib.session.cache import VARIABLE as CACHE
 from lrfcal_lib.session.progress import Progress, duration
@@ -57,16 +56,8 @@ OWN_FILES = (  # folders, files to link to, the page itself
     "findings.json",
     "index.html",
 )
-# begin sentences of a verdict that the first screen tells in numbers
-BESIDE = ("Expected error", "In the image of")
 AT_WORKING_FOLDER = -100  # AT_FDCWD, see renameat2(2)
 EXCHANGE = 2  # RENAME_EXCHANGE of Linux
-PICTURES = (
-    "scene",
-    "cloud",
-    "clouds_of_boards",
-    "frames",
-)  # of the first screen, the best first
 PART = ".report-"  # begins the names of folders in which a report is being written
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
@@ -83,7 +74,6 @@ USUAL_SECONDS = {  # by number, two at a time on two busy cores; only their rati
     "09": 144.0,
 }
 _CLIENTS: set[NotebookClient] = set()  # of the notebooks that are being executed
-MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way first
 
 
 @dataclass(frozen=True)
@@ -454,7 +444,7 @@ def write_pages(out, session, runs, found, seconds):
         )
 
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
-    main = _main_verdict(verdicts)
+    main = first_screen.main_verdict(verdicts)
     _write_page(
         jinja,
         out / "index.html",
@@ -469,9 +459,11 @@ def write_pages(out, session, runs, found, seconds):
         verdicts=verdicts,
         told={entry["key"]: entry for run in runs for entry in found[run.name]["findings"]},
         main=main,
-        headline=_headline(out, main),
-        rest=_sentences_below(main),
-        picture=_first_picture(drawn),
+        headline=first_screen.headline(out, main),
+        handed=first_screen.handed_over(out / "calibration.json"),
+        rest=first_screen.sentences_below(main),
+        picture=first_screen.first_picture(drawn),
+        folded=page.folded,
         files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
     )
@@ -493,67 +485,6 @@ def _templates():
 def _write_page(jinja, file, template, **values):
     """Write a page made by a template."""
     file.write_text(jinja.get_template(template).render(**values), encoding="utf-8")
-
-
-def _main_verdict(verdicts):
-    """The verdict that stands first: one with a record, else any; None without."""
-    with_record = [entry for entry in verdicts if entry["record"] is not None]
-    return next(iter(with_record or verdicts), None)
-
-
-def _sentences_below(verdict):
-    """Sentences of a verdict that the first screen does not tell in numbers."""
-    if verdict is None:
-        return []
-    return [words for words in verdict["sentences"][1:] if not words.startswith(BESIDE)]
-
-
-def _first_picture(drawn):
-    """The figure of the first screen, as HTML; '' where no notebook drew one of them."""
-    figures = {}
-    for of_notebook, _ in drawn.values():
-        figures |= of_notebook
-    return next((figures[name] for name in PICTURES if figures.get(name)), "")
-
-
-def _headline(out, verdict):
-    """Numbers of the first screen as far as there are any, by kind: expected errors, edges."""
-    numbers = {}
-    if verdict and verdict["record"] and verdict["record"]["expected_error_at_m"]:
-        errors = pd.DataFrame(verdict["record"]["expected_error_at_m"])
-        numbers["cloud"] = dict(errors.loc["cloud_mm"])
-        numbers["image"] = dict(errors.drop("cloud_mm").max())
-        numbers["known"] = _known_share(out / "tables" / "placements.csv")
-    if (out / "tables" / "edge_lengths.csv").is_file():
-        edges = _edge_numbers(pd.read_csv(out / "tables" / "edge_lengths.csv"))
-        if edges:
-            numbers["edges"] = edges
-    return numbers
-
-
-def _known_share(file):
-    """How well a standard deviation from n placements is known: to one part in sqrt(2 (n - 1))."""
-    used = 0
-    if file.is_file():
-        used = pd.read_csv(file).used.sum()
-    return (2 * (used - 1)) ** -0.5 if used > 1 else 0.0
-
-
-def _edge_numbers(lengths):
-    """Number, mean absolute error and its scatter of measured edges, the best way; {} without."""
-    lengths = lengths.dropna(subset="error_mm")
-    lengths = lengths.assign(error=lengths.error_mm.abs())
-    own = lengths[lengths.source != "paper"]
-    best = next((way for way in MEASURED if (own.variant == way).any()), None)
-    if best is None:
-        return {}
-    part = own[own.variant == best]
-    return {
-        "n": len(part),
-        "mean": part.error.mean(),
-        "sigma": part.groupby("placement").error.mean().sem(),
-        "paper": lengths[lengths.source == "paper"].error.mean(),
-    }
 
 
 def _provenance(session):
