@@ -10,7 +10,7 @@ NO_BUILD_QUESTION := --ServerApp.tornado_settings="{'page_config_data': {'buildC
 SAVING := --ServerApp.contents_manager_class=lrfcal_lib.report.saving.Contents
 # JupyterLab refuses root, who often is the only user of a container or a board computer
 AS_ROOT := $(if $(filter 0,$(shell id -u)),--allow-root)
-SIMULATED := sim_lms221 sim_quick
+SIMULATED := sim_lms221 sim_quick room_lms221
 # one thread a process where it is no matter (Open3D): two notebooks run side by side; lrfcal_lib sees to the rest
 export OMP_NUM_THREADS ?= 1
 

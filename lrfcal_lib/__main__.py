@@ -20,6 +20,10 @@ def run(args):
 
             with side_by_side():
                 return calibrate_session(args.session, args.out)
+        case "compare":
+            from lrfcal_lib.report.compare import compare_files
+
+            return compare_files(args.calibrations, args.figure)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
@@ -27,10 +31,13 @@ def run(args):
             simulate(args.dst, load_setup(args.setup), workers=args.workers)
             print(f"{args.dst}: simulated")
         case "record":
-            from lrfcal_lib.acquire.record import main
+            return record(args)
+        case "reconstruct":
+            from lrfcal_lib.report.reconstruct import reconstruct_session
 
-            options = {"resume": args.resume, "count": args.placements, "mode": args.mode}
-            return main(args.rig_file, args.session, **options)
+            return reconstruct_session(
+                args.session, args.calibration, args.out, args.untrusted
+            )
         case "report":
             from lrfcal_lib.report.report import main
 
@@ -39,6 +46,26 @@ def run(args):
             from lrfcal_lib.emulators.rig import main
 
             return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
+        case "board":
+            print_board(args)
+
+
+def print_board(args):
+    """Write a board to print, and what session.json and rig files say about it."""
+    from json import dumps
+
+    from lrfcal_lib.plots.sheet import print_sheet, sheet
+    from lrfcal_lib.session.stated import board_to_json
+    from lrfcal_lib.session.write import whole
+
+    board = sheet(args.columns, args.rows, args.square)
+    with whole(args.out) as file:
+        print_sheet(file, board)
+    width, height = 1000 * board.known_corners()[2]
+    print(
+        f"{args.out}: print at 100 %, glue on a flat plate, cut to {width:.0f} x {height:.0f} mm"
+    )
+    print("state it as:", dumps(board_to_json(board)))
 
 
 def import_recording(args):
@@ -59,18 +86,55 @@ def check(args):
         print("\n".join(problems))
         return 1
     print(f"{printable(args.session)}: nothing to complain about")
-    count = len(open_session(args.session).board_placements)
-    if count < FEW:
+    session = open_session(args.session)
+    count = len(session.board_placements)
+    if count == 0 and session.scene_placements:
+        print("no placement of the board: a scene, for a calibration made elsewhere")
+    elif count < FEW:
         needed = f"{FEW} or more are needed to see errors of the model"
         print(f"warning: {count} placements of the board; {needed}")
     return 0
+
+
+def record(args):
+    """Record placements of the board, or stations of a scene."""
+    from lrfcal_lib.acquire.record import main
+
+    options = {"resume": args.resume, "count": args.placements, "mode": args.mode}
+    if args.scene:
+        from lrfcal_lib.acquire.stations import Stations
+        from lrfcal_lib.calibrate.calibration_file import load_calibration
+
+        rig = None
+        if args.calibration is not None:
+            rig = load_calibration(args.calibration)
+        options["guide"] = Stations(args.stations or 1, rig)
+    elif args.stations or args.calibration:
+        raise ValueError("--stations and --calibration are for a scene: add --scene")
+    return main(args.rig_file, args.session, **options)
 
 
 def how_many(text):
     """A number of placements on the command line."""
     value = int(text)
     if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} placements: 1 or more are needed")
+        raise argparse.ArgumentTypeError(f"{value}: 1 or more are needed")
+    return value
+
+
+def metres(text):
+    """A length on the command line."""
+    value = float(text)
+    if not 0.001 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{value} m: squares have 0.001 to 1 m")
+    return value
+
+
+def inner(text):
+    """A number of inner corners on the command line."""
+    value = int(text)
+    if not 3 <= value <= 50:
+        raise argparse.ArgumentTypeError(f"{value} inner corners: 3 to 50 are possible")
     return value
 
 
@@ -111,7 +175,7 @@ def _add_sessions(verbs):
     check.add_argument("session")
 
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
-    simulate.add_argument("setup", help="sim_lms221 or sim_quick, as shipped in data/")
+    simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
     simulate.add_argument("dst", help="folder of the new session")
     simulate.add_argument(
         "--workers", type=int, default=2, help="processes that render images (default 2)"
@@ -121,6 +185,31 @@ def _add_sessions(verbs):
     calibrate.add_argument("session")
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
+    )
+
+    compare = verbs.add_parser(
+        "compare", help="say how far calibrations of one rig differ, beside what they claim"
+    )
+    compare.add_argument(
+        "calibrations",
+        nargs="+",
+        metavar="calibration.json",
+        help="two or more, the earliest first; a session is calibrated",
+    )
+    compare.add_argument("--figure", metavar="PNG", help="also draw them")
+
+    reconstruct = verbs.add_parser(
+        "reconstruct", help="make coloured clouds of a scene with a calibration of its rig"
+    )
+    reconstruct.add_argument("session", help="as 'record --scene' recorded it")
+    reconstruct.add_argument("--calibration", required=True, help="calibration.json")
+    reconstruct.add_argument(
+        "--out", help="folder of its files (default reports/<session> under this folder)"
+    )
+    reconstruct.add_argument(
+        "--untrusted",
+        action="store_true",
+        help="even if the verdict on the calibration is 'no'; every file says so",
     )
 
 
@@ -145,6 +234,15 @@ def _add_rigs(verbs):
     record.add_argument(
         "--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's"
     )
+    record.add_argument(
+        "--scene", action="store_true", help="record a scene instead of the plan's boards"
+    )
+    record.add_argument(
+        "--stations", type=how_many, metavar="N", help="of the scene (default 1)"
+    )
+    record.add_argument(
+        "--calibration", help="calibration.json of the rig: plans the images of the scene"
+    )
 
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument(
@@ -164,6 +262,16 @@ def _add_rigs(verbs):
 
 
 def _add_report(verbs):
+    board = verbs.add_parser("board", help="a board to print at its true size")
+    board.add_argument(
+        "columns", type=inner, help="inner corners of the chessboard along x"
+    )
+    board.add_argument(
+        "rows", type=inner, help="and along y, odd where the columns are even"
+    )
+    board.add_argument("square", type=metres, help="side of a square, metres")
+    board.add_argument("--out", default="board.pdf", help="PDF, SVG or PNG (board.pdf)")
+
     report = verbs.add_parser(
         "report", help="execute the notebooks on a session and write what they found"
     )

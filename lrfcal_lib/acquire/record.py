@@ -15,7 +15,7 @@ from tqdm import tqdm
 from lrfcal_lib.acquire.checks import Light, check_image, check_placement
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned, Tracked
-from lrfcal_lib.drivers.rig_file import Placement, read_rig_file
+from lrfcal_lib.drivers.rig_file import Placement, RigFile, read_rig_file
 from lrfcal_lib.session.progress import Progress, duration
 from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.recorder import SessionRecorder
@@ -404,20 +404,49 @@ def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) 
 
 
 def show(light: Light, name: str) -> None:
-    """Print what a check found.
-
-    Parameters
-    ----------
-    light
-        Of the check.
-    name
-        What was checked.
-    """
+    """Print what a check found of something with a name."""
     print(f"{MARKS[light.state]}  {name}: {light.text}", flush=True)
 
 
+class Boards:
+    """Recording what the plan lists."""
+
+    def planned(self, stated: RigFile) -> RigFile:
+        """The rig file with what is to be recorded."""
+        return stated
+
+    def ready(self, rig: Rig, placement: Placement, before: int | None) -> str:
+        """Wait until a placement can be recorded: '', or what else the user wants, 'q' or 'r'."""
+        if rig.move_board(placement.number):
+            return ""
+        what = "put the board"
+        if placement.purpose == "scene":
+            what = "take the board away"
+        return ask_before("placement", placement.number, what, before)
+
+    def check(self, session: Session, number: int) -> list[Light]:
+        """Lights of a finished placement."""
+        return check_placement(session, number)
+
+    def next_step(self, recording: Recording) -> str:
+        """What can be done with a finished recording, half a sentence."""
+        boards = {p.number for p in recording.plan if p.purpose == "board"}
+        if boards & set(recording.finished):
+            return f"'python -m lrfcal_lib calibrate {recording.path}' calibrates the rig"
+        return (
+            "all of them show scenes, which a calibration of the same rig can colour ('python -m "
+            f"lrfcal_lib reconstruct {recording.path}'): to calibrate, record placements of the "
+            "board"
+        )
+
+
 def record_session(
-    rig: Rig, path: str | os.PathLike, *, resume: bool = False, count: int | None = None
+    rig: Rig,
+    path: str | os.PathLike,
+    *,
+    resume: bool = False,
+    count: int | None = None,
+    guide: Boards | None = None,
 ) -> Recording:
     """Record a session with an open rig, from the first placement that is missing to the last.
 
@@ -425,6 +454,8 @@ def record_session(
     ----------
     rig, path, resume, count
         As of :class:`Recording`.
+    guide
+        What is asked before a placement, and checked after it.
 
     Returns
     -------
@@ -441,7 +472,7 @@ def record_session(
             print(f"{path}: going on, {recording.safe()}", flush=True)
         try:
             _close_views(recording)
-            _placements(recording)
+            _placements(recording, guide or Boards())
             recording.finish()
         except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:
             error.add_note(recording.safe(resume=True))
@@ -464,16 +495,14 @@ def _close_views(recording):
             kept = emulated or light.state != "bad"
 
 
-def _placements(recording):
+def _placements(recording, guide):
     """Each placement that is missing; the user may have the one before again (r), or end (q)."""
     before = None
     of = len(recording.plan)
     recorded = []  # seconds of each placement of this run
     while todo := recording.to_do():
         placement = todo[0]
-        answer = ""
-        if not recording.rig.move_board(placement.number):
-            answer = _ask_for_board(placement, before)
+        answer = guide.ready(recording.rig, placement, before)
         if answer == "q":
             return
         if answer == "r":
@@ -484,7 +513,7 @@ def _placements(recording):
         follow(placement, of - len(todo) + 1, of, recording.run(placement))
         recorded.append(progress.seconds)
         before = placement.number
-        for light in recording.check(before):
+        for light in guide.check(open_session(recording.path), before):
             show(light, light.name)
         if left := len(todo) - 1:
             expected = duration(left * sum(recorded) / len(recorded))
@@ -494,17 +523,14 @@ def _placements(recording):
             )
 
 
-def _ask_for_board(placement, before):
-    """Wait until the board is where it should be: '', or what else the user wants, 'q' or 'r'."""
-    what = "put the board"
-    if placement.purpose == "scene":
-        what = "take the board away"
-    again = ""
+def ask_before(kind: str, number: int, what: str, before: int | None) -> str:
+    """Ask for something to be done before a placement or station: '', 'q' to end, 'r' to repeat."""
     possible = ["", "q"]
+    again = ""
     if before is not None:
-        again = f", r: placement {before} again"
         possible.append("r")
-    text = f"placement {placement.number}: {what}, then press Enter{again} (q: end here) "
+        again = f", r: {kind} {before} again"
+    text = f"{kind} {number}: {what}, then press Enter{again} (q: end here) "
     while (answer := ask(text)) not in possible:
         pass
     return answer
@@ -517,6 +543,7 @@ def main(
     resume: bool = False,
     count: int | None = None,
     mode: str | None = None,
+    guide: Boards | None = None,
 ) -> int:
     """Record from the command line.
 
@@ -528,6 +555,8 @@ def main(
         As of :func:`record_session`.
     mode
         Instead of the plan's.
+    guide
+        As of :func:`record_session`.
 
     Returns
     -------
@@ -536,11 +565,12 @@ def main(
         after a signal. The head is stopped in any case.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    guide = guide or Boards()
     try:
-        stated = read_rig_file(rig_file).with_mode(mode)
+        stated = guide.planned(read_rig_file(rig_file).with_mode(mode))
         print(f"{rig_file}: opening the devices", flush=True)
         with Rig.open(stated) as rig:
-            recording = record_session(rig, path, resume=resume, count=count)
+            recording = record_session(rig, path, resume=resume, count=count, guide=guide)
     except (
         DeviceError,
         RecordingError,
@@ -559,24 +589,5 @@ def main(
         with contextlib.suppress(OSError):  # after SIGHUP the terminal may be gone
             print("; ".join([text, *getattr(error, "__notes__", [])]), file=sys.stderr)
         return code
-    print(f"{path}: {recording.safe()}; {next_step(recording)}")
+    print(f"{path}: {recording.safe()}; {guide.next_step(recording)}")
     return 0
-
-
-def next_step(recording: Recording) -> str:
-    """What can be done with a recording that has ended, half a sentence.
-
-    Parameters
-    ----------
-    recording
-        Finished.
-    """
-    boards = {
-        placement.number for placement in recording.plan if placement.purpose == "board"
-    }
-    if boards & set(recording.finished):
-        return f"'python -m lrfcal_lib calibrate {recording.path}' calibrates the rig"
-    return (
-        "all of them show scenes, which a calibration of the same rig can colour: "
-        "to calibrate, record placements of the board"
-    )

@@ -159,7 +159,7 @@ class Calibration:
             if name == method:
                 on_base = self.observations[camera, "half_step"].source == "platform"
                 mount = "platform" if on_base else "head"
-                model = self.prepared.models[camera]
+                model = solution.model or self.prepared.models[camera]
                 cameras[camera] = CalibratedCamera(solution.transform, mount, model)
                 solved[camera] = solution
         noise = [scan.sigma_range for scan in self.prepared.scans.values()]

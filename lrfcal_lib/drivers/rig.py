@@ -305,6 +305,8 @@ class Rig(Closed):
                 if isinstance(event, Scanned) and not self.head.has_feedback:
                     scans += [reading.ranges for reading in event.readings]
                 yield event
+            if placement.closing:
+                yield from self._close(placement)
             wide = np.ptp(placement.pitch) >= LEAST_SWEEP
             if wide and len(scans) >= FEWEST_SCANS and unchanged(scans):
                 head = self.stated.devices.head
@@ -365,6 +367,17 @@ class Rig(Closed):
             if any(abs(pitch - image) < SAME_STOP for image in images):
                 yield from self._photograph(self.cameras, moved, placement.purpose)
         self.lrf.stop()
+
+    def _close(self, placement):
+        """Scan once more at the first pitch of a sweep."""
+        interlaced = self.stated.devices.lrf.interlaced
+        moved = self._move(placement.number, float(placement.pitch[0]), 1, 1)
+        if interlaced:
+            self.lrf.start(interlaced=True)
+        readings = tuple(self._scans(moved.time_s, interlaced))
+        self.lrf.stop()
+        yield moved
+        yield Scanned(placement.number, readings, np.full(len(readings), moved.pitch), 1.0)
 
     def _scans(self, after, interlaced):
         """Scans of a stream, or one by one, later than an instant.

@@ -287,14 +287,15 @@ class Devices(Stated):
 
 
 class ListedPlacement(Stated):
-    """A placement of the plan; a board of false is a scene without one, what is left out is as in
-    the plan.
+    """A placement of the plan; a board of false is a scene without one, one that is closing ends
+    with a scan back at its first pitch, what is left out is as in the plan.
     """
 
     number: whole(0, 999_999) = None
     pitch_deg: Sweep = None
     image_pitch_deg: tuple[Angle, ...] = None
     board: StrictBool = True
+    closing: StrictBool = False
 
 
 @dataclass(frozen=True)
@@ -306,6 +307,9 @@ class Placement:
     pitch: np.ndarray
     image_pitch: tuple[float, ...]  # where images are taken, radians
     purpose: str = "board"  # of the images, or "scene"
+    closing: bool = (
+        False  # back at its first pitch a last scan shows whether all stood still
+    )
 
     @property
     def direction(self) -> int:
@@ -364,9 +368,8 @@ class Plan(Stated):
             purpose = "scene"
             if entry.board:
                 purpose = "board"
-            placements.append(
-                Placement(number, stops, tuple(map(math.radians, images)), purpose)
-            )
+            pitches = tuple(map(math.radians, images))
+            placements.append(Placement(number, stops, pitches, purpose, entry.closing))
         return placements
 
 

@@ -40,6 +40,7 @@ class Place:
     T_platform_board: RigidTransform | None = field(default=None, compare=False)
     # on its stand, or held by nothing close to a camera
     stand: bool = field(default=True, compare=False)
+    T_room_platform: RigidTransform | None = field(default=None, compare=False)
 
 
 class EmulatedWorld:
@@ -97,13 +98,18 @@ class EmulatedWorld:
         ValueError
             For a placement that the setup does not have.
         """
-        pose = None
+        place = Place(("placement", number))
         if number is not None:
             if number not in self.placements:
                 known = ", ".join(map(str, self.placements))
                 raise ValueError(f"no placement {number}; there are {known}, and none")
-            pose = self.placements[number].T_platform_board
-        self._set(Place(("placement", number), pose))
+            placement = self.placements[number]
+            place = replace(
+                place,
+                T_platform_board=placement.T_platform_board,
+                T_room_platform=placement.T_room_platform,
+            )
+        self._set(place)
 
     def hold_close(self, camera: str, view: int) -> None:
         """Hold the board close to a camera, in one of the views for its intrinsics.
@@ -132,7 +138,9 @@ class EmulatedWorld:
         # in one go, as a scan may be cast meanwhile
         self.current = (
             place,
-            world_of(self.setup, place.T_platform_board, stand=place.stand),
+            world_of(
+                self.setup, place.T_platform_board, place.stand, place.T_room_platform
+            ),
         )
 
     def scan(

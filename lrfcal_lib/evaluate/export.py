@@ -3,9 +3,12 @@
 import hashlib
 import json
 import os
+import re
+from datetime import UTC, datetime
 from pathlib import Path
 
 from lrfcal_lib import __version__
+from lrfcal_lib.calibrate.calibration_file import FORMULAS, KIND, SCHEMA, rig_record
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
@@ -15,28 +18,14 @@ from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import FILES, opened
 from lrfcal_lib.session.write import whole
 
-SCHEMA = 1
+# numbers one below the other; no text of JSON has a line end
+ROW = re.compile(r"\[\n\s+(?:-?[\d.]\S*|null)(?:\n\s+(?:-?[\d.]\S*|null))*\n\s+\]")
 AXIS_PARAMETERS = [
     "out_of_scan_plane_rad",
     "in_scan_plane_rad",
     "offset_in_scan_plane_m",
     "offset_across_scan_plane_m",
 ]
-LENS_PARAMETERS = (
-    "fx",
-    "fy",
-    "cx",
-    "cy",
-    "k1",
-    "k2",
-    "p1",
-    "p2",
-    "k3",
-)  # as OpenCV calls them
-FRAMES = (
-    "destination first: p_camera = T_camera_source p_source; metres, radians; "
-    "covariances of [w, v]: R <- exp(w) R, t <- t + v"
-)
 
 
 def calibration_record(
@@ -44,9 +33,9 @@ def calibration_record(
 ) -> dict:
     """Everything that a calibration says about the results of a method, ready for JSON.
 
-    Schema, library version, verdict, session with the SHA-256 of its files, frames and units,
-    platform, and for each camera its pose, intrinsics, covariance, and residual statistics. 'joint'
-    brings its own platform, range offset and pitch terms, and what it says about the sensor.
+    What :func:`lrfcal_lib.calibrate.calibration_file.load_calibration` reads, and for people: the
+    formulas, residual statistics of each camera, what 'joint' says about the sensor, library
+    version, and SHA-256 of the session's files. Results come first.
 
     Parameters
     ----------
@@ -60,30 +49,27 @@ def calibration_record(
     dict
     """
     session = calibration.prepared.session
-    axis = calibration.rig(method).axis
     judged = judged or judge(calibration, method, suggest=False)
-    cameras = {}
-    for (camera, name), solution in calibration.solutions.items():
-        if name == method:
-            cameras[camera] = _camera(calibration, camera, method, solution)
     record = {
         "schema": SCHEMA,
-        "lrfcal": __version__,
+        "kind": KIND,
         "session": session.name,
-        "inputs_sha256": file_hashes(session),
-        "conventions": FRAMES,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "method": method,
         "verdict": judged.record(),
-        "platform": {
-            **_transform(axis.T_head_lrf),
-            "maps": "lrf to head",
-            "axis_covariance": axis.covariance.tolist(),
-            "axis_covariance_of": AXIS_PARAMETERS,
-        },
-        "cameras": cameras,
+        **rig_record(calibration.rig(method)),
     }
+    record["platform"]["axis_covariance_of"] = AXIS_PARAMETERS
+    for (camera, name), solution in calibration.solutions.items():
+        if name == method:
+            record["cameras"][camera] |= _camera(calibration, camera, method, solution)
     if calibration.joint is not None and method == "joint":
         record["sensor"] = _sensor(calibration.joint.solution)
+    # numbers of this recording stand behind those of the rig, hashes last
+    record["uncertainty"] = record.pop("uncertainty")
+    record["formulas"] = FORMULAS
+    record["lrfcal"] = __version__
+    record["inputs_sha256"] = file_hashes(session)
     return record
 
 
@@ -100,7 +86,7 @@ def _sensor(solution):
 
 
 def _camera(calibration, camera, method, solution):
-    """Pose, intrinsics and residuals of a camera.
+    """How well a camera is known, and its residuals.
 
     Of the joint estimate without the edge bias, from its own boards.
     """
@@ -112,29 +98,17 @@ def _camera(calibration, camera, method, solution):
     else:
         plane = plane_residuals_of(obs, solution)
         misfit = {"edge_rms_px": rms(edge), "plane_rms_mm": 1000 * rms(plane)}
-    model = solution.model or calibration.prepared.models[camera]
-    lens = dict(zip(LENS_PARAMETERS, model.parameters.tolist(), strict=True))
     return {
         "maps": f"{obs.source} to {obs.camera}",
-        **_transform(solution.transform),
         "sigma": dict(
             zip(solution.names[:6], solution.trusted_sigma[:6].tolist(), strict=True)
         ),
         "covariance": solution.trusted[:6, :6].tolist(),
-        "intrinsics": {"width": model.width, "height": model.height, **lens},
         "converged": bool(solution.converged),
         "unobservable": list(solution.unobservable),
         **misfit,
         "n_crossings": len(edge),
         "placements": obs.all_placements.tolist(),
-    }
-
-
-def _transform(transform):
-    return {
-        "matrix": transform.as_matrix().tolist(),
-        "rotvec_rad": transform.rotation.as_rotvec().tolist(),
-        "translation_m": transform.translation.tolist(),
     }
 
 
@@ -154,7 +128,7 @@ def file_hashes(session: Session) -> dict[str, str]:
 
 
 def write_calibration(path: str | Path, record: dict) -> None:
-    """Write a calibration as JSON, NaN as null.
+    """Write a calibration as JSON, a row of numbers a line, NaN as null.
 
     Parameters
     ----------
@@ -168,5 +142,6 @@ def write_calibration(path: str | Path, record: dict) -> None:
         If it cannot be written.
     """
     plain = json.loads(json.dumps(record), parse_constant=lambda name: None)
+    text = ROW.sub(lambda row: " ".join(row[0].split()), json.dumps(plain, indent=1))
     with whole(path) as draft:
-        draft.write_text(json.dumps(plain, indent=1) + "\n")
+        draft.write_text(text + "\n")

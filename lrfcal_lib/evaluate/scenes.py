@@ -65,9 +65,10 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     from lrfcal_lib.simulate.record import world_of
     from lrfcal_lib.simulate.rig import load_setup
 
-    world = world_of(load_setup(truth.setup), None)
     rig = calibration.rig(method)
     placement = int(cloud.placement[0])
+    station = truth.stations.get(placement)
+    world = world_of(load_setup(truth.setup), None, T_room_platform=station)
     recorded = session.sweep(placement).pitch
     true_pitch = truth.pitch[placement]
     gauge = truth.T_head_lrf * rig.T_head_lrf.inv()

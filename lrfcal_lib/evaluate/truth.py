@@ -34,6 +34,10 @@ class Truth:
         ``T_platform_board`` by placement.
     pitch : dict of int to ndarray
         Of every scan line by placement, radians.
+    stations : dict of int to RigidTransform
+        ``T_room_platform`` by placement, of a recording from several places.
+    lengths : tuple of dict
+        Of the room: name, kind, metres, and corners of both ends in the frame of the room.
     setup : str
         Name of what it was simulated from, of :func:`lrfcal_lib.simulate.rig.load_setup`.
     """
@@ -43,6 +47,8 @@ class Truth:
     board: Board
     boards: dict[int, RigidTransform]
     pitch: dict[int, np.ndarray]
+    stations: dict[int, RigidTransform]
+    lengths: tuple[dict, ...]
     setup: str
 
 
@@ -77,12 +83,17 @@ def read_truth(session: Session) -> Truth | None:
         pitch = {}
         for number, entry in data["sweeps"].items():
             pitch[int(number)] = np.asarray(entry["pitch_rad"], float)
+        stations = {}
+        for number, entry in data.get("stations", {}).items():
+            stations[int(number)] = _pose(entry["T_room_platform"])
         return Truth(
             T_head_lrf=_pose(data["T_head_lrf"]),
             cameras=cameras,
             board=board_from_json(data["board"]),
             boards=boards,
             pitch=pitch,
+            stations=stations,
+            lengths=tuple(data.get("lengths", ())),
             setup=data.get("setup", ""),
         )
 

@@ -97,8 +97,8 @@ def _write_cloud(folder, calibration, method, scene):
     return [ply, pcd]
 
 
-def write_pcd(path, ply):
-    """Write what a PLY of :func:`write_ply` holds as binary PCD.
+def write_pcd(path, ply, comments=()):
+    """Write what a PLY of :func:`write_ply` holds as binary PCD, with comments in its head.
 
     ValueError if the file cannot be written.
     """
@@ -107,7 +107,7 @@ def write_pcd(path, ply):
         while source.readline() != b"end_header\n":
             pass
         count = (os.path.getsize(ply) - source.tell()) // stored.itemsize
-        file.write(_pcd_header(count).encode())
+        file.write(_pcd_header(count, comments).encode())
         for start in range(0, count, POINTS_AT_ONCE):
             points = np.fromfile(source, stored, min(POINTS_AT_ONCE, count - start))
             packed = np.empty(len(points), point_type(PCD_COLUMNS))
@@ -116,7 +116,7 @@ def write_pcd(path, ply):
             file.write(packed.tobytes())
 
 
-def _pcd_header(count):
+def _pcd_header(count, comments):
     """The lines before the points of a PCD file."""
     names = []
     types = []
@@ -124,6 +124,7 @@ def _pcd_header(count):
         names += columns.split()
         types += [np.dtype(kind)] * len(columns.split())
     lines = (
+        *(f"# {words}" for words in comments),
         "VERSION 0.7",
         f"FIELDS {' '.join(names)}",
         f"SIZE {' '.join(str(kind.itemsize) for kind in types)}",

@@ -1,5 +1,6 @@
 """A scene to turn in a browser, one offline page: points, frames, boards and camera frusta."""
 
+import base64
 from collections.abc import Mapping
 from os import PathLike
 
@@ -10,6 +11,7 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots.recording import AXES_RGB, COLORS, closed, color_of
 
 MOST_POINTS = 150_000  # that browsers turn smoothly
+PAGE = {"xref": "paper", "yref": "paper", "xanchor": "left", "yanchor": "bottom"}
 GAP = np.full((1, 3), np.nan)  # where a line breaks
 Line = tuple[str, np.ndarray]
 
@@ -21,6 +23,7 @@ def scene_page(
     seen: np.ndarray,
     lines: Mapping[str, Line],
     eye: tuple[float, float, float] = (-0.3, -1.5, 0.55),
+    note: str = "",
 ) -> None:
     """Write a page that needs no other file and no network.
 
@@ -38,39 +41,43 @@ def scene_page(
         the line breaks.
     eye
         Where one looks from at first, in widths of the scene from its middle.
+    note
+        A sentence at the bottom of the page.
     """
-    import plotly.graph_objects as go
+    from plotly.io import write_html  # a second
 
-    figure = go.Figure()
+    traces: list[dict] = []
     every = -(-len(points) // MOST_POINTS) or 1
     clouds = {"points": (seen, True), "points that no image saw": (~seen, "legendonly")}
     for name, (which, shown) in clouds.items():
         rgb = colors[which][::every].astype(int)
         shades = [f"#{value:06x}" for value in (rgb @ [1 << 16, 1 << 8, 1]).tolist()]
-        figure.add_scatter3d(
-            **_xyz(points[which][::every]),
-            name=name,
-            visible=shown,
-            mode="markers",
-            marker={"size": 1.6, "color": shades},
-        )
+        marker = {"size": 1.6, "color": shades}
+        traces.append(_trace(name, points[which][::every], "markers", marker=marker))
+        traces[-1]["visible"] = shown
     for name, (color, line) in lines.items():
-        figure.add_scatter3d(
-            **_xyz(line), mode="lines", line={"color": color, "width": 4}, name=name
-        )
-    axes = {f"{axis}axis": {"title": f"{axis} [m]"} for axis in "xyz"}
+        traces.append(_trace(name, line, "lines", line={"color": color, "width": 4}))
+    axes = {f"{axis}axis": {"title": {"text": f"{axis} [m]"}} for axis in "xyz"}
     view = {"eye": dict(zip("xyz", eye, strict=True)), "up": {"x": 0, "y": 0, "z": 1}}
-    figure.update_layout(
-        scene={**axes, "aspectmode": "data", "camera": view},
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        legend={"itemsizing": "constant", "x": 0, "y": 1},
-        hovermode=False,
-    )
-    figure.write_html(path, div_id="scene", default_height="100vh")
+    layout = {
+        "scene": {**axes, "aspectmode": "data", "camera": view},
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "legend": {"itemsizing": "constant", "x": 0, "y": 1},
+        "hovermode": False,
+        "annotations": [{"text": note, "x": 0, "y": 0, "showarrow": False, **PAGE}],
+    }
+    # unchecked: a check looks at every colour, 5 s
+    page = {"data": traces, "layout": layout}
+    write_html(page, path, validate=False, div_id="scene", default_height="100vh")
 
 
-def _xyz(points):
-    return dict(zip("xyz", np.asarray(points, np.float32).T, strict=True))
+def _trace(name, points, mode, **style):
+    """Points (n, 3) as plotly draws them; the coordinates packed."""
+    trace = {"type": "scatter3d", "name": name, "mode": mode, **style}
+    for axis, values in zip("xyz", np.asarray(points, "<f4").T, strict=True):
+        packed = base64.b64encode(values.tobytes()).decode()
+        trace[axis] = {"dtype": "f4", "bdata": packed}
+    return trace
 
 
 def rig_lines(

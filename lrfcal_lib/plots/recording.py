@@ -36,6 +36,7 @@ SERIES = (
 AXES_RGB = ("#d62728", "#2ca02c", "#1f5fd6")  # x, y, z of every frame
 PLANES = {"xz": (0, 2), "yz": (1, 2), "xy": (0, 1)}
 BESIDE = 14  # beams shown on either side of the end of a board
+HEADROOM = 0.12  # metres shown behind the end of a board
 ABOUT = 3.0  # degrees shown around a board
 BEYOND = "#d9d9d9"  # ranges outside the limits of several sweeps
 BRIGHT = 150  # grey level: a picture whose brightest hundredth is darker is brightened
@@ -108,7 +109,8 @@ def range_image(
         _outlined(ax, bearing, height[order], mask[order])
         rows = height[mask.any(axis=1)]
         rim = [rows.min() - ABOUT, rows.max() + ABOUT]
-        ax.set_ylim(np.clip(rim, height.min(), height.max()))
+        if len(height) > 1:
+            ax.set_ylim(np.clip(rim, height.min(), height.max()))
         board = bearing[mask.any(axis=0)]
         shown &= np.abs(bearing - board.mean()) < np.ptp(board) / 2 + ABOUT
     if shown.any():
@@ -194,15 +196,17 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
     raw = scan.sweep.ranges[line]
     filtered = scan.filtered[line]
     fitted = scan.fitted[line]
-    ax.plot(bearing[near], raw[near], "o", color=COLORS["raw"], markersize=5, label="raw")
-    ax.plot(
-        bearing[board],
-        filtered[board],
-        "o",
-        color=COLORS["filtered"],
-        markersize=3,
-        label="filtered",
-    )
+    top = np.nanmax(fitted[board]) + HEADROOM
+    shown = near & (raw < top)
+    farther = near & (raw >= top)
+    ax.plot(bearing[shown], raw[shown], "o", color=COLORS["raw"], markersize=6, label="raw")
+    if farther.any():
+        words = f"raw, farther: {raw[farther].min():.2f} to {raw[farther].max():.2f} m"
+        edge = np.full(farther.sum(), top)
+        ax.plot(
+            bearing[farther], edge, "^", color=COLORS["raw"], clip_on=False, label=words
+        )
+    ax.plot(bearing[board], filtered[board], "x", color=COLORS["truth"], label="filtered")
     ax.plot(
         bearing[board], fitted[board], color=COLORS["fit"], label="line fitted to the board"
     )
@@ -215,6 +219,7 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
             ax.axvline(at, color=COLORS["lrf"], linestyle=style, label=label)
     ax.invert_xaxis()
     ax.set(xlabel="bearing [deg]", ylabel="range [m]")
+    ax.set_ylim(np.nanmin(raw[near]) - HEADROOM / 4, top)
     ax.legend()
 
 

@@ -1,6 +1,6 @@
 """Drawings in space, and coloured clouds as a camera sees them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -34,19 +34,6 @@ def polygon(ax: Axes3D, corners: np.ndarray, color: str = COLORS["truth"]) -> No
         Poly3DCollection([corners], facecolors=color, edgecolors=color, alpha=0.15)
     )
     ax.plot(*closed(corners).T, color=color, linewidth=1.2)
-
-
-def lines(ax: Axes3D, drawn: Mapping[str, tuple[str, np.ndarray]]) -> None:
-    """Lines in space.
-
-    Parameters
-    ----------
-    ax
-    drawn
-        By name a colour and points (n, 3), metres, with NaN rows where a line breaks.
-    """
-    for name, (color, points) in drawn.items():
-        ax.plot(*points.T, color=color, linewidth=1.6, label=name)
 
 
 def space(

@@ -25,6 +25,7 @@ from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.session.write import SessionWriter, write_file
 from lrfcal_lib.simulate.beam import scan
+from lrfcal_lib.simulate.lengths import room_lengths
 from lrfcal_lib.simulate.rig import Placement, Setup, held_close, placements_of, random
 from lrfcal_lib.simulate.scene import (
     Imager,
@@ -59,7 +60,8 @@ class Shots(NamedTuple):
     """Images of one camera, by its number in the rig, in one arrangement of the room.
 
     The placement is -1 for the board held close; `T_platform_board` None where there is no board
-    but a table with things; `poses` are ``T_camera_platform``, `key` that of the random numbers.
+    but a table with things; `poses` are ``T_camera_platform``, `key` that of the random numbers;
+    `T_room_platform` is that of a station.
     """
 
     camera: int
@@ -68,10 +70,14 @@ class Shots(NamedTuple):
     T_platform_board: RigidTransform | None
     poses: list
     key: tuple
+    T_room_platform: RigidTransform | None = None
 
 
 def world_of(
-    setup: Setup, T_platform_board: RigidTransform | None, stand: bool = True
+    setup: Setup,
+    T_platform_board: RigidTransform | None,
+    stand: bool = True,
+    T_room_platform: RigidTransform | None = None,
 ) -> World:
     """The room with the board in it.
 
@@ -82,9 +88,14 @@ def world_of(
         None for a laid table instead of the board.
     stand
         Whether the board is on its stand, or held by nothing.
+    T_room_platform
+        Of a station, where there is no board.
     """
     if T_platform_board is None:
-        return furnished_room(*furnished("still life"))
+        room = furnished_room(*furnished("still life"))
+        if T_room_platform is None:
+            return room
+        return room.seen_from(T_room_platform)
     things = board_on_stand(setup.rig.board, T_platform_board, setup.rig.ring)
     return furnished_room(*(things if stand else things[:1]))
 
@@ -119,7 +130,8 @@ def stops_of(setup: Setup, placement: Placement) -> tuple[Stops, Stops]:
 def sweep_of(setup, placement):
     """The scan lines of a placement, one a stop of the sweep: words (L, B) as a device sends."""
     pitch = stops_of(setup, placement)[1].true
-    world = world_of(setup, placement.T_platform_board)
+    station = placement.T_room_platform
+    world = world_of(setup, placement.T_platform_board, T_room_platform=station)
     return scan(
         setup.rig.beam,
         world,
@@ -173,6 +185,7 @@ def shots_of(setup, placements):
                     pose,
                     poses,
                     (PHOTO, number, placement.number),
+                    placement.T_room_platform,
                 )
             )
     return out
@@ -182,7 +195,8 @@ def photograph(setup, shots):
     """Take pictures, a list of JPEG files as bytes."""
     camera = setup.rig.cameras[shots.camera]
     imager = Imager(camera.model, camera.exposure)
-    world = world_of(setup, shots.T_platform_board, stand=shots.purpose == "board")
+    stand = shots.purpose == "board"
+    world = world_of(setup, shots.T_platform_board, stand, shots.T_room_platform)
     rng = random(setup, *shots.key)
     quality = [cv2.IMWRITE_JPEG_QUALITY, setup.quality]
     return [
@@ -235,27 +249,11 @@ def _record(folder, name, setup, workers):
     placements = placements_of(setup)
     for placement in placements:
         rig.platform.check(np.array(placement.sweep))
-    boards = {
-        p.number: p.T_platform_board for p in placements if p.T_platform_board is not None
-    }
     reference = {
         "recording": RECORDING,
-        "scene_placements": [p.number for p in placements if p.number not in boards],
+        "scene_placements": [p.number for p in placements if p.T_platform_board is None],
     }
-    truth = {
-        "simulated": True,
-        "setup": setup.name,
-        "seed": setup.seed,
-        **rig.truth(),
-        "boards": {
-            number: {"T_platform_board": transform_to_json(pose)}
-            for number, pose in boards.items()
-        },
-        "lrf": asdict(rig.beam),
-        "platform": asdict(rig.platform),
-        "sweeps": {},
-        "images": {},
-    }
+    truth = _truth(setup, placements)
     with SessionWriter(
         folder,
         rig.board,
@@ -273,6 +271,32 @@ def _record(folder, name, setup, workers):
     lines = [",".join(PLATFORM_COLUMNS), *log]
     write_file(folder / "platform.csv", "\n".join(lines) + "\n", folder)
     write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
+
+
+def _truth(setup, placements):
+    """What only the simulator knows, as truth.json has it; sweeps and images come later."""
+    rig = setup.rig
+    boards = {}
+    stations = {}
+    for p in placements:
+        if p.T_platform_board is not None:
+            boards[p.number] = {"T_platform_board": transform_to_json(p.T_platform_board)}
+        if p.T_room_platform is not None:
+            stations[p.number] = {"T_room_platform": transform_to_json(p.T_room_platform)}
+    truth = {
+        "simulated": True,
+        "setup": setup.name,
+        "seed": setup.seed,
+        **rig.truth(),
+        "boards": boards,
+        "lrf": asdict(rig.beam),
+        "platform": asdict(rig.platform),
+        "sweeps": {},
+        "images": {},
+    }
+    if stations:
+        truth |= {"stations": stations, "lengths": room_lengths()}
+    return truth
 
 
 def _add_placements(writer, setup, placements, truth, workers):

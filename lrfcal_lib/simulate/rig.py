@@ -226,13 +226,15 @@ class Setup:
     name: str
     seed: int
     rig: InstanceOf[Rig]
-    pairs: int  # pairs of board placements
+    pairs: NonNegativeInt  # pairs of board placements; none in a recording of the room only
     distances: tuple[float, float]  # of the board, metres
     step: PositiveFloat = math.radians(0.25)  # between the stops of a sweep, radians
     intrinsics_views: NonNegativeInt = 20  # images of the board held close, a camera
     # first pitch, last pitch and step of the sweep of the room, radians; empty for none
     room_sweep: Annotated[tuple[float, ...], AfterValidator(_three_or_none)] = ()
     room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
+    # T_room_platform of each sweep of the room; empty for one sweep from where the boards are seen
+    stations: tuple[InstanceOf[RigidTransform], ...] = ()
     quality: Annotated[int, Field(ge=1, le=100)] = 95  # of JPEG
 
 
@@ -293,7 +295,10 @@ def load_setup(name: str) -> Setup:
         tuple(cameras),
         printed_triangle(),
     )
-    return Setup(name, rig=rig, **{k: row[k] for k in names})
+    settings = {k: row[k] for k in names}
+    if "stations" in row:
+        settings["stations"] = tuple(_placed(station) for station in row["stations"])
+    return Setup(name, rig=rig, **settings)
 
 
 def _placed(row):
@@ -326,6 +331,7 @@ class Placement:
     ]  # pitch commands of the first and the last scan line, radians
     # pitch commands of the images in the order in which they are taken, radians
     image_pitch: tuple[float, ...]
+    T_room_platform: RigidTransform | None = None  # of a station; room is room.json's frame
 
     @property
     def direction(self):
@@ -339,16 +345,26 @@ def random(setup: Setup, *key: int) -> np.random.Generator:
 
 
 def placements_of(setup: Setup) -> list[Placement]:
-    """The placements of a setup: those of the board, then a sweep of the room if there is any.
+    """The placements of a setup: those of the board, then the sweeps of the room if there are any.
 
     Parameters
     ----------
     setup
     """
-    out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
+    out = []
+    if setup.pairs:
+        out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
     if setup.room_sweep:
         first, last, _ = setup.room_sweep
-        out.append(Placement(2 * setup.pairs + 1, None, (first, last), setup.room_images))
+        for T_room_platform in setup.stations or (None,):
+            room = Placement(
+                number=len(out) + 1,
+                T_platform_board=None,
+                sweep=(first, last),
+                image_pitch=setup.room_images,
+                T_room_platform=T_room_platform,
+            )
+            out.append(room)
     return out
 
 

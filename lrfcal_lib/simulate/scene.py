@@ -9,7 +9,7 @@ rebuilt from them to the byte.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -236,6 +236,15 @@ class World:
         self._scene.add_triangles(
             vertices.astype(np.float32), faces[whole].astype(np.uint32)
         )
+
+    def seen_from(self, T_world_platform: RigidTransform) -> "World":
+        """The same world in the frame of a platform that stands elsewhere."""
+        back = T_world_platform.inv()
+        things = [replace(thing, pose=back * thing.pose) for thing in self.things]
+        lights = self.lights
+        if lights is not None:
+            lights = replace(lights, positions=back.apply(lights.positions))
+        return World(things, lights)
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """Follow rays to the first surface.

@@ -1,0 +1,125 @@
+"""Scenes recorded from one or more stations, for a rig that is calibrated: ``record --scene``."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lrfcal_lib.acquire.checks import LEAST_SCENE, Light
+from lrfcal_lib.acquire.record import Boards, ask_before
+from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.drivers.rig import Rig
+from lrfcal_lib.drivers.rig_file import ListedPlacement, Placement, RigFile
+from lrfcal_lib.measure.planning import plan_images
+from lrfcal_lib.measure.scene import colored_blocks, station_of
+from lrfcal_lib.preprocess.closing_scan import closing_of
+from lrfcal_lib.session.read import Session
+
+EXPECTED = 0.8  # of the share that the plan says will get a colour
+
+
+class Stations(Boards):
+    """Recording stations instead of the placements of the plan.
+
+    Parameters
+    ----------
+    count
+        How many.
+    rig
+        What is known of the rig; without, images are taken where the plan says.
+    """
+
+    def __init__(self, count: int, rig: CalibratedRig | None = None):
+        self.count = count
+        self.rig = rig
+        self.share = 0.0  # of the cloud that the planned images color
+        self._listed: tuple[int, ...] = ()
+
+    def planned(self, stated: RigFile) -> RigFile:
+        """The rig file with a plan of the stations; says how much will get a colour.
+
+        Sweep and numbers are those of the scenes that the plan lists, as far as there are any.
+        """
+        plan = stated.plan
+        scenes = [entry for entry in plan.placements if not entry.board]
+        numbers = [p.number for p in plan.to_do() if p.purpose == "scene"][: self.count]
+        self._listed = tuple(numbers)
+        scene = [*scenes, ListedPlacement()][0]
+        sweep = scene.pitch_deg or plan.pitch_deg
+        images = scene.image_pitch_deg or plan.image_pitch_deg
+        if self.rig is not None:
+            images = self._images(sweep, stated.devices.head.pitch_limits_deg)
+        while len(numbers) < self.count:
+            numbers.append(max(numbers, default=0) + 1)
+        placements = [
+            ListedPlacement(
+                number=number,
+                pitch_deg=sweep,
+                image_pitch_deg=images,
+                board=False,
+                closing=True,
+            )
+            for number in numbers
+        ]
+        changed = {"placements": tuple(placements), "intrinsics_images": 0}
+        return replace(stated, plan=plan.model_copy(update=changed))
+
+    def _images(self, sweep, limits):
+        """Pitch angles of the images, degrees; prints them."""
+        first, last, low, high = np.radians([*sweep[:2], *limits])
+        best = plan_images(self.rig, (first, last), (low, high))
+        self.share = best.share
+        images = tuple(np.degrees(best.pitch).round(2).tolist())
+        where = ", ".join(f"{pitch:g}" for pitch in images)
+        print(
+            f"images at {where} deg: {100 * best.share:.0f} % of the cloud can get a colour"
+        )
+        return images
+
+    def ready(self, rig: Rig, placement: Placement, before: int | None) -> str:
+        """As of :class:`Boards`; an emulated rig goes where its plan puts the station."""
+        place: int | str = "none"
+        if placement.number in self._listed:
+            place = placement.number
+        if rig.move_board(place):
+            return ""
+        what = "set the rig up, so that nobody moves it or walks by"
+        return ask_before("station", placement.number, what, before)
+
+    def check(self, session: Session, number: int) -> list[Light]:
+        """How good a station is: share of returns, share with a colour, whether it moved."""
+        ranges = session.sweep(number).ranges
+        back = float(np.isfinite(ranges).mean())
+        text = f"{len(ranges)} scan lines, {100 * back:.0f} % of the beams came back"
+        lights = [Light("returns", _state(back > LEAST_SCENE), text)]
+        if self.rig is not None:
+            lights.append(self._colors(session, number))
+        closing = closing_of(session.sweep(number))
+        if closing is None:
+            still = Light(
+                "stood still", "warn", "not known: too little came back to compare"
+            )
+        else:
+            text = (
+                f"back at its first pitch, ranges differ by {1000 * closing.apart:.0f} mm, "
+                f"by {1000 * closing.expected:.0f} mm between neighbouring scan lines"
+            )
+            still = Light("stood still", "ok", text)
+            if closing.moved:
+                still = Light("stood still", "bad", f"{text}: it moved, record it again")
+        return [*lights, still]
+
+    def _colors(self, session, number):
+        """The Light of the share of points that get a colour."""
+        station = station_of(session, self.rig, number)
+        clouds = list(colored_blocks(session, self.rig, station))
+        share = sum(cloud.seen.sum() for cloud in clouds)
+        share = float(share / max(1, sum(len(cloud.seen) for cloud in clouds)))
+        text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
+        return Light("colour", _state(share > EXPECTED * self.share), text)
+
+
+def _state(good):
+    """Of a Light."""
+    if good:
+        return "ok"
+    return "warn"

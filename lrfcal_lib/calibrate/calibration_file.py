@@ -1,0 +1,399 @@
+"""``calibration.json``: what is needed to use a calibrated rig, without the session it is of."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, Field, FiniteFloat
+
+from lrfcal_lib.calibrate.cameras import KnownAxis
+from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig
+from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import pose_transform
+from lrfcal_lib.model.kinematics import Corrections
+from lrfcal_lib.session.files import SessionError, naming, read_json
+from lrfcal_lib.session.read import Session
+from lrfcal_lib.session.stated import LrfInfo, from_json, model_to_json
+
+SCHEMA = 2
+KIND = "lrfcal calibration"
+AGAIN = "calibrate its session again"
+FORMULAS = {
+    "frames": (
+        "Destination first: p_camera = T_camera_source p_source, metres and radians; `matrix` is "
+        "the 4 x 4 matrix, `rotvec_rad` and `translation_m` say the same. Camera: x right, y "
+        "down, z ahead; LRF: x right, y ahead, in the scan plane."
+    ),
+    "range": (
+        "A range is too long by range_offset_m: p_lrf = (range - range_offset_m) (cos b, sin b, "
+        "0), where the bearing b is 0 to the right and pi/2 ahead."
+    ),
+    "pitch": (
+        "Radians, positive lifts the view: true pitch = (1 + pitch_scale) times the recorded "
+        "one, of scans and of images."
+    ),
+    "head": (
+        "p_platform = Rx(pitch) T_head_lrf p_lrf with the pitch of the scan line; `platform` is "
+        "T_head_lrf. Rx(a) turns about x: y' = y cos a - z sin a, z' = y sin a + z cos a."
+    ),
+    "camera on the head": (
+        "p_camera = T_camera_lrf inverse(T_head_lrf) Rx(-pitch of the image) p_platform."
+    ),
+    "camera on the platform": "p_camera = T_camera_platform p_platform, at any pitch.",
+    "lens": (
+        "K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] and distortion (k1, k2, p1, p2, k3) as OpenCV "
+        "takes them; pixel (0, 0) is the centre of the top-left one."
+    ),
+    "covariance": (
+        "Of the increments [w, v] of a pose: R <- exp(w) R, t <- t + v. `trusted` is what to rely "
+        "on, `covariance` what noise alone explains; null where nothing bounds an unknown. A turn "
+        "about the tilt axis and a shift along it are as stated: no data show them."
+    ),
+    "uncertainty": (
+        "`unseen_...` are motions of (axis: 4, pose of the camera: 6, range offset, pitch scale, "
+        "pitch offset by direction) that nothing determines; `sweep_sigma` (radians, a fraction) "
+        "is the offset and stretch that the pitch of every sweep has of its own."
+    ),
+}
+ROUND = 1e-9  # a rotation's matrix may be off by so much
+
+
+Four = tuple[(FiniteFloat,) * 4]
+Unbounded = Annotated[
+    float, BeforeValidator(lambda value: np.inf if value is None else value)
+]
+Matrix = list[list[Unbounded]]
+
+
+class PoseWritten(BaseModel):
+    """A transform, by its matrix."""
+
+    matrix: tuple[(Four,) * 4]
+
+    def made(self):
+        """As a RigidTransform, to the last bit."""
+        whole = np.array(self.matrix)
+        R = whole[:3, :3]
+        proper = np.abs(R @ R.T - np.eye(3)).max() < ROUND and np.linalg.det(R) > 0
+        if not proper or whole[3].tolist() != [0, 0, 0, 1]:
+            raise ValueError(f"matrix {whole.tolist()} is no rotation and translation")
+        return pose_transform(whole[:3], proper=True)
+
+
+class PlatformWritten(PoseWritten):
+    """The tilt axis."""
+
+    axis_covariance: Matrix
+
+
+class LensWritten(BaseModel):
+    """What ``CameraModel(**lens)`` takes."""
+
+    width: Annotated[int, Field(ge=1)]
+    height: Annotated[int, Field(ge=1)]
+    fx: Annotated[FiniteFloat, Field(gt=0)]
+    fy: Annotated[FiniteFloat, Field(gt=0)]
+    cx: FiniteFloat
+    cy: FiniteFloat
+    distortion: tuple[(FiniteFloat,) * 5]
+    covariance: Matrix | None
+    rms_px: FiniteFloat | None
+
+    def made(self):
+        """As a CameraModel."""
+        values = dict(self)
+        values["distortion"] = np.array(self.distortion)
+        if self.covariance is not None:
+            values["covariance"] = shaped("lens.covariance", self.covariance, 9, 9)
+        return CameraModel(**values)
+
+
+class CameraWritten(PoseWritten):
+    """A camera."""
+
+    mount: Literal["head", "platform"]
+    lens: LensWritten
+
+
+class LrfWritten(BaseModel):
+    """A range finder as `LrfInfo` has it, but radians."""
+
+    model: str
+    field_of_view: tuple[FiniteFloat, FiniteFloat]
+    bearing_step: Annotated[FiniteFloat, Field(gt=0)]
+    sigma_range: FiniteFloat
+    sigma_bearing: FiniteFloat
+    range_resolution: FiniteFloat
+    max_range: Unbounded
+    systematic_error: FiniteFloat | None
+    spot_exit: FiniteFloat | None
+    spot_divergence: FiniteFloat | None
+
+
+class CorrectionsWritten(BaseModel):
+    """What is wrong with what any session records."""
+
+    range_offset_m: FiniteFloat
+    pitch_scale: FiniteFloat
+
+
+class UncertaintyWritten(BaseModel):
+    """What :class:`RigUncertainty` has."""
+
+    names: tuple[str, ...]
+    covariance: Matrix
+    trusted: Matrix
+    unseen_of_cloud: Matrix
+    unseen_of_cameras: dict[str, Matrix]
+    sweep_sigma: tuple[FiniteFloat, FiniteFloat]
+    range_noise: FiniteFloat
+
+    def made(self):
+        """As a RigUncertainty."""
+        count = len(self.names)
+        motions = len(COLUMNS)
+        return RigUncertainty(
+            names=self.names,
+            covariance=shaped("covariance", self.covariance, count, count),
+            trusted=shaped("trusted", self.trusted, count, count),
+            unseen_of_cloud=shaped("unseen_of_cloud", self.unseen_of_cloud, None, motions),
+            unseen_of_cameras={
+                camera: shaped(f"unseen_of_cameras.{camera}", rows, None, motions)
+                for camera, rows in self.unseen_of_cameras.items()
+            },
+            sweep_sigma=self.sweep_sigma,
+            range_noise=self.range_noise,
+        )
+
+
+class ReasonWritten(BaseModel):
+    """Why a calibration is not to be trusted as it is."""
+
+    words: str
+
+
+class VerdictWritten(BaseModel):
+    """Whether a calibration can be trusted."""
+
+    answer: Literal["yes", "with care", "no"]
+    reasons: tuple[ReasonWritten, ...]
+
+
+class CalibrationFile(BaseModel):
+    """What a use of a calibration reads of its file; other keys are for people."""
+
+    session: str
+    date: str
+    method: str
+    verdict: VerdictWritten
+    platform: PlatformWritten
+    cameras: dict[str, CameraWritten]
+    corrections: CorrectionsWritten
+    lrf: LrfWritten
+    uncertainty: UncertaintyWritten | None
+
+
+def rig_record(rig: CalibratedRig) -> dict[str, Any]:
+    """A rig as `CalibrationFile` reads it, without a verdict, by key.
+
+    The errors of the recorded sweeps are left out: they say nothing about any other sweep.
+
+    Parameters
+    ----------
+    rig : CalibratedRig
+    """
+    lens_of = {name: camera.model for name, camera in rig.cameras.items()}
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        size = {"width": lens_of[name].width, "height": lens_of[name].height}
+        cameras[name] = {
+            "mount": camera.mount,
+            **pose_record(camera.T_camera),
+            "lens": {**size, **(model_to_json(lens_of[name]) or {})},
+        }
+    uncertainty = None
+    if rig.uncertainty is not None:
+        uncertainty = {name: listed(value) for name, value in vars(rig.uncertainty).items()}
+    return {
+        "platform": {
+            "maps": "lrf to head",
+            **pose_record(rig.axis.T_head_lrf),
+            "axis_covariance": rig.axis.covariance.tolist(),
+        },
+        "cameras": cameras,
+        "corrections": {
+            "range_offset_m": float(rig.corrections.range_offset),
+            "pitch_scale": float(rig.corrections.pitch_scale),
+        },
+        "lrf": {name: getattr(rig.lrf, name) for name in LrfWritten.model_fields},
+        "uncertainty": uncertainty,
+    }
+
+
+def listed(value: Any) -> Any:
+    """A field of a RigUncertainty as JSON has it."""
+    if isinstance(value, dict):
+        return {key: listed(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value
+
+
+def pose_record(transform) -> dict[str, list]:
+    """A RigidTransform by its matrix and, the same, by rotation vector and translation."""
+    return {
+        "matrix": transform.as_matrix().tolist(),
+        "rotvec_rad": transform.rotation.as_rotvec().tolist(),
+        "translation_m": transform.translation.tolist(),
+    }
+
+
+def shaped(name: str, rows: list[list[float]], count: int | None, width: int) -> np.ndarray:
+    """Rows of numbers as an array (count, width); ValueError where they are of another shape."""
+    if any(len(row) != width for row in rows) or len(rows) != (count or len(rows)):
+        lengths = sorted({len(row) for row in rows})
+        raise ValueError(
+            f"{name} has {len(rows)} rows of {lengths} numbers, expected {count or 'any'} of "
+            f"{width}"
+        )
+    return np.array(rows, float).reshape(len(rows), width)
+
+
+def load_calibration(path: str | Path) -> CalibratedRig:
+    """Read a calibrated rig from ``calibration.json``: the numbers that were written, to the last
+    bit.
+
+    It needs no other file. What single sweeps of the calibrated session were off by is not in it.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    CalibratedRig
+        Also one whose verdict was 'no', which it says in `answer`, see
+        :func:`refuse_untrusted`.
+
+    Raises
+    ------
+    SessionError
+        For a file that cannot be read, is damaged, no calibration, or of another schema.
+    """
+    data = read_json(path, None)
+    if data.get("kind") != KIND and data.get("schema") != 1:
+        raise SessionError(
+            f"{path}: is no calibration: its key 'kind' is {data.get('kind')!r}, not {KIND!r}; "
+            "'calibrate' writes calibration.json"
+        )
+    if data["schema"] != SCHEMA:
+        newer = isinstance(data["schema"], int) and data["schema"] > SCHEMA
+        remedy = "take a newer lrfcal" if newer else AGAIN
+        raise SessionError(
+            f"{path}: schema {data['schema']}, this reads {SCHEMA}: {remedy}"
+        )
+    with naming(path):
+        return _made(from_json(CalibrationFile, data))
+
+
+def _made(file):
+    """The CalibratedRig of a CalibrationFile."""
+    cameras = {
+        name: CalibratedCamera(camera.made(), camera.mount, camera.lens.made())
+        for name, camera in file.cameras.items()
+    }
+    uncertainty = None
+    if file.uncertainty is not None:
+        uncertainty = file.uncertainty.made()
+        if set(uncertainty.unseen_of_cameras) != set(cameras):
+            raise ValueError("uncertainty.unseen_of_cameras is of other cameras")
+    axis_covariance = shaped("axis_covariance", file.platform.axis_covariance, 4, 4)
+    return CalibratedRig(
+        method=file.method,
+        axis=KnownAxis(file.platform.made(), axis_covariance),
+        corrections=Corrections(
+            file.corrections.range_offset_m, file.corrections.pitch_scale
+        ),
+        cameras=cameras,
+        lrf=LrfInfo(**dict(file.lrf)),
+        uncertainty=uncertainty,
+        session=file.session,
+        answer=file.verdict.answer,
+        reasons=tuple(reason.words for reason in file.verdict.reasons),
+        date=file.date,
+    )
+
+
+def refuse_untrusted(rig: CalibratedRig, untrusted: bool = False) -> None:
+    """ValueError for a calibration whose verdict was 'no', unless it is wanted all the same.
+
+    Parameters
+    ----------
+    rig : CalibratedRig
+    untrusted : bool
+        It is wanted.
+    """
+    if rig.answer == "no" and not untrusted:
+        raise ValueError(
+            f"the calibration of '{rig.session}' cannot be trusted: {'; '.join(rig.reasons)}. "
+            "Take a better one, or --untrusted"
+        )
+
+
+def require_same_rig(rig: CalibratedRig, other: Session | CalibratedRig) -> None:
+    """ValueError where a session cannot have been recorded by a calibrated rig, or another
+    calibration is of another rig.
+
+    One may know fewer cameras than the other; those both know are the same.
+
+    Parameters
+    ----------
+    rig : CalibratedRig
+    other : Session or CalibratedRig
+    """
+    if isinstance(other, CalibratedRig):
+        name = f"the calibration of '{other.session}'"
+        sizes = {key: camera.model for key, camera in other.cameras.items()}
+    else:
+        name = other.name
+        sizes = other.cameras
+    mounts = {key: camera.mount for key, camera in other.cameras.items()}
+    differences = [
+        *_other_cameras(rig, sizes, mounts),
+        *_other_lrf(rig.lrf, other.lrf),
+    ]
+    if differences:
+        raise ValueError(
+            f"{name} is of another rig than the calibration of '{rig.session}': "
+            f"{'; '.join(differences)}"
+        )
+
+
+def _other_cameras(rig, sizes, mounts):
+    """What tells the cameras of another rig from a calibrated one's, in words.
+
+    `sizes` has a width and a height by name, `mounts` what a camera is fixed to.
+    """
+    known = set(rig.cameras)
+    other = set(mounts)
+    if other and not (known <= other or other <= known):
+        yield f"its cameras are {sorted(other)}, not {sorted(known)}"
+    for name in sorted(known & other):
+        camera = rig.cameras[name]
+        size = f"{sizes[name].width} x {sizes[name].height}"
+        expected = f"{camera.model.width} x {camera.model.height}"
+        if size != expected:
+            yield f"images of '{name}' have {size} pixels, not {expected}"
+        if mounts[name] != camera.mount:
+            yield f"'{name}' is fixed to the {mounts[name]}, not to the {camera.mount}"
+
+
+def _other_lrf(lrf, other):
+    """What tells another range finder from a calibrated one, in words."""
+    step, expected = np.degrees([other.bearing_step, lrf.bearing_step]).round(6)
+    if step != expected:
+        yield f"its beams are {step:g} deg apart, not {expected:g}"
+    view, expected = np.degrees([other.field_of_view, lrf.field_of_view]).round(4).tolist()
+    if view != expected:
+        yield f"its range finder sees {view} deg, not {expected}"

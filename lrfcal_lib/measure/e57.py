@@ -1,0 +1,276 @@
+"""Scans and the images that coloured them in one E57 file (ASTM E2807), for CloudCompare."""
+
+import errno
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.calibrate.cloud import Cloud
+from lrfcal_lib.calibrate.painting import View
+from lrfcal_lib.model.camera import CameraModel, fold, undistort
+
+AT_ONCE = 1 << 18  # points that are handed over to the library
+PIXEL = 5e-6  # metres; E57 wants a focal length in metres, of which only the ratio counts
+QUALITY = 95  # of JPEG
+OUTSIDE = -2.0  # a pixel of no image
+LARGEST = 2.0  # times the width and height of an image without its distortion
+COLORS = ("colorRed", "colorGreen", "colorBlue")
+COLOR_LIMITS = {
+    f"{name}{end}": level
+    for name in COLORS
+    for end, level in (("Minimum", 0), ("Maximum", 255))
+}
+POINT = ("cartesianX", "cartesianY", "cartesianZ")
+# E57 looks along -z, y up; ours along z, y down
+E57_FROM_OPENCV = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0.0, 0.0]))
+
+
+class E57Writer:
+    """Writes an E57 file scan by scan, each scan block by block; a context manager.
+
+    Parameters
+    ----------
+    path
+        Where nothing stands yet.
+    about
+        A sentence that every scan carries.
+
+    Raises
+    ------
+    OSError
+        At the end, where it cannot be written.
+    """
+
+    def __init__(self, path: Path, about: str):
+        import pye57
+
+        self.about = about
+        self._file = pye57.E57(str(path), "w")
+        self._lenses: dict[str, FlatLens] = {}  # by camera
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        libe57, image_file = self._library()
+        try:
+            image_file.close()
+        except libe57.E57Exception as failed:
+            error = error or failed
+        if isinstance(error, libe57.E57Exception):
+            raise OSError(errno.EIO, f"E57: {error}") from error
+
+    @contextmanager
+    def scan(
+        self, name: str, guid: str, T_file_scan: RigidTransform, intensity: bool
+    ) -> Iterator[Callable[[Cloud], None]]:
+        """Append a scan.
+
+        Parameters
+        ----------
+        name, guid
+            What CloudCompare shows, and what images refer to.
+        T_file_scan
+            Its pose.
+        intensity
+            Whether its points have one.
+
+        Yields
+        ------
+        callable
+            ``write(cloud)`` appends points in the scan's own frame.
+        """
+        libe57, image_file = self._library()
+        arrays, prototype, buffers = self._columns(intensity)
+        scan = self._node(
+            {
+                "guid": guid,
+                "name": name,
+                "description": self.about,
+                "pose": _pose(T_file_scan),
+                "colorLimits": COLOR_LIMITS,
+            }
+        )
+        codecs = libe57.VectorNode(image_file, True)
+        points = libe57.CompressedVectorNode(image_file, prototype, codecs)
+        scan.set("points", points)
+        self._file.data3d.append(scan)
+        writer = points.writer(buffers)
+
+        def write(cloud):
+            """Hand over blocks that fit into the buffers."""
+            for start in range(0, len(cloud.points), AT_ONCE):
+                columns = _values(cloud.rows(slice(start, start + AT_ONCE)))
+                count = len(columns["intensity"])
+                for field, array in arrays.items():
+                    array[:count] = columns[field]
+                writer.write(count)
+
+        try:
+            yield write
+        finally:
+            writer.close()
+
+    def _columns(self, intensity):
+        """Arrays by field, with the library's statement of their types and its view of them."""
+        libe57, image_file = self._library()
+        fields = dict.fromkeys(POINT, np.float32) | dict.fromkeys(COLORS, np.uint8)
+        if intensity:
+            fields["intensity"] = np.float32
+        arrays = {}
+        prototype = libe57.StructureNode(image_file)
+        buffers = libe57.VectorSourceDestBuffer()
+        for field, kind in fields.items():
+            node = libe57.FloatNode(image_file, 0.0, libe57.E57_SINGLE)
+            if field in COLORS:
+                node = libe57.IntegerNode(image_file, 0, 0, 255)
+            prototype.set(field, node)
+            arrays[field] = np.empty(AT_ONCE, kind)
+            view = (image_file, field, arrays[field], AT_ONCE, True, False)
+            buffers.append(libe57.SourceDestBuffer(*view))
+        return arrays, prototype, buffers
+
+    def image(
+        self, name: str, scan: str, T_file_camera: RigidTransform, view: View
+    ) -> None:
+        """Append an image without its distortion, posed in the frame of the file.
+
+        Parameters
+        ----------
+        name
+        scan
+            The guid of the scan that it belongs to.
+        T_file_camera
+            Pose of the camera (OpenCV's axes).
+        view
+            Its pixels and intrinsics.
+        """
+        libe57, image_file = self._library()
+        if view.camera not in self._lenses:
+            self._lenses[view.camera] = flat_lens(view.model)
+        lens = self._lenses[view.camera]
+        quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+        jpeg = cv2.imencode(".jpg", lens.of(view.image), quality)[1].ravel()
+        blob = libe57.BlobNode(image_file, len(jpeg))
+        representation = self._node(_pinhole(lens.model))
+        representation.set("jpegImage", blob)
+        node = self._node(
+            {
+                "guid": new_guid(),
+                "name": name,
+                "description": f"{self.about}; distortion removed",
+                "associatedData3DGuid": scan,
+                "pose": _pose(T_file_camera * E57_FROM_OPENCV),
+            }
+        )
+        node.set("pinholeRepresentation", representation)
+        self._file.root["images2D"].append(node)
+        blob.write(jpeg, 0, len(jpeg))
+
+    def _library(self):
+        """The module of nodes, and the file that they are made for."""
+        from pye57 import libe57
+
+        return libe57, self._file.image_file
+
+    def _node(self, value):
+        """A value as a node; mappings become structures."""
+        libe57, image_file = self._library()
+        if isinstance(value, Mapping):
+            structure = libe57.StructureNode(image_file)
+            for key, child in value.items():
+                structure.set(key, self._node(child))
+            return structure
+        if isinstance(value, str):
+            return libe57.StringNode(image_file, value)
+        if isinstance(value, int):
+            return libe57.IntegerNode(image_file, value)
+        return libe57.FloatNode(image_file, float(value))
+
+
+def _values(cloud):
+    """Values of the points by their names in the file."""
+    columns = dict(zip(POINT, cloud.points.T, strict=True))
+    columns |= dict(zip(COLORS, cloud.colors.T, strict=True))
+    return columns | {"intensity": cloud.intensity}
+
+
+def _pose(T):
+    """A RigidTransform as a structure."""
+    x, y, z, w = T.rotation.as_quat(canonical=True).tolist()
+    translation = dict(zip("xyz", T.translation.tolist(), strict=True))
+    return {"rotation": {"w": w, "x": x, "y": y, "z": z}, "translation": translation}
+
+
+def _pinhole(model):
+    """Intrinsics as a structure; E57 counts pixels from the corner of the image."""
+    focal = PIXEL * model.fy
+    return {
+        "imageWidth": int(model.width),
+        "imageHeight": int(model.height),
+        "focalLength": focal,
+        "pixelWidth": focal / model.fx,
+        "pixelHeight": PIXEL,
+        "principalPointX": model.cx + 0.5,
+        "principalPointY": model.cy + 0.5,
+    }
+
+
+def new_guid() -> str:
+    """A name that nothing else has."""
+    return f"{{{uuid.uuid4()}}}"
+
+
+@dataclass(frozen=True)
+class FlatLens:
+    """How images of a camera become those of a pinhole camera of the same focal lengths.
+
+    Attributes
+    ----------
+    model : CameraModel
+        Of the pinhole camera, whose image has room for all that the camera sees, up to `LARGEST`
+        times its width and height.
+    maps : ndarray of float32, shape (height, width, 2)
+        The pixel of the recorded image that each of its pixels shows; outside where none does.
+    """
+
+    model: CameraModel
+    maps: np.ndarray
+
+    def of(self, image: np.ndarray) -> np.ndarray:
+        """The image without its distortion, black where the camera sees nothing."""
+        return cv2.remap(image, self.maps, None, cv2.INTER_LINEAR)
+
+
+def flat_lens(model: CameraModel) -> FlatLens:
+    """What takes the distortion out of the images of a camera."""
+    v, u = np.indices((model.height, model.width))
+    rim = (u == 0) | (u == model.width - 1) | (v == 0) | (v == model.height - 1)
+    straight = undistort(np.stack([u[rim], v[rim]], axis=1), model)
+    recorded = np.array([model.width, model.height])
+    spare = (LARGEST - 1) / 2 * recorded
+    low = np.ceil(np.clip(-straight.min(axis=0), 0, spare))
+    high = np.ceil(np.clip(straight.max(axis=0) - recorded + 1, 0, spare))
+    width, height = (recorded + low + high).astype(int).tolist()
+    flat = replace(
+        model,
+        width=width,
+        height=height,
+        cx=model.cx + low[0],
+        cy=model.cy + low[1],
+        distortion=np.zeros(5),
+    )
+    size = (width, height)
+    maps = cv2.initUndistortRectifyMap(
+        model.matrix, model.distortion, None, flat.matrix, size, cv2.CV_32FC2
+    )[0]
+    x = (np.arange(width) - flat.cx) / flat.fx
+    y = (np.arange(height) - flat.cy) / flat.fy
+    maps[np.add.outer(y**2, x**2) >= fold(model)] = OUTSIDE
+    return FlatLens(flat, maps)

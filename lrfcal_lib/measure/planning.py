@@ -1,0 +1,100 @@
+"""At which pitch angles images colour what the laser range finder sees."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.model.camera import fold, project
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+
+DISTANCES = (1.0, 2.0, 4.0)  # metres, to the walls of a room
+GRID = np.radians(
+    2.0
+)  # between the beams that stand for the cloud, and between pitch angles
+WORTH = 0.01  # share of the cloud that one more pitch has to add
+MOST = 12  # pitch angles
+NEW = -1  # a placement of which no sweep was calibrated
+
+
+@dataclass(frozen=True)
+class ImagePlan:
+    """Pitch angles of images, radians, ascending, and the share of the cloud that they colour."""
+
+    pitch: tuple[float, ...]
+    share: float
+
+
+def plan_images(
+    rig: CalibratedRig, sweep: tuple[float, float], limits: tuple[float, float]
+) -> ImagePlan:
+    """Choose pitch angles for images, the one that colours most of what is left first.
+
+    Parameters
+    ----------
+    rig : CalibratedRig
+    sweep : tuple of float
+        First and last pitch of the scan lines, radians.
+    limits : tuple of float
+        Of the head, radians.
+
+    Returns
+    -------
+    ImagePlan
+    """
+    candidates = _grid(*limits)
+    visible = seen_at(rig, sweep, candidates)
+    left = np.ones(visible.shape[1], bool)
+    chosen: list[int] = []
+    while len(chosen) < MOST:
+        gains = np.mean(visible & left, axis=1)
+        best = int(np.argmax(gains))
+        if gains[best] < WORTH:
+            break
+        chosen.append(best)
+        left &= ~visible[best]
+    return ImagePlan(
+        pitch=tuple(np.sort(candidates[chosen]).tolist()),
+        share=float(1 - left.mean()),
+    )
+
+
+def seen_at(
+    rig: CalibratedRig, sweep: tuple[float, float], pitches: np.ndarray
+) -> np.ndarray:
+    """Which beams of a grid over a sweep end where a camera sees, if nothing hides anything.
+
+    Parameters
+    ----------
+    rig, sweep
+        As of :func:`plan_images`.
+    pitches : ndarray, shape (p,)
+        Of the head while images are taken, radians.
+
+    Returns
+    -------
+    ndarray of bool, shape (p, n)
+        By pitch; beams of all `DISTANCES`.
+    """
+    first, last = np.sort(sweep)
+    bearings = _grid(*rig.lrf.field_of_view)
+    ranges = np.repeat(DISTANCES, len(bearings)).reshape(len(DISTANCES), -1)
+    p_lrf = polar_to_points(ranges, bearings).reshape(-1, 3)
+    turns = rig.corrections.pitch(NEW, _grid(first, last))
+    clouds = [lrf_to_platform(p_lrf, turn, rig.T_head_lrf) for turn in turns]
+    points = np.concatenate(clouds)
+    visible = np.zeros((len(pitches), len(points)), bool)
+    for row, pitch in zip(visible, rig.corrections.pitch(NEW, pitches), strict=True):
+        for name, camera in rig.cameras.items():
+            p_camera = rig.camera_at(name, pitch).apply(points)
+            uv = project(p_camera, camera.model)
+            size = [camera.model.width, camera.model.height]
+            inside = np.all((uv > -0.5) & (uv < np.subtract(size, 0.5)), axis=1)
+            squared = np.sum(p_camera[:, :2] ** 2, axis=1) / p_camera[:, 2] ** 2
+            row |= inside & (squared < fold(camera.model))
+    return visible
+
+
+def _grid(first, last):
+    """Angles from one to another, about `GRID` apart."""
+    return np.linspace(first, last, 1 + max(1, round((last - first) / GRID)))

@@ -1,0 +1,261 @@
+"""A scene recorded with a calibrated rig: a coloured cloud of every station, and its files.
+
+A station is one place where the rig stood: a sweep and the images taken there.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.calibrate.cloud import Cloud, join, write_ply
+from lrfcal_lib.calibrate.clouds import views_of
+from lrfcal_lib.calibrate.painting import View
+from lrfcal_lib.calibrate.reconstruct import reconstruct
+from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.measure.cloud_files import write_pcd
+from lrfcal_lib.measure.e57 import E57Writer, new_guid
+from lrfcal_lib.measure.features import with_sigma
+from lrfcal_lib.plots.interactive import MOST_POINTS, rig_lines, scene_page
+from lrfcal_lib.preprocess.closing_scan import closing_of, without_closing
+from lrfcal_lib.session.faults import repeated_scans
+from lrfcal_lib.session.read import Session, Sweep
+from lrfcal_lib.session.write import whole
+
+DARKEST = 48  # grey of the weakest echo among points that no image saw
+BRIGHTEST = 208
+AT_REST_S = 0.1  # no head moves on, settles and is scanned again in less
+Told = Callable[[int], object]
+
+
+@dataclass(frozen=True)
+class Station:
+    """A place where the rig stood.
+
+    Attributes
+    ----------
+    number : int
+        Of the placement.
+    sweep : Sweep
+        Without the scan that closed it.
+    views : list of View
+    """
+
+    number: int
+    sweep: Sweep
+    views: list[View]
+
+
+def stations_of(session: Session) -> tuple[int, ...]:
+    """The stations of a session.
+
+    Parameters
+    ----------
+    session : Session
+
+    Returns
+    -------
+    tuple of int
+        Placements, in order.
+
+    Raises
+    ------
+    ValueError
+        If there is none, if two are copies, or the rig moved during one of them.
+    """
+    numbers = session.scene_placements
+    if not numbers:
+        raise ValueError(
+            f"{session.path}: no placement has an image of purpose 'scene' in images.csv, and "
+            "without images nothing can be coloured: record one with 'record --scene'"
+        )
+    for fault in repeated_scans(session):
+        if set(fault.placements) & set(numbers):
+            raise ValueError(f"{session.path}: a station stands there twice: {fault.words}")
+    for number in numbers:
+        _refuse_moved(session, number)
+    return numbers
+
+
+def _refuse_moved(session, number):
+    """ValueError for a station during which the rig, or the head within a scan, moved."""
+    sweep = session.sweep(number)
+    again = "record it again"
+    closing = closing_of(sweep)
+    if closing is not None and closing.moved:
+        raise ValueError(
+            f"{session.path}: station {number} moved while it was recorded: back at its first "
+            f"pitch, ranges differ by {1000 * closing.apart:.0f} mm, by "
+            f"{1000 * closing.expected:.0f} mm between neighbouring scan lines: {again}"
+        )
+    steps = np.abs(np.diff(sweep.time_s))[np.diff(sweep.pitch) != 0]
+    if not session.continuous and len(steps) and np.nanmedian(steps) < AT_REST_S:
+        raise ValueError(
+            f"{session.path}: station {number} was recorded while the head moved: its scan lines "
+            f"follow each other within {1000 * np.nanmedian(steps):.0f} ms, each at another "
+            f"pitch, and rig.continuous of session.json is not true: state it, or {again}"
+        )
+
+
+def station_of(session: Session, rig: CalibratedRig, number: int) -> Station:
+    """A station with its images posed.
+
+    Parameters
+    ----------
+    session : Session
+    rig : CalibratedRig
+        That recorded it.
+    number : int
+        Of :func:`stations_of`.
+
+    Returns
+    -------
+    Station
+
+    Raises
+    ------
+    ValueError
+        For a sweep without a range, or images that the rig cannot pose or that have another size.
+    """
+    sweep, _ = without_closing(session.sweep(number))
+    return Station(number, sweep, views_of(session, rig, number))
+
+
+def colored_blocks(
+    session: Session, rig: CalibratedRig, station: Station
+) -> Iterator[Cloud]:
+    """The coloured points of a station in its platform frame, block by block.
+
+    Parameters
+    ----------
+    session : Session
+    rig : CalibratedRig
+    station : Station
+
+    Yields
+    ------
+    Cloud
+        Points that no image saw are grey, by intensity where the sensor has it.
+    """
+    levels = None
+    if station.sweep.intensities is not None:
+        levels = np.nanpercentile(station.sweep.intensities, [2, 98])
+    blocks = reconstruct(
+        station.sweep,
+        station.views,
+        rig.T_head_lrf,
+        rig.corrections,
+        lrf=session.lrf,
+        continuous=session.continuous,
+    )
+    for cloud in blocks:
+        if levels is not None:
+            cloud = _shaded(cloud, *levels)
+        yield cloud
+
+
+def _shaded(cloud, weak, strong):
+    """A Cloud whose points that no image saw are as bright as their echoes."""
+    share = np.clip((cloud.intensity - weak) / max(strong - weak, 1e-9), 0, 1)
+    grey = np.nan_to_num(DARKEST + (BRIGHTEST - DARKEST) * share, nan=DARKEST)
+    shades = np.repeat(grey[:, None].astype(np.uint8), 3, axis=1)
+    return replace(cloud, colors=np.where(cloud.seen[:, None], cloud.colors, shades))
+
+
+def station_cloud(session: Session, rig: CalibratedRig, number: int) -> Cloud:
+    """A station as one cloud, with the sigma of every point.
+
+    Parameters
+    ----------
+    session : Session
+    rig : CalibratedRig
+    number : int
+
+    Returns
+    -------
+    Cloud
+    """
+    station = station_of(session, rig, number)
+    blocks = colored_blocks(session, rig, station)
+    return join(with_sigma(cloud, rig) for cloud in blocks)
+
+
+def write_scene(
+    folder: Path,
+    session: Session,
+    rig: CalibratedRig,
+    poses: dict[int, RigidTransform],
+    about: str,
+    told: Told = lambda count: None,
+) -> list[Path]:
+    """Write stations as ``scene.ply``, ``scene.pcd``, ``scene.e57`` and ``scene.html``.
+
+    Parameters
+    ----------
+    folder : Path
+    session : Session
+    rig : CalibratedRig
+    poses : dict of int to RigidTransform
+        ``T_scene_platform`` of the stations by their number; the identity for a single one.
+    about : str
+        Where it is from and whether to trust it, for every file.
+    told : callable
+        ``told(count)`` is called after every block with the number of its points.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    ValueError
+        For a station that cannot be coloured, or a file that cannot be written; every file is
+        whole, or as it was before.
+    """
+    ply, pcd, e57, page = (
+        folder / f"scene.{kind}" for kind in ("ply", "pcd", "e57", "html")
+    )
+    thinned: list[Cloud] = []
+    with ExitStack() as stack:
+        page_draft, e57_draft = (stack.enter_context(whole(file)) for file in (page, e57))
+        writer = E57Writer(e57_draft, about)
+        with writer:
+            blocks = _written(writer, session, rig, poses, thinned, told)
+            write_ply(ply, blocks, [about])
+        write_pcd(pcd, ply, [about])
+        shown = join(thinned)
+        cameras = {
+            name: (rig.camera_at(name, 0.0), camera.model)
+            for name, camera in rig.cameras.items()
+        }
+        lines = rig_lines(rig.T_head_lrf, cameras)
+        scene_page(page_draft, shown.points, shown.colors, shown.seen, lines, note=about)
+    return [ply, pcd, e57, page]
+
+
+def _written(writer, session, rig, poses, thinned, told):
+    """Blocks of all stations in the frame of the scene; they are in the E57 file already."""
+    count = sum(np.isfinite(session.sweep(number).ranges).sum() for number in poses)
+    every = int(-(-count // MOST_POINTS))
+    for number, pose in poses.items():
+        station = station_of(session, rig, number)
+        guid = new_guid()
+        intensity = station.sweep.intensities is not None
+        with writer.scan(f"station {number}", guid, pose, intensity) as write:
+            for colored in colored_blocks(session, rig, station):
+                cloud = with_sigma(colored, rig)
+                write(cloud)
+                placed = replace(
+                    cloud,
+                    points=pose.apply(cloud.points),
+                    normals=pose.rotation.apply(cloud.normals),
+                )
+                thinned.append(placed.rows(np.arange(0, len(cloud.points), every)))
+                told(len(cloud.points))
+                yield placed
+        for view in station.views:
+            name = f"station {number}, {view.camera}, image {view.number}"
+            writer.image(name, guid, pose * view.T_camera_platform.inv(), view)

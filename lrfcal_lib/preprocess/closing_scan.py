@@ -1,0 +1,133 @@
+"""The scan that closes a sweep, back at its first pitch: whether the rig stood still meanwhile.
+
+It shows what changes the ranges at that pitch: a shift along a wall that fills the scan does not.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lrfcal_lib.session.read import Sweep
+
+FEW = 0.1  # share of a sweep's scan lines, above which it was swept both ways instead
+PLAY = np.radians(1.0)  # by which a head may come back wrong: backlash
+STEPS = 21  # of the search for it
+# times the scatter between neighbouring scan lines; a rig that stands still has 0.9 to 1.2
+MOVED = 1.8
+FINEST = 0.002  # metres; below it no two readings differ for sure
+# of the beams; more than a median shows, since not all of them meet what comes nearer
+QUANTILE = 0.8
+LEAST = 20  # beams that must be there to compare
+
+
+@dataclass(frozen=True)
+class Closing:
+    """How the last scan of a sweep agrees with its first ones.
+
+    Attributes
+    ----------
+    apart : float
+        By which most ranges differ at most, the head's play aside, metres.
+    expected : float
+        The same between neighbouring scan lines of the sweep.
+    """
+
+    apart: float
+    expected: float
+
+    @property
+    def moved(self) -> bool:
+        """Whether the rig, or the head beyond its play, was elsewhere at the end."""
+        return self.apart > MOVED * max(self.expected, FINEST)
+
+
+def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
+    """A sweep on its way, and the scan lines that close it where there are any.
+
+    Parameters
+    ----------
+    sweep : Sweep
+
+    Returns
+    -------
+    sweep, closing : Sweep, Sweep or None
+    """
+    pitch = sweep.pitch
+    count = len(pitch)
+    way = np.sign(
+        np.median(pitch[-(count // 4 + 1) :]) - np.median(pitch[: count // 4 + 1])
+    )
+    turn = int(np.argmax(way * pitch)) + 1
+    back = np.arange(turn, count)
+    far = np.abs(pitch[turn:] - pitch[0]) < 0.5 * np.ptp(pitch)
+    if not far.any() or len(back) > max(1, FEW * count):
+        return sweep, None
+    return _lines(sweep, slice(0, turn)), _lines(sweep, back[far])
+
+
+def _lines(sweep, which):
+    """Some of the scan lines of a Sweep."""
+    intensities = sweep.intensities
+    if intensities is not None:
+        intensities = intensities[which]
+    return replace(
+        sweep,
+        ranges=sweep.ranges[which],
+        pitch=sweep.pitch[which],
+        time_s=sweep.time_s[which],
+        intensities=intensities,
+    )
+
+
+def closing_of(sweep: Sweep) -> Closing | None:
+    """What the scan that closes a sweep tells.
+
+    Parameters
+    ----------
+    sweep : Sweep
+
+    Returns
+    -------
+    Closing or None
+        None where nothing closes the sweep, or too few beams came back.
+    """
+    sweep, closing = without_closing(sweep)
+    if closing is None:
+        return None
+    order = np.argsort(sweep.pitch, kind="stable")
+    pitch = sweep.pitch[order]
+    at = closing.pitch.mean()
+    near = np.flatnonzero(np.abs(pitch - at) < 2 * PLAY)
+    if len(near) < 3:
+        return None
+    pitch = pitch[near]
+    ranges = sweep.ranges[order[near]]
+    last = np.nanmean(closing.ranges, axis=0)
+    between = ranges[1:-1] - (ranges[:-2] + ranges[2:]) / 2
+    apart = []
+    step = np.median(np.diff(pitch))
+    for play in np.linspace(-PLAY, PLAY, STEPS):
+        if pitch[0] - step <= at + play <= pitch[-1] + step:
+            apart.append(_apart(last, _at(at + play, pitch, ranges)))
+    if np.isfinite(between).sum() < LEAST or not np.isfinite(apart).any():
+        return None
+    return Closing(
+        apart=float(np.nanmin(apart)),
+        expected=float(np.nanquantile(np.abs(between), QUANTILE)),
+    )
+
+
+def _at(pitch, pitches, ranges):
+    """Ranges (b,) at a pitch between scan lines (l, b)."""
+    upper = int(np.clip(np.searchsorted(pitches, pitch), 1, len(pitches) - 1))
+    low, high = pitches[upper - 1], pitches[upper]
+    share = (pitch - low) / max(high - low, 1e-12)
+    return (1 - share) * ranges[upper - 1] + share * ranges[upper]
+
+
+def _apart(first, second):
+    """By which most ranges differ at most, metres; NaN where too few came back both times."""
+    apart = np.abs(first - second)
+    if np.isfinite(apart).sum() < LEAST:
+        return np.nan
+    return np.nanquantile(apart, QUANTILE)
