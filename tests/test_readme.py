@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -16,9 +17,14 @@ from shared import ROOT, stages
 from test_skeleton import git
 
 from lrfcal_lib import __main__ as command_line
+from lrfcal_lib.calibrate.calibration_file import rig_record
 from lrfcal_lib.drivers import rig_file
 from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.video import Camera
+from lrfcal_lib.evaluate.export import write_calibration
+from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session import cache
 from lrfcal_lib.solvers import METHODS
 
@@ -115,13 +121,42 @@ def test_the_clone_line_gives_a_checkout_that_checks_its_session(tmp_path):
 def test_the_example_projects_a_scan_line_into_the_image(monkeypatch):
     monkeypatch.setenv(cache.VARIABLE, str(stages()))
     monkeypatch.chdir(ROOT)
-    exec(*blocks("python"), names := {})
+    exec(blocks("python")[0], names := {})
     u, v = names["pixels"][np.isfinite(names["pixels"]).all(axis=1)].T
     inside = (u > 0) & (u < names["lens"].width - 1)
     assert inside.sum() > 100 and np.all(
         (v[inside] > 0) & (v[inside] < names["lens"].height - 1)
     )
     assert np.ptp(v[inside]) < 60 < np.ptp(u[inside]), "a scan line is nearly level"
+
+
+@pytest.mark.parametrize("mount", ["head", "platform"])
+def test_twenty_lines_project_a_scan_from_the_file_alone(
+    quick, tmp_path, monkeypatch, mount
+):
+    """The same pixels as ours, for errors of range and pitch that would show."""
+    rig = quick.rig("joint")
+    left = replace(rig.cameras["left"], mount=mount)
+    if mount == "platform":
+        left = replace(left, T_camera=left.T_camera * rig.T_head_lrf.inv())
+    rig = replace(rig, corrections=Corrections(0.05, 0.03), cameras={"left": left})
+    write_calibration(tmp_path / "calibration.json", rig_record(rig))
+    monkeypatch.chdir(tmp_path)
+    bearings = np.radians(np.linspace(60, 120, 50))
+    ranges = np.linspace(1.0, 3.0, 50)
+    names = {"bearings": bearings, "ranges": ranges, "pitch_of_scan": 0.1}
+    names["pitch_of_image"] = -0.05
+    code = blocks("python")[1]
+    exec(code, names)
+    assert (
+        len([line for line in code.splitlines() if line.strip()]) <= 23
+    )  # imports are three
+    p_lrf = rig.corrections.points(polar_to_points(ranges, bearings))
+    p_platform = lrf_to_platform(p_lrf, rig.corrections.pitch(1, 0.1), rig.T_head_lrf)
+    T_camera = rig.camera_at("left", float(rig.corrections.pitch(1, -0.05)))
+    ours = project(T_camera.apply(p_platform), left.model)
+    np.testing.assert_allclose(names["pixels"][:, 0], ours, atol=1e-6)
+    assert np.isfinite(ours).all()
 
 
 def golden(session, name):
