@@ -22,7 +22,9 @@ from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.write import whole
 
 NOT_ALL = 3  # exit code where stations are left out
-FRAME = "the joined cloud is in the platform frame of station {}, as the calibration states it"
+FRAME = (
+    "the joined cloud is in the platform frame of station {}, as the calibration states it"
+)
 SLICE = (-0.3, 0.6)  # metres, heights of the points in the plan
 WIDTH = 150  # letters a line under the plan
 ARROW = 0.35  # metres, of the view of a station in the plan
@@ -150,13 +152,22 @@ def stations_figure(joined: Joined, cloud: Cloud) -> Figure:
     for number, T in joined.T_world_station.items():
         ahead = T.rotation.apply([0.0, ARROW, 0.0])[:2]
         plan.annotate(
-            "", places[number] + ahead, places[number], arrowprops={"color": "C3", "width": 1}
+            "",
+            places[number] + ahead,
+            places[number],
+            arrowprops={"color": "C3", "width": 1},
         )
         beside = places[number] - 0.4 * ahead
-        plan.annotate(f"{number}", beside, color="C3", fontsize=13, ha="center", va="center")
+        plan.annotate(
+            f"{number}", beside, color="C3", fontsize=13, ha="center", va="center"
+        )
     dots = np.array(list(places.values())).T
-    plan.plot(*dots, "o", color="C3", ms=4, label="stations, and where they look at pitch 0")
-    plan.plot([], [], "-", color="C0", label="pairs used, and how far off all pairs put them")
+    plan.plot(
+        *dots, "o", color="C3", ms=4, label="stations, and where they look at pitch 0"
+    )
+    plan.plot(
+        [], [], "-", color="C0", label="pairs used, and how far off all pairs put them"
+    )
     plan.set(aspect="equal", xlabel="x, m", ylabel="y, m", title="Stations from above")
     plan.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=2, fontsize=8)
     words.axis("off")
