@@ -42,6 +42,17 @@ def run(args):
             from lrfcal_lib.report.merge import merge_session
 
             return merge_session(args.session, args.calibration, args.out, args.untrusted)
+        case "measure":
+            from lrfcal_lib.report.measure import measure_session
+
+            return measure_session(
+                args.session,
+                args.calibration,
+                args.picks,
+                args.out,
+                args.station,
+                args.untrusted,
+            )
         case "report":
             from lrfcal_lib.report.report import main
 
@@ -150,6 +161,7 @@ def parser():
     verbs = top.add_subparsers(title="verbs", metavar="VERB", dest="verb", required=True)
     _add_import(verbs)
     _add_sessions(verbs)
+    _add_measure(verbs)
     _add_rigs(verbs)
     _add_report(verbs)
     return top
@@ -218,6 +230,27 @@ def _add_scene(verb):
         "--untrusted",
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",
+    )
+
+
+def _add_measure(verbs):
+    """The verb that measures in a scene."""
+    measure = verbs.add_parser(
+        "measure", help="measure lengths between places picked in scene.html"
+    )
+    measure.add_argument("session", help="as 'record --scene' recorded it")
+    measure.add_argument("--calibration", required=True, help="calibration.json")
+    measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
+    measure.add_argument(
+        "--station", type=int, help="whose scene.html, if there are several"
+    )
+    measure.add_argument(
+        "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"
+    )
+    measure.add_argument(
+        "--untrusted",
+        action="store_true",
+        help="even if the verdict on the calibration is 'no'",
     )
 
 
