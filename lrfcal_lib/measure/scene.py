@@ -88,7 +88,7 @@ def _refuse_moved(session, number):
     if closing is not None and closing.moved:
         raise ValueError(
             f"{session.path}: station {number} moved while it was recorded: back at its first "
-            f"pitch, ranges differ by {1000 * closing.apart:.0f} mm in the median, by "
+            f"pitch, ranges differ by {1000 * closing.apart:.0f} mm, by "
             f"{1000 * closing.expected:.0f} mm between neighbouring scan lines: {again}"
         )
     steps = np.abs(np.diff(sweep.time_s))[np.diff(sweep.pitch) != 0]

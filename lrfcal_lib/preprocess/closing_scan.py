@@ -1,4 +1,7 @@
-"""The scan that closes a sweep, back at its first pitch: whether the rig stood still meanwhile."""
+"""The scan that closes a sweep, back at its first pitch: whether the rig stood still meanwhile.
+
+It shows what changes the ranges at that pitch: a shift along a wall that fills the scan does not.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -9,8 +12,11 @@ from lrfcal_lib.session.read import Sweep
 FEW = 0.1  # share of a sweep's scan lines, above which it was swept both ways instead
 PLAY = np.radians(1.0)  # by which a head may come back wrong: backlash
 STEPS = 21  # of the search for it
-# times the scatter between neighbouring scan lines; a rig that stands still stays below 1.5
-MOVED = 2.5
+# times the scatter between neighbouring scan lines; a rig that stands still has 0.9 to 1.2
+MOVED = 1.8
+FINEST = 0.002  # metres; below it no two readings differ for sure
+# of the beams; more than a median shows, since not all of them meet what comes nearer
+QUANTILE = 0.8
 LEAST = 20  # beams that must be there to compare
 
 
@@ -21,7 +27,7 @@ class Closing:
     Attributes
     ----------
     apart : float
-        Median difference of the ranges after the head's play, metres.
+        By which most ranges differ at most, the head's play aside, metres.
     expected : float
         The same between neighbouring scan lines of the sweep.
     """
@@ -32,7 +38,7 @@ class Closing:
     @property
     def moved(self) -> bool:
         """Whether the rig, or the head beyond its play, was elsewhere at the end."""
-        return self.apart > MOVED * self.expected
+        return self.apart > MOVED * max(self.expected, FINEST)
 
 
 def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
@@ -99,14 +105,15 @@ def closing_of(sweep: Sweep) -> Closing | None:
     last = np.nanmean(closing.ranges, axis=0)
     between = ranges[1:-1] - (ranges[:-2] + ranges[2:]) / 2
     apart = []
+    step = np.median(np.diff(pitch))
     for play in np.linspace(-PLAY, PLAY, STEPS):
-        if pitch[0] <= at + play <= pitch[-1]:
+        if pitch[0] - step <= at + play <= pitch[-1] + step:
             apart.append(_apart(last, _at(at + play, pitch, ranges)))
     if np.isfinite(between).sum() < LEAST or not np.isfinite(apart).any():
         return None
     return Closing(
         apart=float(np.nanmin(apart)),
-        expected=float(np.nanmedian(np.abs(between))),
+        expected=float(np.nanquantile(np.abs(between), QUANTILE)),
     )
 
 
@@ -119,8 +126,8 @@ def _at(pitch, pitches, ranges):
 
 
 def _apart(first, second):
-    """Median difference of ranges, metres; NaN where too few came back both times."""
+    """By which most ranges differ at most, metres; NaN where too few came back both times."""
     apart = np.abs(first - second)
     if np.isfinite(apart).sum() < LEAST:
         return np.nan
-    return np.nanmedian(apart)
+    return np.nanquantile(apart, QUANTILE)

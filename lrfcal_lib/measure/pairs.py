@@ -1,0 +1,314 @@
+"""Two stations of a scene beside each other: where one may stand in the frame of the other.
+
+The start needs no guess but that both platforms stand on their feet: directions of walls and floor
+give the turns, the correlation of all surfaces gives the shifts. Every start that is good enough is
+refined, and judged by what overlaps and by what stands where the other station looked through.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import small_gicp
+from scipy.fft import irfftn, next_fast_len, rfftn
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.spatial import KDTree
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.calibrate.cloud import Cloud
+
+PATCH = 0.05  # metres, side of the cells whose points make one patch of a surface
+FLAT = 0.97  # length of the mean normal of a patch; less has an edge in it
+DIRECTIONS = 8  # of walls, floor and furniture that make turns
+NEAR = np.cos(np.radians(8.0))  # between normals of one direction
+FEW = 0.01  # share of the patches that makes a direction
+SAME_ANGLE = np.radians(4.0)  # between two directions in one station and in the other
+SAME_TURN = np.radians(6.0)  # turns that are refined to the same one
+UPRIGHT = np.cos(
+    np.radians(25.0)
+)  # between the z axes of platforms that stand on their feet
+CELL = 0.2  # metres, of the grid on which shifts are looked for
+PEAKS = 6  # shifts tried a turn
+STARTS = 10  # tried a pair
+WIDTHS = (0.3, 0.12, 0.06)  # metres within which patches are taken for the same, one by one
+AROUND = 20  # patches that make a covariance
+SAME_PLACE = 0.15  # metres, and
+SAME_YAW = np.radians(3.0)  # within which two starts ended at the same pose
+MATCHED = 0.1  # metres between patches of the same surface
+FACING = np.cos(np.radians(30.0))  # between normals of the same surface
+LOOK = np.radians(1.5)  # side of a cell of what a station saw
+CLEAR = 0.15  # metres before a surface; a patch there stands where the other looked through
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a station saw, in patches.
+
+    Attributes
+    ----------
+    points, normals : ndarray, shape (n, 3)
+        Means of the points of a patch, platform frame, metres; unit vectors.
+    sigma : ndarray, shape (n,)
+        Standard deviation of a mean along the normal, metres.
+    nearest, farthest : ndarray, shape (k, l)
+        Ranges by azimuth and height about the platform, metres; infinite and 0 where it saw none.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    sigma: np.ndarray
+    nearest: np.ndarray
+    farthest: np.ndarray
+    gicp: small_gicp.PointCloud
+    gicp_tree: small_gicp.KdTree
+    tree: KDTree
+
+
+def surface_of(cloud: Cloud) -> Surface:
+    """The patches of a cloud of one station.
+
+    Parameters
+    ----------
+    cloud : Cloud
+
+    Returns
+    -------
+    Surface
+
+    Raises
+    ------
+    ValueError
+        If no part of it is smooth.
+    """
+    whole = cloud.rows(np.isfinite(cloud.normals).all(axis=1))
+    cells = np.floor(whole.points / PATCH).astype(int)
+    _, patch, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+
+    def mean(columns):
+        sums = [np.bincount(patch, column) for column in columns.T]
+        return np.stack(sums, axis=1) / count[:, None]
+
+    points = mean(whole.points)
+    normals = mean(whole.normals)
+    sigma = np.sqrt(mean(whole.sigma[:, None] ** 2)[:, 0] / count)
+    length = np.linalg.norm(normals, axis=1)
+    flat = length > FLAT
+    if not flat.any():
+        raise ValueError("no part of the cloud is a smooth surface")
+    points = points[flat]
+    gicp = small_gicp.PointCloud(points)
+    gicp_tree = small_gicp.KdTree(gicp)
+    small_gicp.estimate_normals_covariances(gicp, gicp_tree, AROUND)
+    nearest, farthest = _look(cloud.points)
+    return Surface(
+        points=points,
+        normals=normals[flat] / length[flat, None],
+        sigma=sigma[flat],
+        nearest=nearest,
+        farthest=farthest,
+        gicp=gicp,
+        gicp_tree=gicp_tree,
+        tree=KDTree(points),
+    )
+
+
+def _cells(points):
+    """Where points (n, 3) stand in the view of a platform: row, column, range (n,)."""
+    distance = np.linalg.norm(points, axis=1)
+    azimuth = np.arctan2(points[:, 0], points[:, 1])
+    height = np.arcsin(points[:, 2] / np.maximum(distance, 1e-9))
+    row = np.floor((azimuth + np.pi) / LOOK).astype(int)
+    column = np.floor((height + np.pi / 2) / LOOK).astype(int)
+    return row, column, distance
+
+
+def _look(points):
+    """Nearest and farthest range in every cell of the view of a platform and the cells about it."""
+    row, column, distance = _cells(points)
+    shape = (int(2 * np.pi / LOOK) + 1, int(np.pi / LOOK) + 1)
+    nearest = np.full(shape, np.inf)
+    farthest = np.zeros(shape)
+    np.minimum.at(nearest, (row, column), distance)
+    np.maximum.at(farthest, (row, column), distance)
+    return minimum_filter(nearest, 3), maximum_filter(farthest, 3)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Where the second of two stations may stand.
+
+    Attributes
+    ----------
+    T_first_second : RigidTransform
+    overlap : float
+        Share of the patches of the station that has fewer which the other one has too.
+    against : float
+        Share of patches in the other's view that stand where it looked through.
+    """
+
+    T_first_second: RigidTransform
+    overlap: float
+    against: float
+
+
+def candidates(first: Surface, second: Surface) -> list[Candidate]:
+    """Poses of the second station at which surfaces of both fall together, the best first.
+
+    Parameters
+    ----------
+    first, second : Surface
+
+    Returns
+    -------
+    list of Candidate
+        All different; empty where the stations have no two directions of walls in common.
+    """
+    ended: list[RigidTransform] = []
+    for start in starts(first, second):
+        T = refined(first, second, start)
+        if not any(_same(T, other) for other in ended):
+            ended.append(T)
+    found = [agreement(first, second, T) for T in ended]
+    return sorted(found, key=lambda c: -c.overlap * (1 - c.against))
+
+
+def _same(a, b):
+    """Whether two poses are one."""
+    apart = a.inv() * b
+    near = np.linalg.norm(apart.translation) < SAME_PLACE
+    return near and apart.rotation.magnitude() < SAME_YAW
+
+
+def starts(first: Surface, second: Surface) -> list[RigidTransform]:
+    """Rough poses of the second station in the frame of the first, the most likely first."""
+    found = []
+    for turn in _turns(_directions(first), _directions(second)):
+        found += _shifts(first, second, turn)
+    found.sort(key=lambda scored: -scored[0])
+    return [T for _, T in found[:STARTS]]
+
+
+def _directions(surface):
+    """Directions (k, 3) in which many patches face, the most of them first."""
+    every = max(1, len(surface.normals) // 2000)
+    left = surface.normals[::every]
+    least = FEW * len(left)
+    found = []
+    while len(found) < DIRECTIONS and len(left):
+        near = left @ left.T > NEAR
+        best = near[np.argmax(near.sum(axis=1))]
+        if best.sum() < least:
+            break
+        mean = left[best].mean(axis=0)
+        mean /= np.linalg.norm(mean)
+        found.append(mean)
+        left = left[left @ mean < NEAR]
+    return np.array(found).reshape(-1, 3)
+
+
+def _turns(first, second):
+    """Turns of the second station by which two of its directions fall on two of the first."""
+    found: list[Rotation] = []
+    for a, b in _two_of(first):
+        for c, d in _two_of(second):
+            if abs(np.arccos(a @ b) - np.arccos(c @ d)) > SAME_ANGLE:
+                continue
+            turn = Rotation.align_vectors([a, b], [c, d])[0]
+            upright = turn.as_matrix()[2, 2] > UPRIGHT
+            if upright and not any(
+                (turn * other.inv()).magnitude() < SAME_TURN for other in found
+            ):
+                found.append(turn)
+    return found
+
+
+def _two_of(directions) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Ordered pairs of directions that are neither parallel nor opposite."""
+    for a in directions:
+        for b in directions:
+            if abs(a @ b) < FACING:
+                yield a, b
+
+
+def _shifts(first, second, turn):
+    """The best shifts of the second station after a turn: score and pose of each.
+
+    The correlation of normals on a grid: surfaces count that face the same way.
+    """
+    moved = turn.apply(second.points)
+    low = first.points.min(axis=0)
+    low_moved = moved.min(axis=0)
+    span = np.ptp(first.points, axis=0) + np.ptp(moved, axis=0)
+    shape = [next_fast_len(int(n) + 4, real=True) for n in span / CELL]
+    score = np.zeros(shape)
+    for axis in range(3):
+        here = _on_grid(first.points - low, first.normals[:, axis], shape)
+        there = _on_grid(moved - low_moved, turn.apply(second.normals)[:, axis], shape)
+        blurred = gaussian_filter(here, 1.0, mode="wrap")
+        score += irfftn(rfftn(blurred) * np.conj(rfftn(there)), s=shape)
+    top = np.where(score == maximum_filter(score, 5, mode="wrap"), score, 0.0)
+    best = np.argsort(top, axis=None)[::-1][:PEAKS]
+    found = []
+    for place in best:
+        cell = np.array(np.unravel_index(place, shape))
+        # beyond the extent of the first, a shift is one to the other side
+        back = cell * CELL > np.ptp(first.points, axis=0) + 2 * CELL
+        shift = (cell - back * np.array(shape)) * CELL + low - low_moved
+        found.append((top.flat[place], RigidTransform.from_components(shift, turn)))
+    return found
+
+
+def _on_grid(points, values, shape):
+    """Sums of values (n,) on the nearest points of a grid."""
+    grid = np.zeros(shape)
+    np.add.at(grid, tuple(np.rint(points / CELL).astype(int).T), values)
+    return grid
+
+
+def refined(first: Surface, second: Surface, start: RigidTransform) -> RigidTransform:
+    """A rough pose of the second station after GICP in shrinking widths."""
+    T = start.as_matrix()
+    for width in WIDTHS:
+        T = small_gicp.align(
+            first.gicp,
+            second.gicp,
+            first.gicp_tree,
+            T,
+            registration_type="GICP",
+            max_correspondence_distance=width,
+            max_iterations=30,
+        ).T_target_source
+    return RigidTransform.from_matrix(T)
+
+
+def agreement(first: Surface, second: Surface, T: RigidTransform) -> Candidate:
+    """How two stations agree at a pose of the second."""
+    matched = len(matches(first, second, T)[0])
+    conflicts = _before(first, T.apply(second.points))
+    conflicts += _before(second, T.inv().apply(first.points))
+    fewer = min(len(first.points), len(second.points))
+    against = conflicts / max(conflicts + 2 * matched, 1)
+    return Candidate(T, matched / fewer, against)
+
+
+def matches(first: Surface, second: Surface, T: RigidTransform):
+    """Numbers of patches of the first and second station that are of one surface."""
+    distance, near = first.tree.query(
+        T.apply(second.points), distance_upper_bound=MATCHED, workers=2
+    )
+    there = np.flatnonzero(np.isfinite(distance))
+    here = near[there]
+    normals = T.rotation.apply(second.normals[there])
+    same = np.vecdot(first.normals[here], normals) > FACING
+    return here[same], there[same]
+
+
+def _before(surface, points):
+    """How many points (n, 3) stand where a station looked through."""
+    row, column, distance = _cells(points)
+    return int(np.sum(distance < _finite(surface.nearest[row, column]) - CLEAR))
+
+
+def _finite(nearest):
+    """Ranges, 0 where nothing came back: there nothing is known."""
+    return np.where(np.isfinite(nearest), nearest, 0.0)
