@@ -19,6 +19,7 @@ CONTRADICTION = 16.0  # mean squared residual, relative to the median placement'
 LEAST_MISFIT = 1e-6  # of images: below, they agree exactly
 LARGEST_SHARE = 0.3  # of the placements that may contradict the others
 LAST_MISS = 0.025  # metres, of a board from where images of it put it
+MOST_SIGMA = 4.0  # by which images may put a board elsewhere, of what is stated of them
 FAR_MISS = 5.0  # times the usual miss: an image puts the board elsewhere
 FEW_STEPS = 8  # of a minimisation that only has to show where it leads
 BOARD = 6  # numbers of a pose
@@ -82,7 +83,8 @@ def refuse_contradiction(
     state: JointState, data: JointData, most: float, left_out: list[Problem] | None = None
 ) -> None:
     """Raise DegenerateGeometry where a third of the placements contradict: images put their boards
-    more than `most` metres off where they are, or they are left out already for that.
+    more than `most` metres (and `MOST_SIGMA` of what is stated of the images) off where they are,
+    or they are left out already for that.
     """
     used = data.view["used"]
     shown = used.any(axis=1)
@@ -91,8 +93,10 @@ def refuse_contradiction(
     lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=())
     shift = view_block(state, data, lone).residuals.reshape(used.shape + (6,))[..., 3:]
     misses = medians(np.linalg.norm(shift, axis=-1), used)
+    variance = np.trace(data.view["covariance"][..., 3:, 3:], axis1=-2, axis2=-1)
+    stated = medians(np.sqrt(variance), used)
     gone = sum(one.kind is CONTRADICTS and one.camera is None for one in left_out or ())
-    wrong = gone + np.sum(misses[shown] > most)
+    wrong = gone + np.sum(misses[shown] > np.maximum(most, MOST_SIGMA * stated[shown]))
     count = gone + np.sum(shown)
     if 3 * wrong > count:
         raise DegenerateGeometry(
