@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -16,9 +17,14 @@ from shared import ROOT, stages
 from test_skeleton import git
 
 from lrfcal_lib import __main__ as command_line
+from lrfcal_lib.calibrate.calibration_file import rig_record
 from lrfcal_lib.drivers import rig_file
 from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.video import Camera
+from lrfcal_lib.evaluate.export import write_calibration
+from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.solvers import METHODS
@@ -28,6 +34,7 @@ CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
 METHODS_PAGE = (ROOT / "notebooks" / "METHODS.md").read_text()
 RIG_PAGE = (ROOT / "notebooks" / "RIG_FILE.md").read_text()
 RESULTS_PAGE = (ROOT / "notebooks" / "RESULTS.md").read_text()
+FILE_PAGE = (ROOT / "notebooks" / "CALIBRATION_FILE.md").read_text()
 SENSORS_PAGE = (ROOT / "notebooks" / "OTHER_SENSORS.md").read_text()
 WORKFLOW = (ROOT / ".github" / "workflows" / "test.yml").read_text()
 
@@ -44,7 +51,9 @@ def test_notebooks_methods_functions_and_files_are_all_there():
     ] == []
     assert [method for method in METHODS if f"| `{method}` |" not in METHODS_PAGE] == []
     links = re.findall(r"\]\(([^)#:]+)\)", README + CONTRIBUTING)
-    pages = README + CONTRIBUTING + METHODS_PAGE + RIG_PAGE + RESULTS_PAGE + SENSORS_PAGE
+    pages = "".join(
+        [README, CONTRIBUTING, METHODS_PAGE, RIG_PAGE, RESULTS_PAGE, SENSORS_PAGE]
+    )
     files = re.findall(r"`((?:lrfcal_lib|tests|data|notebooks)/[\w/.]+)`", pages)
     assert (
         len(files) > 4
@@ -150,6 +159,35 @@ def test_a_session_of_another_sensor_is_written_as_the_page_says(tmp_path, monke
     )
     assert len(written.images("left")) == sum(len(my_images(p)) for p in (1, 2, 3, 4))
     np.testing.assert_array_equal(written.sweep(3).ranges, given.sweep(3).ranges)
+
+
+@pytest.mark.parametrize("mount", ["head", "platform"])
+def test_twenty_lines_project_a_scan_from_the_file_alone(
+    quick, tmp_path, monkeypatch, mount
+):
+    """The same pixels as ours, for errors of range and pitch that would show."""
+    rig = quick.rig("joint")
+    left = replace(rig.cameras["left"], mount=mount)
+    if mount == "platform":
+        left = replace(left, T_camera=left.T_camera * rig.T_head_lrf.inv())
+    rig = replace(rig, corrections=Corrections(0.05, 0.03), cameras={"left": left})
+    write_calibration(tmp_path / "calibration.json", rig_record(rig))
+    monkeypatch.chdir(tmp_path)
+    bearings = np.radians(np.linspace(60, 120, 50))
+    ranges = np.linspace(1.0, 3.0, 50)
+    names = {"bearings": bearings, "ranges": ranges, "pitch_of_scan": 0.1}
+    names["pitch_of_image"] = -0.05
+    code = blocks("python", FILE_PAGE)[0]
+    exec(code, names)
+    assert (
+        len([line for line in code.splitlines() if line.strip()]) <= 23
+    )  # imports are three
+    p_lrf = rig.corrections.points(polar_to_points(ranges, bearings))
+    p_platform = lrf_to_platform(p_lrf, rig.corrections.pitch(1, 0.1), rig.T_head_lrf)
+    T_camera = rig.camera_at("left", float(rig.corrections.pitch(1, -0.05)))
+    ours = project(T_camera.apply(p_platform), left.model)
+    np.testing.assert_allclose(names["pixels"][:, 0], ours, atol=1e-6)
+    assert np.isfinite(ours).all()
 
 
 def golden(session, name):
