@@ -8,7 +8,7 @@ from scipy.special import ndtr
 from lrfcal_lib.plots.recording import COLORS
 
 BEAMS = 12  # drawn of a scan
-ABOUT = 1.6  # spot radii shown on either side of an edge
+ABOUT = 2.0  # spot radii shown on either side of an edge
 
 
 def plane_constraint(
@@ -75,14 +75,14 @@ def spot_over_edge(ax: Axes, radius: float, bias: float) -> None:
         at = (2 - row) * height
         ax.add_patch(Circle((u, at), r, color=color, alpha=0.3, linewidth=0))
         ax.plot(u, at, "+", color=color, markersize=9, markeredgewidth=1.6)
-        ax.text(1.05 * reach, at, words, va="center", color=color)
+        ax.text(1.1 * reach, at, words, va="center", color=color)
     ax.text(-0.97 * reach, 2.3 * height, "board", va="center")
     ax.text(0.97 * reach, 2.3 * height, "beyond", va="center", ha="right")
     ax.annotate(
         "b", (1000 * bias, 0.5 * height), ha="center", va="center", color=COLORS["fit"]
     )
     ax.plot([0, 1000 * bias], [0.38 * height] * 2, color=COLORS["fit"], linewidth=2)
-    ax.set(xlim=(-reach, 2.2 * reach), ylim=(-0.6 * height, 2.6 * height), aspect="equal")
+    ax.set(xlim=(-reach, 2.6 * reach), ylim=(-0.6 * height, 2.6 * height), aspect="equal")
     ax.set(xlabel="distance u of the beam from the edge [mm]", yticks=[])
     ax.grid(False)
 
