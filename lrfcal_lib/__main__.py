@@ -38,6 +38,10 @@ def run(args):
             return reconstruct_session(
                 args.session, args.calibration, args.out, args.untrusted
             )
+        case "merge":
+            from lrfcal_lib.report.merge import merge_session
+
+            return merge_session(args.session, args.calibration, args.out, args.untrusted)
         case "report":
             from lrfcal_lib.report.report import main
 
@@ -198,15 +202,19 @@ def _add_sessions(verbs):
     )
     compare.add_argument("--figure", metavar="PNG", help="also draw them")
 
-    reconstruct = verbs.add_parser(
-        "reconstruct", help="make coloured clouds of a scene with a calibration of its rig"
-    )
-    reconstruct.add_argument("session", help="as 'record --scene' recorded it")
-    reconstruct.add_argument("--calibration", required=True, help="calibration.json")
-    reconstruct.add_argument(
+    words = "make coloured clouds of a scene with a calibration of its rig"
+    _add_scene(verbs.add_parser("reconstruct", help=words))
+    _add_scene(verbs.add_parser("merge", help="join the stations of a scene in one cloud"))
+
+
+def _add_scene(verb):
+    """What the use of a calibration on a scene takes."""
+    verb.add_argument("session", help="as 'record --scene' recorded it")
+    verb.add_argument("--calibration", required=True, help="calibration.json")
+    verb.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
-    reconstruct.add_argument(
+    verb.add_argument(
         "--untrusted",
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",

@@ -130,7 +130,9 @@ def _rim(readings, side):
     at = np.arange(BESIDE) - (BESIDE - 1) / 2
     mean = readings.mean(axis=-1)
     slope = readings @ at / (at @ at)
-    rough = np.sqrt(np.mean((readings - mean[..., None] - slope[..., None] * at) ** 2, axis=-1))
+    rough = np.sqrt(
+        np.mean((readings - mean[..., None] - slope[..., None] * at) ** 2, axis=-1)
+    )
     return mean + slope * (side - BESIDE / 2), np.abs(slope), rough
 
 
@@ -153,7 +155,9 @@ def _straight(place, outward, near, far, lrf):
         if np.sqrt(size[0]) > STRAIGHT * step or across @ outward[i] < np.sqrt(0.5):
             continue
         on_rim = mean + along * (along @ (place[i] - mean))
-        rows.append((i, *on_rim, np.median(near[others]), np.median(far[others]), *along, *across))
+        rows.append(
+            (i, *on_rim, np.median(near[others]), np.median(far[others]), *along, *across)
+        )
         links += [(i, other) for other in others]
     table = np.array(rows).reshape(-1, 9)
     index = table[:, 0].astype(int)

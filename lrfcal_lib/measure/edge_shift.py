@@ -38,7 +38,9 @@ OUTSIDE = np.linspace(1, -1, 201)  # spot radii of the spot's middle from the ri
 SHARE = (np.arccos(OUTSIDE) - OUTSIDE * np.sqrt(1 - OUTSIDE**2)) / np.pi
 STARTS = np.linspace(-0.75, 0.75, 7)  # of REACH, right and down
 BEST_STARTS = 4
-WIDTHS = np.geomspace(0.3, 0.09, 12)  # of REACH: how far off an edge may lie, while it is sought
+WIDTHS = np.geomspace(
+    0.3, 0.09, 12
+)  # of REACH: how far off an edge may lie, while it is sought
 OUTLIERS = 0.15  # of the clearest edge's weight
 RIM_SHARE = 0.25  # of the variance of places on a rim that all of them have in common
 
@@ -239,7 +241,9 @@ def edge_shift(seen: Sights, chain: Chain, model: CameraModel) -> EdgeShift:
     starts[:, :2] = turns
     width = WIDTHS[0] * reach
     starts = sorted(starts, key=lambda x: -_score(seen, trust, x, width))[:BEST_STARTS]
-    fits = [_narrowed(seen, trust, start, reach) for start in [np.zeros(len(SPREAD)), *starts]]
+    fits = [
+        _narrowed(seen, trust, start, reach) for start in [np.zeros(len(SPREAD)), *starts]
+    ]
     best = max(fits, key=lambda x: _score(seen, trust, x, WIDTHS[-1] * reach))
     return _judged(seen, trust, rim, best, chain, model)
 
@@ -304,7 +308,11 @@ def _judged(seen, trust, rim, x, chain, model):
         p_value=float(fisher.sf(square / 6 * free / max(rims - 1, 1), 6, free)),
         rims=rims,
         places=len(seen.rim),
-        scatter=float(np.sqrt(np.sum(trust[:, None] * share * miss**2) / np.sum(trust[:, None] * share))),
+        scatter=float(
+            np.sqrt(
+                np.sum(trust[:, None] * share * miss**2) / np.sum(trust[:, None] * share)
+            )
+        ),
     )
 
 
