@@ -24,7 +24,9 @@ NEAR = np.cos(np.radians(8.0))  # between normals of one direction
 FEW = 0.01  # share of the patches that makes a direction
 SAME_ANGLE = np.radians(4.0)  # between two directions in one station and in the other
 SAME_TURN = np.radians(6.0)  # turns that are refined to the same one
-UPRIGHT = np.cos(np.radians(25.0))  # between the z axes of platforms that stand on their feet
+UPRIGHT = np.cos(
+    np.radians(25.0)
+)  # between the z axes of platforms that stand on their feet
 CELL = 0.2  # metres, of the grid on which shifts are looked for
 PEAKS = 6  # shifts tried a turn
 STARTS = 10  # tried a pair

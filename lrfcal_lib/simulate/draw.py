@@ -94,7 +94,9 @@ class ShotSetup(Devices):
     poses: str = "ahead"  # of the board, a row of POSES
     lean: float = 0.6  # radians: the most ('ahead'), or always (`parallel`)
     fewest_beams: int = FEWEST_BEAMS  # on the board
-    seen_whole: bool = True  # both crossings are clear of corners, the image shows the board
+    seen_whole: bool = (
+        True  # both crossings are clear of corners, the image shows the board
+    )
 
     def bearings(self):
         """Of all beams, radians, shape (B,)."""
