@@ -27,7 +27,7 @@ help:
 	@echo "make fuzz                    200 000 damaged sessions and rig files, a million telegrams: only our own errors"
 	@echo "make lab [SESSION=path]      open JupyterLab"
 	@echo "make data                    rebuild the simulated sessions in data/ from their seeds"
-	@echo "make picture                 the picture of the README: the first screen of the shipped session's report"
+	@echo "make picture                 the picture of the README: the scene of the shipped session beside its rig"
 	@echo "make clean                   remove the environment, reports and caches"
 
 setup:
@@ -79,12 +79,8 @@ data: setup
 	rmdir data/.new
 	cd data && find $(SIMULATED) -type f | LC_ALL=C sort | xargs sha256sum > SHA256SUMS
 
-picture: export TESTS := 1
 picture: setup
-	$(RUN) -m lrfcal_lib report data/sim_lms221
-	$$(command -v chromium || command -v chromium-browser || command -v google-chrome) --headless --no-sandbox \
-		--hide-scrollbars --window-size=1280,730 --screenshot=reports/.readme.png "file://$$PWD/reports/sim_lms221/index.html"
-	$(RUN) -c "import cv2; cv2.imwrite('reports/readme.jpg', cv2.imread('reports/.readme.png'), [cv2.IMWRITE_JPEG_QUALITY, 85])" && rm reports/.readme.png
+	$(RUN) .ci/picture
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache reports/*/ reports/.sessions reports/.report-*

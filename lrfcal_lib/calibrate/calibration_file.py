@@ -59,7 +59,7 @@ FORMULAS = {
 ROUND = 1e-9  # a rotation's matrix may be off by so much
 
 
-Four = tuple[(FiniteFloat,) * 4]
+Four = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 Unbounded = Annotated[
     float, BeforeValidator(lambda value: np.inf if value is None else value)
 ]
@@ -69,7 +69,7 @@ Matrix = list[list[Unbounded]]
 class PoseWritten(BaseModel):
     """A transform, by its matrix."""
 
-    matrix: tuple[(Four,) * 4]
+    matrix: tuple[Four, Four, Four, Four]
 
     def made(self):
         """As a RigidTransform, to the last bit."""
@@ -96,7 +96,7 @@ class LensWritten(BaseModel):
     fy: Annotated[FiniteFloat, Field(gt=0)]
     cx: FiniteFloat
     cy: FiniteFloat
-    distortion: tuple[(FiniteFloat,) * 5]
+    distortion: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
     covariance: Matrix | None
     rms_px: FiniteFloat | None
 
@@ -352,12 +352,10 @@ def require_same_rig(rig: CalibratedRig, other: Session | CalibratedRig) -> None
     rig : CalibratedRig
     other : Session or CalibratedRig
     """
+    name = other.name
+    sizes: dict[str, Any] = dict(other.cameras)
     if isinstance(other, CalibratedRig):
-        name = f"the calibration of '{other.session}'"
         sizes = {key: camera.model for key, camera in other.cameras.items()}
-    else:
-        name = other.name
-        sizes = other.cameras
     mounts = {key: camera.mount for key, camera in other.cameras.items()}
     differences = [
         *_other_cameras(rig, sizes, mounts),

@@ -69,6 +69,11 @@ class CalibratedRig:
     date: str = ""
 
     @property
+    def name(self) -> str:
+        """For messages."""
+        return f"the calibration of '{self.session}'"
+
+    @property
     def T_head_lrf(self) -> RigidTransform:
         """Of its axis."""
         return self.axis.T_head_lrf

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import KDTree
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -11,7 +12,8 @@ from lrfcal_lib.session.read import Session
 
 NEAR = 0.03  # metres from a true face or edge to a point of the cloud that shows it
 INSIDE = 0.9  # of a face: what is near its rim is not picked
-FEWEST = 60  # points that show a face
+FEWEST = 60  # points about a place, which must show the face
+MEAN = 0.006  # metres by which these may be off it on average
 PLACES = 41  # along an edge, at which one looks whether it can be seen
 
 
@@ -30,8 +32,8 @@ def true_picks(session: Session, rig: CalibratedRig, cloud: Cloud) -> pd.DataFra
     Returns
     -------
     DataFrame
-        A row a length: name, kind, x_m, y_m and z_m of both ends with _1 and _2 (the middle of
-        what the cloud shows of each; platform frame, metres), and true_m. Empty
+        A row a length: name, kind, x_m, y_m and z_m of both ends with _1 and _2 (the place nearest
+        to the middle of each that the cloud shows; platform frame, metres), and true_m. Empty
         where no lengths are stated, as in a recording.
     """
     truth = read_truth(session)
@@ -54,7 +56,7 @@ def true_picks(session: Session, rig: CalibratedRig, cloud: Cloud) -> pd.DataFra
             if kind == "plane":
                 shown = _on_face(cloud, corners)
             if len(shown):
-                away = np.linalg.norm(shown - np.median(shown, axis=0), axis=1)
+                away = np.linalg.norm(shown - corners.mean(axis=0), axis=1)
                 row[f"kind_{number}"] = kind
                 for axis, value in zip("xyz", shown[np.argmin(away)], strict=True):
                     row[f"{axis}_m_{number}"] = float(value)
@@ -64,14 +66,16 @@ def true_picks(session: Session, rig: CalibratedRig, cloud: Cloud) -> pd.DataFra
 
 
 def _on_face(cloud, corners):
-    """Points of a Cloud that lie on a face with these corners (4, 3)."""
-    off = corners - corners.mean(axis=0)
-    axes = np.linalg.svd(off)[2]
-    half = np.abs(off @ axes.T).max(axis=0) * INSIDE + [0.0, 0.0, NEAR]
-    inside = (np.abs((cloud.points - corners.mean(axis=0)) @ axes.T) < half).all(axis=1)
-    facing = np.abs(cloud.normals @ axes[2]) > INSIDE
-    shown = cloud.points[inside & facing]
-    return shown if len(shown) >= FEWEST else shown[:0]
+    """Points of a Cloud about which it shows a face with these corners (4, 3)."""
+    middle = corners.mean(axis=0)
+    axes = np.linalg.svd(corners - middle)[2]
+    half = np.abs((corners - middle) @ axes.T).max(axis=0) * INSIDE + [0.0, 0.0, NEAR]
+    off = (cloud.points - middle) @ axes.T
+    near = (np.abs(off) < half).all(axis=1) & (np.abs(cloud.normals @ axes[2]) > INSIDE)
+    shown = cloud.points[near]
+    _, about = KDTree(cloud.points).query(shown, FEWEST)
+    on_it = np.abs(off[about, 2].mean(axis=1)) < MEAN
+    return shown[on_it]
 
 
 def _on_edge(cloud, ends):

@@ -10,9 +10,11 @@ import pandas as pd
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.judge.uncertainty import chain_of, range_noise
+from lrfcal_lib.calibrate.rig_uncertainty import columns_of
+from lrfcal_lib.judge.uncertainty import SEEN, chain_of, uncertainty_of
 from lrfcal_lib.measure.edges import SceneEdge, edges_of, nearest_edge
 from lrfcal_lib.measure.features import (
+    ALIKE,
     Feature,
     Kind,
     fit_feature,
@@ -24,7 +26,8 @@ from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import Session
 
-REACH = 0.1  # metres from a picked place to its plane or edge
+REACH = 0.1  # metres from a picked place to its plane, and from a click to its edge
+ON_EDGE = 0.01  # metres from a picked place to its edge: a click moves onto it
 ABOUT = 9  # points whose middle a picked point is
 NINETY = 1.645  # standard deviations to either side that hold 90 %
 PLACE = ("x", "y", "z")
@@ -70,16 +73,16 @@ class SceneFeatures:
         Raises
         ------
         DegenerateGeometry
-            If there is none within `REACH`.
+            If there is none within `REACH`, of an edge `ON_EDGE`.
         """
         if kind == Kind.EDGE:
             number, away = nearest_edge(self.edges, place)
-            _refuse_far(kind, away)
+            _refuse_far(kind, away, ON_EDGE)
             return self.edges[number].feature
         away = np.linalg.norm(self.cloud.points - place, axis=1)
         if kind == Kind.PLANE:
             away[self.of_point < 0] = np.inf
-        _refuse_far(kind, away.min(initial=np.inf))
+        _refuse_far(kind, away.min(initial=np.inf), REACH)
         nearest = int(np.argmin(away))
         if kind == Kind.PLANE:
             return self.planes[self.of_point[nearest]]
@@ -87,11 +90,11 @@ class SceneFeatures:
         return fit_feature(self.cloud, about, self.rig, plane=False)
 
 
-def _refuse_far(kind, away):
+def _refuse_far(kind, away, reach):
     """DegenerateGeometry where the feature is too far from what was picked."""
-    if away > REACH:
+    if away > reach:
         raise DegenerateGeometry(
-            f"no {kind} within {1000 * REACH:.0f} mm of it: pick another place, or a point"
+            f"no {kind} within {1000 * reach:.0f} mm of it: pick another place, or a point"
         )
 
 
@@ -216,7 +219,7 @@ def for_page(scene: SceneFeatures) -> dict:
     """What a page needs to measure by clicks, see :func:`lrfcal_lib.plots.interactive.scene_page`.
 
     Every plane and edge with its derivatives by the unknowns that all share, and the covariances of
-    these once; for points the page has the formulas.
+    these once; for points the page has the formulas. That is exact, and 0.3 MB for 300 edges.
 
     Parameters
     ----------
@@ -235,16 +238,28 @@ def for_page(scene: SceneFeatures) -> dict:
         for f in features
     ]
     chain = chain_of(rig)
+    known = uncertainty_of(rig)
+    stations = np.unique(scene.cloud.placement).tolist()
+    still = {"R": np.eye(3).tolist(), "t": [0.0, 0.0, 0.0]}
     return {
         "kinds": [str(feature.kind) for feature in features],
         "cameras": [cameras.index(feature.camera) for feature in features],
         "placements": [feature.placement for feature in features],
         "features": np.array(rows),
         "ends": np.array([edge.ends for edge in scene.edges]).reshape(-1, 6),
-        "covariances": np.array(shared_covariances(rig)),
+        "plane_of_point": scene.of_point,
+        "station_of_point": scene.cloud.placement,
+        "poses": dict.fromkeys(stations, still),
+        "unknowns": len(known.names),
+        "columns": columns_of(known.names).tolist(),
+        "covariances": shared_covariances(rig),
         "unseen": [unseen_motions(rig, camera).tolist() for camera in cameras],
-        "sweep_sigma": list(chain.sweep_sigma),
-        "range_noise": range_noise(rig),
+        "sweep_sigma": known.sweep_sigma,
+        "range_noise": known.range_noise,
         "head": chain.head.tolist(),
+        "alike": ALIKE,
+        "least": SEEN,
+        "reach": REACH,
+        "about": ABOUT,
         "ninety": NINETY,
     }
