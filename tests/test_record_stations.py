@@ -105,3 +105,11 @@ def test_scenes_that_the_plan_lists_keep_their_sweeps_and_numbers():
 def test_options_of_a_scene_need_a_scene(option, capsys):
     assert command_line.main(["record", "rig.json", "s", option]) == 1
     assert "add --scene" in capsys.readouterr().err
+
+
+def test_the_calibration_of_another_rig_is_refused_before_anything_is_recorded(quick):
+    stated = make_rig(rig_data()).stated
+    with pytest.raises(
+        ValueError, match="images of 'left' have 32 x 24 pixels, not 640 x 480"
+    ):
+        Stations(1, quick.rig("joint")).planned(stated)

@@ -14,6 +14,7 @@ PLAY = np.radians(1.0)  # by which a head may come back wrong: backlash
 STEPS = 21  # of the search for it
 # times the scatter between neighbouring scan lines; a rig that stands still has 0.9 to 1.2
 MOVED = 1.8
+LINES = 4  # of a sweep that its closing scan is compared with, or more
 FINEST = 0.002  # metres; below it no two readings differ for sure
 # of the beams; more than a median shows, since not all of them meet what comes nearer
 QUANTILE = 0.8
@@ -94,14 +95,14 @@ def closing_of(sweep: Sweep) -> Closing | None:
     sweep, closing = without_closing(sweep)
     if closing is None:
         return None
-    order = np.argsort(sweep.pitch, kind="stable")
-    pitch = sweep.pitch[order]
     at = closing.pitch.mean()
-    near = np.flatnonzero(np.abs(pitch - at) < 2 * PLAY)
-    if len(near) < 3:
+    away = np.abs(sweep.pitch - at)
+    near = np.flatnonzero(away <= max(2 * PLAY, np.sort(away)[:LINES].max()))
+    near = near[np.argsort(sweep.pitch[near])]
+    pitch = sweep.pitch[near]
+    ranges = sweep.ranges[near]
+    if len(near) < LINES:
         return None
-    pitch = pitch[near]
-    ranges = sweep.ranges[order[near]]
     last = np.nanmean(closing.ranges, axis=0)
     between = ranges[1:-1] - (ranges[:-2] + ranges[2:]) / 2
     apart = []
