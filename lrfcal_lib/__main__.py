@@ -38,6 +38,21 @@ def run(args):
             return reconstruct_session(
                 args.session, args.calibration, args.out, args.untrusted
             )
+        case "merge":
+            from lrfcal_lib.report.merge import merge_session
+
+            return merge_session(args.session, args.calibration, args.out, args.untrusted)
+        case "measure":
+            from lrfcal_lib.report.measure import measure_session
+
+            return measure_session(
+                args.session,
+                args.calibration,
+                args.picks,
+                args.out,
+                args.station,
+                args.untrusted,
+            )
         case "report":
             from lrfcal_lib.report.report import main
 
@@ -146,6 +161,7 @@ def parser():
     verbs = top.add_subparsers(title="verbs", metavar="VERB", dest="verb", required=True)
     _add_import(verbs)
     _add_sessions(verbs)
+    _add_measure(verbs)
     _add_rigs(verbs)
     _add_report(verbs)
     return top
@@ -198,18 +214,43 @@ def _add_sessions(verbs):
     )
     compare.add_argument("--figure", metavar="PNG", help="also draw them")
 
-    reconstruct = verbs.add_parser(
-        "reconstruct", help="make coloured clouds of a scene with a calibration of its rig"
-    )
-    reconstruct.add_argument("session", help="as 'record --scene' recorded it")
-    reconstruct.add_argument("--calibration", required=True, help="calibration.json")
-    reconstruct.add_argument(
+    words = "make coloured clouds of a scene with a calibration of its rig"
+    _add_scene(verbs.add_parser("reconstruct", help=words))
+    _add_scene(verbs.add_parser("merge", help="join the stations of a scene in one cloud"))
+
+
+def _add_scene(verb):
+    """What the use of a calibration on a scene takes."""
+    verb.add_argument("session", help="as 'record --scene' recorded it")
+    verb.add_argument("--calibration", required=True, help="calibration.json")
+    verb.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
-    reconstruct.add_argument(
+    verb.add_argument(
         "--untrusted",
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",
+    )
+
+
+def _add_measure(verbs):
+    """The verb that measures in a scene."""
+    measure = verbs.add_parser(
+        "measure", help="measure lengths between places picked in scene.html"
+    )
+    measure.add_argument("session", help="as 'record --scene' recorded it")
+    measure.add_argument("--calibration", required=True, help="calibration.json")
+    measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
+    measure.add_argument(
+        "--station", type=int, help="whose scene.html, if there are several"
+    )
+    measure.add_argument(
+        "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"
+    )
+    measure.add_argument(
+        "--untrusted",
+        action="store_true",
+        help="even if the verdict on the calibration is 'no'",
     )
 
 

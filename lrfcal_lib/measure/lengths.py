@@ -7,8 +7,10 @@ from os import PathLike
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.calibrate.cloud import Cloud
+from lrfcal_lib.calibrate.cloud import Cloud, join
+from lrfcal_lib.calibrate.clouds import views_of
 from lrfcal_lib.calibrate.painting import View
+from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.judge.uncertainty import SEEN, chain_of, uncertainty_of
@@ -24,6 +26,7 @@ from lrfcal_lib.measure.features import (
 )
 from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.read import Session
 
 REACH = 0.1  # metres from a picked place to its plane, and from a click to its edge
@@ -110,7 +113,7 @@ def features_of(
     rig : CalibratedRig
     views : sequence of View
     pitches : sequence of float
-        Of the head at each view, radians, see :func:`pitches_of`.
+        Of the head at each view, radians.
 
     Returns
     -------
@@ -121,12 +124,40 @@ def features_of(
     return SceneFeatures(cloud, rig, planes, of_point, edges)
 
 
-def pitches_of(
-    session: Session, rig: CalibratedRig, placement: int, views: Sequence[View]
-) -> list[float]:
-    """The pitch of the head at views of a placement, radians."""
+def features_of_station(
+    session: Session, rig: CalibratedRig, number: int, cloud: Cloud | None = None
+) -> SceneFeatures:
+    """All planes and edges that a station of a session shows.
+
+    Parameters
+    ----------
+    session : Session
+    rig : CalibratedRig
+    number : int
+        Placement.
+    cloud : Cloud, optional
+        Of it, platform frame, if it is there already.
+
+    Returns
+    -------
+    SceneFeatures
+    """
+    views = views_of(session, rig, number)
     recorded = [session.image_records[view.number].pitch for view in views]
-    return [float(rig.corrections.pitch(placement, pitch)) for pitch in recorded]
+    pitches = [float(rig.corrections.pitch(number, pitch)) for pitch in recorded]
+    if cloud is None:
+        sweep, _ = without_closing(session.sweep(number))
+        cloud = join(
+            reconstruct(
+                sweep,
+                views,
+                rig.T_head_lrf,
+                rig.corrections,
+                lrf=session.lrf,
+                continuous=session.continuous,
+            )
+        )
+    return features_of(cloud, rig, views, pitches)
 
 
 def measure(scene: SceneFeatures, picks: pd.DataFrame) -> pd.DataFrame:

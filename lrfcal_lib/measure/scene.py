@@ -19,6 +19,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.cloud_files import write_pcd
 from lrfcal_lib.measure.e57 import E57Writer, new_guid
 from lrfcal_lib.measure.features import with_sigma
+from lrfcal_lib.measure.lengths import features_of_station, for_page
 from lrfcal_lib.plots.interactive import MOST_POINTS, rig_lines, scene_page
 from lrfcal_lib.preprocess.closing_scan import closing_of, without_closing
 from lrfcal_lib.session.faults import repeated_scans
@@ -202,7 +203,8 @@ def write_scene(
     session : Session
     rig : CalibratedRig
     poses : dict of int to RigidTransform
-        ``T_scene_platform`` of the stations by their number; the identity for a single one.
+        ``T_scene_platform`` of the stations by their number; the identity for a single one, in
+        whose page one can measure.
     about : str
         Where it is from and whether to trust it, for every file.
     told : callable
@@ -235,7 +237,20 @@ def write_scene(
             for name, camera in rig.cameras.items()
         }
         lines = rig_lines(rig.T_head_lrf, cameras)
-        scene_page(page_draft, shown.points, shown.colors, shown.seen, lines, note=about)
+        measuring = None
+        if len(poses) == 1:
+            (number,) = poses
+            measuring = for_page(features_of_station(session, rig, number, shown))
+        scene_page(
+            page_draft,
+            shown.points,
+            shown.colors,
+            shown.seen,
+            lines,
+            note=about,
+            title=f"{session.name}, station {', '.join(map(str, poses))}",
+            measuring=measuring,
+        )
     return [ply, pcd, e57, page]
 
 
