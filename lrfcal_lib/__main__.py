@@ -57,6 +57,10 @@ def run(args):
             from lrfcal_lib.report.report import main
 
             return main(args.sessions, args.out, args.jobs, args.store)
+        case "study":
+            from lrfcal_lib.report.study import study
+
+            return study(args)
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
@@ -164,6 +168,7 @@ def parser():
     _add_measure(verbs)
     _add_rigs(verbs)
     _add_report(verbs)
+    _add_study(verbs)
     return top
 
 
@@ -330,6 +335,45 @@ def _add_report(verbs):
         "--store",
         action="store_true",
         help="store the executed notebooks instead of a report",
+    )
+
+
+def _add_study(verbs):
+    study = verbs.add_parser(
+        "study",
+        help="compare methods on many drawn sessions of published and other set-ups",
+    )
+    study.add_argument("scenarios", nargs="+", metavar="SCENARIO", help="e.g. paper_rig")
+    study.add_argument("--methods", nargs="+", help="default: all that single shots allow")
+    study.add_argument(
+        "--poses",
+        nargs="+",
+        type=int,
+        metavar="N",
+        help="placements (default 5 10 20 50 100)",
+    )
+    study.add_argument("--trials", type=int, default=100, help="of each (default 100)")
+    study.add_argument("--seed", type=int, default=0)
+    study.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="KEY=V,V,...",
+        help="e.g. step_deg=0.25,0.5; several times: every combination",
+    )
+    study.add_argument(
+        "--out",
+        required=True,
+        help="the table, CSV; a killed study goes on when asked again",
+    )
+    _add_scheduler(study)
+
+
+def _add_scheduler(verb):
+    verb.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a Dask cluster, e.g. tcp://10.0.0.1:8786 (default: the cores of this machine)",
     )
 
 
