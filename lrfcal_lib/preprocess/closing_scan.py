@@ -1,4 +1,4 @@
-"""The scan that closes a sweep, back at its first pitch: whether the rig stood still meanwhile.
+"""The scan that closes a sweep, back in its first half: whether the rig stood still meanwhile.
 
 It shows what changes the ranges at that pitch: a shift along a wall that fills the scan does not.
 """
@@ -10,6 +10,7 @@ import numpy as np
 
 from lrfcal_lib.session.read import Sweep
 
+FIRST = 0.6  # share of the way, up to which a scan closes a sweep
 FEW = 0.1  # share of a sweep's scan lines, above which it was swept both ways instead
 PLAY = np.radians(1.0)  # by which a head may come back wrong: backlash
 # times the scatter between neighbouring scan lines; a rig that stands still has 0.4 to 1.0
@@ -23,7 +24,7 @@ LEAST = 20  # beams that must be there to compare
 
 @dataclass(frozen=True)
 class Closing:
-    """How the last scan of a sweep agrees with its first ones.
+    """How the last scan of a sweep agrees with those of about its pitch.
 
     Attributes
     ----------
@@ -60,7 +61,7 @@ def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
     )
     turn = int(np.argmax(way * pitch)) + 1
     back = np.arange(turn, count)
-    far = np.abs(pitch[turn:] - pitch[0]) < 0.5 * np.ptp(pitch)
+    far = np.abs(pitch[turn:] - pitch[0]) < FIRST * np.ptp(pitch)
     if not far.any() or len(back) > max(1, FEW * count):
         return sweep, None
     return _lines(sweep, slice(0, turn)), _lines(sweep, back[far])
@@ -97,13 +98,14 @@ def closing_of(sweep: Sweep) -> Closing | None:
         return None
     away = np.abs(sweep.pitch - closing.pitch.mean())
     near = np.argsort(away, kind="stable")[: max(LINES, np.sum(away <= PLAY))]
-    lines = sweep.ranges[np.sort(near)]
+    _, stops = np.unique(sweep.pitch[near], return_index=True)
+    lines = sweep.ranges[near[stops]]
     last = closing.ranges[-1]
     apart = [_apart(last, line) for line in lines]
     expected = [_apart(*pair) for pair in pairwise(lines)]
     if not (np.isfinite(apart).any() and np.isfinite(expected).any()):
         return None
-    return Closing(float(np.nanmin(apart)), float(np.nanmax(expected)))
+    return Closing(float(np.nanmin(apart)), float(np.nanmedian(expected)))
 
 
 def _apart(first, second):
