@@ -111,7 +111,7 @@ class Stations(Boards):
             )
         else:
             text = (
-                f"back at its first pitch, ranges differ by {1000 * closing.apart:.0f} mm, "
+                f"back at a pitch that it had, ranges differ by {1000 * closing.apart:.0f} mm, "
                 f"by {1000 * closing.expected:.0f} mm between neighbouring scan lines"
             )
             still = Light("stood still", "ok", text)

@@ -89,8 +89,8 @@ def _refuse_moved(session, number):
     closing = closing_of(sweep)
     if closing is not None and closing.moved:
         raise ValueError(
-            f"{session.path}: station {number} moved while it was recorded: back at its first "
-            f"pitch, ranges differ by {1000 * closing.apart:.0f} mm, by "
+            f"{session.path}: station {number} moved while it was recorded: back at a pitch "
+            f"that it had, ranges differ by {1000 * closing.apart:.0f} mm, by "
             f"{1000 * closing.expected:.0f} mm between neighbouring scan lines: {again}"
         )
     steps = np.abs(np.diff(sweep.time_s))[np.diff(sweep.pitch) != 0]
