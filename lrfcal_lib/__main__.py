@@ -20,10 +20,8 @@ def run(args):
 
             with side_by_side():
                 return calibrate_session(args.session, args.out)
-        case "compare":
-            from lrfcal_lib.report.compare import compare_files
-
-            return compare_files(args.calibrations, args.figure)
+        case "compare" | "reconstruct" | "merge" | "measure":
+            return use_calibrations(args)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
@@ -32,6 +30,29 @@ def run(args):
             print(f"{args.dst}: simulated")
         case "record":
             return record(args)
+        case "report":
+            from lrfcal_lib.report.report import main
+
+            return main(args.sessions, args.out, args.jobs, args.store)
+        case "study":
+            from lrfcal_lib.report.study import study
+
+            return study(args)
+        case "emulate":
+            from lrfcal_lib.emulators.rig import main
+
+            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
+        case "board":
+            print_board(args)
+
+
+def use_calibrations(args):
+    """Do what a verb asks for that takes calibration.json."""
+    match args.verb:
+        case "compare":
+            from lrfcal_lib.report.compare import compare_files
+
+            return compare_files(args.calibrations, args.figure)
         case "reconstruct":
             from lrfcal_lib.report.reconstruct import reconstruct_session
 
@@ -53,20 +74,6 @@ def run(args):
                 args.station,
                 args.untrusted,
             )
-        case "report":
-            from lrfcal_lib.report.report import main
-
-            return main(args.sessions, args.out, args.jobs, args.store)
-        case "study":
-            from lrfcal_lib.report.study import study
-
-            return study(args)
-        case "emulate":
-            from lrfcal_lib.emulators.rig import main
-
-            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
-        case "board":
-            print_board(args)
 
 
 def print_board(args):
