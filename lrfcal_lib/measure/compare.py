@@ -384,7 +384,7 @@ def rig_at(path: str | Path) -> CalibratedRig:
         if method is None:
             raise ValueError(f"{path}: cannot be calibrated; 'calibrate' says why")
         return calibration.rig(method)
-    return load_calibration(path / "calibration.json" if path.is_dir() else path)
+    return load_calibration(path)
 
 
 def history(rigs: Sequence[CalibratedRig]) -> list[Comparison]:
