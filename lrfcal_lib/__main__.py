@@ -15,11 +15,7 @@ def run(args):
         case "check":
             return check(args)
         case "calibrate":
-            from lrfcal_lib.report.calibrate import calibrate_session
-            from lrfcal_lib.session.workers import side_by_side
-
-            with side_by_side():
-                return calibrate_session(args.session, args.out)
+            return calibrate(args)
         case "compare" | "reconstruct" | "merge" | "measure":
             return use_calibrations(args)
         case "simulate":
@@ -100,6 +96,19 @@ def import_recording(args):
 
     miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
     print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
+
+
+def calibrate(args):
+    """Calibrate the rig of a session, on the cores of this machine or a cluster."""
+    from lrfcal_lib.report.calibrate import calibrate_session
+    from lrfcal_lib.session.cluster import workers_at
+    from lrfcal_lib.session.workers import side_by_side
+
+    if args.scheduler is None:
+        with side_by_side():
+            return calibrate_session(args.session, args.out)
+    with workers_at(args.scheduler) as executor, side_by_side(executor):
+        return calibrate_session(args.session, args.out)
 
 
 def check(args):
@@ -214,6 +223,7 @@ def _add_sessions(verbs):
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
+    _add_scheduler(calibrate)
 
     compare = verbs.add_parser(
         "compare", help="say how far calibrations of one rig differ, beside what they claim"

@@ -131,10 +131,10 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     DataFrame
         Columns scenario, what was varied of it, n_poses, method, trials, failed, failures (why,
         how often); of rotation (deg) and translation (mm) the median with its 90 % bootstrap
-        interval (``_low``, ``_high``) over all trials that gave an estimate, the root mean square
-        (``_rmse``) over those that did not fail, and Cramer-Rao bounds with unknown (``_bound``)
-        and known (``_known``) sensor; of trials that did not fail rmse_over_bound, nees and
-        coverage of the six numbers of the pose.
+        interval (``_low``, ``_high``) and the mean over all trials that gave an estimate, the root
+        mean square (``_rmse``) over those that did not fail, and Cramer-Rao bounds with unknown
+        (``_bound``) and known (``_known``) sensor; of trials that did not fail rmse_over_bound,
+        nees and coverage of the six numbers of the pose.
     """
     keys = ["scenario", "n_poses", "method"]
     rows = rows.reindex(
@@ -169,6 +169,7 @@ def _summed_up(part):
         low, high = median_interval(errors)
         column = f"{name}_{unit}"
         row[column] = np.median(errors) if len(errors) else np.nan
+        row[f"{column}_mean"] = np.mean(errors) if len(errors) else np.nan
         row[f"{column}_low"] = low
         row[f"{column}_high"] = high
         if len(good):

@@ -26,6 +26,7 @@ REACH = 2  # beams kept on either side of an edge, along and across the scan lin
 CLEAR = 1.3  # spot radii between a crossing and a second edge
 FEWEST_BEAMS = 8
 MOST_ROUNDS = 200
+LEAST_DEPTH = 0.1  # of a corner before the camera, metres: nearer, its pixel means nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -403,7 +404,7 @@ def _shots(setup, rng, T_camera_lrf):
     corners = board.corners @ true[..., :2].mT + true[:, None, :, 3]
     uv = pinhole(corners, setup.model)
     inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
-    ahead = (corners[..., 2] > 0).all(axis=1)
+    ahead = (corners[..., 2] > LEAST_DEPTH).all(axis=1)
     if setup.whole_image:
         ahead &= inside.all(axis=(1, 2))
     conditions = {
@@ -412,7 +413,8 @@ def _shots(setup, rng, T_camera_lrf):
         "are not in the image": ahead,
     }
 
-    boards, covariance = _seen_poses(setup, true, rng, 1.0)
+    shown = np.where(ahead[:, None, None], true, true[ahead.argmax()])
+    boards, covariance = _seen_poses(setup, shown, rng, 1.0)
     noisy = ranges + setup.range_errors(rng, ranges.shape)
     homography = (
         setup.model.matrix @ true[..., [0, 1, 3]]
