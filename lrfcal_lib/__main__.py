@@ -15,11 +15,7 @@ def run(args):
         case "check":
             return check(args)
         case "calibrate":
-            from lrfcal_lib.report.calibrate import calibrate_session
-            from lrfcal_lib.session.workers import side_by_side
-
-            with side_by_side():
-                return calibrate_session(args.session, args.out)
+            return calibrate(args)
         case "compare":
             from lrfcal_lib.report.compare import compare_files
 
@@ -42,10 +38,25 @@ def run(args):
             from lrfcal_lib.report.merge import merge_session
 
             return merge_session(args.session, args.calibration, args.out, args.untrusted)
+        case "measure":
+            from lrfcal_lib.report.measure import measure_session
+
+            return measure_session(
+                args.session,
+                args.calibration,
+                args.picks,
+                args.out,
+                args.station,
+                args.untrusted,
+            )
         case "report":
             from lrfcal_lib.report.report import main
 
             return main(args.sessions, args.out, args.jobs, args.store)
+        case "study":
+            from lrfcal_lib.report.study import study
+
+            return study(args)
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
@@ -78,6 +89,19 @@ def import_recording(args):
 
     miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
     print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
+
+
+def calibrate(args):
+    """Calibrate the rig of a session, on the cores of this machine or a cluster."""
+    from lrfcal_lib.report.calibrate import calibrate_session
+    from lrfcal_lib.session.cluster import workers_at
+    from lrfcal_lib.session.workers import side_by_side
+
+    if args.scheduler is None:
+        with side_by_side():
+            return calibrate_session(args.session, args.out)
+    with workers_at(args.scheduler) as executor, side_by_side(executor):
+        return calibrate_session(args.session, args.out)
 
 
 def check(args):
@@ -150,8 +174,10 @@ def parser():
     verbs = top.add_subparsers(title="verbs", metavar="VERB", dest="verb", required=True)
     _add_import(verbs)
     _add_sessions(verbs)
+    _add_measure(verbs)
     _add_rigs(verbs)
     _add_report(verbs)
+    _add_study(verbs)
     return top
 
 
@@ -190,6 +216,7 @@ def _add_sessions(verbs):
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
+    _add_scheduler(calibrate)
 
     compare = verbs.add_parser(
         "compare", help="say how far calibrations of one rig differ, beside what they claim"
@@ -218,6 +245,27 @@ def _add_scene(verb):
         "--untrusted",
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",
+    )
+
+
+def _add_measure(verbs):
+    """The verb that measures in a scene."""
+    measure = verbs.add_parser(
+        "measure", help="measure lengths between places picked in scene.html"
+    )
+    measure.add_argument("session", help="as 'record --scene' recorded it")
+    measure.add_argument("--calibration", required=True, help="calibration.json")
+    measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
+    measure.add_argument(
+        "--station", type=int, help="whose scene.html, if there are several"
+    )
+    measure.add_argument(
+        "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"
+    )
+    measure.add_argument(
+        "--untrusted",
+        action="store_true",
+        help="even if the verdict on the calibration is 'no'",
     )
 
 
@@ -297,6 +345,45 @@ def _add_report(verbs):
         "--store",
         action="store_true",
         help="store the executed notebooks instead of a report",
+    )
+
+
+def _add_study(verbs):
+    study = verbs.add_parser(
+        "study",
+        help="compare methods on many drawn sessions of published and other set-ups",
+    )
+    study.add_argument("scenarios", nargs="+", metavar="SCENARIO", help="e.g. paper_rig")
+    study.add_argument("--methods", nargs="+", help="default: all that single shots allow")
+    study.add_argument(
+        "--poses",
+        nargs="+",
+        type=int,
+        metavar="N",
+        help="placements (default 5 10 20 50 100)",
+    )
+    study.add_argument("--trials", type=int, default=100, help="of each (default 100)")
+    study.add_argument("--seed", type=int, default=0)
+    study.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="KEY=V,V,...",
+        help="e.g. step_deg=0.25,0.5; several times: every combination",
+    )
+    study.add_argument(
+        "--out",
+        required=True,
+        help="the table, CSV; a killed study goes on when asked again",
+    )
+    _add_scheduler(study)
+
+
+def _add_scheduler(verb):
+    verb.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a Dask cluster, e.g. tcp://10.0.0.1:8786 (default: the cores of this machine)",
     )
 
 

@@ -291,9 +291,8 @@ class _Test:
         sigma = np.sqrt(np.diag(self.covariance)[index])
         z = np.array(list(self.steps.values()))[index] / sigma
         correlation = self.covariance[np.ix_(index, index)] / np.outer(sigma, sigma)
-        size, axes = np.linalg.eigh(correlation)
-        told = size > TOLD * size.max(initial=0.0)
-        return float(np.sum((axes.T @ z)[told] ** 2 / size[told])), int(told.sum())
+        inverse = np.linalg.pinv(correlation, rcond=TOLD, hermitian=True)
+        return float(z @ inverse @ z), int(np.linalg.matrix_rank(inverse, hermitian=True))
 
 
 def _exceeds(chi2, freedom):
