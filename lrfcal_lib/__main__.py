@@ -112,7 +112,9 @@ def calibrate(args):
 
 
 def check(args):
-    """Say what is wrong with a session: 0 where nothing is, else 1."""
+    """Say what is wrong with a session: 0 where nothing is, else 1. With a calibration 3 where that
+    has moved, 2 where it cannot be told.
+    """
     from lrfcal_lib.session.read import open_session, validate
     from lrfcal_lib.session.shown import printable
 
@@ -128,6 +130,10 @@ def check(args):
     elif count < FEW:
         needed = f"{FEW} or more are needed to see errors of the model"
         print(f"warning: {count} placements of the board; {needed}")
+    if args.calibration is not None:
+        from lrfcal_lib.report.holds import check_calibration
+
+        return check_calibration(session, args.calibration)
     return 0
 
 
@@ -210,6 +216,11 @@ def _add_sessions(verbs):
     """Verbs that make or use a session without devices."""
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
+    check.add_argument(
+        "--calibration",
+        metavar="JSON",
+        help="a calibration.json: does it still hold for the rig that recorded this session?",
+    )
 
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
