@@ -15,15 +15,9 @@ def run(args):
         case "check":
             return check(args)
         case "calibrate":
-            from lrfcal_lib.report.calibrate import calibrate_session
-            from lrfcal_lib.session.workers import side_by_side
-
-            with side_by_side():
-                return calibrate_session(args.session, args.out)
-        case "compare":
-            from lrfcal_lib.report.compare import compare_files
-
-            return compare_files(args.calibrations, args.figure)
+            return calibrate(args)
+        case "compare" | "reconstruct" | "merge" | "measure":
+            return use_calibrations(args)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
@@ -32,12 +26,39 @@ def run(args):
             print(f"{args.dst}: simulated")
         case "record":
             return record(args)
+        case "report":
+            from lrfcal_lib.report.report import main
+
+            return main(args.sessions, args.out, args.jobs, args.store)
+        case "study":
+            from lrfcal_lib.report.study import study
+
+            return study(args)
+        case "emulate":
+            from lrfcal_lib.emulators.rig import main
+
+            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
+        case "board":
+            print_board(args)
+
+
+def use_calibrations(args):
+    """Do what a verb asks for that takes calibration.json."""
+    match args.verb:
+        case "compare":
+            from lrfcal_lib.report.compare import compare_files
+
+            return compare_files(args.calibrations, args.figure)
         case "reconstruct":
             from lrfcal_lib.report.reconstruct import reconstruct_session
 
             return reconstruct_session(
                 args.session, args.calibration, args.out, args.untrusted
             )
+        case "merge":
+            from lrfcal_lib.report.merge import merge_session
+
+            return merge_session(args.session, args.calibration, args.out, args.untrusted)
         case "measure":
             from lrfcal_lib.report.measure import measure_session
 
@@ -49,16 +70,6 @@ def run(args):
                 args.station,
                 args.untrusted,
             )
-        case "report":
-            from lrfcal_lib.report.report import main
-
-            return main(args.sessions, args.out, args.jobs, args.store)
-        case "emulate":
-            from lrfcal_lib.emulators.rig import main
-
-            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
-        case "board":
-            print_board(args)
 
 
 def print_board(args):
@@ -87,8 +98,23 @@ def import_recording(args):
     print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
 
 
+def calibrate(args):
+    """Calibrate the rig of a session, on the cores of this machine or a cluster."""
+    from lrfcal_lib.report.calibrate import calibrate_session
+    from lrfcal_lib.session.cluster import workers_at
+    from lrfcal_lib.session.workers import side_by_side
+
+    if args.scheduler is None:
+        with side_by_side():
+            return calibrate_session(args.session, args.out)
+    with workers_at(args.scheduler) as executor, side_by_side(executor):
+        return calibrate_session(args.session, args.out)
+
+
 def check(args):
-    """Say what is wrong with a session: 0 where nothing is, else 1."""
+    """Say what is wrong with a session: 0 where nothing is, else 1. With a calibration 3 where that
+    has moved, 2 where it cannot be told.
+    """
     from lrfcal_lib.session.read import open_session, validate
     from lrfcal_lib.session.shown import printable
 
@@ -104,6 +130,10 @@ def check(args):
     elif count < FEW:
         needed = f"{FEW} or more are needed to see errors of the model"
         print(f"warning: {count} placements of the board; {needed}")
+    if args.calibration is not None:
+        from lrfcal_lib.report.holds import check_calibration
+
+        return check_calibration(session, args.calibration)
     return 0
 
 
@@ -160,6 +190,7 @@ def parser():
     _add_measure(verbs)
     _add_rigs(verbs)
     _add_report(verbs)
+    _add_study(verbs)
     return top
 
 
@@ -185,6 +216,11 @@ def _add_sessions(verbs):
     """Verbs that make or use a session without devices."""
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
+    check.add_argument(
+        "--calibration",
+        metavar="JSON",
+        help="a calibration.json: does it still hold for the rig that recorded this session?",
+    )
 
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
@@ -198,6 +234,7 @@ def _add_sessions(verbs):
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
+    _add_scheduler(calibrate)
 
     compare = verbs.add_parser(
         "compare", help="say how far calibrations of one rig differ, beside what they claim"
@@ -210,15 +247,19 @@ def _add_sessions(verbs):
     )
     compare.add_argument("--figure", metavar="PNG", help="also draw them")
 
-    reconstruct = verbs.add_parser(
-        "reconstruct", help="make coloured clouds of a scene with a calibration of its rig"
-    )
-    reconstruct.add_argument("session", help="as 'record --scene' recorded it")
-    reconstruct.add_argument("--calibration", required=True, help="calibration.json")
-    reconstruct.add_argument(
+    words = "make coloured clouds of a scene with a calibration of its rig"
+    _add_scene(verbs.add_parser("reconstruct", help=words))
+    _add_scene(verbs.add_parser("merge", help="join the stations of a scene in one cloud"))
+
+
+def _add_scene(verb):
+    """What the use of a calibration on a scene takes."""
+    verb.add_argument("session", help="as 'record --scene' recorded it")
+    verb.add_argument("--calibration", required=True, help="calibration.json")
+    verb.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
-    reconstruct.add_argument(
+    verb.add_argument(
         "--untrusted",
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",
@@ -322,6 +363,45 @@ def _add_report(verbs):
         "--store",
         action="store_true",
         help="store the executed notebooks instead of a report",
+    )
+
+
+def _add_study(verbs):
+    study = verbs.add_parser(
+        "study",
+        help="compare methods on many drawn sessions of published and other set-ups",
+    )
+    study.add_argument("scenarios", nargs="+", metavar="SCENARIO", help="e.g. paper_rig")
+    study.add_argument("--methods", nargs="+", help="default: all that single shots allow")
+    study.add_argument(
+        "--poses",
+        nargs="+",
+        type=int,
+        metavar="N",
+        help="placements (default 5 10 20 50 100)",
+    )
+    study.add_argument("--trials", type=int, default=100, help="of each (default 100)")
+    study.add_argument("--seed", type=int, default=0)
+    study.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="KEY=V,V,...",
+        help="e.g. step_deg=0.25,0.5; several times: every combination",
+    )
+    study.add_argument(
+        "--out",
+        required=True,
+        help="the table, CSV; a killed study goes on when asked again",
+    )
+    _add_scheduler(study)
+
+
+def _add_scheduler(verb):
+    verb.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a Dask cluster, e.g. tcp://10.0.0.1:8786 (default: the cores of this machine)",
     )
 
 

@@ -7,8 +7,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from lrfcal_lib.calibrate.reconstruct import after_middle
+from lrfcal_lib.calibrate.reconstruct import grid_normals
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.measure.pulls import directions
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import LrfInfo
 
@@ -19,6 +21,7 @@ STEEPEST = 0.1  # of a jump from one reading to the next: a rim, no slanted surf
 REACH = 5.0  # steps about a place, in which its rim is straight
 FEWEST = 6  # places of a straight rim
 STRAIGHT = 0.6  # steps: standard deviation of places across a rim
+LEAST_COSINE = 0.05  # of incidence
 LEAST_STEP = np.radians(0.01)  # of a head that rests nearly
 SAME_SURFACE = 0.05  # of the range: neighbours along a rim
 
@@ -33,8 +36,13 @@ class DepthJumps:
         Of the rim as beams have it, corrected: radians, radians, metres.
     along, outward : ndarray, shape (n, 2)
         Unit vectors of bearing and pitch along the rim, and away from the nearer surface.
+    slope : ndarray, shape (n,)
+        By which the range of the nearer surface grows outwards, metres a radian.
     behind : ndarray, shape (n,)
         Range of the farther surface, metres.
+    returns : ndarray, shape (n,)
+        Log of what the farther surface sends back over what the nearer one does, as distance and
+        incidence tell it: the reflectivity is not in it.
     radius : ndarray, shape (n,)
         Of the spot at the rim, metres.
     rim : ndarray of int, shape (n,)
@@ -46,7 +54,9 @@ class DepthJumps:
     range: np.ndarray
     along: np.ndarray
     outward: np.ndarray
+    slope: np.ndarray
     behind: np.ndarray
+    returns: np.ndarray
     radius: np.ndarray
     rim: np.ndarray
 
@@ -71,25 +81,31 @@ def depth_jumps(
     DepthJumps
         None, of zero rows, where nothing stands before anything else.
     """
-    pitch = np.repeat(sweep.pitch[:, None], len(sweep.bearings), axis=1)
-    if continuous and len(sweep.pitch) > 1:
-        rate = np.gradient(sweep.pitch, sweep.time_s)
-        pitch = pitch + rate[:, None] * after_middle(sweep.bearings, lrf)
-    pitch = pitch * (1 + rig.corrections.pitch_scale)
+    grid = directions(sweep, rig, lrf, continuous)
     ranges = sweep.ranges - rig.corrections.range_offset
-    grid = np.stack([np.broadcast_to(sweep.bearings, pitch.shape), pitch], axis=-1)
-
-    found = [_crossings(ranges, grid, lrf)]
+    energy = _energy(ranges, grid, rig)
+    found = [_crossings(ranges, grid, energy, lrf)]
     if len(sweep.pitch) > 1:
-        found.append(_crossings(ranges.T, np.swapaxes(grid, 0, 1), lrf))
-    place, outward, near, far = (np.concatenate(part) for part in zip(*found, strict=True))
-    return _straight(place, outward, near, far, lrf)
+        found.append(_crossings(ranges.T, np.swapaxes(grid, 0, 1), energy.T, lrf))
+    return _straight(*(np.concatenate(part) for part in zip(*found, strict=True)), lrf)
 
 
-def _crossings(ranges, grid, lrf):
+def _energy(ranges, grid, rig):
+    """Log (l, b) of what a matt surface sends back: by its distance and incidence."""
+    bearing, pitch = np.moveaxis(grid, -1, 0)
+    p_lrf = polar_to_points(ranges, bearing)
+    points = lrf_to_platform(p_lrf, pitch, rig.T_head_lrf)
+    origin = lrf_to_platform(np.zeros(3), pitch, rig.T_head_lrf)
+    normals, _ = grid_normals(points, origin)
+    cosine = np.vecdot(normals, origin - points) / ranges
+    return np.log(np.nan_to_num(cosine, nan=1.0).clip(LEAST_COSINE)) - 2 * np.log(ranges)
+
+
+def _crossings(ranges, grid, energy, lrf):
     """Jumps along the second axis of ranges (l, b) at directions (l, b, 2).
 
-    Directions (n, 2) of the jump and outwards, range of the nearer side and height of the jump.
+    Directions (n, 2) of the jump and outwards, range and slope of the nearer side, range of the
+    farther one and what it returns.
     """
     steps = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
     step = max(float(np.median(steps)), LEAST_STEP)
@@ -97,7 +113,7 @@ def _crossings(ranges, grid, lrf):
     gap = int(np.ceil(lrf.spot_radius(typical) / typical / step))
     side = gap + BESIDE
     if ranges.shape[1] < 2 * side:
-        return (np.zeros(shape) for shape in ((0, 2), (0, 2), 0, 0))
+        return (np.zeros(shape) for shape in ((0, 2), (0, 2), 0, 0, 0, 0))
     windows = np.lib.stride_tricks.sliding_window_view(ranges, 2 * side, axis=1)
     first, first_slope, first_rough = _rim(windows[..., :BESIDE], side)
     last, last_slope, last_rough = _rim(windows[..., ::-1][..., :BESIDE], side)
@@ -107,7 +123,9 @@ def _crossings(ranges, grid, lrf):
         beyond = (windows - middle) * np.sign(jump)[..., None] > 0
         clear = np.abs(jump) > LEAST_JUMP
         clear &= np.maximum(first_rough, last_rough) < ROUGH * lrf.sigma_range
-        clear &= np.maximum(first_slope, last_slope) < STEEPEST * np.abs(jump)
+        clear &= np.maximum(np.abs(first_slope), np.abs(last_slope)) < STEEPEST * np.abs(
+            jump
+        )
     clear &= np.isfinite(windows).all(axis=-1)
     clear &= ~beyond[..., :side].any(axis=-1) & beyond[..., side:].all(axis=-1)
     line, start = np.nonzero(clear)
@@ -120,21 +138,25 @@ def _crossings(ranges, grid, lrf):
     near = np.minimum(first, last)[line, start]
     far = np.maximum(first, last)[line, start]
     outward = sign[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
-    return before + share * way, outward, near, far
+    more = energy[line, start + 2 * side - BESIDE // 2] - energy[line, start + BESIDE // 2]
+    slope = np.where(sign > 0, first_slope[line, start], last_slope[line, start]) / step
+    return before + share * way, outward, near, slope, far, sign * more
 
 
 def _rim(readings, side):
-    """Readings (..., BESIDE) drawn on to the middle of 2 `side` of them: range, slope (size), and
+    """Readings (..., BESIDE) drawn on to the middle of 2 `side` of them: range, slope, and
     scatter about the line.
     """
     at = np.arange(BESIDE) - (BESIDE - 1) / 2
     mean = readings.mean(axis=-1)
     slope = readings @ at / (at @ at)
-    rough = np.sqrt(np.mean((readings - mean[..., None] - slope[..., None] * at) ** 2, axis=-1))
-    return mean + slope * (side - BESIDE / 2), np.abs(slope), rough
+    rough = np.sqrt(
+        np.mean((readings - mean[..., None] - slope[..., None] * at) ** 2, axis=-1)
+    )
+    return mean + slope * (side - BESIDE / 2), slope, rough
 
 
-def _straight(place, outward, near, far, lrf):
+def _straight(place, outward, near, slope, far, returns, lrf):
     """The DepthJumps among places (n, 2) that lie on straight rims, moved onto them."""
     step = lrf.bearing_step
     tree = cKDTree(place)
@@ -153,9 +175,20 @@ def _straight(place, outward, near, far, lrf):
         if np.sqrt(size[0]) > STRAIGHT * step or across @ outward[i] < np.sqrt(0.5):
             continue
         on_rim = mean + along * (along @ (place[i] - mean))
-        rows.append((i, *on_rim, np.median(near[others]), np.median(far[others]), *along, *across))
+        rows.append(
+            (
+                i,
+                *on_rim,
+                np.median(near[others]),
+                np.median(slope[others]),
+                np.median(far[others]),
+                np.median(returns[others]),
+                *along,
+                *across,
+            )
+        )
         links += [(i, other) for other in others]
-    table = np.array(rows).reshape(-1, 9)
+    table = np.array(rows).reshape(-1, 11)
     index = table[:, 0].astype(int)
     links = np.array(links, int).reshape(-1, 2)
     graph = coo_array((np.ones(len(links)), tuple(links.T)), shape=(len(place),) * 2)
@@ -163,9 +196,11 @@ def _straight(place, outward, near, far, lrf):
         bearing=table[:, 1],
         pitch=table[:, 2],
         range=table[:, 3],
-        behind=table[:, 4],
-        along=table[:, 5:7],
-        outward=table[:, 7:],
+        slope=table[:, 4],
+        behind=table[:, 5],
+        returns=table[:, 6],
+        along=table[:, 7:9],
+        outward=table[:, 9:],
         radius=lrf.spot_radius(table[:, 3]),
         rim=connected_components(graph, directed=False)[1][index],
     )

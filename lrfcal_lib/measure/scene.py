@@ -28,6 +28,7 @@ from lrfcal_lib.session.write import whole
 
 DARKEST = 48  # grey of the weakest echo among points that no image saw
 BRIGHTEST = 208
+COMPARED = 100_000  # echoes that tell which are weak and strong
 AT_REST_S = 0.1  # no head moves on, settles and is scanned again in less
 Told = Callable[[int], object]
 
@@ -88,8 +89,8 @@ def _refuse_moved(session, number):
     closing = closing_of(sweep)
     if closing is not None and closing.moved:
         raise ValueError(
-            f"{session.path}: station {number} moved while it was recorded: back at its first "
-            f"pitch, ranges differ by {1000 * closing.apart:.0f} mm, by "
+            f"{session.path}: station {number} moved while it was recorded: back at a pitch "
+            f"that it had, ranges differ by {1000 * closing.apart:.0f} mm, by "
             f"{1000 * closing.expected:.0f} mm between neighbouring scan lines: {again}"
         )
     steps = np.abs(np.diff(sweep.time_s))[np.diff(sweep.pitch) != 0]
@@ -142,8 +143,10 @@ def colored_blocks(
         Points that no image saw are grey, by intensity where the sensor has it.
     """
     levels = None
-    if station.sweep.intensities is not None:
-        levels = np.nanpercentile(station.sweep.intensities, [2, 98])
+    intensities = station.sweep.intensities
+    if intensities is not None:
+        some = intensities.ravel()[:: 1 + intensities.size // COMPARED]
+        levels = np.nanpercentile(some, [2, 98])
     blocks = reconstruct(
         station.sweep,
         station.views,
