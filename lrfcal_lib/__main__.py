@@ -16,6 +16,10 @@ def run(args):
             return check(args)
         case "calibrate":
             return calibrate(args)
+        case "compare":
+            from lrfcal_lib.report.compare import compare_files
+
+            return compare_files(args.calibrations, args.figure)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
@@ -30,6 +34,21 @@ def run(args):
             return reconstruct_session(
                 args.session, args.calibration, args.out, args.untrusted
             )
+        case "merge":
+            from lrfcal_lib.report.merge import merge_session
+
+            return merge_session(args.session, args.calibration, args.out, args.untrusted)
+        case "measure":
+            from lrfcal_lib.report.measure import measure_session
+
+            return measure_session(
+                args.session,
+                args.calibration,
+                args.picks,
+                args.out,
+                args.station,
+                args.untrusted,
+            )
         case "report":
             from lrfcal_lib.report.report import main
 
@@ -42,6 +61,26 @@ def run(args):
             from lrfcal_lib.emulators.rig import main
 
             return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
+        case "board":
+            print_board(args)
+
+
+def print_board(args):
+    """Write a board to print, and what session.json and rig files say about it."""
+    from json import dumps
+
+    from lrfcal_lib.plots.sheet import print_sheet, sheet
+    from lrfcal_lib.session.stated import board_to_json
+    from lrfcal_lib.session.write import whole
+
+    board = sheet(args.columns, args.rows, args.square)
+    with whole(args.out) as file:
+        print_sheet(file, board)
+    width, height = 1000 * board.known_corners()[2]
+    print(
+        f"{args.out}: print at 100 %, glue on a flat plate, cut to {width:.0f} x {height:.0f} mm"
+    )
+    print("state it as:", dumps(board_to_json(board)))
 
 
 def import_recording(args):
@@ -111,6 +150,22 @@ def how_many(text):
     return value
 
 
+def metres(text):
+    """A length on the command line."""
+    value = float(text)
+    if not 0.001 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{value} m: squares have 0.001 to 1 m")
+    return value
+
+
+def inner(text):
+    """A number of inner corners on the command line."""
+    value = int(text)
+    if not 3 <= value <= 50:
+        raise argparse.ArgumentTypeError(f"{value} inner corners: 3 to 50 are possible")
+    return value
+
+
 def parser():
     """The command line, an ArgumentParser."""
     top = argparse.ArgumentParser(
@@ -119,6 +174,7 @@ def parser():
     verbs = top.add_subparsers(title="verbs", metavar="VERB", dest="verb", required=True)
     _add_import(verbs)
     _add_sessions(verbs)
+    _add_measure(verbs)
     _add_rigs(verbs)
     _add_report(verbs)
     _add_study(verbs)
@@ -162,18 +218,54 @@ def _add_sessions(verbs):
     )
     _add_scheduler(calibrate)
 
-    reconstruct = verbs.add_parser(
-        "reconstruct", help="make coloured clouds of a scene with a calibration of its rig"
+    compare = verbs.add_parser(
+        "compare", help="say how far calibrations of one rig differ, beside what they claim"
     )
-    reconstruct.add_argument("session", help="as 'record --scene' recorded it")
-    reconstruct.add_argument("--calibration", required=True, help="calibration.json")
-    reconstruct.add_argument(
+    compare.add_argument(
+        "calibrations",
+        nargs="+",
+        metavar="calibration.json",
+        help="two or more, the earliest first; a session is calibrated",
+    )
+    compare.add_argument("--figure", metavar="PNG", help="also draw them")
+
+    words = "make coloured clouds of a scene with a calibration of its rig"
+    _add_scene(verbs.add_parser("reconstruct", help=words))
+    _add_scene(verbs.add_parser("merge", help="join the stations of a scene in one cloud"))
+
+
+def _add_scene(verb):
+    """What the use of a calibration on a scene takes."""
+    verb.add_argument("session", help="as 'record --scene' recorded it")
+    verb.add_argument("--calibration", required=True, help="calibration.json")
+    verb.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
-    reconstruct.add_argument(
+    verb.add_argument(
         "--untrusted",
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",
+    )
+
+
+def _add_measure(verbs):
+    """The verb that measures in a scene."""
+    measure = verbs.add_parser(
+        "measure", help="measure lengths between places picked in scene.html"
+    )
+    measure.add_argument("session", help="as 'record --scene' recorded it")
+    measure.add_argument("--calibration", required=True, help="calibration.json")
+    measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
+    measure.add_argument(
+        "--station", type=int, help="whose scene.html, if there are several"
+    )
+    measure.add_argument(
+        "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"
+    )
+    measure.add_argument(
+        "--untrusted",
+        action="store_true",
+        help="even if the verdict on the calibration is 'no'",
     )
 
 
@@ -226,6 +318,16 @@ def _add_rigs(verbs):
 
 
 def _add_report(verbs):
+    board = verbs.add_parser("board", help="a board to print at its true size")
+    board.add_argument(
+        "columns", type=inner, help="inner corners of the chessboard along x"
+    )
+    board.add_argument(
+        "rows", type=inner, help="and along y, odd where the columns are even"
+    )
+    board.add_argument("square", type=metres, help="side of a square, metres")
+    board.add_argument("--out", default="board.pdf", help="PDF, SVG or PNG (board.pdf)")
+
     report = verbs.add_parser(
         "report", help="execute the notebooks on a session and write what they found"
     )

@@ -21,7 +21,8 @@ FLOORS = [
     {"acquire", "report"},
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names} | {
-    "__main__": len(FLOORS)
+    "__main__": len(FLOORS),
+    "api": len(FLOORS),
 }
 MODULES = sorted(LIBRARY.rglob("*.py"))
 

@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from figure_checks import complaints
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard
 from lrfcal_lib.plots import recording, rig
@@ -132,3 +132,17 @@ def test_faults_of_a_figure_are_found(kind):
     words = complaints(fig, fig.canvas.get_renderer())
     plt.close(fig)
     assert bool(words) == bool(told) and any(told in word for word in words or [""])
+
+
+def test_face_on_shows_a_flat_part_square_and_whole():
+    x, y = np.mgrid[-0.2:0.2:21j, -0.1:0.1:11j]
+    flat = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    turn = Rotation.from_euler("xyz", [100, 15, 20], degrees=True)
+    points = turn.apply(flat) + [0.3, 2.0, 0.1]
+    view, focal, splat = rig.face_on(points, (300, 400), fill=0.8)
+    uv = rig.pixels(view.apply(points), (300, 400), focal)
+    assert (uv >= 0).all() and (uv < [400, 300]).all()
+    assert max(np.ptp(uv, axis=0) / [400, 300]) == pytest.approx(0.8, abs=1e-6)
+    depth = view.apply(points)[:, 2]
+    assert np.ptp(depth) < 1e-9 and depth.min() > 0, "seen from its front"
+    assert splat >= 1

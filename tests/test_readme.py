@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -16,16 +17,25 @@ from shared import ROOT, stages
 from test_skeleton import git
 
 from lrfcal_lib import __main__ as command_line
+from lrfcal_lib.calibrate.calibration_file import rig_record
 from lrfcal_lib.drivers import rig_file
 from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.video import Camera
+from lrfcal_lib.evaluate.export import write_calibration
+from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session import cache
+from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.solvers import METHODS
 
 README = (ROOT / "README.md").read_text()
 CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
 METHODS_PAGE = (ROOT / "notebooks" / "METHODS.md").read_text()
 RIG_PAGE = (ROOT / "notebooks" / "RIG_FILE.md").read_text()
+RESULTS_PAGE = (ROOT / "notebooks" / "RESULTS.md").read_text()
+FILE_PAGE = (ROOT / "notebooks" / "CALIBRATION_FILE.md").read_text()
+SENSORS_PAGE = (ROOT / "notebooks" / "OTHER_SENSORS.md").read_text()
 WORKFLOW = (ROOT / ".github" / "workflows" / "test.yml").read_text()
 
 
@@ -41,7 +51,9 @@ def test_notebooks_methods_functions_and_files_are_all_there():
     ] == []
     assert [method for method in METHODS if f"| `{method}` |" not in METHODS_PAGE] == []
     links = re.findall(r"\]\(([^)#:]+)\)", README + CONTRIBUTING)
-    pages = README + CONTRIBUTING + METHODS_PAGE + RIG_PAGE
+    pages = "".join(
+        [README, CONTRIBUTING, METHODS_PAGE, RIG_PAGE, RESULTS_PAGE, SENSORS_PAGE]
+    )
     files = re.findall(r"`((?:lrfcal_lib|tests|data|notebooks)/[\w/.]+)`", pages)
     assert (
         len(files) > 4
@@ -59,7 +71,9 @@ def test_notebooks_methods_functions_and_files_are_all_there():
 
 def commands():
     """Every command of README, CONTRIBUTING and the workflow, a list of words each."""
-    lines = "\n".join([*blocks("sh"), re.sub(r"- run: |run: ", "", WORKFLOW)]).splitlines()
+    lines = "\n".join(
+        [*blocks("sh"), *blocks("sh", SENSORS_PAGE), re.sub(r"- run: |run: ", "", WORKFLOW)]
+    ).splitlines()
     lines += re.findall(
         r"`((?:make|\.venv/bin/python|python -m) [^`]+)`", README + CONTRIBUTING
     )
@@ -112,10 +126,12 @@ def test_the_clone_line_gives_a_checkout_that_checks_its_session(tmp_path):
     assert done.returncode == 0
 
 
-def test_the_example_projects_a_scan_line_into_the_image(monkeypatch):
+def test_the_example_projects_a_scan_line_into_the_image(monkeypatch, capsys):
     monkeypatch.setenv(cache.VARIABLE, str(stages()))
     monkeypatch.chdir(ROOT)
     exec(*blocks("python"), names := {})
+    shown = blocks("python")[0].splitlines()[-1]
+    assert shown == "# " + capsys.readouterr().out.strip(), "the output is what it prints"
     u, v = names["pixels"][np.isfinite(names["pixels"]).all(axis=1)].T
     inside = (u > 0) & (u < names["lens"].width - 1)
     assert inside.sum() > 100 and np.all(
@@ -124,13 +140,64 @@ def test_the_example_projects_a_scan_line_into_the_image(monkeypatch):
     assert np.ptp(v[inside]) < 60 < np.ptp(u[inside]), "a scan line is nearly level"
 
 
+def test_a_session_of_another_sensor_is_written_as_the_page_says(tmp_path, monkeypatch):
+    given = open_session(ROOT / "data" / "sim_quick")
+
+    def my_sweep(placement):
+        sweep = given.sweep(placement)
+        return sweep.ranges, sweep.bearings, sweep.pitch
+
+    def my_images(placement):
+        records = given.images("left", placement=placement)
+        return [(given.read_image(record), record.pitch) for record in records]
+
+    monkeypatch.chdir(tmp_path)
+    exec(*blocks("python", SENSORS_PAGE), {"my_sweep": my_sweep, "my_images": my_images})
+    written = open_session(tmp_path / "my_session")
+    assert (
+        written.board_placements == (1, 2, 3, 4) and validate(tmp_path / "my_session") == []
+    )
+    assert len(written.images("left")) == sum(len(my_images(p)) for p in (1, 2, 3, 4))
+    np.testing.assert_array_equal(written.sweep(3).ranges, given.sweep(3).ranges)
+
+
+@pytest.mark.parametrize("mount", ["head", "platform"])
+def test_twenty_lines_project_a_scan_from_the_file_alone(
+    quick, tmp_path, monkeypatch, mount
+):
+    """The same pixels as ours, for errors of range and pitch that would show."""
+    rig = quick.rig("joint")
+    left = replace(rig.cameras["left"], mount=mount)
+    if mount == "platform":
+        left = replace(left, T_camera=left.T_camera * rig.T_head_lrf.inv())
+    rig = replace(rig, corrections=Corrections(0.05, 0.03), cameras={"left": left})
+    write_calibration(tmp_path / "calibration.json", rig_record(rig))
+    monkeypatch.chdir(tmp_path)
+    bearings = np.radians(np.linspace(60, 120, 50))
+    ranges = np.linspace(1.0, 3.0, 50)
+    names = {"bearings": bearings, "ranges": ranges, "pitch_of_scan": 0.1}
+    names["pitch_of_image"] = -0.05
+    code = blocks("python", FILE_PAGE)[0]
+    exec(code, names)
+    assert (
+        len([line for line in code.splitlines() if line.strip()]) <= 23
+    )  # imports are three
+    p_lrf = rig.corrections.points(polar_to_points(ranges, bearings))
+    p_platform = lrf_to_platform(p_lrf, rig.corrections.pitch(1, 0.1), rig.T_head_lrf)
+    T_camera = rig.camera_at("left", float(rig.corrections.pitch(1, -0.05)))
+    ours = project(T_camera.apply(p_platform), left.model)
+    np.testing.assert_allclose(names["pixels"][:, 0], ours, atol=1e-6)
+    assert np.isfinite(ours).all()
+
+
 def golden(session, name):
     return pd.read_csv(GOLDEN / session / f"{name}.csv")
 
 
 def cells(row):
-    """The cells of a row of one of README's tables, without its first."""
-    (line,) = (line for line in README.splitlines() if line.startswith(f"| {row} |"))
+    """The cells of a row of a table of README or the page of results, without its first."""
+    lines = (README + RESULTS_PAGE).splitlines()
+    (line,) = (line for line in lines if line.startswith(f"| {row} |"))
     return [cell.strip() for cell in line.split("|")[2:-1]]
 
 
@@ -226,7 +293,7 @@ def test_shares_within_intervals_and_the_papers_figure_are_those_of_the_stored_t
         s: golden(s, "edge_summary").set_index(["source", "variant", "ends"])
         for s in ("sim_lms221", "lms400_zed")
     }
-    shares = re.search(r"(\d+) % \(simulated\) and (\d+) % \(real\)", README).groups()
+    shares = re.search(r"(\d+) % \(simulated\) and (\d+) % \(real\)", RESULTS_PAGE).groups()
     within = [
         table.loc[name, "combined", "image"].within_90_percent
         for name, table in summary.items()
@@ -234,7 +301,7 @@ def test_shares_within_intervals_and_the_papers_figure_are_those_of_the_stored_t
     assert [*shares] == [f"{share:.0f}" for share in within]
     assert (
         f"error of {summary['sim_lms221'].loc['paper'].squeeze().mean_abs_error_mm:.2f} mm"
-        in README
+        in RESULTS_PAGE
     )
 
 

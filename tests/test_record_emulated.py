@@ -1,7 +1,10 @@
 """From the emulated devices to a calibration that agrees with their truth."""
 
 import json
+import re
+from contextlib import contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,7 +12,10 @@ import pytest
 from scipy.stats import chi2
 from virtual import VirtualHost
 
+from lrfcal_lib import __main__ as command_line
+from lrfcal_lib.acquire import record
 from lrfcal_lib.acquire.record import record_session
+from lrfcal_lib.calibrate.calibration_file import load_calibration
 from lrfcal_lib.calibrate.pipeline import calibrate_jointly, prepare
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import read_rig_file
@@ -17,6 +23,8 @@ from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.emulators.rig import EmulatedRig
 from lrfcal_lib.emulators.world import scaled
 from lrfcal_lib.fit.axis_chart import chart_parameters
+from lrfcal_lib.measure.features import flatness, largest_plane
+from lrfcal_lib.measure.scene import station_cloud
 from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import model_to_json
@@ -69,10 +77,9 @@ class Still:
         pass
 
 
-@pytest.fixture(scope="module")
-def recorded_session(setup, tmp_path_factory):
-    """What `record` makes of the emulated devices."""
-    folder = tmp_path_factory.mktemp("recorded")
+@contextmanager
+def emulated_rig(setup, file):
+    """Opens the emulated devices, each time from a rig file that a guide may have changed."""
     host = VirtualHost()
     with EmulatedRig(
         setup[0], placements=setup[1], host=host, rest_s=0.0,
@@ -84,12 +91,29 @@ def recorded_session(setup, tmp_path_factory):
             "poll_s": 0.05,
             "gap_s": 0.025,
         }  # the head wobbles for 0.2 s
-        (folder / "rig.json").write_text(json.dumps(data))
-        stated = read_rig_file(folder / "rig.json")
-        with Rig.open(stated, host=host, camera=lambda name: Still(emulated, name)) as rig:
-            record_session(
-                rig, folder / "s"
-            )  # nobody is asked for anything: the board moves by itself
+        data["plan"] |= {"pitch_deg": [-20, 8, 2]}  # of the scene
+        file.write_text(json.dumps(data))
+
+        def opened(stated):
+            return Rig.open(stated, host=host, camera=lambda name: Still(emulated, name))
+
+        yield SimpleNamespace(open=opened)
+
+
+@pytest.fixture(scope="module")
+def devices(setup, tmp_path_factory):
+    """The folder of the rig file, and what opens the rig."""
+    folder = tmp_path_factory.mktemp("recorded")
+    with emulated_rig(setup, folder / "rig.json") as rig:
+        yield folder, rig
+
+
+@pytest.fixture(scope="module")
+def recorded_session(devices):
+    """What `record` makes of the emulated devices."""
+    folder, rig = devices
+    with rig.open(read_rig_file(folder / "rig.json")) as opened:
+        record_session(opened, folder / "s")  # nobody is asked: the board moves by itself
     return open_session(folder / "s")
 
 
@@ -107,6 +131,44 @@ def test_the_recording_calibrates_to_the_truth_within_what_it_says(recorded_sess
         chart_parameters(pose_array(head)) for head in (solution.T_head_lrf, rig.T_head_lrf)
     )
     assert nees(axis - true, solution.covariance("axis_", "offset_")) < chi2.ppf(0.999, 4)
+
+
+def test_a_scene_is_recorded_and_rebuilt_with_that_calibration(
+    recorded_session, devices, monkeypatch, capsys
+):
+    """As a new user does it, by the commands alone."""
+    folder, rig = devices
+    monkeypatch.setattr(record, "Rig", rig)
+    file = folder / "out" / "calibration.json"
+    verb(0, "calibrate", folder / "s", "--out", folder / "out")
+    plan = ["--scene", "--stations", "1", "--calibration", file]
+    verb(0, "record", folder / "rig.json", folder / "room", *plan)
+    said = capsys.readouterr().out
+    planned = float(re.search(r"deg: (\d+) % of the cloud can get a colour", said)[1])
+    colored = float(re.search(r"colour: (\d+) % of the points", said)[1])
+    # things hide more from a camera than planned, the more the farther apart the beams are
+    assert planned - 20 < colored < planned + 5 and "ok    stood still" in said
+
+    verb(
+        0,
+        "reconstruct",
+        folder / "room",
+        "--calibration",
+        file,
+        "--out",
+        folder / "room_out",
+    )
+    names = sorted(path.name for path in (folder / "room_out").iterdir())
+    assert names == ["scene.e57", "scene.html", "scene.pcd", "scene.ply"]
+    session = open_session(folder / "room")
+    cloud = station_cloud(session, load_calibration(file), 1)
+    wall = cloud.points[largest_plane(cloud)]
+    assert len(wall) > 500 and flatness(wall)[1] < 0.02
+
+
+def verb(code, *words):
+    """Run a command."""
+    assert command_line.main([str(word) for word in words]) == code
 
 
 def nees(miss, covariance):

@@ -14,7 +14,7 @@ from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import LrfInfo, from_json, model_to_json
+from lrfcal_lib.session.stated import LrfInfo, from_json, plain
 
 SCHEMA = 2
 KIND = "lrfcal calibration"
@@ -59,7 +59,7 @@ FORMULAS = {
 ROUND = 1e-9  # a rotation's matrix may be off by so much
 
 
-Four = tuple[(FiniteFloat,) * 4]
+Four = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 Unbounded = Annotated[
     float, BeforeValidator(lambda value: np.inf if value is None else value)
 ]
@@ -69,7 +69,7 @@ Matrix = list[list[Unbounded]]
 class PoseWritten(BaseModel):
     """A transform, by its matrix."""
 
-    matrix: tuple[(Four,) * 4]
+    matrix: tuple[Four, Four, Four, Four]
 
     def made(self):
         """As a RigidTransform, to the last bit."""
@@ -96,7 +96,7 @@ class LensWritten(BaseModel):
     fy: Annotated[FiniteFloat, Field(gt=0)]
     cx: FiniteFloat
     cy: FiniteFloat
-    distortion: tuple[(FiniteFloat,) * 5]
+    distortion: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
     covariance: Matrix | None
     rms_px: FiniteFloat | None
 
@@ -203,18 +203,13 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
     ----------
     rig : CalibratedRig
     """
-    lens_of = {name: camera.model for name, camera in rig.cameras.items()}
     cameras = {}
     for name, camera in rig.cameras.items():
-        size = {"width": lens_of[name].width, "height": lens_of[name].height}
         cameras[name] = {
             "mount": camera.mount,
             **pose_record(camera.T_camera),
-            "lens": {**size, **(model_to_json(lens_of[name]) or {})},
+            "lens": plain(vars(camera.model)),
         }
-    uncertainty = None
-    if rig.uncertainty is not None:
-        uncertainty = {name: listed(value) for name, value in vars(rig.uncertainty).items()}
     return {
         "platform": {
             "maps": "lrf to head",
@@ -227,17 +222,8 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
             "pitch_scale": float(rig.corrections.pitch_scale),
         },
         "lrf": {name: getattr(rig.lrf, name) for name in LrfWritten.model_fields},
-        "uncertainty": uncertainty,
+        "uncertainty": None if rig.uncertainty is None else plain(vars(rig.uncertainty)),
     }
-
-
-def listed(value: Any) -> Any:
-    """A field of a RigUncertainty as JSON has it."""
-    if isinstance(value, dict):
-        return {key: listed(part) for key, part in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return value
 
 
 def pose_record(transform) -> dict[str, list]:
@@ -352,12 +338,10 @@ def require_same_rig(rig: CalibratedRig, other: Session | CalibratedRig) -> None
     rig : CalibratedRig
     other : Session or CalibratedRig
     """
+    name = other.name
+    sizes: dict[str, Any] = dict(other.cameras)
     if isinstance(other, CalibratedRig):
-        name = f"the calibration of '{other.session}'"
         sizes = {key: camera.model for key, camera in other.cameras.items()}
-    else:
-        name = other.name
-        sizes = other.cameras
     mounts = {key: camera.mount for key, camera in other.cameras.items()}
     differences = [
         *_other_cameras(rig, sizes, mounts),

@@ -36,6 +36,8 @@ class Truth:
         Of every scan line by placement, radians.
     stations : dict of int to RigidTransform
         ``T_room_platform`` by placement, of a recording from several places.
+    lengths : tuple of dict
+        Of the room: name, kind, metres, and corners of both ends in the frame of the room.
     setup : str
         Name of what it was simulated from, of :func:`lrfcal_lib.simulate.rig.load_setup`.
     """
@@ -46,6 +48,7 @@ class Truth:
     boards: dict[int, RigidTransform]
     pitch: dict[int, np.ndarray]
     stations: dict[int, RigidTransform]
+    lengths: tuple[dict, ...]
     setup: str
 
 
@@ -90,6 +93,7 @@ def read_truth(session: Session) -> Truth | None:
             boards=boards,
             pitch=pitch,
             stations=stations,
+            lengths=tuple(data.get("lengths", ())),
             setup=data.get("setup", ""),
         )
 

@@ -64,6 +64,8 @@ class Part:
     freedom : int
     p : float
         How often honest calibrations differ more.
+    p_of_others : float
+        How often all other parts together do.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Part:
     chi2: float
     freedom: int
     p: float
+    p_of_others: float
 
     def __str__(self):
         amounts = ", ".join(map(str, self.amounts))
@@ -134,17 +137,25 @@ class Comparison:
 
     def sentence(self) -> str:
         """The answer."""
-        odds = f"honest calibrations differ more in {100 * self.whole.p:.2g} % of cases"
+        odds = f"honest calibrations differ more in {_percent(self.whole.p)} of cases"
         names = f"'{self.first.session}' and '{self.second.session}'"
         if self.within:
             return f"{names} differ within what both claim ({odds})."
-        limit = CHANCE / len(self.parts)
-        guilty = [part.name for part in self.parts if part.p < limit]
-        where = f", most in: {', '.join(guilty)}" if guilty else ""
+        suspects = [part.name for part in self.parts if part.p_of_others >= CHANCE]
+        where = "in more than one part"
+        if suspects:
+            where = f"in {' or '.join(suspects)} alone, all others agree"
         return (
-            f"{names} differ by more than both claim ({odds}){where}: the rig has changed in "
+            f"{names} differ by more than both claim ({odds}): {where}. The rig has changed in "
             "between, or one of them errs."
         )
+
+
+def _percent(share):
+    """A share in words."""
+    if share < 1e-4:
+        return "less than 0.01 %"
+    return f"{100 * share:.{0 if share > 0.1 else 2}f} %"
 
 
 def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
@@ -254,9 +265,11 @@ class _Test:
             )
         if shifts:
             amounts.append(self._amount("shift", shifts, 1000, "mm"))
-        chi2, freedom = self._chi2([*turns, *shifts] or list(self.steps))
-        p = float(chdtrc(freedom, chi2)) if freedom else 1.0
-        return Part(name, (*amounts, *more), chi2, freedom, p)
+        names = [*turns, *shifts] or list(self.steps)
+        chi2, freedom = self._chi2(names)
+        others = self._chi2([other for other in self.steps if other not in names])
+        p = _exceeds(chi2, freedom)
+        return Part(name, (*amounts, *more), chi2, freedom, p, _exceeds(*others))
 
     def _amount(self, what, names, scale, unit):
         index = self._index(names)
@@ -272,15 +285,19 @@ class _Test:
 
         Without what nothing bounds, or both take as known.
         """
-        index = np.array(self._index(names))
+        index = np.array(self._index(names), int)
         variance = np.diag(self.covariance)[index]
         index = index[np.isfinite(variance) & (variance > 0)]
         sigma = np.sqrt(np.diag(self.covariance)[index])
         z = np.array(list(self.steps.values()))[index] / sigma
         correlation = self.covariance[np.ix_(index, index)] / np.outer(sigma, sigma)
-        size, axes = np.linalg.eigh(correlation)
-        told = size > TOLD * size.max(initial=0.0)
-        return float(np.sum((axes.T @ z)[told] ** 2 / size[told])), int(told.sum())
+        inverse = np.linalg.pinv(correlation, rcond=TOLD, hermitian=True)
+        return float(z @ inverse @ z), int(np.linalg.matrix_rank(inverse, hermitian=True))
+
+
+def _exceeds(chi2, freedom):
+    """How often chance exceeds a chi-square; always, where nothing is free."""
+    return float(chdtrc(freedom, chi2)) if freedom else 1.0
 
 
 def recorded_by(rig: CalibratedRig, pitch, distance):
@@ -337,7 +354,7 @@ def cloud_shifts(first: CalibratedRig, second: CalibratedRig) -> Shifts:
     at = np.stack(np.meshgrid(bearings, PITCHES), axis=-1)
     bearing, pitch = np.moveaxis(at, -1, 0)
     ends = []
-    variance = 0.0
+    variance = np.zeros(bearing.shape)
     for rig in (first, second):
         chain = chain_of(rig)
         points, by_link, _ = carried(chain, bearing, *true_beams(rig, pitch, DISTANCE))

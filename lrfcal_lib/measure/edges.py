@@ -5,7 +5,7 @@ line and the eye of the camera span a plane of sight, which meets the plane of t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -29,6 +29,8 @@ from lrfcal_lib.preprocess.edges_in_image import (
 
 SHORTEST_PX = 40.0  # of an edge in an image
 HALF_WIDTH_PX = 1.5  # about a detected segment, in which its line is looked for
+CLOSE_PX = 5.0  # between two lines that pull each other
+PULLED_PX = 0.4  # by how much: edges of a printed rim of 2 px
 BESIDE_PX = (2.0, 40.0)  # from the edge: where the points of its surface lie
 FEWEST = 30  # points that make a plane beside an edge
 LEAST_SHARE = 0.6  # of the points beside an edge that lie on one plane
@@ -83,13 +85,12 @@ def edges_of(
         rows = np.flatnonzero(cloud.image == view.number)
         p_camera = view.T_camera_platform.apply(cloud.points[rows])
         seen = _Seen(pinhole(p_camera, view.model), p_camera[:, 2], of_point[rows])
-        for start, end in _segments(view):
-            normal = np.array([end[1] - start[1], start[0] - end[0]])
+        segments = _segments(view)
+        for ends in segments:
             try:
-                line = refine_edge(
-                    view.image, view.model, "", start, end, normal, HALF_WIDTH_PX
-                )
-                edges.append(_on_plane(planes[_surface_at(line, seen)], view, pitch, line))
+                plane = planes[_surface_at(ends, seen)]
+                line = _refined(view, ends, segments)
+                edges.append(_on_plane(plane, view, pitch, line))
             except (EdgeNotSeen, DegenerateGeometry):
                 continue
     return edges
@@ -130,12 +131,28 @@ def _segments(view):
     return ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= SHORTEST_PX]
 
 
-def _surface_at(line, seen):
-    """The number of the surface that ends at a line of an image, or on which it is drawn."""
-    first, last = line.ends
+def _refined(view, ends, segments):
+    """The line of an image near a segment (2, 2), less certain where another one is beside it."""
+    first, last = ends
+    normal = np.array([last[1] - first[1], first[0] - last[0]])
+    line = refine_edge(view.image, view.model, "", first, last, normal, HALF_WIDTH_PX)
+    off = segments - line.centre
+    away = np.abs(off @ line.line[:2]).max(axis=1)
+    along = off @ [-line.line[1], line.line[0]]
+    beside = (along.min(axis=1) < 0) & (along.max(axis=1) > 0) & (away < CLOSE_PX)
+    if beside.sum() < 2:
+        return line
+    covariance = line.covariance + np.diag([PULLED_PX**2, 0.0])
+    return replace(line, covariance=covariance)
+
+
+def _surface_at(ends, seen):
+    """The number of the surface that ends at a segment (2, 2) of an image, or that it is on."""
+    first, last = ends
     length = np.linalg.norm(last - first)
-    s = (seen.uv - first) @ (last - first) / length
-    t = seen.uv @ line.line[:2] + line.line[2]
+    along = (last - first) / length
+    s = (seen.uv - first) @ along
+    t = (seen.uv - first) @ [along[1], -along[0]]
     near, far = BESIDE_PX
     beside = (s > 0) & (s < length) & (np.abs(t) > near) & (np.abs(t) < far)
     found = []  # depth, points of the surface, its number

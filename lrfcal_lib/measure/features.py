@@ -332,16 +332,31 @@ def _spread_of_rig(first, second, by_unknowns):
     """Standard deviation of a length from all unknowns of the rig, of which it has derivatives
     (c,); inf where a motion that nothing determines matters.
     """
-    known = uncertainty_of(first.rig)
-    unseen = []
-    for camera in {first.camera, second.camera}:
-        motions = known.unseen_of_cloud
-        if camera is not None:
-            motions = known.unseen_of_cameras[camera]
-        still = np.zeros(len(motions))
-        unseen.append(by_all_unknowns(first.rig, camera, motions, still, still)[:, :-2])
-    bounded = [np.where(np.isfinite(C), C, 0.0) for C in (known.covariance, known.trusted)]
+    rig = first.rig
+    unseen = [unseen_motions(rig, feature.camera) for feature in (first, second)]
     chain = replace(
-        chain_of(first.rig), covariances=tuple(bounded), unseen=np.concatenate(unseen)
+        chain_of(rig), covariances=shared_covariances(rig), unseen=np.concatenate(unseen)
     )
     return float(spread(chain, by_unknowns[None]))
+
+
+def shared_covariances(rig: CalibratedRig) -> tuple[np.ndarray, np.ndarray]:
+    """Covariances (c, c) of a rig's unknowns, of which the one that gives more counts; zero where
+    nothing bounds them, see :func:`unseen_motions`.
+    """
+    known = uncertainty_of(rig)
+    noise_only = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
+    trusted = np.where(np.isfinite(known.trusted), known.trusted, 0.0)
+    return noise_only, trusted
+
+
+def unseen_motions(rig: CalibratedRig, camera: str | None) -> np.ndarray:
+    """Motions (m, c) of a rig's unknowns that nothing determines, and that move points of the cloud
+    or what a camera sees.
+    """
+    known = uncertainty_of(rig)
+    motions = known.unseen_of_cloud
+    if camera is not None:
+        motions = known.unseen_of_cameras[camera]
+    still = np.zeros(len(motions))
+    return by_all_unknowns(rig, camera, motions, still, still)[:, :-2]

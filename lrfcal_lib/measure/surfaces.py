@@ -1,5 +1,7 @@
 """Flat surfaces of a scanned cloud: planes that grow cell by cell as long as they stay flat."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import binary_erosion, label
 from scipy.spatial import KDTree
@@ -19,6 +21,8 @@ LIMIT = 3.0  # standard deviations of the mean of a cell
 FEWEST = 60  # points of a surface
 IN_CELL = 3  # points that make a cell
 ROUNDS = 8  # of growing and fitting again
+# metres by which a surface without a middle may be off: its readings are mixed with what is beside
+ALL_RIM = 0.006
 SEEDS = 1500  # places at which a plane may begin
 
 
@@ -49,7 +53,7 @@ def planes_of(cloud: Cloud, rig: CalibratedRig) -> tuple[list[Feature], np.ndarr
             continue
         if len(surface) >= FEWEST:
             of_point[surface] = len(planes)
-            planes.append(fit_feature(cloud, _inner(cloud, surface), rig))
+            planes.append(_fitted(cloud, surface, rig))
     return planes, of_point
 
 
@@ -89,6 +93,17 @@ def _connected(points, normal, miss, sigma):
     allowed = BENT + LIMIT * sigma / np.sqrt(np.maximum(count, 1))
     numbers, _ = label((count >= IN_CELL) & (np.abs(mean) < allowed))
     return (numbers[place] == numbers[seed]) & (numbers[seed] > 0)
+
+
+def _fitted(cloud, surface, rig):
+    """The plane of a surface, less certain where it is all rim."""
+    inner = _inner(cloud, surface)
+    plane = fit_feature(cloud, inner, rig)
+    if len(inner) < len(surface):
+        return plane
+    noise = plane.noise.copy()
+    noise[:3, :3] += ALL_RIM**2 * np.outer(plane.axis, plane.axis)
+    return replace(plane, noise=noise)
 
 
 def _inner(cloud, surface):

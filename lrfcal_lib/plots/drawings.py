@@ -86,7 +86,7 @@ class View:
         self.ax.annotate(
             "", end, start, arrowprops=DIMENSION | {"shrinkA": 0, "shrinkB": 0}
         )
-        self.name(np.mean(ends, axis=0), text, away)
+        self.name(np.asarray(ends).mean(axis=0), text, away)
 
     def box(self, T: RigidTransform, low: ArrayLike, high: ArrayLike, color: str) -> None:
         """A solid box between two corners (3,) of its own frame, metres, the far faces first."""

@@ -1,8 +1,11 @@
 """A scene to turn in a browser, one offline page: points, frames, boards and camera frusta."""
 
 import base64
+import json
 from collections.abc import Mapping
 from os import PathLike
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -12,6 +15,9 @@ from lrfcal_lib.plots.recording import AXES_RGB, COLORS, closed, color_of
 
 MOST_POINTS = 150_000  # that browsers turn smoothly
 PAGE = {"xref": "paper", "yref": "paper", "xanchor": "left", "yanchor": "bottom"}
+SCRIPT = Path(__file__).with_name("scene.js")
+PLOT = "document.getElementById('scene')"
+EYE = (-0.3, -1.5, 0.55)  # where one looks from at first, in widths of the scene
 GAP = np.full((1, 3), np.nan)  # where a line breaks
 Line = tuple[str, np.ndarray]
 
@@ -22,8 +28,9 @@ def scene_page(
     colors: np.ndarray,
     seen: np.ndarray,
     lines: Mapping[str, Line],
-    eye: tuple[float, float, float] = (-0.3, -1.5, 0.55),
     note: str = "",
+    title: str = "",
+    measuring: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a page that needs no other file and no network.
 
@@ -35,49 +42,107 @@ def scene_page(
     colors
         Of uint8, shape (n, 3).
     seen
-        Of bool, shape (n,): the others are hidden until one clicks on them in the legend.
+        Of bool, shape (n,): the others have a name of their own in the legend.
     lines
         What else to draw, by its name in the legend: a colour and points (m, 3), NaN rows where
-        the line breaks.
-    eye
-        Where one looks from at first, in widths of the scene from its middle.
+        the line breaks. Boards are hidden until one clicks on them there.
     note
         A sentence at the bottom of the page.
+    title
+        At its top.
+    measuring
+        What :func:`lrfcal_lib.measure.lengths.for_page` gives for these points: two clicks give a
+        length.
     """
     from plotly.io import write_html  # a second
 
     traces: list[dict] = []
     every = -(-len(points) // MOST_POINTS) or 1
-    clouds = {"points": (seen, True), "points that no image saw": (~seen, "legendonly")}
-    for name, (which, shown) in clouds.items():
-        rgb = colors[which][::every].astype(int)
+    shown = {
+        "points": np.flatnonzero(seen)[::every],
+        "points that no image saw": np.flatnonzero(~seen)[::every],
+    }
+    for name, rows in shown.items():
+        rgb = colors[rows].astype(int)
         shades = [f"#{value:06x}" for value in (rgb @ [1 << 16, 1 << 8, 1]).tolist()]
         marker = {"size": 1.6, "color": shades}
-        traces.append(_trace(name, points[which][::every], "markers", marker=marker))
-        traces[-1]["visible"] = shown
+        traces.append(_trace(name, points[rows], "markers", marker=marker))
+        traces[-1]["hoverinfo"] = "none"
     for name, (color, line) in lines.items():
         traces.append(_trace(name, line, "lines", line={"color": color, "width": 4}))
-    axes = {f"{axis}axis": {"title": {"text": f"{axis} [m]"}} for axis in "xyz"}
-    view = {"eye": dict(zip("xyz", eye, strict=True)), "up": {"x": 0, "y": 0, "z": 1}}
+        traces[-1]["visible"] = "legendonly" if name == "boards" else True
+    data = "null"
+    if measuring is not None:
+        data = json.dumps(_packed(measuring, list(shown.values()), len(traces)))
+        traces += _measured_traces(measuring)
+    axes = {
+        f"{axis}axis": {"title": {"text": f"{axis} [m]"}, "showspikes": False}
+        for axis in "xyz"
+    }
+    view = {"eye": dict(zip("xyz", EYE, strict=True)), "up": {"x": 0, "y": 0, "z": 1}}
     layout = {
-        "scene": {**axes, "aspectmode": "data", "camera": view},
-        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "scene": {**axes, "aspectmode": "data", "camera": view, "dragmode": "turntable"},
+        "margin": {"l": 0, "r": 0, "t": 30 if title else 0, "b": 0},
+        "title": {"text": title, "x": 0.5, "y": 0.99, "yanchor": "top"},
         "legend": {"itemsizing": "constant", "x": 0, "y": 1},
-        "hovermode": False,
+        "hovermode": "closest",
         "annotations": [{"text": note, "x": 0, "y": 0, "showarrow": False, **PAGE}],
     }
     # unchecked: a check looks at every colour, 5 s
-    page = {"data": traces, "layout": layout}
-    write_html(page, path, validate=False, div_id="scene", default_height="100vh")
+    script = f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});"
+    write_html(
+        {"data": traces, "layout": layout},
+        path,
+        config={"scrollZoom": False},
+        validate=False,
+        div_id="scene",
+        default_height="100vh",
+        post_script=script,
+    )
+
+
+def _packed(measuring, shown, first_trace):
+    """What scene.js needs, as JSON holds it: arrays of numbers as text."""
+    data = dict(measuring)
+    for name in ("features", "ends"):
+        data[name] = _text(measuring[name])
+    data["covariances"] = [_text(C) for C in measuring["covariances"]]
+    for name in ("plane_of_point", "station_of_point"):
+        data[name] = [_text(measuring[name][rows]) for rows in shown]
+    data["edges_trace"] = first_trace
+    data["lengths_trace"] = first_trace + 1
+    return data
+
+
+def _measured_traces(measuring):
+    """Edges that can be picked, and the lengths that were."""
+    ends = np.asarray(measuring["ends"]).reshape(-1, 2, 3)
+    broken = np.full((len(ends), 3, 3), np.nan)
+    broken[:, :2] = ends
+    edges = _trace(
+        "edges", broken.reshape(-1, 3), "lines", line={"color": COLORS["fit"], "width": 3}
+    )
+    edges |= {"visible": "legendonly", "hoverinfo": "skip"}
+    lengths = _trace("lengths", np.zeros((0, 3)), "lines+markers")
+    lengths |= {
+        "line": {"color": "#d00", "width": 6},
+        "marker": {"color": "#d00", "size": 4},
+        "hoverinfo": "skip",
+    }
+    return [edges, lengths]
 
 
 def _trace(name, points, mode, **style):
     """Points (n, 3) as plotly draws them; the coordinates packed."""
     trace = {"type": "scatter3d", "name": name, "mode": mode, **style}
     for axis, values in zip("xyz", np.asarray(points, "<f4").T, strict=True):
-        packed = base64.b64encode(values.tobytes()).decode()
-        trace[axis] = {"dtype": "f4", "bdata": packed}
+        trace[axis] = {"dtype": "f4", "bdata": _text(values)}
     return trace
+
+
+def _text(values):
+    """Numbers as the text of single-precision bytes."""
+    return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
 
 
 def rig_lines(

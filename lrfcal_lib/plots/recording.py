@@ -109,7 +109,8 @@ def range_image(
         _outlined(ax, bearing, height[order], mask[order])
         rows = height[mask.any(axis=1)]
         rim = [rows.min() - ABOUT, rows.max() + ABOUT]
-        ax.set_ylim(np.clip(rim, height.min(), height.max()))
+        if len(height) > 1:
+            ax.set_ylim(np.clip(rim, height.min(), height.max()))
         board = bearing[mask.any(axis=0)]
         shown &= np.abs(bearing - board.mean()) < np.ptp(board) / 2 + ABOUT
     if shown.any():

@@ -1,6 +1,6 @@
 """Drawings in space, and coloured clouds as a camera sees them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -8,11 +8,14 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.model.geometry import fit_plane
 from lrfcal_lib.plots.recording import CENTRED, COLORS, closed
 
 SURFACE = {"color": COLORS["left"], "alpha": 0.15, "linewidth": 0}
 NEAREST = 1e-6  # metres: what is nearer, or behind a camera, is not seen
 PARALLEL = 1e-9  # sine of an angle below which two directions are one
+FAR = 4.0  # widths of a part from which it is looked at, so that it is hardly distorted
+COVER = 0.75  # half the width of a drawn point, of the usual spacing: scattered points leave gaps
 Vector = Sequence[float] | np.ndarray
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
@@ -31,19 +34,6 @@ def polygon(ax: Axes3D, corners: np.ndarray, color: str = COLORS["truth"]) -> No
         Poly3DCollection([corners], facecolors=color, edgecolors=color, alpha=0.15)
     )
     ax.plot(*closed(corners).T, color=color, linewidth=1.2)
-
-
-def lines(ax: Axes3D, drawn: Mapping[str, tuple[str, np.ndarray]]) -> None:
-    """Lines in space.
-
-    Parameters
-    ----------
-    ax
-    drawn
-        By name a colour and points (n, 3), metres, with NaN rows where a line breaks.
-    """
-    for name, (color, points) in drawn.items():
-        ax.plot(*points.T, color=color, linewidth=1.6, label=name)
 
 
 def space(
@@ -242,6 +232,40 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
     ahead = ahead / distance
     rotation = Rotation.from_matrix(np.stack([right, np.cross(ahead, right), ahead]))
     return RigidTransform.from_components(-rotation.apply(eye), rotation)
+
+
+def face_on(
+    points: np.ndarray, size: tuple[int, int], fill: float = 0.85
+) -> tuple[RigidTransform, float, int]:
+    """The view of a flat part of a cloud from its front, for :func:`render`.
+
+    Parameters
+    ----------
+    points
+        Shape (n, 3), metres, in a frame whose origin is in front of them.
+    size
+        Height and width of the picture, pixels.
+    fill
+        Share of the picture that they fill.
+
+    Returns
+    -------
+    T_view : RigidTransform
+    focal : float
+        Pixels.
+    splat : int
+        Half a width of a point that leaves few gaps, pixels.
+    """
+    normal, _, _ = fit_plane(points)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+
+    wide = 2 * np.linalg.norm(points - middle, axis=1).max()
+    T_view = look_at(middle - FAR * wide * normal, middle)
+    spread = np.ptp(pixels(T_view.apply(points), size, 1.0), axis=0)
+    focal = fill * min(size[1] / spread[0], size[0] / spread[1])
+    # half of a rectangle about points of a triangle is empty
+    spacing = focal * np.sqrt(spread[0] * spread[1] / 2 / len(points))
+    return T_view, float(focal), int(np.ceil(COVER * spacing))
 
 
 def measured_edges(

@@ -280,6 +280,11 @@ class Session:
     telegrams: TelegramLog | None = field(default=None, repr=False)
     continuous: bool = False
 
+    def __repr__(self):
+        cameras = ", ".join(self.cameras) or "none"
+        boards = f"{len(self.board_placements)} placements of {self.board.name}"
+        return f"Session({self.name}: {boards}, LRF {self.lrf.model}, cameras {cameras})"
+
     def sweep(self, placement: int) -> Sweep:
         """The scan lines of a placement.
 

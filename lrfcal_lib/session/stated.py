@@ -5,7 +5,7 @@ import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 import pydantic
@@ -344,6 +344,14 @@ Endless = Annotated[
 ]
 
 
+def plainly_typed(kind: type) -> type:
+    """A record whose help shows plain types, without the limits that pydantic reads."""
+    plain_types = get_type_hints(kind)
+    kind.__init__.__annotations__ = plain_types | {"return": None}
+    return kind
+
+
+@plainly_typed
 @dataclass(frozen=True)
 class LrfInfo:
     """What is known about the laser range finder, read from the device or its data, never from the
@@ -440,6 +448,7 @@ else:  # stated without the size of the image, which stands beside it
     ]
 
 
+@plainly_typed
 @dataclass(frozen=True)
 class CameraInfo:
     """A camera of the rig.

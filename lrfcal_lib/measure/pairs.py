@@ -1,0 +1,431 @@
+"""Two stations of a scene beside each other: where one may stand in the frame of the other.
+
+The start needs no guess but that both platforms stand on their feet: directions of walls and floor
+give the turns, the correlation of all surfaces gives the shifts. Every start that is good enough is
+refined, and judged by what overlaps and by what stands where the other station looked through.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import small_gicp
+from scipy.fft import irfftn, next_fast_len, rfftn
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.spatial import KDTree
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.calibrate.cloud import Cloud
+from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
+
+# metres, side of the cells whose points make one patch of a surface: for a start, for the fit
+COARSE = 0.1
+FINE = 0.05
+FLAT = 0.97  # length of the mean normal of a patch; less has an edge in it
+DIRECTIONS = 8  # of walls, floor and furniture that make turns
+NEAR = np.cos(np.radians(8.0))  # between normals of one direction
+FEW = 0.01  # share of the patches that makes a direction
+SAME_ANGLE = np.radians(4.0)  # between two directions in one station and in the other
+SAME_TURN = np.radians(6.0)  # turns that are refined to the same one
+UPRIGHT = np.cos(
+    np.radians(25.0)
+)  # between the z axes of platforms that stand on their feet
+CELL = 0.2  # metres, of the grid on which shifts are looked for
+PEAKS = 6  # shifts tried a turn
+STARTS = 10  # tried a pair
+WIDTHS = (0.4, 0.2)  # metres within which patches are taken for the same, one by one
+AROUND = 20  # patches that make a covariance
+SAME_PLACE = 0.15  # metres, and
+SAME_YAW = np.radians(3.0)  # within which two starts ended at the same pose
+MATCHED = 0.1  # metres between patches of the same surface
+FACING = np.cos(np.radians(30.0))  # between normals of the same surface
+LOOK = np.radians(1.0)  # side of a cell of what a station saw
+CLEAR = 0.15  # metres before a surface; a patch there stands where the other looked through
+CLOSER = (0.1, 0.05, 0.05, 0.05)  # metres within which a fit takes patches for the same
+COMMON = 0.002  # metres, error of a patch that its neighbours have too
+TUKEY = 4.685  # sigma beyond which a patch counts for nothing (Beaton and Tukey 1974)
+NEIGHBOURS = (
+    0.5  # metres; the errors of patches nearer together are not taken as independent
+)
+ACROSS = 0.35  # cosine between a normal and a direction from which a patch holds it
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a station saw, in patches.
+
+    Attributes
+    ----------
+    points, normals : ndarray, shape (n, 3)
+        Means of the points of a patch, platform frame, metres; unit vectors.
+    sigma : ndarray, shape (n,)
+        Standard deviation of a mean along the normal, metres.
+    by_rig : ndarray, shape (n, 13)
+        Motion of a patch along its normal by what the calibration may have wrong, see `COLUMNS`.
+    by_sweep : ndarray, shape (n, 2)
+        The same by one sigma of the sweep's own offset and stretch of the pitch.
+    nearest : ndarray, shape (k, l)
+        Range by azimuth and height about the platform, metres; 0 where it saw nothing.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    sigma: np.ndarray
+    by_rig: np.ndarray
+    by_sweep: np.ndarray
+    nearest: np.ndarray
+    gicp: small_gicp.PointCloud
+    gicp_tree: small_gicp.KdTree
+    tree: KDTree
+
+
+def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> Surface:
+    """The patches of a cloud of one station.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    size : float
+        Of a patch, metres: `COARSE` for a start, `FINE` for a fit.
+    rig : CalibratedRig, optional
+        That made the cloud; without it no error of the calibration is looked at.
+
+    Returns
+    -------
+    Surface
+
+    Raises
+    ------
+    ValueError
+        If no part of it is smooth.
+    """
+    whole = cloud.rows(np.isfinite(cloud.normals).all(axis=1))
+    cells = np.floor(whole.points / size).astype(int)
+    _, patch, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+
+    def mean(columns):
+        sums = [np.bincount(patch, column) for column in columns.T]
+        return np.stack(sums, axis=1) / count[:, None]
+
+    points = mean(whole.points)
+    normals = mean(whole.normals)
+    sigma = np.sqrt(mean(whole.sigma[:, None] ** 2)[:, 0] / count)
+    length = np.linalg.norm(normals, axis=1)
+    flat = length > FLAT
+    if not flat.any():
+        raise ValueError("no part of the cloud is a smooth surface")
+    points = points[flat]
+    gicp = small_gicp.PointCloud(points)
+    gicp_tree = small_gicp.KdTree(gicp)
+    small_gicp.estimate_normals_covariances(gicp, gicp_tree, AROUND)
+    moves = mean(_moves(whole, rig))[flat]
+    return Surface(
+        points=points,
+        normals=normals[flat] / length[flat, None],
+        sigma=sigma[flat],
+        by_rig=moves[:, :-2],
+        by_sweep=moves[:, -2:],
+        nearest=_look(cloud.points),
+        gicp=gicp,
+        gicp_tree=gicp_tree,
+        tree=KDTree(points),
+    )
+
+
+def _moves(cloud, rig):
+    """Motions (n, 13 + 2) of points along their normals: by the rig, by the sweep's pitch."""
+    if rig is None:
+        return np.zeros((len(cloud.points), len(COLUMNS) + 2))
+    # as the platform sees it, whatever stands on the head
+    chain = replace(chain_of(rig), on_head=False)
+    _, J, by_pitch = carried(chain, cloud.bearing, cloud.pitch, cloud.range)
+    by_rig = np.einsum("ni,nij->nj", cloud.normals, J)
+    turn = np.vecdot(cloud.normals, by_pitch)
+    offset, stretch = chain.sweep_sigma
+    return np.column_stack([by_rig, offset * turn, stretch * cloud.pitch * turn])
+
+
+def _cells(points):
+    """Where points (n, 3) stand in the view of a platform: row, column, range (n,)."""
+    distance = np.linalg.norm(points, axis=1)
+    azimuth = np.arctan2(points[:, 0], points[:, 1])
+    height = np.arcsin(points[:, 2] / np.maximum(distance, 1e-9))
+    row = np.floor((azimuth + np.pi) / LOOK).astype(int)
+    column = np.floor((height + np.pi / 2) / LOOK).astype(int)
+    return row, column, distance
+
+
+def _look(points):
+    """Nearest range in every cell of the view of a platform and the cells about it, or 0."""
+    row, column, distance = _cells(points)
+    shape = (int(2 * np.pi / LOOK) + 1, int(np.pi / LOOK) + 1)
+    nearest = np.full(shape, np.inf)
+    np.minimum.at(nearest, (row, column), distance)
+    nearest = minimum_filter(nearest, 3)
+    return np.where(np.isfinite(nearest), nearest, 0.0)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Where the second of two stations may stand.
+
+    Attributes
+    ----------
+    T_first_second : RigidTransform
+    overlap : float
+        Share of the patches of the station that has fewer which the other one has too.
+    against : float
+        Share of patches in the other's view that stand where it looked through.
+    """
+
+    T_first_second: RigidTransform
+    overlap: float
+    against: float
+
+
+def candidates(first: Surface, second: Surface) -> list[Candidate]:
+    """Poses of the second station at which surfaces of both fall together, the best first.
+
+    Parameters
+    ----------
+    first, second : Surface
+
+    Returns
+    -------
+    list of Candidate
+        All different; empty where the stations have no two directions of walls in common.
+    """
+    ended: list[RigidTransform] = []
+    for start in starts(first, second):
+        T = refined(first, second, start)
+        if not any(_same(T, other) for other in ended):
+            ended.append(T)
+    found = [agreement(first, second, T) for T in ended]
+    return sorted(found, key=lambda c: -c.overlap * (1 - c.against))
+
+
+def _same(a, b):
+    """Whether two poses are one."""
+    apart = a.inv() * b
+    near = np.linalg.norm(apart.translation) < SAME_PLACE
+    return near and apart.rotation.magnitude() < SAME_YAW
+
+
+def starts(first: Surface, second: Surface) -> list[RigidTransform]:
+    """Rough poses of the second station in the frame of the first, the most likely first."""
+    found = []
+    for turn in _turns(_directions(first), _directions(second)):
+        found += _shifts(first, second, turn)
+    found.sort(key=lambda scored: -scored[0])
+    return [T for _, T in found[:STARTS]]
+
+
+def _directions(surface):
+    """Directions (k, 3) in which many patches face, the most of them first."""
+    every = max(1, len(surface.normals) // 2000)
+    left = surface.normals[::every]
+    least = FEW * len(left)
+    found = []
+    while len(found) < DIRECTIONS and len(left):
+        near = left @ left.T > NEAR
+        best = near[np.argmax(near.sum(axis=1))]
+        if best.sum() < least:
+            break
+        mean = left[best].mean(axis=0)
+        mean /= np.linalg.norm(mean)
+        found.append(mean)
+        left = left[left @ mean < NEAR]
+    return np.array(found).reshape(-1, 3)
+
+
+def _turns(first, second):
+    """Turns of the second station by which two of its directions fall on two of the first."""
+    found: list[Rotation] = []
+    for a, b in _two_of(first):
+        for c, d in _two_of(second):
+            if abs(np.arccos(a @ b) - np.arccos(c @ d)) > SAME_ANGLE:
+                continue
+            turn = Rotation.align_vectors([a, b], [c, d])[0]
+            upright = turn.as_matrix()[2, 2] > UPRIGHT
+            if upright and not any(
+                (turn * other.inv()).magnitude() < SAME_TURN for other in found
+            ):
+                found.append(turn)
+    return found
+
+
+def _two_of(directions) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Ordered pairs of directions that are neither parallel nor opposite."""
+    for a in directions:
+        for b in directions:
+            if abs(a @ b) < FACING:
+                yield a, b
+
+
+def _shifts(first, second, turn):
+    """The best shifts of the second station after a turn: score and pose of each.
+
+    The correlation of normals on a grid: surfaces count that face the same way.
+    """
+    moved = turn.apply(second.points)
+    low = first.points.min(axis=0)
+    low_moved = moved.min(axis=0)
+    span = np.ptp(first.points, axis=0) + np.ptp(moved, axis=0)
+    shape = [next_fast_len(int(n) + 4, real=True) for n in span / CELL]
+    score = np.zeros(shape)
+    for axis in range(3):
+        here = _on_grid(first.points - low, first.normals[:, axis], shape)
+        there = _on_grid(moved - low_moved, turn.apply(second.normals)[:, axis], shape)
+        blurred = gaussian_filter(here, 1.0, mode="wrap")
+        score += irfftn(rfftn(blurred) * np.conj(rfftn(there)), s=shape)
+    top = np.where(score == maximum_filter(score, 5, mode="wrap"), score, 0.0)
+    best = np.argsort(top, axis=None)[::-1][:PEAKS]
+    found = []
+    for place in best:
+        cell = np.array(np.unravel_index(place, shape))
+        # beyond the extent of the first, a shift is one to the other side
+        back = cell * CELL > np.ptp(first.points, axis=0) + 2 * CELL
+        shift = (cell - back * np.array(shape)) * CELL + low - low_moved
+        found.append((top.flat[place], RigidTransform.from_components(shift, turn)))
+    return found
+
+
+def _on_grid(points, values, shape):
+    """Sums of values (n,) on the nearest points of a grid."""
+    grid = np.zeros(shape)
+    np.add.at(grid, tuple(np.rint(points / CELL).astype(int).T), values)
+    return grid
+
+
+def refined(first: Surface, second: Surface, start: RigidTransform) -> RigidTransform:
+    """A rough pose of the second station after GICP in shrinking widths."""
+    T = start.as_matrix()
+    for width in WIDTHS:
+        T = small_gicp.align(
+            first.gicp,
+            second.gicp,
+            first.gicp_tree,
+            T,
+            registration_type="GICP",
+            max_correspondence_distance=width,
+            max_iterations=30,
+        ).T_target_source
+    return RigidTransform.from_matrix(T)
+
+
+def agreement(first: Surface, second: Surface, T: RigidTransform) -> Candidate:
+    """How two stations agree at a pose of the second."""
+    here, there = matches(first, second, T)
+    both = len(np.unique(here)), len(there)
+    conflicts = _before(first, T.apply(second.points))
+    conflicts += _before(second, T.inv().apply(first.points))
+    fewer = min(len(first.points), len(second.points))
+    against = conflicts / max(conflicts + sum(both), 1)
+    return Candidate(T, min(both) / fewer, against)
+
+
+def matches(first: Surface, second: Surface, T: RigidTransform, width: float = MATCHED):
+    """Numbers of patches of the first and second station that are of one surface."""
+    distance, near = first.tree.query(T.apply(second.points), distance_upper_bound=width)
+    there = np.flatnonzero(np.isfinite(distance))
+    here = near[there]
+    normals = T.rotation.apply(second.normals[there])
+    same = np.vecdot(first.normals[here], normals) > FACING
+    return here[same], there[same]
+
+
+def _before(surface, points):
+    """How many points (n, 3) stand where a station looked through."""
+    row, column, distance = _cells(points)
+    return int(np.sum(distance < surface.nearest[row, column] - CLEAR))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The pose of a second station that fits best, and how well it is known.
+
+    Attributes
+    ----------
+    T_first_second : RigidTransform
+    covariance : ndarray, shape (6, 6)
+        Of a turn and a shift in the first station's frame, without errors of the calibration.
+    by_rig : ndarray, shape (6, 13)
+        Turn and shift by what the calibration may have wrong, see `COLUMNS`.
+    rms : float
+        Of the distances between the surfaces of both, metres.
+    loose : ndarray, shape (3,)
+        Direction in the first station's frame along which the least holds the second.
+    held : float
+        Share of the patches that hold it there.
+    """
+
+    T_first_second: RigidTransform
+    covariance: np.ndarray
+    by_rig: np.ndarray
+    rms: float
+    loose: np.ndarray
+    held: float
+
+
+def fitted(first: Surface, second: Surface, start: RigidTransform) -> Fit:
+    """The pose of a second station by all patches of both, each by its sigma.
+
+    The distance of a patch from the nearest one of the other station, along the normal. What few
+    disagree about counts little (Tukey's weights). Errors of neighbours are taken as one in the
+    covariance.
+
+    Parameters
+    ----------
+    first, second : Surface
+        In patches of `FINE`.
+    start : RigidTransform
+        Within a few centimetres of it.
+
+    Returns
+    -------
+    Fit
+    """
+    T = start
+    for width in CLOSER:
+        here, there = matches(first, second, T, width)
+        J, r = _distances(first, second, T, here, there)
+        sigma = np.sqrt(first.sigma[here] ** 2 + second.sigma[there] ** 2 + COMMON**2)
+        scale = max(1.0, 1.4826 * float(np.median(np.abs(r / sigma))))
+        share = np.clip(np.abs(r / sigma) / (TUKEY * scale), 0, 1)
+        weight = (1 - share**2) ** 2 / (scale * sigma) ** 2
+        H = np.einsum("ni,n,nj->ij", J, weight, J)
+        step = -np.linalg.pinv(H, rcond=1e-12) @ (J.T @ (weight * r))
+        T = _moved(T, step)
+    pulls = J * (weight * (r + J @ step))[:, None]
+    cells = np.floor(first.points[here] / NEIGHBOURS).astype(int)
+    _, group = np.unique(cells, axis=0, return_inverse=True)
+    sums = np.stack([np.bincount(group, column) for column in pulls.T], axis=1)
+    inverse = np.linalg.pinv(H, rcond=1e-12)
+    gain = -inverse @ (J * weight[:, None]).T
+    by_sweeps = np.hstack([gain @ first.by_sweep[here], gain @ second.by_sweep[there]])
+    shift = H[3:, 3:] - H[3:, :3] @ np.linalg.pinv(H[:3, :3], rcond=1e-12) @ H[:3, 3:]
+    loose = np.linalg.eigh(shift)[1][:, 0]
+    return Fit(
+        T_first_second=T,
+        covariance=inverse @ (sums.T @ sums) @ inverse + by_sweeps @ by_sweeps.T,
+        by_rig=gain @ (second.by_rig[there] - first.by_rig[here]),
+        rms=float(np.sqrt(np.sum(weight * r**2) / np.sum(weight))),
+        loose=loose,
+        held=float(np.mean(np.abs(J[:, 3:] @ loose) > ACROSS)),
+    )
+
+
+def _distances(first, second, T, here, there):
+    """Distances (m,) of matched patches along the normal, by turn and shift (m, 6)."""
+    turned = T.rotation.apply(second.points[there])
+    normals = first.normals[here] + T.rotation.apply(second.normals[there])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    r = np.vecdot(normals, turned + T.translation - first.points[here])
+    return np.hstack([np.cross(turned, normals), normals]), r
+
+
+def _moved(T, step):
+    """A pose after a turn and a shift."""
+    turn = Rotation.from_rotvec(step[:3]) * T.rotation
+    return RigidTransform.from_components(T.translation + step[3:], turn)

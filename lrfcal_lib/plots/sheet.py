@@ -1,0 +1,66 @@
+"""A board to print: a chessboard at its true size, with the outline along which it is cut."""
+
+from os import PathLike
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon, Rectangle
+
+from lrfcal_lib.model.board import Board, Chessboard
+
+BORDER = 0.5  # squares between the chessboard and the cut
+PAPER = 0.02  # metres around the cut
+RULER = 0.1  # metres, to check the size of the print
+INCH = 0.0254
+
+
+def sheet(columns: int, rows: int, square: float) -> Board:
+    """A rectangular board around a chessboard, with its lower left corner in the origin.
+
+    Parameters
+    ----------
+    columns, rows
+        Inner corners along x and y.
+    square
+        Metres.
+    """
+    start = (1 + BORDER) * square
+    width = (columns + 1 + 2 * BORDER) * square
+    height = (rows + 1 + 2 * BORDER) * square
+    corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+    pattern = Chessboard(columns, rows, square, (start, start))
+    edges = ("bottom", "right", "top", "left")
+    return Board("printed", edges, corners, pattern, ("bottom", "left"))
+
+
+def print_sheet(path: str | PathLike, board: Board, dpi: float = 300) -> None:
+    """Write a board as one page of its own size.
+
+    Parameters
+    ----------
+    path
+        Its ending decides: ``.pdf``, ``.svg``, or ``.png`` with `dpi`.
+    board
+        With an outline and a pattern.
+    dpi
+    """
+    corners = board.known_corners()
+    low = corners.min(axis=0) - PAPER
+    high = corners.max(axis=0) + PAPER
+    page = Figure(figsize=(high - low) / INCH)
+    ax = page.add_axes((0, 0, 1, 1))
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    ax.set_axis_off()
+    pattern = board.pattern
+    first = np.subtract(pattern.origin, pattern.square)
+    for row, column in np.ndindex(pattern.rows + 1, pattern.columns + 1):
+        if (row + column) % 2 == 0:
+            at = first + pattern.square * np.array([column, row])
+            side = pattern.square
+            ax.add_patch(Rectangle(tuple(at), side, side, color="black", linewidth=0))
+    ax.add_patch(Polygon(corners, fill=False, edgecolor="black", linewidth=0.5))
+    ruler = low + [PAPER, PAPER / 3]
+    ax.plot(ruler[0] + np.array([0, RULER]), [ruler[1], ruler[1]], "|-", color="black")
+    words = f"{1000 * RULER:.0f} mm at 100 %; squares of {1000 * pattern.square:g} mm"
+    ax.text(ruler[0] + 1.1 * RULER, ruler[1], words, fontsize=7, va="center")
+    page.savefig(path, dpi=dpi)
