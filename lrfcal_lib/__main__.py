@@ -28,6 +28,27 @@ def run(args):
             print(f"{args.dst}: simulated")
         case "record":
             return record(args)
+        case "reconstruct" | "merge" | "measure":
+            return use_calibration(args)
+        case "report":
+            from lrfcal_lib.report.report import main
+
+            return main(args.sessions, args.out, args.jobs, args.store)
+        case "study":
+            from lrfcal_lib.report.study import study
+
+            return study(args)
+        case "emulate":
+            from lrfcal_lib.emulators.rig import main
+
+            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
+        case "board":
+            print_board(args)
+
+
+def use_calibration(args):
+    """Verbs that take a calibration to a scene."""
+    match args.verb:
         case "reconstruct":
             from lrfcal_lib.report.reconstruct import reconstruct_session
 
@@ -49,20 +70,6 @@ def run(args):
                 args.station,
                 args.untrusted,
             )
-        case "report":
-            from lrfcal_lib.report.report import main
-
-            return main(args.sessions, args.out, args.jobs, args.store)
-        case "study":
-            from lrfcal_lib.report.study import study
-
-            return study(args)
-        case "emulate":
-            from lrfcal_lib.emulators.rig import main
-
-            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
-        case "board":
-            print_board(args)
 
 
 def print_board(args):
