@@ -29,26 +29,13 @@ def run(args):
         case "record":
             return record(args)
         case "reconstruct":
-            from lrfcal_lib.report.reconstruct import reconstruct_session
-
-            return reconstruct_session(
-                args.session, args.calibration, args.out, args.untrusted
-            )
+            return reconstruct(args)
         case "merge":
             from lrfcal_lib.report.merge import merge_session
 
             return merge_session(args.session, args.calibration, args.out, args.untrusted)
         case "measure":
-            from lrfcal_lib.report.measure import measure_session
-
-            return measure_session(
-                args.session,
-                args.calibration,
-                args.picks,
-                args.out,
-                args.station,
-                args.untrusted,
-            )
+            return measure(args)
         case "report":
             from lrfcal_lib.report.report import main
 
@@ -122,6 +109,22 @@ def check(args):
         needed = f"{FEW} or more are needed to see errors of the model"
         print(f"warning: {count} placements of the board; {needed}")
     return 0
+
+
+def reconstruct(args):
+    """Write coloured clouds of a scene."""
+    from lrfcal_lib.report.reconstruct import reconstruct_session
+
+    return reconstruct_session(args.session, args.calibration, args.out, args.untrusted)
+
+
+def measure(args):
+    """Measure lengths between picked places of a scene."""
+    from lrfcal_lib.report.measure import measure_session
+
+    return measure_session(
+        args.session, args.calibration, args.picks, args.out, args.station, args.untrusted
+    )
 
 
 def record(args):
