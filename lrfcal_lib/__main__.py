@@ -16,10 +16,8 @@ def run(args):
             return check(args)
         case "calibrate":
             return calibrate(args)
-        case "compare":
-            from lrfcal_lib.report.compare import compare_files
-
-            return compare_files(args.calibrations, args.figure)
+        case "compare" | "reconstruct" | "merge" | "measure":
+            return use_calibrations(args)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
@@ -28,6 +26,29 @@ def run(args):
             print(f"{args.dst}: simulated")
         case "record":
             return record(args)
+        case "report":
+            from lrfcal_lib.report.report import main
+
+            return main(args.sessions, args.out, args.jobs, args.store)
+        case "study":
+            from lrfcal_lib.report.study import study
+
+            return study(args)
+        case "emulate":
+            from lrfcal_lib.emulators.rig import main
+
+            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
+        case "board":
+            print_board(args)
+
+
+def use_calibrations(args):
+    """Do what a verb asks for that takes calibration.json."""
+    match args.verb:
+        case "compare":
+            from lrfcal_lib.report.compare import compare_files
+
+            return compare_files(args.calibrations, args.figure)
         case "reconstruct":
             from lrfcal_lib.report.reconstruct import reconstruct_session
 
@@ -49,20 +70,6 @@ def run(args):
                 args.station,
                 args.untrusted,
             )
-        case "report":
-            from lrfcal_lib.report.report import main
-
-            return main(args.sessions, args.out, args.jobs, args.store)
-        case "study":
-            from lrfcal_lib.report.study import study
-
-            return study(args)
-        case "emulate":
-            from lrfcal_lib.emulators.rig import main
-
-            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
-        case "board":
-            print_board(args)
 
 
 def print_board(args):
@@ -105,7 +112,9 @@ def calibrate(args):
 
 
 def check(args):
-    """Say what is wrong with a session: 0 where nothing is, else 1."""
+    """Say what is wrong with a session: 0 where nothing is, else 1. With a calibration 3 where that
+    has moved, 2 where it cannot be told.
+    """
     from lrfcal_lib.session.read import open_session, validate
     from lrfcal_lib.session.shown import printable
 
@@ -121,6 +130,10 @@ def check(args):
     elif count < FEW:
         needed = f"{FEW} or more are needed to see errors of the model"
         print(f"warning: {count} placements of the board; {needed}")
+    if args.calibration is not None:
+        from lrfcal_lib.report.holds import check_calibration
+
+        return check_calibration(session, args.calibration)
     return 0
 
 
@@ -203,6 +216,8 @@ def _add_sessions(verbs):
     """Verbs that make or use a session without devices."""
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
+    holds = "a calibration.json: does it still hold for the rig that recorded the session?"
+    check.add_argument("--calibration", metavar="JSON", help=holds)
 
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")

@@ -47,8 +47,9 @@ def test_honest_calibrations_differ_within_what_they_claim(days):
     for pair in compared:
         for part in (*pair.parts, pair.whole):
             for amount in part.amounts:
-                assert 0 <= amount.claimed < np.inf
                 assert amount.value <= 4 * amount.claimed
+                # the scale of the pitch was held at zero: nobody claims to know it
+                assert np.isfinite(amount.claimed) == (amount.what != "scale")
 
 
 def test_a_camera_that_was_turned_is_named(days):
@@ -129,5 +130,5 @@ def test_a_session_is_calibrated_and_a_folder_has_its_file(quick, tmp_path, monk
     found = compare(of_session, rig_at(tmp_path))
     assert found.first.session == found.second.session == "sim_quick"
     assert found.whole.chi2 < 1e-20
-    with pytest.raises(ValueError, match="other.*No such file"):
+    with pytest.raises(ValueError, match="other.*no such file"):
         rig_at(tmp_path / "other")

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.geometry import polar_to_points
-from lrfcal_lib.plots.recording import COLORS
+from lrfcal_lib.plots.colors import COLORS
 
 WIDTH = 400  # of a picture, pixels
 HEIGHT = 300

@@ -255,6 +255,7 @@ def load_calibration(path: str | Path) -> CalibratedRig:
     Parameters
     ----------
     path : path-like
+        Of the file, or of its folder.
 
     Returns
     -------
@@ -267,6 +268,11 @@ def load_calibration(path: str | Path) -> CalibratedRig:
     SessionError
         For a file that cannot be read, is damaged, no calibration, or of another schema.
     """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "calibration.json"
+    if not path.exists():
+        raise SessionError(f"{path}: there is no such file; 'calibrate' writes it")
     data = read_json(path, None)
     if data.get("kind") != KIND and data.get("schema") != 1:
         raise SessionError(

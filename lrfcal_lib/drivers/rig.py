@@ -369,7 +369,7 @@ class Rig(Closed):
         self.lrf.stop()
 
     def _close(self, placement):
-        """Scan once more in the first half of a sweep, as level as it was there: walls show most."""
+        """Scan again in the first half of a sweep, as level as it was there: walls show most."""
         interlaced = self.stated.devices.lrf.interlaced
         half = placement.pitch[: len(placement.pitch) // 2 + 1]
         level = float(half[np.argmin(np.abs(half))])

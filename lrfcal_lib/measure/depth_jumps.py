@@ -36,6 +36,8 @@ class DepthJumps:
         Of the rim as beams have it, corrected: radians, radians, metres.
     along, outward : ndarray, shape (n, 2)
         Unit vectors of bearing and pitch along the rim, and away from the nearer surface.
+    slope : ndarray, shape (n,)
+        By which the range of the nearer surface grows outwards, metres a radian.
     behind : ndarray, shape (n,)
         Range of the farther surface, metres.
     returns : ndarray, shape (n,)
@@ -52,6 +54,7 @@ class DepthJumps:
     range: np.ndarray
     along: np.ndarray
     outward: np.ndarray
+    slope: np.ndarray
     behind: np.ndarray
     returns: np.ndarray
     radius: np.ndarray
@@ -101,8 +104,8 @@ def _energy(ranges, grid, rig):
 def _crossings(ranges, grid, energy, lrf):
     """Jumps along the second axis of ranges (l, b) at directions (l, b, 2).
 
-    Directions (n, 2) of the jump and outwards, ranges of the nearer and the farther side, and what
-    the farther one returns.
+    Directions (n, 2) of the jump and outwards, range and slope of the nearer side, range of the
+    farther one and what it returns.
     """
     steps = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
     step = max(float(np.median(steps)), LEAST_STEP)
@@ -110,7 +113,7 @@ def _crossings(ranges, grid, energy, lrf):
     gap = int(np.ceil(lrf.spot_radius(typical) / typical / step))
     side = gap + BESIDE
     if ranges.shape[1] < 2 * side:
-        return (np.zeros(shape) for shape in ((0, 2), (0, 2), 0, 0, 0))
+        return (np.zeros(shape) for shape in ((0, 2), (0, 2), 0, 0, 0, 0))
     windows = np.lib.stride_tricks.sliding_window_view(ranges, 2 * side, axis=1)
     first, first_slope, first_rough = _rim(windows[..., :BESIDE], side)
     last, last_slope, last_rough = _rim(windows[..., ::-1][..., :BESIDE], side)
@@ -120,7 +123,9 @@ def _crossings(ranges, grid, energy, lrf):
         beyond = (windows - middle) * np.sign(jump)[..., None] > 0
         clear = np.abs(jump) > LEAST_JUMP
         clear &= np.maximum(first_rough, last_rough) < ROUGH * lrf.sigma_range
-        clear &= np.maximum(first_slope, last_slope) < STEEPEST * np.abs(jump)
+        clear &= np.maximum(np.abs(first_slope), np.abs(last_slope)) < STEEPEST * np.abs(
+            jump
+        )
     clear &= np.isfinite(windows).all(axis=-1)
     clear &= ~beyond[..., :side].any(axis=-1) & beyond[..., side:].all(axis=-1)
     line, start = np.nonzero(clear)
@@ -134,23 +139,27 @@ def _crossings(ranges, grid, energy, lrf):
     far = np.maximum(first, last)[line, start]
     outward = sign[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
     more = energy[line, start + 2 * side - BESIDE // 2] - energy[line, start + BESIDE // 2]
-    return before + share * way, outward, near, far, sign * more
+    slope = np.where(sign > 0, first_slope[line, start], last_slope[line, start]) / step
+    return before + share * way, outward, near, slope, far, sign * more
 
 
 def _rim(readings, side):
-    """Readings (..., BESIDE) drawn on to the middle of 2 `side` of them: range, slope (size), and
+    """Readings (..., BESIDE) drawn on to the middle of 2 `side` of them: range, slope, and
     scatter about the line.
     """
     at = np.arange(BESIDE) - (BESIDE - 1) / 2
     mean = readings.mean(axis=-1)
     slope = readings @ at / (at @ at)
-    rough = np.sqrt(np.mean((readings - mean[..., None] - slope[..., None] * at) ** 2, axis=-1))
-    return mean + slope * (side - BESIDE / 2), np.abs(slope), rough
+    rough = np.sqrt(
+        np.mean((readings - mean[..., None] - slope[..., None] * at) ** 2, axis=-1)
+    )
+    return mean + slope * (side - BESIDE / 2), slope, rough
 
 
-def _straight(place, outward, near, far, returns, lrf):
+def _straight(place, outward, near, slope, far, returns, lrf):
     """The DepthJumps among places (n, 2) that lie on straight rims, moved onto them."""
     step = lrf.bearing_step
+    surfaces = np.stack([near, slope, far, returns])
     tree = cKDTree(place)
     rows = []
     links = []
@@ -167,9 +176,10 @@ def _straight(place, outward, near, far, returns, lrf):
         if np.sqrt(size[0]) > STRAIGHT * step or across @ outward[i] < np.sqrt(0.5):
             continue
         on_rim = mean + along * (along @ (place[i] - mean))
-        rows.append((i, *on_rim, np.median(near[others]), np.median(far[others]), np.median(returns[others]), *along, *across))
+        about = np.median(surfaces[:, others], axis=1)
+        rows.append((i, *on_rim, *about, *along, *across))
         links += [(i, other) for other in others]
-    table = np.array(rows).reshape(-1, 10)
+    table = np.array(rows).reshape(-1, 11)
     index = table[:, 0].astype(int)
     links = np.array(links, int).reshape(-1, 2)
     graph = coo_array((np.ones(len(links)), tuple(links.T)), shape=(len(place),) * 2)
@@ -177,10 +187,11 @@ def _straight(place, outward, near, far, returns, lrf):
         bearing=table[:, 1],
         pitch=table[:, 2],
         range=table[:, 3],
-        behind=table[:, 4],
-        returns=table[:, 5],
-        along=table[:, 6:8],
-        outward=table[:, 8:],
+        slope=table[:, 4],
+        behind=table[:, 5],
+        returns=table[:, 6],
+        along=table[:, 7:9],
+        outward=table[:, 9:],
         radius=lrf.spot_radius(table[:, 3]),
         rim=connected_components(graph, directed=False)[1][index],
     )

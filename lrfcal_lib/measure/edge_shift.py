@@ -37,7 +37,9 @@ OUTSIDE = np.linspace(1, -1, 201)  # spot radii of the spot's middle from the ri
 SHARE = (np.arccos(OUTSIDE) - OUTSIDE * np.sqrt(1 - OUTSIDE**2)) / np.pi
 STARTS = np.linspace(-0.75, 0.75, 7)  # of REACH, right and down
 BEST_STARTS = 4
-WIDTHS = np.geomspace(0.3, 0.09, 12)  # of REACH: how far off an edge may lie, while it is sought
+WIDTHS = np.geomspace(
+    0.3, 0.09, 12
+)  # of REACH: how far off an edge may lie, while it is sought
 OUTLIERS = 0.15  # of the clearest edge's weight
 UNKNOWN_BIAS = 0.3  # spot radii, of one rim: reflectivities differ by a factor of 2
 LEAST_MISS = 1.0  # pixels, of rounded rims and shadows
@@ -83,15 +85,20 @@ def sights(jumps: DepthJumps, view: View) -> Sights:
         Of places inside the image.
     """
     model = view.model
-    beams = np.stack([jumps.bearing, jumps.pitch])
+    blended = jumps.behind - jumps.range < PULSE
+    odds = np.where(blended, BLENDED, FIRST_ECHO) + jumps.returns
+    outside, by_odds = _change_over(odds)
+    angle = jumps.radius / jumps.range
+    beams = np.stack([jumps.bearing, jumps.pitch]) - outside * angle * jumps.outward.T
+    ranges = jumps.range - outside * angle * jumps.slope
 
     def seen(directions):
-        points, by_link, by_pitch = carried(view.chain, *directions, jumps.range, view.pitch)
+        points, by_link, by_pitch = carried(view.chain, *directions, ranges, view.pitch)
         return pinhole(points, model), points, by_link, by_pitch
 
-    uv, points, by_link, by_pitch = seen(beams)
-    along = (seen(beams + ASIDE * jumps.along.T)[0] - uv) / ASIDE
-    outward = (seen(beams + ASIDE * jumps.outward.T)[0] - uv) / ASIDE
+    edge, points, by_link, by_pitch = seen(beams)
+    along = (seen(beams + ASIDE * jumps.along.T)[0] - edge) / ASIDE
+    outward = (seen(beams + ASIDE * jumps.outward.T)[0] - edge) / ASIDE
     normal = np.stack([along[:, 1], -along[:, 0]], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     normal *= np.sign(np.vecdot(normal, outward))[:, None]
@@ -99,25 +106,17 @@ def sights(jumps: DepthJumps, view: View) -> Sights:
     size = np.array([model.width, model.height])
     recorded = project(points, model)
     inside = ((recorded > reach) & (recorded < size - 1 - reach)).all(axis=1)
-
     n = normal[inside]
-    spot = np.vecdot(n, outward[inside]) * (jumps.radius / jumps.range)[inside]
-    blended = (jumps.behind - jumps.range)[inside] < PULSE
-    odds = np.where(blended, BLENDED, FIRST_ECHO) + jumps.returns[inside]
-    outside, by_odds = _change_over(odds)
-    edge = uv[inside] - (spot * outside)[:, None] * n
+    spot = (np.vecdot(normal, outward) * angle)[inside]
 
-    across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    tangent = np.stack([-n[:, 1], n[:, 0]], axis=-1)
-    side = np.arange(ALONG) - ALONG // 2
-    profile = edge[:, None] + side[:, None] * tangent[:, None]
-    strips = sample(view.image, model, profile + across[:, None, None, None] * n[:, None])
-    offset, weight = _candidates(strips, across)
+    offset, weight = _candidates(view, edge[inside], n, reach)
 
     P = np.einsum("ni,nij->nj", n, pinhole_jacobian(points[inside], model))
     links = view.links(by_link, by_pitch)[inside]
     by_link = np.einsum("nj,njk->nk", P, links)
-    biases = -(spot * by_odds)[:, None] * np.stack([blended, ~blended], axis=-1)
+    biases = (
+        -(spot * by_odds[inside])[:, None] * np.stack([blended, ~blended], axis=-1)[inside]
+    )
     return Sights(
         by_unknown=np.hstack([by_link[:, POSE], biases]),
         by_all=view.spread(by_link),
@@ -138,8 +137,16 @@ def _change_over(odds):
     return outside, (more - less) / 0.2
 
 
-def _candidates(strips, across):
-    """Places and clearness (n, k) of steps in strips (across, n, along, channels)."""
+def _candidates(view, edge, n, reach):
+    """Places and clearness (n, k) of edges about pixels (n, 2), along their normals (n, 2)."""
+    if not len(edge):
+        return np.zeros((0, CANDIDATES)), np.zeros((0, CANDIDATES))
+    across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
+    tangent = np.stack([-n[:, 1], n[:, 0]], axis=-1)
+    side = np.arange(ALONG) - ALONG // 2
+    profile = edge[:, None] + side[:, None] * tangent[:, None]
+    away = across[:, None, None, None] * n[:, None]
+    strips = sample(view.image, view.model, profile + away)
     count = strips.shape[1]
     mean = strips.mean(axis=2)  # NaN outside the image
     height = step_contrast(mean, SMOOTH_PX / ACROSS_STEP_PX, along=1)
@@ -217,7 +224,9 @@ def _score(seen, trust, x, width):
     """Log likelihood but for a constant."""
     miss = seen.offset - (seen.by_unknown @ x)[:, None]
     likely = seen.weight * np.exp(-0.5 * (miss / width) ** 2)
-    return float(trust @ np.log(OUTLIERS + likely.sum(axis=1)) - 0.5 * np.sum((x / SPREAD) ** 2))
+    return float(
+        trust @ np.log(OUTLIERS + likely.sum(axis=1)) - 0.5 * np.sum((x / SPREAD) ** 2)
+    )
 
 
 def _narrowed(seen, trust, x, reach):

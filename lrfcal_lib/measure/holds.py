@@ -2,32 +2,40 @@
 
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtrc
 
+from lrfcal_lib.calibrate.calibration_file import require_same_rig
+from lrfcal_lib.calibrate.cloud import join as join_clouds
+from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
-from lrfcal_lib.judge.uncertainty import uncertainty_of
+from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
 from lrfcal_lib.measure.depth_jumps import depth_jumps
 from lrfcal_lib.measure.edge_shift import edges_pull, join, sights
+from lrfcal_lib.measure.features import flatness, largest_plane
 from lrfcal_lib.measure.image_pairs import STIFF, pairs_pull, patches_of
 from lrfcal_lib.measure.pulls import Pull, views_of_station
 from lrfcal_lib.model.camera import pinhole_jacobian
-from lrfcal_lib.model.geometry import hat
+from lrfcal_lib.model.geometry import fit_plane, hat
 from lrfcal_lib.session.read import Session
 
 # what no covariance of a calibration knows, radians and metres of a camera's pose: lens and light,
-# of one camera; and what all on the head have in common, whose pitch is never quite what is recorded
-# (both found from honest simulated rooms)
+# of one camera; and what all on the head have in common, whose pitch is never quite what is
+# recorded (both found from honest simulated rooms)
 OWN = np.array([*np.radians([0.03, 0.03, 0.03]), 0.001, 0.001, 0.001])
 COMMON = np.array([*np.radians([0.12, 0.04, 0.04]), 0.002, 0.002, 0.002])
-# of the variance of rims: reflectivities bias those of one side alike (honest rooms have a chi
-# square of 37 for 6 unknowns without it)
-RIM_DOUBT = 8.0
+# of the variance of rims: reflectivities bias all those of one side alike, by 0.1 deg of the pitch
+# in honest simulated rooms
+RIM_DOUBT = 20.0
 PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
 LEVEL = 5e-3  # probability of an alarm for nothing
-LEAST_SHIFT = 0.7  # pixels, that matter
+UNEVEN = 0.003  # metres, of real walls
+FEWEST_POINTS = 200  # of a wall, or of two passes
+STEEP = 3.0  # metres a radian, by which ranges grow with the pitch on a smooth surface
+SAME_PLACE = 0.5  # of the readings agree where two sweeps are of one place
 FEWEST_GROUPS = 8  # rims, or regions of patches, that must speak
 WANTED = np.radians(0.3)  # a turn that must not pass unseen
 AWAY = 3.0  # metres, where shifts are stated
@@ -162,8 +170,8 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         answer=answer,
         culprit=culprit,
         shifts=tuple(shifts),
-        walls=(),
-        passes=(),
+        walls=tuple(wall_of(session, rig, placement) for placement in stations),
+        passes=tuple(passes_of(session)),
         rims=rims,
         regions=regions,
         all_on_head=all(c.mount == "head" for c in rig.cameras.values()),
@@ -172,16 +180,11 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
 
 def _stations(session, rig):
     """Placements with a sweep and images of the rig's cameras."""
-    for name, camera in rig.cameras.items():
-        info = session.cameras.get(name)
-        size = (camera.model.width, camera.model.height)
-        if info is not None and (info.width, info.height) != size:
-            raise ValueError(
-                f"{session.name}: images of '{name}' are {info.width} x {info.height} pixels, its "
-                f"calibration is for {size[0]} x {size[1]}: take that of the same rig"
-            )
+    require_same_rig(rig, session)
     shown = {r.placement for r in session.image_records if r.camera in rig.cameras}
-    swept = set(session.scans["placement"][np.isfinite(session.scans["ranges"]).any(axis=1)])
+    swept = set(
+        session.scans["placement"][np.isfinite(session.scans["ranges"]).any(axis=1)]
+    )
     stations = [p for p in session.placements if p in shown & swept]
     if not stations:
         raise ValueError(
@@ -211,6 +214,83 @@ def _station_pulls(session, rig, placement):
         if pair is not None:
             of_pairs.append(pair)
     return of_edges, of_pairs
+
+
+def wall_of(session: Session, rig: CalibratedRig, placement: int) -> Wall:
+    """How flat the largest plane of a station is, beside what the calibration's errors do to it.
+
+    Parameters
+    ----------
+    session : Session
+    rig : CalibratedRig
+    placement : int
+    """
+    sweep = session.sweep(placement)
+    clean = replace(rig.corrections, sweeps={})
+    options = {"lrf": session.lrf, "continuous": session.continuous}
+    cloud = join_clouds(reconstruct(sweep, [], rig.T_head_lrf, clean, **options))
+    wall = cloud.rows(largest_plane(cloud))
+    if len(wall.points) < FEWEST_POINTS:
+        return Wall(placement, np.nan, np.nan)
+    _, bend = flatness(wall.points)
+    normal, _, _ = fit_plane(wall.points)
+    chain = chain_of(rig)
+    pitch = clean.pitch(placement, wall.pitch)
+    _, J, _ = carried(chain, wall.bearing, pitch, wall.range)
+    by_link = np.einsum("i,nij->nj", normal @ chain.head[:, :3], J)
+    # a plane turns and shifts with the errors: only what bends it shows
+    plane = np.column_stack([np.ones(len(by_link)), wall.points - wall.points.mean(axis=0)])
+    by_link -= plane @ np.linalg.lstsq(plane, by_link, rcond=None)[0]
+    variance = max(
+        np.mean(np.sum(by_link @ C * by_link, axis=1)) for C in chain.covariances
+    )
+    return Wall(placement, bend, float(np.sqrt(variance + UNEVEN**2)))
+
+
+def passes_of(session: Session) -> list[Passes]:
+    """What two sweeps of one place, one up and one down, show shifted against each other.
+
+    Placements in turn whose ranges agree but for the noise and for a shift of the pitch.
+
+    Parameters
+    ----------
+    session : Session
+    """
+    found = []
+    swept = [p for p in session.placements if (session.scans["placement"] == p).any()]
+    for first, second in pairwise(swept):
+        ways = [session.sweep_direction(placement) for placement in (first, second)]
+        if ways[0] * ways[1] < 0:
+            one, other = session.sweep(first), session.sweep(second)
+            slip = _slip_between(one, other, session.lrf.sigma_range)
+            if slip is not None:
+                found.append(Passes((first, second), *slip))
+    return found
+
+
+def _slip_between(one, other, noise):
+    """By how much more the second of two sweeps says its pitch is than the first, and sigma,
+    radians; None where they are of different places.
+    """
+    order = np.argsort(other.pitch)
+    inside = (one.pitch >= other.pitch.min()) & (one.pitch <= other.pitch.max())
+    if inside.sum() < 3:
+        return None
+    at = np.interp(one.pitch[inside], other.pitch[order], np.arange(len(order)))
+    low = np.clip(at.astype(int), 0, len(order) - 2)
+    share = (at - low)[:, None]
+    sorted_ranges = other.ranges[order]
+    met = (1 - share) * sorted_ranges[low] + share * sorted_ranges[low + 1]
+    growth = np.gradient(one.ranges[inside], one.pitch[inside], axis=0)
+    miss = met - one.ranges[inside]
+    with np.errstate(invalid="ignore"):
+        smooth = (np.abs(growth) < STEEP) & (np.abs(miss) < STEEP * WANTED * 3)
+    if smooth.sum() < max(FEWEST_POINTS, SAME_PLACE * np.isfinite(miss).sum()):
+        return None
+    slope = growth[smooth]
+    slip = slope @ miss[smooth] / (slope @ slope)
+    rough = max(np.std(miss[smooth] - slip * slope), noise)
+    return -float(slip), float(rough / np.sqrt(slope @ slope))
 
 
 def suspects(pulls: list[Pull], rig: CalibratedRig) -> list[Shift]:
@@ -280,7 +360,9 @@ def _shift(camera, columns, score, sharp, rig):
     covariance = np.linalg.inv(known + np.diag(likely**-2.0))
     change = covariance @ score[columns]
     # the score test, of what is known at all
-    square = score[columns] @ np.linalg.pinv(known, rcond=1e-6, hermitian=True) @ score[columns]
+    square = (
+        score[columns] @ np.linalg.pinv(known, rcond=1e-6, hermitian=True) @ score[columns]
+    )
     pixels = np.full(3, np.nan)
     spread = pixels
     sigma = np.sqrt(np.diag(covariance))

@@ -81,7 +81,7 @@ def patches_of(sweep, rig, lrf, continuous=False) -> Patches:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Patches in one image: their samples (n, s, 2), derivatives (n, 2, c), and which are inside."""
+    """Patches in one image: samples (n, s, 2), derivatives (n, 2, c), and which are inside."""
 
     uv: np.ndarray
     by_unknown: np.ndarray
@@ -142,7 +142,9 @@ def pairs_pull(patches: Patches, views: list[View]) -> Pull | None:
 
 def _pair(patches, first, second):
     """The clearest patches that two images show, as a list of one tuple or none."""
-    points = carried(first.chain, patches.bearing, patches.pitch, patches.range, first.pitch)[0]
+    points = carried(
+        first.chain, patches.bearing, patches.pitch, patches.range, first.pitch
+    )[0]
     spacing = SPACING * points[:, 2] / first.model.fx
     a = _seen(patches, first, spacing)
     b = _seen(patches, second, spacing)
@@ -155,7 +157,17 @@ def _pair(patches, first, second):
     rows = rows[order[texture[order] > LEAST_TEXTURE]]
     if not len(rows):
         return []
-    return [(first, second, a.uv[rows], b.uv[rows], a.by_unknown[rows], b.by_unknown[rows], patches.cell[rows])]
+    return [
+        (
+            first,
+            second,
+            a.uv[rows],
+            b.uv[rows],
+            a.by_unknown[rows],
+            b.by_unknown[rows],
+            patches.cell[rows],
+        )
+    ]
 
 
 def _compared(pair, sharp, x):

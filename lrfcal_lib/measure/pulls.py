@@ -152,8 +152,8 @@ def directions(
 def pull_of_groups(information, by_row, group, change, fitted):
     """A Pull whose information is what the scatter of groups leaves of it.
 
-    `by_row` (n, c) are the slopes that rows, of groups (n,), have left at `change`, which was fitted
-    in some of its places.
+    `by_row` (n, c) are the slopes that rows, of groups (n,), have left at `change`, which was
+    `fitted` in some of its places.
     """
     _, group = np.unique(group, return_inverse=True)
     sums = np.zeros((group.max() + 1, len(change)))
@@ -162,6 +162,8 @@ def pull_of_groups(information, by_row, group, change, fitted):
     groups = float(load.sum() ** 2 / np.sum(load**2))
     own = information[np.ix_(fitted, fitted)]
     scatter = sums[:, fitted].T @ sums[:, fitted]
-    excess = np.trace(np.linalg.pinv(own, rcond=1e-9, hermitian=True) @ scatter) / len(fitted)
+    excess = np.trace(np.linalg.pinv(own, rcond=1e-9, hermitian=True) @ scatter) / len(
+        fitted
+    )
     few = groups / max(groups - len(fitted), 1.0)
     return Pull(information / max(excess * few, 1e-12), change, groups)

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 from scipy.special import ndtr
 
-from lrfcal_lib.plots.recording import COLORS
+from lrfcal_lib.plots.colors import COLORS
 
 BEAMS = 12  # drawn of a scan
 ROOM = 0.45  # for labels at the sides, of the height of a drawing

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.plots.recording import AXES_RGB, COLORS, closed, color_of
+from lrfcal_lib.plots.colors import AXES_RGB, COLORS, closed, color_of
 
 MOST_POINTS = 150_000  # that browsers turn smoothly
 PAGE = {"xref": "paper", "yref": "paper", "xanchor": "left", "yanchor": "bottom"}

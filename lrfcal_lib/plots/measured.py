@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.plots.recording import COLORS
+from lrfcal_lib.plots.colors import COLORS
 from lrfcal_lib.plots.rig import pixels, render
 
 PALETTE = np.array(  # of surfaces side by side, light enough for the edges upon them

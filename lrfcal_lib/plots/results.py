@@ -10,7 +10,7 @@ from matplotlib.collections import PathCollection
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.plots.recording import COLORS, SERIES, color_of, series
+from lrfcal_lib.plots.colors import COLORS, SERIES, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
 SPREAD: dict[str, Any] = {
