@@ -80,16 +80,18 @@ data: setup
 	rmdir data/.new
 	cd data && find $(SIMULATED) -type f | LC_ALL=C sort | xargs sha256sum > SHA256SUMS
 
-# OUTDOOR and PAPER: one thing varied of a set-up, twenty placements
+# one or two things varied of a set-up, twenty placements
 STUDY := $(RUN) -m lrfcal_lib study
 OUTDOOR := $(STUDY) outdoor_lms221 --poses 20 --methods line zhang_pless joint --trials 10
-PAPER := $(STUDY) paper_rig --poses 20 --methods line_printed line zhang_pless joint --trials 10
+MAP := $(STUDY) --poses 20 --methods line_printed line zhang_pless joint --trials 10 \
+	--vary spot_mm=4,16,48 --vary step_deg=0.125,0.25,0.5,1
 studies: setup
 	$(STUDY) zhang_pless_2004 --poses 6 10 15 20 24 --methods zhang_pless_printed zhang_pless --trials 60 \
 		--out data/studies/zhang_pless_2004.csv
 	$(STUDY) corner_calib_2015 --poses 10 20 50 --methods zhang_pless_printed zhang_pless --trials 60 \
 		--out data/studies/corner_calib_2015.csv
-	$(PAPER) --vary spot_mm=4,16,48 --vary step_deg=0.125,0.25,0.5,1 --out data/studies/map.csv
+	$(MAP) paper_rig --out data/studies/map_paper_rig.csv
+	$(MAP) outdoor_lms221 --out data/studies/map_outdoor_lms221.csv
 	$(OUTDOOR) --vary range_noise_mm=2.5,10,40 --out data/studies/range_noise.csv
 	$(OUTDOOR) --vary pixel_noise_px=0.1,0.5,2 --out data/studies/pixel_noise.csv
 	$(OUTDOOR) --vary step_deg=0.125,0.25,0.5 --out data/studies/step.csv
@@ -99,7 +101,7 @@ studies: setup
 	$(STUDY) outdoor_lms221 --poses 20 --methods line zhang_pless three_planes --trials 20 \
 		--vary start_deg=1,10,20,40,80 --out data/studies/start_error.csv
 	$(STUDY) paper_rig zhang_pless_2004 corner_calib_2015 indoor_lms200 outdoor_lms221 hokuyo_head pan_scanner \
-		--poses 5 10 20 50 --trials 20 --out data/studies/methods.csv
+		--poses 5 10 20 50 --trials 10 --out data/studies/methods.csv
 
 picture: setup
 	$(RUN) .ci/picture

@@ -216,11 +216,8 @@ def _add_sessions(verbs):
     """Verbs that make or use a session without devices."""
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
-    check.add_argument(
-        "--calibration",
-        metavar="JSON",
-        help="a calibration.json: does it still hold for the rig that recorded this session?",
-    )
+    holds = "a calibration.json: does it still hold for the rig that recorded the session?"
+    check.add_argument("--calibration", metavar="JSON", help=holds)
 
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")

@@ -21,6 +21,7 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+import rooms
 from distributed import LocalCluster
 from joint_draws import draw, none
 from scipy.optimize import least_squares
@@ -31,6 +32,7 @@ from telegrams import encode_scan
 from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.evaluate.study import finished, tasks_of
 from lrfcal_lib.evaluate.study_trials import STUDIED
+from lrfcal_lib.measure.stations import join_stations
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
@@ -48,11 +50,11 @@ ROOT = Path(__file__).resolve().parent.parent
 FULL = {
     "repeats": 7, "trials": 1000, "placements": (10, 30, 100, 300, 1000), "joint": 100, "points": 10_000_000,
     "growth": (10_000, 100_000, 1_000_000, 10_000_000, 100_000_000), "telegrams": 20_000, "session": "sim_lms221",
-    "pixels": 12_000_000, "study": 160, "calls": 2000,
+    "pixels": 12_000_000, "study": 160, "calls": 2000, "step_deg": 0.25,
 }  # fmt: skip
 TINY = {  # for the test, which only asks whether everything is written
     "repeats": 1, "trials": 2, "placements": (10,), "joint": 10, "points": 10_000, "growth": (1_000,),
-    "telegrams": 100, "session": None, "pixels": 2_000_000, "study": 10, "calls": 20,
+    "telegrams": 100, "session": None, "pixels": 2_000_000, "study": 10, "calls": 20, "step_deg": 0.5,
 }  # fmt: skip
 SURVEYED = 4  # images in a survey
 CHUNK = 1_000_000  # points that growth hands over at a time
@@ -460,12 +462,31 @@ def studies(size):
     yield "study_most_workers_on_paper", task / overhead, None, "", np.nan, None
 
 
+def joining(size):
+    """Four stations of a simulated room in one frame, without a guess."""
+    rng = np.random.default_rng(71)
+    world, half = rooms.furnished_at_random(rng)
+    clouds = {
+        number: rooms.scanned(world, T, rng, number=number, step=size["step_deg"])
+        for number, T in rooms.around(rng, half).items()
+    }
+    yield (
+        "join_4_stations_s",
+        elapsed(lambda: join_stations(clouds)),
+        None,
+        "",
+        np.nan,
+        None,
+    )
+
+
 def main(out, size=None):
     """Measure everything at a size and write bench.json, bench.csv and growth.png."""
     size = size or FULL
     rows = []
     figures = {}
-    for part in (cameras, joint, colouring, decoding, images, studies, commands):
+    parts = (cameras, joint, colouring, decoding, images, studies, joining, commands)
+    for part in parts:
         for key, value, ratio_key, against, times_faster, call in part(size):
             rows.append(
                 [key, value, against, times_faster, memory(call) if call else np.nan]

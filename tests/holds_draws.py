@@ -19,7 +19,7 @@ AXIS_SIGMA = [0.001, 0.0005, 0.002, 0.001]
 CAMERA_SIGMA = [0.0006, 0.0006, 0.001, 0.001, 0.001, 0.002]
 
 
-def room(stations, pitches=(), slip=0.0):
+def room(stations, pitches=(), slip=0.0, mount="head"):
     """The shipped room from some of its stations, images at some pitch angles (deg); the head slipped by so much."""
     session = open_session(ROOM)
     chosen = []
@@ -28,7 +28,8 @@ def room(stations, pitches=(), slip=0.0):
         if record.placement in stations and (any(near) or not pitches):
             chosen.append(record)
     scans = session.scans | {"pitch": session.scans["pitch"] - slip}
-    return replace(session, image_records=tuple(chosen), scans=scans)
+    cameras = {name: replace(camera, mount=mount) for name, camera in session.cameras.items()}
+    return replace(session, image_records=tuple(chosen), scans=scans, cameras=cameras)
 
 
 def true_rig(session):

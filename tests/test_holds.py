@@ -98,7 +98,7 @@ def test_a_head_that_slipped_under_cameras_on_the_base_is_named_in_9_of_10_draws
     for draw in range(10):
         pitch = (-15, -4)[draw % 2]
         slip = TURN * (-1) ** (draw // 2)
-        session = room(STATIONS[draw % 6], (pitch,), slip)
+        session = room(STATIONS[draw % 6], (pitch,), slip, "platform")
         rig = erring(on_base(true_rig(session), 1.003 * np.radians(pitch)), rng)
         held = holds(session, rig)
         named += held.culprit is not None and held.culprit.camera is None
@@ -106,15 +106,15 @@ def test_a_head_that_slipped_under_cameras_on_the_base_is_named_in_9_of_10_draws
 
 
 @campaign
-@pytest.mark.parametrize("mount", ["head", "base"])
+@pytest.mark.parametrize("mount", ["head", "platform"])
 def test_at_most_1_of_20_honest_recordings_is_called_moved(mount):
     rng = np.random.default_rng(30)
     wrong = 0
     for draw in range(10):
         pitches = (-15, -4, 7) if mount == "head" else ((-15, -4)[draw % 2],)
-        session = room(STATIONS[draw % 6], pitches)
+        session = room(STATIONS[draw % 6], pitches, 0.0, mount)
         rig = true_rig(session)
-        if mount == "base":
+        if mount == "platform":
             rig = on_base(rig, 1.003 * np.radians(pitches[0]))
         wrong += holds(session, erring(rig, rng)).answer is Answer.MOVED
     assert wrong <= 1

@@ -149,7 +149,7 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     table = table.assign(order=table.method.map(order))
     table = table.sort_values(["scenario", "n_poses", "order"]).drop(columns="order")
     settings = table.scenario.str.findall(r"(\w+)=(\S+)").map(dict)
-    table["scenario"] = table.scenario.str.split().str[0]
+    table["scenario"] = table.scenario.str.replace(r" \w+=\S+", "", regex=True)
     for key in sorted({key for row in settings for key in row}, reverse=True):
         table.insert(
             1, key, [float(row[key]) if key in row else np.nan for row in settings]

@@ -19,6 +19,7 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
 )
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
+from lrfcal_lib.preprocess.surfaces import row_ends
 from lrfcal_lib.simulate.draw import REACH, draw_shots
 from lrfcal_lib.simulate.scenarios import Scenario
 from lrfcal_lib.solvers import solve_camera
@@ -31,6 +32,7 @@ BATCHED = {"line_printed": True, "line": False, "wasielewski_strauss": False}
 PLANES = ("zhang_pless_printed", "zhang_pless")
 STUDIED = (*BATCHED, *PLANES, "three_planes", "joint")
 DIGITS = 9
+LEAST_RANGE = 0.05  # metres: noise may make a near one negative
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ def run_task(task: Task) -> list[dict]:
     T0 = RigidTransform.from_components(true.translation + shift, turn * true.rotation)
 
     sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
-    bounds = [bounds_of_camera(*session, task.scenario.sensor) for session in sessions]
+    sensor = task.scenario.sensor
+    bounds = [bounds_of_camera(obs, truth, sensor) for obs, truth in sessions]
     rows = []
     for method in task.methods:
         if method in BATCHED:
@@ -195,40 +198,14 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     scenario : Scenario
     trial : int
     """
-    ranges = shots["ranges"][trial]
-    bearings = scenario.bearings()
-    count = len(ranges)
-    hit = np.isfinite(ranges)
-    placement, beam = np.nonzero(hit)
-    last = len(bearings) - 1 - hit[:, ::-1].argmax(axis=1)
-    first = hit.argmax(axis=1)
-    near = np.arange(2 * REACH) - REACH  # beams about the end of a scan line
-    beams = np.stack([first[:, None] + near, last[:, None] + 1 + near], axis=1)
-    beams = np.clip(beams, 0, len(bearings) - 1)
-    at_end = np.stack([ranges[np.arange(count), first], ranges[np.arange(count), last]], 1)
-    shape = beams.shape
-    which = np.broadcast_to(np.arange(count)[:, None, None], shape).ravel()
-    at_end = np.broadcast_to(np.maximum(at_end, 0.05)[..., None], shape).ravel()
-    edges = np.broadcast_to(shots["edges"][trial][..., None], shape).ravel()
+    count = len(shots["ranges"][trial])
     views = np.tile(np.eye(4), (count, 1, 1))
     views[:, :3] = shots["boards"][trial]
     obs = JointObservations(
         placements=np.arange(1, count + 1),
         middle=np.zeros(count),
         direction=np.zeros(count, int),
-        face_range=ranges[placement, beam],
-        face_bearing=bearings[beam],
-        face_pitch=np.zeros(len(beam)),
-        face_sigma=np.full(len(beam), scenario.sigma_range),
-        face_placement=placement,
-        beam_bearing=bearings[beams].ravel(),
-        beam_pitch=np.zeros(len(which)),
-        beam_hit=hit[which, beams.ravel()],
-        beam_edge=edges,
-        beam_radius=scenario.radius(at_end),
-        beam_background=np.zeros(len(which)),
-        beam_step=scenario.step * at_end,
-        beam_placement=which,
+        **_readings(shots, scenario, trial),
         view_camera=np.zeros(count, int),
         view_pitch=np.zeros(count),
         view_pose=views,
@@ -251,6 +228,37 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
         softness=scenario.softness,
     )
     return obs, truth
+
+
+def _readings(shots, scenario, trial):
+    """Readings of the boards, and the beams about the ends of their scan lines."""
+    ranges = shots["ranges"][trial]
+    bearings = scenario.bearings()
+    hit = np.isfinite(ranges)
+    placement, beam = np.nonzero(hit)
+    _, first, last = row_ends(hit)
+    near = np.arange(2 * REACH) - REACH  # beams about the end of a scan line
+    beams = np.stack([first[:, None] + near, last[:, None] + 1 + near], axis=1)
+    beams = np.clip(beams, 0, len(bearings) - 1)
+    shape = beams.shape
+    which = np.broadcast_to(np.arange(len(ranges))[:, None, None], shape).ravel()
+    ends = np.take_along_axis(ranges, np.stack([first, last], axis=1), axis=1)
+    at_end = np.broadcast_to(np.maximum(ends, LEAST_RANGE)[..., None], shape).ravel()
+    return {
+        "face_range": ranges[placement, beam],
+        "face_bearing": bearings[beam],
+        "face_pitch": np.zeros(len(beam)),
+        "face_sigma": np.full(len(beam), scenario.sigma_range),
+        "face_placement": placement,
+        "beam_bearing": bearings[beams].ravel(),
+        "beam_pitch": np.zeros(len(which)),
+        "beam_hit": hit[which, beams.ravel()],
+        "beam_edge": np.broadcast_to(shots["edges"][trial][..., None], shape).ravel(),
+        "beam_radius": scenario.radius(at_end),
+        "beam_background": np.zeros(len(which)),
+        "beam_step": scenario.step * at_end,
+        "beam_placement": which,
+    }
 
 
 def bounds_of_camera(obs, truth, sensor):

@@ -159,6 +159,7 @@ def _rim(readings, side):
 def _straight(place, outward, near, slope, far, returns, lrf):
     """The DepthJumps among places (n, 2) that lie on straight rims, moved onto them."""
     step = lrf.bearing_step
+    surfaces = np.stack([near, slope, far, returns])
     tree = cKDTree(place)
     rows = []
     links = []
@@ -175,18 +176,8 @@ def _straight(place, outward, near, slope, far, returns, lrf):
         if np.sqrt(size[0]) > STRAIGHT * step or across @ outward[i] < np.sqrt(0.5):
             continue
         on_rim = mean + along * (along @ (place[i] - mean))
-        rows.append(
-            (
-                i,
-                *on_rim,
-                np.median(near[others]),
-                np.median(slope[others]),
-                np.median(far[others]),
-                np.median(returns[others]),
-                *along,
-                *across,
-            )
-        )
+        about = np.median(surfaces[:, others], axis=1)
+        rows.append((i, *on_rim, *about, *along, *across))
         links += [(i, other) for other in others]
     table = np.array(rows).reshape(-1, 11)
     index = table[:, 0].astype(int)

@@ -109,12 +109,7 @@ def sights(jumps: DepthJumps, view: View) -> Sights:
     n = normal[inside]
     spot = (np.vecdot(normal, outward) * angle)[inside]
 
-    across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    tangent = np.stack([-n[:, 1], n[:, 0]], axis=-1)
-    side = np.arange(ALONG) - ALONG // 2
-    profile = edge[inside, None] + side[:, None] * tangent[:, None]
-    strips = sample(view.image, model, profile + across[:, None, None, None] * n[:, None])
-    offset, weight = _candidates(strips, across)
+    offset, weight = _candidates(view, edge[inside], n, reach)
 
     P = np.einsum("ni,nij->nj", n, pinhole_jacobian(points[inside], model))
     links = view.links(by_link, by_pitch)[inside]
@@ -142,8 +137,16 @@ def _change_over(odds):
     return outside, (more - less) / 0.2
 
 
-def _candidates(strips, across):
-    """Places and clearness (n, k) of steps in strips (across, n, along, channels)."""
+def _candidates(view, edge, n, reach):
+    """Places and clearness (n, k) of edges about pixels (n, 2), along their normals (n, 2)."""
+    if not len(edge):
+        return np.zeros((0, CANDIDATES)), np.zeros((0, CANDIDATES))
+    across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
+    tangent = np.stack([-n[:, 1], n[:, 0]], axis=-1)
+    side = np.arange(ALONG) - ALONG // 2
+    profile = edge[:, None] + side[:, None] * tangent[:, None]
+    away = across[:, None, None, None] * n[:, None]
+    strips = sample(view.image, view.model, profile + away)
     count = strips.shape[1]
     mean = strips.mean(axis=2)  # NaN outside the image
     height = step_contrast(mean, SMOOTH_PX / ACROSS_STEP_PX, along=1)

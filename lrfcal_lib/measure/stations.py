@@ -34,7 +34,7 @@ from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 # of 0.4 to 0.95 and 0.001 to 0.022 against them, wrong ones seldom less than 0.06 against them
 LEAST_OVERLAP = 0.2
 MOST_AGAINST = 0.02
-RIVAL = 0.6  # share of the best overlap from which another pose is as good
+RIVAL = 0.3  # share of the best overlap from which another pose may be the right one
 DOUBTFUL = 0.03  # against a rival
 LEAST_HELD = 0.03  # share of patches that hold a station in its loosest direction
 MOST_SIGMA = (np.radians(0.3), 0.015)  # of the turn and shift of a pair that is joined
@@ -141,7 +141,9 @@ def join_stations(clouds: Mapping[int, Cloud], rig: CalibratedRig | None = None)
     problems = []
     for first, second in combinations(sorted(clouds), 2):
         result = join_pair(
-            (first, second), coarse[first], coarse[second], fine[first], fine[second]
+            (first, second),
+            (coarse[first], coarse[second]),
+            (fine[first], fine[second]),
         )
         if isinstance(result, Pair):
             pairs.append(result)
@@ -152,7 +154,9 @@ def join_stations(clouds: Mapping[int, Cloud], rig: CalibratedRig | None = None)
 
 
 def join_pair(
-    names: tuple[int, int], first: Surface, second: Surface, *fine: Surface
+    names: tuple[int, int],
+    coarse: tuple[Surface, Surface],
+    fine: tuple[Surface, Surface],
 ) -> Pair | Problem:
     """Two stations beside each other.
 
@@ -160,17 +164,15 @@ def join_pair(
     ----------
     names : tuple of int
         Their numbers.
-    first, second : Surface
-        In coarse patches.
-    *fine : Surface
-        The same in fine ones.
+    coarse, fine : tuple of Surface
+        Both in patches of `COARSE` and of `FINE`.
 
     Returns
     -------
     Pair or Problem
         Why they are not joined.
     """
-    tried = candidates(first, second)
+    tried = candidates(*coarse)
     good = [c for c in tried if c.overlap > LEAST_OVERLAP and c.against < MOST_AGAINST]
     if not good:
         return _apart(names, tried)
@@ -179,12 +181,12 @@ def join_pair(
         as_much = other.overlap > RIVAL * best.overlap and other.against < DOUBTFUL
         if other is not best and as_much:
             return _ambiguous(names, best, other)
-    fit = fitted(*fine, best.T_first_second)
+    fit = fitted(fine[0], fine[1], best.T_first_second)
     sigma = np.sqrt(np.linalg.eigvalsh(fit.covariance[3:, 3:])[-1])
     turn_sigma = np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1])
     if fit.held < LEAST_HELD or turn_sigma > MOST_SIGMA[0] or sigma > MOST_SIGMA[1]:
         return _loose(names, fit)
-    final = agreement(*fine, fit.T_first_second)
+    final = agreement(fine[0], fine[1], fit.T_first_second)
     return Pair(
         first=names[0],
         second=names[1],

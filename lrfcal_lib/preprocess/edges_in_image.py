@@ -208,7 +208,7 @@ def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:
     pixels = np.ascontiguousarray(uv, float).reshape(-1, 2)
     out = np.empty((len(pixels), image.shape[2]), np.float32)
     loops().bilinear(image, pixels, model.parameters, fold(model), out)
-    return out.reshape(uv.shape[:-1] + (-1,))
+    return out.reshape(uv.shape[:-1] + image.shape[2:])
 
 
 def step_contrast(strip, sigma, along=AVERAGED_PROFILES):

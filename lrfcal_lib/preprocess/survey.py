@@ -168,10 +168,8 @@ def survey(
         return _survey_plain(groups, look, board, models)
 
     shots = _find_corners(groups, read, board)
-    flat = spread(
-        partial(_intrinsics, models=models, shots=shots, board=board, read=read), models
-    )
-    rough = dict(zip(models, flat, strict=True))
+    find = partial(_intrinsics, models=models, shots=shots, board=board, read=read)
+    rough = dict(zip(models, spread(find, models), strict=True))
     ordered = _ordered(shots, read, board, rough)
     refined, relief = _with_relief(ordered.shots, board, models, rough)
     shots = [shot for shot in ordered.shots if shot.record.purpose != "intrinsics"]
@@ -399,16 +397,13 @@ def _find_corners(groups, read, board):
     room = KEPT_BYTES // max(len(groups), 1)
 
     begin = partial(_shot_with_corners, read=read, board=board, finder=finder, room=room)
-    shots = [
-        _first(group, begin) for group in groups[:1]
-    ]  # tells the finder what to look for
+    # the first one tells the finder what to look for
+    shots = [_first(group, begin) for group in groups[:1]]
     return shots + spread(partial(_first, begin=begin), groups[1:])
 
 
 def _shot_with_corners(record, read, board, finder, room):
-    """A shot with its corners, and the part of the image that is looked at again, if that has
-    room (bytes).
-    """
+    """A shot with its corners and, within `room` bytes, the part that is looked at again."""
     image = read(record)
     view = _corners(_view(record), image, finder)
     if view.reason:
@@ -447,9 +442,8 @@ def _intrinsics(camera, models, shots, board, read):
             size = read(shot.record).shape[1::-1]
             break
     try:
-        return estimate_intrinsics(
-            _for_intrinsics(shots, camera), board.pattern, size
-        ).models[0]
+        pixels = _for_intrinsics(shots, camera)
+        return estimate_intrinsics(pixels, board.pattern, size).models[0]
     except ValueError as error:
         raise DegenerateGeometry(f"camera '{camera}': {error}") from error
 

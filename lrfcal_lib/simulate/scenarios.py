@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -124,7 +125,7 @@ def load_scenario(name: str) -> Scenario:
     if name not in FILE:
         raise ValueError(f"unknown scenario {name!r}: use one of {', '.join(FILE)}")
     facts = FILE[name]
-    settings = {key: facts[key] for key in PLAIN if key in facts}
+    settings: dict[str, Any] = {key: facts[key] for key in PLAIN if key in facts}
     for key in ("spot", "bearings_deg", "distances", "start", "sensor"):
         if key in settings:
             settings[key] = tuple(settings[key])
@@ -163,6 +164,7 @@ def varied(scenario: Scenario, key: str, value: float) -> Scenario:
     """
     if not value > 0:
         raise ValueError(f"{key}={value:g}: a positive number is needed")
+    change: dict[str, Any]
     match key:
         case "range_noise_mm":
             change = {"sigma_range": value / 1000}
