@@ -227,8 +227,10 @@ def wall_of(session: Session, rig: CalibratedRig, placement: int) -> Wall:
     """
     sweep = session.sweep(placement)
     clean = replace(rig.corrections, sweeps={})
-    options = {"lrf": session.lrf, "continuous": session.continuous}
-    cloud = join_clouds(reconstruct(sweep, [], rig.T_head_lrf, clean, **options))
+    blocks = reconstruct(
+        sweep, [], rig.T_head_lrf, clean, lrf=session.lrf, continuous=session.continuous
+    )
+    cloud = join_clouds(blocks)
     wall = cloud.rows(largest_plane(cloud))
     if len(wall.points) < FEWEST_POINTS:
         return Wall(placement, np.nan, np.nan)
