@@ -14,7 +14,7 @@ SIMULATED := sim_lms221 sim_quick room_lms221
 # one thread a process where it is no matter (Open3D): two notebooks run side by side; lrfcal_lib sees to the rest
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup report test campaign notebooks golden lab data picture docs bench fuzz clean
+.PHONY: help setup report test campaign notebooks golden lab data picture docs bench fuzz studies clean
 
 help:
 	@echo "make report [SESSION=path]   execute the notebooks on a session, write reports/<session>/"
@@ -27,6 +27,7 @@ help:
 	@echo "make fuzz                    200 000 damaged sessions and rig files, a million telegrams: only our own errors"
 	@echo "make lab [SESSION=path]      open JupyterLab"
 	@echo "make data                    rebuild the simulated sessions in data/ from their seeds"
+	@echo "make studies                 the studies of notebook 08 in data/studies from their seeds"
 	@echo "make picture                 the picture of the README: the scene of the shipped session beside its rig"
 	@echo "make clean                   remove the environment, reports and caches"
 
@@ -78,6 +79,29 @@ data: setup
 	mv $(addprefix data/.new/,$(SIMULATED)) data
 	rmdir data/.new
 	cd data && find $(SIMULATED) -type f | LC_ALL=C sort | xargs sha256sum > SHA256SUMS
+
+# one or two things varied of a set-up, twenty placements
+STUDY := $(RUN) -m lrfcal_lib study
+OUTDOOR := $(STUDY) outdoor_lms221 --poses 20 --methods line zhang_pless joint --trials 10
+MAP := $(STUDY) --poses 20 --methods line_printed line zhang_pless joint --trials 10 \
+	--vary spot_mm=4,16,48 --vary step_deg=0.125,0.25,0.5,1
+studies: setup
+	$(STUDY) zhang_pless_2004 --poses 6 10 15 20 24 --methods zhang_pless_printed zhang_pless --trials 60 \
+		--out data/studies/zhang_pless_2004.csv
+	$(STUDY) corner_calib_2015 --poses 10 20 50 --methods zhang_pless_printed zhang_pless --trials 60 \
+		--out data/studies/corner_calib_2015.csv
+	$(MAP) paper_rig --out data/studies/map_paper_rig.csv
+	$(MAP) outdoor_lms221 --out data/studies/map_outdoor_lms221.csv
+	$(OUTDOOR) --vary range_noise_mm=2.5,10,40 --out data/studies/range_noise.csv
+	$(OUTDOOR) --vary pixel_noise_px=0.1,0.5,2 --out data/studies/pixel_noise.csv
+	$(OUTDOOR) --vary step_deg=0.125,0.25,0.5 --out data/studies/step.csv
+	$(OUTDOOR) --vary spot_mm=5,20,60 --out data/studies/spot.csv
+	$(OUTDOOR) --vary board_scale=0.7,1,2 --out data/studies/board_size.csv
+	$(OUTDOOR) --vary lean_deg=5,15,35 --out data/studies/pose_spread.csv
+	$(STUDY) outdoor_lms221 --poses 20 --methods line zhang_pless three_planes --trials 20 \
+		--vary start_deg=1,10,20,40,80 --out data/studies/start_error.csv
+	$(STUDY) paper_rig zhang_pless_2004 corner_calib_2015 indoor_lms200 outdoor_lms221 hokuyo_head pan_scanner \
+		--poses 5 10 20 50 --trials 10 --out data/studies/methods.csv
 
 picture: setup
 	$(RUN) .ci/picture

@@ -15,15 +15,9 @@ def run(args):
         case "check":
             return check(args)
         case "calibrate":
-            from lrfcal_lib.report.calibrate import calibrate_session
-            from lrfcal_lib.session.workers import side_by_side
-
-            with side_by_side():
-                return calibrate_session(args.session, args.out)
-        case "compare":
-            from lrfcal_lib.report.compare import compare_files
-
-            return compare_files(args.calibrations, args.figure)
+            return calibrate(args)
+        case "compare" | "reconstruct" | "merge" | "measure":
+            return use_calibrations(args)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
@@ -32,22 +26,50 @@ def run(args):
             print(f"{args.dst}: simulated")
         case "record":
             return record(args)
-        case "reconstruct":
-            from lrfcal_lib.report.reconstruct import reconstruct_session
-
-            return reconstruct_session(
-                args.session, args.calibration, args.out, args.untrusted
-            )
         case "report":
             from lrfcal_lib.report.report import main
 
             return main(args.sessions, args.out, args.jobs, args.store)
+        case "study":
+            from lrfcal_lib.report.study import study
+
+            return study(args)
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
             return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
         case "board":
             print_board(args)
+
+
+def use_calibrations(args):
+    """Do what a verb asks for that takes calibration.json."""
+    match args.verb:
+        case "compare":
+            from lrfcal_lib.report.compare import compare_files
+
+            return compare_files(args.calibrations, args.figure)
+        case "reconstruct":
+            from lrfcal_lib.report.reconstruct import reconstruct_session
+
+            return reconstruct_session(
+                args.session, args.calibration, args.out, args.untrusted
+            )
+        case "merge":
+            from lrfcal_lib.report.merge import merge_session
+
+            return merge_session(args.session, args.calibration, args.out, args.untrusted)
+        case "measure":
+            from lrfcal_lib.report.measure import measure_session
+
+            return measure_session(
+                args.session,
+                args.calibration,
+                args.picks,
+                args.out,
+                args.station,
+                args.untrusted,
+            )
 
 
 def print_board(args):
@@ -74,6 +96,19 @@ def import_recording(args):
 
     miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
     print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
+
+
+def calibrate(args):
+    """Calibrate the rig of a session, on the cores of this machine or a cluster."""
+    from lrfcal_lib.report.calibrate import calibrate_session
+    from lrfcal_lib.session.cluster import workers_at
+    from lrfcal_lib.session.workers import side_by_side
+
+    if args.scheduler is None:
+        with side_by_side():
+            return calibrate_session(args.session, args.out)
+    with workers_at(args.scheduler) as executor, side_by_side(executor):
+        return calibrate_session(args.session, args.out)
 
 
 def check(args):
@@ -152,8 +187,10 @@ def parser():
     verbs = top.add_subparsers(title="verbs", metavar="VERB", dest="verb", required=True)
     _add_import(verbs)
     _add_sessions(verbs)
+    _add_measure(verbs)
     _add_rigs(verbs)
     _add_report(verbs)
+    _add_study(verbs)
     return top
 
 
@@ -194,6 +231,7 @@ def _add_sessions(verbs):
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
+    _add_scheduler(calibrate)
 
     compare = verbs.add_parser(
         "compare", help="say how far calibrations of one rig differ, beside what they claim"
@@ -206,18 +244,43 @@ def _add_sessions(verbs):
     )
     compare.add_argument("--figure", metavar="PNG", help="also draw them")
 
-    reconstruct = verbs.add_parser(
-        "reconstruct", help="make coloured clouds of a scene with a calibration of its rig"
-    )
-    reconstruct.add_argument("session", help="as 'record --scene' recorded it")
-    reconstruct.add_argument("--calibration", required=True, help="calibration.json")
-    reconstruct.add_argument(
+    words = "make coloured clouds of a scene with a calibration of its rig"
+    _add_scene(verbs.add_parser("reconstruct", help=words))
+    _add_scene(verbs.add_parser("merge", help="join the stations of a scene in one cloud"))
+
+
+def _add_scene(verb):
+    """What the use of a calibration on a scene takes."""
+    verb.add_argument("session", help="as 'record --scene' recorded it")
+    verb.add_argument("--calibration", required=True, help="calibration.json")
+    verb.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
-    reconstruct.add_argument(
+    verb.add_argument(
         "--untrusted",
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",
+    )
+
+
+def _add_measure(verbs):
+    """The verb that measures in a scene."""
+    measure = verbs.add_parser(
+        "measure", help="measure lengths between places picked in scene.html"
+    )
+    measure.add_argument("session", help="as 'record --scene' recorded it")
+    measure.add_argument("--calibration", required=True, help="calibration.json")
+    measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
+    measure.add_argument(
+        "--station", type=int, help="whose scene.html, if there are several"
+    )
+    measure.add_argument(
+        "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"
+    )
+    measure.add_argument(
+        "--untrusted",
+        action="store_true",
+        help="even if the verdict on the calibration is 'no'",
     )
 
 
@@ -297,6 +360,45 @@ def _add_report(verbs):
         "--store",
         action="store_true",
         help="store the executed notebooks instead of a report",
+    )
+
+
+def _add_study(verbs):
+    study = verbs.add_parser(
+        "study",
+        help="compare methods on many drawn sessions of published and other set-ups",
+    )
+    study.add_argument("scenarios", nargs="+", metavar="SCENARIO", help="e.g. paper_rig")
+    study.add_argument("--methods", nargs="+", help="default: all that single shots allow")
+    study.add_argument(
+        "--poses",
+        nargs="+",
+        type=int,
+        metavar="N",
+        help="placements (default 5 10 20 50 100)",
+    )
+    study.add_argument("--trials", type=int, default=100, help="of each (default 100)")
+    study.add_argument("--seed", type=int, default=0)
+    study.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="KEY=V,V,...",
+        help="e.g. step_deg=0.25,0.5; several times: every combination",
+    )
+    study.add_argument(
+        "--out",
+        required=True,
+        help="the table, CSV; a killed study goes on when asked again",
+    )
+    _add_scheduler(study)
+
+
+def _add_scheduler(verb):
+    verb.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a Dask cluster, e.g. tcp://10.0.0.1:8786 (default: the cores of this machine)",
     )
 
 

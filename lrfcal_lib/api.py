@@ -4,6 +4,7 @@ The functions stand in the folders of their stages; two folders are called like 
 (``calibrate``, ``judge``), which is why the package itself does not offer them.
 """
 
+from lrfcal_lib.calibrate.calibration_file import load_calibration
 from lrfcal_lib.calibrate.clouds import color_cloud
 from lrfcal_lib.calibrate.observe import observe
 from lrfcal_lib.calibrate.pipeline import calibrate, prepare
@@ -20,6 +21,7 @@ __all__ = [
     "calibrate",
     "color_cloud",
     "judge",
+    "load_calibration",
     "method_comparison",
     "observe",
     "open_session",

@@ -21,6 +21,8 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+import rooms
+from distributed import LocalCluster
 from joint_draws import draw, none
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -28,10 +30,14 @@ from synthetic import camera_observations, random_board_poses, random_rig
 from telegrams import encode_scan
 
 from lrfcal_lib.calibrate.painting import Painter, View
+from lrfcal_lib.evaluate.study import finished, tasks_of
+from lrfcal_lib.evaluate.study_trials import STUDIED
+from lrfcal_lib.measure.stations import join_stations
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
 from lrfcal_lib.preprocess.survey import survey, views_of
+from lrfcal_lib.session.cluster import workers_at
 from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, split_stream
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.solvers import solve_camera
@@ -44,11 +50,11 @@ ROOT = Path(__file__).resolve().parent.parent
 FULL = {
     "repeats": 7, "trials": 1000, "placements": (10, 30, 100, 300, 1000), "joint": 100, "points": 10_000_000,
     "growth": (10_000, 100_000, 1_000_000, 10_000_000, 100_000_000), "telegrams": 20_000, "session": "sim_lms221",
-    "pixels": 12_000_000,
+    "pixels": 12_000_000, "study": 160, "calls": 2000, "step_deg": 0.25,
 }  # fmt: skip
 TINY = {  # for the test, which only asks whether everything is written
     "repeats": 1, "trials": 2, "placements": (10,), "joint": 10, "points": 10_000, "growth": (1_000,),
-    "telegrams": 100, "session": None, "pixels": 2_000_000,
+    "telegrams": 100, "session": None, "pixels": 2_000_000, "study": 10, "calls": 20, "step_deg": 0.5,
 }  # fmt: skip
 SURVEYED = 4  # images in a survey
 CHUNK = 1_000_000  # points that growth hands over at a time
@@ -340,28 +346,34 @@ def images(size):
     yield "survey_12mp_png_s", seconds(repeats, see)[0] / SURVEYED, None, "", np.nan, see
 
 
+COMMANDS = {
+    "calibrate_s": ["calibrate", "session", "--out", "calibrated"],
+    "reconstruct_s": [
+        "reconstruct",
+        "session",
+        "--calibration",
+        "calibrated/calibration.json",
+    ],
+    "report_s": ["report", "session", "--out", "out"],
+}
+
+
 def commands(size):
     """Whole commands on a shipped session, once each: nothing else does the same."""
-    for key, verb in (("calibrate_s", "calibrate"), ("report_s", "report")):
-        taken = np.nan
+    with TemporaryDirectory() as folder:
         if size["session"]:
-            with TemporaryDirectory() as folder:
-                shutil.copytree(ROOT / "data" / size["session"], Path(folder, "session"))
-                command = [
-                    sys.executable,
-                    "-m",
-                    "lrfcal_lib",
-                    verb,
-                    "session",
-                    *["--out", "out"] * (verb == "report"),
-                ]
+            shutil.copytree(ROOT / "data" / size["session"], Path(folder, "session"))
+        for key, words in COMMANDS.items():
+            taken = np.nan
+            if size["session"]:
+                command = [sys.executable, "-m", "lrfcal_lib", *words]
                 environment = os.environ | {
-                    "LRFCAL_CACHE": f"{folder}/cache",
+                    "LRFCAL_CACHE": f"{folder}/{key}",  # none finds what another one left
                     "PYTHONPATH": str(ROOT),
                 }
                 where = {"cwd": folder, "env": environment, "stdout": subprocess.DEVNULL}
                 taken = elapsed(partial(subprocess.run, command, check=True, **where))
-        yield key, taken, None, "", np.nan, None
+            yield key, taken, None, "", np.nan, None
 
 
 def paint_blocks(count):
@@ -417,12 +429,64 @@ def plot(table, path):
     plt.close(figure)
 
 
+def studies(size):
+    """A study on a Dask cluster of this machine: two workers beside one, and the overhead of a task.
+
+    On paper a thousand workers are busy as long as the scheduler hands out tasks faster than they finish: the
+    speed-up ends at the time of a task over the overhead. A task is some hundred bytes, its rows some ten kilobytes.
+    """
+    tasks = tasks_of(["paper_rig"], STUDIED, (20,), size["study"])
+    taken = {}
+    for count in (1, 2):
+        with (
+            LocalCluster(
+                n_workers=count, threads_per_worker=1, dashboard_address=None
+            ) as local,
+            workers_at(local.scheduler_address) as executor,
+        ):
+            list(finished(tasks[: 2 * count], executor))  # imports and compiles
+            taken[count] = elapsed(lambda: list(finished(tasks, executor)))  # noqa: B023
+            calls = elapsed(lambda: list(executor.map(abs, range(size["calls"]))))  # noqa: B023
+    task = taken[1] / len(tasks)
+    overhead = calls / size["calls"]
+    yield (
+        "study_2_workers_s",
+        taken[2],
+        "study_scaling",
+        "one worker",
+        taken[1] / taken[2],
+        None,
+    )
+    yield "study_task_ms", 1000 * task, None, "", np.nan, None
+    yield "study_overhead_ms", 1000 * overhead, None, "", np.nan, None
+    yield "study_most_workers_on_paper", task / overhead, None, "", np.nan, None
+
+
+def joining(size):
+    """Four stations of a simulated room in one frame, without a guess."""
+    rng = np.random.default_rng(71)
+    world, half = rooms.furnished_at_random(rng)
+    clouds = {
+        number: rooms.scanned(world, T, rng, number=number, step=size["step_deg"])
+        for number, T in rooms.around(rng, half).items()
+    }
+    yield (
+        "join_4_stations_s",
+        elapsed(lambda: join_stations(clouds)),
+        None,
+        "",
+        np.nan,
+        None,
+    )
+
+
 def main(out, size=None):
     """Measure everything at a size and write bench.json, bench.csv and growth.png."""
     size = size or FULL
     rows = []
     figures = {}
-    for part in (cameras, joint, colouring, decoding, images, commands):
+    parts = (cameras, joint, colouring, decoding, images, studies, joining, commands)
+    for part in parts:
         for key, value, ratio_key, against, times_faster, call in part(size):
             rows.append(
                 [key, value, against, times_faster, memory(call) if call else np.nan]

@@ -136,7 +136,7 @@ def test_what_is_no_calibration_is_refused(tmp_path, case):
     path.write_text(text)
     with pytest.raises(SessionError, match=words):
         load_calibration(path)
-    with pytest.raises(SessionError, match="No such file"):
+    with pytest.raises(SessionError, match="no such file"):
         load_calibration(tmp_path / "none.json")
 
 

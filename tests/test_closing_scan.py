@@ -1,4 +1,4 @@
-"""A sweep that ends with a scan back at its first pitch tells whether the rig stood still."""
+"""A sweep that ends with a scan back in its first half tells whether the rig stood still."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,6 @@ from lrfcal_lib.preprocess.closing_scan import closing_of, without_closing
 from lrfcal_lib.session.read import Sweep
 
 BEARINGS = np.radians(np.arange(40, 140.1, 0.5))
-STEP = 0.5  # deg
 
 
 def ranges_at(pitch, yaw=0.0, shift=0.0):
@@ -22,10 +21,11 @@ def ranges_at(pitch, yaw=0.0, shift=0.0):
     return np.minimum.reduce(walls)
 
 
-def sweep(first=-25.0, last=15.0, play=0.0, noise=0.01, seed=0, **moved):
+def sweep(first=-25.0, last=15.0, play=0.0, noise=0.01, seed=0, step=0.5, **moved):
     """A sweep with its closing scan, degrees; the head comes back off by `play`."""
-    pitch = np.arange(first, last, np.copysign(STEP, last - first))
-    told = np.radians([*pitch, first])
+    pitch = np.arange(first, last, np.copysign(step, last - first))
+    half = pitch[: len(pitch) // 2 + 1]
+    told = np.radians([*pitch, half[np.argmin(np.abs(half))]])
     ranges = ranges_at(told[:-1])
     closing = ranges_at(told[-1:] + np.radians(play), **moved)
     ranges = np.concatenate([ranges, closing])
@@ -36,15 +36,15 @@ def sweep(first=-25.0, last=15.0, play=0.0, noise=0.01, seed=0, **moved):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
 @pytest.mark.parametrize("play", [0.0, 0.1, 0.4, 0.9])
-def test_a_rig_that_stands_still_is_not_accused(seed, noise, play):
-    assert not closing_of(sweep(play=play, noise=noise, seed=seed)).moved
-    assert not closing_of(sweep(15, -25, play=-play, noise=noise, seed=seed)).moved
+@pytest.mark.parametrize("step", [0.25, 0.5, 2.0])
+def test_a_rig_that_stands_still_is_not_accused(seed, noise, play, step):
+    options = {"noise": noise, "seed": seed, "step": step}
+    assert not closing_of(sweep(play=play, **options)).moved
+    assert not closing_of(sweep(15, -25, play=-play, **options)).moved
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(
-    "moved", [{"yaw": np.radians(3)}, {"shift": 0.1}, {"play": -6.0}], ids=str
-)
+@pytest.mark.parametrize("moved", [{"yaw": np.radians(3)}, {"shift": 0.1}], ids=str)
 def test_one_that_moved_is(seed, moved):
     assert closing_of(sweep(15.0, -25.0, seed=seed, **moved)).moved
 
@@ -54,7 +54,7 @@ def test_the_closing_scan_is_no_part_of_the_sweep():
     main, closing = without_closing(whole)
     assert len(main.pitch) == len(whole.pitch) - 1 and len(closing.pitch) == 1
     np.testing.assert_array_equal(main.ranges, whole.ranges[:-1])
-    assert closing.pitch[0] == whole.pitch[0]
+    assert closing.pitch[0] == whole.pitch[-1]
 
 
 def test_what_closes_nothing_stays_whole():

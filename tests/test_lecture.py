@@ -3,7 +3,9 @@
 import re
 
 import pandas as pd
-from notebook_runs import GOLDEN, NOTEBOOKS, read
+import pytest
+from notebook_runs import GOLDEN, NOTEBOOKS, read, run_plainly
+from shared import ROOT, campaign, stages
 
 LECTURE = [
     path for path in NOTEBOOKS if path.stem[:2] in ("00", "01", "02", "03", "04", "05")
@@ -62,3 +64,27 @@ def test_only_the_joint_estimate_states_its_errors_rightly():
         pulls["joint"] < 1
         and pulls[["line", "line_last_beam", "zhang_pless_printed"]].min() > 3
     )
+
+
+def outputs(path):
+    """What the solutions of a notebook's exercises are said to print."""
+    said = [part for text in texts(path) for part in re.findall(r"Output: (.*)", text)]
+    return [output for part in said for output in re.findall(r"`([^`]+)`", part)]
+
+
+SHOWN = [path for path in LECTURE if outputs(path)]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=campaign if path.stem[:2] == "03" else ())
+        for path in SHOWN
+    ],
+)
+def test_solutions_print_what_is_said(path, tmp_path):
+    printed = run_plainly(
+        path, ROOT / "data" / "sim_lms221", stages(), tmp_path, drawn=False
+    )
+    missing = [output for output in outputs(path) if output not in printed]
+    assert len(outputs(path)) >= 2 and not missing

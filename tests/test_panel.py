@@ -4,17 +4,26 @@ import json
 import logging
 import re
 import threading
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from fake_rig import make_rig, opened, raising, rig_data
+from fake_rig import SIZE, make_rig, opened, raising, rig_data
+from scipy.spatial.transform import RigidTransform, Rotation
 from shared import until
 
 from lrfcal_lib.acquire import collector
 from lrfcal_lib.acquire import panel as page
 from lrfcal_lib.acquire.collector import Busy, Collector, Interrupted
 from lrfcal_lib.acquire.record import RecordingError
+from lrfcal_lib.calibrate.calibration_file import KIND, SCHEMA, rig_record
+from lrfcal_lib.calibrate.cameras import KnownAxis
+from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig
 from lrfcal_lib.drivers.port import DeviceError, LineLost, OutOfRange, PortError
 from lrfcal_lib.drivers.rig_file import RigFileError
+from lrfcal_lib.evaluate.export import write_calibration
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session.read import open_session
 
 WAIT_S = 120  # guards against hanging
@@ -261,3 +270,56 @@ def test_what_nobody_expects_and_what_drivers_report_is_said_too(
     assert "does not tell its tilt" in panel.parts.notes.value
     panel.close()
     assert panel.notes not in logging.getLogger("lrfcal_lib").handlers
+
+
+def chosen(panel, path):
+    """The panel with a calibration chosen, and what it says about it."""
+    panel.parts.calibration.value = str(path)
+    return panel.parts.overlay.value
+
+
+def a_calibration(path, answer="yes", size=SIZE):
+    """A file that says of every camera it is where the LRF is, looking along the middle beam."""
+    ahead = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi / 2, 0, 0]))
+    model = CameraModel(*size, 100.0, 100.0, size[0] / 2, size[1] / 2)
+    cameras = {c: CalibratedCamera(ahead, "head", model) for c in ("left", "right")}
+    axis = KnownAxis(RigidTransform.identity(), np.eye(4))
+    rig = CalibratedRig("joint", axis, Corrections(0.5), cameras)
+    verdict = {"answer": answer, "reasons": [{"words": "nobody leaned"}]}
+    head = {"schema": SCHEMA, "kind": KIND, "session": "s", "date": "", "method": "joint"}
+    write_calibration(path, {**head, "verdict": verdict, **rig_record(rig)})
+    return path
+
+
+def test_the_scan_is_drawn_where_a_calibration_puts_it(panel, tmp_path):
+    size = width, height = 320, 240
+    image = np.zeros((height, width, 3), np.uint8)
+    bearings = np.radians([75.0, 90.0, 105.0, 170.0])
+    view = SimpleNamespace(
+        ranges=np.array([1.0, np.nan, 3.0, 2.0]), bearings=bearings, pitch=0.2
+    )
+    plain, words = panel._overlaid("left", image, view)
+    assert plain is image and "dots" not in words
+    assert chosen(panel, a_calibration(tmp_path / "c.json", size=size)) == ""
+    drawn, words = panel._overlaid("left", image, view)
+    assert "dots: the scan" in words and not image.any()
+    v, u = np.nonzero(drawn.any(axis=2))
+    # a camera at the LRF sees a beam by its bearing, whatever the range; one has no return, one is not seen
+    expected = width / 2 + 100.0 / np.tan(bearings[[0, 2]])
+    assert np.abs(u[:, None] - expected).min(axis=1).max() < 4
+    assert np.abs(v - height / 2).max() < 4
+    near, far = (drawn[height // 2, round(at)].astype(int) for at in expected)
+    assert near.sum() > far.sum(), "near is bright"
+
+
+def test_a_calibration_that_does_not_fit_is_said(panel, tmp_path):
+    view = SimpleNamespace(ranges=np.ones(3), bearings=np.ones(3), pitch=0.0)
+    image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    (tmp_path / "broken.json").write_text("{")
+    assert "not JSON" in chosen(panel, tmp_path / "broken.json")
+    assert panel._overlaid("left", image, view)[0] is image
+    assert "nobody leaned" in chosen(panel, a_calibration(tmp_path / "no.json", "no"))
+    assert chosen(panel, a_calibration(tmp_path / "c.json", size=(100, 80))) == ""
+    assert "of 100 x 80" in panel._overlaid("left", image, view)[1]
+    assert "does not know" in panel._overlaid("top", image, view)[1]
+    assert chosen(panel, "") == ""

@@ -34,6 +34,7 @@ CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
 METHODS_PAGE = (ROOT / "notebooks" / "METHODS.md").read_text()
 RIG_PAGE = (ROOT / "notebooks" / "RIG_FILE.md").read_text()
 RESULTS_PAGE = (ROOT / "notebooks" / "RESULTS.md").read_text()
+FILE_PAGE = (ROOT / "notebooks" / "CALIBRATION_FILE.md").read_text()
 SENSORS_PAGE = (ROOT / "notebooks" / "OTHER_SENSORS.md").read_text()
 WORKFLOW = (ROOT / ".github" / "workflows" / "test.yml").read_text()
 
@@ -50,7 +51,9 @@ def test_notebooks_methods_functions_and_files_are_all_there():
     ] == []
     assert [method for method in METHODS if f"| `{method}` |" not in METHODS_PAGE] == []
     links = re.findall(r"\]\(([^)#:]+)\)", README + CONTRIBUTING)
-    pages = README + CONTRIBUTING + METHODS_PAGE + RIG_PAGE + RESULTS_PAGE + SENSORS_PAGE
+    pages = "".join(
+        [README, CONTRIBUTING, METHODS_PAGE, RIG_PAGE, RESULTS_PAGE, SENSORS_PAGE]
+    )
     files = re.findall(r"`((?:lrfcal_lib|tests|data|notebooks)/[\w/.]+)`", pages)
     assert (
         len(files) > 4
@@ -126,44 +129,15 @@ def test_the_clone_line_gives_a_checkout_that_checks_its_session(tmp_path):
 def test_the_example_projects_a_scan_line_into_the_image(monkeypatch, capsys):
     monkeypatch.setenv(cache.VARIABLE, str(stages()))
     monkeypatch.chdir(ROOT)
-    exec(blocks("python")[0], names := {})
+    exec(*blocks("python"), names := {})
     shown = blocks("python")[0].splitlines()[-1]
-    assert shown == f"# {capsys.readouterr().out.strip()}", "what it prints"
+    assert shown == "# " + capsys.readouterr().out.strip(), "the output is what it prints"
     u, v = names["pixels"][np.isfinite(names["pixels"]).all(axis=1)].T
     inside = (u > 0) & (u < names["lens"].width - 1)
     assert inside.sum() > 100 and np.all(
         (v[inside] > 0) & (v[inside] < names["lens"].height - 1)
     )
     assert np.ptp(v[inside]) < 60 < np.ptp(u[inside]), "a scan line is nearly level"
-
-
-@pytest.mark.parametrize("mount", ["head", "platform"])
-def test_twenty_lines_project_a_scan_from_the_file_alone(
-    quick, tmp_path, monkeypatch, mount
-):
-    """The same pixels as ours, for errors of range and pitch that would show."""
-    rig = quick.rig("joint")
-    left = replace(rig.cameras["left"], mount=mount)
-    if mount == "platform":
-        left = replace(left, T_camera=left.T_camera * rig.T_head_lrf.inv())
-    rig = replace(rig, corrections=Corrections(0.05, 0.03), cameras={"left": left})
-    write_calibration(tmp_path / "calibration.json", rig_record(rig))
-    monkeypatch.chdir(tmp_path)
-    bearings = np.radians(np.linspace(60, 120, 50))
-    ranges = np.linspace(1.0, 3.0, 50)
-    names = {"bearings": bearings, "ranges": ranges, "pitch_of_scan": 0.1}
-    names["pitch_of_image"] = -0.05
-    code = blocks("python")[1]
-    exec(code, names)
-    assert (
-        len([line for line in code.splitlines() if line.strip()]) <= 23
-    )  # imports are three
-    p_lrf = rig.corrections.points(polar_to_points(ranges, bearings))
-    p_platform = lrf_to_platform(p_lrf, rig.corrections.pitch(1, 0.1), rig.T_head_lrf)
-    T_camera = rig.camera_at("left", float(rig.corrections.pitch(1, -0.05)))
-    ours = project(T_camera.apply(p_platform), left.model)
-    np.testing.assert_allclose(names["pixels"][:, 0], ours, atol=1e-6)
-    assert np.isfinite(ours).all()
 
 
 def test_a_session_of_another_sensor_is_written_as_the_page_says(tmp_path, monkeypatch):
@@ -185,6 +159,35 @@ def test_a_session_of_another_sensor_is_written_as_the_page_says(tmp_path, monke
     )
     assert len(written.images("left")) == sum(len(my_images(p)) for p in (1, 2, 3, 4))
     np.testing.assert_array_equal(written.sweep(3).ranges, given.sweep(3).ranges)
+
+
+@pytest.mark.parametrize("mount", ["head", "platform"])
+def test_twenty_lines_project_a_scan_from_the_file_alone(
+    quick, tmp_path, monkeypatch, mount
+):
+    """The same pixels as ours, for errors of range and pitch that would show."""
+    rig = quick.rig("joint")
+    left = replace(rig.cameras["left"], mount=mount)
+    if mount == "platform":
+        left = replace(left, T_camera=left.T_camera * rig.T_head_lrf.inv())
+    rig = replace(rig, corrections=Corrections(0.05, 0.03), cameras={"left": left})
+    write_calibration(tmp_path / "calibration.json", rig_record(rig))
+    monkeypatch.chdir(tmp_path)
+    bearings = np.radians(np.linspace(60, 120, 50))
+    ranges = np.linspace(1.0, 3.0, 50)
+    names = {"bearings": bearings, "ranges": ranges, "pitch_of_scan": 0.1}
+    names["pitch_of_image"] = -0.05
+    code = blocks("python", FILE_PAGE)[0]
+    exec(code, names)
+    assert (
+        len([line for line in code.splitlines() if line.strip()]) <= 23
+    )  # imports are three
+    p_lrf = rig.corrections.points(polar_to_points(ranges, bearings))
+    p_platform = lrf_to_platform(p_lrf, rig.corrections.pitch(1, 0.1), rig.T_head_lrf)
+    T_camera = rig.camera_at("left", float(rig.corrections.pitch(1, -0.05)))
+    ours = project(T_camera.apply(p_platform), left.model)
+    np.testing.assert_allclose(names["pixels"][:, 0], ours, atol=1e-6)
+    assert np.isfinite(ours).all()
 
 
 def golden(session, name):

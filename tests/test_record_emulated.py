@@ -146,7 +146,8 @@ def test_a_scene_is_recorded_and_rebuilt_with_that_calibration(
     said = capsys.readouterr().out
     planned = float(re.search(r"deg: (\d+) % of the cloud can get a colour", said)[1])
     colored = float(re.search(r"colour: (\d+) % of the points", said)[1])
-    assert abs(colored - planned) < 10 and "ok    stood still" in said
+    # things hide more from a camera than planned, the more the farther apart the beams are
+    assert planned - 20 < colored < planned + 5 and "ok    stood still" in said
 
     verb(
         0,

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import COLUMNS, point_type
+from lrfcal_lib.calibrate.clouds import color_cloud
 from lrfcal_lib.measure.scene import station_cloud, stations_of, write_scene
 
 ABOUT = "session sim_quick, UNTRUSTED for a test"
@@ -163,3 +164,18 @@ def test_a_file_that_breaks_off_is_not_there(session, rig, tmp_path, little_spac
     with little_space(100_000), pytest.raises(ValueError, match="cannot be written"):
         write_scene(tmp_path, session, rig, still, ABOUT)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_scan_that_closes_a_sweep_makes_no_points(quick, session, rig, cloud):
+    number = session.scene_placements[0]
+    first = np.flatnonzero(session.scans["placement"] == number)[0]
+    scans = {
+        key: values if key == "bearings" else np.concatenate([values, values[[first]]])
+        for key, values in session.scans.items()
+    }
+    closed = replace(session, scans=scans)
+    assert len(closed.sweep(number).pitch) == len(session.sweep(number).pitch) + 1
+    np.testing.assert_array_equal(station_cloud(closed, rig, number).points, cloud.points)
+    other = replace(quick, prepared=replace(quick.prepared, session=closed))
+    painted = color_cloud(other, "joint", scene=True)
+    np.testing.assert_array_equal(painted.points, cloud.points)

@@ -4,11 +4,15 @@ import re
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
+from lrfcal_lib.measure.features import length_between
+from lrfcal_lib.measure.lengths import features_of_station, for_page, measure, read_picks
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.plots import interactive
 
 BY_THE_PROCESSOR = [
@@ -66,3 +70,84 @@ def test_a_browser_draws_it(tmp_path, browser):
         "no red points in the picture"
     )
     assert len(np.unique(np.stack([blue, green, red], -1).reshape(-1, 3), axis=0)) > 50
+
+
+@pytest.fixture(scope="module")
+def scene(quick):
+    """What can be measured in the scene of the small session."""
+    session = quick.prepared.session
+    return features_of_station(session, quick.rig("joint"), session.scene_placements[0])
+
+
+@pytest.fixture(scope="module")
+def measuring(scene, tmp_path_factory):
+    """A page with it."""
+    file = tmp_path_factory.mktemp("page") / "scene.html"
+    cloud = scene.cloud
+    data = for_page(scene)
+    interactive.scene_page(
+        file, cloud.points, cloud.colors, cloud.seen, {}, title="A room", measuring=data
+    )
+    return file
+
+
+def test_the_browser_computes_what_python_computes(scene, measuring, browser):
+    """Lengths and intervals between planes and edges, between points, and the list that it saves."""
+    view = browser.new_page()
+    view.goto(measuring.as_uri())
+    view.wait_for_selector("#measure", state="attached")
+    between = "([i, j]) => { const m = measuring.measurer; return m.between(m.feature(i), m.feature(j)) }"
+    found = [*scene.planes, *(edge.feature for edge in scene.edges)]
+    rng = np.random.default_rng(0)
+    compared = 0
+    for i, j in rng.integers(0, len(found), (150, 2)).tolist():
+        told = view.evaluate(between, [i, j])
+        try:
+            length, sigma = length_between(found[i], found[j])
+        except DegenerateGeometry:
+            assert "from parallel" in told
+            continue
+        if length > 0.01 and sigma < 0.1:
+            compared += 1
+            assert told["length"] == pytest.approx(length, abs=1e-5)
+            assert told["sigma"] == pytest.approx(sigma, rel=1e-2, abs=1e-5)
+    assert compared > 20
+
+    seen = np.flatnonzero(scene.cloud.seen)
+    numbers = [100, len(seen) - 100]
+    for number in numbers:
+        place = scene.cloud.points[seen[number]].tolist()
+        view.evaluate("([p, n]) => measuring.pick('point', p, 0, n)", [place, number])
+    saved = measuring.with_name("picks.csv")
+    saved.write_text(view.evaluate("measuring.csv()"))
+    view.close()
+    told = pd.read_csv(saved).iloc[0]
+    expected = measure(scene, read_picks(saved)).iloc[0]
+    for column in ("length_m", "low_m", "high_m"):
+        assert told[column] == pytest.approx(expected[column], abs=1e-4)
+
+
+@campaign
+@pytest.mark.parametrize("browser", [BY_THE_PROCESSOR], indirect=True, ids=["webgl"])
+def test_two_clicks_measure_and_the_wheel_comes_closer_slowly(measuring, browser):
+    view = browser.new_page(viewport={"width": 900, "height": 700})
+    view.set_default_timeout(280_000)
+    view.goto(measuring.as_uri())
+    view.wait_for_selector("canvas", state="attached")
+    view.click("input[value=point]")
+    eye = "Object.values(document.getElementById('scene')._fullLayout.scene._scene.getCamera().eye)"
+    before = np.array(view.evaluate(eye))
+    for x in range(300, 700, 25):
+        if view.evaluate("measuring.list.length"):
+            break
+        view.mouse.move(x, 350)
+        view.wait_for_timeout(700)
+        view.mouse.click(x, 350)
+        view.wait_for_timeout(700)
+    assert view.evaluate("measuring.list.length") == 1
+    assert " m" in view.text_content("#pointer") or view.text_content("#lengths")
+    view.mouse.wheel(0, -300)
+    view.wait_for_timeout(1000)
+    after = np.array(view.evaluate(eye))
+    view.close()
+    assert 0.8 < np.linalg.norm(after) / np.linalg.norm(before) < 0.95

@@ -17,8 +17,17 @@ from markupsafe import Markup
 
 from lrfcal_lib.acquire.checks import Light
 from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted, Result
-from lrfcal_lib.acquire.pictures import WIDTH, jpeg, png, scan_picture, sweep_picture
+from lrfcal_lib.acquire.pictures import (
+    WIDTH,
+    jpeg,
+    png,
+    scan_picture,
+    sweep_picture,
+    with_scan,
+)
 from lrfcal_lib.acquire.record import RecordingError
+from lrfcal_lib.calibrate.calibration_file import load_calibration
+from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.session.shown import escape
 from lrfcal_lib.session.write import new_session_path
@@ -138,7 +147,9 @@ class Parts:
             w.HTML(STYLE),
             self.top,
             fields,
+            self.calibration,
             self.places,
+            self.overlay,
             self.error,
             self.trouble,
             *below,
@@ -161,6 +172,13 @@ class Parts:
             style=style,
             layout=w.Layout(flex="2 1 320px"),
         )
+        self.calibration = w.Text(
+            placeholder="calibration.json: shows the scan in the images",
+            description="calibration",
+            continuous_update=False,
+            style={"description_width": "80px"},
+            layout=w.Layout(width="100%"),
+        )
         self.slider = w.FloatSlider(
             min=-60,
             max=60,
@@ -173,7 +191,7 @@ class Parts:
         self.progress = w.FloatProgress(
             min=0, max=1, description="", style=style, layout=w.Layout(width="100%")
         )
-        for name in ("rig", "session", "slider", "progress"):
+        for name in ("rig", "session", "calibration", "slider", "progress"):
             named(name, getattr(self, name))
 
     def _make_buttons(self):
@@ -222,6 +240,7 @@ class Parts:
         self.state = text("state", HTML.state("off"))
         self.places = text("places")
         self.error = text("error")
+        self.overlay = text("overlay")
         self.trouble = text("trouble")
         self.notes = text("notes")
         self.pitch = text("pitch")
@@ -316,6 +335,8 @@ class Panel(Closed):
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         for name in ("rig", "session"):
             getattr(self.parts, name).observe(self._show_places, "value")
+        self._calibrated: CalibratedRig | None = None  # shows the scan in the images
+        self.parts.calibration.observe(self._choose_calibration, "value")
         self._show_places()
         self._refresh()
 
@@ -327,6 +348,21 @@ class Panel(Closed):
     def _show_places(self, _=None):
         """Show what the fields name: relative paths are taken from where this notebook lies."""
         self.parts.places.value = HTML.places(rig_named(self.parts.rig.value), self.session)
+
+    def _choose_calibration(self, _=None):
+        """Read the calibration that the field names, and say what is wrong with it."""
+        self._calibrated = None
+        name = self.parts.calibration.value.strip()
+        words = ""
+        if name:
+            try:
+                self._calibrated = load_calibration(absolute(name))
+            except ValueError as error:
+                words = str(error)
+            else:
+                if self._calibrated.answer == "no":
+                    words = f"cannot be trusted: {'; '.join(self._calibrated.reasons)}"
+        self.parts.overlay.value = HTML.error("calibration", words)
 
     def show(self) -> None:
         """Display the panel."""
@@ -393,6 +429,9 @@ class Panel(Closed):
         with self._doing("calibrating"):
             result = self.collector.calibrate()
             self.parts.result.value = HTML.result(result)
+            if result.file is not None:
+                self.parts.calibration.value = ""  # read again, if it is the same file
+                self.parts.calibration.value = str(result.file)
         return result
 
     def stop(self) -> None:
@@ -501,8 +540,23 @@ class Panel(Closed):
             words = f"{len(rows)} scan lines; near is bright, white is no range"
             pictures["sweep"].show(png(picture), words)
         for name, frame in dict(view.frames).items():
-            height, width = frame.image.shape[:2]
-            picture = jpeg(frame.image, WIDTH)
-            pictures[name].show(picture, f"{width} x {height} pixels")
+            image, words = self._overlaid(name, frame.image, view)
+            pictures[name].show(jpeg(image, WIDTH), words)
 
         self.parts.trouble.value = HTML.error("view", view.trouble)
+
+    def _overlaid(self, name, image, view):
+        """An image with the current scan over it where a calibration tells, and a remark."""
+        rig = self._calibrated
+        height, width = image.shape[:2]
+        words = f"{width} x {height} pixels"
+        if rig is None or view.ranges is None:
+            return image, words
+        if name not in rig.cameras:
+            return image, f"{words}; the calibration does not know this camera"
+        model = rig.cameras[name].model
+        if (model.width, model.height) != (width, height):
+            return image, f"{words}; the calibration is of {model.width} x {model.height}"
+        pixels = rig.project_scan(name, view.ranges, view.bearings, view.pitch)
+        image = with_scan(image, pixels, view.ranges)
+        return image, f"{words}; dots: the scan, near is bright"

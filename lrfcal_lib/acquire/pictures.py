@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.geometry import polar_to_points
-from lrfcal_lib.plots.recording import COLORS
+from lrfcal_lib.plots.colors import COLORS
 
 WIDTH = 400  # of a picture, pixels
 HEIGHT = 300
@@ -129,6 +129,35 @@ def sweep_picture(
     nearest = away.argmin(axis=1)[covered]
     image[TOP:BOTTOM, LEFT:RIGHT][covered] = shades[nearest][:, beam]
     return image
+
+
+def with_scan(image: np.ndarray, pixels: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    """A scan line over an image, coloured by range: near is bright.
+
+    Parameters
+    ----------
+    image
+        (height, width, 3), BGR.
+    pixels
+        Of its beams, (B, 2); NaN where there is none.
+    ranges
+        (B,), metres.
+
+    Returns
+    -------
+    ndarray of uint8
+        A copy.
+    """
+    drawn = image.copy()
+    height, width = image.shape[:2]
+    radius = max(2, round(width / WIDTH * 2))
+    inside = np.all((pixels >= 0) & (pixels < (width, height)), axis=1)
+    colours = _shades(ranges[None])[0]
+    for pixel, colour in zip(
+        pixels[inside].round().astype(int), colours[inside], strict=True
+    ):
+        cv2.circle(drawn, pixel.tolist(), radius, colour.tolist(), -1, cv2.LINE_AA)
+    return drawn
 
 
 def write(image: np.ndarray, text: str, u: float, v: float) -> None:

@@ -1,11 +1,14 @@
 """Scenes recorded from one or more stations, for a rig that is calibrated: ``record --scene``."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from lrfcal_lib.acquire.checks import LEAST_SCENE, Light
 from lrfcal_lib.acquire.record import Boards, ask_before
+from lrfcal_lib.calibrate.calibration_file import require_same_rig
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import ListedPlacement, Placement, RigFile
@@ -39,6 +42,12 @@ class Stations(Boards):
 
         Sweep and numbers are those of the scenes that the plan lists, as far as there are any.
         """
+        if self.rig is not None:
+            # what its range finder is set to shows once it is open
+            known: Any = SimpleNamespace(
+                name=stated.path, cameras=stated.cameras, lrf=self.rig.lrf
+            )
+            require_same_rig(self.rig, known)
         plan = stated.plan
         scenes = [entry for entry in plan.placements if not entry.board]
         numbers = [p.number for p in plan.to_do() if p.purpose == "scene"][: self.count]
@@ -87,6 +96,8 @@ class Stations(Boards):
 
     def check(self, session: Session, number: int) -> list[Light]:
         """How good a station is: share of returns, share with a colour, whether it moved."""
+        if self.rig is not None:
+            require_same_rig(self.rig, session)
         ranges = session.sweep(number).ranges
         back = float(np.isfinite(ranges).mean())
         text = f"{len(ranges)} scan lines, {100 * back:.0f} % of the beams came back"
@@ -100,7 +111,7 @@ class Stations(Boards):
             )
         else:
             text = (
-                f"back at its first pitch, ranges differ by {1000 * closing.apart:.0f} mm, "
+                f"back at a pitch that it had, ranges differ by {1000 * closing.apart:.0f} mm, "
                 f"by {1000 * closing.expected:.0f} mm between neighbouring scan lines"
             )
             still = Light("stood still", "ok", text)

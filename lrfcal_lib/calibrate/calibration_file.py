@@ -14,7 +14,7 @@ from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import LrfInfo, from_json, model_to_json
+from lrfcal_lib.session.stated import LrfInfo, from_json, plain
 
 SCHEMA = 2
 KIND = "lrfcal calibration"
@@ -203,18 +203,13 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
     ----------
     rig : CalibratedRig
     """
-    lens_of = {name: camera.model for name, camera in rig.cameras.items()}
     cameras = {}
     for name, camera in rig.cameras.items():
-        size = {"width": lens_of[name].width, "height": lens_of[name].height}
         cameras[name] = {
             "mount": camera.mount,
             **pose_record(camera.T_camera),
-            "lens": {**size, **(model_to_json(lens_of[name]) or {})},
+            "lens": plain(vars(camera.model)),
         }
-    uncertainty = None
-    if rig.uncertainty is not None:
-        uncertainty = {name: listed(value) for name, value in vars(rig.uncertainty).items()}
     return {
         "platform": {
             "maps": "lrf to head",
@@ -227,17 +222,8 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
             "pitch_scale": float(rig.corrections.pitch_scale),
         },
         "lrf": {name: getattr(rig.lrf, name) for name in LrfWritten.model_fields},
-        "uncertainty": uncertainty,
+        "uncertainty": None if rig.uncertainty is None else plain(vars(rig.uncertainty)),
     }
-
-
-def listed(value: Any) -> Any:
-    """A field of a RigUncertainty as JSON has it."""
-    if isinstance(value, dict):
-        return {key: listed(part) for key, part in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return value
 
 
 def pose_record(transform) -> dict[str, list]:
@@ -269,6 +255,7 @@ def load_calibration(path: str | Path) -> CalibratedRig:
     Parameters
     ----------
     path : path-like
+        Of the file, or of its folder.
 
     Returns
     -------
@@ -281,6 +268,11 @@ def load_calibration(path: str | Path) -> CalibratedRig:
     SessionError
         For a file that cannot be read, is damaged, no calibration, or of another schema.
     """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "calibration.json"
+    if not path.exists():
+        raise SessionError(f"{path}: there is no such file; 'calibrate' writes it")
     data = read_json(path, None)
     if data.get("kind") != KIND and data.get("schema") != 1:
         raise SessionError(

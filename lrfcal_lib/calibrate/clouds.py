@@ -10,6 +10,7 @@ from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.read import Session
 
 MARGIN = 20  # scan lines and beams about a board that are worked on with it
@@ -74,7 +75,9 @@ def cloud_blocks(
     for placement, mask in masks.items():
         sweep = session.sweep(placement)
         views = views_of(session, rig, placement)
-        if mask is not None:
+        if mask is None:
+            sweep, _ = without_closing(sweep)
+        else:
             sweep, mask = _about(sweep, mask)
         yield from reconstruct(
             sweep,

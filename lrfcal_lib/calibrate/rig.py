@@ -7,7 +7,8 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.rig_uncertainty import RigUncertainty, joint_uncertainty
-from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.model.kinematics import Corrections, camera_at
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.solvers.joint_solution import JointSolution
@@ -82,6 +83,31 @@ class CalibratedRig:
         """``T_camera_platform`` of a camera at a true pitch (radians)."""
         camera = self.cameras[name]
         return camera_at(camera.T_camera, camera.mount, self.T_head_lrf, pitch)
+
+    def project_scan(
+        self, name: str, ranges: np.ndarray, bearings: np.ndarray, pitch: float
+    ) -> np.ndarray:
+        """Pixels of a scan line in an image that a camera takes at the same pitch, shape (n, 2).
+
+        Parameters
+        ----------
+        name : str
+            The camera.
+        ranges, bearings : ndarray, shape (n,)
+            As recorded, metres (NaN for none) and radians.
+        pitch : float
+            As recorded, radians.
+
+        Returns
+        -------
+        ndarray
+            NaN where nothing came back, or behind the camera.
+        """
+        scan = self.corrections.points(polar_to_points(ranges, bearings))
+        true_pitch = pitch * (1 + self.corrections.pitch_scale)
+        p_platform = lrf_to_platform(scan, true_pitch, self.T_head_lrf)
+        p_camera = self.camera_at(name, true_pitch).apply(p_platform)
+        return project(p_camera, self.cameras[name].model)
 
 
 def joint_rig(solution: JointSolution, models: dict[str, CameraModel]) -> CalibratedRig:

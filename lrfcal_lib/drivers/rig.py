@@ -369,9 +369,11 @@ class Rig(Closed):
         self.lrf.stop()
 
     def _close(self, placement):
-        """Scan once more at the first pitch of a sweep."""
+        """Scan again in the first half of a sweep, as level as it was there: walls show most."""
         interlaced = self.stated.devices.lrf.interlaced
-        moved = self._move(placement.number, float(placement.pitch[0]), 1, 1)
+        half = placement.pitch[: len(placement.pitch) // 2 + 1]
+        level = float(half[np.argmin(np.abs(half))])
+        moved = self._move(placement.number, level, 1, 1)
         if interlaced:
             self.lrf.start(interlaced=True)
         readings = tuple(self._scans(moved.time_s, interlaced))

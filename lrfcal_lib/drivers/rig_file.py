@@ -288,7 +288,7 @@ class Devices(Stated):
 
 class ListedPlacement(Stated):
     """A placement of the plan; a board of false is a scene without one, one that is closing ends
-    with a scan back at its first pitch, what is left out is as in the plan.
+    with a scan back in its first half, what is left out is as in the plan.
     """
 
     number: whole(0, 999_999) = None
@@ -308,7 +308,7 @@ class Placement:
     image_pitch: tuple[float, ...]  # where images are taken, radians
     purpose: str = "board"  # of the images, or "scene"
     closing: bool = (
-        False  # back at its first pitch a last scan shows whether all stood still
+        False  # back in its first half a last scan shows whether all stood still
     )
 
     @property

@@ -46,15 +46,16 @@ def true_picks(session: Session, rig: CalibratedRig, cloud: Cloud) -> pd.DataFra
     turn += np.mean(truth.pitch[station] - rig.corrections.pitch(station, recorded))
     shift = np.array([gauge.translation[0], 0.0, 0.0])
     T_platform_room = truth.stations[station].inv()
+    tree = KDTree(cloud.points)
     rows = []
     for length in truth.lengths:
         row = {"name": length["name"], "true_m": length["metres"]}
         kinds = length["kind"].split("-")
         for number, (kind, end) in enumerate(zip(kinds, length["ends"], strict=True), 1):
             corners = tilt(T_platform_room.apply(end) - shift, -turn)
-            shown = _on_edge(cloud, corners)
+            shown = _on_edge(tree, corners)
             if kind == "plane":
-                shown = _on_face(cloud, corners)
+                shown = _on_face(cloud, tree, corners)
             if len(shown):
                 away = np.linalg.norm(shown - corners.mean(axis=0), axis=1)
                 row[f"kind_{number}"] = kind
@@ -65,7 +66,7 @@ def true_picks(session: Session, rig: CalibratedRig, cloud: Cloud) -> pd.DataFra
     return pd.DataFrame(rows)
 
 
-def _on_face(cloud, corners):
+def _on_face(cloud, tree, corners):
     """Points of a Cloud about which it shows a face with these corners (4, 3)."""
     middle = corners.mean(axis=0)
     axes = np.linalg.svd(corners - middle)[2]
@@ -73,14 +74,14 @@ def _on_face(cloud, corners):
     off = (cloud.points - middle) @ axes.T
     near = (np.abs(off) < half).all(axis=1) & (np.abs(cloud.normals @ axes[2]) > INSIDE)
     shown = cloud.points[near]
-    _, about = KDTree(cloud.points).query(shown, FEWEST)
+    _, about = tree.query(shown, FEWEST)
     on_it = np.abs(off[about, 2].mean(axis=1)) < MEAN
     return shown[on_it]
 
 
-def _on_edge(cloud, ends):
-    """Places of an edge with these ends (2, 3) that have a point of a Cloud close by."""
+def _on_edge(tree, ends):
+    """Places of an edge with these ends (2, 3) that have a point of a cloud close by."""
     share = np.linspace(0, 1, PLACES)[:, None]
     places = ends[0] + share * (ends[1] - ends[0])
-    away = np.linalg.norm(cloud.points[:, None] - places, axis=2)
-    return places[(away < NEAR).any(axis=0)]
+    away, _ = tree.query(places)
+    return places[away < NEAR]

@@ -317,10 +317,10 @@ def step_not_told(solution, admitted_offset, stated=ALTERNATIVES):
         moved = doubt.moved * doubt.sigma / abs(doubt.value)
         if moved > MOVED:
             return (
-                f"The angular step is taken as stated: these data tell it to "
-                f"{100 * doubt.sigma:.1f} % only, and were it off by that, axis or cameras would "
-                f"be off by {moved:.1f} of their standard deviations; boards at more different "
-                "distances tell more."
+                "The angular step is taken as stated: these data determine it only to "
+                f"{100 * doubt.sigma:.1f} %. An error of that size would move axis or cameras by "
+                f"{moved:.1f} of their standard deviations. Boards at more different distances "
+                "determine it better."
             )
     return ""
 

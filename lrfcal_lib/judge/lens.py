@@ -46,7 +46,10 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
             views, raised_points(prepared.board.pattern, prepared.relief), model
         )
         if miss > LENS_MISS:
-            faults.append(f"all corners of the chessboard miss by {miss:.2f} px alike")
+            faults.append(
+                f"in parts of the images the corners of the chessboard lie {miss:.2f} px beside "
+                "their prediction, all in one direction"
+            )
         reach = reach_of_fold(model)
         if reach < 1:
             faults.append(

@@ -100,8 +100,8 @@ class Suggestion:
         """What to record next and what it brings."""
         return (
             f"Record next: {self.words()}. The standard deviations of axis and cameras would "
-            f"shrink by about {100 * self.gain:.0f} % (after a placement chosen blindly by "
-            f"{100 * self.median_gain:.0f} %)."
+            f"shrink by about {100 * self.gain:.0f} %; a placement chosen at random would "
+            f"bring {100 * self.median_gain:.0f} %."
         )
 
 

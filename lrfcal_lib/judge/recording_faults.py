@@ -340,8 +340,8 @@ def _mirrored_camera(camera, stated, found):
     """The Fault of one camera whose images are mirrored."""
     words = (
         f"the images of camera '{camera}' are mirrored: the mirror images of its boards lie "
-        f"{1000 * found.size:.0f} mm off the scans, as recorded {1000 * stated.size:.0f} mm; turn "
-        "mirroring off in the camera, or flip the images"
+        f"{1000 * found.size:.0f} mm from the scans, the images as recorded "
+        f"{1000 * stated.size:.0f} mm; turn mirroring off in the camera, or flip the images"
     )
     return Fault("sense", words, severe=True, camera=camera)
 
@@ -356,8 +356,8 @@ def _misread(prepared, fitting, stated):
     likely.sort(key=lambda r: (_far_from_guess(prepared, fitting[r]), _worst(fitting[r])))
     causes = "; or ".join(reading.words for reading in likely)
     words = (
-        f"{causes}; scans lie {1000 * _worst(fitting[likely[0]]):.0f} mm off the boards in the "
-        f"images then, as recorded {1000 * _worst(stated):.0f} mm"
+        f"{causes}; read so, scans lie {1000 * _worst(fitting[likely[0]]):.0f} mm from the boards "
+        f"in the images; as recorded, {1000 * _worst(stated):.0f} mm"
     )
     return Fault(likely[0].kind, words, severe=True)
 

@@ -24,9 +24,7 @@ SIZES = (Kind.SQUARES, Kind.RANGES)  # an error of them is one of all distances
 LARGE_SIZE = 0.02  # error of a size that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
 RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
-NOT_WEIGHED = (
-    "whether session.json states sizes, step and spot rightly could not be weighed"
-)
+NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be tested"
 # statements that are falsified on purpose, as relative errors of alternatives
 LIES = {
     "as recorded": {},
@@ -141,7 +139,7 @@ def pitch_turns_otherwise(solution) -> Iterator[Finding]:
         words = (
             f"the platform turns {100 * abs(scale):.1f} +- {100 * sigma:.1f} % "
             f"{by_sign(scale, 'more', 'less')} than its recorded pitch says: check its gear or "
-            "encoder (the estimate has taken this off)"
+            "encoder (the estimate has corrected this)"
         )
         yield Finding(CARE, Kind.PITCH_SCALE, words)
 

@@ -385,8 +385,8 @@ def _scatter_note(placements):
     known = 100 / np.sqrt(2 * (placements - 1))
     within = stdtrit(placements - 1, 0.95)
     return (
-        f"The scatter over {placements} placements is itself known to {known:.0f} % only: 90 % of "
-        f"errors lie within {within:.1f} of its standard deviations, not 1.6."
+        f"{placements} placements determine their own scatter to {known:.0f} % only: 90 % of the "
+        f"errors lie within {within:.1f} stated standard deviations, not 1.6."
     )
 
 

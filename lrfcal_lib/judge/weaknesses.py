@@ -172,7 +172,7 @@ def large_residuals(solution) -> Iterator[Finding]:
     if share < DEPENDENT:
         words = (
             f"only {100 * share:.0f} % of the errors of ranges are independent: neighbouring "
-            "ranges have the same error (boards that bend, a pitch that is off)"
+            "ranges have the same error (bent boards, or a wrong pitch)"
         )
         yield Finding(CARE, Kind.DEPENDENT, words)
 

@@ -239,9 +239,10 @@ def _increments(first, second):
 
 
 def _covariance(rig, names):
-    """Covariance to rely on of shared unknowns; zero for what was none."""
+    """Covariance to rely on of shared unknowns; what was taken as it is has no bound."""
     known = uncertainty_of(rig)
     covariance = np.zeros((len(names), len(names)))
+    np.fill_diagonal(covariance, np.inf)
     rows = [row for row, name in enumerate(names) if name in known.names]
     index = [known.names.index(names[row]) for row in rows]
     covariance[np.ix_(rows, rows)] = known.trusted[np.ix_(index, index)]
@@ -283,7 +284,7 @@ class _Test:
     def _chi2(self, names):
         """Chi-square of the differences and its degrees of freedom.
 
-        Without what nothing bounds, or both take as known.
+        Without what nothing bounds, or one of the two took as it is.
         """
         index = np.array(self._index(names), int)
         variance = np.diag(self.covariance)[index]
@@ -291,9 +292,8 @@ class _Test:
         sigma = np.sqrt(np.diag(self.covariance)[index])
         z = np.array(list(self.steps.values()))[index] / sigma
         correlation = self.covariance[np.ix_(index, index)] / np.outer(sigma, sigma)
-        size, axes = np.linalg.eigh(correlation)
-        told = size > TOLD * size.max(initial=0.0)
-        return float(np.sum((axes.T @ z)[told] ** 2 / size[told])), int(told.sum())
+        inverse = np.linalg.pinv(correlation, rcond=TOLD, hermitian=True)
+        return float(z @ inverse @ z), int(np.linalg.matrix_rank(inverse, hermitian=True))
 
 
 def _exceeds(chi2, freedom):
@@ -384,7 +384,7 @@ def rig_at(path: str | Path) -> CalibratedRig:
         if method is None:
             raise ValueError(f"{path}: cannot be calibrated; 'calibrate' says why")
         return calibration.rig(method)
-    return load_calibration(path / "calibration.json" if path.is_dir() else path)
+    return load_calibration(path)
 
 
 def history(rigs: Sequence[CalibratedRig]) -> list[Comparison]:

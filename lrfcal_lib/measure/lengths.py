@@ -1,14 +1,17 @@
 """Lengths in a scene between picked places, with their 90 % intervals."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike
 
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.calibrate.cloud import Cloud
+from lrfcal_lib.calibrate.cloud import Cloud, join
+from lrfcal_lib.calibrate.clouds import views_of
 from lrfcal_lib.calibrate.painting import View
+from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.judge.uncertainty import SEEN, chain_of, uncertainty_of
@@ -24,6 +27,8 @@ from lrfcal_lib.measure.features import (
 )
 from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.preprocess.closing_scan import without_closing
+from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 
 REACH = 0.1  # metres from a picked place to its plane, and from a click to its edge
@@ -110,7 +115,7 @@ def features_of(
     rig : CalibratedRig
     views : sequence of View
     pitches : sequence of float
-        Of the head at each view, radians, see :func:`pitches_of`.
+        Of the head at each view, radians.
 
     Returns
     -------
@@ -121,12 +126,41 @@ def features_of(
     return SceneFeatures(cloud, rig, planes, of_point, edges)
 
 
-def pitches_of(
-    session: Session, rig: CalibratedRig, placement: int, views: Sequence[View]
-) -> list[float]:
-    """The pitch of the head at views of a placement, radians."""
+@cached
+def features_of_station(
+    session: Session, rig: CalibratedRig, number: int, cloud: Cloud | None = None
+) -> SceneFeatures:
+    """All planes and edges that a station of a session shows.
+
+    Parameters
+    ----------
+    session : Session
+    rig : CalibratedRig
+    number : int
+        Placement.
+    cloud : Cloud, optional
+        Of it, platform frame, if it is there already.
+
+    Returns
+    -------
+    SceneFeatures
+    """
+    views = views_of(session, rig, number)
     recorded = [session.image_records[view.number].pitch for view in views]
-    return [float(rig.corrections.pitch(placement, pitch)) for pitch in recorded]
+    pitches = [float(rig.corrections.pitch(number, pitch)) for pitch in recorded]
+    if cloud is None:
+        sweep, _ = without_closing(session.sweep(number))
+        cloud = join(
+            reconstruct(
+                sweep,
+                views,
+                rig.T_head_lrf,
+                rig.corrections,
+                lrf=session.lrf,
+                continuous=session.continuous,
+            )
+        )
+    return features_of(cloud, rig, views, pitches)
 
 
 def measure(scene: SceneFeatures, picks: pd.DataFrame) -> pd.DataFrame:
@@ -148,27 +182,47 @@ def measure(scene: SceneFeatures, picks: pd.DataFrame) -> pd.DataFrame:
     ValueError
         For a place without such a feature, or two that are not parallel; it names the row.
     """
+    return pd.DataFrame([_measured(scene, row) for row in picks.to_dict("records")])
+
+
+def measure_all(scene: SceneFeatures, picks: pd.DataFrame) -> pd.DataFrame:
+    """The same as :func:`measure` without the rows of which it would complain.
+
+    Parameters
+    ----------
+    scene : SceneFeatures
+    picks : DataFrame
+
+    Returns
+    -------
+    DataFrame
+    """
     rows = []
     for row in picks.to_dict("records"):
-        ends = []
-        for number in (1, 2):
-            place = np.array([row[f"{axis}_m_{number}"] for axis in PLACE], float)
-            try:
-                ends.append(scene.at(row[f"kind_{number}"], place))
-            except DegenerateGeometry as problem:
-                raise ValueError(f"'{row['name']}', place {number}: {problem}") from None
-        try:
-            length, sigma = length_between(*ends)
-        except DegenerateGeometry as problem:
-            raise ValueError(f"'{row['name']}': {problem}") from None
-        interval = {
-            "length_m": length,
-            "sigma_m": sigma,
-            "low_m": max(length - NINETY * sigma, 0.0),
-            "high_m": length + NINETY * sigma,
-        }
-        rows.append(row | interval)
+        with suppress(ValueError):
+            rows.append(_measured(scene, row))
     return pd.DataFrame(rows)
+
+
+def _measured(scene, row):
+    """A row of picks with its length."""
+    ends = []
+    for number in (1, 2):
+        place = np.array([row[f"{axis}_m_{number}"] for axis in PLACE], float)
+        try:
+            ends.append(scene.at(row[f"kind_{number}"], place))
+        except DegenerateGeometry as problem:
+            raise ValueError(f"'{row['name']}', place {number}: {problem}") from None
+    try:
+        length, sigma = length_between(*ends)
+    except DegenerateGeometry as problem:
+        raise ValueError(f"'{row['name']}': {problem}") from None
+    return row | {
+        "length_m": length,
+        "sigma_m": sigma,
+        "low_m": max(length - NINETY * sigma, 0.0),
+        "high_m": length + NINETY * sigma,
+    }
 
 
 def read_picks(path: str | PathLike) -> pd.DataFrame:

@@ -6,7 +6,7 @@ refined, and judged by what overlaps and by what stands where the other station 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import small_gicp
@@ -16,8 +16,12 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
+from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
 
-PATCH = 0.05  # metres, side of the cells whose points make one patch of a surface
+# metres, side of the cells whose points make one patch of a surface: for a start, for the fit
+COARSE = 0.1
+FINE = 0.05
 FLAT = 0.97  # length of the mean normal of a patch; less has an edge in it
 DIRECTIONS = 8  # of walls, floor and furniture that make turns
 NEAR = np.cos(np.radians(8.0))  # between normals of one direction
@@ -30,14 +34,21 @@ UPRIGHT = np.cos(
 CELL = 0.2  # metres, of the grid on which shifts are looked for
 PEAKS = 6  # shifts tried a turn
 STARTS = 10  # tried a pair
-WIDTHS = (0.3, 0.12, 0.06)  # metres within which patches are taken for the same, one by one
+WIDTHS = (0.4, 0.2)  # metres within which patches are taken for the same, one by one
 AROUND = 20  # patches that make a covariance
 SAME_PLACE = 0.15  # metres, and
 SAME_YAW = np.radians(3.0)  # within which two starts ended at the same pose
 MATCHED = 0.1  # metres between patches of the same surface
 FACING = np.cos(np.radians(30.0))  # between normals of the same surface
-LOOK = np.radians(1.5)  # side of a cell of what a station saw
+LOOK = np.radians(1.0)  # side of a cell of what a station saw
 CLEAR = 0.15  # metres before a surface; a patch there stands where the other looked through
+CLOSER = (0.1, 0.05, 0.05, 0.05)  # metres within which a fit takes patches for the same
+COMMON = 0.002  # metres, error of a patch that its neighbours have too
+TUKEY = 4.685  # sigma beyond which a patch counts for nothing (Beaton and Tukey 1974)
+NEIGHBOURS = (
+    0.5  # metres; the errors of patches nearer together are not taken as independent
+)
+ACROSS = 0.35  # cosine between a normal and a direction from which a patch holds it
 
 
 @dataclass(frozen=True)
@@ -50,26 +61,35 @@ class Surface:
         Means of the points of a patch, platform frame, metres; unit vectors.
     sigma : ndarray, shape (n,)
         Standard deviation of a mean along the normal, metres.
-    nearest, farthest : ndarray, shape (k, l)
-        Ranges by azimuth and height about the platform, metres; infinite and 0 where it saw none.
+    by_rig : ndarray, shape (n, 13)
+        Motion of a patch along its normal by what the calibration may have wrong, see `COLUMNS`.
+    by_sweep : ndarray, shape (n, 2)
+        The same by one sigma of the sweep's own offset and stretch of the pitch.
+    nearest : ndarray, shape (k, l)
+        Range by azimuth and height about the platform, metres; 0 where it saw nothing.
     """
 
     points: np.ndarray
     normals: np.ndarray
     sigma: np.ndarray
+    by_rig: np.ndarray
+    by_sweep: np.ndarray
     nearest: np.ndarray
-    farthest: np.ndarray
     gicp: small_gicp.PointCloud
     gicp_tree: small_gicp.KdTree
     tree: KDTree
 
 
-def surface_of(cloud: Cloud) -> Surface:
+def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> Surface:
     """The patches of a cloud of one station.
 
     Parameters
     ----------
     cloud : Cloud
+    size : float
+        Of a patch, metres: `COARSE` for a start, `FINE` for a fit.
+    rig : CalibratedRig, optional
+        That made the cloud; without it no error of the calibration is looked at.
 
     Returns
     -------
@@ -81,7 +101,7 @@ def surface_of(cloud: Cloud) -> Surface:
         If no part of it is smooth.
     """
     whole = cloud.rows(np.isfinite(cloud.normals).all(axis=1))
-    cells = np.floor(whole.points / PATCH).astype(int)
+    cells = np.floor(whole.points / size).astype(int)
     _, patch, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
 
     def mean(columns):
@@ -99,17 +119,31 @@ def surface_of(cloud: Cloud) -> Surface:
     gicp = small_gicp.PointCloud(points)
     gicp_tree = small_gicp.KdTree(gicp)
     small_gicp.estimate_normals_covariances(gicp, gicp_tree, AROUND)
-    nearest, farthest = _look(cloud.points)
+    moves = mean(_moves(whole, rig))[flat]
     return Surface(
         points=points,
         normals=normals[flat] / length[flat, None],
         sigma=sigma[flat],
-        nearest=nearest,
-        farthest=farthest,
+        by_rig=moves[:, :-2],
+        by_sweep=moves[:, -2:],
+        nearest=_look(cloud.points),
         gicp=gicp,
         gicp_tree=gicp_tree,
         tree=KDTree(points),
     )
+
+
+def _moves(cloud, rig):
+    """Motions (n, 13 + 2) of points along their normals: by the rig, by the sweep's pitch."""
+    if rig is None:
+        return np.zeros((len(cloud.points), len(COLUMNS) + 2))
+    # as the platform sees it, whatever stands on the head
+    chain = replace(chain_of(rig), on_head=False)
+    _, J, by_pitch = carried(chain, cloud.bearing, cloud.pitch, cloud.range)
+    by_rig = np.einsum("ni,nij->nj", cloud.normals, J)
+    turn = np.vecdot(cloud.normals, by_pitch)
+    offset, stretch = chain.sweep_sigma
+    return np.column_stack([by_rig, offset * turn, stretch * cloud.pitch * turn])
 
 
 def _cells(points):
@@ -123,14 +157,13 @@ def _cells(points):
 
 
 def _look(points):
-    """Nearest and farthest range in every cell of the view of a platform and the cells about it."""
+    """Nearest range in every cell of the view of a platform and the cells about it, or 0."""
     row, column, distance = _cells(points)
     shape = (int(2 * np.pi / LOOK) + 1, int(np.pi / LOOK) + 1)
     nearest = np.full(shape, np.inf)
-    farthest = np.zeros(shape)
     np.minimum.at(nearest, (row, column), distance)
-    np.maximum.at(farthest, (row, column), distance)
-    return minimum_filter(nearest, 3), maximum_filter(farthest, 3)
+    nearest = minimum_filter(nearest, 3)
+    return np.where(np.isfinite(nearest), nearest, 0.0)
 
 
 @dataclass(frozen=True)
@@ -283,19 +316,18 @@ def refined(first: Surface, second: Surface, start: RigidTransform) -> RigidTran
 
 def agreement(first: Surface, second: Surface, T: RigidTransform) -> Candidate:
     """How two stations agree at a pose of the second."""
-    matched = len(matches(first, second, T)[0])
+    here, there = matches(first, second, T)
+    both = len(np.unique(here)), len(there)
     conflicts = _before(first, T.apply(second.points))
     conflicts += _before(second, T.inv().apply(first.points))
     fewer = min(len(first.points), len(second.points))
-    against = conflicts / max(conflicts + 2 * matched, 1)
-    return Candidate(T, matched / fewer, against)
+    against = conflicts / max(conflicts + sum(both), 1)
+    return Candidate(T, min(both) / fewer, against)
 
 
-def matches(first: Surface, second: Surface, T: RigidTransform):
+def matches(first: Surface, second: Surface, T: RigidTransform, width: float = MATCHED):
     """Numbers of patches of the first and second station that are of one surface."""
-    distance, near = first.tree.query(
-        T.apply(second.points), distance_upper_bound=MATCHED, workers=2
-    )
+    distance, near = first.tree.query(T.apply(second.points), distance_upper_bound=width)
     there = np.flatnonzero(np.isfinite(distance))
     here = near[there]
     normals = T.rotation.apply(second.normals[there])
@@ -306,9 +338,94 @@ def matches(first: Surface, second: Surface, T: RigidTransform):
 def _before(surface, points):
     """How many points (n, 3) stand where a station looked through."""
     row, column, distance = _cells(points)
-    return int(np.sum(distance < _finite(surface.nearest[row, column]) - CLEAR))
+    return int(np.sum(distance < surface.nearest[row, column] - CLEAR))
 
 
-def _finite(nearest):
-    """Ranges, 0 where nothing came back: there nothing is known."""
-    return np.where(np.isfinite(nearest), nearest, 0.0)
+@dataclass(frozen=True)
+class Fit:
+    """The pose of a second station that fits best, and how well it is known.
+
+    Attributes
+    ----------
+    T_first_second : RigidTransform
+    covariance : ndarray, shape (6, 6)
+        Of a turn and a shift in the first station's frame, without errors of the calibration.
+    by_rig : ndarray, shape (6, 13)
+        Turn and shift by what the calibration may have wrong, see `COLUMNS`.
+    rms : float
+        Of the distances between the surfaces of both, metres.
+    loose : ndarray, shape (3,)
+        Direction in the first station's frame along which the least holds the second.
+    held : float
+        Share of the patches that hold it there.
+    """
+
+    T_first_second: RigidTransform
+    covariance: np.ndarray
+    by_rig: np.ndarray
+    rms: float
+    loose: np.ndarray
+    held: float
+
+
+def fitted(first: Surface, second: Surface, start: RigidTransform) -> Fit:
+    """The pose of a second station by all patches of both, each by its sigma.
+
+    The distance of a patch from the nearest one of the other station, along the normal. What few
+    disagree about counts little (Tukey's weights). Errors of neighbours are taken as one in the
+    covariance.
+
+    Parameters
+    ----------
+    first, second : Surface
+        In patches of `FINE`.
+    start : RigidTransform
+        Within a few centimetres of it.
+
+    Returns
+    -------
+    Fit
+    """
+    T = start
+    for width in CLOSER:
+        here, there = matches(first, second, T, width)
+        J, r = _distances(first, second, T, here, there)
+        sigma = np.sqrt(first.sigma[here] ** 2 + second.sigma[there] ** 2 + COMMON**2)
+        scale = max(1.0, 1.4826 * float(np.median(np.abs(r / sigma))))
+        share = np.clip(np.abs(r / sigma) / (TUKEY * scale), 0, 1)
+        weight = (1 - share**2) ** 2 / (scale * sigma) ** 2
+        H = np.einsum("ni,n,nj->ij", J, weight, J)
+        step = -np.linalg.pinv(H, rcond=1e-12) @ (J.T @ (weight * r))
+        T = _moved(T, step)
+    pulls = J * (weight * (r + J @ step))[:, None]
+    cells = np.floor(first.points[here] / NEIGHBOURS).astype(int)
+    _, group = np.unique(cells, axis=0, return_inverse=True)
+    sums = np.stack([np.bincount(group, column) for column in pulls.T], axis=1)
+    inverse = np.linalg.pinv(H, rcond=1e-12)
+    gain = -inverse @ (J * weight[:, None]).T
+    by_sweeps = np.hstack([gain @ first.by_sweep[here], gain @ second.by_sweep[there]])
+    shift = H[3:, 3:] - H[3:, :3] @ np.linalg.pinv(H[:3, :3], rcond=1e-12) @ H[:3, 3:]
+    loose = np.linalg.eigh(shift)[1][:, 0]
+    return Fit(
+        T_first_second=T,
+        covariance=inverse @ (sums.T @ sums) @ inverse + by_sweeps @ by_sweeps.T,
+        by_rig=gain @ (second.by_rig[there] - first.by_rig[here]),
+        rms=float(np.sqrt(np.sum(weight * r**2) / np.sum(weight))),
+        loose=loose,
+        held=float(np.mean(np.abs(J[:, 3:] @ loose) > ACROSS)),
+    )
+
+
+def _distances(first, second, T, here, there):
+    """Distances (m,) of matched patches along the normal, by turn and shift (m, 6)."""
+    turned = T.rotation.apply(second.points[there])
+    normals = first.normals[here] + T.rotation.apply(second.normals[there])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    r = np.vecdot(normals, turned + T.translation - first.points[here])
+    return np.hstack([np.cross(turned, normals), normals]), r
+
+
+def _moved(T, step):
+    """A pose after a turn and a shift."""
+    turn = Rotation.from_rotvec(step[:3]) * T.rotation
+    return RigidTransform.from_components(T.translation + step[3:], turn)

@@ -19,6 +19,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.cloud_files import write_pcd
 from lrfcal_lib.measure.e57 import E57Writer, new_guid
 from lrfcal_lib.measure.features import with_sigma
+from lrfcal_lib.measure.lengths import features_of_station, for_page
 from lrfcal_lib.plots.interactive import MOST_POINTS, rig_lines, scene_page
 from lrfcal_lib.preprocess.closing_scan import closing_of, without_closing
 from lrfcal_lib.session.faults import repeated_scans
@@ -27,6 +28,7 @@ from lrfcal_lib.session.write import whole
 
 DARKEST = 48  # grey of the weakest echo among points that no image saw
 BRIGHTEST = 208
+COMPARED = 100_000  # echoes that tell which are weak and strong
 AT_REST_S = 0.1  # no head moves on, settles and is scanned again in less
 Told = Callable[[int], object]
 
@@ -87,8 +89,8 @@ def _refuse_moved(session, number):
     closing = closing_of(sweep)
     if closing is not None and closing.moved:
         raise ValueError(
-            f"{session.path}: station {number} moved while it was recorded: back at its first "
-            f"pitch, ranges differ by {1000 * closing.apart:.0f} mm, by "
+            f"{session.path}: station {number} moved while it was recorded: back at a pitch "
+            f"that it had, ranges differ by {1000 * closing.apart:.0f} mm, by "
             f"{1000 * closing.expected:.0f} mm between neighbouring scan lines: {again}"
         )
     steps = np.abs(np.diff(sweep.time_s))[np.diff(sweep.pitch) != 0]
@@ -141,8 +143,10 @@ def colored_blocks(
         Points that no image saw are grey, by intensity where the sensor has it.
     """
     levels = None
-    if station.sweep.intensities is not None:
-        levels = np.nanpercentile(station.sweep.intensities, [2, 98])
+    intensities = station.sweep.intensities
+    if intensities is not None:
+        some = intensities.ravel()[:: 1 + intensities.size // COMPARED]
+        levels = np.nanpercentile(some, [2, 98])
     blocks = reconstruct(
         station.sweep,
         station.views,
@@ -199,7 +203,8 @@ def write_scene(
     session : Session
     rig : CalibratedRig
     poses : dict of int to RigidTransform
-        ``T_scene_platform`` of the stations by their number; the identity for a single one.
+        ``T_scene_platform`` of the stations by their number; the identity for a single one, in
+        whose page one can measure.
     about : str
         Where it is from and whether to trust it, for every file.
     told : callable
@@ -232,7 +237,20 @@ def write_scene(
             for name, camera in rig.cameras.items()
         }
         lines = rig_lines(rig.T_head_lrf, cameras)
-        scene_page(page_draft, shown.points, shown.colors, shown.seen, lines, note=about)
+        measuring = None
+        if len(poses) == 1:
+            (number,) = poses
+            measuring = for_page(features_of_station(session, rig, number, shown))
+        scene_page(
+            page_draft,
+            shown.points,
+            shown.colors,
+            shown.seen,
+            lines,
+            note=about,
+            title=f"{session.name}, station {', '.join(map(str, poses))}",
+            measuring=measuring,
+        )
     return [ply, pcd, e57, page]
 
 

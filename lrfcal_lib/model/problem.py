@@ -13,6 +13,7 @@ class Stage(Enum):
     PLATFORM = auto()  # the tilt axis by itself
     CAMERAS = auto()  # one by one
     JOINT = auto()  # everything at once
+    STATIONS = auto()  # of a scene, beside each other
 
 
 class ProblemKind(Enum):
@@ -27,7 +28,9 @@ class ProblemKind(Enum):
     SMALL_SQUARES = auto()  # of the pattern, in images of a camera
     NO_RESULT = auto()  # by a method
     TOO_LITTLE = auto()  # neither images nor edges enough for the pose of a board
-    CONTRADICTS = auto()  # placement or image: all others, in the joint estimate
+    CONTRADICTS = auto()  # placement, image or pair of stations: all others
+    NO_OVERLAP = auto()  # of two stations
+    AMBIGUOUS = auto()  # two stations fit together in more than one way
 
 
 LEAVES_OUT = {ProblemKind.NO_BOARD, ProblemKind.OTHER_PLANE}  # the whole placement

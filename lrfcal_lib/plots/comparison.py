@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 
-from lrfcal_lib.plots.recording import COLORS, series
+from lrfcal_lib.plots.colors import COLORS, series
 
 LONGEST = 0.08  # of the image's width, the arrow of the largest shift
 LEAST = 0.01  # pixels that such an arrow stands for

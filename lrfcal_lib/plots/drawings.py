@@ -11,7 +11,8 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.camera import CameraModel, pinhole
-from lrfcal_lib.plots.recording import AXES_RGB, CENTRED, COLORS, closed, to_scale
+from lrfcal_lib.plots.colors import AXES_RGB, COLORS, closed
+from lrfcal_lib.plots.recording import CENTRED, to_scale
 from lrfcal_lib.plots.rig import SQUARE, Vector, look_at
 
 # of a box: the axis along which a face lies at the low or at the high end
@@ -86,7 +87,7 @@ class View:
         self.ax.annotate(
             "", end, start, arrowprops=DIMENSION | {"shrinkA": 0, "shrinkB": 0}
         )
-        self.name(np.mean(ends, axis=0), text, away)
+        self.name(np.asarray(ends).mean(axis=0), text, away)
 
     def box(self, T: RigidTransform, low: ArrayLike, high: ArrayLike, color: str) -> None:
         """A solid box between two corners (3,) of its own frame, metres, the far faces first."""

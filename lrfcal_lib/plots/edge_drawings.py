@@ -5,9 +5,11 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 from scipy.special import ndtr
 
-from lrfcal_lib.plots.recording import COLORS
+from lrfcal_lib.plots.colors import COLORS
 
 BEAMS = 12  # drawn of a scan
+ROOM = 0.45  # for labels at the sides, of the height of a drawing
+ABOVE = 0.05  # of labels beside what they name, metres
 ABOUT = 2.0  # spot radii shown on either side of an edge
 
 
@@ -38,7 +40,7 @@ def plane_constraint(
     height = sign * distance
     first, last = flat[:, 0].min() - 0.15, flat[:, 0].max() + 0.15
     ax.plot([first, last], [height, height], color=COLORS["truth"], linewidth=2)
-    ax.text(last, height, " plane of the board", va="bottom", ha="right")
+    ax.text(last, height + ABOVE, "plane of the board", va="bottom", ha="right")
     for x, y in flat[:: max(1, len(flat) // BEAMS)]:
         ax.plot([lrf[0], x], [lrf[1], y], color=COLORS["lrf"], linewidth=0.5, alpha=0.6)
     ax.plot(*flat.T, ".", color=COLORS["lrf"], markersize=3)
@@ -46,13 +48,13 @@ def plane_constraint(
     ax.plot(
         [0, first], [height, height], color=COLORS["truth"], linewidth=0.6, linestyle=":"
     )
-    ax.text(0, height / 2, f"  n, d = {height:.2f} m", va="center")
+    ax.text(-ABOVE, height / 2, f"n, d = {height:.2f} m", va="center", ha="right")
     ax.plot(0, 0, "s", color=COLORS["left"], markersize=8)
-    ax.text(0, -0.07, "camera", va="top", ha="center", color=COLORS["left"])
+    ax.text(-ABOVE, 0, "camera", va="center", ha="right", color=COLORS["left"])
     ax.plot(*lrf, "o", color=COLORS["lrf"], markersize=8)
-    ax.text(lrf[0], lrf[1] + 0.06, "LRF", ha="center", color=COLORS["lrf"])
+    ax.text(lrf[0] + ABOVE, lrf[1], "LRF", va="center", color=COLORS["lrf"])
     ax.set(xlabel="along the board [m]", ylabel="along its normal [m]", aspect="equal")
-    ax.margins(0.12)
+    ax.set_xlim(min(0.0, first, lrf[0]) - ROOM * height, max(last, lrf[0] + ROOM * height))
 
 
 def spot_over_edge(ax: Axes, radius: float, bias: float) -> None:

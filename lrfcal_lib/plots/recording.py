@@ -11,29 +11,10 @@ from matplotlib.patches import Rectangle
 from lrfcal_lib.model.board import Board, outline_lines
 from lrfcal_lib.model.camera import CameraModel, distort
 from lrfcal_lib.model.geometry import polar_to_points
+from lrfcal_lib.plots.colors import AXES_RGB as AXES_RGB
+from lrfcal_lib.plots.colors import COLORS, closed, color_of, series
+from lrfcal_lib.plots.colors import SERIES as SERIES
 
-COLORS = {
-    "lrf": "#d55e00",
-    "left": "#0072b2",
-    "right": "#009e73",
-    "fit": "#b5378a",
-    "truth": "#222222",
-    "raw": "#a3a3a3",
-    "filtered": "#e69f00",
-    "outlier": "#cc2222",
-    "platform": "#666666",
-}
-SERIES = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#b5378a",
-    "#e69f00",
-    "#56b4e9",
-    "#7a5c3e",
-    "#222222",
-)
-AXES_RGB = ("#d62728", "#2ca02c", "#1f5fd6")  # x, y, z of every frame
 PLANES = {"xz": (0, 2), "yz": (1, 2), "xy": (0, 1)}
 BESIDE = 14  # beams shown on either side of the end of a board
 HEADROOM = 0.12  # metres shown behind the end of a board
@@ -44,29 +25,6 @@ GAIN = 5.0  # by this factor at most
 STRETCH = 61  # points of an edge as the lens bends it
 CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}  # text about its place
 DARK = {"facecolor": "#333333", "edgecolor": "none"}  # behind white text in a picture
-
-
-def series(index: int) -> str:
-    """The colour of the `index`-th thing of a series."""
-    return SERIES[index % len(SERIES)]
-
-
-def color_of(name: str, index: int = 0) -> str:
-    """The colour of a sensor or role.
-
-    Parameters
-    ----------
-    name
-        A key of `COLORS`, or any other name.
-    index
-        Of the colour in a series, for any other name.
-    """
-    return COLORS.get(name, series(index))
-
-
-def closed(corners: np.ndarray) -> np.ndarray:
-    """Corners (n, d) of a polygon with the first one at the end as well."""
-    return np.vstack([corners, corners[:1]])
 
 
 def range_image(

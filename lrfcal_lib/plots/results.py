@@ -10,13 +10,14 @@ from matplotlib.collections import PathCollection
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.plots.recording import COLORS, SERIES, color_of, series
+from lrfcal_lib.plots.colors import COLORS, SERIES, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
 SPREAD: dict[str, Any] = {
     "capsize": 2,
     "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]},
 }  # of bars
+ROOM = 1.4  # of an axis of bars, times the longest: the legend stands beside them
 WORST = 4.0  # times the median: a placement that fits so badly is an outlier
 
 
@@ -193,9 +194,11 @@ def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
     mean = values.loc[methods].mean(axis=1)
     title = "no method could be judged"
     if mean.notna().any():
-        title = f"least: {mean.idxmin()}"
+        title = f"smallest: {mean.idxmin()}"
     ax.set_title(title)
-    ax.legend(ncols=len(cameras), loc="lower right", bbox_to_anchor=(1.0, -0.02))
+    if mean.notna().any():
+        ax.set_xlim(0, ROOM * np.nanmax(values))
+    ax.legend(loc="center right")
 
 
 def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:

@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.geometry import fit_plane
-from lrfcal_lib.plots.recording import CENTRED, COLORS, closed
+from lrfcal_lib.plots.colors import COLORS, closed
+from lrfcal_lib.plots.recording import CENTRED
 
 SURFACE = {"color": COLORS["left"], "alpha": 0.15, "linewidth": 0}
 NEAREST = 1e-6  # metres: what is nearer, or behind a camera, is not seen

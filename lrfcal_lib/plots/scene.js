@@ -186,7 +186,9 @@ function panel(page, data) {
   const say = (text) => { box.querySelector("#pointer").textContent = text; };
   const placeOf = (event) => ["x", "y", "z"].map((axis) => event.points[0][axis]);
   const inWords = (place) => `x ${place[0].toFixed(3)}, y ${place[1].toFixed(3)}, z ${place[2].toFixed(3)} m`;
-  page.on("plotly_hover", (event) => say(inWords(placeOf(event))));
+  let hovered = null;
+  page.on("plotly_hover", (event) => { hovered = event; say(inWords(placeOf(event))); });
+  page.on("plotly_unhover", () => { hovered = null; });
   if (!data) return;
   const measurer = new Measurer(data);
   const planes = data.plane_of_point.map((text) => unpacked(text));
@@ -260,10 +262,18 @@ function panel(page, data) {
     Plotly.restyle(page, { x: [along(0)], y: [along(1)], z: [along(2)] }, [data.lengths_trace]);
   }
 
-  page.on("plotly_click", (event) => {
-    const { curveNumber, pointNumber } = event.points[0];
-    if (curveNumber < 2) pick(mode(), placeOf(event), curveNumber, pointNumber);
-  });
+  // not plotly_click, which comes with every picture that is drawn while a button is down
+  let down = null;
+  const scene = page.querySelector(".gl-container") || page;
+  scene.addEventListener("mousedown", (event) => { down = { x: event.clientX, y: event.clientY, hovered }; }, true);
+  window.addEventListener("mouseup", (event) => {
+    const still = down && Math.hypot(event.clientX - down.x, event.clientY - down.y) < 4;
+    const on = still && down.hovered;
+    down = null;
+    if (!on) return;
+    const { curveNumber, pointNumber } = on.points[0];
+    if (curveNumber < 2) pick(mode(), placeOf(on), curveNumber, pointNumber);
+  }, true);
   box.querySelector("#undo").addEventListener("click", () => { if (picked.length) picked = []; else list.pop(); show(); });
   box.querySelector("#save").addEventListener("click", () => {
     const link = document.createElement("a");

@@ -1,19 +1,21 @@
-"""The scan that closes a sweep, back at its first pitch: whether the rig stood still meanwhile.
+"""The scan that closes a sweep, back in its first half: whether the rig stood still meanwhile.
 
 It shows what changes the ranges at that pitch: a shift along a wall that fills the scan does not.
 """
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from lrfcal_lib.session.read import Sweep
 
+FIRST = 0.6  # share of the way, up to which a scan closes a sweep
 FEW = 0.1  # share of a sweep's scan lines, above which it was swept both ways instead
 PLAY = np.radians(1.0)  # by which a head may come back wrong: backlash
-STEPS = 21  # of the search for it
-# times the scatter between neighbouring scan lines; a rig that stands still has 0.9 to 1.2
-MOVED = 1.8
+# times the scatter between neighbouring scan lines; a rig that stands still has 0.4 to 1.0
+MOVED = 1.6
+LINES = 4  # of a sweep that its closing scan is compared with, or more
 FINEST = 0.002  # metres; below it no two readings differ for sure
 # of the beams; more than a median shows, since not all of them meet what comes nearer
 QUANTILE = 0.8
@@ -22,7 +24,7 @@ LEAST = 20  # beams that must be there to compare
 
 @dataclass(frozen=True)
 class Closing:
-    """How the last scan of a sweep agrees with its first ones.
+    """How the last scan of a sweep agrees with those of about its pitch.
 
     Attributes
     ----------
@@ -59,7 +61,7 @@ def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
     )
     turn = int(np.argmax(way * pitch)) + 1
     back = np.arange(turn, count)
-    far = np.abs(pitch[turn:] - pitch[0]) < 0.5 * np.ptp(pitch)
+    far = np.abs(pitch[turn:] - pitch[0]) < FIRST * np.ptp(pitch)
     if not far.any() or len(back) > max(1, FEW * count):
         return sweep, None
     return _lines(sweep, slice(0, turn)), _lines(sweep, back[far])
@@ -94,35 +96,16 @@ def closing_of(sweep: Sweep) -> Closing | None:
     sweep, closing = without_closing(sweep)
     if closing is None:
         return None
-    order = np.argsort(sweep.pitch, kind="stable")
-    pitch = sweep.pitch[order]
-    at = closing.pitch.mean()
-    near = np.flatnonzero(np.abs(pitch - at) < 2 * PLAY)
-    if len(near) < 3:
+    away = np.abs(sweep.pitch - closing.pitch.mean())
+    near = np.argsort(away, kind="stable")[: max(LINES, np.sum(away <= PLAY))]
+    _, stops = np.unique(sweep.pitch[near], return_index=True)
+    lines = sweep.ranges[near[stops]]
+    last = closing.ranges[-1]
+    apart = [_apart(last, line) for line in lines]
+    expected = [_apart(*pair) for pair in pairwise(lines)]
+    if not (np.isfinite(apart).any() and np.isfinite(expected).any()):
         return None
-    pitch = pitch[near]
-    ranges = sweep.ranges[order[near]]
-    last = np.nanmean(closing.ranges, axis=0)
-    between = ranges[1:-1] - (ranges[:-2] + ranges[2:]) / 2
-    apart = []
-    step = np.median(np.diff(pitch))
-    for play in np.linspace(-PLAY, PLAY, STEPS):
-        if pitch[0] - step <= at + play <= pitch[-1] + step:
-            apart.append(_apart(last, _at(at + play, pitch, ranges)))
-    if np.isfinite(between).sum() < LEAST or not np.isfinite(apart).any():
-        return None
-    return Closing(
-        apart=float(np.nanmin(apart)),
-        expected=float(np.nanquantile(np.abs(between), QUANTILE)),
-    )
-
-
-def _at(pitch, pitches, ranges):
-    """Ranges (b,) at a pitch between scan lines (l, b)."""
-    upper = int(np.clip(np.searchsorted(pitches, pitch), 1, len(pitches) - 1))
-    low, high = pitches[upper - 1], pitches[upper]
-    share = (pitch - low) / max(high - low, 1e-12)
-    return (1 - share) * ranges[upper - 1] + share * ranges[upper]
+    return Closing(float(np.nanmin(apart)), float(np.nanmedian(expected)))
 
 
 def _apart(first, second):

@@ -168,10 +168,8 @@ def survey(
         return _survey_plain(groups, look, board, models)
 
     shots = _find_corners(groups, read, board)
-    flat = spread(
-        lambda camera: models[camera] or _intrinsics(camera, shots, board, read), models
-    )
-    rough = dict(zip(models, flat, strict=True))
+    find = partial(_intrinsics, models=models, shots=shots, board=board, read=read)
+    rough = dict(zip(models, spread(find, models), strict=True))
     ordered = _ordered(shots, read, board, rough)
     refined, relief = _with_relief(ordered.shots, board, models, rough)
     shots = [shot for shot in ordered.shots if shot.record.purpose != "intrinsics"]
@@ -323,9 +321,12 @@ def _look(shot, models, *, read, board, marks, lines=None, relief=None):
 
 def _views(shots, look, **options):
     """The views of shots, those that show the corners of the pattern with pose and edges."""
-    return spread(
-        lambda shot: shot.view if shot.view.reason else look(shot, **options), shots
-    )
+    return spread(partial(_view_again, look=look, options=options), shots)
+
+
+def _view_again(shot, look, options):
+    """The view of a shot with pose and edges, unless it does not show the pattern."""
+    return shot.view if shot.view.reason else look(shot, **options)
 
 
 def _corners(view, image, finder):
@@ -378,13 +379,16 @@ def _survey_plain(groups, look, board, models):
                 "them with: state them"
             )
 
-    def begin(record):
-        shot = Shot(record, _view(record))
-        return replace(shot, view=look(shot, models))
-
-    shots = spread(lambda group: _first(group, begin), groups)
+    begin = partial(_plain_shot, look=look, models=models)
+    shots = spread(partial(_first, begin=begin), groups)
     views = _turned_alike([shot.view for shot in shots])
     return Survey(_by_camera(models, views), dict(models), None, board)
+
+
+def _plain_shot(record, look, models):
+    """A shot of a board without pattern, with its view."""
+    shot = Shot(record, _view(record))
+    return replace(shot, view=look(shot, models))
 
 
 def _find_corners(groups, read, board):
@@ -392,19 +396,20 @@ def _find_corners(groups, read, board):
     finder = PatternFinder(board.pattern)
     room = KEPT_BYTES // max(len(groups), 1)
 
-    def begin(record):
-        """A shot with its corners, and the part of the image that is looked at again."""
-        image = read(record)
-        view = _corners(_view(record), image, finder)
-        if view.reason:
-            return Shot(record, view)
-        part = part_around(image, view.pixels, board)
-        return Shot(record, view, part if part.pixels.nbytes <= room else None)
+    begin = partial(_shot_with_corners, read=read, board=board, finder=finder, room=room)
+    # the first one tells the finder what to look for
+    shots = [_first(group, begin) for group in groups[:1]]
+    return shots + spread(partial(_first, begin=begin), groups[1:])
 
-    shots = [
-        _first(group, begin) for group in groups[:1]
-    ]  # tells the finder what to look for
-    return shots + spread(lambda group: _first(group, begin), groups[1:])
+
+def _shot_with_corners(record, read, board, finder, room):
+    """A shot with its corners and, within `room` bytes, the part that is looked at again."""
+    image = read(record)
+    view = _corners(_view(record), image, finder)
+    if view.reason:
+        return Shot(record, view)
+    part = part_around(image, view.pixels, board)
+    return Shot(record, view, part if part.pixels.nbytes <= room else None)
 
 
 def _for_intrinsics(shots, camera):
@@ -427,17 +432,18 @@ def _for_intrinsics(shots, camera):
     ]
 
 
-def _intrinsics(camera, shots, board, read):
-    """Intrinsics of a camera from the corners in its images, in any order."""
+def _intrinsics(camera, models, shots, board, read):
+    """Intrinsics of a camera as stated, or from the corners in its images, in any order."""
+    if models[camera] is not None:
+        return models[camera]
     size = (0, 0)
     for shot in shots:
         if shot.record.camera == camera:
             size = read(shot.record).shape[1::-1]
             break
     try:
-        return estimate_intrinsics(
-            _for_intrinsics(shots, camera), board.pattern, size
-        ).models[0]
+        pixels = _for_intrinsics(shots, camera)
+        return estimate_intrinsics(pixels, board.pattern, size).models[0]
     except ValueError as error:
         raise DegenerateGeometry(f"camera '{camera}': {error}") from error
 
@@ -447,18 +453,7 @@ def _with_relief(shots, board, models, rough):
 
     `models` are those that are stated, `rough` also those estimated of a flat sheet.
     """
-
-    def estimate(camera):
-        """The Adjustment of a camera that sees the pattern often enough."""
-        pixels = _for_intrinsics(shots, camera)
-        model = rough[camera]
-        if len(pixels) < LEAST_VIEWS_FOR_RELIEF:
-            return None
-        if models[camera] is None:
-            size = (model.width, model.height)
-            return estimate_intrinsics(pixels, board.pattern, size, relief=True)
-        return estimate_relief(pixels, board.pattern, model)
-
+    estimate = partial(_adjustment, shots=shots, board=board, models=models, rough=rough)
     refined = dict(rough)
     reliefs = []
     for camera, adjustment in zip(rough, spread(estimate, rough), strict=True):
@@ -468,6 +463,18 @@ def _with_relief(shots, board, models, rough):
     if not reliefs:
         reliefs.append(np.zeros(len(board.pattern.points())))
     return refined, np.mean(reliefs, axis=0)
+
+
+def _adjustment(camera, shots, board, models, rough):
+    """The Adjustment of a camera that sees the pattern often enough."""
+    pixels = _for_intrinsics(shots, camera)
+    model = rough[camera]
+    if len(pixels) < LEAST_VIEWS_FOR_RELIEF:
+        return None
+    if models[camera] is None:
+        size = (model.width, model.height)
+        return estimate_intrinsics(pixels, board.pattern, size, relief=True)
+    return estimate_relief(pixels, board.pattern, model)
 
 
 @dataclass(frozen=True)
@@ -543,13 +550,15 @@ def _orders(shots, pattern, models, mirrored):
 
 def _by_outline(shots, orders, read, board, models):
     """Columns (m,) of the orders that the known outline prefers."""
+    score = partial(_order_scores, read=read, board=board, models=models)
+    scores = spread(score, zip(shots, orders.poses, strict=True))
+    return decide(np.array(scores), orders.leader)
 
-    def score(number):
-        shot = shots[number]
-        model = models[shot.record.camera]
-        return order_scores(shot.image(read), board, model, orders.poses[number])
 
-    return decide(np.array(spread(score, range(len(shots)))), orders.leader)
+def _order_scores(shot_and_poses, read, board, models):
+    """How well each order of the corners puts the known outline onto edges of the image."""
+    shot, poses = shot_and_poses
+    return order_scores(shot.image(read), board, models[shot.record.camera], poses)
 
 
 def _by_votes(shots, orders, read, board, models):

@@ -83,7 +83,7 @@ def comparison_figure(comparisons: Sequence[Comparison]) -> Figure:
         for ax, unit in zip(axes[1], ("deg", "mm", "px"), strict=False):
             _claims(ax, comparisons, unit)
         axes[1, 0].set_title("dots: differences; bars: one standard deviation, as claimed")
-        axes[1, 2].legend(title="from, to")
+        axes[1, 2].legend(title="from, to", loc="upper left", bbox_to_anchor=(1.0, 1.0))
         for ax in [*axes[0, len(last.images) : -1], *axes[1, 3:]]:
             ax.set_axis_off()
     return figure

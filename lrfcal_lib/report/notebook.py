@@ -39,6 +39,7 @@ UNITS = {
 }
 OTHER_LABELS = {  # of what is no row of METHODS
     "joint": "joint estimate",
+    "three_planes": "three-plane start, robust search",
     "line_3d": "lines in space",
     "projected_last_beam": "projected lines, last beam",
     "projected_printed": "projected lines as the paper prints them",

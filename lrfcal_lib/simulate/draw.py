@@ -26,11 +26,7 @@ REACH = 2  # beams kept on either side of an edge, along and across the scan lin
 CLEAR = 1.3  # spot radii between a crossing and a second edge
 FEWEST_BEAMS = 8
 MOST_ROUNDS = 200
-# of the simulation of Gomez-Ojeda and others: how far the LRF keeps from the planes of the world,
-# and how far it is turned about its view, across it, and upright, radians
-CLEAR_OF_PLANES = np.radians(10)
-TURNS_OF_EYES = np.radians([180.0, 5.0, 25.0])
-ROUNDS_OF_EYES = 16  # draws, of which the first good one is taken
+LEAST_DEPTH = 0.1  # of a corner before the camera, metres: nearer, its pixel means nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +47,8 @@ class Devices:
     # how far outside an edge the centre of a spot still reads the board, in spot radii
     bias: float = 0.0
     softness: float = 0.1  # standard deviation of that from beam to beam, in spot radii
+    # least softness, in beam steps; real edges have none, the model of the joint estimate has
+    floor: float = 0.0
 
     def radius(self, ranges):
         """Of the spot, metres."""
@@ -71,8 +69,6 @@ class Bench(Devices):
     sigma_stop: float = 0.0
     # standard deviation of the log odds of the edge from side to side: uneven backgrounds
     spread: float = 0.0
-    # least softness, in beam steps; real edges have none, the model of the joint estimate has
-    floor: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,21 +84,39 @@ class ShotSetup(Devices):
     # standard deviation of `bias` from edge to edge of every placement: uneven backgrounds
     spread: float = 0.0
     distances: tuple[float, float] = (1.0, 2.5)
-    T_camera_lrf: RigidTransform | None = None  # drawn near AHEAD unless given
-    field_of_view: tuple[float, float] = (np.radians(40), np.radians(140))
-    uniform: bool = False  # errors of ranges are spread evenly instead of normally
-    poses: str = "ahead"  # of the board, a row of POSES
-    lean: float = 0.6  # radians: the most ('ahead'), or always (`parallel`)
-    fewest_beams: int = FEWEST_BEAMS  # on the board
-    seen_whole: bool = (
-        True  # both crossings are clear of corners, the image shows the board
-    )
+    lean: float = 0.6  # of the boards about x and y at most, radians
+    bearings_deg: tuple[float, float] = (40.0, 140.0)
+    fewest_beams: int = FEWEST_BEAMS  # on a board
+    whole_image: bool = True  # placements with corners outside the image are drawn anew
+    uniform: bool = False  # the errors of ranges; normal otherwise
 
     def bearings(self):
-        """Of all beams, radians, shape (B,)."""
-        first, last = self.field_of_view
-        count = int((last - first) / self.step + 1.5)
-        return first + self.step * np.arange(count)
+        """Of the beams, radians, shape (B,)."""
+        first, last = np.radians(self.bearings_deg)
+        return first + self.step * np.arange(int((last - first) / self.step + 1.5))
+
+    def range_errors(self, rng, shape):
+        """Errors of ranges, metres."""
+        if self.uniform:
+            return self.sigma_range * np.sqrt(3) * rng.uniform(-1, 1, shape)
+        return self.sigma_range * rng.standard_normal(shape)
+
+    def rigs(self, rng, trials):
+        """True poses ``T_camera_lrf``, one a trial."""
+        rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3))) * AHEAD
+        centre = np.array([0.12, 0.03, 0.12]) + rng.normal(0, 0.01, (trials, 3))
+        return RigidTransform.from_components(-rotation.apply(centre), rotation)
+
+    def boards(self, rng, T_camera_lrf):
+        """Poses ``T_lrf_board`` of boards that face the LRF, one for each rig."""
+        count = len(T_camera_lrf)
+        spin = rng.uniform(0, 2 * np.pi, count)
+        lean = rng.uniform(-self.lean, self.lean, (count, 2))
+        away = rng.uniform(*self.distances, count)
+        right = rng.uniform(-0.35, 0.35, count) * away
+        up = rng.uniform(-0.12, 0.12, count)
+        middle = np.append(self.board.corners.mean(axis=0), 0.0)
+        return _posed(spin, lean, np.column_stack([right, away, up]), middle)
 
 
 def bench(
@@ -334,28 +348,36 @@ def draw_shots(
         ``T_camera_lrf`` (t, 3, 4), truth; ``ranges`` (t, p, B), metres, NaN off the board;
         ``lines`` (t, p, 2, 3) and ``edges`` (t, p, 2), undistorted image lines and numbers of the
         edges at the low and the high bearings; ``boards`` (t, p, 3, 4) and ``board_covariance`` (t,
-        p, 6, 6), ``T_camera_board`` as the pattern shows it.
+        p, 6, 6), ``T_camera_board`` as the pattern shows it; ``true_boards``, the truth of that.
 
     Raises
     ------
     ValueError
-        If hardly any board is crossed on two edges and seen by the camera.
+        If hardly any board is crossed on two edges and seen by the camera, with the shares that
+        fail each condition.
     """
-    T_camera_lrf = _mountings(setup, rng, trials)
+    T_camera_lrf = setup.rigs(rng, trials)
     parts = []
+    failing = []
     missing = np.full(trials, placements)
     for _ in range(MOST_ROUNDS):
         if not missing.any():
             break
         trial = np.repeat(np.arange(trials), 2 * missing)
-        usable, shots = _shots(setup, rng, T_camera_lrf[trial])
+        conditions, shots = _shots(setup, rng, T_camera_lrf[trial])
+        usable = np.logical_and.reduce(list(conditions.values()))
+        failing.append({words: np.mean(~good) for words, good in conditions.items()})
         parts.append({name: value[usable] for name, value in shots.items()})
         parts[-1]["trial"] = trial[usable]
         missing = np.maximum(missing - np.bincount(trial[usable], minlength=trials), 0)
     if missing.any():
+        shares = [
+            f"{100 * np.mean([part[words] for part in failing]):.0f} % {words}"
+            for words in failing[0]
+        ]
         raise ValueError(
             f"boards at {setup.distances} m are hardly ever crossed on two edges and seen by "
-            f"the camera: {setup.fewest_beams} beams on the board are asked for"
+            f"the camera: {', '.join(shares)}"
         )
 
     drawn = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -367,49 +389,46 @@ def draw_shots(
     return {"T_camera_lrf": pose_array(T_camera_lrf)} | shots
 
 
-def _mountings(setup, rng, trials):
-    """``T_camera_lrf`` of every trial: the stated one, or like the paper's and some degrees off."""
-    if setup.T_camera_lrf is not None:
-        return RigidTransform.from_matrix([setup.T_camera_lrf.as_matrix()] * trials)
-    rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3))) * AHEAD
-    centre = np.array([0.12, 0.03, 0.12]) + rng.normal(0, 0.01, (trials, 3))
-    return RigidTransform.from_components(-rotation.apply(centre), rotation)
-
-
 def _shots(setup, rng, T_camera_lrf):
-    """Which shots, one for each of some rigs, can be used, and the shots."""
+    """Of shots, one for each of some rigs, which meet the conditions (named by what fails), and the
+    shots.
+    """
     board = setup.board
-    T_lrf_board = POSES[setup.poses](setup, rng, T_camera_lrf)
-    ranges, hit, ends, usable = _ends_of_scan_lines(setup, rng, T_lrf_board)
+    T_lrf_board = setup.boards(rng, T_camera_lrf)
+    ranges, hit, ends, enough = _ends_of_scan_lines(setup, rng, T_lrf_board)
     edges = ends.argmax(axis=-1)
     second = np.sort(ends, axis=-1)[..., -2]
+    clear = (edges[:, 0] != edges[:, 1]) & (second < -CLEAR).all(axis=1)
+
     true = pose_array(T_camera_lrf * T_lrf_board)
     corners = board.corners @ true[..., :2].mT + true[:, None, :, 3]
-    usable &= (corners[..., 2] > 0).all(axis=1)
-    if setup.seen_whole:
-        usable &= (edges[:, 0] != edges[:, 1]) & (second < -CLEAR).all(axis=1)
-        uv = pinhole(corners, setup.model)
-        inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
-        usable &= inside.all(axis=(1, 2))
+    uv = pinhole(corners, setup.model)
+    inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
+    ahead = (corners[..., 2] > LEAST_DEPTH).all(axis=1)
+    if setup.whole_image:
+        ahead &= inside.all(axis=(1, 2))
+    conditions = {
+        f"have fewer than {setup.fewest_beams} beams on the board": enough,
+        "are crossed near a corner": clear,
+        "are not in the image": ahead,
+    }
 
-    boards, covariance = _seen_poses(setup, true, rng, 1.0)
-    if setup.uniform:
-        errors = np.sqrt(3) * rng.uniform(-1, 1, ranges.shape)
-    else:
-        errors = rng.standard_normal(ranges.shape)
-    noisy = ranges + setup.sigma_range * errors
+    shown = np.where(ahead[:, None, None], true, true[ahead.argmax()])
+    boards, covariance = _seen_poses(setup, shown, rng, 1.0)
+    noisy = ranges + setup.range_errors(rng, ranges.shape)
     homography = (
         setup.model.matrix @ true[..., [0, 1, 3]]
     )  # from the board's plane to pixels
     lines = board.lines()[edges] @ np.linalg.inv(homography)  # normals out of the board
     lines /= np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
     lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
-    return usable, {
+    return conditions, {
         "ranges": np.where(hit, noisy, np.nan),
         "lines": lines,
         "edges": edges,
         "boards": boards,
         "board_covariance": covariance,
+        "true_boards": true,
     }
 
 
@@ -426,7 +445,9 @@ def _ends_of_scan_lines(setup, rng, T_lrf_board):
     of_edges = 0.0
     if setup.spread:
         of_edges = setup.spread * rng.standard_normal((len(R), 1, radii.shape[-1]))
-    flips = setup.bias + setup.softness * rng.standard_normal(ranges.shape)
+    spot = setup.radius(np.abs(ranges))
+    soft = np.hypot(setup.softness, setup.floor * setup.step * ranges / spot)
+    flips = setup.bias + soft * rng.standard_normal(ranges.shape)
     hit = ((radii - of_edges).max(axis=-1) < flips) & (ranges > 0)
     last = len(bearings) - 1
     first_hit = hit.argmax(axis=1)
@@ -434,63 +455,6 @@ def _ends_of_scan_lines(setup, rng, T_lrf_board):
     ends = np.stack([first_hit, last_hit], axis=1)
     enough = (hit.sum(axis=1) >= setup.fewest_beams) & (first_hit > 0) & (last_hit < last)
     return ranges, hit, np.take_along_axis(radii, ends[..., None], axis=1), enough
-
-
-def _boards_ahead(setup, rng, T_camera_lrf):
-    """Poses ``T_lrf_board`` of boards that face the LRF, one for each of some rigs."""
-    count = len(T_camera_lrf)
-    spin = rng.uniform(0, 2 * np.pi, count)
-    lean = rng.uniform(-setup.lean, setup.lean, (count, 2))
-    away = rng.uniform(*setup.distances, count)
-    right = rng.uniform(-0.35, 0.35, count) * away
-    up = rng.uniform(-0.12, 0.12, count)
-    middle = np.append(setup.board.corners.mean(axis=0), 0.0)
-    return _posed(spin, lean, np.column_stack([right, away, up]), middle)
-
-
-def _boards_parallel(setup, rng, T_camera_lrf):
-    """Of boards parallel to the image, then turned by `lean` about an axis in them (Zhang and
-    Pless 2004), anywhere in the image.
-    """
-    model = setup.model
-    count = len(T_camera_lrf)
-    about = rng.uniform(0, 2 * np.pi, count)
-    axis = np.column_stack([np.cos(about), np.sin(about), np.zeros(count)])
-    to_camera = Rotation.from_euler("x", 180, degrees=True)
-    turn = to_camera * Rotation.from_rotvec(setup.lean * axis)
-    pixel = rng.uniform(0, [model.width, model.height], (count, 2))
-    away = rng.uniform(*setup.distances, count)
-    sight = (pixel - [model.cx, model.cy]) / [model.fx, model.fy]
-    middle = np.append(setup.board.corners.mean(axis=0), 0.0)
-    place = away[:, None] * np.column_stack([sight, np.ones(count)])
-    T_camera_board = RigidTransform.from_components(place - turn.apply(middle), turn)
-    return T_camera_lrf.inv() * T_camera_board
-
-
-def _boards_around(setup, rng, T_camera_lrf):
-    """Of a board that stands still while the LRF looks at its middle from all sides of an octant
-    (the simulation of Gomez-Ojeda and others 2015).
-    """
-    count = len(T_camera_lrf)
-    to_eye = np.abs(rng.uniform(0, 1, (ROUNDS_OF_EYES, count, 3)))
-    to_eye /= np.linalg.norm(to_eye, axis=-1, keepdims=True)
-    clear = to_eye.min(axis=-1) >= np.sin(CLEAR_OF_PLANES)
-    to_eye = to_eye[clear.argmax(axis=0), np.arange(count)]
-    away = rng.uniform(*setup.distances, count)
-    right = np.cross([0.0, 0.0, 1.0], to_eye)
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    camera = np.stack([right, np.cross(-to_eye, right), -to_eye], axis=-1)
-    angles = rng.uniform(-1, 1, (count, 3)) * TURNS_OF_EYES
-    looking = Rotation.from_matrix(camera) * Rotation.from_euler("ZXY", angles)
-    axes = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # of camera and LRF
-    T_world_lrf = RigidTransform.from_components(away[:, None] * to_eye, looking * axes)
-    standing = Rotation.from_euler("ZY", [45, 45], degrees=True)
-    middle = np.append(setup.board.corners.mean(axis=0), 0.0)
-    T_world_board = RigidTransform.from_components(-standing.apply(middle), standing)
-    return T_world_lrf.inv() * T_world_board
-
-
-POSES = {"ahead": _boards_ahead, "parallel": _boards_parallel, "around": _boards_around}
 
 
 def _posed(spin, lean, centre, middle):

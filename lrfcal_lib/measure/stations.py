@@ -1,0 +1,353 @@
+"""Several stations of a scene in one frame.
+
+The frame of a joined cloud is the platform frame of one station, as the calibration states it. No
+calibration knows the zero of the pitch: its platform frames are turned about the tilt axis, all by
+the same angle. Stations joined do not tell that angle either. With G for the turn, a pose of the
+true frames, ``T_12``, is ``G T_12 G^-1`` here: a joined cloud has the right shape whatever G is,
+and only a level or a plumb line would tell G. Compare poses with a truth after turning it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.calibrate.cloud import Cloud, join
+from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.judge.uncertainty import COLUMNS, chain_of
+from lrfcal_lib.measure.pairs import (
+    COARSE,
+    FINE,
+    Surface,
+    agreement,
+    candidates,
+    fitted,
+    surface_of,
+)
+from lrfcal_lib.measure.pose_graph import Edge, connected, solved
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
+
+# Of pairs that were drawn (tests/rooms.py, other seeds than any test): right ones have an overlap
+# of 0.4 to 0.95 and 0.001 to 0.022 against them, wrong ones seldom less than 0.06 against them
+LEAST_OVERLAP = 0.2
+MOST_AGAINST = 0.02
+RIVAL = 0.3  # share of the best overlap from which another pose may be the right one
+DOUBTFUL = 0.03  # against a rival
+LEAST_HELD = 0.03  # share of patches that hold a station in its loosest direction
+MOST_SIGMA = (np.radians(0.3), 0.015)  # of the turn and shift of a pair that is joined
+GREATEST_MISS = 5.0  # sigma of a pair in a loop
+ALLOWED_MISS = (np.radians(0.2), 0.01)  # and at least, of turn and shift
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two stations that were joined.
+
+    Attributes
+    ----------
+    first, second : int
+    T_first_second : RigidTransform
+    covariance : ndarray, shape (6, 6)
+        Of its turn and shift in the first one's frame, without errors of the calibration.
+    by_rig : ndarray, shape (6, 13)
+        What errors of the calibration do to it, see :class:`pairs.Fit`.
+    overlap : float
+        Share of the surfaces of the station that saw less which the other saw too.
+    against : float
+        Share of surfaces that stand where the other looked through.
+    rms : float
+        Of the distances between their surfaces, metres.
+    """
+
+    first: int
+    second: int
+    T_first_second: RigidTransform
+    covariance: np.ndarray
+    by_rig: np.ndarray
+    overlap: float
+    against: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Stations in one frame.
+
+    Attributes
+    ----------
+    T_world_station : dict of int to RigidTransform
+        Of all stations that could be joined. The world is the platform frame of the first of them.
+    covariance : ndarray, shape (6 n, 6 n)
+        Of turn and shift of each in the order of `T_world_station`; zeros for the first.
+    pairs : tuple of Pair
+        That were used.
+    problems : tuple of Problem
+        Stations and pairs that were not, and why.
+    """
+
+    T_world_station: dict[int, RigidTransform]
+    covariance: np.ndarray
+    pairs: tuple[Pair, ...]
+    problems: tuple[Problem, ...]
+
+    def miss(self, pair: Pair) -> tuple[float, float]:
+        """Turn (radians) and shift (metres) by which a pair differs from the poses of all.
+
+        That is the error which loops through it leave there; 0 without loops.
+        """
+        miss = _edge(pair).miss(self.T_world_station)
+        return float(np.linalg.norm(miss[:3])), float(np.linalg.norm(miss[3:]))
+
+    def covariance_of(self, station: int) -> np.ndarray:
+        """Of turn and shift of a station, (6, 6)."""
+        place = 6 * list(self.T_world_station).index(station)
+        return self.covariance[place : place + 6, place : place + 6]
+
+
+def join_stations(clouds: Mapping[int, Cloud], rig: CalibratedRig | None = None) -> Joined:
+    """Bring stations into one frame, without a guess where they stood.
+
+    Parameters
+    ----------
+    clouds : dict of int to Cloud
+        By station, each in its own platform frame, with sigma (:func:`features.with_sigma`). The
+        platforms stood upright to about 10 deg.
+    rig : CalibratedRig, optional
+        That made them; without it, covariances leave out errors of the calibration.
+
+    Returns
+    -------
+    Joined
+
+    Raises
+    ------
+    ValueError
+        For fewer than two stations, or a station without a smooth surface.
+    """
+    if len(clouds) < 2:
+        raise ValueError(f"{len(clouds)} station: two or more are needed to join them")
+    coarse = {}
+    fine = {}
+    for number, cloud in clouds.items():
+        try:
+            coarse[number] = surface_of(cloud, COARSE)
+            fine[number] = surface_of(cloud, FINE, rig)
+        except ValueError as error:
+            raise ValueError(f"station {number}: {error}") from error
+    pairs = []
+    problems = []
+    for first, second in combinations(sorted(clouds), 2):
+        result = join_pair(
+            (first, second),
+            (coarse[first], coarse[second]),
+            (fine[first], fine[second]),
+        )
+        if isinstance(result, Pair):
+            pairs.append(result)
+        else:
+            problems.append(result)
+    of_rig = chain_of(rig).covariances[-1] if rig else np.zeros((len(COLUMNS),) * 2)
+    return _joined(sorted(clouds), pairs, problems, of_rig)
+
+
+def join_pair(
+    names: tuple[int, int],
+    coarse: tuple[Surface, Surface],
+    fine: tuple[Surface, Surface],
+) -> Pair | Problem:
+    """Two stations beside each other.
+
+    Parameters
+    ----------
+    names : tuple of int
+        Their numbers.
+    coarse, fine : tuple of Surface
+        Both in patches of `COARSE` and of `FINE`.
+
+    Returns
+    -------
+    Pair or Problem
+        Why they are not joined.
+    """
+    tried = candidates(*coarse)
+    good = [c for c in tried if c.overlap > LEAST_OVERLAP and c.against < MOST_AGAINST]
+    if not good:
+        return _apart(names, tried)
+    best = good[0]
+    for other in tried:
+        as_much = other.overlap > RIVAL * best.overlap and other.against < DOUBTFUL
+        if other is not best and as_much:
+            return _ambiguous(names, best, other)
+    fit = fitted(fine[0], fine[1], best.T_first_second)
+    sigma = np.sqrt(np.linalg.eigvalsh(fit.covariance[3:, 3:])[-1])
+    turn_sigma = np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1])
+    if fit.held < LEAST_HELD or turn_sigma > MOST_SIGMA[0] or sigma > MOST_SIGMA[1]:
+        return _loose(names, fit)
+    final = agreement(fine[0], fine[1], fit.T_first_second)
+    return Pair(
+        first=names[0],
+        second=names[1],
+        T_first_second=fit.T_first_second,
+        covariance=fit.covariance,
+        by_rig=fit.by_rig,
+        overlap=final.overlap,
+        against=final.against,
+        rms=fit.rms,
+    )
+
+
+def _apart(names, tried):
+    """The Problem of two stations whose surfaces fall together nowhere."""
+    kind = ProblemKind.NO_OVERLAP
+    if not tried:
+        return _problem(names, kind, "they have no two directions of walls in common")
+    best = max(tried, key=lambda c: c.overlap)
+    words = (
+        f"they do not overlap enough: at best {100 * best.overlap:.0f} % of the surfaces fall "
+        f"together, while {100 * best.against:.0f} % of what one saw stands where the other "
+        "looked through"
+    )
+    return _problem(names, kind, words)
+
+
+def _ambiguous(names, best, other):
+    """The Problem of two stations that fit together in two ways."""
+    apart = best.T_first_second.inv() * other.T_first_second
+    words = (
+        f"they fit together in two ways, {np.linalg.norm(apart.translation):.2f} m and "
+        f"{np.degrees(apart.rotation.magnitude()):.0f} deg apart (overlap "
+        f"{100 * best.overlap:.0f} % and {100 * other.overlap:.0f} %): the scene repeats itself "
+        "or is symmetric"
+    )
+    return _problem(names, ProblemKind.AMBIGUOUS, words)
+
+
+def _loose(names, fit):
+    """The Problem of two stations of which nothing holds one in some direction."""
+    x, y, z = fit.loose
+    words = (
+        f"nothing holds the second along ({x:.2f}, {y:.2f}, {z:.2f}) of the first, where "
+        f"{100 * fit.held:.1f} % of the surfaces stand across: a corridor, or too little of both "
+        "in view"
+    )
+    return _problem(names, ProblemKind.AMBIGUOUS, words)
+
+
+def _problem(names, kind, words):
+    first, second = names
+    return Problem(Stage.STATIONS, kind, f"stations {first} and {second}: {words}")
+
+
+def _edge(pair):
+    """A Pair as the pose graph has it."""
+    return Edge(pair.first, pair.second, pair.T_first_second, pair.covariance)
+
+
+def _joined(numbers, pairs, problems, of_rig):
+    """The Joined of the largest group of stations, without pairs that loops contradict."""
+    groups = [connected(map(_edge, pairs), number) for number in numbers]
+    largest = max(groups, key=len)
+    reference = min(largest)
+    pairs = [pair for pair in pairs if pair.first in largest]
+    while True:
+        poses, response = solved([_edge(pair) for pair in pairs], reference)
+        covariance = _covariance(pairs, response, of_rig)
+        joined = Joined(poses, covariance, tuple(pairs), tuple(problems))
+        worst = max(pairs, key=lambda pair: _excess(joined, pair), default=None)
+        if worst is None or _excess(joined, worst) < 1.0:
+            break
+        pairs.remove(worst)
+        turn, shift = joined.miss(worst)
+        words = (
+            f"the loops through them miss by {np.degrees(turn):.2f} deg and {1000 * shift:.0f} mm: "
+            "they are not used together"
+        )
+        names = (worst.first, worst.second)
+        problems.append(_problem(names, ProblemKind.CONTRADICTS, words))
+        if len(connected(map(_edge, pairs), reference)) < len(poses):
+            return _joined(numbers, pairs, problems, of_rig)
+    for number in sorted(set(numbers) - set(poses)):
+        words = (
+            f"station {number} is left out: nothing joins it to station {reference}; record one "
+            "between them that sees what both see"
+        )
+        problems.append(Problem(Stage.STATIONS, ProblemKind.NO_OVERLAP, words))
+    return replace(joined, problems=tuple(problems))
+
+
+def _covariance(pairs, response, of_rig):
+    """Of the poses of stations: noise of each pair, and the calibration, common to all."""
+    if not pairs:
+        return np.zeros((6, 6))
+    noise = block_diag(*(pair.covariance for pair in pairs))
+    by_rig = response @ np.vstack([pair.by_rig for pair in pairs])
+    return response @ noise @ response.T + by_rig @ of_rig @ by_rig.T
+
+
+def _excess(joined, pair):
+    """By how much a pair misses the poses of all, as a share of what is allowed."""
+    miss = _edge(pair).miss(joined.T_world_station)
+    allowed = GREATEST_MISS * np.sqrt(np.diag(pair.covariance))
+    allowed = np.maximum(allowed, np.repeat(ALLOWED_MISS, 3))
+    return float(np.max(np.abs(miss) / allowed))
+
+
+def advice(joined: Joined) -> list[str]:
+    """What to record next, in sentences; empty where every pair is checked by others.
+
+    Parameters
+    ----------
+    joined : Joined
+    """
+    sentences = []
+    missing = [p.words for p in joined.problems if p.kind is ProblemKind.NO_OVERLAP]
+    if any(words.startswith("station ") for words in missing):
+        sentences.append(
+            "Some stations are left out: record one between them and the others, that sees what "
+            "both see, at most 1 m and 40 deg from each."
+        )
+    for pair in joined.pairs:
+        others = [_edge(other) for other in joined.pairs if other is not pair]
+        if pair.second not in connected(others, pair.first):
+            sentences.append(
+                f"Nothing checks how stations {pair.first} and {pair.second} lie: record one more "
+                "that overlaps with both."
+            )
+    return sentences
+
+
+def joined_cloud(clouds: Mapping[int, Cloud], joined: Joined) -> Cloud:
+    """One cloud of all stations that were joined, in the frame of the first.
+
+    Parameters
+    ----------
+    clouds : dict of int to Cloud
+    joined : Joined
+        Of them.
+
+    Returns
+    -------
+    Cloud
+        With the sigma of the stations' poses added to that of the points.
+    """
+    return join(
+        placed(clouds[number], T, joined.covariance_of(number))
+        for number, T in joined.T_world_station.items()
+    )
+
+
+def placed(cloud: Cloud, T: RigidTransform, covariance: np.ndarray) -> Cloud:
+    """A cloud after a pose with the (6, 6) covariance of its turn and shift."""
+    turned = T.rotation.apply(cloud.points)
+    normals = T.rotation.apply(cloud.normals)
+    J = np.hstack([np.cross(turned, normals), normals])
+    of_pose = np.einsum("ni,ij,nj->n", J, covariance, J)
+    return replace(
+        cloud,
+        points=turned + T.translation,
+        normals=normals,
+        sigma=np.sqrt(cloud.sigma**2 + np.nan_to_num(of_pose)),
+    )

@@ -1,0 +1,23 @@
+"""What the verb ``study`` does."""
+
+from tqdm import tqdm
+
+from lrfcal_lib.evaluate.study import COUNTS, study_to_file, tasks_of, variations
+from lrfcal_lib.evaluate.study_trials import STUDIED
+from lrfcal_lib.session.cluster import workers_at
+
+
+def study(args):
+    """Compare methods on scenarios and write the table."""
+    scenarios = variations(args.scenarios, args.vary)
+    methods = args.methods or STUDIED
+    tasks = tasks_of(scenarios, methods, args.poses or COUNTS, args.trials, args.seed)
+    with (
+        workers_at(args.scheduler) as executor,
+        tqdm(total=len(tasks), desc="tasks", disable=None) as bar,
+    ):
+        table = study_to_file(tasks, args.out, executor, bar.update)
+    failed = int(table.failed.sum())
+    print(
+        f"{args.out}: {len(table)} rows; {failed} of {table.trials.sum()} estimates failed"
+    )

@@ -1,0 +1,283 @@
+"""Studies: the same numbers whoever works, nothing lost or counted twice, and what cannot be asked is refused."""
+
+import os
+import time
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pytest
+from shared import ROOT
+
+from lrfcal_lib.evaluate import study
+from lrfcal_lib.evaluate.study import (
+    finished,
+    median_interval,
+    run_study,
+    study_to_file,
+    summary,
+    tasks_of,
+    variations,
+)
+from lrfcal_lib.evaluate.study_trials import run_task
+from lrfcal_lib.model.geometry import pose_array
+from lrfcal_lib.session import cluster
+from lrfcal_lib.session.cluster import checked, refuse_others, workers_at
+from lrfcal_lib.simulate.draw import draw_shots
+from lrfcal_lib.simulate.scenarios import FILE, load_scenario, varied
+
+FAST = ("line", "zhang_pless")
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """A study of four tasks."""
+    monkeypatch.setattr(study, "CHUNK", 2)
+    return tasks_of(["paper_rig"], FAST, (6, 8), 4)
+
+
+# scenarios
+
+
+@pytest.mark.parametrize("name", FILE)
+def test_a_scenario_shows_boards_that_agree_with_its_sensors(name):
+    """Without noise the readings lie on the board that the camera sees, and their ends near the edges."""
+    scenario = replace(
+        load_scenario(name),
+        sigma_range=1e-9,
+        sigma_px=1e-9,
+        bias=0.0,
+        softness=0.0,
+        floor=0.0,
+    )
+    shots = draw_shots(scenario, np.random.default_rng(5), 1, 6)
+    T = shots["T_camera_lrf"][0]
+    bearings = scenario.bearings()
+    for ranges, board in zip(shots["ranges"][0], shots["true_boards"][0], strict=True):
+        hit = np.isfinite(ranges)
+        rays = np.column_stack([np.cos(bearings), np.sin(bearings), 0 * bearings])
+        in_camera = (ranges[:, None] * rays)[hit] @ T[:, :3].T + T[:, 3]
+        on_board = (in_camera - board[:, 3]) @ board[:, :3]
+        assert np.abs(on_board[:, 2]).max() < 1e-6
+        outside = (
+            on_board[:, :2] @ scenario.board.lines()[:, :2].T + scenario.board.lines()[:, 2]
+        )
+        assert outside.max() < 1e-6
+
+
+def test_published_rigs_are_as_published():
+    corner = pose_array(load_scenario("corner_calib_2015").T_camera_lrf)
+    stated = [[-0.258819045, -0.965925826, 0], [0, 0, -1], [0.965925826, -0.258819045, 0]]
+    assert np.allclose(corner[:, :3], stated) and np.allclose(corner[:, 3], [0.15, 0, -0.1])
+    zhang = load_scenario("zhang_pless_2004").T_camera_lrf.inv()
+    assert np.allclose(zhang.translation, [0, 0.1, 1.0]), "the camera is a metre above"
+
+
+def test_what_is_varied_changes_and_is_told():
+    scenario = varied(load_scenario("outdoor_lms221"), "spot_mm", 30)
+    assert 2000 * scenario.radius(2.0) == pytest.approx(30)
+    big = varied(load_scenario("outdoor_lms221"), "board_scale", 2.0)
+    assert np.allclose(big.board.corners, 2 * load_scenario("outdoor_lms221").board.corners)
+    assert [s.name for s in variations(["paper_rig"], ["step_deg=0.5,1"])] == [
+        "paper_rig step_deg=0.5",
+        "paper_rig step_deg=1",
+    ]
+
+
+# the study
+
+
+def test_a_method_sees_the_same_draws_whatever_others_there_are_and_whoever_works(small):
+    alone = run_study("paper_rig", ("line",), (6,), 4)
+    both = run_study("paper_rig", FAST, (6,), 4)
+    pd.testing.assert_frame_equal(alone, both[both.method == "line"].reset_index(drop=True))
+    rows = [row for _, part in finished(small) for row in part]
+    shuffled = pd.DataFrame(rows).sample(frac=1, random_state=1)
+    pd.testing.assert_frame_equal(summary(pd.DataFrame(rows)), summary(shuffled))
+    assert set(both.trials) == {4}
+
+
+def test_errors_fall_with_noise_and_the_joint_estimate_keeps_to_its_bound():
+    exact = replace(
+        load_scenario("paper_rig"), sigma_range=1e-5, sigma_px=1e-3, name="nearly exact"
+    )
+    quiet = run_study(exact, ("zhang_pless",), (8,), 4)
+    noisy = run_study("paper_rig", ("zhang_pless", "joint"), (8,), 8)
+    assert quiet.rotation_deg[0] < 0.01 * noisy.rotation_deg.max()
+    joint = noisy[noisy.method == "joint"].iloc[0]
+    assert joint.failed == 0 and 0.6 < joint.rmse_over_bound < 1.6
+    assert joint.rotation_deg_known <= joint.rotation_deg_bound
+
+
+def test_failures_are_counted_and_named():
+    rows = pd.DataFrame(
+        [
+            {
+                "scenario": "x",
+                "n_poses": 3,
+                "method": "line",
+                "trial": i,
+                "outcome": outcome,
+            }
+            for i, outcome in enumerate(
+                ["refused: too few", "refused: too few", "not finite"]
+            )
+        ]
+    )
+    row = summary(rows).iloc[0]
+    assert row.failed == 3 and row.failures == "1 not finite; 2 refused: too few"
+    assert np.isnan(row.rotation_deg)
+
+
+def test_the_interval_of_a_median_holds_it():
+    values = np.random.default_rng(0).normal(size=101)
+    low, high = median_interval(values)
+    assert low < np.median(values) < high and high - low < 0.6
+    assert (low, high) == median_interval(values[::-1])
+
+
+def test_a_killed_study_goes_on(small, tmp_path, monkeypatch):
+    out = tmp_path / "study.csv"
+    whole = study_to_file(small, tmp_path / "whole.csv")
+
+    begun = []
+
+    def stop(task):
+        begun.append(task)
+        if len(begun) == 3:
+            raise KeyboardInterrupt
+        return run_task(task)
+
+    monkeypatch.setattr(study, "run_task", stop)
+    with pytest.raises(KeyboardInterrupt):
+        study_to_file(small, out)
+    part = tmp_path / "study.csv.part"
+    assert len(part.read_text().splitlines()) == 3 and not out.exists()
+    with part.open("a") as file:
+        file.write('{"task": "paper_rig/8/0", "ro')  # the end of a line is missing
+    with pytest.raises(ValueError, match="belongs to another study"):
+        study_to_file(small[:2], out)
+    done = []
+    monkeypatch.setattr(
+        study, "run_task", lambda task: done.append(task.key) or run_task(task)
+    )
+    pd.testing.assert_frame_equal(study_to_file(small, out), whole)
+    assert len(done) == 2 and not part.exists()
+    assert out.read_bytes() == (tmp_path / "whole.csv").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((["mars"], FAST, (6,), 4), "unknown scenario 'mars': use one of paper_rig, "),
+        (
+            (["paper_rig"], ("bauermann",), (6,), 4),
+            "unknown method 'bauermann': .* line_printed",
+        ),
+        ((["paper_rig"], (), (6,), 4), "no method"),
+        ((["paper_rig"], FAST, (6,), 0), "0 trials"),
+        ((["paper_rig"], FAST, (2,), 4), "3 or more"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        tasks_of(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("wind=3", "nothing called 'wind'"),
+        ("step_deg=x", "write key=number"),
+        ("step_deg=-1", "positive"),
+    ],
+)
+def test_what_cannot_be_varied_is_refused(setting, words):
+    with pytest.raises(ValueError, match=words):
+        variations(["paper_rig"], [setting])
+
+
+def test_poses_that_cannot_be_drawn_name_the_condition():
+    far = replace(load_scenario("paper_rig"), distances=(60.0, 61.0))
+    with pytest.raises(ValueError, match="100 % have fewer than 8 beams"):
+        run_study(far, ("line",), (3,), 1)
+
+
+def test_a_file_that_is_no_part_is_refused(small, tmp_path):
+    (tmp_path / "a.csv.part").write_text("nonsense\n")
+    with pytest.raises(ValueError, match="no part of a study"):
+        study_to_file(small, tmp_path / "a.csv")
+
+
+def test_what_is_stored_is_of_the_scenarios_that_there_are():
+    table = pd.read_csv(ROOT / "data" / "studies" / "methods.csv")
+    assert set(table.scenario) == set(FILE)
+    assert (table.groupby(["scenario", "method"]).n_poses.count() == 4).all()
+
+
+# a cluster
+
+
+def die_once(marker, task):
+    """As a worker whose machine goes down in its first task."""
+    if not os.path.exists(marker):
+        with open(marker, "w"):
+            pass
+        time.sleep(0.2)
+        os._exit(1)
+    return run_task(task)
+
+
+@pytest.fixture(scope="module")
+def dask():
+    """Two worker processes of this machine."""
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as local:
+        yield local
+
+
+def test_a_worker_that_dies_loses_nothing_and_nothing_counts_twice(
+    dask, small, tmp_path, monkeypatch
+):
+    alone = study_to_file(small, tmp_path / "alone.csv")
+    monkeypatch.setattr(study, "run_task", partial(die_once, str(tmp_path / "marker")))
+    with workers_at(dask.scheduler_address) as executor:
+        shared = study_to_file(small, tmp_path / "shared.csv", executor)
+    assert (tmp_path / "marker").exists(), "a worker died"
+    pd.testing.assert_frame_equal(alone, shared)
+    assert (tmp_path / "alone.csv").read_bytes() == (tmp_path / "shared.csv").read_bytes()
+
+
+def test_a_worker_with_another_version_is_refused(dask, monkeypatch):
+    monkeypatch.setattr(cluster, "source_digest", lambda: "0123")
+    with (
+        pytest.raises(ValueError, match=r"worker tcp.* another version of lrfcal_lib"),
+        workers_at(dask.scheduler_address),
+    ):
+        pass
+    with pytest.raises(ValueError, match="joined later has another version"):
+        checked("4567", abs, -1)
+
+
+def test_a_dead_scheduler_is_a_clear_error(monkeypatch):
+    monkeypatch.setattr(cluster, "PATIENCE", 0.5)
+    with (
+        pytest.raises(ValueError, match=r"no scheduler answers at tcp://127.0.0.1:9"),
+        workers_at("tcp://127.0.0.1:9"),
+    ):
+        pass
+
+
+def test_a_cluster_without_workers_is_refused():
+    class Empty:
+        scheduler = type("Scheduler", (), {"address": "tcp://x:1"})
+
+        def run(self, work):
+            return {}
+
+    with pytest.raises(ValueError, match="tcp://x:1 has no workers"):
+        refuse_others(Empty())
