@@ -87,7 +87,8 @@ def depth_jumps(
     found = [_crossings(ranges, grid, energy, lrf)]
     if len(sweep.pitch) > 1:
         found.append(_crossings(ranges.T, np.swapaxes(grid, 0, 1), energy.T, lrf))
-    return _straight(*(np.concatenate(part) for part in zip(*found, strict=True)), lrf)
+    place, outward, *surfaces = (np.concatenate(part) for part in zip(*found, strict=True))
+    return _straight(place, outward, np.stack(surfaces), lrf)
 
 
 def _energy(ranges, grid, rig):
@@ -156,10 +157,10 @@ def _rim(readings, side):
     return mean + slope * (side - BESIDE / 2), slope, rough
 
 
-def _straight(place, outward, near, slope, far, returns, lrf):
+def _straight(place, outward, surfaces, lrf):
     """The DepthJumps among places (n, 2) that lie on straight rims, moved onto them."""
     step = lrf.bearing_step
-    surfaces = np.stack([near, slope, far, returns])
+    near = surfaces[0]
     tree = cKDTree(place)
     rows = []
     links = []

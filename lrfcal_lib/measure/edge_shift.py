@@ -193,9 +193,9 @@ def edges_pull(seen: Sights, poses: np.ndarray, width: int) -> Pull:
     starts = np.zeros((len(STARTS) ** 2, len(SPREAD)))
     starts[:, :2] = np.stack(np.meshgrid(STARTS, STARTS), axis=-1).reshape(-1, 2)
     starts *= reach * a_pixel
-    starts = sorted(starts, key=lambda x: -_score(seen, trust, x, WIDTHS[0] * reach))
+    ordered = sorted(starts, key=lambda x: -_score(seen, trust, x, WIDTHS[0] * reach))
     nothing = np.zeros(len(SPREAD))
-    fits = [_narrowed(seen, trust, x, reach) for x in [nothing, *starts[:BEST_STARTS]]]
+    fits = [_narrowed(seen, trust, x, reach) for x in [nothing, *ordered[:BEST_STARTS]]]
     best = max(fits, key=lambda x: _score(seen, trust, x, WIDTHS[-1] * reach))
 
     share, miss = _shares(seen, best, WIDTHS[-1] * reach)

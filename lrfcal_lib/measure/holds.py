@@ -31,7 +31,7 @@ COMMON = np.array([*np.radians([0.12, 0.04, 0.04]), 0.002, 0.002, 0.002])
 # in honest simulated rooms
 RIM_DOUBT = 20.0
 PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
-LEVEL = 5e-3  # probability of an alarm for nothing
+LEVEL = 0.01  # probability of an alarm for nothing, of a recording; 0.05 is asked for
 UNEVEN = 0.003  # metres, of real walls
 FEWEST_POINTS = 200  # of a wall, or of two passes
 STEEP = 3.0  # metres a radian, by which ranges grow with the pitch on a smooth surface
@@ -227,8 +227,10 @@ def wall_of(session: Session, rig: CalibratedRig, placement: int) -> Wall:
     """
     sweep = session.sweep(placement)
     clean = replace(rig.corrections, sweeps={})
-    options = {"lrf": session.lrf, "continuous": session.continuous}
-    cloud = join_clouds(reconstruct(sweep, [], rig.T_head_lrf, clean, **options))
+    blocks = reconstruct(
+        sweep, [], rig.T_head_lrf, clean, lrf=session.lrf, continuous=session.continuous
+    )
+    cloud = join_clouds(blocks)
     wall = cloud.rows(largest_plane(cloud))
     if len(wall.points) < FEWEST_POINTS:
         return Wall(placement, np.nan, np.nan)

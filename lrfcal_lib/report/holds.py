@@ -34,7 +34,7 @@ def check_calibration(session: Session, calibration: str | Path) -> int:
         For a calibration or a session that cannot be used.
     """
     held = holds(session, load_calibration(calibration))
-    print("\n".join(held_in_words(held, printable(calibration))))
+    print("\n".join(held_in_words(held, printable(str(calibration)))))
     return EXIT[held.answer]
 
 
