@@ -227,7 +227,7 @@ def test_what_cannot_be_told_is_refused_with_the_cause(make, words):
 def test_no_pair_is_joined_wrongly():
     """50 rooms, three stations anywhere in each, looking anywhere: what is joined is right."""
     count = 0
-    for seed in range(5000, 5050):
+    for seed in range(6000, 6050):
         rng = np.random.default_rng(seed)
         world, half = rooms.furnished_at_random(rng)
         stations = {

@@ -34,7 +34,7 @@ from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 # of 0.4 to 0.95 and 0.001 to 0.022 against them, wrong ones seldom less than 0.06 against them
 LEAST_OVERLAP = 0.2
 MOST_AGAINST = 0.02
-RIVAL = 0.6  # share of the best overlap from which another pose is as good
+RIVAL = 0.3  # share of the best overlap from which another pose may be the right one
 DOUBTFUL = 0.03  # against a rival
 LEAST_HELD = 0.03  # share of patches that hold a station in its loosest direction
 MOST_SIGMA = (np.radians(0.3), 0.015)  # of the turn and shift of a pair that is joined

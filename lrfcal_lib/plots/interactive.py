@@ -56,18 +56,14 @@ def scene_page(
     """
     from plotly.io import write_html  # a second
 
-    traces: list[dict] = []
     every = -(-len(points) // MOST_POINTS) or 1
     shown = {
         "points": np.flatnonzero(seen)[::every],
         "points that no image saw": np.flatnonzero(~seen)[::every],
     }
-    for name, rows in shown.items():
-        rgb = colors[rows].astype(int)
-        shades = [f"#{value:06x}" for value in (rgb @ [1 << 16, 1 << 8, 1]).tolist()]
-        marker = {"size": 1.6, "color": shades}
-        traces.append(_trace(name, points[rows], "markers", marker=marker))
-        traces[-1]["hoverinfo"] = "none"
+    traces = [
+        _cloud_trace(name, points[rows], colors[rows]) for name, rows in shown.items()
+    ]
     for name, (color, line) in lines.items():
         traces.append(_trace(name, line, "lines", line={"color": color, "width": 4}))
         traces[-1]["visible"] = "legendonly" if name == "boards" else True
@@ -75,19 +71,7 @@ def scene_page(
     if measuring is not None:
         data = json.dumps(_packed(measuring, list(shown.values()), len(traces)))
         traces += _measured_traces(measuring)
-    axes = {
-        f"{axis}axis": {"title": {"text": f"{axis} [m]"}, "showspikes": False}
-        for axis in "xyz"
-    }
-    view = {"eye": dict(zip("xyz", EYE, strict=True)), "up": {"x": 0, "y": 0, "z": 1}}
-    layout = {
-        "scene": {**axes, "aspectmode": "data", "camera": view, "dragmode": "turntable"},
-        "margin": {"l": 0, "r": 0, "t": 30 if title else 0, "b": 0},
-        "title": {"text": title, "x": 0.5, "y": 0.99, "yanchor": "top"},
-        "legend": {"itemsizing": "constant", "x": 0, "y": 1},
-        "hovermode": "closest",
-        "annotations": [{"text": note, "x": 0, "y": 0, "showarrow": False, **PAGE}],
-    }
+    layout = _layout(title, note)
     # unchecked: a check looks at every colour, 5 s
     script = f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});"
     write_html(
@@ -99,6 +83,31 @@ def scene_page(
         default_height="100vh",
         post_script=script,
     )
+
+
+def _cloud_trace(name, points, colors):
+    """Points (n, 3) of a cloud in their colours (n, 3)."""
+    rgb = colors.astype(int)
+    shades = [f"#{value:06x}" for value in (rgb @ [1 << 16, 1 << 8, 1]).tolist()]
+    marker = {"size": 1.6, "color": shades}
+    return _trace(name, points, "markers", marker=marker, hoverinfo="none")
+
+
+def _layout(title, note):
+    """Axes of one scale, an orbit that keeps the vertical, a title and a note."""
+    axes = {
+        f"{axis}axis": {"title": {"text": f"{axis} [m]"}, "showspikes": False}
+        for axis in "xyz"
+    }
+    view = {"eye": dict(zip("xyz", EYE, strict=True)), "up": {"x": 0, "y": 0, "z": 1}}
+    return {
+        "scene": {**axes, "aspectmode": "data", "camera": view, "dragmode": "turntable"},
+        "margin": {"l": 0, "r": 0, "t": 30 if title else 0, "b": 0},
+        "title": {"text": title, "x": 0.5, "y": 0.99, "yanchor": "top"},
+        "legend": {"itemsizing": "constant", "x": 0, "y": 1},
+        "hovermode": "closest",
+        "annotations": [{"text": note, "x": 0, "y": 0, "showarrow": False, **PAGE}],
+    }
 
 
 def _packed(measuring, shown, first_trace):

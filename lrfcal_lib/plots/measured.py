@@ -71,8 +71,8 @@ def sigma_by_points(
     noise, together
         Parts of single points and of what all points share, metres, shape as `counts`.
     """
-    counts = np.asarray(counts)
-    ax.loglog(counts, 1000 * noise, "--", color=COLORS["platform"], label="noise of points")
+    number = np.asarray(counts)
+    ax.loglog(number, 1000 * noise, "--", color=COLORS["platform"], label="noise of points")
     ax.loglog(
         counts, 1000 * together, ":", color=COLORS["right"], label="shared by all points"
     )

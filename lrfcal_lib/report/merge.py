@@ -143,12 +143,7 @@ def stations_figure(joined: Joined, cloud: Cloud) -> Figure:
     places = {n: T.translation[:2] for n, T in joined.T_world_station.items()}
     for pair in joined.pairs:
         ends = np.array([places[pair.first], places[pair.second]])
-        _, shift = joined.miss(pair)
         plan.plot(*ends.T, "-", color="C0", lw=1.2)
-        label = f"{1000 * shift:.1f} mm"
-        white = {"facecolor": "white", "edgecolor": "none", "pad": 1}
-        middle = ends.mean(axis=0)
-        plan.annotate(label, middle, color="C0", fontsize=8, ha="center", bbox=white)
     for number, T in joined.T_world_station.items():
         ahead = T.rotation.apply([0.0, ARROW, 0.0])[:2]
         plan.annotate(
@@ -165,11 +160,9 @@ def stations_figure(joined: Joined, cloud: Cloud) -> Figure:
     plan.plot(
         *dots, "o", color="C3", ms=4, label="stations, and where they look at pitch 0"
     )
-    plan.plot(
-        [], [], "-", color="C0", label="pairs used, and how far off all pairs put them"
-    )
+    plan.plot([], [], "-", color="C0", label="pairs used")
     plan.set(aspect="equal", xlabel="x, m", ylabel="y, m", title="Stations from above")
-    plan.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=2, fontsize=8)
+    figure.legend(loc="outside upper center", ncols=3, markerscale=2, fontsize=9)
     words.axis("off")
     lines = [fill(sentence, WIDTH) for sentence in sentences(joined)]
     words.text(0, 1, "\n".join(lines), fontsize=9, va="top")
