@@ -183,10 +183,11 @@ def observe_joint(
     session = prepared.session
     board = prepared.board
     scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.left_out}
-    corners = board.known_corners()
     if board.corners is None and board.pattern is not None:
         # nobody knows the outline: no beam is named after the sides of the printed squares
         corners = board.pattern.outline()
+    else:
+        corners = board.known_corners()
     lens_covariance = np.zeros((len(views), LENS, LENS))
     for number, camera in enumerate(views):
         known = prepared.models[camera].covariance

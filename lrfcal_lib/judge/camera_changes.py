@@ -21,6 +21,7 @@ POSE = 6  # numbers of a camera's pose
 BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong
 # false alarms a recording, over all cameras and places that a step might be at
 LEVEL = 0.001
+MUCH_MORE = 5.0  # motion than growth of an image, pixels
 LEAST_SIZE = 0.5  # pixels; edges and corners of a board are off by less at one placement
 ASKED = 4.0  # standard deviations: a change of the image scale that is none of chance
 STEP = 1e-4  # of the numeric derivative by the image scale
@@ -72,7 +73,9 @@ class CameraChange:
     @property
     def zoomed(self):
         """Whether the image scale has changed; turn and shift are then off, too."""
-        return abs(self.zoom) > ASKED * self.zoom_sigma and self.corner_px > LEAST_SIZE
+        asked = abs(self.zoom) > ASKED * self.zoom_sigma and self.corner_px > LEAST_SIZE
+        # the lens of an image that was moved by far fits no longer: that looks like a little zoom
+        return asked and self.motion_px < MUCH_MORE * self.corner_px
 
     @property
     def moved(self):
@@ -195,7 +198,8 @@ def with_change(obs, step, camera, prepared, settings):
     later = f"{camera} from placement {obs.placements[step.row]}"
     with suppress(DegenerateGeometry):
         solution = solve_joint(with_two_poses(obs, step, later), required=False, **settings)
-        if {first, later} <= solution.transforms.keys():
+        both = {first, later} <= solution.transforms.keys()
+        if both and np.isfinite(solution.covariance(f"{first}_", f"{later}_")).all():
             change = change_between(solution, first, later, camera, prepared)
             if change.moved or change.zoomed:
                 return solution, change
