@@ -29,14 +29,21 @@ def room(stations, pitches=(), slip=0.0, mount="head"):
         if record.placement in stations and (any(near) or not pitches):
             chosen.append(record)
     scans = session.scans | {"pitch": session.scans["pitch"] - slip}
-    cameras = {name: replace(camera, mount=mount) for name, camera in session.cameras.items()}
+    cameras = {
+        name: replace(camera, mount=mount) for name, camera in session.cameras.items()
+    }
     return replace(session, image_records=tuple(chosen), scans=scans, cameras=cameras)
 
 
 def true_rig(session):
     """The rig as it is, with the uncertainty that a good calibration states."""
     truth = load_setup("room_lms221").rig
-    names = ["axis_out_of_scan_plane", "axis_in_scan_plane", "offset_in_scan_plane", "offset_across_scan_plane"]
+    names = [
+        "axis_out_of_scan_plane",
+        "axis_in_scan_plane",
+        "offset_in_scan_plane",
+        "offset_across_scan_plane",
+    ]
     sigma = [*AXIS_SIGMA]
     cameras = {}
     for camera in truth.cameras:
@@ -49,19 +56,28 @@ def true_rig(session):
     covariance += together @ together.T
     nothing = np.zeros((0, 13))
     uncertainty = RigUncertainty(
-        names=tuple(names), covariance=covariance, trusted=covariance, unseen_of_cloud=nothing,
-        unseen_of_cameras=dict.fromkeys(cameras, nothing), sweep_sigma=(0.0, 0.0), range_noise=0.01,
+        names=tuple(names),
+        covariance=covariance,
+        trusted=covariance,
+        unseen_of_cloud=nothing,
+        unseen_of_cameras=dict.fromkeys(cameras, nothing),
+        sweep_sigma=(0.0, 0.0),
+        range_noise=0.01,
     )
     axis = KnownAxis(truth.T_head_lrf, covariance[:4, :4])
     corrections = Corrections(range_offset=0.005, pitch_scale=0.003)
-    return CalibratedRig("joint", axis, corrections, cameras, session.lrf, uncertainty, session="truth")
+    return CalibratedRig(
+        "joint", axis, corrections, cameras, session.lrf, uncertainty, session="truth"
+    )
 
 
 def on_base(rig, pitch):
     """The same cameras, fixed to the base where they are at a pitch of the head."""
     cameras = {}
     for name, camera in rig.cameras.items():
-        cameras[name] = CalibratedCamera(rig.camera_at(name, pitch), "platform", camera.model)
+        cameras[name] = CalibratedCamera(
+            rig.camera_at(name, pitch), "platform", camera.model
+        )
     return replace(rig, cameras=cameras)
 
 

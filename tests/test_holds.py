@@ -38,7 +38,9 @@ def test_a_turned_camera_is_named(seen):
 def test_too_little_to_see_is_not_called_holding(seen):
     first = tuple(record for record in seen.image_records if record.camera == "left")[:1]
     rig = true_rig(seen)
-    blank = replace(seen, scans=seen.scans | {"ranges": np.full_like(seen.scans["ranges"], 3.0)})
+    blank = replace(
+        seen, scans=seen.scans | {"ranges": np.full_like(seen.scans["ranges"], 3.0)}
+    )
     held = holds(replace(blank, image_records=first), rig)
     assert held.answer is Answer.UNKNOWN
     assert "cannot be told here" in held_in_words(held)[0]
@@ -47,7 +49,9 @@ def test_too_little_to_see_is_not_called_holding(seen):
 @pytest.mark.parametrize("slip", [0.0, np.radians(0.1), -np.radians(0.2)])
 def test_two_passes_over_one_place_tell_the_slip_between_them(seen, slip):
     rows = seen.scans["placement"] == 1
-    again = {key: values[rows] for key, values in seen.scans.items() if len(values) == len(rows)}
+    again = {
+        key: values[rows] for key, values in seen.scans.items() if len(values) == len(rows)
+    }
     down = {key: values[::-1].copy() for key, values in again.items()}
     down["pitch"] += slip
     down["placement"] = np.full(rows.sum(), 2)
