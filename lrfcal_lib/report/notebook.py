@@ -44,13 +44,13 @@ OTHER_LABELS = {  # of what is no row of METHODS
     "projected_last_beam": "projected lines, last beam",
     "projected_printed": "projected lines as the paper prints them",
 }
+# read by Open3D when it is imported, perhaps in the same cell as this module
+os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
 _found: dict[str, list] = {"figures": [], "tables": [], "findings": [], "verdicts": []}
 
 
 def set_up() -> None:
     """Style figures and tables and keep libraries quiet; for a notebook that needs no session."""
-    # read by Open3D when it is imported
-    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
     # without it Mesa complains on stderr, in some runs only
     os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")
     plt.style.use(STYLE)
