@@ -28,7 +28,7 @@ help:
 	@echo "make lab [SESSION=path]      open JupyterLab"
 	@echo "make data                    rebuild the simulated sessions in data/ from their seeds"
 	@echo "make studies                 the studies of notebook 08 in data/studies from their seeds"
-	@echo "make picture                 the picture of the README: the scene of the shipped session beside its rig"
+	@echo "make picture                 the picture of the README: the scene of the shipped session beside its rig, and its report"
 	@echo "make clean                   remove the environment, reports and caches"
 
 setup:
@@ -103,8 +103,13 @@ studies: setup
 	$(STUDY) paper_rig zhang_pless_2004 corner_calib_2015 indoor_lms200 outdoor_lms221 hokuyo_head pan_scanner \
 		--poses 5 10 20 50 --trials 10 --out data/studies/methods.csv
 
+picture: export TESTS := 1
 picture: setup
 	$(RUN) .ci/picture
+	$(RUN) -m lrfcal_lib report data/sim_lms221
+	$$(command -v chromium || command -v chromium-browser || command -v google-chrome) --headless --no-sandbox \
+		--hide-scrollbars --window-size=1280,1500 --screenshot=reports/.report.png "file://$$PWD/reports/sim_lms221/index.html"
+	$(RUN) -c "import cv2; cv2.imwrite('reports/report.jpg', cv2.imread('reports/.report.png'), [cv2.IMWRITE_JPEG_QUALITY, 80])" && rm reports/.report.png
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache reports/*/ reports/.sessions reports/.report-*
