@@ -1,5 +1,6 @@
 """Calibrations and clouds on disk: whole or as they were, and what cannot be written is said."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -12,7 +13,7 @@ from lrfcal_lib.calibrate.cloud import write_ply
 from lrfcal_lib.evaluate.export import write_calibration
 from lrfcal_lib.measure.cloud_files import write_clouds, write_pcd
 from lrfcal_lib.model.board import triangle_board
-from lrfcal_lib.session import cache
+from lrfcal_lib.session import cache, workers
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.write import SessionWriter
 
@@ -105,7 +106,11 @@ def calibrate(tmp_path, monkeypatch, capsys):
     return calibrate
 
 
-def test_calibrate_on_a_full_disk_says_so(calibrate, quick, tmp_path, little_space):
+def test_calibrate_on_a_full_disk_says_so(
+    calibrate, quick, tmp_path, little_space, monkeypatch
+):
+    # processes that another test has left running would know nothing of the little space
+    monkeypatch.setattr(workers, "side_by_side", nullcontext)
     with little_space(LITTLE):
         code, _, complaint = calibrate(QUICK)
     assert (
