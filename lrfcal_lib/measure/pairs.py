@@ -404,7 +404,9 @@ def fitted(first: Surface, second: Surface, start: RigidTransform) -> Fit:
     inverse = np.linalg.pinv(H, rcond=1e-12)
     gain = -inverse @ (J * weight[:, None]).T
     by_sweeps = np.hstack([gain @ first.by_sweep[here], gain @ second.by_sweep[there]])
-    shift = H[3:, 3:] - H[3:, :3] @ np.linalg.pinv(H[:3, :3], rcond=1e-12) @ H[:3, 3:]
+    # what the data say about the shift once the turn is eliminated
+    turn = np.linalg.pinv(H[:3, :3], rcond=1e-12)
+    shift = H[3:, 3:] - H[3:, :3] @ turn @ H[:3, 3:]
     loose = np.linalg.eigh(shift)[1][:, 0]
     return Fit(
         T_first_second=T,

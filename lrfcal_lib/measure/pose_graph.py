@@ -85,6 +85,7 @@ def solved(edges: list[Edge], station: int) -> tuple[dict[int, RigidTransform], 
         return np.concatenate([np.zeros(0), *misses])
 
     def move(poses, step):
+        """Poses with increments ``[w, v]`` of the free stations: R <- exp(w) R, t <- t + v."""
         moved = dict(poses)
         for number, part in zip(free, step.reshape(-1, 6), strict=True):
             turn = Rotation.from_rotvec(part[:3]) * poses[number].rotation
