@@ -331,6 +331,23 @@ def fit_plane(points: np.ndarray) -> tuple[np.ndarray, float, float]:
     return normal, float(normal @ centre), float(np.sqrt(max(values[0], 0.0)))
 
 
+def plane_axes(normal: np.ndarray) -> np.ndarray:
+    """Two unit vectors in a plane, at right angles.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (3,)
+
+    Returns
+    -------
+    ndarray, shape (2, 3)
+    """
+    other = [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0]
+    across = np.cross(normal, other)
+    across /= np.linalg.norm(across)
+    return np.stack([np.cross(across, normal), across])
+
+
 def fit_line(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Total least squares line of points.
 
