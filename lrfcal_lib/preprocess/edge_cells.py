@@ -91,9 +91,8 @@ def edge_cells(
         "across": across,
         "step": np.where(across, median_step(sweep.pitch), median_step(sweep.bearings)),
     }
-    names = ",".join(columns)
     arrays = [column[keep] for column in columns.values()]
-    return np.rec.fromarrays(arrays, names=names)  # type: ignore[call-overload]
+    return np.rec.fromarrays(arrays, names=[*columns])
 
 
 def _readings(scan, cells, k, board, radius, close):

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.signal import correlate
 
 from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.model.camera import CameraModel, fold, line_through, pinhole
@@ -329,7 +328,7 @@ def _correlation_factor(column, residuals):
     series[place] = residuals
     present[place] = 1.0
     products, pairs = (
-        correlate(values, values)[len(values) - 1 :] for values in (series, present)
+        np.correlate(values, values, "full")[place.max() :] for values in (series, present)
     )
     mean_product = products / np.maximum(pairs, 1)
     rho = mean_product / max(mean_product[0], 1e-300)

@@ -36,11 +36,17 @@ def bilinear(image, uv, lens, fold, out):
         right = np.float32(u - column)
         down = np.float32(v - row)
         left = np.float32(1) - right
+        up = np.float32(1) - down
         for c in range(channels):
-            square = image[row : row + 2, column : column + 2, c]
-            top = np.float32(square[0, 0]) * left + np.float32(square[0, 1]) * right
-            bottom = np.float32(square[1, 0]) * left + np.float32(square[1, 1]) * right
-            out[i, c] = top * (np.float32(1) - down) + bottom * down
+            top = (
+                np.float32(image[row, column, c]) * left
+                + np.float32(image[row, column + 1, c]) * right
+            )
+            bottom = (
+                np.float32(image[row + 1, column, c]) * left
+                + np.float32(image[row + 1, column + 1, c]) * right
+            )
+            out[i, c] = top * up + bottom * down
 
 
 @njit(**COMPILED)
