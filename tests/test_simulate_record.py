@@ -69,7 +69,9 @@ def test_a_sweep_and_an_image_are_rebuilt(session):
     off = np.nan_to_num(np.abs(made - shipped))
     assert off.max() < 0.0011 and np.mean(off > 0) < 1e-3
     shots = [
-        s for s in record.shots_of(FULL, [placement]) if s.placement == 4 and s.camera == 0
+        s
+        for s in record.shots_of(FULL, [placement])
+        if s.placement == placement and s.camera == 0
     ]
     shipped = [r.file.read_bytes() for r in session.images("left", 4)]
     for pair in zip(record.photograph(FULL, shots[0]), shipped, strict=True):

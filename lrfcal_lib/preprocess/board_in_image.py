@@ -216,19 +216,17 @@ def _view_pattern(view, image, board, model, picks, lines, relief):
         if name in picks:
             edges.append(picked_edge(name, undistort(picks[name], model), inner))
             continue
-        start = corners[i]
-        end = corners[(i + 1) % len(corners)]
+        start, end = corners[[i, (i + 1) % len(corners)]]
         inset = CORNER_INSET * (end - start)
         middle = (start + end) / 2
         beside = middle + WINDOW * lines[i, :2]
         uv = on_board(np.stack([start + inset, end - inset, middle, beside]), pose, model)
-        scale = np.linalg.norm(uv[3] - uv[2]) / WINDOW  # pixels a metre
-        reach = np.clip(scale * WINDOW, LEAST_REACH_PX, MOST_REACH_PX)
-        prior = max(scale * PREDICTION_SIGMA, 1.0)
+        window = np.linalg.norm(uv[3] - uv[2])
+        reach = np.clip(window, LEAST_REACH_PX, MOST_REACH_PX)
+        prior = max(window / WINDOW * PREDICTION_SIGMA, 1.0)
+        outward = uv[2] - inner
         try:
-            edges.append(
-                refine_edge(image, model, name, uv[0], uv[1], uv[2] - inner, reach, prior)
-            )
+            edges.append(refine_edge(image, model, name, *uv[:2], outward, reach, prior))
         except EdgeNotSeen as error:
             rejected.append((name, str(error)))
     return replace(view, edges=tuple(edges), rejected=tuple(rejected))
@@ -244,18 +242,13 @@ def _view_plain(view, image, board, model, picks):
     views = []
     for found in outline_poses(sides, board, model):
         inner = np.mean([edge.centre for edge in found.edges], axis=0)
-        edges = []
-        agree = True
-        for edge in found.edges:
-            if edge.name in ends:
-                agree &= (
-                    np.abs(line_distance(ends[edge.name], edge.line)).max() < SAME_NAMES_PX
-                )
-                edge = picked_edge(edge.name, ends[edge.name], inner)
-            edges.append(edge)
-        if agree:
-            pose = {"T_camera_board": found.T_camera_board, "covariance": found.covariance}
-            views.append(replace(view, edges=tuple(edges), **pose))
+        edges = {edge.name: edge for edge in found.edges}
+        off = [line_distance(uv, edges[name].line) for name, uv in ends.items()]
+        if off and np.abs(off).max() >= SAME_NAMES_PX:
+            continue
+        edges |= {name: picked_edge(name, uv, inner) for name, uv in ends.items()}
+        pose = {"T_camera_board": found.T_camera_board, "covariance": found.covariance}
+        views.append(replace(view, edges=tuple(edges.values()), **pose))
     if not views:
         reason = f"no pose of board '{board.name}' explains the outline in the image"
         return replace(view, reason=reason)

@@ -122,8 +122,6 @@ def refine_edge(
         With the reason.
     """
     length = np.linalg.norm(end - start)
-    if min(*start, *end) <= BEHIND:
-        raise EdgeNotSeen("it passes behind the camera")
     if not LEAST_PROFILES <= length < LONGEST * max(image.shape):
         raise EdgeNotSeen(f"its predicted length is {length:.0f} px")
     along = (end - start) / length

@@ -51,7 +51,10 @@ def part_around(image: np.ndarray, corners: np.ndarray, board) -> Part:
     pattern = board.pattern
     beyond = FARTHEST + ALONG  # squares
     if board.corners is not None:
-        beyond = np.ptp(board.corners, axis=0).max() / pattern.square
+        grid = pattern.points()[:, :2]
+        low = np.max(grid.min(axis=0) - board.corners)
+        high = np.max(board.corners - grid.max(axis=0))
+        beyond = max(low, high) / pattern.square
     sides = np.linalg.norm(square_axes(corners, (pattern.columns, pattern.rows)), axis=1)
     room = NEARER * beyond * sides.max() + ROOM_PX
     left, top = np.maximum(corners.min(axis=0) - room, 0).astype(int)

@@ -100,12 +100,11 @@ def edge_votes(
     distances = _distances(pattern)
     slopes = np.linspace(-STEEPEST_SLOPE, STEEPEST_SLOPE, SLOPES) * APART
     size = _size(pattern)
+    square = pattern.square
     shares = []
     for normal in SIDE_NORMALS:
         along = np.abs(normal[::-1])
-        s = np.arange(
-            -pattern.square, size @ along + pattern.square, APART * STEP * pattern.square
-        )
+        s = np.arange(-square, size @ along + square, APART * STEP * square)
         corner = np.asarray(pattern.origin) + np.maximum(normal, 0) * size
         xy = corner + s[None, :, None] * along + distances[:, None, None] * normal
         strip = sample(image, model, on_board(xy, pose, model))
@@ -115,7 +114,8 @@ def edge_votes(
         votes = loops().vote(column, place, weight, height.shape, slopes).max(axis=0)
         visible = np.isfinite(strip[..., 0]).sum(axis=1)
         share = votes / np.maximum(visible, 1)
-        shares.append(np.where(visible > LEAST_SHARE * len(s), share, np.nan))
+        share[visible <= LEAST_SHARE * len(s)] = np.nan
+        shares.append(share)
     return np.stack(shares)
 
 
@@ -247,14 +247,13 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     ends = np.stack([rough, np.roll(rough, -1, axis=0)], axis=1)
     medians = [_median_line(*each) for each in zip(lines, ends, strict=True)]
     fitted = [line for line, _ in medians]
-    lengths = {}
+    lengths: dict[str, list] = {name: [] for name in board.edges}
     for i, name in enumerate(board.edges):
         trio = board.edges[i - 1], name, board.edges[(i + 1) % len(board.edges)]
-        lengths[name] = [
-            _length([of_view[each] for each in trio])
-            for of_view in lines_of_views
-            if of_view.keys() >= {*trio}
-        ]
+        for of_view in lines_of_views:
+            if of_view.keys() >= {*trio}:
+                corners = corners_of_lines([of_view[each] for each in trio])
+                lengths[name].append(np.linalg.norm(corners[2] - corners[1]))
     return Outline(
         board=replace(board, corners=corners_of_lines(fitted)),
         lines=np.array(fitted),
@@ -290,12 +289,6 @@ def _outer_peak(votes):
         best = int(i)
         start = best + 2 * LINE_WIDTH
     return best
-
-
-def _length(trio):
-    """Length of the edge between its two neighbours, lines (3, 3) in order."""
-    corners = corners_of_lines(trio)
-    return np.linalg.norm(corners[2] - corners[1])
 
 
 def _median_line(lines, ends):

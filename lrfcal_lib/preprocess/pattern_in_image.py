@@ -328,7 +328,7 @@ def square_px(corners, size):
 def scale_error(side_px):
     """Standard deviation, a share, of the scale of corners whose squares have a side in pixels."""
     error = SCALE_ERROR * (SCALE_ERROR_AT_PX / side_px) ** SCALE_ERROR_POWER
-    return float(min(error, LARGEST_SCALE_ERROR))
+    return float(min(LARGEST_SCALE_ERROR, error))
 
 
 def _ends_in_squares(picture, corners, size):

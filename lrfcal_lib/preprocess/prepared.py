@@ -226,7 +226,7 @@ def prepare_images(prepared: Prepared) -> Prepared:
         With the board in every image, the cameras' intrinsics, and the board's outline.
     """
     try:
-        surveyed = views_of(prepared.session, one_per_placement=True)
+        surveyed = views_of(prepared.session)
     except DegenerateGeometry as error:  # what remains is a session without cameras
         words = f"no image can be used: {error}"
         lost = Problem(Stage.IMAGES, ProblemKind.NO_IMAGES, words)

@@ -72,10 +72,8 @@ def line_of(points: np.ndarray, among=slice(None)):
     """
     centre = points[among].mean(axis=0)
     offset = points - centre
-    spread = offset[among].T @ offset[among]
-    direction = np.linalg.eigh(spread)[1][:, 1]
-    across = offset[:, 1] * direction[0] - offset[:, 0] * direction[1]
-    return centre, direction, offset @ direction, across
+    across, direction = np.linalg.eigh(offset[among].T @ offset[among])[1].T
+    return centre, direction, offset @ direction, offset @ across
 
 
 def _without_gaps(run, order):

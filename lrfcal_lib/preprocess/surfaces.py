@@ -39,10 +39,6 @@ NEIGHBOURS = 0.3  # metres; points that may span a plane together
 TRIALS = 200  # of random sample consensus
 SAMPLE = 1500  # points that it looks at
 REFINE_ROUNDS = 3
-# share of its convex hull that a board fills; what clutter leaves on a plane is patchy
-LEAST_FILL = 0.5
-# that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
-FEWEST_LINES = 4
 LEAST_LENGTH = 0.3  # of a scan line on a board, in units of the root of its least area
 
 
@@ -155,7 +151,10 @@ def planar_surface(
         Says what was seen instead.
     """
     ranges = sweep.ranges
-    points = _in_platform(sweep, T_head_lrf)
+    if not np.isfinite(ranges).any():
+        raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
+    p_lrf = polar_to_points(ranges, sweep.bearings)
+    points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)  # (L, B, 3), metres
     upright = None
     if np.ptp(sweep.pitch) <= SAME_PITCH:
         across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
@@ -167,22 +166,17 @@ def planar_surface(
         if nearest > best_reach:
             break
         for part in _planes(sweep, points, mask, upright, rng):
-            if ranges[part.mask].min() > best_reach:
-                continue
             reach = float(np.median(ranges[part.mask]))
             grown = 0.0 if lrf is None else float(lrf.spot_radius(reach))
             limits = _size_limits(board, grown)
-            fault = ""
             if upright is None:
                 part = _trimmed(part, points, limits)
-                fault = _fault(part, sweep, T_head_lrf, points)
             area, length = plane_size(points[part.mask], part.normal)
             fits = limits.hold(area, length)
             if upright is not None:
                 fits = LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest
-            if not fits or fault:
-                size = f"{area:.2f} m2, {length:.2f} m long"
-                rejected.append(f"{size} at {reach:.2f} m{fault}")
+            if not fits:
+                rejected.append(f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m")
             elif reach < best_reach:
                 best = part
                 best_reach = reach
@@ -190,14 +184,6 @@ def planar_surface(
         words = "; ".join(rejected[:4]) or "no flat surface"
         raise BoardNotFound(f"no flat surface of the board's size; seen: {words}")
     return _grown(best, points)
-
-
-def _in_platform(sweep, T_head_lrf):
-    """All points of a sweep (L, B, 3), metres."""
-    if not np.isfinite(sweep.ranges).any():
-        raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
-    p_lrf = polar_to_points(sweep.ranges, sweep.bearings)
-    return lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)
 
 
 def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
@@ -331,22 +317,3 @@ def _size_limits(board, grown):
         area = np.prod(sides)
         return Limits(0.3 * area, 4 * area, 2.5 * np.linalg.norm(sides))
     return ANY_BOARD
-
-
-def _fault(surface, sweep, T_head_lrf, points):
-    """Why a surface is no face of a board: few scan lines, seen along itself, patchy; or ''."""
-    mask = surface.mask
-    lines = int(mask.any(axis=1).sum())
-    if lines < min(FEWEST_LINES, len(sweep.pitch)):
-        return f" on {lines} of {len(sweep.pitch)} scan lines"
-    cells = np.argwhere(mask)
-    rays = points[mask] - tilt(T_head_lrf.translation, sweep.pitch[cells[:, 0]])
-    cosine = np.abs(rays @ surface.normal) / np.linalg.norm(rays, axis=1)
-    if np.median(cosine) * STEEPEST < 1:
-        return " seen along itself"
-    hull = cv2.convexHull(cells[:, ::-1].astype(np.int32))
-    within = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1).sum()
-    fill = len(cells) / within
-    if fill < LEAST_FILL:
-        return f" filled to {100 * fill:.0f} %"
-    return ""

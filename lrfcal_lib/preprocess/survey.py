@@ -90,14 +90,12 @@ class Shot:
         return read(self.record) if self.part is None else self.part.image()
 
 
-def views_of(session: Session, *, one_per_placement: bool = False) -> Survey:
+def views_of(session: Session) -> Survey:
     """:func:`survey` of a session's images.
 
     Parameters
     ----------
     session : Session
-    one_per_placement : bool
-        See :func:`survey`.
 
     Returns
     -------
@@ -113,28 +111,24 @@ def views_of(session: Session, *, one_per_placement: bool = False) -> Survey:
         session.board,
         {name: info.model for name, info in session.cameras.items()},
         session.picks,
-        one_per_placement=one_per_placement,
     )
 
 
-def survey(
-    records, read, board: Board, models, picks=(), *, one_per_placement=False
-) -> Survey:
-    """Find the board in all images of several cameras.
+def survey(records, read, board: Board, models, picks=()) -> Survey:
+    """Find the board in the images of several cameras, one of each camera and placement.
+
+    Of those that show the board it is the one whose pitch is nearest to the middle of the
+    placement's images. Images of no placement are all used.
 
     Parameters
     ----------
     records : sequence of ImageRecord
-        Of the cameras in `models`.
     read : callable
         ``read(record)`` gives the image, uint8.
     board : Board
     models : dict of str to (CameraModel or None)
         By camera; None asks for an estimate from these images.
     picks : sequence of EdgePick
-    one_per_placement : bool
-        Use one image of each camera and placement: of those that show the board the one whose pitch
-        is nearest to the middle of the placement's images. Images of no placement are all used.
 
     Returns
     -------
@@ -149,7 +143,7 @@ def survey(
     look = partial(_look, read=read, board=board, marks=_marks(picks, board))
     if board.pattern is None:
         records = [record for record in records if record.purpose != "intrinsics"]
-    groups = _choices(records, list(models), one_per_placement)
+    groups = _choices(records, list(models))
     if board.pattern is None:
         return _survey_plain(groups, look, board, models)
 
@@ -320,14 +314,12 @@ def _by_camera(cameras, views):
     return {camera: [view for view in views if view.camera == camera] for camera in cameras}
 
 
-def _choices(records, cameras, one_per_placement):
+def _choices(records, cameras):
     """Records in lists of those of which one is to be used, the best first."""
     groups = {}
-    for number, record in enumerate(records):
-        alone = (
-            not one_per_placement or record.placement < 0 or record.purpose == "intrinsics"
-        )
-        key = number if alone else (record.camera, record.placement)
+    for number, record in enumerate(r for r in records if r.camera in cameras):
+        shared = record.placement >= 0 and record.purpose != "intrinsics"
+        key = (record.camera, record.placement) if shared else number
         groups.setdefault(key, []).append(record)
     for group in groups.values():
         pitch = [record.pitch for record in group]
