@@ -91,7 +91,8 @@ class Bundle:
         ):
             mounted = rotate_points(mount, p_first)
             p_camera = mounted + mount[:, 3]
-            model = CameraModel(1, 1, *lens[:4], lens[4:])
+            fx, fy, cx, cy = lens[:4]
+            model = CameraModel(1, 1, fx, fy, cx, cy, lens[4:])
             by_point, by_lens = project_jacobians(p_camera, model)
             by_first = by_point @ mount[:, :3]
             by_mount = gradient_by_pose(mounted[..., None, :], by_point)

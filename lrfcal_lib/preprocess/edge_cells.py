@@ -54,8 +54,8 @@ def edge_cells(
     ways = [edges for edges in (along, swept) if edges is not None]
     sweep = scan.sweep
     ends = [np.column_stack([e.line, e.beam, e.step, e.side])[e.side >= 0] for e in ways]
-    line, beam, *step, side = np.concatenate(ends).T
-    step = np.stack(step, axis=1)
+    line, beam, up, along_line, side = np.concatenate(ends).T
+    step = np.stack([up, along_line], axis=1)
     rays = polar_to_points(1.0, sweep.bearings)
     board, cosine = plane_range(scan, rays, sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
@@ -65,11 +65,8 @@ def edge_cells(
     visible = np.isfinite(behind)
     mixed = behind - here < MIXING
     close = 2 * visible.sum() < len(visible) or 2 * mixed.sum() >= len(mixed)
-    odds = np.zeros(len(here))
-    usable = np.arange(len(here))
-    if not close:
-        odds = background_odds(here, behind)
-        usable = np.flatnonzero(visible & ~mixed)
+    odds = np.where(close, 0.0, background_odds(here, behind))
+    usable = np.flatnonzero(close | (visible & ~mixed))
 
     row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape)
     cells = line, beam
@@ -92,7 +89,8 @@ def edge_cells(
         "step": np.where(across, median_step(sweep.pitch), median_step(sweep.bearings)),
     }
     arrays = [column[keep] for column in columns.values()]
-    return np.rec.fromarrays(arrays, names=[*columns])
+    names = ",".join(columns)
+    return np.rec.fromarrays(arrays, names=names)  # type: ignore[call-overload]
 
 
 def _readings(scan, cells, k, board, radius, close):

@@ -114,7 +114,9 @@ def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     setup
     placement
     """
-    step = setup.step if placement.T_platform_board is not None else setup.room_sweep[2]
+    step = setup.step
+    if placement.T_platform_board is None:
+        _, _, step = setup.room_sweep  # type: ignore[misc]
     rng = random(setup, STOPS, placement.number)
     images = np.asarray(placement.image_pitch)
     lines = step_angles(*placement.sweep, step)

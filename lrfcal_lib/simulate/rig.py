@@ -243,7 +243,8 @@ def load_setup(name: str) -> Setup:
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
     row = _radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
-    cameras = [_camera(*item, row["image_width"]) for item in row["cameras"].items()]
+    width = row["image_width"]
+    cameras = [_camera(key, camera, width) for key, camera in row["cameras"].items()]
     rig = Rig(
         beam=replace(LMS221, **row["beam"]),
         platform=Platform(**_radians(row["platform"])),
