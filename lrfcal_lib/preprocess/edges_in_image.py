@@ -27,8 +27,8 @@ SLOPES = 41  # of lines that are voted for
 STEEPEST = 24  # samples from the middle of a line to its end
 TOLERANCE_PX = 1.5  # from the line of most votes
 FIT_ROUNDS = 12
-LEAST_SIGMA = 0.02  # samples
-SETTLED = 1e-7  # samples
+LEAST_SIGMA_PX = 0.01
+SETTLED_PX = 5e-8
 # of the correlation of averaged profiles, which share pixels, whatever a short series says
 LEAST_CORRELATION = 1.1 * AVERAGED_PROFILES
 SOKAL = 3.0  # window of an integrated autocorrelation, in units of the latter
@@ -71,10 +71,10 @@ class EdgeNotSeen(ValueError):
 
 @dataclass(frozen=True)
 class _Fit:
-    """A line ``place = offset + slope column`` in a strip, in samples.
+    """A line ``place = offset + slope column`` in a strip, pixels from the prediction.
 
-    `covariance` (2, 2) is of offset and slope, `columns` are those of the peaks that it goes
-    through, `rms` is their distance.
+    `covariance` (2, 2) is of the offset at the middle of the `columns` and of the slope; `columns`
+    are those of the peaks that it goes through, `rms` is their distance.
     """
 
     offset: float
@@ -137,31 +137,21 @@ def refine_edge(
         share = 100 * visible / len(columns)
         raise EdgeNotSeen(f"cut by the image border: {share:.0f}% of it inside the image")
     fit = _line_in_strip(strip, visible, across, half_width, prior_px)
-    middle = fit.columns.mean()
-    seen = np.array([fit.columns.min(), fit.columns.max(), middle])[:, None]
-    off = across[0] + ACROSS_STEP_PX * (fit.offset + fit.slope * seen)
+    seen = np.array([fit.columns.min(), fit.columns.max(), fit.columns.mean()])[:, None]
+    off = fit.offset + fit.slope * seen
     first, last, centre = start + seen * along + off * normal
     line = outward_line(first, last, normal)
-    covariance = _about_middle(fit, middle)
     # a slope ds moves the far end outwards; the angle turns the normal from u to v
     turn = -np.sign(along @ [-line[1], line[0]])
     return ImageEdge(
         name=name,
         line=line,
-        covariance=covariance * np.outer([1, turn], [1, turn]),
+        covariance=fit.covariance * np.outer([1, turn], [1, turn]),
         centre=centre,
         ends=np.stack([first, last]),
         n_points=len(fit.columns),
-        rms_px=fit.rms * ACROSS_STEP_PX,
+        rms_px=fit.rms,
     )
-
-
-def _about_middle(fit, middle):
-    """Covariance of offset (pixels) and slope about the middle column, systematic part included."""
-    to_middle = np.array([[1.0, middle], [0.0, 1.0]])
-    covariance = to_middle @ fit.covariance @ to_middle.T * ACROSS_STEP_PX**2
-    stretch = max(np.ptp(fit.columns), 1)
-    return covariance + np.diag([1.0, 12 / stretch**2]) * SYSTEMATIC_PX**2
 
 
 def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
@@ -280,8 +270,9 @@ def _line_in_strip(strip, visible, across, half_width, prior_px):
     likely = np.exp(-0.5 * (across**2 + tilted**2) / prior_px**2)
     allowed = (np.abs(across) <= half_width) * likely
     turned, at = np.unravel_index(np.argmax(votes * allowed), votes.shape)
-    slope = slopes[turned]
-    fit = _fit_line(column, place, at - slope * (count - 1) / 2, slope)
+    slope = ACROSS_STEP_PX * slopes[turned]
+    offset = across[at] - slope * (count - 1) / 2
+    fit = _fit_line(column, across[0] + ACROSS_STEP_PX * place, offset, slope)
     support = len(np.unique(fit.columns)) / visible
     if support < LEAST_SUPPORT:
         raise EdgeNotSeen(
@@ -300,22 +291,25 @@ def _fit_line(column, place, offset, slope):
     line = np.array([offset, slope])
     for _ in range(FIT_ROUNDS):
         residuals = place - design @ line
-        near = np.abs(residuals) < TOLERANCE_PX / ACROSS_STEP_PX
+        near = np.abs(residuals) < TOLERANCE_PX
         if near.sum() < LEAST_PROFILES:
             raise EdgeNotSeen(f"no clear edge: {near.sum()} profiles agree on a line")
-        sigma = robust_sigma(residuals[near], least=LEAST_SIGMA)
+        sigma = robust_sigma(residuals[near], least=LEAST_SIGMA_PX)
         weight = np.where(near, biweight(residuals, sigma), 0)
         normal = design.T @ (design * weight[:, None])
         before = line
         line = np.linalg.solve(normal, design.T @ (weight * place))
-        if np.allclose(line, before, rtol=0, atol=SETTLED):
+        if np.allclose(line, before, rtol=0, atol=SETTLED_PX):
             break
     kept = weight > 0
+    column = column[kept]
     residuals = (place - design @ line)[kept]
-    variance = residuals @ residuals / max(len(residuals) - 2, 1)
-    factor = max(_correlation_factor(column[kept], residuals), LEAST_CORRELATION)
-    covariance = np.linalg.inv(design[kept].T @ design[kept]) * variance * factor
-    return _Fit(*line, covariance, column[kept], float(np.sqrt(np.mean(residuals**2))))
+    variance = residuals @ residuals / (len(residuals) - 2)
+    factor = max(_correlation_factor(column, residuals), LEAST_CORRELATION)
+    about_middle = np.column_stack([np.ones(len(column)), column - column.mean()])
+    covariance = np.linalg.inv(about_middle.T @ about_middle) * variance * factor
+    covariance += np.diag([1.0, 12 / np.ptp(column) ** 2]) * SYSTEMATIC_PX**2
+    return _Fit(*line, covariance, column, float(np.sqrt(np.mean(residuals**2))))
 
 
 def _correlation_factor(column, residuals):

@@ -179,8 +179,8 @@ def crossings(
 
     def at(angle):
         if across:
-            return _down_columns(scan, ends, angle)
-        return _along_lines(scan, ends.line, angle, shift)
+            return _at(scan, ends.line, scan.sweep.bearings[ends.beam], angle, across)
+        return _at(scan, ends.line, angle, scan.sweep.pitch[ends.line], shift=shift)
 
     last = at(ends.inner)
     middle = at((ends.inner + ends.outer) / 2)
@@ -310,47 +310,34 @@ def _ends(scan, across):
     return _Ends(*(part[visible] for part in ends))
 
 
-def _along_lines(scan, line, bearing, shift=0.0):
-    """Crossings on the fitted lines at bearings, moved by `shift` (metres) along the ray."""
+def _at(scan, line, bearing, pitch, across=False, shift=0.0):
+    """Crossings of fitted lines and rays, moved by `shift` (metres) along the ray.
+
+    At another pitch than that of the line changed as the board's plane predicts.
+    """
     rays = polar_to_points(1.0, bearing)
-    turned = np.cross([0.0, 0.0, 1.0], rays)
+    flat = rays[:, :2]
     u = scan.lines[line]
-    r = 1 / np.sum(u * rays[:, :2], axis=1)
-    slope = -(r**2) * np.sum(u * turned[:, :2], axis=1)
-    return _Crossings(
-        points=(r + shift)[:, None] * rays,
-        pitch=scan.sweep.pitch[line],
-        by_angle=slope[:, None] * rays + r[:, None] * turned,
-        range_sigma=_range_sigma(scan, line, rays),
-    )
-
-
-def _down_columns(scan, ends, pitch):
-    """Crossings at pitch angles: on the fitted lines, changed as the board's plane predicts."""
-    rays = polar_to_points(1.0, scan.sweep.bearings[ends.beam])
-    there, _ = plane_range(scan, rays, pitch)
-    here, _ = plane_range(scan, rays, scan.sweep.pitch[ends.line])
-    fitted = scan.fitted[ends.line, ends.beam]
-    points = (fitted + (there - here))[:, None] * rays
-    rotation = scan.T_head_lrf.rotation.as_matrix()
-    # d p / d pitch, in the LRF frame
-    turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation
-    normal = tilt(scan.normal, -pitch) @ rotation
+    fitted = 1 / np.sum(u * flat, axis=1)
+    variance = np.einsum("ni,nij,nj->n", flat, scan.lines_covariance[line], flat)
+    if across:
+        there, _ = plane_range(scan, rays, pitch)
+        here, _ = plane_range(scan, rays, scan.sweep.pitch[line])
+        points = (fitted + (there - here))[:, None] * rays
+        rotation = scan.T_head_lrf.rotation.as_matrix()
+        turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation
+        normal = tilt(scan.normal, -pitch) @ rotation
+    else:
+        points = fitted[:, None] * rays
+        turned = np.cross([0.0, 0.0, 1.0], points)
+        normal = np.pad(u, ((0, 0), (0, 1)))
     slide = np.sum(normal * turned, axis=1) / np.sum(normal * rays, axis=1)
     return _Crossings(
-        points=points,
+        points=points + np.reshape(shift, (-1, 1)) * rays,
         pitch=pitch,
         by_angle=turned - slide[:, None] * rays,
-        range_sigma=_range_sigma(scan, ends.line, rays),
+        range_sigma=np.sqrt(variance) * fitted**2,
     )
-
-
-def _range_sigma(scan, line, rays):
-    """Standard deviation (n,) of the ranges of fitted lines along rays (n, 3), metres."""
-    ray = rays[:, :2]
-    inverse = np.sum(scan.lines[line] * ray, axis=1)
-    variance = np.einsum("ni,nij,nj->n", ray, scan.lines_covariance[line], ray)
-    return np.sqrt(variance) / inverse**2
 
 
 def _to_platform(scan, vectors, pitch):
@@ -437,8 +424,8 @@ def _spacing(scan):
     """Median distance of neighbouring beams at the ends of the board's scan lines, metres."""
     row, first, last = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
     bearing = scan.sweep.bearings[np.r_[first, last]]
-    by_bearing = _along_lines(scan, np.tile(row, 2), bearing).by_angle
-    apart = np.median(np.linalg.norm(by_bearing, axis=1))
+    ends = _at(scan, np.tile(row, 2), bearing, 0.0)
+    apart = np.median(np.linalg.norm(ends.by_angle, axis=1))
     return float(apart) * median_step(scan.sweep.bearings)
 
 

@@ -114,8 +114,10 @@ def outline_poses(edges, board: Board, model: CameraModel) -> list[OutlinePose]:
                 continue
             off = np.linalg.norm(pinhole(pose.apply(flat), model) - corners, axis=1).max()
             exact = off < EXACT_PX or chi2 < EXACT_CHI2 * len(corners)
-            turns = [pose.rotation * other.T_camera_board.rotation.inv() for other in poses]
-            known = any(turn.magnitude() < SAME_POSE for turn in turns)
+            known = any(
+                pose.rotation.approx_equal(other.T_camera_board.rotation, SAME_POSE)
+                for other in poses
+            )
             if exact and frontal(pose) > 0 and not known:
                 poses.append(OutlinePose(pose, covariance, named))
     return sorted(poses, key=lambda pose: -frontal(pose.T_camera_board))

@@ -147,7 +147,10 @@ def survey(records, read, board: Board, models, picks=()) -> Survey:
     if board.pattern is None:
         return _survey_plain(groups, look, board, models)
 
-    shots = _find_corners(groups, read, board)
+    finder = PatternFinder(board.pattern)
+    room = KEPT_BYTES // max(len(groups), 1)
+    begin = partial(_shot_with_corners, read=read, board=board, finder=finder, room=room)
+    shots = spread(partial(_first, begin=begin), groups)
     find = partial(_intrinsics, models=models, shots=shots, board=board, read=read)
     rough = dict(zip(models, spread(find, models), strict=True))
     shots, lines, unseen = _ordered(shots, read, board, rough)
@@ -358,15 +361,6 @@ def _plain_shot(record, look):
     return replace(shot, view=look(shot))
 
 
-def _find_corners(groups, read, board):
-    """Shots with the corners of the pattern, in any order."""
-    finder = PatternFinder(board.pattern)
-    room = KEPT_BYTES // max(len(groups), 1)
-
-    begin = partial(_shot_with_corners, read=read, board=board, finder=finder, room=room)
-    return spread(partial(_first, begin=begin), groups)
-
-
 def _shot_with_corners(record, read, board, finder, room):
     """A shot with its corners and, within `room` bytes, the part that is looked at again."""
     image = read(record)
@@ -383,9 +377,12 @@ def _for_intrinsics(shots, camera):
 
     Without images taken for the intrinsics all are used.
     """
-    visible = [s for s in shots if s.record.camera == camera and s.view.pixels is not None]
-    meant = [s.view.pixels for s in visible if s.record.purpose == "intrinsics"]
-    others = [s.view.pixels for s in visible if s.record.purpose != "intrinsics"]
+    meant = []
+    others = []
+    for shot in shots:
+        if shot.record.camera == camera and shot.view.pixels is not None:
+            taken = meant if shot.record.purpose == "intrinsics" else others
+            taken.append(shot.view.pixels)
     if not meant:
         return others
     chosen = [meant[i] for i in spread_views(meant, VIEWS_FOR_INTRINSICS)]
@@ -474,13 +471,11 @@ def _ordered(shots, read, board, models):
             lines = common_lines(np.stack(votes), board)
         except OutlineNotSeen as error:
             unseen = str(error)
-    in_order = iter(corners[np.arange(len(visible)), chosen])
-    ordered = []
-    for shot in shots:
-        if shot.view.pixels is not None:
-            shot = replace(shot, view=replace(shot.view, pixels=next(in_order)))
-        ordered.append(shot)
-    return ordered, lines, unseen
+    ordered = {id(shot): shot for shot in shots}
+    for shot, orders, column in zip(visible, corners, chosen, strict=True):
+        view = replace(shot.view, pixels=orders[column])
+        ordered[id(shot)] = replace(shot, view=view)
+    return list(ordered.values()), lines, unseen
 
 
 def _orders(shots, pattern, models, mirrored):
@@ -533,14 +528,10 @@ def _turned_alike(views):
         stacks.append(poses.rotation)
     placements = [view.placement for view in posed]
     together = alike(stacks, placements, [view.camera for view in posed])
-    chosen = iter(zip(turned, together.order[:, :1].ravel(), strict=True))
-    alike_views = []
-    for view in views:
-        if view.T_camera_board is not None:
-            same, order = next(chosen)
-            view = same[order]
-        alike_views.append(view)
-    return alike_views
+    chosen = {}
+    for view, same, order in zip(posed, turned, together.order, strict=True):
+        chosen[id(view)] = same[order[0]]
+    return [chosen.get(id(view), view) for view in views]
 
 
 def _normal(view):
