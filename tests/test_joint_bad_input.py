@@ -110,30 +110,6 @@ def test_contradictory_noise_is_repaired_from_the_data(kind, factor, mount):
     assert np.allclose(found.solution.sigma[:4], honest(mount), rtol=0.15)
 
 
-@pytest.mark.parametrize(
-    ("kind", "factor", "words"),
-    [("face", 0.1, "ranges scatter"), ("view", 10.0, "camera 'left' scatter"),
-     pytest.param("face", 1e3, "ranges scatter", marks=campaign),
-     pytest.param("view", 1e-3, "camera 'left' scatter", marks=campaign)],
-)  # fmt: skip
-def test_contradictory_noise_is_said_when_it_is_kept(kind, factor, words):
-    obs, *_ = draw(rng())
-    found = solve_joint(mis_stated(obs, kind, factor), required=False)
-    assert any(
-        words in warning and "noise='estimate'" in warning for warning in found.warnings
-    )
-
-
-@MOUNTS
-def test_sound_recordings_need_no_warning(mount):
-    """Cameras on the base hardly show the axis of a small board's sweep, which may be said; nothing else."""
-    for seed in range(2):
-        found = solve_joint(draw(rng(seed), 12, mount=mount, pitch_step=np.radians(0.5))[0])
-        assert all(
-            mount == "platform" and "weakly known" in words for words in found.warnings
-        )
-
-
 def mis_stated(obs, kind, factor):
     """Observations whose stated standard deviations are wrong by a factor."""
     field, power = {"face": ("face_sigma", 1), "view": ("view_covariance", 2)}[kind]

@@ -97,22 +97,21 @@ class Block:
         return self.whitened(self.jacobian if self.corrected is None else self.corrected)
 
 
-def _weigh(block, loss, scale, axes):
+def _weigh(block, robust, axes):
     """Robust weights (..., n) of a block at its own state, None without, and half the loss summed
     over the trial.
     """
     if block.cost is not None:
         return None, block.cost.sum(axis=axes)
     r = block.white
-    if loss is None:
+    if not robust:
         return None, 0.5 * (r * r).sum(axis=axes)
     d = block.size
     squares = np.sum(r.reshape(r.shape[:-1] + (-1, d)) ** 2, axis=-1)
     count = np.asarray(d if block.count is None else block.count, float)
     count = np.broadcast_to(count, squares.shape)
     z = np.sqrt(squares / count)  # sizes of groups of residuals that are judged together
-    if scale == "auto":
-        scale = _level(z, count, block, axes)
+    scale = _level(z, count, block, axes)
     square = (z / scale / CAUCHY) ** 2
     value = np.sum(count * scale**2 * CAUCHY**2 * np.log1p(square), axis=axes)
     return np.repeat(1 / (1 + square), d, axis=-1), 0.5 * value
@@ -151,13 +150,13 @@ class Linearised(NamedTuple):
     roots: list
 
 
-def linearise(blocks: Iterable[Block], loss=None, scale=1.0, axes=(-2, -1)) -> Linearised:
+def linearise(blocks: Iterable[Block], robust=False, axes=(-2, -1)) -> Linearised:
     """Normal equations of blocks with the placement as leading axis, or of trials.
 
     Parameters
     ----------
     blocks : iterable of Block
-    loss, scale
+    robust : bool
         See :func:`minimise`.
     axes : int or tuple of int
         Over which the cost is summed: placements and residuals, or -1 for residuals of trials.
@@ -165,7 +164,7 @@ def linearise(blocks: Iterable[Block], loss=None, scale=1.0, axes=(-2, -1)) -> L
     hessian = gradient = cost = np.zeros(())
     roots = []
     for block in blocks:
-        weights, value = _weigh(block, loss, scale, axes)
+        weights, value = _weigh(block, robust, axes)
         r = block.white
         J = block.white_jacobian
         root = None
@@ -285,8 +284,7 @@ def minimise(
     retract: Callable,
     *,
     shared: int | None = None,
-    loss: str | None = None,
-    scale: float | str = 1.0,
+    robust: bool = False,
     max_iterations: int = 60,
     tolerance: float = 1e-8,
 ) -> Minimum:
@@ -301,20 +299,16 @@ def minimise(
         ``(state, step) -> state``; with `shared` the step is the pair (common (c,), own (p, l)).
     shared : int, optional
         Number of unknowns common to all entries of the leading axis.
-    loss : {None, 'cauchy'}
-    scale : float or 'auto'
-        Unit of the loss in standard deviations; 'auto' takes it from the median of the residuals in
-        every iteration.
+    robust : bool
+        Cauchy's loss, in units of the median of the residuals in every iteration.
     max_iterations : int
     tolerance : float
         A trial has converged when a step is shorter than this many standard deviations of the
         estimate.
     """
-    if loss not in (None, "cauchy"):
-        raise ValueError(f"unknown loss {loss!r}: use None or 'cauchy'")
     axes = -1 if shared is None else (-2, -1)
     blocks = _blocks(evaluate, state)
-    at = linearise(blocks, loss, scale, axes)
+    at = linearise(blocks, robust, axes)
     history = [at.cost]
     converged = np.zeros(np.shape(at.cost), bool)
     damping = np.full(np.shape(at.cost), FIRST_DAMPING)
@@ -322,7 +316,7 @@ def minimise(
         step, length, promised = _step(at.hessian, at.gradient, damping, shared)
         trial = retract(state, step)
         tried = _blocks(evaluate, trial)
-        before = at.cost if loss is None else _frozen_cost(blocks, at.roots, axes)
+        before = _frozen_cost(blocks, at.roots, axes) if robust else at.cost
         after = _frozen_cost(tried, at.roots, axes)
         accepted = after <= before * (1 + 1e-12) + 1e-26
         small = (length < tolerance**2) | (length < 1e-14 * before)
@@ -334,7 +328,7 @@ def minimise(
             chosen = accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim))
             state = np.where(chosen, trial, state)
             blocks = _blocks(evaluate, state)
-        at = linearise(blocks, loss, scale, axes)
+        at = linearise(blocks, robust, axes)
         history.append(at.cost)
         gain = np.ones_like(before)
         np.divide(before - after, promised, out=gain, where=promised > 3e-15 * before)
@@ -358,7 +352,7 @@ def _next_damping(damping, gain, accepted):
 
 def minimise_in_rounds(
     freeze: Callable, state: Any, retract: Callable, rounds: int, **options
-) -> tuple[Callable, Any, list[np.ndarray]]:
+) -> tuple[Callable, Any]:
     """Minimise a few times with what depends on the state frozen anew (weights, say).
 
     Parameters
@@ -377,14 +371,10 @@ def minimise_in_rounds(
         The problem that is left to solve.
     state
         Where to begin.
-    earlier : list of ndarray
-        Cost histories so far.
     """
-    earlier = []
     for number in range(rounds):
-        state, _, _, history = minimise(freeze(state, number), state, retract, **options)
-        earlier.append(history)
-    return freeze(state, rounds), state, earlier
+        state = minimise(freeze(state, number), state, retract, **options).state
+    return freeze(state, rounds), state
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -447,19 +437,15 @@ def solve(
     retract: Callable,
     *,
     shared: int | None = None,
-    loss: str | None = None,
-    scale: float | str = 1.0,
-    earlier: Sequence[np.ndarray] = (),
+    robust: bool = False,
     **asked,
 ) -> Solution:
     """Minimise, then report covariances and what was not observed.
 
     Parameters
     ----------
-    evaluate, start, retract, shared, loss, scale
+    evaluate, start, retract, shared, robust
         See :func:`minimise`.
-    earlier : sequence of ndarray
-        Cost histories of earlier rounds.
     **asked
         Fields of :class:`Question`; `max_iterations` and `tolerance` of :func:`minimise`.
 
@@ -487,18 +473,12 @@ def solve(
             f"{question.method}: residuals at the start value are not finite: check the "
             "observations and T0"
         )
-    options: dict[str, Any] = {"shared": shared, "loss": loss, "scale": scale}
-    minimum = minimise(once, start, retract, **options, **steps)
-    costs = [costs[:-1] for costs in earlier]
-    minimum = minimum._replace(
-        iterations=minimum.iterations + sum(map(len, costs)),
-        cost_history=np.concatenate([*costs, minimum.cost_history]),
-    )
+    minimum = minimise(once, start, retract, shared=shared, robust=robust, **steps)
     blocks = once(minimum.state)
     axes = -1 if shared is None else (-2, -1)
     weights = []
     for block in blocks:
-        of_block = _weigh(block, loss, scale, axes)[0]
+        of_block = _weigh(block, robust, axes)[0]
         weights.append(np.ones_like(block.white) if of_block is None else of_block)
     return _solution(question, minimum, blocks, np.concatenate(weights, axis=-1), shared)
 

@@ -29,12 +29,7 @@ def hat(v: ArrayLike) -> np.ndarray:
     -------
     ndarray, shape (..., 3, 3)
     """
-    v = np.asarray(v, dtype=float)
-    upper = np.zeros(v.shape + (3,))
-    upper[..., 0, 1] = -v[..., 2]
-    upper[..., 0, 2] = v[..., 1]
-    upper[..., 1, 2] = -v[..., 0]
-    return upper - np.swapaxes(upper, -1, -2)
+    return cross(np.eye(3), np.asarray(v, float)[..., None, :])
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -421,22 +416,8 @@ def log_rotation(R: np.ndarray) -> np.ndarray:
     ndarray, shape (..., 3)
         Radians.
     """
-    if R.ndim == 2:
-        return Rotation.from_matrix(R, assume_valid=True).as_rotvec()
-    x = R[..., 2, 1] - R[..., 1, 2]
-    y = R[..., 0, 2] - R[..., 2, 0]
-    z = R[..., 1, 0] - R[..., 0, 1]
-    twice_sine = np.sqrt(x * x + y * y + z * z)
-    twice_cosine = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1
-    angle_by_sine = np.arctan2(twice_sine, twice_cosine) / np.maximum(twice_sine, 1e-12)
-    turn = np.where(twice_sine > 1e-12, angle_by_sine, 0.5)
-    w = np.stack([x, y, z], axis=-1) * turn[..., None]
-    near_half_turn = twice_cosine < -1.8  # the sine says little there
-    if near_half_turn.any():
-        w[near_half_turn] = Rotation.from_matrix(
-            R[near_half_turn], assume_valid=True
-        ).as_rotvec()
-    return w
+    flat = Rotation.from_matrix(R.reshape(-1, 3, 3), assume_valid=True)
+    return flat.as_rotvec().reshape(R.shape[:-1])
 
 
 def pose_parameters(pose: np.ndarray) -> np.ndarray:

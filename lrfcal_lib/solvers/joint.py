@@ -40,7 +40,7 @@ from lrfcal_lib.solvers.joint_model import (
 from lrfcal_lib.solvers.joint_noise import estimate_noise, settled
 from lrfcal_lib.solvers.joint_residuals import MOST_STEPS, minimum, named_blocks
 from lrfcal_lib.solvers.joint_search import best_start, coarse
-from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words, warnings_of
+from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words
 
 # what counts as a change by one, beside rad and m
 SCALES = {
@@ -260,11 +260,11 @@ def finished(obs, state, data, unknowns, required):
         by_placements = by_placements + lens.covariance
     found = replace(
         found,
-        covariance=found.covariance + lens.covariance - lens.counted,
+        covariance=found.covariance + lens.covariance,
         covariance_placements=by_placements,
     )
     squares = misfits(named_blocks(found.state, data, unknowns), data)
-    solution = JointSolution(
+    return JointSolution(
         found,
         obs,
         data,
@@ -274,7 +274,6 @@ def finished(obs, state, data, unknowns, required):
         lens=lens.covariance,
         lens_scale=lens.scatter,
     )
-    return replace(solution, warnings=warnings_of(solution))
 
 
 def parameters_of(state: JointState, unknowns: Unknowns) -> np.ndarray:

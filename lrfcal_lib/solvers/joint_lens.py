@@ -7,7 +7,6 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import OWN_RANK
-from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import CameraModel, project_jacobians
 from lrfcal_lib.model.observations import LENS, JointObservations
@@ -52,16 +51,12 @@ class LensShare(NamedTuple):
     ----------
     covariance : ndarray, shape (c, c)
         Of the shared unknowns, from those of the intrinsics.
-    counted : ndarray, shape (c, c)
-        What the scatter of views that these errors cause has added to the covariance through the
-        scale of views, as far as that exceeds the stated noise: the intrinsics would count twice.
     scatter : float
         Of views in stated standard deviations: what no unknown can take up of the error that all
         views of a camera share.
     """
 
     covariance: np.ndarray
-    counted: np.ndarray
     scatter: float
 
 
@@ -71,15 +66,11 @@ def lens_share(
     """The LensShare of a solution."""
     c = unknowns.shared
     if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
-        return LensShare(np.zeros((c, c)), np.zeros((c, c)), 0.0)
+        return LensShare(np.zeros((c, c)), 0.0)
     block = view_block(found.state, data, unknowns)
     J = block.white_jacobian
     J_own = J[..., c:]
-    camera = data.view["camera"]
-    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(camera))[
-        "lens"
-    ]
-    by_lens = among_cameras(lens, camera, len(obs.cameras))
+    by_lens = among_cameras(data.view["lens"], data.view["camera"], len(obs.cameras))
     shift = block.whitened(by_lens.reshape(*J.shape[:2], -1))
     spread = block_diag(*obs.lens_covariance)
     hessian = np.swapaxes(found.jacobian, -1, -2) @ found.jacobian
@@ -91,9 +82,6 @@ def lens_share(
     square = np.sum(left @ spread * left)
     level = data.levels.view_scale**2
     taken = np.sum((J_own @ own) * J_own) + np.sum((reduced @ finite) * reduced)
-    square *= level / max(
-        6 * len(obs.view_camera) - taken, 1.0
-    )  # rows that are left to show it
-    share = np.clip(level - 1, 0, square) / level
-    counted = share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite
-    return LensShare(gain @ spread @ gain.T, counted, float(np.sqrt(square)))
+    # rows that are left to show it
+    square *= level / max(6 * len(obs.view_camera) - taken, 1.0)
+    return LensShare(gain @ spread @ gain.T, float(np.sqrt(square)))

@@ -104,7 +104,7 @@ def estimate_from_planes(
         return lambda p: residual(p, triangles, sets.boards, whitener, offset=offset)
 
     rounds = ROUNDS if weighted else 0
-    problem, pose, earlier = minimise_in_rounds(freeze, pose, move_pose, rounds, **options)
+    problem, pose = minimise_in_rounds(freeze, pose, move_pose, rounds, **options)
     chi2_rest = correct_and_compress(sets, pose)[2] if weighted else 0.0
     count = int(sets.number.sum())
     return solve(
@@ -115,7 +115,6 @@ def estimate_from_planes(
         freedom=count - len(POSE_NAMES),
         n_observations=count,
         chi2_rest=chi2_rest,
-        earlier=earlier,
         **pose_unknowns(method, obs.camera),
         **options,
     )
@@ -374,7 +373,6 @@ def estimate_with_lens(
     error = plane_error(obs, solution)
     numbers = int(np.sum(plane_sets(obs).number) + visible.sum())
     state = (pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3])
-    earlier: list[np.ndarray] = []
     for _ in range(2):
         planes, rest = _planes_at(obs, state, error)
         solution = solve(
@@ -389,11 +387,9 @@ def estimate_with_lens(
             freedom=numbers - 6 - lens - 6 * len(obs.placements),
             chi2_rest=rest,
             n_observations=numbers,
-            earlier=earlier,
             **options,
         )
         state = solution.state
-        earlier = [solution.cost_history]
     return _with_refined_model(solution, obs, lens)
 
 
