@@ -311,9 +311,9 @@ class JointObservations(_Grouped):
         Of the intrinsics of every camera. Zeros (exactly known) by default.
     """
 
-    placements: np.ndarray = rows("board")
-    direction: np.ndarray = rows("board")
-    middle: np.ndarray = rows("board")
+    placements: np.ndarray
+    direction: np.ndarray
+    middle: np.ndarray
     face_range: np.ndarray = rows("face")
     face_bearing: np.ndarray = rows("face")
     face_pitch: np.ndarray = rows("face")
@@ -346,12 +346,10 @@ class JointObservations(_Grouped):
             exact = np.zeros((len(self.cameras), LENS, LENS))
             object.__setattr__(self, "lens_covariance", exact)
         count = len(self.placements)
-        for place in (self.face_placement, self.beam_placement, self.view_placement):
+        for name in ("face_placement", "beam_placement", "view_placement"):
+            place = getattr(self, name)
             if len(place) and not 0 <= place.min() <= place.max() < count:
-                raise ValueError(
-                    f"placements of observations are indices below {count}, got {place.min()} to "
-                    f"{place.max()}"
-                )
+                raise ValueError(f"{name} are indices below {count}, got up to {place.max()}")
         if len(self.face_sigma) and self.face_sigma.min() <= 0:
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
 
@@ -363,13 +361,15 @@ class JointObservations(_Grouped):
         """The observations of some placements (numbers) only."""
         kept = np.flatnonzero(np.isin(self.placements, list(placements)))
         out = self.keep(
-            board=kept,
             face=np.isin(self.face_placement, kept),
             beam=np.isin(self.beam_placement, kept),
             view=np.isin(self.view_placement, kept),
         )
         return replace(
             out,
+            placements=self.placements[kept],
+            direction=self.direction[kept],
+            middle=self.middle[kept],
             face_placement=np.searchsorted(kept, out.face_placement),
             beam_placement=np.searchsorted(kept, out.beam_placement),
             view_placement=np.searchsorted(kept, out.view_placement),
