@@ -13,7 +13,7 @@ weights are frozen while a step is judged and renewed for the next one.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -97,24 +97,26 @@ class Block:
         return self.whitened(self.jacobian if self.corrected is None else self.corrected)
 
 
-def _weigh(block, robust, axes):
-    """Robust weights (..., n) of a block at its own state, None without, and half the loss summed
-    over the trial.
-    """
+def _roots(block, axes):
+    """Roots of Cauchy's weights of residuals, or of groups of them, that are judged together."""
     if block.cost is not None:
-        return None, block.cost.sum(axis=axes)
-    r = block.white
-    if not robust:
-        return None, 0.5 * (r * r).sum(axis=axes)
-    d = block.size
-    squares = np.sum(r.reshape(r.shape[:-1] + (-1, d)) ** 2, axis=-1)
-    count = np.asarray(d if block.count is None else block.count, float)
+        return np.ones(())
+    groups = block.white.reshape(*block.white.shape[:-1], -1, block.size)
+    squares = np.sum(groups**2, axis=-1)
+    count = np.asarray(block.size if block.count is None else block.count, float)
     count = np.broadcast_to(count, squares.shape)
-    z = np.sqrt(squares / count)  # sizes of groups of residuals that are judged together
-    scale = _level(z, count, block, axes)
-    square = (z / scale / CAUCHY) ** 2
-    value = np.sum(count * scale**2 * CAUCHY**2 * np.log1p(square), axis=axes)
-    return np.repeat(1 / (1 + square), d, axis=-1), 0.5 * value
+    z = np.sqrt(squares / count)
+    return (1 + (z / _level(z, count, block, axes) / CAUCHY) ** 2) ** -0.5
+
+
+def _times(blocks, roots):
+    """Blocks with the roots of their weights in their whiteners."""
+    weighted = []
+    for block, root in zip(blocks, roots, strict=True):
+        whole = block.size > 1 and root.ndim > 0
+        factor = root[..., None, None] if whole else root
+        weighted.append(replace(block, whitener=block.whitener * factor))
+    return weighted
 
 
 def _level(z, count, block, axes):
@@ -138,58 +140,38 @@ def _blocks(evaluate, state):
 
 
 class Linearised(NamedTuple):
-    """Whitened, robustly weighted blocks at a state.
-
-    Normal equations (..., k, k) and (..., k), the cost, and of each block the roots of its weights
-    (None without).
-    """
+    """Normal equations (..., k, k) and (..., k) of whitened blocks at a state, and the cost."""
 
     hessian: np.ndarray
     gradient: np.ndarray
     cost: np.ndarray
-    roots: list
 
 
-def linearise(blocks: Iterable[Block], robust=False, axes=(-2, -1)) -> Linearised:
+def linearise(blocks: Iterable[Block], axes=(-2, -1)) -> Linearised:
     """Normal equations of blocks with the placement as leading axis, or of trials.
 
     Parameters
     ----------
     blocks : iterable of Block
-    robust : bool
-        See :func:`minimise`.
     axes : int or tuple of int
         Over which the cost is summed: placements and residuals, or -1 for residuals of trials.
     """
     hessian = gradient = cost = np.zeros(())
-    roots = []
     for block in blocks:
-        weights, value = _weigh(block, robust, axes)
-        r = block.white
         J = block.white_jacobian
-        root = None
-        if weights is not None:
-            root = np.sqrt(weights)
-            r = root * r
-            J = root[..., None] * J
-        roots.append(root)
         transposed = J.swapaxes(-1, -2)
         hessian = hessian + transposed @ J
-        gradient = gradient + (transposed @ r[..., None])[..., 0]
-        cost = cost + value
-    return Linearised(hessian, gradient, cost, roots)
+        gradient = gradient + (transposed @ block.white[..., None])[..., 0]
+        cost = cost + _cost(block, axes)
+    return Linearised(hessian, gradient, cost)
 
 
-def _frozen_cost(blocks, roots, axes):
-    """Half the sum of squares with the robust weights of an earlier state."""
-    total = 0.0
-    for block, root in zip(blocks, roots, strict=True):
-        if block.cost is not None:
-            total = total + block.cost.sum(axis=axes)
-            continue
-        r = block.white if root is None else root * block.white
-        total = total + 0.5 * (r * r).sum(axis=axes)
-    return total
+def _cost(block, axes):
+    """Half the sum of squares, or the negative log likelihood."""
+    cost = block.cost
+    if cost is None:
+        cost = 0.5 * block.white**2
+    return cost.sum(axis=axes)
 
 
 def eliminate(
@@ -307,32 +289,42 @@ def minimise(
         estimate.
     """
     axes = -1 if shared is None else (-2, -1)
-    blocks = _blocks(evaluate, state)
-    at = linearise(blocks, robust, axes)
+
+    def problem(state, roots=None):
+        """Blocks at a state, and their weights: these, or those of the state."""
+        blocks = _blocks(evaluate, state)
+        if not robust:
+            return blocks, None
+        if roots is None:
+            roots = [_roots(block, axes) for block in blocks]
+        return _times(blocks, roots), roots
+
+    blocks, roots = problem(state)
+    at = linearise(blocks, axes)
     history = [at.cost]
     converged = np.zeros(np.shape(at.cost), bool)
     damping = np.full(np.shape(at.cost), FIRST_DAMPING)
     while len(history) <= max_iterations and not converged.all():
         step, length, promised = _step(at.hessian, at.gradient, damping, shared)
         trial = retract(state, step)
-        tried = _blocks(evaluate, trial)
-        before = _frozen_cost(blocks, at.roots, axes) if robust else at.cost
-        after = _frozen_cost(tried, at.roots, axes)
-        accepted = after <= before * (1 + 1e-12) + 1e-26
-        small = (length < tolerance**2) | (length < 1e-14 * before)
+        tried, _ = problem(trial, roots)
+        after = sum(_cost(block, axes) for block in tried)
+        accepted = after <= at.cost * (1 + 1e-12) + 1e-26
+        small = (length < tolerance**2) | (length < 1e-14 * at.cost)
         converged = converged | (small & np.isfinite(after) & (damping < SMALL_DAMPING))
+        gain = np.ones_like(at.cost)
+        np.divide(at.cost - after, promised, out=gain, where=promised > 3e-15 * at.cost)
+        damping = _next_damping(damping, gain, accepted)
         if accepted.all():
             state = trial
             blocks = tried
         elif accepted.any():
             chosen = accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim))
             state = np.where(chosen, trial, state)
-            blocks = _blocks(evaluate, state)
-        at = linearise(blocks, robust, axes)
+        if robust or not accepted.all():
+            blocks, roots = problem(state)
+        at = linearise(blocks, axes)
         history.append(at.cost)
-        gain = np.ones_like(before)
-        np.divide(before - after, promised, out=gain, where=promised > 3e-15 * before)
-        damping = _next_damping(damping, gain, accepted)
     if converged.ndim == 0:
         converged = converged[()]
     return Minimum(state, converged, len(history) - 1, np.array(history))
@@ -460,26 +452,20 @@ def solve(
         name: asked.pop(name) for name in ("max_iterations", "tolerance") if name in asked
     }
     question = Question(**asked)
-    last = [None, None]
-
-    def once(state):
-        """Blocks at a state; those of the last state are kept."""
-        if last[0] is not state:
-            last[:] = state, _blocks(evaluate, state)
-        return last[1]
-
-    if not all(np.isfinite(block.residuals).all() for block in once(start)):
+    if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
         raise ValueError(
             f"{question.method}: residuals at the start value are not finite: check the "
             "observations and T0"
         )
-    minimum = minimise(once, start, retract, shared=shared, robust=robust, **steps)
-    blocks = once(minimum.state)
+    minimum = minimise(evaluate, start, retract, shared=shared, robust=robust, **steps)
+    blocks = _blocks(evaluate, minimum.state)
     axes = -1 if shared is None else (-2, -1)
     weights = []
     for block in blocks:
-        of_block = _weigh(block, robust, axes)[0]
-        weights.append(np.ones_like(block.white) if of_block is None else of_block)
+        weight = np.ones_like(block.white)
+        if robust and block.cost is None:
+            weight = np.repeat(_roots(block, axes) ** 2, block.size, axis=-1)
+        weights.append(weight)
     return _solution(question, minimum, blocks, np.concatenate(weights, axis=-1), shared)
 
 

@@ -21,12 +21,9 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint_contradictions import (
-    LAST_MISS,
     misfits,
-    refuse_contradiction,
     without_blind_cameras,
     without_lost_placements,
-    without_misfits,
 )
 from lrfcal_lib.solvers.joint_lens import lens_share
 from lrfcal_lib.solvers.joint_model import (
@@ -178,14 +175,8 @@ def solve_joint(
     data = replace(data, levels=replace(data.levels, lapse=chosen.lapse))
     if chosen.noise == "estimate":
         state, data = settle(state, data, unknowns)
-        obs, state, contradicting = without_misfits(obs, state, data, unknowns)
-        if contradicting:
-            left_out += contradicting
-            state, data = settle(state, gather(obs, data.levels), unknowns)
     if chosen.noise == "estimate" or chosen.lapse:
         state = minimum(state, data, unknowns, LAST_STEP).state
-    if required:  # a cause before what follows from it: edges that fit nowhere, say
-        refuse_contradiction(state, data, LAST_MISS, left_out)
     found = finished(obs, state, data, unknowns, required)
     return replace(found, excluded=tuple(left_out))
 

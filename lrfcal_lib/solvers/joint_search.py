@@ -13,9 +13,8 @@ from lrfcal_lib.model.geometry import (
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_contradictions import (
-    CONTRADICTION,
-    FEW_STEPS,
     LARGEST_SHARE,
+    ROUGH_MISS,
     face_misses,
     left_out_share,
     refuse_contradiction,
@@ -27,7 +26,9 @@ from lrfcal_lib.solvers.joint_start import start_states, state_of
 
 # mean half squared residual; a start value this good is not searched further
 GOOD_START = 0.7
-ROUGH_MISS = 0.08  # metres, of a start value's boards from where images put them
+# of all that is left out: what it counts against a start value
+PENALTY = 16.0
+FEW_STEPS = 8  # of a minimisation that only has to show where it leads
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def best_start(
     chosen = int(np.argmin([start.badness for start in tried]))
     best = tried[chosen]
     if misses[chosen] > ROUGH_MISS:
-        refuse_contradiction(best.state, gather(best.kept), ROUGH_MISS)
+        refuse_contradiction(best.kept, best.state)
     if left_out_share(obs, best.left_out) > LARGEST_SHARE:
         names = []
         for problem in best.left_out[:8]:
@@ -120,7 +121,7 @@ def agreeing_start(obs, state, data, unknowns):
         share = left_out_share(obs, left_out)
         count = len(kept.face_range) + len(kept.beam_hit) + len(kept.view_pitch)
         cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / count
-        badness = cost * (1 + CONTRADICTION * share)
+        badness = cost * (1 + PENALTY * share)
         attempts.append(Start(kept, found.state, left_out, found.converged, badness))
         if not left_out or share > LARGEST_SHARE:
             break
