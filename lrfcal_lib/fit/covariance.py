@@ -1,4 +1,7 @@
-"""How well normal equations determine their unknowns: by the noise, and by placements left out."""
+"""How well normal equations determine their unknowns: by the noise, and by placements left out.
+
+No equations of the paper, which states no accuracy of its own.
+"""
 
 from collections.abc import Sequence
 

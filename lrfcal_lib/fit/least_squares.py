@@ -27,7 +27,7 @@ from lrfcal_lib.fit.covariance import (
     null_space,
     placement_covariance,
 )
-from lrfcal_lib.fit.padding import medians, pad
+from lrfcal_lib.fit.padding import medians
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
@@ -117,6 +117,21 @@ def _times(blocks, roots):
         factor = root[..., None, None] if whole else root
         weighted.append(replace(block, whitener=block.whitener * factor))
     return weighted
+
+
+def _weighted(evaluate, robust, axes):
+    """A problem whose blocks have robust weights: given ones, or those of the state."""
+
+    def problem(state, roots=None):
+        """Blocks at a state, and the roots of their weights."""
+        blocks = _blocks(evaluate, state)
+        if not robust:
+            return blocks, None
+        if roots is None:
+            roots = [_roots(block, axes) for block in blocks]
+        return _times(blocks, roots), roots
+
+    return problem
 
 
 def _level(z, count, block, axes):
@@ -289,16 +304,7 @@ def minimise(
         estimate.
     """
     axes = -1 if shared is None else (-2, -1)
-
-    def problem(state, roots=None):
-        """Blocks at a state, and their weights: these, or those of the state."""
-        blocks = _blocks(evaluate, state)
-        if not robust:
-            return blocks, None
-        if roots is None:
-            roots = [_roots(block, axes) for block in blocks]
-        return _times(blocks, roots), roots
-
+    problem = _weighted(evaluate, robust, axes)
     blocks, roots = problem(state)
     at = linearise(blocks, axes)
     history = [at.cost]
@@ -399,7 +405,7 @@ class Question:
     names: Sequence[str]
     method: str
     read: Callable
-    scales: ArrayLike | None = None
+    scales: ArrayLike = 1.0
     limit: float = 1.0
     words: Callable | None = None
     groups: np.ndarray | None = None
@@ -473,25 +479,17 @@ def _by_placement(r, J, weights, groups, shared):
     """Normal equations of the reported unknowns by placement (one group where they are not told
     apart).
     """
-    weighted = weights[..., None] * J
-    if groups is not None:  # rows of a placement together, padded with what counts nothing
-        rows = np.arange(r.shape[-1])
-        placement = np.repeat(
-            np.unique(groups, return_inverse=True)[1], len(rows) // len(groups)
-        )
-        together = pad({"row": rows, "placement": placement}, placement.max() + 1)
-        index = together["row"]
-        r = r[..., index]
-        J = J[..., index, :]
-        weighted = weighted[..., index, :] * together["used"][..., None]
-    weighted = weighted.swapaxes(-1, -2)
-    hessians = weighted @ J
-    scores = (weighted @ r[..., None])[..., 0]
+    weighted = (weights[..., None] * J).mT
     if shared is not None:
-        return reduced_hessian(hessians, shared), scores[:, :shared]
-    if groups is None:
-        return hessians[..., None, :, :], scores[..., None, :]
-    return hessians, scores
+        scores = np.matvec(weighted, r)
+        return reduced_hessian(weighted @ J, shared), scores[:, :shared]
+    index = (
+        np.zeros(1, int) if groups is None else np.unique(groups, return_inverse=True)[1]
+    )
+    index = np.repeat(index, r.shape[-1] // len(index))
+    member = index == np.arange(index.max() + 1)[:, None]
+    weighted = weighted[..., None, :, :] * member[:, None]
+    return weighted @ J[..., None, :, :], np.matvec(weighted, r[..., None, :])
 
 
 def _solution(question, minimum, blocks, weights, shared):
@@ -500,9 +498,7 @@ def _solution(question, minimum, blocks, weights, shared):
     J = np.concatenate([block.white_jacobian for block in blocks], axis=-2)
     hessians, scores = _by_placement(r, J, weights, question.groups, shared)
     hessian = np.sum(hessians, axis=-3)
-    scales = np.ones(hessian.shape[-1])
-    if question.scales is not None:
-        scales = np.asarray(question.scales)
+    scales = np.broadcast_to(question.scales, hessian.shape[-1:])
     motions = question.open_motions(hessian, scales)
     chi2 = (
         np.sum(weights * r**2, axis=-1 if shared is None else (-2, -1)) + question.chi2_rest

@@ -1,9 +1,8 @@
 """Pinhole camera with lens distortion: projection, undistortion, straight lines in pixels."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -67,13 +66,9 @@ class CameraModel:
         covariance : ndarray, shape (9, 9), optional
         rms_px : float, optional
         """
-        matrix: dict[str, Any] = dict(
-            zip(INTRINSIC_NAMES[:4], map(float, values[:4]), strict=True)
-        )
-        distortion = np.asarray(values[4:9], float)
-        return replace(
-            self, **matrix, distortion=distortion, covariance=covariance, rms_px=rms_px
-        )
+        fx, fy, cx, cy, *distortion = map(float, values)
+        size = self.width, self.height
+        return CameraModel(*size, fx, fy, cx, cy, np.array(distortion), covariance, rms_px)
 
 
 def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:

@@ -349,7 +349,9 @@ class JointObservations(_Grouped):
         for name in ("face_placement", "beam_placement", "view_placement"):
             place = getattr(self, name)
             if len(place) and not 0 <= place.min() <= place.max() < count:
-                raise ValueError(f"{name} are indices below {count}, got up to {place.max()}")
+                raise ValueError(
+                    f"{name} are indices below {count}, got up to {place.max()}"
+                )
         if len(self.face_sigma) and self.face_sigma.min() <= 0:
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
 

@@ -1,4 +1,7 @@
-"""Calibration methods of one camera: the same observations in, a `Solution` out."""
+"""Calibration methods of one camera: the same observations in, a `Solution` out.
+
+A table of the methods and their choice; equations are in the modules of their residuals.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -221,7 +224,7 @@ def solve_camera(
             problems.append(error)
     if not minima:
         raise problems[0]
-    return minima[0] if len(minima) == 1 else best_minimum(obs, row.uses, minima)
+    return minima[0] if len(minima) == 1 else best_minimum(obs, row, minima)
 
 
 def left_out(
@@ -312,13 +315,15 @@ def _mean(values):
     return values.mean() if len(values) else np.nan
 
 
-def best_minimum(obs, uses, minima):
+def best_minimum(obs, row, minima):
     """The best of several Solutions, with another one as `rival` that explains the data nearly as
     well.
     """
-    squares = [_misses(obs, uses, solution.transform) ** 2 for solution in minima]
+    squares = [_misses(obs, row, solution.transform) ** 2 for solution in minima]
     sizes = plane_start.sizes_of_minima(np.array(squares))
-    before = np.array([_lies_before(obs, uses, solution.transform) for solution in minima])
+    points = getattr(obs, f"{row.uses}_points")
+    depths = np.array([solution.transform.apply(points)[:, 2] for solution in minima])
+    before = np.mean(depths < 0, axis=1) <= 0.5  # most of the board is ahead of the camera
     order = np.lexsort([sizes, ~before])
     best = order[0]
     nearly = (before == before[best]) & (sizes <= plane_start.NEARLY * sizes[best])
@@ -329,21 +334,12 @@ def best_minimum(obs, uses, minima):
     return minima[best]
 
 
-def _misses(obs, uses, transform):
+def _misses(obs, row, transform):
     """Distances or pixels by which observations miss at a pose."""
-    if uses == "crossing":
-        misses = line_block(pose_array(transform), obs).residuals
-    elif uses == "scene":
-        misses = lines.point_block(pose_array(transform), obs).residuals
-    else:
-        misses = plane_residuals_m(obs, transform)
+    if row.uses != "plane":
+        return row.residual(pose_array(transform), obs).residuals
+    misses = plane_residuals_m(obs, transform)
     return misses[np.isfinite(misses)]
-
-
-def _lies_before(obs, uses, transform):
-    """Whether a pose puts (most of) the board before the camera."""
-    depth = transform.apply(getattr(obs, f"{uses}_points"))[:, 2]
-    return bool(np.mean(depth < 0) <= 0.5)
 
 
 def find_outlying_placements(obs: CameraObservations) -> tuple[list[int], dict[int, float]]:

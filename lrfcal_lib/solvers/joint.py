@@ -103,14 +103,6 @@ class JointSettings:
                 raise ValueError(f"sensor unknowns are {', '.join(SENSOR)}; got {name!r}")
         if self.noise not in ("stated", "estimate"):
             raise ValueError(f"noise is 'stated' or 'estimate', got {self.noise!r}")
-        if not 0 <= self.lapse < 0.5:
-            raise ValueError(
-                f"lapse is the share of beams that say nothing, 0 to 0.5, got {self.lapse}"
-            )
-        if min(self.sweep_sigma) <= 0:
-            raise ValueError(
-                f"sweep_sigma must be positive (radians, fraction), got {self.sweep_sigma}"
-            )
 
     def unknowns(self, obs: JointObservations) -> Unknowns:
         """The unknowns for some observations."""
@@ -159,18 +151,15 @@ def solve_joint(
     obs, left_out = without_blind_cameras(obs, required)
     unknowns = chosen.unknowns(obs)
     levels = Levels(sweep_sigma=chosen.sweep_sigma)
-    coarsely_settled = False
     if start is None:
         obs, lost = without_lost_placements(obs)
         best = best_start(obs, unknowns, levels, T0)
         obs = best.kept
         start = best.state
-        coarsely_settled = best.settled
         left_out += lost + best.left_out
     data = gather(obs, replace(levels, prior=chosen.prior))
     # stated levels of the noise may be wrong by far: what takes many steps with them leads away
-    if chosen.prior is not None or not coarsely_settled:
-        start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
+    start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
     state = minimum(start, data, unknowns, LAST_STEP, FIRST_STEPS).state
     data = replace(data, levels=replace(data.levels, lapse=chosen.lapse))
     if chosen.noise == "estimate":

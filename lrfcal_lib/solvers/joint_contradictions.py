@@ -1,4 +1,7 @@
-"""Placements and images that contradict all others: found, named and left out."""
+"""Placements and images that contradict all others: found, named and left out.
+
+By equations (4) to (6) and (16); a board lies where the images and where the scans put it.
+"""
 
 from dataclasses import replace
 
@@ -11,7 +14,7 @@ from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.solvers.joint_model import JointData, JointState
 from lrfcal_lib.solvers.joint_noise import face_points
-from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images
+from lrfcal_lib.solvers.joint_start import boards_in_images
 
 CONTRADICTS = ProblemKind.CONTRADICTS
 LARGEST_SHARE = 0.3  # of the placements that may contradict the others
@@ -61,19 +64,15 @@ def without_blind_cameras(obs, required):
 
 
 def without_lost_placements(obs):
-    """Leave out placements that no image shows and whose scans cross fewer than two edges."""
-    count = np.zeros((len(obs.placements), len(obs.edges)), int)
-    np.add.at(count, (obs.beam_placement[obs.beam_hit], obs.beam_edge[obs.beam_hit]), 1)
-    crossed = np.sum(count >= FEWEST_ANGLE_POINTS, axis=1)
-    lost = crossed < 2
-    lost[obs.view_placement] = False
+    """Leave out placements that no image shows: nothing says where their board is at the start."""
+    shown = np.isin(np.arange(len(obs.placements)), obs.view_placement)
     left_out = []
-    for row in np.flatnonzero(lost):
-        why = f"no image shows the board and scans cross {crossed[row]} edges, two needed"
+    for row in np.flatnonzero(~shown):
+        why = "no image shows the board"
         left_out.append(of_placement(obs, row, ProblemKind.TOO_LITTLE, why))
-    if lost.all():
+    if not shown.any():
         raise DegenerateGeometry("; ".join(map(str, left_out)))
-    return obs.select(obs.placements[~lost]), left_out
+    return obs.select(obs.placements[shown]), left_out
 
 
 def refuse_contradiction(obs: JointObservations, state: JointState) -> None:

@@ -1,4 +1,7 @@
-"""What errors of the intrinsics, which all images share, do to the joint estimate."""
+"""What errors of the intrinsics, which all images share, do to the joint estimate.
+
+Equations (18) and (19), to first order.
+"""
 
 from typing import NamedTuple
 
@@ -9,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.fit.least_squares import OWN_RANK
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import CameraModel, project_jacobians
+from lrfcal_lib.model.geometry import gradient_by_pose
 from lrfcal_lib.model.observations import LENS, JointObservations
 from lrfcal_lib.solvers.joint_model import JointData, Unknowns
 from lrfcal_lib.solvers.joint_residuals import among_cameras, view_block
@@ -38,7 +42,7 @@ def pose_by_intrinsics(
         return np.zeros((6, LENS))
     turned = T_camera_board.rotation.apply(corners)
     by_point, by_lens = project_jacobians(turned + T_camera_board.translation, model)
-    by_pose = np.concatenate([np.cross(turned[:, None, :], by_point), by_point], axis=-1)
+    by_pose = gradient_by_pose(turned[:, None], by_point)
     return -np.linalg.lstsq(by_pose.reshape(-1, 6), by_lens.reshape(-1, LENS), rcond=None)[
         0
     ]

@@ -1,4 +1,7 @@
-"""The start value of the joint estimate that leads to the best minimum, among closed forms."""
+"""The start value of the joint estimate that leads to the best minimum, among closed forms.
+
+No equations of its own.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -41,8 +44,6 @@ class Start:
         Without what contradicts it.
     state : JointState
     left_out : list of Problem
-    settled : bool
-        Whether more steps with the coarse unknowns would change nothing.
     badness : float
         Mean half squared residual of what is kept; the share that is left out counts against it.
     """
@@ -50,7 +51,6 @@ class Start:
     kept: JointObservations
     state: JointState
     left_out: list[Problem]
-    settled: bool
     badness: float
 
 
@@ -122,7 +122,7 @@ def agreeing_start(obs, state, data, unknowns):
         count = len(kept.face_range) + len(kept.beam_hit) + len(kept.view_pitch)
         cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / count
         badness = cost * (1 + PENALTY * share)
-        attempts.append(Start(kept, found.state, left_out, found.converged, badness))
+        attempts.append(Start(kept, found.state, left_out, badness))
         if not left_out or share > LARGEST_SHARE:
             break
         cameras = [pose_transform(pose) for pose in found.state.cameras]

@@ -1,4 +1,7 @@
-"""What the joint estimate hands over: the rig, how well it is known, and what may be doubted."""
+"""What the joint estimate hands over: the rig, and how well it is known.
+
+No equations of its own; residuals are in :mod:`lrfcal_lib.solvers.joint_residuals`.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -8,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.edge_likelihood import disc_edge
-from lrfcal_lib.fit.least_squares import Block, eliminate, linearise
+from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import pose_array, pose_parameters, pose_transform
@@ -337,3 +340,38 @@ def joint_words(
         WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS
     ]
     return " with ".join(words)
+
+
+def expected_information(
+    obs: JointObservations, state: JointState, unknowns: Unknowns
+) -> np.ndarray:
+    """What placements are expected to say about the shared unknowns.
+
+    Parameters
+    ----------
+    obs : JointObservations
+        Of the drawn values nothing enters but which beams and views there are.
+    state : JointState
+        The truth.
+    unknowns : Unknowns
+
+    Returns
+    -------
+    ndarray, shape (p, c, c)
+    """
+    data = gather(obs)
+    hit = np.ones_like(data.beam["hit"])
+    all_read = replace(data, beam=data.beam | {"hit": hit})
+    none_read = replace(data, beam=data.beam | {"hit": ~hit})
+    read = named_blocks(state, all_read, unknowns)
+    hessian = np.zeros(())
+    if "beam" in read:  # over both readings, weighted by how likely each is
+        hits = read["beam"]
+        misses = named_blocks(state, none_read, unknowns)["beam"]
+        chance = np.exp(-np.asarray(hits.cost))
+        weights = ((hits, chance), (misses, 1 - chance))
+        for block, share in weights:
+            J = np.sqrt(share)[..., None] * block.white_jacobian
+            hessian = hessian + J.mT @ J
+    others = [block for name, block in read.items() if name != "beam"]
+    return reduced_hessian(hessian + linearise(others).hessian, unknowns.shared)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
-    lrf_to_platform,
     polar_to_points,
     pose_array,
     pose_transform,
@@ -28,7 +27,6 @@ SAME_PITCH = np.radians(0.6)  # scan lines so near the pitch of an image are use
 POINTS = 30  # a plane
 VIEWS = 24  # a camera; closed forms do not get much better with more
 FEWEST_VIEWS = 5
-FEWEST_ANGLE_POINTS = 6  # on an edge, for its direction
 
 
 def start_states(
@@ -151,17 +149,11 @@ def _axis_from_cameras(obs, poses):
 def state_of(
     obs: JointObservations, head: RigidTransform, cameras: list[RigidTransform]
 ) -> JointState:
-    """All unknowns from an axis and the cameras: boards from their first images, or from the
-    scans alone.
-    """
-    poses = np.array([pose_array(T) for T in cameras]).reshape(-1, 3, 4)
+    """All unknowns from an axis and the cameras: boards from their first images."""
+    poses = np.array([pose_array(T) for T in cameras])
     count = len(obs.placements)
-    boards = np.zeros((count, 3, 4))
-    shown, first = np.unique(obs.view_placement, return_index=True)
-    if len(shown):
-        boards[shown] = boards_in_images(obs, pose_array(head), poses, first)
-    for placement in np.setdiff1d(np.arange(count), shown):
-        boards[placement] = pose_array(board_from_scan(obs, placement, head))
+    _, first = np.unique(obs.view_placement, return_index=True)
+    boards = boards_in_images(obs, pose_array(head), poses, first)
     return JointState(
         head=pose_array(head),
         cameras=poses,
@@ -187,54 +179,3 @@ def boards_in_images(
     T_camera_board = RigidTransform.from_matrix(obs.view_pose[views])
     boards = turn * T_head_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
     return pose_array(boards)
-
-
-def board_from_scan(obs, placement, head):
-    """``T_platform_board`` of a placement (by index) from its plane and where scans cross its
-    edges.
-
-    Raises DegenerateGeometry when fewer than two edges are crossed, or the scans span no plane.
-    """
-    face = obs.face_placement == placement
-    p = polar_to_points(obs.face_range[face], obs.face_bearing[face])
-    p = lrf_to_platform(p, obs.face_pitch[face], head)
-    origin = lrf_to_platform(np.zeros((1, 3)), obs.face_pitch[face][:1], head)[0]
-    centre = p.mean(axis=0)
-    normal = np.linalg.svd(p - centre, full_matrices=False)[2][2]
-    normal = normal * (
-        -np.sign(normal @ (centre - origin))
-    )  # the printed side faces the rig
-    level = np.cross([0.0, 0.0, 1.0], normal)
-    axes = np.stack([level, np.cross(normal, level), normal])
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    R, shift = _turn_in_plane(obs, placement, head, axes, centre)
-    rotation = Rotation.from_matrix(np.column_stack([axes[:2].T @ R, normal]))
-    return RigidTransform.from_components(centre + axes[:2].T @ shift, rotation)
-
-
-def _turn_in_plane(obs, placement, head, axes, centre):
-    """Turn (2, 2) and shift (2,) of the outline in the plane, from points on its edges (last
-    beams on the board).
-    """
-    beams = (obs.beam_placement == placement) & obs.beam_hit
-    ray = polar_to_points(np.ones(beams.sum()), obs.beam_bearing[beams])
-    o = lrf_to_platform(np.zeros_like(ray), obs.beam_pitch[beams], head)
-    d = lrf_to_platform(ray, obs.beam_pitch[beams], head) - o
-    x = (o + (((centre - o) @ axes[2]) / (d @ axes[2]))[:, None] * d - centre) @ axes[:2].T
-    edge = obs.beam_edge[beams]
-    line = obs.lines()[obs.beam_edge[beams]]
-    crossed = np.sum(np.bincount(edge) >= FEWEST_ANGLE_POINTS)
-    if crossed < 2:
-        raise DegenerateGeometry(
-            f"placement {obs.placements[placement]}: scans cross {crossed} edges, two needed"
-        )
-    # n . (R^T x + t) + c = 0, linear in cosine and sine of the turn and in t; then the shift for
-    # that turn alone
-    sine = line[:, 0] * x[:, 1] - line[:, 1] * x[:, 0]
-    A = np.column_stack([np.sum(line[:, :2] * x, axis=1), sine, line[:, :2]])
-    c, s = np.linalg.lstsq(A, -line[:, 2], rcond=None)[0][:2]
-    R = np.array([[c, -s], [s, c]]) / np.hypot(c, s)
-    normals = line[:, :2] @ R.T
-    return R, np.linalg.lstsq(
-        normals, np.sum(normals * x, axis=1) + line[:, 2], rcond=None
-    )[0]

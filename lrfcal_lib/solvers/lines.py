@@ -68,14 +68,11 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     force = np.linalg.solve(noise, errors[..., None])[..., 0]
     shift = np.matvec(pulled, force) @ pose[..., :3].mT
 
-    one = np.ones(errors.shape[:-1])
-    gradients = [by_point[..., 0, :], by_point[..., 1, :]]  # of u and of v
-    rows = [gradient_by_pose(rotated, gradient) for gradient in gradients]
-    corrections = [
-        noise_correction(rotated, moved, gradient, shift, one) for gradient in gradients
-    ]
-    jacobian = np.stack(rows, axis=-2)
-    corrected = jacobian - np.stack(corrections, axis=-2)
+    rotated = rotated[..., None, :]  # u and v, two scalars of one point
+    jacobian = gradient_by_pose(rotated, by_point)
+    corrected = jacobian - noise_correction(
+        rotated, moved[..., None, :], by_point, shift[..., None, :], np.ones(())
+    )
     shape = errors.shape[:-2] + (-1,)
     return Block(
         errors.reshape(shape),

@@ -1,4 +1,7 @@
-"""Start values of a camera from planes: minimal and closed forms, and the choice among minima."""
+"""Start values of a camera from planes: minimal and closed forms, and the choice among minima.
+
+After Zhang and Pless 2004, and Vasconcelos, Barreto and Nunes 2012.
+"""
 
 from functools import partial
 from itertools import combinations

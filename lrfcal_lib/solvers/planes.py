@@ -311,10 +311,7 @@ def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> lis
     by_point, by_lens = project_jacobians(corners, camera)
     visible = np.isfinite(obs.pattern_pixels)
     errors = np.where(visible, project(corners, camera) - obs.pattern_pixels, 0.0)
-    rows = [
-        gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)
-    ]  # of u and of v
-    by_board = np.stack(rows, axis=-2)
+    by_board = gradient_by_pose(rotated[..., None, :], by_point)
     jacobian = np.concatenate(
         [np.zeros_like(by_board), by_lens[..., :lens], by_board], axis=-1
     )

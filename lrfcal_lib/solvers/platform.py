@@ -9,7 +9,13 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS, chart_parameters, move_head
+from lrfcal_lib.fit.axis_chart import (
+    AXIS_COLUMNS,
+    SMALL,
+    by_chart,
+    chart_parameters,
+    move_head,
+)
 from lrfcal_lib.fit.covariance import name_words
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.padding import pad
@@ -35,8 +41,6 @@ LEAST_SLOPE = 0.1  # nearer to a coordinate plane (6 degrees) a projected fit is
 # a combination of the four motions of the axis
 WORDS = partial(name_words, names=AXIS_WORDS, share=0.3)
 LEAST_SCATTER = 1e-6  # metres
-# of the differences that stand for derivatives of the projected fits: radians, metres
-SMALL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -439,11 +443,15 @@ def projected_block(head, obs, groups, scatter=1.0, printed=False):
     printed : bool
         As of :func:`solve_projected`.
     """
-    steps = SMALL * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
-    q = points_of(move_head(head, steps), obs, printed)
-    terms = np.concatenate([_six_terms(q[:, a], q[:, b]) for a, b in groups], axis=1)
-    here, ahead, behind = np.split(terms / scatter, [1, 5])
-    return Block(here[0], (ahead - behind).T / (2 * SMALL), np.ones(here.shape[1]))
+
+    def terms(heads):
+        """Those of heads (k, 3, 4), shape (k, m)."""
+        q = points_of(heads, obs, printed)
+        every = [_six_terms(q[:, a], q[:, b]) for a, b in groups]
+        return np.concatenate(every, axis=1) / scatter
+
+    residuals, jacobian = by_chart(terms, head)
+    return Block(residuals, jacobian, np.ones_like(residuals))
 
 
 def points_of(heads, obs, printed):
