@@ -240,7 +240,7 @@ def finished(obs, state, data, unknowns, required):
         by_placements = by_placements + lens.covariance
     found = replace(
         found,
-        covariance=found.covariance + lens.covariance,
+        covariance=found.covariance + lens.covariance - lens.counted,
         covariance_placements=by_placements,
     )
     squares = misfits(named_blocks(found.state, data, unknowns), data)

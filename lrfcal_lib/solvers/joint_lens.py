@@ -55,12 +55,16 @@ class LensShare(NamedTuple):
     ----------
     covariance : ndarray, shape (c, c)
         Of the shared unknowns, from those of the intrinsics.
+    counted : ndarray, shape (c, c)
+        What the scatter of views that these errors cause has added to the covariance through the
+        scale of views, as far as that exceeds the stated noise: the intrinsics would count twice.
     scatter : float
         Of views in stated standard deviations: what no unknown can take up of the error that all
         views of a camera share.
     """
 
     covariance: np.ndarray
+    counted: np.ndarray
     scatter: float
 
 
@@ -70,7 +74,8 @@ def lens_share(
     """The LensShare of a solution."""
     c = unknowns.shared
     if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
-        return LensShare(np.zeros((c, c)), 0.0)
+        exact = np.zeros((c, c))
+        return LensShare(exact, exact, 0.0)
     block = view_block(found.state, data, unknowns)
     J = block.white_jacobian
     J_own = J[..., c:]
@@ -88,4 +93,6 @@ def lens_share(
     taken = np.sum((J_own @ own) * J_own) + np.sum((reduced @ finite) * reduced)
     # rows that are left to show it
     square *= level / max(6 * len(obs.view_camera) - taken, 1.0)
-    return LensShare(gain @ spread @ gain.T, float(np.sqrt(square)))
+    share = np.clip(level - 1, 0, square) / level
+    counted = share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite
+    return LensShare(gain @ spread @ gain.T, counted, float(np.sqrt(square)))
