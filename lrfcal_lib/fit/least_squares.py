@@ -436,16 +436,18 @@ def solve(
     *,
     shared: int | None = None,
     robust: bool = False,
+    max_iterations: int = 60,
+    tolerance: float = 1e-8,
     **asked,
 ) -> Solution:
     """Minimise, then report covariances and what was not observed.
 
     Parameters
     ----------
-    evaluate, start, retract, shared, robust
+    evaluate, start, retract, shared, robust, max_iterations, tolerance
         See :func:`minimise`.
     **asked
-        Fields of :class:`Question`; `max_iterations` and `tolerance` of :func:`minimise`.
+        Fields of :class:`Question`.
 
     Raises
     ------
@@ -454,16 +456,21 @@ def solve(
     ValueError
         When residuals at the start are not finite.
     """
-    steps = {
-        name: asked.pop(name) for name in ("max_iterations", "tolerance") if name in asked
-    }
     question = Question(**asked)
     if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
         raise ValueError(
             f"{question.method}: residuals at the start value are not finite: check the "
             "observations and T0"
         )
-    minimum = minimise(evaluate, start, retract, shared=shared, robust=robust, **steps)
+    minimum = minimise(
+        evaluate,
+        start,
+        retract,
+        shared=shared,
+        robust=robust,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+    )
     blocks = _blocks(evaluate, minimum.state)
     axes = -1 if shared is None else (-2, -1)
     weights = []

@@ -85,11 +85,14 @@ def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2)
         NaN where z <= 0.
     """
-    x, y, z = np.moveaxis(np.asarray(p_camera, float), -1, 0)
-    z = np.where(z > 0, z, np.nan)
-    u = model.fx * x / z + model.cx
-    v = model.fy * y / z + model.cy
-    return np.stack([u, v], axis=-1)
+    return _before(p_camera) * [model.fx, model.fy] + [model.cx, model.cy]
+
+
+def _before(p_camera):
+    """Normalised coordinates ``(x / z, y / z)`` of points, NaN where z <= 0."""
+    p_camera = np.asarray(p_camera, float)
+    z = p_camera[..., 2:]
+    return p_camera[..., :2] / np.where(z > 0, z, np.nan)
 
 
 def pinhole_jacobian(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
@@ -201,9 +204,7 @@ def project(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2)
         NaN where z <= 0.
     """
-    p_camera = np.asarray(p_camera, float)
-    z = np.where(p_camera[..., 2:] > 0, p_camera[..., 2:], np.nan)
-    distorted = distort(p_camera[..., :2] / z, model.distortion)
+    distorted = distort(_before(p_camera), model.distortion)
     return distorted * [model.fx, model.fy] + [model.cx, model.cy]
 
 

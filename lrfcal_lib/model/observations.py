@@ -9,6 +9,7 @@ from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
+Array = np.ndarray
 LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 ROUGH_NOISE = 1e-4 * np.eye(
     3
@@ -153,31 +154,31 @@ class CameraObservations(_Grouped):
     model: CameraModel
     camera: str = "camera"
     source: str = "lrf"
-    crossing_points: np.ndarray = rows("crossing", 3)
-    crossing_covariance: np.ndarray = rows("crossing", 3, 3, default=ROUGH_NOISE)
-    crossing_lines: np.ndarray = rows("crossing", 3, default=np.nan)
-    crossing_line_sigma: np.ndarray = rows("crossing", default=0.5)
-    crossing_placement: np.ndarray = rows("crossing", default=None)
-    crossing_edge: np.ndarray = rows("crossing", default="")
-    crossing_pitch: np.ndarray = rows("crossing")
-    crossing_across: np.ndarray = rows("crossing", default=False)
-    crossing_radius: np.ndarray = rows("crossing", default=0.005)
-    crossing_background: np.ndarray = rows("crossing")
-    plane_points: np.ndarray = rows("plane", 3)
-    plane_covariance: np.ndarray = rows("plane", 3, 3, default=ROUGH_NOISE)
-    plane_placement: np.ndarray = rows("plane", default=None)
-    plane_pitch: np.ndarray = rows("plane")
-    board_poses: np.ndarray = rows("board", 4, 4)
-    placements: np.ndarray = rows("board", default=None)
-    board_covariance: np.ndarray = rows("board", 6, 6)
-    pattern_points: np.ndarray = rows("pattern", 3)
-    pattern_pixels: np.ndarray = rows("board", default=np.nan)
+    crossing_points: Array = rows("crossing", 3)
+    crossing_covariance: Array = rows("crossing", 3, 3, default=ROUGH_NOISE)
+    crossing_lines: Array = rows("crossing", 3, default=np.nan)
+    crossing_line_sigma: Array = rows("crossing", default=0.5)
+    crossing_placement: Array = rows("crossing", default=None)
+    crossing_edge: Array = rows("crossing", default="")
+    crossing_pitch: Array = rows("crossing")
+    crossing_across: Array = rows("crossing", default=False)
+    crossing_radius: Array = rows("crossing", default=0.005)
+    crossing_background: Array = rows("crossing")
+    plane_points: Array = rows("plane", 3)
+    plane_covariance: Array = rows("plane", 3, 3, default=ROUGH_NOISE)
+    plane_placement: Array = rows("plane", default=None)
+    plane_pitch: Array = rows("plane")
+    board_poses: Array = rows("board", 4, 4)
+    placements: Array = rows("board", default=None)
+    board_covariance: Array = rows("board", 6, 6)
+    pattern_points: Array = rows("pattern", 3)
+    pattern_pixels: Array = rows("board", default=np.nan)
     pattern_sigma_px: float = 0.2
-    scene_points: np.ndarray = rows("scene", 3)
-    scene_covariance: np.ndarray = rows("scene", 3, 3, default=ROUGH_NOISE)
-    scene_pixels: np.ndarray = rows("scene", 2, default=np.nan)
-    scene_sigma_px: np.ndarray = rows("scene", default=0.5)
-    scene_placement: np.ndarray = rows("scene", default=None)
+    scene_points: Array = rows("scene", 3)
+    scene_covariance: Array = rows("scene", 3, 3, default=ROUGH_NOISE)
+    scene_pixels: Array = rows("scene", 2, default=np.nan)
+    scene_sigma_px: Array = rows("scene", default=0.5)
+    scene_placement: Array = rows("scene", default=None)
 
     def __post_init__(self):
         self.complete(f" of camera '{self.camera}'", gaps=("pattern_pixels",))
@@ -244,15 +245,15 @@ class PlatformObservations(_Grouped):
         1 or 2: the two perpendicular edges of equations (7) to (14).
     """
 
-    edge_points: np.ndarray = rows("edge", 3)
-    edge_covariance: np.ndarray = rows("edge", 3, 3)
-    edge_pitch: np.ndarray = rows("edge")
-    edge_placement: np.ndarray = rows("edge", default=0)
-    edge_number: np.ndarray = rows("edge", default=1)
-    face_points: np.ndarray = rows("face", 3)
-    face_covariance: np.ndarray = rows("face", 3, 3)
-    face_pitch: np.ndarray = rows("face")
-    face_placement: np.ndarray = rows("face", default=0)
+    edge_points: Array = rows("edge", 3)
+    edge_covariance: Array = rows("edge", 3, 3)
+    edge_pitch: Array = rows("edge")
+    edge_placement: Array = rows("edge", default=0)
+    edge_number: Array = rows("edge", default=1)
+    face_points: Array = rows("face", 3)
+    face_covariance: Array = rows("face", 3, 3)
+    face_pitch: Array = rows("face")
+    face_placement: Array = rows("face", default=0)
 
     def __post_init__(self):
         self.complete()
@@ -311,34 +312,34 @@ class JointObservations(_Grouped):
         Of the intrinsics of every camera. Zeros (exactly known) by default.
     """
 
-    placements: np.ndarray
-    direction: np.ndarray
-    middle: np.ndarray
-    face_range: np.ndarray = rows("face")
-    face_bearing: np.ndarray = rows("face")
-    face_pitch: np.ndarray = rows("face")
-    face_sigma: np.ndarray = rows("face")
-    face_placement: np.ndarray = rows("face", default=0)
-    beam_bearing: np.ndarray = rows("beam")
-    beam_pitch: np.ndarray = rows("beam")
-    beam_hit: np.ndarray = rows("beam", default=False)
-    beam_edge: np.ndarray = rows("beam", default=0)
-    beam_radius: np.ndarray = rows("beam")
-    beam_background: np.ndarray = rows("beam")
-    beam_step: np.ndarray = rows("beam")
-    beam_placement: np.ndarray = rows("beam", default=0)
-    view_pose: np.ndarray = rows("view", 4, 4)
-    view_camera: np.ndarray = rows("view", default=0)
-    view_pitch: np.ndarray = rows("view")
-    view_covariance: np.ndarray = rows("view", 6, 6)
-    view_placement: np.ndarray = rows("view", default=0)
+    placements: Array
+    direction: Array
+    middle: Array
+    face_range: Array = rows("face")
+    face_bearing: Array = rows("face")
+    face_pitch: Array = rows("face")
+    face_sigma: Array = rows("face")
+    face_placement: Array = rows("face", default=0)
+    beam_bearing: Array = rows("beam")
+    beam_pitch: Array = rows("beam")
+    beam_hit: Array = rows("beam", default=False)
+    beam_edge: Array = rows("beam", default=0)
+    beam_radius: Array = rows("beam")
+    beam_background: Array = rows("beam")
+    beam_step: Array = rows("beam")
+    beam_placement: Array = rows("beam", default=0)
+    view_pose: Array = rows("view", 4, 4)
+    view_camera: Array = rows("view", default=0)
+    view_pitch: Array = rows("view")
+    view_covariance: Array = rows("view", 6, 6)
+    view_placement: Array = rows("view", default=0)
     edges: tuple
-    corners: np.ndarray
+    corners: Array
     cameras: tuple
     mounts: tuple
     T_head_lrf: RigidTransform | None = None
-    view_lens: np.ndarray = rows("view", 6, 9)
-    lens_covariance: np.ndarray = rows("camera", 9, 9)
+    view_lens: Array = rows("view", 6, 9)
+    lens_covariance: Array = rows("camera", 9, 9)
 
     def __post_init__(self):
         self.complete()

@@ -21,7 +21,9 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint_contradictions import (
+    LAST_MISS,
     misfits,
+    refuse_contradiction,
     without_blind_cameras,
     without_lost_placements,
 )
@@ -166,6 +168,8 @@ def solve_joint(
         state, data = settle(state, data, unknowns)
     if chosen.noise == "estimate" or chosen.lapse:
         state = minimum(state, data, unknowns, LAST_STEP).state
+    if required:  # a cause before what follows from it: edges that fit nowhere, say
+        refuse_contradiction(obs, state, LAST_MISS)
     found = finished(obs, state, data, unknowns, required)
     return replace(found, excluded=tuple(left_out))
 

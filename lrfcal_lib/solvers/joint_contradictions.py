@@ -18,7 +18,6 @@ from lrfcal_lib.solvers.joint_start import boards_in_images
 
 CONTRADICTS = ProblemKind.CONTRADICTS
 LARGEST_SHARE = 0.3  # of the placements that may contradict the others
-ROUGH_MISS = 0.08  # metres, of a start value's boards from where images put them
 LAST_MISS = 0.025  # metres, of a board from where images of it put it
 MOST_SIGMA = 4.0  # by which images may put a board elsewhere, of what is stated of them
 FAR_MISS = 5.0  # times the usual miss: an image puts the board elsewhere
@@ -75,9 +74,9 @@ def without_lost_placements(obs):
     return obs.select(obs.placements[shown]), left_out
 
 
-def refuse_contradiction(obs: JointObservations, state: JointState) -> None:
+def refuse_contradiction(obs: JointObservations, state: JointState, most: float) -> None:
     """Raise DegenerateGeometry where images put the boards of a third of the placements more than
-    `ROUGH_MISS` (and `MOST_SIGMA` of what is stated of the images) off where they are.
+    `most` metres (and `MOST_SIGMA` of what is stated of the images) off where they are.
     """
     place = obs.view_placement
     boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
@@ -87,12 +86,12 @@ def refuse_contradiction(obs: JointObservations, state: JointState) -> None:
     wrong = 0
     for row in shown:
         mine = place == row
-        most = max(ROUGH_MISS, MOST_SIGMA * np.median(stated[mine]))
-        wrong += int(np.median(misses[mine]) > most)
+        limit = max(most, MOST_SIGMA * np.median(stated[mine]))
+        wrong += int(np.median(misses[mine]) > limit)
     if wrong and 3 * wrong > len(shown):
         raise DegenerateGeometry(
             f"images and scans contradict each other: for {wrong} of {len(shown)} placements the "
-            f"board lies more than {1000 * ROUGH_MISS:.0f} mm off where the images put it; check "
+            f"board lies more than {1000 * most:.0f} mm off where the images put it; check "
             "that images and scans carry the right numbers"
         )
 

@@ -17,8 +17,6 @@ from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_contradictions import (
     LARGEST_SHARE,
-    ROUGH_MISS,
-    face_misses,
     left_out_share,
     refuse_contradiction,
     without_contradictions,
@@ -29,6 +27,7 @@ from lrfcal_lib.solvers.joint_start import start_states, state_of
 
 # mean half squared residual; a start value this good is not searched further
 GOOD_START = 0.7
+ROUGH_MISS = 0.08  # metres, of a start value's boards from where images put them
 # of all that is left out: what it counts against a start value
 PENALTY = 16.0
 FEW_STEPS = 8  # of a minimisation that only has to show where it leads
@@ -66,34 +65,23 @@ def best_start(
     which ones are wrong.
     """
     data = gather(obs, levels)
-    tried = []
-    misses = []
+    tried: list[Start] = []
     for number, states in enumerate(start_states(obs, T0)):
         for state in states:
             if not unknowns.axis:
                 heads = (T0, obs.T_head_lrf, RigidTransform.identity())
                 known = next(head for head in heads if head is not None)
                 state = replace(state, head=pose_array(known))
-            rows = np.arange(len(state.boards))
-            misses.append(np.median(face_misses(state, data, state.boards, rows)))
             tried.append(agreeing_start(obs, state, data, unknowns))
         if min(start.badness for start in tried) < GOOD_START and (T0 is None or number):
             break
-    chosen = int(np.argmin([start.badness for start in tried]))
-    best = tried[chosen]
-    if misses[chosen] > ROUGH_MISS:
-        refuse_contradiction(best.kept, best.state)
+    best = min(tried, key=lambda start: start.badness)
+    refuse_contradiction(best.kept, best.state, ROUGH_MISS)
     if left_out_share(obs, best.left_out) > LARGEST_SHARE:
-        names = []
-        for problem in best.left_out[:8]:
-            name = str(problem.placement)
-            if problem.camera is not None:
-                name += f" in camera '{problem.camera}'"
-            names.append(name)
+        words = "; ".join(map(str, best.left_out[:8]))
         raise DegenerateGeometry(
             f"{len(best.left_out)} placements or images of {len(obs.placements)} placements "
-            f"contradict the others: images put boards elsewhere than scans ({', '.join(names)}); "
-            "check that images and scans carry the right numbers"
+            f"contradict the others ({words}); check that images and scans carry the right numbers"
         )
     return best
 

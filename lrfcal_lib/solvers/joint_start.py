@@ -4,7 +4,6 @@ the cameras turn.
 
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -35,8 +34,8 @@ def start_states(
     """Start values to choose from, made one by one: each with those of the cameras' other minima.
 
     From the closed form of the axis, from T0, from the stated platform, from an axis along x
-    through the mirror; with cameras from scan lines at the pitch of their images, then from whole
-    sweeps. Raises DegenerateGeometry when no placement gives the pose of a board.
+    through the mirror; with cameras from scan lines at the pitch of their images, or else from
+    whole sweeps. Raises DegenerateGeometry when no placement gives the pose of a board.
     """
     if len(obs.face_range) == 0:
         raise DegenerateGeometry(
@@ -48,14 +47,13 @@ def start_states(
             with suppress(DegenerateGeometry):
                 direct[camera] = _camera(obs, camera)
     heads = [_axis_from_cameras(obs, direct), T0, obs.T_head_lrf, RigidTransform.identity()]
-    ways = [direct, {}] if direct else [{}]
     possible = False
     reasons = []
-    for head, known in product(heads, ways):
+    for head in heads:
         if head is None:
             continue
         try:
-            states = _states(obs, head, known)
+            states = _states(obs, head, direct)
         except (DegenerateGeometry, np.linalg.LinAlgError) as error:
             reasons.append(str(error))
             continue
