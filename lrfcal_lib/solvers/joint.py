@@ -7,7 +7,6 @@ Equations (4) to (6) and (16) to (19) at once, every board's pose unknown and el
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.least_squares import solve
@@ -66,7 +65,7 @@ class JointSettings:
         A rough measurement of the axis with its standard deviations. It yields where the data
         contradict it.
     axis : bool
-        False: the axis is the one of T0 (or the stated one), and known.
+        False: the axis is the stated one, and known.
     sensor : sequence of str
         Unknowns of the sensor, of :data:`lrfcal_lib.solvers.joint_model.SENSOR`; others stay zero
         (softness: 0.2).
@@ -120,7 +119,6 @@ class JointSettings:
 
 def solve_joint(
     obs: JointObservations,
-    T0: RigidTransform | None = None,
     *,
     start: JointState | None = None,
     required: bool = True,
@@ -131,8 +129,6 @@ def solve_joint(
     Parameters
     ----------
     obs : JointObservations
-    T0 : RigidTransform, optional
-        Rough ``T_head_lrf``; closed forms are tried in any case.
     start : JointState, optional
         Skips the search for a start value.
     required : bool
@@ -155,7 +151,7 @@ def solve_joint(
     levels = Levels(sweep_sigma=chosen.sweep_sigma)
     if start is None:
         obs, lost = without_lost_placements(obs)
-        best = best_start(obs, unknowns, levels, T0)
+        best = best_start(obs, unknowns, levels)
         obs = best.kept
         start = best.state
         left_out += lost + best.left_out

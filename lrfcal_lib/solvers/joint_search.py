@@ -53,12 +53,7 @@ class Start:
     badness: float
 
 
-def best_start(
-    obs: JointObservations,
-    unknowns: Unknowns,
-    levels: Levels,
-    T0: RigidTransform | None = None,
-) -> Start:
+def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> Start:
     """The most promising start value.
 
     More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows
@@ -66,14 +61,13 @@ def best_start(
     """
     data = gather(obs, levels)
     tried: list[Start] = []
-    for number, states in enumerate(start_states(obs, T0)):
+    for states in start_states(obs):
         for state in states:
             if not unknowns.axis:
-                heads = (T0, obs.T_head_lrf, RigidTransform.identity())
-                known = next(head for head in heads if head is not None)
+                known = obs.T_head_lrf or RigidTransform.identity()
                 state = replace(state, head=pose_array(known))
             tried.append(agreeing_start(obs, state, data, unknowns))
-        if min(start.badness for start in tried) < GOOD_START and (T0 is None or number):
+        if min(start.badness for start in tried) < GOOD_START:
             break
     best = min(tried, key=lambda start: start.badness)
     refuse_contradiction(best.kept, best.state, ROUGH_MISS)

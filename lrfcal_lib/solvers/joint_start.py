@@ -28,12 +28,10 @@ VIEWS = 24  # a camera; closed forms do not get much better with more
 FEWEST_VIEWS = 5
 
 
-def start_states(
-    obs: JointObservations, T0: RigidTransform | None = None
-) -> Iterator[list[JointState]]:
+def start_states(obs: JointObservations) -> Iterator[list[JointState]]:
     """Start values to choose from, made one by one: each with those of the cameras' other minima.
 
-    From the closed form of the axis, from T0, from the stated platform, from an axis along x
+    From the closed form of the axis, from the stated platform, from an axis along x
     through the mirror; with cameras from scan lines at the pitch of their images, or else from
     whole sweeps. Raises DegenerateGeometry when no placement gives the pose of a board.
     """
@@ -46,7 +44,7 @@ def start_states(
         if mount == "head":
             with suppress(DegenerateGeometry):
                 direct[camera] = _camera(obs, camera)
-    heads = [_axis_from_cameras(obs, direct), T0, obs.T_head_lrf, RigidTransform.identity()]
+    heads = [_axis_from_cameras(obs, direct), obs.T_head_lrf, RigidTransform.identity()]
     possible = False
     reasons = []
     for head in heads:
