@@ -71,7 +71,7 @@ MISSING = {
         lambda s: np.where(s.on, np.nan, s.sweep.ranges),
     ),
     "seen: no flat": (scene, lambda s: np.random.default_rng(0).uniform(1, 90, s.on.shape)),
-    r"seen: 0\.00 m2": (noisy_triangle, lambda s: np.where(s.on, np.nan, shelf(s))),
+    "on 1 of 161 scan lines": (noisy_triangle, lambda s: np.where(s.on, np.nan, shelf(s))),
     r"seen: 0\.5\d m2": (
         lambda: replace(scene(wall=None), board=TRIANGLE),
         lambda s: s.sweep.ranges,

@@ -39,6 +39,8 @@ NEIGHBOURS = 0.3  # metres; points that may span a plane together
 TRIALS = 200  # of random sample consensus
 SAMPLE = 1500  # points that it looks at
 REFINE_ROUNDS = 3
+# that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
+FEWEST_LINES = 4
 LEAST_LENGTH = 0.3  # of a scan line on a board, in units of the root of its least area
 
 
@@ -172,11 +174,13 @@ def planar_surface(
             if upright is None:
                 part = _trimmed(part, points, limits)
             area, length = plane_size(points[part.mask], part.normal)
-            fits = limits.hold(area, length)
+            lines = int(part.mask.any(axis=1).sum())
+            fits = limits.hold(area, length) and lines >= min(FEWEST_LINES, len(ranges))
             if upright is not None:
                 fits = LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest
             if not fits:
-                rejected.append(f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m")
+                size = f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m"
+                rejected.append(f"{size} on {lines} of {len(ranges)} scan lines")
             elif reach < best_reach:
                 best = part
                 best_reach = reach

@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt
 from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.geometry import tilt
+from lrfcal_lib.model.geometry import polar_to_points, tilt
 from lrfcal_lib.session.lms2xx_codec import MODES, REASONS, encode_values
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.scene import World, need
@@ -19,7 +19,6 @@ NOT_VALID, DAZZLED, WEAK = (
 # deg, 1/100 deg: of telegram 0x3B
 VARIANTS = ((100, 25), (100, 50), (100, 100), (180, 50), (180, 100))
 UNITS = {0.001: "mm", 0.01: "cm"}  # by metres a count
-RAYS_AT_ONCE = 1 << 19
 
 
 @dataclass(frozen=True)
@@ -238,14 +237,10 @@ def ideal_readings(
 
 def _sub_rays(beam, bearings):
     """Origins and unit directions of the sub-rays of spots in the LRF frame, shape (n, K, 3)."""
-    c = np.cos(bearings)
-    s = np.sin(bearings)
-    zero = np.zeros_like(c)
     right, over = np.split(spot_pattern(beam.rings), 2, axis=1)
-    across = np.stack([-s, c, zero], axis=-1)
     up = np.array([0.0, 0.0, 1.0])
-    shift = right * across[:, None] + over * up
-    middle = np.stack([c, s, zero], axis=-1)
+    middle = polar_to_points(1.0, bearings)
+    shift = right * np.cross(up, middle)[:, None] + over * up
     directions = middle[:, None] + beam.divergence / 2 * shift
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     return beam.spot_exit / 2 * shift, directions
@@ -300,16 +295,10 @@ def scan(
         Words of 13 bits.
     """
     bearings, pitch = np.broadcast_arrays(beam.bearings(), pitch)
-    shape = bearings.shape
-    bearings = bearings.ravel()
-    pitch = pitch.ravel()
-    step = max(1, RAYS_AT_ONCE // beam.rays)
-    parts = []
-    for start in range(0, len(bearings), step):
-        rows = slice(start, start + step)
-        parts.append(ideal_readings(beam, world, bearings[rows], pitch[rows], T_head_lrf))
-    ideal = Readings(
-        *(np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True))
-    )
+    lines = [
+        ideal_readings(beam, world, *line, T_head_lrf)
+        for line in zip(bearings, pitch, strict=True)
+    ]
+    ideal = Readings(*map(np.stack, zip(*lines, strict=True)))
     ranges, reasons = measured(beam, ideal, rng)
     return encode_values(ranges, unit=beam.unit_name, reasons=reasons)

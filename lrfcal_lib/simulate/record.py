@@ -302,10 +302,8 @@ def _add_placements(writer, setup, placements, truth):
         arrived = np.round(began + took + REPLY_TIME, 4)
         writer.add_telegrams(placement.number, telegrams, lines.measured, arrived)
         for stops, times in ((images, shot_at), (lines, began)):
-            commanded = np.degrees(stops.commanded)
-            measured = np.degrees(stops.measured)
-            for t, c, m in zip(times, commanded, measured, strict=True):
-                log.append(f"{t:.4f},{c:.4f},{m:.4f}")
+            rows = [times, np.degrees(stops.commanded), np.degrees(stops.measured)]
+            log += [",".join(f"{value:.4f}" for value in row) for row in np.transpose(rows)]
         truth["sweeps"][placement.number] = {"pitch_rad": lines.true.tolist()}
         clock = float(began[-1] + took + pause)
     return log
