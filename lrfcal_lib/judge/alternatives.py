@@ -17,18 +17,19 @@ from lrfcal_lib.model.geometry import (
     axis_of,
     transform_difference,
 )
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.solvers.joint_model import SENSOR
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
-MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement, whatever it does
 # so many are exceeded by chance once in 20 times; enough where it does harm:
 PREFERRED = 2.0
 MOVED = 2.0  # standard deviations by which what is handed over would move
 HELD = 0.001  # metres, of a range offset that is asked whether bearings may stand for it
+LARGE_SHARE = 0.9  # of a standard deviation, due to the angular step
 INSTEAD = 6.0  # standard deviations beyond which they do
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
@@ -88,15 +89,6 @@ def _views_and_outline(obs, s):
     return replace(_views(obs, s), corners=obs.corners * (1 + s))
 
 
-def _bearings(obs, s):
-    """Bearings stretched by s about the middle."""
-    return replace(
-        obs,
-        face_bearing=MIDDLE + (obs.face_bearing - MIDDLE) * (1 + s),
-        beam_bearing=MIDDLE + (obs.beam_bearing - MIDDLE) * (1 + s),
-    )
-
-
 def _lag(obs, s):
     """The pitch of scan lines later by s (radians) in the sense of the sweep."""
     return replace(
@@ -127,7 +119,7 @@ ALTERNATIVES = {
         ),
     ),
     Kind.BEARINGS: Alternative(
-        _bearings,
+        JointObservations.stretched,
         "bearings are {size} +- {sigma} % too {sign}",
         "check the angular step that session.json states",
         ("small", "large"),
@@ -262,12 +254,9 @@ def doubt_about(kind, alternative, solution, admitted_offset):
     sigma = float(np.sqrt(max(noise, scatter)))
 
     handed = [i for i, name in enumerate(names) if name not in SENSOR]
-    moves = (
-        covariance[handed, -1]
-        / max(noise, 1e-300)
-        * value
-        / solution.solution.trusted_sigma[handed]
-    )
+    # what the accuracy of the angular step may do must not hide that it is wrong
+    spread = np.sqrt(solution.solution.trusted_sigma**2 - solution.step**2)[handed]
+    moves = covariance[handed, -1] / max(noise, 1e-300) * value / spread
     words = alternative.words.format(
         size=f"{abs(value) * alternative.unit:.2g}",
         sigma=f"{sigma * alternative.unit:.2g}",
@@ -305,24 +294,22 @@ def _certain(doubt, stated):
     return doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
 
 
-def step_not_told(solution, admitted_offset, stated=ALTERNATIVES):
-    """In words, where the data cannot tell whether the angular step is stated rightly and what is
-    handed over hangs on it; else ''.
+def step_words(solution: JointSolution) -> str:
+    """In words, where the accuracy of the angular step makes up much of the expected errors; else
+    ''.
 
-    With cameras on the head, a step that is off and a range offset that the maker admits stretch
-    the cloud nearly alike.
+    Parameters
+    ----------
+    solution
     """
-    told = weigh(solution, admitted_offset, {"bearings": stated["bearings"]})
-    for doubt in told:
-        moved = doubt.moved * doubt.sigma / abs(doubt.value)
-        if moved > MOVED:
-            return (
-                "The angular step is taken as stated: these data determine it only to "
-                f"{100 * doubt.sigma:.1f} %. An error of that size would move axis or cameras by "
-                f"{moved:.1f} of their standard deviations. Boards at more different distances "
-                "determine it better."
-            )
-    return ""
+    share = np.max(np.abs(solution.step) / solution.solution.trusted_sigma)
+    if share < LARGE_SHARE:
+        return ""
+    return (
+        f"The angular step is taken to be known to {100 * solution.data.levels.step_sigma:.2g} %, "
+        "which makes up most of the errors of axis or cameras: state angular_step_relative in "
+        "session.json where it is known better."
+    )
 
 
 def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):

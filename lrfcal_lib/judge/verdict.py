@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.rig import joint_rig
-from lrfcal_lib.judge.alternatives import places_of_cameras, step_not_told
+from lrfcal_lib.judge.alternatives import places_of_cameras, step_words
 from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief, no_if
 from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_placement
@@ -209,7 +209,6 @@ def judge(
         findings.append(Finding(no_if(fault.severe), fault.kind, fault.words))
     findings += lens_findings(prepared)
     doubt = 0.0
-    contradictions: list[Finding] = []
     # also where the joint estimate is not handed over: a wrong size may be why
     if joint is not None and not explained(faults):
         contradictions, doubt = contradicts_stated(joint)
@@ -231,11 +230,11 @@ def judge(
         kept = [reason for reason in judged.reasons if reason.kind != Kind.EXCLUDED]
         judged = replace(judged, reasons=tuple(kept))
     findings += sides_elsewhere(prepared)
-    notes = _notes(calibration, method, lost.note, not contradictions)
+    notes = _notes(calibration, method, lost.note)
     return replace(judged.because(findings), notes=notes)
 
 
-def _notes(calibration, method, lost, as_stated):
+def _notes(calibration, method, lost):
     """What is handed over, where the cameras are, what was left out, and what is not known."""
     axis = calibration.platform.axis_with(method)
     notes = [f"Handed over: the cameras of the method '{method}' and the axis '{axis}'."]
@@ -243,9 +242,7 @@ def _notes(calibration, method, lost, as_stated):
         return tuple(filter(None, [*notes, lost]))
     solution = calibration.joint.solution
     notes += [*places_of_cameras(solution), lost]
-    if as_stated:
-        admitted = calibration.prepared.session.lrf.admitted_offset
-        notes.append(step_not_told(solution, admitted))
+    notes.append(step_words(solution))
     notes.append(_scatter_note(len(solution.boards)))
     return tuple(filter(None, notes))
 

@@ -40,7 +40,7 @@ from lrfcal_lib.solvers.joint_model import (
 from lrfcal_lib.solvers.joint_noise import estimate_noise, settled
 from lrfcal_lib.solvers.joint_residuals import MOST_STEPS, minimum, named_blocks
 from lrfcal_lib.solvers.joint_search import best_start, coarse
-from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words, warnings_of
+from lrfcal_lib.solvers.joint_solution import RANK, JointSolution, joint_words, warnings_of
 
 # what counts as a change by one, beside rad and m
 SCALES = {
@@ -53,6 +53,7 @@ FIRST_STEPS = 60
 NOISE_ROUNDS = 10
 ROUND_STEPS = 10
 LAST_STEP = 1e-4  # standard deviations: a shorter step ends the whole
+STEP = 1e-4  # of the numeric derivative by the angular step, a fraction of it
 # a direction whose standard deviation exceeds this (rad, m) is called unobservable
 UNSEEN = 0.5
 
@@ -80,6 +81,9 @@ class JointSettings:
         Their expected standard deviations, radians and fraction.
     lapse : float
         Share of edge beams expected to say nothing.
+    step_sigma : float
+        Standard deviation of the angular step of the beams, a fraction of it. It is no unknown; the
+        covariance has what it does to the result.
     noise : {'stated', 'estimate'}
         Estimate the noise levels (ranges, images, pitch, sides, repetition of errors among
         neighbours) from the residuals, and leave out placements and images that contradict all
@@ -98,6 +102,7 @@ class JointSettings:
     sweep: str = "none"
     sweep_sigma: tuple[float, float] = Levels.sweep_sigma
     lapse: float = 0.0
+    step_sigma: float = 0.0
     noise: str = "stated"
 
     def __post_init__(self):
@@ -161,7 +166,7 @@ def solve_joint(
         raise DegenerateGeometry("no placement to calibrate with")
     obs, left_out = without_blind_cameras(obs, required)
     unknowns = chosen.unknowns(obs)
-    levels = Levels(sweep_sigma=chosen.sweep_sigma)
+    levels = Levels(sweep_sigma=chosen.sweep_sigma, step_sigma=chosen.step_sigma)
     coarsely_settled = False
     if start is None:
         obs, lost = without_lost_placements(obs)
@@ -273,8 +278,33 @@ def finished(obs, state, data, unknowns, required):
         misfit=dict(zip(obs.placements.tolist(), squares.tolist(), strict=True)),
         lens=lens.covariance,
         lens_scale=lens.scatter,
+        step=np.zeros(unknowns.shared),
     )
+    solution = with_step_error(solution)
     return replace(solution, warnings=warnings_of(solution))
+
+
+def with_step_error(solution: JointSolution) -> JointSolution:
+    """The solution with what errors of the angular step do to it in its covariances."""
+    sigma = solution.data.levels.step_sigma
+    if sigma == 0:
+        return solution
+    changed = gather(solution.observations.stretched(STEP), solution.data.levels)
+    here = solution.score()
+    pull = replace(solution, data=changed).score().gradient - here.gradient
+    free = np.linalg.pinv(here.information.sum(axis=0), rcond=RANK, hermitian=True)
+    moved = -free @ pull.sum(axis=0) / STEP * sigma
+    spread = np.outer(moved, moved)
+    estimate = solution.solution
+    by_placements = estimate.covariance_placements
+    if by_placements is not None:
+        by_placements = by_placements + spread
+    estimate = replace(
+        estimate,
+        covariance=estimate.covariance + spread,
+        covariance_placements=by_placements,
+    )
+    return replace(solution, solution=estimate, step=moved)
 
 
 def parameters_of(state: JointState, unknowns: Unknowns) -> np.ndarray:
