@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
@@ -18,13 +17,11 @@ from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_p
 from lrfcal_lib.judge.recording_faults import explained, recording_faults
 from lrfcal_lib.judge.statements import contradicts_stated
 from lrfcal_lib.judge.uncertainty import (
-    COLUMNS,
-    Chain,
     chain_of,
     point_sigma,
     projection_sigma,
-    range_noise,
     root_mean_square,
+    uncertainty_of,
 )
 from lrfcal_lib.judge.weaknesses import (
     FEW,
@@ -35,7 +32,7 @@ from lrfcal_lib.judge.weaknesses import (
     sides_elsewhere,
 )
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint_solution import JointSolution
@@ -271,13 +268,9 @@ def verdict(
     field_of_view
         Bearings that the LRF measures, radians.
     """
-    rig = joint_rig(solution, models)
-    cameras = {camera: chain_of(rig, camera) for camera in rig.cameras}
-    pitch = np.concatenate(
-        [solution.observations.face_pitch, solution.observations.beam_pitch]
-    )
-    ways = Ways(chain_of(rig), cameras, pitch)
-    judged = _expected(ways.doubted(doubt), models, range_noise(rig))
+    obs = solution.observations
+    pitch = np.concatenate([obs.face_pitch, obs.beam_pitch])
+    judged = _expected(joint_rig(solution, models), pitch, doubt)
     judged = judged.because(diagnose(solution))
     if not suggest:
         return judged
@@ -288,47 +281,24 @@ def verdict(
     return replace(judged, suggestion=suggestion)
 
 
-@dataclass(frozen=True)
-class Ways:
-    """How well a calibration knows the ways of beams to the cloud and to images.
-
-    Attributes
-    ----------
-    cloud : Chain
-    cameras : dict of str to Chain
-    pitch : ndarray, shape (n,)
-        Of the recorded scan lines, radians.
+def _expected(rig, pitch, doubt):
+    """A Verdict by the errors that are to be expected of a rig over the recorded pitch (n,), not a
+    narrow strip, where all ranges may be wrong by `doubt` (metres) beside what is known.
     """
-
-    cloud: Chain
-    cameras: dict[str, Chain]
-    pitch: np.ndarray
-
-    def doubted(self, doubt: float) -> "Ways":
-        """The same where all ranges may be wrong by so many metres beside what is known."""
-        cameras = {camera: chain.doubted(doubt) for camera, chain in self.cameras.items()}
-        return Ways(self.cloud.doubted(doubt), cameras, self.pitch)
-
-
-def _expected(ways, models, noise):
-    """A Verdict by the errors that are to be expected over the recorded pitch, not a narrow strip.
-
-    `noise` is that of single ranges, metres.
-    """
-    low = high = 0.0
-    if len(ways.pitch):
-        low, high = ways.pitch.min(), ways.pitch.max()
-    middle = (low + high) / 2
+    low = pitch.min(initial=np.inf)
+    high = pitch.max(initial=-np.inf)
+    middle = (low + high) / 2 if len(pitch) else 0.0
     field = (min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD))
     middle = sum(field) / 2
     pitches = np.linspace(*field, PITCHES)
-    cloud, sweeps = point_sigma(ways.cloud, BEARINGS, pitches, DISTANCES, reference=middle)
-    images = {
-        camera: projection_sigma(
-            chain, models[camera], DISTANCES, PIXELS, image_pitch=middle, pitches=field
+    chain = chain_of(rig).doubted(doubt)
+    cloud, sweeps = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
+    images = {}
+    for name, camera in rig.cameras.items():
+        chain = chain_of(rig, name).doubted(doubt)
+        images[name] = projection_sigma(
+            chain, camera.model, DISTANCES, PIXELS, image_pitch=middle, pitches=field
         )
-        for camera, chain in ways.cameras.items()
-    }
     errors = {}
     for i, distance in enumerate(DISTANCES):
         pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
@@ -338,7 +308,7 @@ def _expected(ways, models, noise):
         YES,
         (),
         errors,
-        range_noise_mm=1000 * float(noise),
+        range_noise_mm=1000 * uncertainty_of(rig).range_noise,
         sweep_mm=1000 * root_mean_square(sweeps[DISTANCES.index(WORKING)]),
     )
     large = errors[WORKING].words(POOR_MM, POOR_PX)
@@ -394,9 +364,8 @@ def _without_joint(calibration, method, doubt):
     for (camera, name), solution in calibration.solutions.items():
         if name == method:
             solved[camera] = solution
-    ways = _ways_of_platform(calibration, solved)
-    noise = np.median([board.sigma_range for board in prepared.scans.values()])
-    judged = _expected(ways.doubted(doubt), prepared.models, noise)
+    pitch = np.concatenate([scan.sweep.pitch for scan in prepared.scans.values()])
+    judged = _expected(calibration.rig(method), pitch, doubt)
     findings = [_not_joint(calibration)]
     fewest = min(
         len(calibration.observations[camera, "half_step"].all_placements)
@@ -438,25 +407,3 @@ def _not_joint(calibration):
     return Finding(
         answer, Kind.HANDED_OVER, f"the joint estimate is not handed over ({why})"
     )
-
-
-def _ways_of_platform(calibration, solved):
-    """The Ways of cameras that were calibrated one by one (Solutions by name)."""
-    prepared = calibration.prepared
-    platform = calibration.platform
-    head = pose_array(platform.transform("combined"))
-    unseen = np.zeros((0, len(COLUMNS)))
-    sweep_sigma = (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)
-    # the range offset of the cloud may be what the maker admits
-    of_axis = platform.axes["combined"].covariance
-    offset = np.diag([prepared.session.lrf.admitted_offset**2, 0.0, 0.0])
-    covariance = block_diag(of_axis, np.zeros((6, 6)), offset)
-    cloud = Chain(head, None, True, (covariance,), unseen, sweep_sigma)
-    cameras = {}
-    for camera, solution in solved.items():
-        covariance = block_diag(of_axis, solution.trusted[:6, :6], np.zeros((3, 3)))
-        on_head = prepared.session.cameras[camera].mount == "head"
-        pose = pose_array(solution.transform)
-        cameras[camera] = Chain(head, pose, on_head, (covariance,), unseen, sweep_sigma)
-    pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
-    return Ways(cloud, cameras, pitch)
