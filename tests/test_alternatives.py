@@ -10,13 +10,10 @@ from scipy.spatial.transform import Rotation
 from shared import campaign
 
 from lrfcal_lib.evaluate.monte_carlo import state_errors
-from lrfcal_lib.judge import alternatives
 from lrfcal_lib.judge.alternatives import (
     ALTERNATIVES,
-    HELD,
     alternatives_of,
     doubtful,
-    not_an_offset,
     step_words,
     weigh,
 )
@@ -104,23 +101,9 @@ def test_an_outline_that_the_images_measured_is_no_statement():
 
 @pytest.mark.parametrize(("value", "mount"), [(0.03, "head"), (-0.03, "platform")])
 def test_an_angular_step_that_is_off_is_no_range_offset(value, mount):
-    solution = solved(
-        7, lambda obs: ALTERNATIVES["bearings"].change(obs, value), mount=mount
-    )
-    found = not_an_offset(solution, ADMITTED)
-    assert found.value == pytest.approx(-value, abs=0.25 * abs(value) + 5 * found.sigma)
-    assert (
-        "check the angular step" in found.words
-        and "instead of a range offset" in found.words
-    )
-
-
-@pytest.mark.parametrize(("offset", "mount"), [(0.03, "platform"), (0.06, "head")])
-def test_a_range_offset_is_no_angular_step(offset, mount):
-    solution = solved(
-        7, lambda obs: replace(obs, face_range=obs.face_range + offset), mount=mount
-    )
-    assert not_an_offset(solution, ADMITTED) is None
+    best = doubtful(solved(7, lambda obs: obs.stretched(value), mount=mount), ADMITTED)[0]
+    assert best.kind == "bearings" and "check the angular step" in best.words
+    assert best.value == pytest.approx(-value, abs=5 * best.sigma)
 
 
 @pytest.mark.parametrize(("mount", "least"), [("head", 1.5), ("platform", 0.5)])
@@ -142,21 +125,6 @@ def test_what_errors_of_the_step_do_is_what_another_estimate_finds(mount, least)
 def test_a_step_that_makes_up_most_of_the_errors_is_said(step_sigma, said):
     words = step_words(solved(1, step_sigma=step_sigma))
     assert ("angular_step_relative" in words) is said
-
-
-def test_what_bearings_explain_alone_must_not_be_contradicted_where_both_are_free(
-    monkeypatch,
-):
-    """An offset of 18 mm that a maker admits looked like bearings 1.4 % too large in 2 of 24 honest sessions."""
-    solution = solved(7, lambda obs: ALTERNATIVES["bearings"].change(obs, 0.03))
-    told = weigh(solution, ADMITTED)
-    free = next(doubt for doubt in told if doubt.kind == "bearings")
-    away = replace(free, value=free.value + 0.02, sigma=0.004)
-    answers = {ADMITTED: [away], HELD: weigh(solution, HELD)}
-    monkeypatch.setattr(
-        alternatives, "weigh", lambda solution, admitted, stated: answers[admitted]
-    )
-    assert not_an_offset(solution, ADMITTED) is None
 
 
 def fisheye_views(field_deg, count, rng, size=(640, 480)):

@@ -28,9 +28,7 @@ ASKED = 4.0  # standard deviations beyond which the data contradict a statement,
 # so many are exceeded by chance once in 20 times; enough where it does harm:
 PREFERRED = 2.0
 MOVED = 2.0  # standard deviations by which what is handed over would move
-HELD = 0.001  # metres, of a range offset that is asked whether bearings may stand for it
 LARGE_SHARE = 0.9  # of a standard deviation, due to the angular step
-INSTEAD = 6.0  # standard deviations beyond which they do
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 # of a camera from its guess
@@ -283,15 +281,11 @@ def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
     asked = []
     for doubt in weigh(solution, admitted_offset, stated):
         harmful = doubt.exceeds(PREFERRED) and doubt.moved > MOVED
-        certain = doubt.kind not in faint and _certain(doubt, stated)
-        if abs(doubt.value) < stated[doubt.kind].reach and (harmful or certain):
+        certain = doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
+        asks = harmful or (certain and doubt.kind not in faint)
+        if asks and abs(doubt.value) < stated[doubt.kind].reach:
             asked.append(doubt)
     return [doubt for doubt in asked if doubt.ratio > AS_GOOD * asked[0].ratio]
-
-
-def _certain(doubt, stated):
-    """Whether the data contradict a statement beyond chance, by as much as is worth a word."""
-    return doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
 
 
 def step_words(solution: JointSolution) -> str:
@@ -309,31 +303,6 @@ def step_words(solution: JointSolution) -> str:
         f"The angular step is taken to be known to {100 * solution.data.levels.step_sigma:.2g} %, "
         "which makes up most of the errors of axis or cameras: state angular_step_relative in "
         "session.json where it is known better."
-    )
-
-
-def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):
-    """The Doubt about bearings where they explain the data far better than the range offset found
-    does, or None.
-
-    Both stretch the cloud sideways, so that each can stand for the other; bearings are asked with
-    the offset held. Where both are free, what the data say of bearings must not contradict it.
-    """
-    offset = solution.sensor["range_offset"]
-    sigma = solution.sigma.get("range_offset")
-    if sigma is None or abs(offset) < ASKED * sigma:
-        return None
-    best = weigh(solution, HELD, stated)[0]
-    far_better = best.ratio > max((offset / sigma) ** 2 / AS_GOOD, INSTEAD**2)
-    if best.kind != Kind.BEARINGS or not far_better:
-        return None
-    for free in weigh(solution, admitted_offset, stated):
-        if free.kind == Kind.BEARINGS and abs(best.value - free.value) > ASKED * free.sigma:
-            return None
-    if best.moved < MOVED and not _certain(best, stated):
-        return None
-    return replace(
-        best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)"
     )
 
 
