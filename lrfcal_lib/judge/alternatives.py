@@ -404,23 +404,3 @@ def _seat(solution, camera):
 
 def _apart(angle, distance):
     return f"{np.degrees(angle):.1f} deg and {1000 * distance:.0f} mm"
-
-
-def places_of_cameras(solution: JointSolution) -> list[str]:
-    """Where the cameras stand, in words: who mixed up their folders sees it here.
-
-    Parameters
-    ----------
-    solution
-    """
-    sentences = []
-    for camera in solution.transforms:
-        x, y, z = 1000 * _seat(solution, camera)
-        side = by_sign(x, "right", "left")
-        before = by_sign(y, "in front of", "behind")
-        above = by_sign(z, "above", "below")
-        sentences.append(
-            f"Seen along the middle beam, camera '{camera}' is {abs(x):.0f} mm to the {side} of, "
-            f"{abs(y):.0f} mm {before} and {abs(z):.0f} mm {above} the range finder."
-        )
-    return sentences

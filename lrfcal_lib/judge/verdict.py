@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.rig import joint_rig
-from lrfcal_lib.judge.alternatives import places_of_cameras, step_words
+from lrfcal_lib.judge.alternatives import step_words
 from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief, no_if
 from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_placement
@@ -117,9 +117,6 @@ class Verdict:
         empty where nothing is handed over.
     range_noise_mm : float
         Of every single point, on top.
-    sweep_mm : float
-        What the pitch error that every sweep has of its own adds to the cloud at 2 m; 0 where not
-        estimated.
     suggestion : Suggestion or None
     no_suggestion : str
         Why there is none.
@@ -131,7 +128,6 @@ class Verdict:
     reasons: tuple[Finding, ...]
     errors: dict[float, ExpectedError]
     range_noise_mm: float
-    sweep_mm: float
     suggestion: Suggestion | None = None
     no_suggestion: str = ""
     notes: tuple[str, ...] = ()
@@ -161,11 +157,6 @@ class Verdict:
                 "These errors are single standard deviations of the calibration. They include "
                 "errors of the model as far as placements disagree about them. Each range has "
                 f"{brief(self.range_noise_mm)} mm of noise of its own."
-            )
-        if self.sweep_mm:
-            sentences.append(
-                f"Errors of the pitch of single sweeps contribute {brief(self.sweep_mm)} mm to the "
-                f"error of the cloud at {WORKING:g} m."
             )
         sentences.append(
             self.suggestion.sentence() if self.suggestion else self.no_suggestion
@@ -238,9 +229,7 @@ def _notes(calibration, method, lost):
     if method != "joint" or calibration.joint is None:
         return tuple(filter(None, [*notes, lost]))
     solution = calibration.joint.solution
-    notes += [*places_of_cameras(solution), lost]
-    notes.append(step_words(solution))
-    notes.append(_scatter_note(len(solution.boards)))
+    notes += [lost, step_words(solution), _scatter_note(len(solution.boards))]
     return tuple(filter(None, notes))
 
 
@@ -292,7 +281,7 @@ def _expected(rig, pitch, doubt):
     middle = sum(field) / 2
     pitches = np.linspace(*field, PITCHES)
     chain = chain_of(rig).doubted(doubt)
-    cloud, sweeps = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
+    cloud = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
     images = {}
     for name, camera in rig.cameras.items():
         chain = chain_of(rig, name).doubted(doubt)
@@ -309,7 +298,6 @@ def _expected(rig, pitch, doubt):
         (),
         errors,
         range_noise_mm=1000 * uncertainty_of(rig).range_noise,
-        sweep_mm=1000 * root_mean_square(sweeps[DISTANCES.index(WORKING)]),
     )
     large = errors[WORKING].words(POOR_MM, POOR_PX)
     if not large:
@@ -341,7 +329,7 @@ def _refused(calibration, findings):
     if prepared.problems:
         lost = [str(problem) for problem in prepared.problems]
         notes = (f"Left out: {len(lost)} ({'; '.join(lost)}).",)
-    judged = Verdict(NO, (), {}, np.nan, 0.0, no_suggestion=RECORD, notes=notes)
+    judged = Verdict(NO, (), {}, np.nan, no_suggestion=RECORD, notes=notes)
     return judged.because([*findings, refused])
 
 
@@ -388,7 +376,7 @@ def _without_joint(calibration, method, doubt):
     unknown = calibration.platform.problem("combined")
     if unknown is not None and sweeps:
         findings.append(Finding(NO, Kind.FAR_FROM_STATED, unknown.words))
-    return replace(judged.because(findings), sweep_mm=0.0)
+    return judged.because(findings)
 
 
 def _not_joint(calibration):
