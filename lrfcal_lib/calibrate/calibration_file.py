@@ -127,6 +127,7 @@ class LrfWritten(BaseModel):
     range_resolution: FiniteFloat
     max_range: Unbounded
     systematic_error: FiniteFloat | None
+    step_error: FiniteFloat | None = None
     spot_exit: FiniteFloat | None
     spot_divergence: FiniteFloat | None
 

@@ -361,6 +361,7 @@ def joint_settings(prepared: Prepared, observations: JointObservations) -> dict:
         "lapse": LAPSE,
         "sides": sides >= LEAST_SIDES,
         "axis": sweeps,
+        "step_sigma": session.lrf.step_sigma,
     }
     if noise.offset:
         settings["sweep"] = "offset_stretch" if noise.stretch else "offset"

@@ -290,24 +290,18 @@ class LeftOut:
     @property
     def words(self) -> str:
         """The placements that are left out, counted, with their reasons."""
-        why = ", ".join(
-            f"{placement} ({words})" for placement, words in self.placements.items()
-        )
-        return f"{len(self.placements)} of {self.recorded} placements are left out: {why}"
+        why = [f"{placement} ({words})" for placement, words in self.placements.items()]
+        return f"{len(why)} of {self.recorded} placements are left out: {', '.join(why) or 'none'}"
 
     @property
     def note(self) -> str:
         """What became of all placements, as far as it is no finding."""
         notes = []
-        if not self.placements:
-            notes.append(f"All {self.recorded} placements were used.")
-        elif not self.many:
+        if not self.many:
             notes.append(f"{self.words}.")
         if self.parts:
             parts = "; ".join(self.parts)
-            notes.append(
-                f"Parts left out beside whole placements: {len(self.parts)} ({parts})."
-            )
+            notes.append(f"Parts left out beside them: {len(self.parts)} ({parts}).")
         return " ".join(notes)
 
 
