@@ -30,9 +30,8 @@ class View:
         True one of the head, radians.
     T_camera_platform : RigidTransform
     image : ndarray of uint8, shape (h, w, 3)
-    columns : ndarray of int, shape (15,)
-        Where the chain's columns, the sweep's pitch and the image's stand among the unknowns; -1
-        for none.
+    columns : ndarray of int, shape (14,)
+        Where the chain's columns and the sweep's pitch stand among the unknowns; -1 for none.
     count : int
         Of unknowns.
     """
@@ -62,14 +61,11 @@ class View:
         return cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
 
     def links(self, by_link, by_pitch):
-        """Derivatives (..., 3, 15) of points by the links of the chain, the pitch of the sweep, and
-        that of the image.
-        """
-        by_both = [by_pitch[..., None], -by_pitch[..., None] * self.chain.on_head]
-        return np.concatenate([by_link, *by_both], axis=-1)
+        """Derivatives (..., 3, 14) of points by the links of the chain and the sweep's pitch."""
+        return np.concatenate([by_link, by_pitch[..., None]], axis=-1)
 
     def spread(self, by_link):
-        """Derivatives (..., 15) by links as those by all unknowns (..., c)."""
+        """Derivatives (..., 14) by links as those by all unknowns (..., c)."""
         out = np.zeros((*by_link.shape[:-1], self.count))
         known = self.columns >= 0
         out[..., self.columns[known]] = by_link[..., known]
@@ -80,7 +76,7 @@ class View:
 class Pull:
     """What observations say about the unknowns of a rig.
 
-    These are those of its uncertainty, then the pitch of the sweep, then that of every image.
+    These are those of its uncertainty, then the pitch of sweeps.
 
     Attributes
     ----------
@@ -109,14 +105,11 @@ def views_of_station(session: Session, rig: CalibratedRig, placement: int) -> li
     """
     records = [r for r in session.images(placement=placement) if r.camera in rig.cameras]
     names = rig.uncertainty.names
-    recorded = [record.pitch for record in records]
-    stops, stop = np.unique(np.round(np.nan_to_num(recorded), 5), return_inverse=True)
     views = []
     taken = set()
-    for record, number in zip(records, stop, strict=True):
+    for record in records:
         camera = rig.cameras[record.camera]
         pitch = record.pitch * (1 + rig.corrections.pitch_scale)
-        own = [len(names), len(names) + 1 + number]
         if camera.mount == "platform":
             pitch = 0.0
         # a camera on the base sees the same again
@@ -130,8 +123,8 @@ def views_of_station(session: Session, rig: CalibratedRig, placement: int) -> li
             pitch=float(pitch),
             T_camera_platform=rig.camera_at(record.camera, pitch),
             image=session.read_image(record),
-            columns=np.append(columns_of(names, record.camera), own),
-            count=len(names) + 1 + len(stops),
+            columns=np.append(columns_of(names, record.camera), len(names)),
+            count=len(names) + 1,
         )
         views.append(view)
     return views
