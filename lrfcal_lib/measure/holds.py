@@ -96,7 +96,8 @@ class Shift:
         chance = f"by chance with a probability of {self.p_value:.2g}"
         turn, sigma = np.degrees([self.change, self.sigma])
         if self.camera is None:
-            return f"{self.name}, if only it slipped: by {turn[0]:+.2f} +- {sigma[0]:.2f} deg; {chance}"
+            amount = f"by {turn[0]:+.2f} +- {sigma[0]:.2f} deg"
+            return f"{self.name}, if only it slipped: {amount}; {chance}"
         (right, down), (of_right, of_down) = self.pixels, self.pixels_sigma
         return (
             f"{self.name}, if only it moved: image {right:+.2f} +- {of_right:.2f} px to the right, "
