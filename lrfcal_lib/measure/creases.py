@@ -10,12 +10,9 @@ import numpy as np
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, columns_of
-from lrfcal_lib.judge.uncertainty import beams_to, carried
 from lrfcal_lib.measure.features import Feature
-from lrfcal_lib.measure.pulls import Pull, View, pull_of_groups
+from lrfcal_lib.measure.pulls import Pull, View, poses_of, pull_of_groups
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
-from lrfcal_lib.model.geometry import POSE_NAMES
 from lrfcal_lib.preprocess.edges_in_image import (
     ACROSS_STEP_PX,
     FULL_CONTRAST,
@@ -30,14 +27,11 @@ BESIDE = 0.1  # metres from a crease, within which both surfaces have readings
 STEP = 0.05  # metres between places of a crease
 MOST = 100_000  # creases of a station
 FEWEST = 4  # places of a crease
-POSE = [COLUMNS.index(name) for name in POSE_NAMES]
 REACH = 0.016  # of the image's width: 0.9 deg of a camera that sees 56 deg
 ALONG = 5  # pixels of a profile that are averaged
 CANDIDATES = 6  # edges of one profile, the clearest
 # before anything is seen: radians and metres of a camera's pose
 SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
-STARTS = np.linspace(-0.75, 0.75, 7)  # of REACH, right and down
-BEST_STARTS = 4
 # of REACH: how far off an edge may lie, while it is sought
 WIDTHS = np.geomspace(0.3, 0.09, 12)
 OUTLIERS = 0.15  # of the clearest edge's weight
@@ -113,29 +107,26 @@ class Sights:
 
     Attributes
     ----------
-    by_pose, by_all : ndarray, shapes (n, 6), (n, c)
-        How far the place moves along the normal of the crease, pixels, by the camera's pose
-        ``[w, v]`` (radians, metres), and by all unknowns of the rig.
+    by_unknown : ndarray, shape (n, c)
+        How far the place moves along the normal of the crease, pixels, by the unknowns of a Pull.
     offset, weight : ndarray, shape (n, k)
         Of edges in the image: distance along the normal, pixels, and how clear they are, 0 to 1.
     number : ndarray of int, shape (n,)
         Of the crease.
     """
 
-    by_pose: np.ndarray
-    by_all: np.ndarray
+    by_unknown: np.ndarray
     offset: np.ndarray
     weight: np.ndarray
     number: np.ndarray
 
 
-def sights(creases: Creases, rig: CalibratedRig, view: View) -> Sights:
+def sights(creases: Creases, view: View) -> Sights:
     """Look in an image for edges near creases.
 
     Parameters
     ----------
     creases : Creases
-    rig : CalibratedRig
     view : View
 
     Returns
@@ -144,23 +135,19 @@ def sights(creases: Creases, rig: CalibratedRig, view: View) -> Sights:
         Of places inside the image.
     """
     model = view.model
-    beams = beams_to(creases.points, rig.T_head_lrf)
-    points, by_link, by_pitch = carried(view.chain, *beams, view.pitch)
+    points, J = view.carried(creases.points)
     reach = REACH * model.width
     size = np.array([model.width, model.height])
     recorded = project(points, model)
     inside = ((recorded > reach) & (recorded < size - 1 - reach)).all(axis=1)
     by_point = pinhole_jacobian(points[inside], model)
-    way = view.T_camera_platform.rotation.apply(creases.along[inside])
+    way = view.rotation.apply(creases.along[inside])
     tangent = np.einsum("nij,nj->ni", by_point, way)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    links = view.links(by_link, by_pitch)[inside]
-    by_link = np.einsum("ni,nij,njk->nk", normal, by_point, links)
     offset, weight = _candidates(view, pinhole(points[inside], model), tangent, normal)
     return Sights(
-        by_pose=by_link[:, POSE],
-        by_all=view.spread(by_link),
+        by_unknown=np.einsum("ni,nij,njk->nk", normal, by_point, J[inside]),
         offset=offset,
         weight=weight,
         number=creases.number[inside],
@@ -195,8 +182,8 @@ def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull |
     """What creases and edges say about a camera: each place may go with one of several edges, or
     with none.
 
-    Its pose is found from several starts, with a width that narrows (expectation and
-    maximisation). Places of one crease err together.
+    Its pose is found with a width that narrows (expectation and maximisation). Places of one
+    crease err together.
 
     Parameters
     ----------
@@ -215,50 +202,32 @@ def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull |
         return None
     names = Sights.__dataclass_fields__
     seen = Sights(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
-    poses = columns_of(rig.uncertainty.names, camera)[4:10]
+    poses = poses_of(rig, camera)
+    by_pose = seen.by_unknown[:, poses]
+    reach = REACH * rig.cameras[camera].model.width
     _, crease, count = np.unique(seen.number, return_inverse=True, return_counts=True)
     trust = 1 / count[crease]
-    reach = REACH * rig.cameras[camera].model.width
-    a_pixel = 1 / np.sqrt(np.mean(np.sum(seen.by_pose[:, :2] ** 2, axis=1)) / 2)
-    starts = np.zeros((len(STARTS) ** 2, len(SPREAD)))
-    starts[:, :2] = np.stack(np.meshgrid(STARTS, STARTS), axis=-1).reshape(-1, 2)
-    starts *= reach * a_pixel
-    ordered = sorted(starts, key=lambda x: -_score(seen, trust, x, WIDTHS[0] * reach))
-    nothing = np.zeros(len(SPREAD))
-    fits = [_narrowed(seen, trust, x, reach) for x in [nothing, *ordered[:BEST_STARTS]]]
-    best = max(fits, key=lambda x: _score(seen, trust, x, WIDTHS[-1] * reach))
+    x = np.zeros(len(poses))
+    for width in np.append(WIDTHS, np.full(8, WIDTHS[-1])) * reach:
+        share, miss = _shares(seen, by_pose @ x, width)
+        pull = trust * np.sum(share * miss, axis=1)
+        weight = trust * share.sum(axis=1)
+        H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(SPREAD**-2.0)
+        x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / SPREAD**2)
 
-    likely, miss = _likely(seen, best, WIDTHS[-1] * reach)
-    share = likely / (OUTLIERS + likely.sum(axis=1, keepdims=True))
+    share, miss = _shares(seen, by_pose @ x, WIDTHS[-1] * reach)
     weight = trust * share.sum(axis=1) / MISS**2
-    information = (seen.by_all.T * weight) @ seen.by_all
+    information = (seen.by_unknown.T * weight) @ seen.by_unknown
     pull = trust * np.sum(share * miss, axis=1) / MISS**2
-    change = np.zeros(seen.by_all.shape[1])
-    change[poses] = best
-    return pull_of_groups(information, pull[:, None] * seen.by_all, crease, change, poses)
+    change = np.zeros(seen.by_unknown.shape[1])
+    change[poses] = x
+    return pull_of_groups(
+        information, pull[:, None] * seen.by_unknown, crease, change, poses
+    )
 
 
-def _likely(seen, x, width):
-    """How likely each edge goes with its place (n, k), and how far off it is (n, k), pixels."""
-    miss = seen.offset - (seen.by_pose @ x)[:, None]
-    return seen.weight * np.exp(-0.5 * (miss / width) ** 2), miss
-
-
-def _score(seen, trust, x, width):
-    """Log likelihood but for a constant."""
-    likely, _ = _likely(seen, x, width)
-    fit = trust @ np.log(OUTLIERS + likely.sum(axis=1))
-    return float(fit - 0.5 * np.sum((x / SPREAD) ** 2))
-
-
-def _narrowed(seen, trust, x, reach):
-    """Unknowns (6,) from a start, with narrower and narrower widths."""
-    J = seen.by_pose
-    for width in [*WIDTHS, *WIDTHS[-1:].repeat(8)] * np.array(reach):
-        likely, miss = _likely(seen, x, width)
-        share = likely / (OUTLIERS + likely.sum(axis=1, keepdims=True))
-        pull = trust * np.sum(share * miss, axis=1) / width**2
-        weight = trust * share.sum(axis=1) / width**2
-        H = (J.T * weight) @ J + np.diag(SPREAD**-2.0)
-        x = x + np.linalg.solve(H, J.T @ pull - x / SPREAD**2)
-    return x
+def _shares(seen, moved, width):
+    """What each edge has of its place (n, k) that has moved (n,), and how far off it is, pixels."""
+    miss = seen.offset - moved[:, None]
+    likely = seen.weight * np.exp(-0.5 * (miss / width) ** 2)
+    return likely / (OUTLIERS + likely.sum(axis=1, keepdims=True)), miss

@@ -12,12 +12,11 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.cloud import join as join_clouds
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
 from lrfcal_lib.measure.creases import Sights, creases_of, creases_pull, sights
 from lrfcal_lib.measure.features import flatness, largest_plane
-from lrfcal_lib.measure.image_pairs import STIFF, pairs_pull, patches_of
-from lrfcal_lib.measure.pulls import Pull, views_of_station
+from lrfcal_lib.measure.image_pairs import STIFF, pairs_pull
+from lrfcal_lib.measure.pulls import Pull, poses_of, views_of_station
 from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.model.camera import pinhole_jacobian
 from lrfcal_lib.model.geometry import fit_plane, hat
@@ -273,9 +272,8 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         views = views_of_station(session, rig, placement)
         creases = creases_of(cloud, planes, of_point, placement)
         for view in views:
-            of_creases[view.camera].append(sights(creases, rig, view))
-        patches = patches_of(session.sweep(placement), rig, session.lrf, session.continuous)
-        of_pairs.append(pairs_pull(patches, views))
+            of_creases[view.camera].append(sights(creases, view))
+        of_pairs.append(pairs_pull(cloud.rows(of_point >= 0), views))
     by_camera = [creases_pull(parts, rig, camera) for camera, parts in of_creases.items()]
     pulls = [pull for pull in (*by_camera, *of_pairs) if pull is not None]
     shifts = []
@@ -408,8 +406,7 @@ def suspects(pulls: list[Pull], rig: CalibratedRig) -> list[Shift]:
     sharp = np.linalg.solve(both, information)
     shifts = []
     for camera in rig.cameras:
-        columns = columns_of(names, camera)[4:10]
-        shifts.append(_shift(camera, columns, score, sharp, rig))
+        shifts.append(_shift(camera, poses_of(rig, camera), score, sharp, rig))
     if any(camera.mount == "platform" for camera in rig.cameras.values()):
         shifts.append(_shift(None, np.array([len(names)]), score, sharp, rig))
     return shifts
@@ -423,7 +420,7 @@ def _allowed(rig):
     C[:count, :count] = np.where(np.isfinite(known.trusted), known.trusted, 0.0)
     common = np.zeros((len(C), 6))
     for name, camera in rig.cameras.items():
-        columns = columns_of(known.names, name)[4:10]
+        columns = poses_of(rig, name)
         C[columns, columns] += OWN**2
         if camera.mount == "head":
             common[columns, np.arange(6)] = COMMON
