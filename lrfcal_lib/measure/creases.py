@@ -219,11 +219,9 @@ def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull |
     weight = trust * share.sum(axis=1) / MISS**2
     information = (seen.by_unknown.T * weight) @ seen.by_unknown
     pull = trust * np.sum(share * miss, axis=1) / MISS**2
-    change = np.zeros(seen.by_unknown.shape[1])
-    change[poses] = x
-    return pull_of_groups(
-        information, pull[:, None] * seen.by_unknown, crease, change, poses
-    )
+    fitted = np.zeros(seen.by_unknown.shape[1])
+    fitted[poses] = x
+    return pull_of_groups(information, pull[:, None] * seen.by_unknown, crease, fitted)
 
 
 def _shares(seen, moved, width):

@@ -261,7 +261,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     """
     uncertainty_of(rig)
     of_creases: dict[str, list[Sights]] = {camera: [] for camera in rig.cameras}
-    of_pairs = []
+    stations = []
     walls = []
     for placement in _stations(session, rig):
         cloud = _cloud(session, rig, placement)
@@ -273,9 +273,12 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         creases = creases_of(cloud, planes, of_point, placement)
         for view in views:
             of_creases[view.camera].append(sights(creases, view))
-        of_pairs.append(pairs_pull(cloud.rows(of_point >= 0), views))
+        stations.append((cloud.rows(of_point >= 0), views))
     by_camera = [creases_pull(parts, rig, camera) for camera, parts in of_creases.items()]
-    pulls = [pull for pull in (*by_camera, *of_pairs) if pull is not None]
+    by_camera = [pull for pull in by_camera if pull is not None]
+    of_pairs = [pairs_pull(*station, by_camera) for station in stations]
+    of_pairs = [pull for pull in of_pairs if pull is not None]
+    pulls = [*by_camera, *of_pairs]
     shifts = []
     if pulls:
         shifts = suspects(pulls, rig)
@@ -285,8 +288,8 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         shifts=tuple(shifts),
         walls=tuple(walls),
         passes=tuple(passes_of(session)),
-        creases=sum(pull.groups for pull in by_camera if pull is not None),
-        regions=sum(pull.groups for pull in of_pairs if pull is not None),
+        creases=sum(pull.groups for pull in by_camera),
+        regions=sum(pull.groups for pull in of_pairs),
         all_on_head=all(c.mount == "head" for c in rig.cameras.values()),
     )
 
@@ -399,7 +402,7 @@ def suspects(pulls: list[Pull], rig: CalibratedRig) -> list[Shift]:
     """
     names = rig.uncertainty.names
     information = np.sum([pull.information for pull in pulls], axis=0)
-    slope = np.sum([pull.information @ pull.change for pull in pulls], axis=0)
+    slope = np.sum([pull.slope for pull in pulls], axis=0)
     C = _allowed(rig)
     both = np.eye(len(C)) + information @ C
     score = np.linalg.solve(both, slope)

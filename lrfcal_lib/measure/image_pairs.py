@@ -38,7 +38,7 @@ class _Pair:
     cell: np.ndarray
 
 
-def pairs_pull(cloud: Cloud, views: list[View]) -> Pull | None:
+def pairs_pull(cloud: Cloud, views: list[View], known: list[Pull]) -> Pull | None:
     """What pairs of images say about a rig; None where no pair does.
 
     Every camera's pose is found by Gauss-Newton from blurred to sharp images.
@@ -49,6 +49,8 @@ def pairs_pull(cloud: Cloud, views: list[View]) -> Pull | None:
         Of flat surfaces that a station shows.
     views : list of View
         Images of the station.
+    known : list of Pull
+        What else tells the cameras: pairs leave open what moves both images alike.
     """
     patches = cloud.rows(slice(None, None, EVERY))
     pairs = []
@@ -61,20 +63,23 @@ def pairs_pull(cloud: Cloud, views: list[View]) -> Pull | None:
         return None
     cameras = dict.fromkeys(view.camera for view in views)
     poses = np.concatenate([poses_of(views[0].rig, camera) for camera in cameras])
-    stiff = np.tile(STIFF**-2.0, len(cameras))
     x = np.zeros(pairs[0].by_unknown[0].shape[-1])
+    prior = np.diag(np.tile(STIFF**-2.0, len(cameras)))
+    slope = np.zeros(len(poses))
+    for pull in known:
+        prior = prior + pull.information[np.ix_(poses, poses)]
+        slope = slope + pull.slope[poses]
     for blur in BLURS:
         sharp = {id(view): cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
         parts = [_compared(pair, sharp, x) for pair in pairs]
         H, b, D = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
-        by_group = np.einsum("nia,ni->na", D, b)
-        normal = information[np.ix_(poses, poses)] + np.diag(stiff)
-        x[poses] -= np.linalg.solve(
-            normal, by_group[:, poses].sum(axis=0) + stiff * x[poses]
-        )
+        by_row = np.einsum("nia,ni->na", D, -b)
+        left = by_row.sum(axis=0)[poses] + slope - prior @ x[poses]
+        compared_at = x.copy()
+        x[poses] += np.linalg.solve(information[np.ix_(poses, poses)] + prior, left)
     cell = np.concatenate([pair.cell for pair in pairs])
-    return pull_of_groups(information, by_group, cell, x, poses)
+    return pull_of_groups(information, by_row, cell, compared_at)
 
 
 def _pair(patches, first, second):

@@ -1,4 +1,4 @@
-"""What observations say about all unknowns of a calibrated rig: a change, and its information."""
+"""What observations say about all unknowns of a calibrated rig: a slope, and its information."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -75,14 +75,14 @@ class Pull:
     ----------
     information : ndarray, shape (c, c)
         Inverse of a covariance, zero where they say nothing.
-    change : ndarray, shape (c,)
-        By which they differ from the calibration, radians and metres.
+    slope : ndarray, shape (c,)
+        Information times the change of the unknowns that they ask for.
     groups : float
         Of observations that err together.
     """
 
     information: np.ndarray
-    change: np.ndarray
+    slope: np.ndarray
     groups: float
 
 
@@ -115,18 +115,29 @@ def views_of_station(session: Session, rig: CalibratedRig, placement: int) -> li
     return list(views.values())
 
 
-def pull_of_groups(information, by_row, group, change, fitted):
+def pull_of_groups(
+    information: np.ndarray, by_row: np.ndarray, group: np.ndarray, x: np.ndarray
+) -> Pull:
     """A Pull whose information is what the scatter of groups leaves of it.
 
-    `by_row` (n, c) are the slopes that rows, of groups (n,), have left at `change`, which was
-    `fitted` in some of its places.
+    Parameters
+    ----------
+    information : ndarray, shape (c, c)
+    by_row : ndarray, shape (n, c)
+        Slopes that observations have left at `x`.
+    group : ndarray of int, shape (n,)
+        Those of one group err together.
+    x : ndarray, shape (c,)
+        Change of the unknowns, of which those that are not 0 were fitted.
     """
     _, group = np.unique(group, return_inverse=True)
-    sums = np.zeros((group.max() + 1, len(change)))
+    sums = np.zeros((group.max() + 1, len(x)))
     np.add.at(sums, group, by_row)
     load = np.bincount(group, np.linalg.norm(by_row, axis=1))
     groups = float(load.sum() ** 2 / np.sum(load**2))
+    fitted = np.flatnonzero(x)
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
     excess = np.trace(own @ sums[:, fitted].T @ sums[:, fitted]) / len(fitted)
     few = groups / max(groups - len(fitted), 1.0)
-    return Pull(information / max(excess * few, 1e-12), change, groups)
+    scale = 1 / max(excess * few, 1e-12)
+    return Pull(scale * information, scale * (information @ x + sums.sum(axis=0)), groups)
