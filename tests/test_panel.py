@@ -325,7 +325,7 @@ def test_a_calibration_that_does_not_fit_is_said(panel, tmp_path):
     assert chosen(panel, "") == ""
 
 
-def test_what_check_says_of_the_calibration_is_marked(panel, tmp_path, monkeypatch):
+def test_what_check_says_of_the_calibration_is_marked(panel, fake, tmp_path, monkeypatch):
     """With a fresh recording, in words and about the image of the camera that has moved."""
     culprit = SimpleNamespace(camera="left")
     words = ["the calibration: camera 'left' has moved: recalibrate", "by 3 px"]
@@ -335,6 +335,8 @@ def test_what_check_says_of_the_calibration_is_marked(panel, tmp_path, monkeypat
     monkeypatch.setattr(page, "holds", lambda session, rig: held)
     image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     view = SimpleNamespace(ranges=np.ones(3), bearings=np.full(3, 1.5), pitch=0.0)
+    scenes = [{"number": number, "board": False} for number in (1, 2)]
+    panel.parts.rig.value = str(fake(placements=scenes))
     chosen(panel, a_calibration(tmp_path / "c.json"))
     assert panel.parts.held.value == "", "nothing is recorded yet"
     pressed(panel, "connect")

@@ -36,7 +36,7 @@ DRIVERS = logging.getLogger("lrfcal_lib")
 EXPECTED = (DeviceError, RecordingError, Busy, Interrupted, ValueError, OSError)
 LOOK_S = 0.3  # between looks at the rig
 RED = (0, 0, 255)  # frame of a camera that has moved
-CHECKED = 2  # placements, the newest, that a chosen calibration is checked with
+CHECKED = 2  # scenes, the newest, that a chosen calibration is checked with
 NOTES = 4  # lines of what drivers report
 FOLLOWS = "three placements and more; the recording can go on afterwards"
 PLAIN = "The data collection panel: it appears here while this notebook runs in JupyterLab."
@@ -330,15 +330,17 @@ class Panel(Closed):
         self._check_calibration()
 
     def _check_calibration(self):
-        """Say whether the chosen calibration still holds for what was recorded last."""
+        """Say whether the chosen calibration still holds for the scenes recorded last."""
         self._moved = None
         self.parts.held.value = ""
         if self._calibrated is None or not self.collector.finished:
             return
+        session = open_session(self.session)
+        scenes = session.scene_placements[-CHECKED:]
+        if not scenes:
+            return
         try:
-            session = open_session(self.session)
-            newest = replace(session, placements=session.placements[-CHECKED:])
-            held = holds(newest, self._calibrated)
+            held = holds(replace(session, placements=scenes), self._calibrated)
         except ValueError as error:
             sentences = [f"cannot be told here: {error}"]
             sign = "warn"
