@@ -232,12 +232,15 @@ class Held:
                 "; all cameras are on the head: a slip of the head only turns the whole cloud, "
                 "nothing here can show it"
             )
-        return [
-            f"{name}: {first[self.answer]}",
-            *(each.sentence() for each in (*self.shifts, *self.walls, *self.passes)),
+        basis = (
             f"from {self.creases:.0f} creases, where surfaces meet, against edges of images, and "
-            f"{self.regions:.0f} regions of surfaces that two images show{on_head}",
-        ]
+            f"{self.regions:.0f} regions of surfaces that two images show{on_head}"
+        )
+        lines = [f"{name}: {first[self.answer]}"]
+        lines += [shift.sentence() for shift in self.shifts]
+        lines += [wall.sentence() for wall in self.walls]
+        lines += [passes.sentence() for passes in self.passes]
+        return [*lines, basis]
 
 
 def holds(session: Session, rig: CalibratedRig) -> Held:
