@@ -329,25 +329,13 @@ def image_shifts(first: CalibratedRig, second: CalibratedRig, name: str) -> Shif
     """
     model = first.cameras[name].model
     pixels = pixel_grid(model, PIXELS)
-    chain = chain_of(first, name)
-    bearing, pitch = beams_of_pixels(chain, model, pixels, DISTANCE, 0.0)
-    shown = []
-    variance = np.zeros(bearing.shape)
-    for rig in (first, second):
-        chain = chain_of(rig, name)
-        model = rig.cameras[name].model
-        points, by_link, _ = carried(chain, bearing, *_beams(first, rig, pitch))
-        shown.append(project(points, model))
-        by_pixel = project_jacobians(points, model)[0] @ by_link
-        variance = variance + spread(chain, by_pixel) ** 2
-    return Shifts(pixels, shown[1] - shown[0], np.sqrt(variance))
+    beams = beams_of_pixels(chain_of(first, name), model, pixels, DISTANCE, 0.0)
 
+    def shown(rig, points, by_link):
+        there = rig.cameras[name].model
+        return project(points, there), project_jacobians(points, there)[0] @ by_link
 
-def _beams(first, rig, pitch):
-    """True pitch and length, by a rig, of beams that are `DISTANCE` long by the first one."""
-    recorded = pitch / (1 + first.corrections.pitch_scale)
-    offset = first.corrections.range_offset - rig.corrections.range_offset
-    return recorded * (1 + rig.corrections.pitch_scale), DISTANCE + offset
+    return _shifts(first, second, beams, pixels, name, shown)
 
 
 def cloud_shifts(first: CalibratedRig, second: CalibratedRig) -> Shifts:
@@ -360,14 +348,26 @@ def cloud_shifts(first: CalibratedRig, second: CalibratedRig) -> Shifts:
     """
     bearings = np.linspace(*first.lrf.field_of_view, BEARINGS)
     at = np.stack(np.meshgrid(bearings, PITCHES), axis=-1)
-    bearing, pitch = np.moveaxis(at, -1, 0)
+    return _shifts(first, second, np.moveaxis(at, -1, 0), at)
+
+
+def _shifts(first, second, beams, at, camera=None, shown=lambda rig, *point: point):
+    """The Shifts of the ends of beams (bearing, pitch) that are `DISTANCE` long by the first rig.
+
+    `shown(rig, points, by_link)` is what counts of a point, and its derivative.
+    """
+    bearing, pitch = beams
+    recorded = pitch / (1 + first.corrections.pitch_scale)
     ends = []
     variance = np.zeros(bearing.shape)
     for rig in (first, second):
-        chain = chain_of(rig)
-        points, by_link, _ = carried(chain, bearing, *_beams(first, rig, pitch))
-        ends.append(points)
-        variance = variance + spread(chain, by_link) ** 2
+        chain = chain_of(rig, camera)
+        true = recorded * (1 + rig.corrections.pitch_scale)
+        length = DISTANCE + first.corrections.range_offset - rig.corrections.range_offset
+        points, by_link, _ = carried(chain, bearing, true, length)
+        end, derivative = shown(rig, points, by_link)
+        ends.append(end)
+        variance = variance + spread(chain, derivative) ** 2
     return Shifts(at, ends[1] - ends[0], np.sqrt(variance))
 
 

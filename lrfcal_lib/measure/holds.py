@@ -5,6 +5,7 @@ from enum import Enum
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import interp1d
 from scipy.special import chdtrc
 
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
@@ -356,33 +357,26 @@ def passes_of(session: Session) -> list[Passes]:
     ----------
     session : Session
     """
-    found = []
+    passes = []
     swept = [p for p in session.placements if (session.scans["placement"] == p).any()]
-    for first, second in pairwise(swept):
-        ways = [session.sweep_direction(placement) for placement in (first, second)]
-        if ways[0] * ways[1] < 0:
-            one, other = session.sweep(first), session.sweep(second)
+    for pair in pairwise(swept):
+        one, other = (session.sweep(placement) for placement in pair)
+        if session.sweep_direction(pair[0]) * session.sweep_direction(pair[1]) < 0:
             slip = _slip_between(one, other, session.lrf.sigma_range)
             if slip is not None:
-                found.append(Passes((first, second), *slip))
-    return found
+                passes.append(Passes(pair, *slip))
+    return passes
 
 
 def _slip_between(one, other, noise):
     """By how much more the second of two sweeps says its pitch is than the first, and sigma,
     radians; None where they are of different places.
     """
-    order = np.argsort(other.pitch)
-    inside = (one.pitch >= other.pitch.min()) & (one.pitch <= other.pitch.max())
-    if inside.sum() < 3:
+    if min(len(one.pitch), len(other.pitch)) < 2:
         return None
-    at = np.interp(one.pitch[inside], other.pitch[order], np.arange(len(order)))
-    low = np.clip(at.astype(int), 0, len(order) - 2)
-    share = (at - low)[:, None]
-    sorted_ranges = other.ranges[order]
-    met = (1 - share) * sorted_ranges[low] + share * sorted_ranges[low + 1]
-    growth = np.gradient(one.ranges[inside], one.pitch[inside], axis=0)
-    miss = met - one.ranges[inside]
+    at_pitch = interp1d(other.pitch, other.ranges, axis=0, bounds_error=False)
+    miss = at_pitch(one.pitch) - one.ranges
+    growth = np.gradient(one.ranges, one.pitch, axis=0)
     with np.errstate(invalid="ignore"):
         smooth = (np.abs(growth) < STEEP) & (np.abs(miss) < STEEP * WANTED * 3)
     if smooth.sum() < max(FEWEST_POINTS, SAME_PLACE * np.isfinite(miss).sum()):
