@@ -11,7 +11,11 @@ from lrfcal_lib.simulate.record import simulate
 from lrfcal_lib.simulate.rig import load_setup
 from lrfcal_lib.simulate.scene import FLOOR, ROOM
 
-WHOLE = {"cylinder": [2], "rod": [3], "curtain": [3]}  # settings of a shape that count something
+WHOLE = {
+    "cylinder": [2],
+    "rod": [3],
+    "curtain": [3],
+}  # settings of a shape that count something
 SHEETS = ("poster", "printed_page")  # textures that are as large as their sheet
 TABLE = slice(0, 17)  # of the still life: the table and what is on it
 SEAT = slice(17, 25)
@@ -31,7 +35,9 @@ def sized(row, scale):
     kept = WHOLE.get(shape, [])
     sizes = [s if i in kept else scaled(s, scale) for i, s in enumerate(sizes)]
     if shape == "rod":
-        sizes[:2] = [(middle + scale * (np.array(end) - middle)).tolist() for end in sizes[:2]]
+        sizes[:2] = [
+            (middle + scale * (np.array(end) - middle)).tolist() for end in sizes[:2]
+        ]
     texture = list(row["texture"])
     if texture[0] in SHEETS:
         texture[1:3] = scaled(texture[1:3], scale)

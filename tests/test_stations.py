@@ -21,6 +21,8 @@ from lrfcal_lib.measure.stations import (
 )
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.report import merge
+from lrfcal_lib.report.reconstruct import SceneAsked
+from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate.scene import World
 
 IN_PLACE = RigidTransform.identity()
@@ -266,21 +268,26 @@ def corridor_cloud():
     return world, rooms.pose(rng, places[1], 0), rng
 
 
-def test_merge_writes_one_cloud_and_a_figure(tmp_path, rig, monkeypatch, capsys):
+def test_merge_writes_one_cloud_and_a_page(tmp_path, rig, monkeypatch, capsys):
     room = DATA / "room_lms221"
-    monkeypatch.setattr(merge, "load_calibration", lambda path: rig)
-    monkeypatch.setattr(merge, "require_same_rig", lambda rig, session: None)
-    monkeypatch.setattr(merge, "stations_of", lambda session: (1, 3))
+    asked = SceneAsked(open_session(room), rig, (1, 3), tmp_path)
+    monkeypatch.setattr(merge, "open_scene", lambda *scene: asked)
     monkeypatch.setattr(merge, "write_scene", lambda folder, *rest: [folder / "scene.ply"])
     assert merge.merge_session(room, "calibration.json", tmp_path) == 0
     said = capsys.readouterr().out
     assert "platform frame of station 1" in said
     assert "Nothing checks how stations 1 and 3 lie" in said
-    assert (tmp_path / "stations.png").read_bytes().startswith(b"\x89PNG")
+    page = (tmp_path / "stations.html").read_text()
+    assert "UNTRUSTED" not in page and asked.about in page
+    for words in (
+        "Nothing checks how stations 1 and 3 lie",
+        "<td>1 and 3</td>",
+        "image/png",
+    ):
+        assert words in page
     monkeypatch.setattr(merge, "join_stations", lambda clouds, rig: lonely())
     with pytest.raises(ValueError, match="room_lms221: no two stations can be joined"):
-        merge.merge_session(room, "calibration.json", tmp_path / "new")
-    assert not (tmp_path / "new").exists()
+        merge.merge_session(room, "calibration.json")
 
 
 def lonely():

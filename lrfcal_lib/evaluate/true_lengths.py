@@ -69,7 +69,10 @@ def true_picks(
                 away = np.linalg.norm(shown - shown.mean(axis=0), axis=1)
                 place = shown[np.argmin(away)]
             row[f"kind_{number}"] = kind
-            row |= {f"{axis}_m_{number}": value for axis, value in zip("xyz", place, strict=True)}
+            row |= {
+                f"{axis}_m_{number}": value
+                for axis, value in zip("xyz", place, strict=True)
+            }
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -110,7 +113,9 @@ def _on_edge(scene, ends):
         along = off @ way / length
         miss = off - along * way / length
         away = np.linalg.norm(miss)
-        of_edge = edge.noise[:3, :3] + SYSTEMATIC**2 * np.outer(*[edge.jacobian[:3, -1]] * 2)
+        of_edge = edge.noise[:3, :3] + SYSTEMATIC**2 * np.outer(
+            *[edge.jacobian[:3, -1]] * 2
+        )
         sigma = np.sqrt(miss @ of_edge @ miss) / away
         same = abs(edge.axis @ way) > PARALLEL * length and 0 < along < length
         if same and away < max(ON_IT, 3 * sigma):

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-
 from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.cloud import Cloud

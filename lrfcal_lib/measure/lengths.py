@@ -34,7 +34,9 @@ from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 
-REACH = 0.1  # metres from a picked place to points of its plane, and from a click to its edge
+REACH = (
+    0.1  # metres from a picked place to points of its plane, and from a click to its edge
+)
 ON_IT = 0.01  # metres from a place on a feature of one station to the same one of another
 ABOUT = 9  # points whose middle a picked point is
 PLACE = ("x", "y", "z")
@@ -82,7 +84,9 @@ class SceneFeatures:
         return self.planes[self.of_point[nearest]], away[nearest]
 
 
-def nearest_edge(edges: Sequence[Feature], place: np.ndarray) -> tuple[Feature | None, float]:
+def nearest_edge(
+    edges: Sequence[Feature], place: np.ndarray
+) -> tuple[Feature | None, float]:
     """The edge that passes closest to a place (3,), and how close, metres."""
     if not edges:
         return None, np.inf
