@@ -271,7 +271,7 @@ def _add_measure(verbs):
     measure.add_argument("--calibration", required=True, help="calibration.json")
     measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
     measure.add_argument(
-        "--station", type=int, help="whose scene.html, if there are several"
+        "--station", type=int, help="whose scene.html it was (default: that of 'merge')"
     )
     measure.add_argument(
         "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"
