@@ -360,23 +360,25 @@ def observations(
     Returns
     -------
     CameraObservations
-        Of t trials with two crossings and `FACE` face points a placement.
+        Of t trials with two crossings and `FACE` face points a scan line.
     """
     ranges = shots["ranges"]
     bearings = setup.bearings()
-    t, p, _ = ranges.shape
-    points, covariance = _crossing_points(ranges.reshape(t * p, -1), setup, last_beam)
+    t, p, scans, beams = ranges.shape
+    points, covariance = _crossing_points(ranges.reshape(-1, beams), setup, last_beam)
     face, face_covariance = _face_points(ranges, bearings, setup.sigma_range)
+    ends = 2 * p * scans
+    lines = np.broadcast_to(shots["lines"][:, :, None], (t, p, scans, 2, 3))
     return CameraObservations(
         setup.model,
-        crossing_points=points.reshape(t, 2 * p, 3),
-        crossing_covariance=covariance.reshape(t, 2 * p, 3, 3),
-        crossing_line_sigma=np.full((t, 2 * p), setup.sigma_px),
-        crossing_lines=shots["lines"].reshape(t, 2 * p, 3),
-        crossing_placement=np.repeat(np.arange(p), 2),
+        crossing_points=points.reshape(t, ends, 3),
+        crossing_covariance=covariance.reshape(t, ends, 3, 3),
+        crossing_line_sigma=np.full((t, ends), setup.sigma_px),
+        crossing_lines=lines.reshape(t, ends, 3),
+        crossing_placement=np.repeat(np.arange(p), 2 * scans),
         plane_points=face.reshape(t, -1, 3),
         plane_covariance=face_covariance.reshape(t, -1, 3, 3),
-        plane_placement=np.repeat(np.arange(p), FACE),
+        plane_placement=np.repeat(np.arange(p), scans * FACE),
         board_poses=shots["boards"],
         board_covariance=shots["board_covariance"],
     )
@@ -404,7 +406,7 @@ def _crossing_points(ranges, setup, last_beam):
 
 
 def _face_points(ranges, bearings, sigma_range):
-    """Evenly chosen points on the boards, (t, p, FACE, 3), and their covariances."""
+    """Evenly chosen points of scan lines (..., FACE, 3), and their covariances."""
     hit = np.isfinite(ranges)
     count = hit.sum(axis=-1)
     on_board = np.argsort(~hit, axis=-1, kind="stable")

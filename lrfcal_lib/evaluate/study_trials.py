@@ -12,6 +12,7 @@ from lrfcal_lib.evaluate.monte_carlo import (
     observations,
     pose_errors,
 )
+from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     polar_to_points,
@@ -29,7 +30,7 @@ from lrfcal_lib.solvers.joint_model import Unknowns
 FAR = np.radians(10.0)  # from the truth: another minimum, or nothing was determined
 # of crossings: solved as one batch; whether the edge point is at the last beam
 BATCHED = {"line_printed": True, "line": False, "wasielewski_strauss": False}
-PLANES = ("zhang_pless_printed", "zhang_pless")
+PLANES = ("zhang_pless_printed", "zhang_pless", "zhang_pless_k")
 STUDIED = (*BATCHED, *PLANES, "three_planes", "joint")
 DIGITS = 9
 LEAST_RANGE = 0.05  # metres: noise may make a near one negative
@@ -76,9 +77,12 @@ def run_task(task: Task) -> list[dict]:
     shift = shift_sigma * rng.standard_normal((task.trials, 3))
     T0 = RigidTransform.from_components(true.translation + shift, turn * true.rotation)
 
-    sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
-    sensor = task.scenario.sensor
-    bounds = [bounds_of_camera(obs, truth, sensor) for obs, truth in sessions]
+    sessions = []
+    bounds = [None] * task.trials
+    if not task.scenario.corner_edges:
+        sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
+        sensor = task.scenario.sensor
+        bounds = [bounds_of_camera(obs, truth, sensor) for obs, truth in sessions]
     rows = []
     for method in task.methods:
         if method in BATCHED:
@@ -101,7 +105,10 @@ def run_task(task: Task) -> list[dict]:
 
 def _batch(method, shots, scenario, T0):
     """Pose, covariance and what went wrong, of every trial."""
-    obs = observations(shots, scenario, last_beam=BATCHED[method])
+    if scenario.corner_edges:
+        obs = corner_observations(shots, scenario)
+    else:
+        obs = observations(shots, scenario, last_beam=BATCHED[method])
     try:
         solution = solve_camera(obs, method, T0)
     except DegenerateGeometry as error:
@@ -136,17 +143,18 @@ def _judged(estimate, true, bounds):
     error = pose_errors(pose[None], true[None])[0]
     if not (np.isfinite(error).all() and np.isfinite(covariance).all()):
         return {"outcome": "not finite"}
-    unknown, known = bounds
     turn = np.linalg.norm(error[:3])
     outcome = "ok"
     if turn > FAR:
         outcome = "more than 10 deg from the truth"
     elif not converged:
         outcome = "not converged"
+    numbers = {"rotation": turn, "translation": np.linalg.norm(error[3:])}
+    if bounds is None:
+        return {"outcome": outcome} | numbers
+    unknown, known = bounds
     interval = HALF_WIDTH * np.sqrt(np.maximum(np.diagonal(covariance), 0))
-    numbers = {
-        "rotation": turn,
-        "translation": np.linalg.norm(error[3:]),
+    numbers |= {
         "bound_rotation": np.sqrt(np.trace(unknown[:3, :3])),
         "bound_translation": np.sqrt(np.trace(unknown[3:, 3:])),
         "known_rotation": np.sqrt(np.trace(known[:3, :3])),
@@ -157,6 +165,28 @@ def _judged(estimate, true, bounds):
     }
     rounded = {key: float(f"{value:.{DIGITS}g}") for key, value in numbers.items()}
     return {"outcome": outcome} | rounded
+
+
+def corner_observations(shots: dict, scenario: Scenario) -> CameraObservations:
+    """Where scan lines meet the edges of a corner of two plates, trials first.
+
+    Parameters
+    ----------
+    shots : dict of ndarray
+        Of :func:`lrfcal_lib.simulate.corner.corner_shots`.
+    scenario : Scenario
+    """
+    edges = scenario.corner_edges
+    t, p = shots["points"].shape[:2]
+    shape = (t, p * edges)
+    return CameraObservations(
+        scenario.model,
+        crossing_points=shots["points"][:, :, :edges].reshape(*shape, 3),
+        crossing_covariance=np.broadcast_to(scenario.sigma_range**2 * np.eye(3), (*shape, 3, 3)),
+        crossing_lines=shots["lines"][:, :, :edges].reshape(*shape, 3),
+        crossing_line_sigma=np.full(shape, scenario.sigma_px),
+        crossing_placement=np.repeat(np.arange(p), edges),
+    )
 
 
 def plane_observations(shots: dict, scenario: Scenario, trial: int) -> CameraObservations:
@@ -170,14 +200,20 @@ def plane_observations(shots: dict, scenario: Scenario, trial: int) -> CameraObs
     trial : int
     """
     ranges = shots["ranges"][trial]
-    placement, beam = np.nonzero(np.isfinite(ranges))
+    placement, line, beam = np.nonzero(np.isfinite(ranges))
     rays = polar_to_points(1.0, scenario.bearings()[beam])
     along = rays[:, :, None] * rays[:, None, :]
     boards = np.tile(np.eye(4), (len(ranges), 1, 1))
     boards[:, :3] = shots["boards"][trial]
+    pattern = scenario.board.pattern.points()
+    true = shots["true_boards"][trial][:, None]
+    corners = np.matvec(true[..., :3], pattern) + true[..., 3]
     return CameraObservations(
         scenario.model,
-        plane_points=ranges[placement, beam, None] * rays,
+        pattern_points=pattern,
+        pattern_pixels=pinhole(corners, scenario.model) + shots["pattern_errors"][trial],
+        pattern_sigma_px=scenario.sigma_px,
+        plane_points=ranges[placement, line, beam, None] * rays,
         plane_covariance=scenario.sigma_range**2 * along + 1e-10 * np.eye(3),
         plane_placement=placement,
         placements=np.arange(len(ranges)),
@@ -233,31 +269,35 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
 def _readings(shots, scenario, trial):
     """Readings of the boards, and the beams about the ends of their scan lines."""
     ranges = shots["ranges"][trial]
+    placements, scans, beams = ranges.shape
+    of_line = np.repeat(np.arange(placements), scans)
+    edges = np.repeat(shots["edges"][trial], scans, axis=0)
+    ranges = ranges.reshape(-1, beams)
     bearings = scenario.bearings()
     hit = np.isfinite(ranges)
-    placement, beam = np.nonzero(hit)
+    line, beam = np.nonzero(hit)
     _, first, last = row_ends(hit)
     near = np.arange(2 * REACH) - REACH  # beams about the end of a scan line
-    beams = np.stack([first[:, None] + near, last[:, None] + 1 + near], axis=1)
-    beams = np.clip(beams, 0, len(bearings) - 1)
-    shape = beams.shape
+    window = np.stack([first[:, None] + near, last[:, None] + 1 + near], axis=1)
+    window = np.clip(window, 0, beams - 1)
+    shape = window.shape
     which = np.broadcast_to(np.arange(len(ranges))[:, None, None], shape).ravel()
     ends = np.take_along_axis(ranges, np.stack([first, last], axis=1), axis=1)
     at_end = np.broadcast_to(np.maximum(ends, LEAST_RANGE)[..., None], shape).ravel()
     return {
-        "face_range": ranges[placement, beam],
+        "face_range": ranges[line, beam],
         "face_bearing": bearings[beam],
         "face_pitch": np.zeros(len(beam)),
         "face_sigma": np.full(len(beam), scenario.sigma_range),
-        "face_placement": placement,
-        "beam_bearing": bearings[beams].ravel(),
+        "face_placement": of_line[line],
+        "beam_bearing": bearings[window].ravel(),
         "beam_pitch": np.zeros(len(which)),
-        "beam_hit": hit[which, beams.ravel()],
-        "beam_edge": np.broadcast_to(shots["edges"][trial][..., None], shape).ravel(),
+        "beam_hit": hit[which, window.ravel()],
+        "beam_edge": np.broadcast_to(edges[..., None], shape).ravel(),
         "beam_radius": scenario.radius(at_end),
         "beam_background": np.zeros(len(which)),
         "beam_step": scenario.step * at_end,
-        "beam_placement": which,
+        "beam_placement": of_line[which],
     }
 
 

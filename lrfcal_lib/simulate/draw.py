@@ -23,7 +23,10 @@ PLACES = [(i, j, 0) for i in range(5) for j in range(6) if i + j < 7]
 CORNERS = np.array([0.04, 0.04, 0.0]) + 0.03 * np.array(PLACES)
 MARGIN = 6  # beams beyond the board
 REACH = 2  # beams kept on either side of an edge, along and across the scan lines
-CLEAR = 1.3  # spot radii between a crossing and a second edge
+# between a crossing and a second edge: spot radii, and standard deviations of the least softness
+CLEAR = 1.3
+CLEAR_FLOORS = 3.0
+FARTHER = 1.5  # than the farthest corner no beam reads a board
 FEWEST_BEAMS = 8
 MOST_ROUNDS = 200
 LEAST_DEPTH = 0.1  # of a corner before the camera, metres: nearer, its pixel means nothing
@@ -86,7 +89,8 @@ class ShotSetup(Devices):
     distances: tuple[float, float] = (1.0, 2.5)
     lean: float = 0.6  # of the boards about x and y at most, radians
     bearings_deg: tuple[float, float] = (40.0, 140.0)
-    fewest_beams: int = FEWEST_BEAMS  # on a board
+    scans: int = 1  # lines of a placement, of the LRF at rest
+    fewest_beams: int = FEWEST_BEAMS  # of a scan line on a board
     whole_image: bool = True  # placements with corners outside the image are drawn anew
     uniform: bool = False  # the errors of ranges; normal otherwise
 
@@ -117,6 +121,10 @@ class ShotSetup(Devices):
         up = rng.uniform(-0.12, 0.12, count)
         middle = np.append(self.board.corners.mean(axis=0), 0.0)
         return _posed(spin, lean, np.column_stack([right, away, up]), middle)
+
+    def shots(self, rng, T_camera_lrf):
+        """One of each rig: the conditions that they meet by what else fails, and what is seen."""
+        return _shots(self, rng, T_camera_lrf)
 
 
 def bench(
@@ -320,7 +328,7 @@ def _views(bench, pose, at, rng, noise):
             T_source_platform = bench.T_head_lrf.inv() * T_head_platform
         true.append((camera * T_source_platform * pose).as_matrix())
     true = np.concatenate([*true, np.zeros((0, 4, 4))])
-    drawn, covariance = _seen_poses(bench, true[:, :3], rng, noise)
+    drawn, covariance, _ = _seen_poses(bench, true[:, :3], rng, noise)
     camera = np.repeat(np.arange(len(bench.cameras)), len(at))
     pitch = np.tile(at, len(bench.cameras))
     pose = np.concatenate([drawn, true[:, 3:]], axis=1)
@@ -345,7 +353,7 @@ def draw_shots(
     Returns
     -------
     dict of ndarray
-        ``T_camera_lrf`` (t, 3, 4), truth; ``ranges`` (t, p, B), metres, NaN off the board;
+        ``T_camera_lrf`` (t, 3, 4), truth; ``ranges`` (t, p, scans, B), metres, NaN off the board;
         ``lines`` (t, p, 2, 3) and ``edges`` (t, p, 2), undistorted image lines and numbers of the
         edges at the low and the high bearings; ``boards`` (t, p, 3, 4) and ``board_covariance`` (t,
         p, 6, 6), ``T_camera_board`` as the pattern shows it; ``true_boards``, the truth of that.
@@ -364,7 +372,7 @@ def draw_shots(
         if not missing.any():
             break
         trial = np.repeat(np.arange(trials), 2 * missing)
-        conditions, shots = _shots(setup, rng, T_camera_lrf[trial])
+        conditions, shots = setup.shots(rng, T_camera_lrf[trial])
         usable = np.logical_and.reduce(list(conditions.values()))
         failing.append({words: np.mean(~good) for words, good in conditions.items()})
         parts.append({name: value[usable] for name, value in shots.items()})
@@ -395,10 +403,8 @@ def _shots(setup, rng, T_camera_lrf):
     """
     board = setup.board
     T_lrf_board = setup.boards(rng, T_camera_lrf)
-    ranges, hit, ends, enough = _ends_of_scan_lines(setup, rng, T_lrf_board)
-    edges = ends.argmax(axis=-1)
-    second = np.sort(ends, axis=-1)[..., -2]
-    clear = (edges[:, 0] != edges[:, 1]) & (second < -CLEAR).all(axis=1)
+    edges, clear = _crossed_edges(setup, T_lrf_board)
+    ranges, hit, enough = _scans(setup, rng, T_lrf_board)
 
     true = pose_array(T_camera_lrf * T_lrf_board)
     corners = board.corners @ true[..., :2].mT + true[:, None, :, 3]
@@ -414,8 +420,8 @@ def _shots(setup, rng, T_camera_lrf):
     }
 
     shown = np.where(ahead[:, None, None], true, true[ahead.argmax()])
-    boards, covariance = _seen_poses(setup, shown, rng, 1.0)
-    noisy = ranges + setup.range_errors(rng, ranges.shape)
+    boards, covariance, errors_px = _seen_poses(setup, shown, rng, 1.0)
+    noisy = ranges[:, None] + setup.range_errors(rng, hit.shape)
     homography = (
         setup.model.matrix @ true[..., [0, 1, 3]]
     )  # from the board's plane to pixels
@@ -428,33 +434,59 @@ def _shots(setup, rng, T_camera_lrf):
         "edges": edges,
         "boards": boards,
         "board_covariance": covariance,
+        "pattern_errors": errors_px,
         "true_boards": true,
     }
 
 
-def _ends_of_scan_lines(setup, rng, T_lrf_board):
-    """Of one scan line over each board: exact ranges (n, B), which beams hit, distances (n, 2, E)
-    in spot radii of the first and the last of these from the edges, and whether there are enough.
+def _crossed_edges(setup, T_lrf_board):
+    """Edges (n, 2) of convex boards that the scan plane crosses, at the low and the high bearing,
+    and whether both crossings are clear of the other edges.
+    """
+    R = T_lrf_board.rotation.as_matrix()
+    ends = setup.board.points() @ R.mT + T_lrf_board.translation[:, None]
+    following = np.roll(ends, -1, axis=1)
+    height = ends[..., 2]
+    crossed = height * following[..., 2] < 0
+    share = height / np.where(crossed, height - following[..., 2], 1.0)
+    at = ends + share[..., None] * (following - ends)
+    bearing = np.where(crossed, np.arctan2(at[..., 1], at[..., 0]), np.nan)
+    edges = np.argsort(bearing, axis=1)[:, :2]  # NaN comes last
+    at = np.take_along_axis(at, edges[..., None], axis=1)
+    origin = -T_lrf_board.translation[:, None] @ R
+    distances, _ = _beside(setup.board, origin, at @ R)
+    second = np.sort(distances, axis=-1)[..., -2]
+    away = np.linalg.norm(at, axis=-1)
+    least = CLEAR * setup.radius(away) + CLEAR_FLOORS * setup.floor * setup.step * away
+    return edges, (crossed.sum(axis=1) == 2) & (second < -least).all(axis=1)
+
+
+def _scans(setup, rng, T_lrf_board):
+    """Of the scan lines over each board: exact ranges (n, B), which beams hit (n, S, B), and
+    whether there are enough in every one.
     """
     bearings = setup.bearings()
     R = T_lrf_board.rotation.as_matrix()
     rays = polar_to_points(np.ones(len(bearings)), bearings) @ R
     origin = -T_lrf_board.translation[:, None] @ R
     distances, ranges = _beside(setup.board, origin, rays)
-    radii = distances / setup.radius(ranges)[..., None]
+    spot = setup.radius(np.abs(ranges))
+    radii = distances / spot[..., None]
     of_edges = 0.0
     if setup.spread:
         of_edges = setup.spread * rng.standard_normal((len(R), 1, radii.shape[-1]))
-    spot = setup.radius(np.abs(ranges))
-    soft = np.hypot(setup.softness, setup.floor * setup.step * ranges / spot)
-    flips = setup.bias + soft * rng.standard_normal(ranges.shape)
-    hit = ((radii - of_edges).max(axis=-1) < flips) & (ranges > 0)
-    last = len(bearings) - 1
-    first_hit = hit.argmax(axis=1)
-    last_hit = last - hit[:, ::-1].argmax(axis=1)
-    ends = np.stack([first_hit, last_hit], axis=1)
-    enough = (hit.sum(axis=1) >= setup.fewest_beams) & (first_hit > 0) & (last_hit < last)
-    return ranges, hit, np.take_along_axis(radii, ends[..., None], axis=1), enough
+    outside = (radii - of_edges).max(axis=-1)[:, None]
+    soft = np.hypot(setup.softness, setup.floor * setup.step * ranges / spot)[:, None]
+    shape = (len(R), setup.scans, len(bearings))
+    flips = setup.bias + soft * rng.standard_normal(shape)
+    # rays along the board meet its plane far away, where the least softness means nothing
+    corners = T_lrf_board.translation[:, None] + setup.board.points() @ R.mT
+    farthest = np.linalg.norm(corners, axis=-1).max(axis=-1, keepdims=True)
+    sensible = (ranges > 0) & (ranges < FARTHER * farthest)
+    hit = (outside < flips) & sensible[:, None]
+    enough = hit.sum(axis=-1) >= setup.fewest_beams
+    whole = ~hit[..., [0, -1]].any(axis=-1)
+    return ranges, hit, (enough & whole).all(axis=1)
 
 
 def _posed(spin, lean, centre, middle):
@@ -484,7 +516,9 @@ def _beside(board, origin, rays):
 
 
 def _seen_poses(devices, true, rng, noise):
-    """Poses (n, 3, 4) of boards as their pattern tells them, and their covariances."""
+    """Poses (n, 3, 4) of boards as their pattern tells them, their covariances, and the errors
+    (n, c, 2) of the pattern's corners in the image behind them.
+    """
     pattern = devices.board.pattern
     corners = CORNERS if pattern is None else pattern.points()
     turned = corners @ true[..., :3].mT
@@ -494,9 +528,10 @@ def _seen_poses(devices, true, rng, noise):
     J = np.concatenate([np.cross(turned[:, :, None], by_point), by_point], axis=-1)
     J = J.reshape(len(true), 2 * len(corners), 6)
     information = J.mT @ J
-    covariance = np.linalg.inv(information) * devices.sigma_px**2
-    unit = rng.standard_normal((len(true), 6))
-    error = noise * np.matvec(np.linalg.cholesky(covariance), unit)
+    inverse = np.linalg.inv(information)
+    errors_px = devices.sigma_px * rng.standard_normal((len(true), 2 * len(corners)))
+    error = noise * np.matvec(inverse @ J.mT, errors_px)
     rotation = Rotation.from_rotvec(error[:, :3]).as_matrix() @ true[..., :3]
     translation = true[..., 3:] + error[:, 3:, None]
-    return np.concatenate([rotation, translation], axis=-1), covariance
+    poses = np.concatenate([rotation, translation], axis=-1)
+    return poses, inverse * devices.sigma_px**2, errors_px.reshape(len(true), -1, 2)

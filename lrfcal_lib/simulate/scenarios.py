@@ -12,6 +12,7 @@ from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import AHEAD
+from lrfcal_lib.simulate.corner import corner_shots
 from lrfcal_lib.simulate.draw import ShotSetup
 
 FORWARD_X = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # camera from an LRF that looks along x
@@ -32,6 +33,8 @@ PLAIN = (
     "poses",
     "start",
     "sensor",
+    "scans",
+    "corner_edges",
 )
 
 
@@ -57,6 +60,7 @@ class Scenario(ShotSetup):
     tilt: float = 0.0  # of boards from the image plane, radians ('tilted')
     least_angle: float = 0.0  # between the LRF's place and the target's planes ('around')
     extra: tuple[float, float, float] = (0.0, 0.0, 0.0)  # turns about z, x, y ('around')
+    corner_edges: int = 0  # seen of a corner of two plates, which takes the place of boards
 
     def rigs(self, rng, trials):
         """True poses ``T_camera_lrf``, one a trial."""
@@ -71,7 +75,11 @@ class Scenario(ShotSetup):
         if self.poses == "tilted":
             return T_camera_lrf.inv() * self._tilted(rng, len(T_camera_lrf))
         if self.poses == "around":
-            return self._around(rng, T_camera_lrf)
+            T_world_lrf = self._around(rng, len(T_camera_lrf))
+            if self.corner_edges:
+                return T_world_lrf.inv()
+            centred = RigidTransform.from_translation(-self._middle())
+            return T_world_lrf.inv() * RigidTransform.from_rotation(TARGET) * centred
         return super().boards(rng, T_camera_lrf)
 
     def _middle(self):
@@ -92,9 +100,14 @@ class Scenario(ShotSetup):
             centre - rotation.apply(self._middle()), rotation
         )
 
-    def _around(self, rng, T_camera_lrf):
-        """Poses of a target about which the LRF is put, looking at it but for turns."""
-        count = len(T_camera_lrf)
+    def shots(self, rng, T_camera_lrf):
+        """One of each rig, see :meth:`lrfcal_lib.simulate.draw.ShotSetup.shots`."""
+        if self.corner_edges:
+            return corner_shots(self, rng, T_camera_lrf)
+        return super().shots(rng, T_camera_lrf)
+
+    def _around(self, rng, count):
+        """Poses ``T_world_lrf`` of an LRF that looks at the origin but for turns."""
         direction = np.zeros((count, 3))
         open_ = np.ones(count, bool)
         while open_.any():
@@ -108,13 +121,9 @@ class Scenario(ShotSetup):
         turns = rng.uniform(-1, 1, (count, 3)) * self.extra
         turned = Rotation.from_matrix(looking) * Rotation.from_euler("ZXY", turns)
         away = rng.uniform(*self.distances, (count, 1))
-        T_world_lrf = RigidTransform.from_components(
+        return RigidTransform.from_components(
             away * direction, turned * Rotation.from_matrix(FORWARD_X)
         )
-        T_world_board = RigidTransform.from_components(
-            -TARGET.apply(self._middle()), TARGET
-        )
-        return T_world_lrf.inv() * T_world_board
 
 
 FILE = json.loads(Path(__file__).with_name("scenarios.json").read_text())
@@ -209,7 +218,13 @@ def _board(facts):
     and sides of n squares.
     """
     if "triangle" in facts:
-        return triangle_board(*facts["triangle"], pattern=PATTERN)
+        pattern = PATTERN
+        if "pattern" in facts:
+            columns, rows, square, first = facts["pattern"]
+            pattern = Chessboard(columns, rows, square, (first, first))
+        return triangle_board(*facts["triangle"], pattern=pattern)
+    if "square" not in facts:
+        return triangle_board(pattern=PATTERN)  # a corner is looked at instead
     corners, square, squares = facts["square"]
     side = squares * square
     border = (side - (corners - 1) * square) / 2
