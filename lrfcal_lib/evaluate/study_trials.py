@@ -1,5 +1,6 @@
 """Trials of a study: the same drawn single shots to every method, errors against the truth."""
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
 from lrfcal_lib.preprocess.surfaces import row_ends
+from lrfcal_lib.session.cluster import source_digest
 from lrfcal_lib.simulate.draw import REACH, draw_shots
 from lrfcal_lib.simulate.scenarios import Scenario
 from lrfcal_lib.solvers import solve_camera
@@ -28,10 +30,26 @@ from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Unknowns
 
 FAR = np.radians(10.0)  # from the truth: another minimum, or nothing was determined
-# of crossings: solved as one batch; whether the edge point is at the last beam
-BATCHED = {"line_printed": True, "line": False, "wasielewski_strauss": False}
-PLANES = ("zhang_pless_printed", "zhang_pless", "zhang_pless_k")
-STUDIED = (*BATCHED, *PLANES, "three_planes", "joint")
+# of crossings, solved as one batch: options of `solve_camera`
+BATCHED: dict[str, dict] = {
+    "line_printed": {},
+    "line": {},
+    "line_robust": {"method": "line", "loss": "cauchy"},
+    "wasielewski_strauss": {},
+}
+# of planes, trial by trial; without a start value the minimal solution is searched for
+PLANES: dict[str, dict] = {
+    "zhang_pless_printed": {},
+    "zhang_pless": {},
+    "zhang_pless_k": {},
+    "three_planes": {
+        "method": "zhang_pless",
+        "T0": None,
+        "loss": "cauchy",
+        "scale": "auto",
+    },
+}
+STUDIED = (*BATCHED, *PLANES, "joint")
 DIGITS = 9
 LEAST_RANGE = 0.05  # metres: noise may make a near one negative
 
@@ -49,8 +67,8 @@ class Task:
 
     @property
     def key(self):
-        """What tells it from the others of a study."""
-        return f"{self.scenario.name}/{self.n_poses}/{self.first}"
+        """Tells it from any other, and from the same with another version of this library."""
+        return hashlib.sha256(f"{source_digest()} {self}".encode()).hexdigest()[:24]
 
 
 def run_task(task: Task) -> list[dict]:
@@ -63,11 +81,11 @@ def run_task(task: Task) -> list[dict]:
     Returns
     -------
     list of dict
-        A row for every trial and method: scenario, n_poses, trial, method, outcome ('ok', or why
-        it failed), and where there is an estimate rotation (radians) and translation (metres)
-        errors, the same as bound with unknown and with known sensor, and of the six numbers of the
-        pose the mean squared error over the bound, and over the stated covariance, and how many lie
-        in their 90 % intervals.
+        A row for every trial and method: scenario, what was varied of it, n_poses, trial, method,
+        outcome ('ok', or why it failed), and where there is an estimate rotation (radians) and
+        translation (metres) errors; where boards are looked at the same as bound with unknown and
+        with known sensor, and of the six numbers of the pose the mean squared error over the bound,
+        and over the stated covariance, and how many lie in their 90 % intervals.
     """
     rng = np.random.default_rng([task.seed, task.n_poses, task.first])
     shots = draw_shots(task.scenario, rng, task.trials, task.n_poses)
@@ -95,6 +113,7 @@ def run_task(task: Task) -> list[dict]:
         for t, estimate in enumerate(estimates):
             row = {
                 "scenario": task.scenario.name,
+                **task.scenario.varied,
                 "n_poses": task.n_poses,
                 "trial": task.first + t,
                 "method": method,
@@ -108,9 +127,9 @@ def _batch(method, shots, scenario, T0):
     if scenario.corner_edges:
         obs = corner_observations(shots, scenario)
     else:
-        obs = observations(shots, scenario, last_beam=BATCHED[method])
+        obs = observations(shots, scenario, last_beam=method == "line_printed")
     try:
-        solution = solve_camera(obs, method, T0)
+        solution = solve_camera(obs, **{"method": method, "T0": T0} | BATCHED[method])
     except DegenerateGeometry as error:
         return [str(error)] * len(T0)
     poses = pose_array(solution.transform)
@@ -126,13 +145,11 @@ def _single(method, shots, scenario, trial, T0, obs):
             camera = solution.state.cameras[0]
             return camera, solution.solution.covariance[:6, :6], True
         planes = plane_observations(shots, scenario, trial)
-        if method == "three_planes":
-            found = solve_camera(planes, "zhang_pless", loss="cauchy", scale="auto")
-        else:
-            found = solve_camera(planes, method, T0, search=False)
+        options = {"method": method, "T0": T0} | PLANES[method]
+        found = solve_camera(planes, search=False, **options)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:
         return str(error)
-    return pose_array(found.transform), found.covariance, bool(found.converged)
+    return pose_array(found.transform), found.covariance[:6, :6], bool(found.converged)
 
 
 def _judged(estimate, true, bounds):
@@ -182,7 +199,9 @@ def corner_observations(shots: dict, scenario: Scenario) -> CameraObservations:
     return CameraObservations(
         scenario.model,
         crossing_points=shots["points"][:, :, :edges].reshape(*shape, 3),
-        crossing_covariance=np.broadcast_to(scenario.sigma_range**2 * np.eye(3), (*shape, 3, 3)),
+        crossing_covariance=np.broadcast_to(
+            scenario.sigma_range**2 * np.eye(3), (*shape, 3, 3)
+        ),
         crossing_lines=shots["lines"][:, :, :edges].reshape(*shape, 3),
         crossing_line_sigma=np.full(shape, scenario.sigma_px),
         crossing_placement=np.repeat(np.arange(p), edges),

@@ -9,8 +9,12 @@ import numpy as np
 from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.model.geometry import polar_to_points, pose_array
 
-EDGE = np.array([-0.5, -0.5, 0.70711])  # where the plates meet, through the origin of the target
-PLATES = np.array([[-0.36237, 0.86237, 0.35355], [0.86237, -0.36237, 0.35355]])  # from the edge
+EDGE = np.array(
+    [-0.5, -0.5, 0.70711]
+)  # where the plates meet, through the origin of the target
+PLATES = np.array(
+    [[-0.36237, 0.86237, 0.35355], [0.86237, -0.36237, 0.35355]]
+)  # from the edge
 SIZE = 1.5  # metres, of a plate away from the edge and along it to either side
 FEWEST_POINTS = 2  # on a plate
 LEAST_LENGTH = 15.0  # of an image line, pixels

@@ -1,7 +1,7 @@
 """Set-ups by name to compare methods on, some of them published (``scenarios.json``)."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +20,6 @@ FACING = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))  # camera from a board
 TARGET = Rotation.from_euler("ZY", [45, 45], degrees=True)  # world from the board, 'around'
 # as in `triangle_board` of shots: 23 corners or so, away from the edges
 PATTERN = Chessboard(4, 5, 0.029, (0.03885, 0.03885))
-PLAIN = (
-    "spot",
-    "sigma_range",
-    "sigma_px",
-    "bias",
-    "uniform",
-    "bearings_deg",
-    "fewest_beams",
-    "whole_image",
-    "distances",
-    "poses",
-    "start",
-    "sensor",
-    "scans",
-    "corner_edges",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +29,9 @@ class Scenario(ShotSetup):
     """
 
     name: str = "own"
+    varied: dict[str, float] = field(
+        default_factory=dict
+    )  # settings that differ from its file
     about: str = ""
     softness: float = 0.1
     floor: float = LEAST_STEP
@@ -134,68 +121,65 @@ def load_scenario(name: str) -> Scenario:
     if name not in FILE:
         raise ValueError(f"unknown scenario {name!r}: use one of {', '.join(FILE)}")
     facts = FILE[name]
-    settings: dict[str, Any] = {key: facts[key] for key in PLAIN if key in facts}
-    for key in ("spot", "bearings_deg", "distances", "start", "sensor"):
-        if key in settings:
-            settings[key] = tuple(settings[key])
-    return Scenario(
-        name=name,
-        about=facts["about"],
-        model=_camera(*facts["camera"]),
-        board=_board(facts),
-        step=np.radians(facts["step_deg"]),
-        T_camera_lrf=_mount(facts),
-        roll=np.radians(facts.get("roll_deg", 0.0)),
-        tilt=np.radians(facts.get("tilt_deg", 0.0)),
-        least_angle=np.radians(facts.get("least_angle_deg", 0.0)),
-        extra=tuple(np.radians(facts.get("extra_deg", (0.0, 0.0, 0.0))).tolist()),
-        **settings,
-    )
+    settings: dict[str, Any] = {
+        "name": name,
+        "model": _camera(*facts["camera"]),
+        "board": _board(facts),
+        "T_camera_lrf": _mount(facts),
+    }
+    others = {f.name for f in fields(Scenario)} - settings.keys()
+    for key, value in facts.items():
+        if key not in others and key.endswith("_deg"):
+            key = key.removesuffix("_deg")
+            value = np.radians(value).tolist()
+        if key in others:
+            settings[key] = tuple(value) if isinstance(value, list) else value
+    return Scenario(**settings)
 
 
 def varied(scenario: Scenario, key: str, value: float) -> Scenario:
-    """A scenario with one thing changed, which its name then tells.
+    """A scenario with one thing changed, which it then tells.
 
     Parameters
     ----------
     scenario : Scenario
     key : str
-        ``range_noise_mm``, ``pixel_noise_px``, ``step_deg``, ``spot_mm`` (diameter 2 m away; it
-        grows in proportion), ``board_scale``, ``lean_deg`` (of the boards at most) or ``start_deg``
-        (as standard deviation; a degree comes with 17 mm).
+        Of `VARIED`.
     value : float
-        Positive.
+        Positive but for the bias and its spread.
 
     Raises
     ------
     ValueError
         For an unknown key or a value that is not positive.
     """
-    if not value > 0:
+    if key not in VARIED:
+        known = ", ".join(VARIED)
+        raise ValueError(f"nothing called {key!r} can be varied: use one of {known}")
+    if not value > 0 and key not in ("bias", "spread"):
         raise ValueError(f"{key}={value:g}: a positive number is needed")
-    change: dict[str, Any]
-    match key:
-        case "range_noise_mm":
-            change = {"sigma_range": value / 1000}
-        case "pixel_noise_px":
-            change = {"sigma_px": value}
-        case "step_deg":
-            change = {"step": np.radians(value)}
-        case "spot_mm":
-            scale = value / 2000 / scenario.radius(2.0)
-            change = {"spot": (scale * scenario.spot[0], scale * scenario.spot[1])}
-        case "board_scale":
-            change = {"board": _scaled(scenario.board, value)}
-        case "lean_deg":
-            change = {"lean": np.radians(value)}
-        case "start_deg":
-            change = {"start": (np.radians(value), np.radians(value))}
-        case _:
-            raise ValueError(
-                f"nothing called {key!r} can be varied: use range_noise_mm, pixel_noise_px, "
-                "step_deg, spot_mm, board_scale, lean_deg or start_deg"
-            )
-    return replace(scenario, name=f"{scenario.name} {key}={value:g}", **change)
+    changed = VARIED[key](scenario, value)
+    return replace(scenario, varied=scenario.varied | {key: value}, **changed)
+
+
+def _spot(scenario, value):
+    """Diameter 2 m away; it grows in proportion."""
+    scale = value / 2000 / scenario.radius(2.0)
+    return {"spot": tuple(scale * part for part in scenario.spot)}
+
+
+VARIED = {
+    "range_noise_mm": lambda scenario, value: {"sigma_range": value / 1000},
+    "pixel_noise_px": lambda scenario, value: {"sigma_px": value},
+    "step_deg": lambda scenario, value: {"step": np.radians(value)},
+    "spot_mm": _spot,
+    "bias": lambda scenario, value: {"bias": value},  # spot radii
+    "spread": lambda scenario, value: {"spread": value},  # of the bias, spot radii
+    "board_scale": lambda scenario, value: {"board": _scaled(scenario.board, value)},
+    "lean_deg": lambda scenario, value: {"lean": np.radians(value)},  # at most
+    # standard deviation; a degree comes with 17 mm
+    "start_deg": lambda scenario, value: {"start": (np.radians(value), np.radians(value))},
+}
 
 
 def _scaled(board, scale):
