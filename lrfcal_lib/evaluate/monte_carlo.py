@@ -1,4 +1,4 @@
-"""Monte-Carlo trials of the joint estimate and of single shots, beside bound and truth."""
+"""Monte-Carlo trials of the joint estimate, beside bound and truth."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -6,25 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import logit
 from scipy.stats import binom, chi2
 
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.edge_likelihood import disc_share
 from lrfcal_lib.fit.least_squares import reduced_hessian
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    polar_to_points,
-    pose_array,
-    pose_transform,
-)
-from lrfcal_lib.model.observations import CameraObservations, JointObservations
-from lrfcal_lib.preprocess.board_in_scan import fit_lines
-from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
-from lrfcal_lib.preprocess.surfaces import row_ends
-from lrfcal_lib.simulate.draw import ShotSetup
-from lrfcal_lib.solvers import solve_camera
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_transform
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint import in_stated_gauge
 from lrfcal_lib.solvers.joint_model import JointState, Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import named_blocks
@@ -44,7 +33,6 @@ GROUPS = {  # unknowns by name: what they are together, the unit of that and the
     r"(.+)_r[xyz]": (r"\1 rotation", "deg", np.degrees(1.0)),
     r"(.+)_t[xyz]": (r"\1 translation", "mm", 1000.0),
 }
-FACE = 24  # face points a placement
 
 
 @dataclass(frozen=True)
@@ -341,131 +329,3 @@ def _judge(trials, index, factor):
 def _freedom(C):
     """Independent numbers in a sum of squares of errors with covariance C (Satterthwaite)."""
     return np.trace(C) ** 2 / np.sum(C * C)
-
-
-def observations(
-    shots: dict, setup: ShotSetup, last_beam: bool = False
-) -> CameraObservations:
-    """Drawn shots as the preprocessing makes CameraObservations of a scan line, trials first.
-
-    Parameters
-    ----------
-    shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
-    setup : ShotSetup
-        What they were drawn from.
-    last_beam : bool
-        Crossings are at the last beams on the board instead of half a beam step outside.
-
-    Returns
-    -------
-    CameraObservations
-        Of t trials with two crossings and `FACE` face points a scan line.
-    """
-    ranges = shots["ranges"]
-    bearings = setup.bearings()
-    t, p, scans, beams = ranges.shape
-    points, covariance = _crossing_points(ranges.reshape(-1, beams), setup, last_beam)
-    face, face_covariance = _face_points(ranges, bearings, setup.sigma_range)
-    ends = 2 * p * scans
-    lines = np.broadcast_to(shots["lines"][:, :, None], (t, p, scans, 2, 3))
-    return CameraObservations(
-        setup.model,
-        crossing_points=points.reshape(t, ends, 3),
-        crossing_covariance=covariance.reshape(t, ends, 3, 3),
-        crossing_line_sigma=np.full((t, ends), setup.sigma_px),
-        crossing_lines=lines.reshape(t, ends, 3),
-        crossing_placement=np.repeat(np.arange(p), 2 * scans),
-        plane_points=face.reshape(t, -1, 3),
-        plane_covariance=face_covariance.reshape(t, -1, 3, 3),
-        plane_placement=np.repeat(np.arange(p), scans * FACE),
-        board_poses=shots["boards"],
-        board_covariance=shots["board_covariance"],
-    )
-
-
-def _crossing_points(ranges, setup, last_beam):
-    """Where the lines fitted to scan lines (n, B) end, (n, 2, 3), and their covariances."""
-    bearings = setup.bearings()
-    lines, information = fit_lines(ranges, bearings)
-    _, first, last = row_ends(np.isfinite(ranges))
-    ends = bearings[np.stack([first, last], axis=1)]
-    if not last_beam:
-        ends = ends + np.array([-0.5, 0.5]) * setup.step
-    ray = polar_to_points(1.0, ends)
-    across = np.cross([0.0, 0.0, 1.0], ray)
-    u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
-    r = 1 / np.vecdot(u, ray)  # to the fitted line u . p = 1
-    by_bearing = -(r**2) * np.vecdot(u, across)  # the range's change
-    turned = r[..., None] * across + by_bearing[..., None] * ray
-    of_line = np.linalg.inv(information) * setup.sigma_range**2
-    flat_ray = ray[..., :2]
-    variance = r**4 * np.vecdot(flat_ray @ of_line, flat_ray)
-    spacing = _outer(turned * setup.step * UNIFORM)
-    return r[..., None] * ray, variance[..., None, None] * _outer(ray) + spacing
-
-
-def _face_points(ranges, bearings, sigma_range):
-    """Evenly chosen points of scan lines (..., FACE, 3), and their covariances."""
-    hit = np.isfinite(ranges)
-    count = hit.sum(axis=-1)
-    on_board = np.argsort(~hit, axis=-1, kind="stable")
-    share = np.linspace(0, 1, FACE)
-    pick = (share * (count[..., None] - 1)).round().astype(int)
-    beam = np.take_along_axis(on_board, pick, axis=-1)
-    ray = polar_to_points(1.0, bearings[beam])
-    repeats = np.maximum(FACE / count, 1.0)  # short lines give some twice
-    points = np.take_along_axis(ranges, beam, axis=-1)[..., None] * ray
-    variance = sigma_range**2 * repeats
-    return points, _outer(ray) * variance[..., None, None, None] + 1e-10 * np.eye(3)
-
-
-def _outer(v):
-    return v[..., :, None] * v[..., None, :]
-
-
-def shots_table(shots: dict, setup: ShotSetup, rng: np.random.Generator) -> pd.DataFrame:
-    """Errors of lines by both rules for the edge point, and of planes, over drawn single shots.
-
-    Parameters
-    ----------
-    shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
-    setup : ShotSetup
-        What they were drawn from.
-    rng : numpy.random.Generator
-        Draws the start values, some degrees and centimetres off the truth.
-
-    Returns
-    -------
-    DataFrame
-        Columns method, rotation_median_deg, translation_median_mm, nees (mean normalised squared
-        error of the pose over 6).
-    """
-    true = shots["T_camera_lrf"]
-    near = pose_transform(true)
-    turn = Rotation.from_rotvec(rng.normal(0, 0.05, (len(true), 3)))
-    shift = rng.normal(0, 0.05, (len(true), 3))
-    T0 = RigidTransform.from_components(near.translation + shift, turn * near.rotation)
-    half = observations(shots, setup)
-    solutions = {
-        "line_last_beam": solve_camera(
-            observations(shots, setup, last_beam=True), "line", T0
-        ),
-        "line": solve_camera(half, "line", T0),
-        "zhang_pless": solve_camera(half, "zhang_pless", T0),
-    }
-    rows = []
-    for method, solution in solutions.items():
-        error = pose_errors(pose_array(solution.transform), true)
-        normalised = np.linalg.solve(solution.covariance, error[..., None])[..., 0]
-        row = {
-            "method": method,
-            "rotation_median_deg": np.degrees(
-                np.median(np.linalg.norm(error[:, :3], axis=1))
-            ),
-            "translation_median_mm": 1000 * np.median(np.linalg.norm(error[:, 3:], axis=1)),
-            "nees": np.mean(np.vecdot(error, normalised)) / 6,
-        }
-        rows.append(row)
-    return pd.DataFrame(rows)

@@ -14,7 +14,8 @@ import pandas as pd
 from lrfcal_lib.evaluate.study_trials import STUDIED, Task, run_task
 from lrfcal_lib.session.cluster import checked, source_digest
 from lrfcal_lib.session.write import whole
-from lrfcal_lib.simulate.scenarios import Scenario, load_scenario, varied
+from lrfcal_lib.simulate.scenarios import load_scenario, varied
+from lrfcal_lib.simulate.shots import Scenario
 
 COUNTS = (5, 10, 20, 50, 100)  # placements
 CHUNK = 10  # trials of a task: some seconds, of which handing it over takes a thousandth

@@ -10,7 +10,6 @@ from lrfcal_lib.evaluate.monte_carlo import (
     HALF_WIDTH,
     bound,
     joint_truth,
-    observations,
     pose_errors,
 )
 from lrfcal_lib.model.camera import pinhole
@@ -21,10 +20,12 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
 )
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
+from lrfcal_lib.preprocess.board_in_scan import fit_lines
+from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
 from lrfcal_lib.preprocess.surfaces import row_ends
 from lrfcal_lib.session.cluster import source_digest
-from lrfcal_lib.simulate.draw import REACH, draw_shots
-from lrfcal_lib.simulate.scenarios import Scenario
+from lrfcal_lib.simulate.draw import REACH
+from lrfcal_lib.simulate.shots import Scenario, draw_shots
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Unknowns
@@ -124,10 +125,7 @@ def run_task(task: Task) -> list[dict]:
 
 def _batch(method, shots, scenario, T0):
     """Pose, covariance and what went wrong, of every trial."""
-    if scenario.corner_edges:
-        obs = corner_observations(shots, scenario)
-    else:
-        obs = observations(shots, scenario, last_beam=method == "line_printed")
+    obs = crossing_observations(shots, scenario, last_beam=method == "line_printed")
     try:
         solution = solve_camera(obs, **{"method": method, "T0": T0} | BATCHED[method])
     except DegenerateGeometry as error:
@@ -184,28 +182,70 @@ def _judged(estimate, true, bounds):
     return {"outcome": outcome} | rounded
 
 
-def corner_observations(shots: dict, scenario: Scenario) -> CameraObservations:
-    """Where scan lines meet the edges of a corner of two plates, trials first.
+def crossing_observations(
+    shots: dict, scenario: Scenario, last_beam: bool = False
+) -> CameraObservations:
+    """Where scan lines meet edges of boards, or of corners, trials first.
 
     Parameters
     ----------
     shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.corner.corner_shots`.
+        Of :func:`lrfcal_lib.simulate.shots.draw_shots`.
     scenario : Scenario
+    last_beam : bool
+        Crossings are at the last beams on the board instead of half a beam step outside.
     """
-    edges = scenario.corner_edges
-    t, p = shots["points"].shape[:2]
-    shape = (t, p * edges)
+    if scenario.corner_edges:
+        points = shots["points"][:, :, : scenario.corner_edges]
+        covariance = np.broadcast_to(
+            scenario.sigma_range**2 * np.eye(3), (*points.shape, 3)
+        )
+    else:
+        points, covariance = _ends_of_lines(shots["ranges"], scenario, last_beam)
+    t, p, each = points.shape[:3]
+    lines = shots["lines"]
+    lines = np.tile(lines[:, :, :each], (1, 1, scenario.scans, 1))
+    shape = (t, p * each)
     return CameraObservations(
         scenario.model,
-        crossing_points=shots["points"][:, :, :edges].reshape(*shape, 3),
-        crossing_covariance=np.broadcast_to(
-            scenario.sigma_range**2 * np.eye(3), (*shape, 3, 3)
-        ),
-        crossing_lines=shots["lines"][:, :, :edges].reshape(*shape, 3),
+        crossing_points=points.reshape(*shape, 3),
+        crossing_covariance=covariance.reshape(*shape, 3, 3),
+        crossing_lines=lines.reshape(*shape, 3),
         crossing_line_sigma=np.full(shape, scenario.sigma_px),
-        crossing_placement=np.repeat(np.arange(p), edges),
+        crossing_placement=np.repeat(np.arange(p), each),
     )
+
+
+def _ends_of_lines(ranges, setup, last_beam):
+    """Where the lines fitted to scan lines (t, p, s, B) end, (t, p, 2 s, 3), and their
+    covariances.
+    """
+    bearings = setup.bearings()
+    t, p, scans, beams = ranges.shape
+    ranges = ranges.reshape(-1, beams)
+    lines, information = fit_lines(ranges, bearings)
+    _, first, last = row_ends(np.isfinite(ranges))
+    ends = bearings[np.stack([first, last], axis=1)]
+    if not last_beam:
+        ends = ends + np.array([-0.5, 0.5]) * setup.step
+    ray = polar_to_points(1.0, ends)
+    across = np.cross([0.0, 0.0, 1.0], ray)
+    u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
+    r = 1 / np.vecdot(u, ray)  # to the fitted line u . p = 1
+    by_bearing = -(r**2) * np.vecdot(u, across)  # the range's change
+    turned = r[..., None] * across + by_bearing[..., None] * ray
+    of_line = np.linalg.inv(information) * setup.sigma_range**2
+    flat_ray = ray[..., :2]
+    variance = r**4 * np.vecdot(flat_ray @ of_line, flat_ray)
+    spacing = _outer(turned * setup.step * UNIFORM)
+    points = r[..., None] * ray
+    covariance = variance[..., None, None] * _outer(ray) + spacing
+    shape = (t, p, 2 * scans)
+    return points.reshape(*shape, 3), covariance.reshape(*shape, 3, 3)
+
+
+def _outer(v):
+    return v[..., :, None] * v[..., None, :]
 
 
 def plane_observations(shots: dict, scenario: Scenario, trial: int) -> CameraObservations:
@@ -214,7 +254,7 @@ def plane_observations(shots: dict, scenario: Scenario, trial: int) -> CameraObs
     Parameters
     ----------
     shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
+        Of :func:`lrfcal_lib.simulate.shots.draw_shots`.
     scenario : Scenario
     trial : int
     """
@@ -249,7 +289,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     Parameters
     ----------
     shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
+        Of :func:`lrfcal_lib.simulate.shots.draw_shots`.
     scenario : Scenario
     trial : int
     """

@@ -1,9 +1,8 @@
 """Observations drawn directly from the noise models of beam, platform and cameras, without images.
 
 A session of :mod:`lrfcal_lib.simulate.record` takes minutes; this takes milliseconds, for
-Monte-Carlo trials by the hundred: sweeps of a whole rig (:func:`observe`), or single shots, one
-scan line and one image a placement (:func:`draw_shots`). It returns plain arrays and knows no
-solver.
+Monte-Carlo trials by the hundred. It returns plain arrays and knows no solver. Single shots are in
+:mod:`lrfcal_lib.simulate.shots`.
 """
 
 from collections import defaultdict
@@ -14,22 +13,15 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.board import Board, Chessboard, triangle_board
-from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
-from lrfcal_lib.model.geometry import AHEAD, polar_to_points, pose_array, tilt
+from lrfcal_lib.model.board import Board, triangle_board
+from lrfcal_lib.model.camera import CameraModel, project_jacobians
+from lrfcal_lib.model.geometry import AHEAD, polar_to_points, tilt
 
 # corners of a pattern that fills the triangle, metres, where the board has none
 PLACES = [(i, j, 0) for i in range(5) for j in range(6) if i + j < 7]
 CORNERS = np.array([0.04, 0.04, 0.0]) + 0.03 * np.array(PLACES)
 MARGIN = 6  # beams beyond the board
 REACH = 2  # beams kept on either side of an edge, along and across the scan lines
-# between a crossing and a second edge: spot radii, and standard deviations of the least softness
-CLEAR = 1.3
-CLEAR_FLOORS = 3.0
-FARTHER = 1.5  # than the farthest corner no beam reads a board
-FEWEST_BEAMS = 8
-MOST_ROUNDS = 200
-LEAST_DEPTH = 0.1  # of a corner before the camera, metres: nearer, its pixel means nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,59 +64,6 @@ class Bench(Devices):
     sigma_stop: float = 0.0
     # standard deviation of the log odds of the edge from side to side: uneven backgrounds
     spread: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShotSetup(Devices):
-    """What single shots are drawn from: devices like the paper's, and distances in metres."""
-
-    board: Board = field(
-        default_factory=lambda: triangle_board(
-            pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))
-        )
-    )
-    softness: float = 0.03
-    # standard deviation of `bias` from edge to edge of every placement: uneven backgrounds
-    spread: float = 0.0
-    distances: tuple[float, float] = (1.0, 2.5)
-    lean: float = 0.6  # of the boards about x and y at most, radians
-    bearings_deg: tuple[float, float] = (40.0, 140.0)
-    scans: int = 1  # lines of a placement, of the LRF at rest
-    fewest_beams: int = FEWEST_BEAMS  # of a scan line on a board
-    whole_image: bool = True  # placements with corners outside the image are drawn anew
-    uniform: bool = False  # the errors of ranges; normal otherwise
-
-    def bearings(self):
-        """Of the beams, radians, shape (B,)."""
-        first, last = np.radians(self.bearings_deg)
-        return first + self.step * np.arange(int((last - first) / self.step + 1.5))
-
-    def range_errors(self, rng, shape):
-        """Errors of ranges, metres."""
-        if self.uniform:
-            return self.sigma_range * np.sqrt(3) * rng.uniform(-1, 1, shape)
-        return self.sigma_range * rng.standard_normal(shape)
-
-    def rigs(self, rng, trials):
-        """True poses ``T_camera_lrf``, one a trial."""
-        rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3))) * AHEAD
-        centre = np.array([0.12, 0.03, 0.12]) + rng.normal(0, 0.01, (trials, 3))
-        return RigidTransform.from_components(-rotation.apply(centre), rotation)
-
-    def boards(self, rng, T_camera_lrf):
-        """Poses ``T_lrf_board`` of boards that face the LRF, one for each rig."""
-        count = len(T_camera_lrf)
-        spin = rng.uniform(0, 2 * np.pi, count)
-        lean = rng.uniform(-self.lean, self.lean, (count, 2))
-        away = rng.uniform(*self.distances, count)
-        right = rng.uniform(-0.35, 0.35, count) * away
-        up = rng.uniform(-0.12, 0.12, count)
-        middle = np.append(self.board.corners.mean(axis=0), 0.0)
-        return _posed(spin, lean, np.column_stack([right, away, up]), middle)
-
-    def shots(self, rng, T_camera_lrf):
-        """One of each rig: the conditions that they meet by what else fails, and what is seen."""
-        return _shots(self, rng, T_camera_lrf)
 
 
 def bench(
@@ -175,7 +114,7 @@ def board_poses(
     drawn = rng.uniform(low, high, (count, len(limits)))
     right, up, away = drawn[:, 3:].T
     centre = np.column_stack([right * away, away, up * away])
-    return list(_posed(drawn[:, 0], drawn[:, 1:3], centre, [0.105, 0.127, 0.0]))
+    return list(posed(drawn[:, 0], drawn[:, 1:3], centre, [0.105, 0.127, 0.0]))
 
 
 def observe(
@@ -262,7 +201,7 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     p_head = head.rotation.apply(polar_to_points(np.ones(len(bearings)), bearings))
     rays = tilt(p_head, true) @ R
     origin = (tilt(head.translation, true) - pose.translation) @ R
-    distances, r = _beside(bench.board, origin, rays)
+    distances, r = beside(bench.board, origin, rays)
     radius = bench.radius(r)
     sensible = (r > 0.2) & (r < 30)
     u = distances.max(axis=-1)
@@ -328,168 +267,14 @@ def _views(bench, pose, at, rng, noise):
             T_source_platform = bench.T_head_lrf.inv() * T_head_platform
         true.append((camera * T_source_platform * pose).as_matrix())
     true = np.concatenate([*true, np.zeros((0, 4, 4))])
-    drawn, covariance, _ = _seen_poses(bench, true[:, :3], rng, noise)
+    drawn, covariance, _ = seen_poses(bench, true[:, :3], rng, noise)
     camera = np.repeat(np.arange(len(bench.cameras)), len(at))
     pitch = np.tile(at, len(bench.cameras))
     pose = np.concatenate([drawn, true[:, 3:]], axis=1)
     return {"camera": camera, "pitch": pitch, "pose": pose, "covariance": covariance}
 
 
-def draw_shots(
-    setup: ShotSetup, rng: np.random.Generator, trials: int, placements: int = 20
-) -> dict[str, np.ndarray]:
-    """Draw calibration sessions of single shots: one scan line and one image a placement.
-
-    A beam reads the board while its ray passes an edge line at less than `bias` radii outside, give
-    or take the softness. Placements whose crossings come near a corner are drawn anew.
-
-    Parameters
-    ----------
-    setup : ShotSetup
-    rng : numpy.random.Generator
-    trials, placements : int
-        Sessions t, and shots p of each.
-
-    Returns
-    -------
-    dict of ndarray
-        ``T_camera_lrf`` (t, 3, 4), truth; ``ranges`` (t, p, scans, B), metres, NaN off the board;
-        ``lines`` (t, p, 2, 3) and ``edges`` (t, p, 2), undistorted image lines and numbers of the
-        edges at the low and the high bearings; ``boards`` (t, p, 3, 4) and ``board_covariance`` (t,
-        p, 6, 6), ``T_camera_board`` as the pattern shows it; ``true_boards``, the truth of that.
-
-    Raises
-    ------
-    ValueError
-        If hardly any board is crossed on two edges and seen by the camera, with the shares that
-        fail each condition.
-    """
-    T_camera_lrf = setup.rigs(rng, trials)
-    parts = []
-    failing = []
-    missing = np.full(trials, placements)
-    for _ in range(MOST_ROUNDS):
-        if not missing.any():
-            break
-        trial = np.repeat(np.arange(trials), 2 * missing)
-        conditions, shots = setup.shots(rng, T_camera_lrf[trial])
-        usable = np.logical_and.reduce(list(conditions.values()))
-        failing.append({words: np.mean(~good) for words, good in conditions.items()})
-        parts.append({name: value[usable] for name, value in shots.items()})
-        parts[-1]["trial"] = trial[usable]
-        missing = np.maximum(missing - np.bincount(trial[usable], minlength=trials), 0)
-    if missing.any():
-        shares = [
-            f"{100 * np.mean([part[words] for part in failing]):.0f} % {words}"
-            for words in failing[0]
-        ]
-        raise ValueError(
-            f"boards at {setup.distances} m are hardly ever crossed on two edges and seen by "
-            f"the camera: {', '.join(shares)}"
-        )
-
-    drawn = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    trial = drawn.pop("trial")
-    order = np.argsort(trial, kind="stable")
-    first = np.searchsorted(trial[order], np.arange(trials))
-    kept = order[first[:, None] + np.arange(placements)]
-    shots = {name: value[kept] for name, value in drawn.items()}
-    return {"T_camera_lrf": pose_array(T_camera_lrf)} | shots
-
-
-def _shots(setup, rng, T_camera_lrf):
-    """Of shots, one for each of some rigs, which meet the conditions (named by what fails), and the
-    shots.
-    """
-    board = setup.board
-    T_lrf_board = setup.boards(rng, T_camera_lrf)
-    edges, clear = _crossed_edges(setup, T_lrf_board)
-    ranges, hit, enough = _scans(setup, rng, T_lrf_board)
-
-    true = pose_array(T_camera_lrf * T_lrf_board)
-    corners = board.corners @ true[..., :2].mT + true[:, None, :, 3]
-    uv = pinhole(corners, setup.model)
-    inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
-    ahead = (corners[..., 2] > LEAST_DEPTH).all(axis=1)
-    if setup.whole_image:
-        ahead &= inside.all(axis=(1, 2))
-    conditions = {
-        f"have fewer than {setup.fewest_beams} beams on the board": enough,
-        "are crossed near a corner": clear,
-        "are not in the image": ahead,
-    }
-
-    shown = np.where(ahead[:, None, None], true, true[ahead.argmax()])
-    boards, covariance, errors_px = _seen_poses(setup, shown, rng, 1.0)
-    noisy = ranges[:, None] + setup.range_errors(rng, hit.shape)
-    homography = (
-        setup.model.matrix @ true[..., [0, 1, 3]]
-    )  # from the board's plane to pixels
-    lines = board.lines()[edges] @ np.linalg.inv(homography)  # normals out of the board
-    lines /= np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
-    lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
-    return conditions, {
-        "ranges": np.where(hit, noisy, np.nan),
-        "lines": lines,
-        "edges": edges,
-        "boards": boards,
-        "board_covariance": covariance,
-        "pattern_errors": errors_px,
-        "true_boards": true,
-    }
-
-
-def _crossed_edges(setup, T_lrf_board):
-    """Edges (n, 2) of convex boards that the scan plane crosses, at the low and the high bearing,
-    and whether both crossings are clear of the other edges.
-    """
-    R = T_lrf_board.rotation.as_matrix()
-    ends = setup.board.points() @ R.mT + T_lrf_board.translation[:, None]
-    following = np.roll(ends, -1, axis=1)
-    height = ends[..., 2]
-    crossed = height * following[..., 2] < 0
-    share = height / np.where(crossed, height - following[..., 2], 1.0)
-    at = ends + share[..., None] * (following - ends)
-    bearing = np.where(crossed, np.arctan2(at[..., 1], at[..., 0]), np.nan)
-    edges = np.argsort(bearing, axis=1)[:, :2]  # NaN comes last
-    at = np.take_along_axis(at, edges[..., None], axis=1)
-    origin = -T_lrf_board.translation[:, None] @ R
-    distances, _ = _beside(setup.board, origin, at @ R)
-    second = np.sort(distances, axis=-1)[..., -2]
-    away = np.linalg.norm(at, axis=-1)
-    least = CLEAR * setup.radius(away) + CLEAR_FLOORS * setup.floor * setup.step * away
-    return edges, (crossed.sum(axis=1) == 2) & (second < -least).all(axis=1)
-
-
-def _scans(setup, rng, T_lrf_board):
-    """Of the scan lines over each board: exact ranges (n, B), which beams hit (n, S, B), and
-    whether there are enough in every one.
-    """
-    bearings = setup.bearings()
-    R = T_lrf_board.rotation.as_matrix()
-    rays = polar_to_points(np.ones(len(bearings)), bearings) @ R
-    origin = -T_lrf_board.translation[:, None] @ R
-    distances, ranges = _beside(setup.board, origin, rays)
-    spot = setup.radius(np.abs(ranges))
-    radii = distances / spot[..., None]
-    of_edges = 0.0
-    if setup.spread:
-        of_edges = setup.spread * rng.standard_normal((len(R), 1, radii.shape[-1]))
-    outside = (radii - of_edges).max(axis=-1)[:, None]
-    soft = np.hypot(setup.softness, setup.floor * setup.step * ranges / spot)[:, None]
-    shape = (len(R), setup.scans, len(bearings))
-    flips = setup.bias + soft * rng.standard_normal(shape)
-    # rays along the board meet its plane far away, where the least softness means nothing
-    corners = T_lrf_board.translation[:, None] + setup.board.points() @ R.mT
-    farthest = np.linalg.norm(corners, axis=-1).max(axis=-1, keepdims=True)
-    sensible = (ranges > 0) & (ranges < FARTHER * farthest)
-    hit = (outside < flips) & sensible[:, None]
-    enough = hit.sum(axis=-1) >= setup.fewest_beams
-    whole = ~hit[..., [0, -1]].any(axis=-1)
-    return ranges, hit, (enough & whole).all(axis=1)
-
-
-def _posed(spin, lean, centre, middle):
+def posed(spin, lean, centre, middle):
     """Poses of boards with their middle (board frame) at a centre (n, 3), which face the LRF but
     for a lean (n, 2) about x and y, and are turned in their plane by a spin (n,).
     """
@@ -499,7 +284,7 @@ def _posed(spin, lean, centre, middle):
     return RigidTransform.from_components(centre - facing.apply(middle), facing)
 
 
-def _beside(board, origin, rays):
+def beside(board, origin, rays):
     """Distances between rays (board frame) and the lines of edges (..., E), positive outside.
 
     And the ranges to the plane of the board.
@@ -515,7 +300,7 @@ def _beside(board, origin, rays):
     return inside * np.abs(z) / np.hypot(across, z), ranges
 
 
-def _seen_poses(devices, true, rng, noise):
+def seen_poses(devices, true, rng, noise):
     """Poses (n, 3, 4) of boards as their pattern tells them, their covariances, and the errors
     (n, c, 2) of the pattern's corners in the image behind them.
     """

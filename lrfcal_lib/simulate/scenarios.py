@@ -1,117 +1,17 @@
 """Set-ups by name to compare methods on, some of them published (``scenarios.json``)."""
 
 import json
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import AHEAD
-from lrfcal_lib.simulate.corner import corner_shots
-from lrfcal_lib.simulate.draw import ShotSetup
-
-FORWARD_X = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # camera from an LRF that looks along x
-FACING = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))  # camera from a board before it
-TARGET = Rotation.from_euler("ZY", [45, 45], degrees=True)  # world from the board, 'around'
-# as in `triangle_board` of shots: 23 corners or so, away from the edges
-PATTERN = Chessboard(4, 5, 0.029, (0.03885, 0.03885))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scenario(ShotSetup):
-    """What the single shots of a study are drawn from; see also
-    :class:`lrfcal_lib.simulate.draw.ShotSetup`.
-    """
-
-    name: str = "own"
-    varied: dict[str, float] = field(
-        default_factory=dict
-    )  # settings that differ from its file
-    about: str = ""
-    softness: float = 0.1
-    floor: float = LEAST_STEP
-    # standard deviations of what iterative methods start with, radians and metres
-    start: tuple[float, float] = (0.05, 0.05)
-    # what the joint estimate does not know of the sensor; published simulations know it all
-    sensor: tuple[str, ...] = ("range_offset", "edge_log_odds", "edge_log_softness")
-    T_camera_lrf: RigidTransform | None = (
-        None  # drawn anew for every trial where it is None
-    )
-    roll: float = 0.0  # of the scan plane about the viewing direction, radians
-    poses: str = "ahead"  # of the boards: ahead, tilted or around
-    tilt: float = 0.0  # of boards from the image plane, radians ('tilted')
-    least_angle: float = 0.0  # between the LRF's place and the target's planes ('around')
-    extra: tuple[float, float, float] = (0.0, 0.0, 0.0)  # turns about z, x, y ('around')
-    corner_edges: int = 0  # seen of a corner of two plates, which takes the place of boards
-
-    def rigs(self, rng, trials):
-        """True poses ``T_camera_lrf``, one a trial."""
-        if self.T_camera_lrf is None:
-            roll = Rotation.from_rotvec([0.0, 0.0, self.roll])
-            return RigidTransform.from_rotation(roll) * super().rigs(rng, trials)
-        matrix = np.broadcast_to(self.T_camera_lrf.as_matrix(), (trials, 4, 4))
-        return RigidTransform.from_matrix(matrix)
-
-    def boards(self, rng, T_camera_lrf):
-        """Poses ``T_lrf_board``, one for each rig."""
-        if self.poses == "tilted":
-            return T_camera_lrf.inv() * self._tilted(rng, len(T_camera_lrf))
-        if self.poses == "around":
-            T_world_lrf = self._around(rng, len(T_camera_lrf))
-            if self.corner_edges:
-                return T_world_lrf.inv()
-            centred = RigidTransform.from_translation(-self._middle())
-            return T_world_lrf.inv() * RigidTransform.from_rotation(TARGET) * centred
-        return super().boards(rng, T_camera_lrf)
-
-    def _middle(self):
-        return np.append(self.board.corners.mean(axis=0), 0.0)
-
-    def _tilted(self, rng, count):
-        """Poses ``T_camera_board`` of boards parallel to the image but for a turn about a random
-        axis in the board, anywhere in the image.
-        """
-        angle = rng.uniform(0, 2 * np.pi, count)
-        axis = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
-        rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
-        away = rng.uniform(*self.distances, count)
-        pixels = rng.uniform(0, [self.model.width, self.model.height], (count, 2))
-        ray = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(self.model.matrix).T
-        centre = away[:, None] * ray
-        return RigidTransform.from_components(
-            centre - rotation.apply(self._middle()), rotation
-        )
-
-    def shots(self, rng, T_camera_lrf):
-        """One of each rig, see :meth:`lrfcal_lib.simulate.draw.ShotSetup.shots`."""
-        if self.corner_edges:
-            return corner_shots(self, rng, T_camera_lrf)
-        return super().shots(rng, T_camera_lrf)
-
-    def _around(self, rng, count):
-        """Poses ``T_world_lrf`` of an LRF that looks at the origin but for turns."""
-        direction = np.zeros((count, 3))
-        open_ = np.ones(count, bool)
-        while open_.any():
-            v = rng.uniform(0, 1, (open_.sum(), 3))
-            direction[open_] = v / np.linalg.norm(v, axis=1, keepdims=True)
-            open_ = direction.min(axis=1) < np.sin(self.least_angle)
-        z = -direction
-        x = np.cross(z, [0.0, 0.0, 1.0])
-        x /= np.linalg.norm(x, axis=1, keepdims=True)
-        looking = np.stack([x, np.cross(z, x), z], axis=-1)
-        turns = rng.uniform(-1, 1, (count, 3)) * self.extra
-        turned = Rotation.from_matrix(looking) * Rotation.from_euler("ZXY", turns)
-        away = rng.uniform(*self.distances, (count, 1))
-        return RigidTransform.from_components(
-            away * direction, turned * Rotation.from_matrix(FORWARD_X)
-        )
-
+from lrfcal_lib.simulate.shots import FORWARD_X, PATTERN, Scenario
 
 FILE = json.loads(Path(__file__).with_name("scenarios.json").read_text())
 
