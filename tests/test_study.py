@@ -1,6 +1,9 @@
 """Studies: the same numbers whoever works, nothing lost or counted twice, and what cannot be asked is refused."""
 
 import os
+import shutil
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -8,8 +11,9 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
-from shared import ROOT
+from shared import QUICK, ROOT
 
+from lrfcal_lib.__main__ import main
 from lrfcal_lib.evaluate import study
 from lrfcal_lib.evaluate.study import (
     COUNTS,
@@ -280,34 +284,69 @@ def die_once(marker, task):
     return run_task(task)
 
 
-@pytest.fixture(scope="module")
-def dask():
-    """Two worker processes of this machine."""
-    from distributed import LocalCluster
+# what runs as a process of its own, because a cluster leaves threads behind
+CLUSTER = """
+import sys
+from distributed import LocalCluster
 
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as local:
+        print(local.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """Of a cluster with two worker processes."""
+    script = tmp_path_factory.mktemp("cluster") / "cluster.py"
+    script.write_text(CLUSTER)
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
+    with subprocess.Popen(
+        [sys.executable, script],
+        env=environment,
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as local:
-        yield local
+        yield local.stdout.readline().strip()
 
 
 def test_a_worker_that_dies_loses_nothing_and_nothing_counts_twice(
-    dask, small, tmp_path, monkeypatch
+    address, small, tmp_path, monkeypatch
 ):
     alone = study_to_file(small, tmp_path / "alone.csv")
     monkeypatch.setattr(study, "run_task", partial(die_once, str(tmp_path / "marker")))
-    with workers_at(dask.scheduler_address) as executor:
+    with workers_at(address) as executor:
         shared = study_to_file(small, tmp_path / "shared.csv", executor)
     assert (tmp_path / "marker").exists(), "a worker died"
     pd.testing.assert_frame_equal(alone, shared)
     assert (tmp_path / "alone.csv").read_bytes() == (tmp_path / "shared.csv").read_bytes()
 
 
-def test_a_worker_with_another_version_is_refused(dask, monkeypatch):
+def test_sessions_are_calibrated_on_a_cluster_as_here(
+    address, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    quick = shutil.copytree(QUICK, tmp_path / QUICK.name)
+    assert main(["calibrate", str(quick), "--out", "here"]) == 0
+    assert capsys.readouterr().out.count("Handed over") == 1
+    assert main(["calibrate", str(quick), "nowhere", "--scheduler", address]) == 1
+    out = capsys.readouterr().out
+    assert "Handed over" in out and "nowhere/session.json: No such file" in out
+    for name in ("cloud.ply", "scene.ply"):
+        elsewhere = tmp_path / "reports" / quick.name / name
+        assert elsewhere.read_bytes() == (tmp_path / "here" / name).read_bytes()
+    assert main(["calibrate", "a", "b", "--out", "here"]) == 1
+    assert "one session" in capsys.readouterr().err
+
+
+def test_a_worker_with_another_version_is_refused(address, monkeypatch):
     monkeypatch.setattr(cluster, "source_digest", lambda: "0123")
     with (
         pytest.raises(ValueError, match=r"worker tcp.* another version of lrfcal_lib"),
-        workers_at(dask.scheduler_address),
+        workers_at(address),
     ):
         pass
     with pytest.raises(ValueError, match="joined later has another version"):

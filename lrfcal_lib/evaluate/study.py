@@ -5,14 +5,12 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, as_completed
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from lrfcal_lib.evaluate.study_trials import STUDIED, Task, run_task
-from lrfcal_lib.session.cluster import checked, source_digest
 from lrfcal_lib.session.write import whole
 from lrfcal_lib.simulate.scenarios import load_scenario, varied
 from lrfcal_lib.simulate.shots import Scenario
@@ -114,8 +112,7 @@ def finished(
         for task in tasks:
             yield task, run_task(task)
         return
-    work = partial(checked, source_digest(), run_task)
-    futures = {executor.submit(work, task): task for task in tasks}
+    futures = {executor.submit(run_task, task): task for task in tasks}
     try:
         for future in as_completed(futures):
             yield futures[future], future.result()
