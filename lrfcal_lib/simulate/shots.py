@@ -19,7 +19,7 @@ TARGET = Rotation.from_euler("ZY", [45, 45], degrees=True)  # world from the boa
 PATTERN = Chessboard(4, 5, 0.029, (0.03885, 0.03885))
 # between a crossing and a second edge: spot radii, and standard deviations of the least softness
 CLEAR = 1.3
-CLEAR_FLOORS = 3.0
+CLEAR_FLOORS = 2.0
 FARTHER = 1.5  # than the farthest corner no beam reads a board
 MOST_ROUNDS = 200
 LEAST_DEPTH = 0.1  # of a corner before the camera, metres: nearer, its pixel means nothing
