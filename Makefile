@@ -89,7 +89,7 @@ MAP := --vary spot_mm=4,16,48 --vary step_deg=0.125,0.25,0.5,1
 studies: setup
 	$(STUDY) zhang_pless_2004 --poses 6 10 15 20 24 --methods zhang_pless_printed --trials 400 \
 		--out data/studies/zhang_pless_2004.csv
-	$(STUDY) corner_calib_edge corner_calib_edges --methods line_printed --trials 200 --out data/studies/corner_calib_edges.csv
+	$(STUDY) corner_calib_edge --methods line_printed --trials 200 --out data/studies/corner_calib_edge.csv
 	$(STUDY) corner_calib_triangle corner_calib_triangle_scans --poses 20 --methods joint --trials 100 \
 		--out data/studies/corner_calib_triangle.csv
 	$(AT_20) outdoor_lms221 $(RULES) --vary step_deg=0.25,0.5 --vary bias=-0.5,-0.25,0,0.25,0.5 \

@@ -14,7 +14,7 @@ def test_shots_are_as_many_as_asked_for_and_cross_two_edges_each():
     shapes = {name: values.shape for name, values in shots.items()}
     assert shapes == {
         "T_camera_lrf": (3, 3, 4), "ranges": (3, 5, 1, count), "lines": (3, 5, 2, 3), "edges": (3, 5, 2),
-        "boards": (3, 5, 3, 4), "board_covariance": (3, 5, 6, 6), "pattern_errors": (3, 5, 20, 2),
+        "boards": (3, 5, 3, 4), "board_covariance": (3, 5, 6, 6), "pattern_pixels": (3, 5, 20, 2),
         "true_boards": (3, 5, 3, 4),
     }  # fmt: skip
     assert (shots["edges"][..., 0] != shots["edges"][..., 1]).all()

@@ -46,7 +46,7 @@ def small(monkeypatch):
 # scenarios
 
 
-BOARDS = [name for name in FILE if not load_scenario(name).corner_edges]
+BOARDS = [name for name in FILE if not load_scenario(name).corner]
 QUIET = {"sigma_range": 1e-9, "sigma_px": 1e-9}
 
 
@@ -105,19 +105,15 @@ def test_scans_of_a_placement_are_of_one_board():
 
 
 def test_a_corner_without_noise_is_where_its_image_shows_it():
-    scenario = replace(load_scenario("corner_calib_edges"), **QUIET)
+    scenario = replace(load_scenario("corner_calib_edge"), **QUIET)
     shots = draw_shots(scenario, np.random.default_rng(0), 2, 5)
     obs = crossing_observations(shots, scenario)
     T = shots["T_camera_lrf"][:, None]
     seen = np.matvec(T[..., :3], obs.crossing_points) + T[..., 3]
-    pixels = np.pad(
-        pinhole(seen, scenario.model), [(0, 0), (0, 0), (0, 1)], constant_values=1
-    )
-    misses = np.abs(np.vecdot(obs.crossing_lines, pixels)).reshape(-1, 3)
-    assert misses[:, 0].max() < 1e-5, "the edge where the plates meet"
-    assert np.median(misses) < 1.0, (
-        "outer edges to half a beam, but where a scan line leaves by another"
-    )
+    u, v = np.moveaxis(pinhole(seen, scenario.model), -1, 0)
+    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
+    assert np.abs(np.vecdot(obs.crossing_lines, pixels)).max() < 1e-5
+    assert len(np.unique(obs.crossing_placement)) == obs.crossing_points.shape[1] == 5
 
 
 def test_published_rigs_are_as_published():
@@ -231,6 +227,7 @@ def test_a_killed_study_goes_on(small, tmp_path, monkeypatch):
         ((["paper_rig"], (), (6,), 4), "no method"),
         ((["paper_rig"], FAST, (6,), 0), "0 trials"),
         ((["paper_rig"], FAST, (2,), 4), "3 or more"),
+        ((["corner_calib_edge"], FAST, (6,), 4), "shows no board: use line_printed, line,"),
     ],
 )
 def test_what_cannot_be_asked_is_refused(arguments, words):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.evaluate.study_trials import STUDIED, Task, run_task
+from lrfcal_lib.evaluate.study_trials import BATCHED, STUDIED, Task, run_task
 from lrfcal_lib.session.write import whole
 from lrfcal_lib.simulate.scenarios import load_scenario, varied
 from lrfcal_lib.simulate.shots import Scenario
@@ -94,11 +94,14 @@ def tasks_of(scenarios, methods, n_poses, trials, seed=0) -> list[Task]:
         raise ValueError(f"{trials} trials: 1 or more are needed")
     if not n_poses or min(n_poses) < 3:
         raise ValueError(f"{list(n_poses)} placements: 3 or more are needed for a camera")
+    known = [s if isinstance(s, Scenario) else load_scenario(s) for s in scenarios]
+    for scenario in known:
+        if scenario.corner and not BATCHED.keys() >= set(methods):
+            raise ValueError(f"{scenario.name} shows no board: use {', '.join(BATCHED)}")
     tasks = []
     for first in range(0, trials, CHUNK):
         number = min(CHUNK, trials - first)
-        for given in scenarios:
-            scenario = given if isinstance(given, Scenario) else load_scenario(given)
+        for scenario in known:
             for count in sorted(n_poses, reverse=True):  # the longest first
                 tasks.append(Task(scenario, tuple(methods), count, seed, first, number))
     return tasks

@@ -12,7 +12,6 @@ from lrfcal_lib.evaluate.monte_carlo import (
     joint_truth,
     pose_errors,
 )
-from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     polar_to_points,
@@ -51,7 +50,6 @@ PLANES: dict[str, dict] = {
     },
 }
 STUDIED = (*BATCHED, *PLANES, "joint")
-DIGITS = 9
 LEAST_RANGE = 0.05  # metres: noise may make a near one negative
 
 
@@ -98,7 +96,7 @@ def run_task(task: Task) -> list[dict]:
 
     sessions = []
     bounds = [None] * task.trials
-    if not task.scenario.corner_edges:
+    if not task.scenario.corner:
         sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
         sensor = task.scenario.sensor
         bounds = [bounds_of_camera(obs, truth, sensor) for obs, truth in sessions]
@@ -142,7 +140,7 @@ def _single(method, shots, scenario, trial, T0, obs):
             solution = solve_joint(obs, axis=False, sensor=scenario.sensor)
             camera = solution.state.cameras[0]
             return camera, solution.solution.covariance[:6, :6], True
-        planes = plane_observations(shots, scenario, trial)
+        planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
         options = {"method": method, "T0": T0} | PLANES[method]
         found = solve_camera(planes, search=False, **options)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:
@@ -178,8 +176,7 @@ def _judged(estimate, true, bounds):
         "nees": error @ np.linalg.pinv(covariance) @ error / 6,
         "covered": np.mean(np.abs(error) < interval),
     }
-    rounded = {key: float(f"{value:.{DIGITS}g}") for key, value in numbers.items()}
-    return {"outcome": outcome} | rounded
+    return {"outcome": outcome} | numbers
 
 
 def crossing_observations(
@@ -195,16 +192,15 @@ def crossing_observations(
     last_beam : bool
         Crossings are at the last beams on the board instead of half a beam step outside.
     """
-    if scenario.corner_edges:
-        points = shots["points"][:, :, : scenario.corner_edges]
-        covariance = np.broadcast_to(
-            scenario.sigma_range**2 * np.eye(3), (*points.shape, 3)
-        )
+    if scenario.corner:
+        lines = shots["lines"][:, :, None]
+        points = shots["points"][:, :, None]
+        noise = scenario.sigma_range**2 * np.eye(3)
+        covariance = np.broadcast_to(noise, (*points.shape, 3))
     else:
+        lines = np.tile(shots["lines"], (1, 1, scenario.scans, 1))
         points, covariance = _ends_of_lines(shots["ranges"], scenario, last_beam)
     t, p, each = points.shape[:3]
-    lines = shots["lines"]
-    lines = np.tile(lines[:, :, :each], (1, 1, scenario.scans, 1))
     shape = (t, p * each)
     return CameraObservations(
         scenario.model,
@@ -248,36 +244,31 @@ def _outer(v):
     return v[..., :, None] * v[..., None, :]
 
 
-def plane_observations(shots: dict, scenario: Scenario, trial: int) -> CameraObservations:
-    """All readings on the boards of one trial, as points of planes.
+def plane_observations(
+    obs: JointObservations, pixels, scenario: Scenario
+) -> CameraObservations:
+    """All readings of a session as points of planes, and its pattern corners.
 
     Parameters
     ----------
-    shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.shots.draw_shots`.
+    obs : JointObservations
+        Of :func:`joint_session`.
+    pixels : ndarray, shape (p, c, 2)
+        Of the pattern's corners.
     scenario : Scenario
-    trial : int
     """
-    ranges = shots["ranges"][trial]
-    placement, line, beam = np.nonzero(np.isfinite(ranges))
-    rays = polar_to_points(1.0, scenario.bearings()[beam])
-    along = rays[:, :, None] * rays[:, None, :]
-    boards = np.tile(np.eye(4), (len(ranges), 1, 1))
-    boards[:, :3] = shots["boards"][trial]
-    pattern = scenario.board.pattern.points()
-    true = shots["true_boards"][trial][:, None]
-    corners = np.matvec(true[..., :3], pattern) + true[..., 3]
+    rays = polar_to_points(1.0, obs.face_bearing)
     return CameraObservations(
         scenario.model,
-        pattern_points=pattern,
-        pattern_pixels=pinhole(corners, scenario.model) + shots["pattern_errors"][trial],
+        pattern_points=scenario.board.pattern.points(),
+        pattern_pixels=pixels,
         pattern_sigma_px=scenario.sigma_px,
-        plane_points=ranges[placement, line, beam, None] * rays,
-        plane_covariance=scenario.sigma_range**2 * along + 1e-10 * np.eye(3),
-        plane_placement=placement,
-        placements=np.arange(len(ranges)),
-        board_poses=boards,
-        board_covariance=shots["board_covariance"][trial],
+        plane_points=obs.face_range[:, None] * rays,
+        plane_covariance=scenario.sigma_range**2 * _outer(rays) + 1e-10 * np.eye(3),
+        plane_placement=obs.face_placement,
+        placements=np.arange(len(obs.placements)),
+        board_poses=obs.view_pose,
+        board_covariance=obs.view_covariance,
     )
 
 

@@ -1,7 +1,7 @@
-"""The corner of two plates that Wasielewski and Strauss, and Kwak, look at, as drawn shots.
+"""The corner of two plates that Wasielewski and Strauss look at, as drawn shots.
 
-As in the simulation of Gomez-Ojeda and others (ICRA 2015): three parallel edges, of which the
-middle one is where the plates meet.
+As in the simulation of Gomez-Ojeda and others (ICRA 2015), who use the edge where the plates meet,
+and the outer edges only to tell which shots show the whole corner.
 """
 
 import numpy as np
@@ -22,12 +22,12 @@ LEAST_LENGTH = 15.0  # of an image line, pixels
 
 def corner_shots(setup, rng, T_camera_lrf):
     """Of shots, one for each of some rigs, which meet the conditions (named by what fails), and the
-    shots: points (n, 3, 3) in the LRF frame where the scan line meets middle, left and right edge,
-    and their image lines (n, 3, 3).
+    shots: points (n, 3) in the LRF frame where the scan line meets the middle edge, and image lines
+    (n, 3) of that.
 
     Parameters
     ----------
-    setup : lrfcal_lib.simulate.scenarios.Scenario
+    setup : lrfcal_lib.simulate.shots.Scenario
     rng : numpy.random.Generator
     T_camera_lrf : RigidTransform
     """
@@ -42,34 +42,24 @@ def corner_shots(setup, rng, T_camera_lrf):
 
 
 def _scanned(setup, rng, T_lrf_target):
-    """Points (n, 3, 3) at the edges, and whether there are enough beams on both plates."""
-    bearings = setup.bearings()
-    rays = polar_to_points(1.0, bearings)
-    origin = T_lrf_target.translation
+    """Where lines through the points on both plates meet, and whether there are enough points."""
     R = T_lrf_target.rotation.as_matrix()
+    origin = T_lrf_target.translation @ R  # in the frame of the target but for its place
+    rays = polar_to_points(1.0, setup.bearings())
+    turned = rays @ R
     fits = []
-    ends = []
-    enough = np.ones(len(R), bool)
+    enough = True
     for plate in PLATES:
-        ranges = (R @ np.cross(plate, EDGE))[:, None] @ origin[..., None]
-        ranges = ranges[..., 0] / (rays @ R @ np.cross(plate, EDGE))
-        on_plate = (ranges[..., None] * rays - origin[:, None]) @ R
+        normal = np.cross(plate, EDGE)
+        ranges = (origin[:, None] @ normal) / (turned @ normal)
+        on_plate = ranges[..., None] * turned - origin[:, None]
         away = on_plate @ plate
         hit = (ranges > 0) & (away > 0) & (away < SIZE) & (np.abs(on_plate @ EDGE) < SIZE)
-        enough &= hit.sum(axis=1) >= FEWEST_POINTS
+        enough = enough & (hit.sum(axis=1) >= FEWEST_POINTS)
         noisy = ranges + setup.range_errors(rng, ranges.shape)
         fits.append(_fitted(noisy[..., None] * rays[:, :2], hit))
-        ends.append((hit.argmax(axis=1), len(bearings) - 1 - hit[:, ::-1].argmax(axis=1)))
-    right, left = fits
-    step = setup.step / 2
-    at_left = _ray(bearings[ends[1][1]] + step)
-    at_right = _ray(bearings[ends[0][0]] - step)
-    points = np.stack(
-        [np.cross(right, left), np.cross(left, at_left), np.cross(right, at_right)], axis=1
-    )
-    points[..., :2] /= points[..., 2:]
-    points[..., 2] = 0.0
-    return points, enough
+    meeting = np.cross(*fits)
+    return meeting / meeting[:, 2:] * [1.0, 1.0, 0.0], enough
 
 
 def _fitted(points, used):
@@ -82,35 +72,30 @@ def _fitted(points, used):
     return np.column_stack([normal, -np.vecdot(normal, middle)])
 
 
-def _ray(bearing):
-    """The line of a beam."""
-    return np.column_stack([-np.sin(bearing), np.cos(bearing), np.zeros(len(bearing))])
-
-
 def _image_lines(setup, rng, T_camera_target):
-    """Lines (n, 3, 3) through the noisy ends of the edges in the image, and whether all are
-    there.
+    """Lines (n, 3) through the noisy ends of the middle edge in the image, and whether all three
+    edges are there.
     """
-    right, left = SIZE * PLATES
-    middles = np.array([0 * left, left, right])
-    ends = middles[:, None] + SIZE * EDGE * np.array([[-1.0], [1.0]])
-    poses = pose_array(T_camera_target)[:, None, None]
-    seen = np.matvec(poses[..., :3], ends) + poses[..., 3]
-    whole = (seen[..., 2] > 0).all(axis=(1, 2))
-    start, end = np.moveaxis(pinhole(seen, setup.model), 2, 0)
+    middles = SIZE * np.array([0 * EDGE, *PLATES])
+    poses = pose_array(T_camera_target)[:, None]
+    uv = []
+    for along in (-SIZE, SIZE):
+        seen = np.matvec(poses[..., :3], middles + along * EDGE) + poses[..., 3]
+        uv.append(pinhole(seen, setup.model))  # NaN behind the camera
+    start, end = uv
 
     # shares of the way at which the lines enter and leave the image
-    corner = np.array([[0.5, 0.5], [setup.model.width + 0.5, setup.model.height + 0.5]])
-    borders = (corner[:, None, None] - start) / (end - start)
+    size = np.array([setup.model.width, setup.model.height])
+    borders = np.array(
+        [(0.5 - start) / (end - start), (size + 0.5 - start) / (end - start)]
+    )
     enter = borders.min(axis=0).max(axis=-1)
     leave = borders.max(axis=0).min(axis=-1)
-    first = np.clip(0.0, enter, leave)[..., None]
-    last = np.clip(1.0, enter, leave)[..., None]
-    length = (last - first)[..., 0] * np.linalg.norm(end - start, axis=-1)
-    whole &= ((enter < leave) & (length > LEAST_LENGTH)).all(axis=1)
+    shares = np.clip([0 * enter, 1 + 0 * leave], enter, leave)
+    length = (shares[1] - shares[0]) * np.linalg.norm(end - start, axis=-1)
+    whole = ((enter < leave) & (length > LEAST_LENGTH)).all(axis=1)
 
-    clipped = [start + share * (end - start) for share in (first, last)]
-    noisy = [p + setup.sigma_px * rng.standard_normal(p.shape) for p in clipped]
-    one = np.ones_like(first)
-    lines = np.cross(*(np.concatenate([p, one], axis=-1) for p in noisy))
-    return lines / np.linalg.norm(lines[..., :2], axis=-1, keepdims=True), whole
+    ends = start[:, 0] + shares[:, :, :1] * (end - start)[:, 0]
+    noisy = ends + setup.sigma_px * rng.standard_normal(ends.shape)
+    lines = np.cross(*np.concatenate([noisy, np.ones_like(noisy[..., :1])], axis=-1))
+    return lines / np.linalg.norm(lines[:, :2], axis=-1, keepdims=True), whole

@@ -12,9 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.special import logit
 
+from lrfcal_lib.fit.edge_likelihood import disc_edge, disc_share
 from lrfcal_lib.model.board import Board, triangle_board
-from lrfcal_lib.model.camera import CameraModel, project_jacobians
+from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import AHEAD, polar_to_points, tilt
 
 # corners of a pattern that fills the triangle, metres, where the board has none
@@ -244,12 +246,8 @@ def _bias_of_sides(bench, rng):
     """How far outside each edge (E,) of a placement a spot still reads the board, spot radii."""
     bias = np.full(len(bench.board.edges), float(bench.bias))
     if bench.spread:
-        x = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]
-        # of a disc within an edge x radii inside its centre
-        share = (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi
-        odds = np.log(share / (1 - share))
-        own = np.interp(bias, x, odds) + bench.spread * rng.standard_normal(len(bias))
-        bias = np.interp(-own, -odds, x)
+        own = logit(disc_share(bias)) + bench.spread * rng.standard_normal(len(bias))
+        bias, _ = disc_edge(own)
     return bias
 
 
@@ -301,8 +299,8 @@ def beside(board, origin, rays):
 
 
 def seen_poses(devices, true, rng, noise):
-    """Poses (n, 3, 4) of boards as their pattern tells them, their covariances, and the errors
-    (n, c, 2) of the pattern's corners in the image behind them.
+    """Poses (n, 3, 4) of boards as their pattern tells them, their covariances, and the pixels
+    (n, c, 2) of the pattern's corners behind them.
     """
     pattern = devices.board.pattern
     corners = CORNERS if pattern is None else pattern.points()
@@ -314,9 +312,11 @@ def seen_poses(devices, true, rng, noise):
     J = J.reshape(len(true), 2 * len(corners), 6)
     information = J.mT @ J
     inverse = np.linalg.inv(information)
-    errors_px = devices.sigma_px * rng.standard_normal((len(true), 2 * len(corners)))
-    error = noise * np.matvec(inverse @ J.mT, errors_px)
+    sigma_px = noise * devices.sigma_px
+    errors_px = sigma_px * rng.standard_normal((len(true), 2 * len(corners)))
+    error = np.matvec(inverse @ J.mT, errors_px)
+    pixels = pinhole(points, devices.model) + errors_px.reshape(len(true), -1, 2)
     rotation = Rotation.from_rotvec(error[:, :3]).as_matrix() @ true[..., :3]
     translation = true[..., 3:] + error[:, 3:, None]
     poses = np.concatenate([rotation, translation], axis=-1)
-    return poses, inverse * devices.sigma_px**2, errors_px.reshape(len(true), -1, 2)
+    return poses, inverse * devices.sigma_px**2, pixels

@@ -59,7 +59,7 @@ class Scenario(Devices):
     tilt: float = 0.0  # of boards from the image plane, radians ('tilted')
     least_angle: float = 0.0  # between the LRF's place and the target's planes ('around')
     extra: tuple[float, float, float] = (0.0, 0.0, 0.0)  # turns about z, x, y ('around')
-    corner_edges: int = 0  # seen of a corner of two plates, which takes the place of boards
+    corner: bool = False  # of two plates, which takes the place of boards
 
     def bearings(self):
         """Of the beams, radians, shape (B,)."""
@@ -92,14 +92,14 @@ class Scenario(Devices):
         if self.poses == "ahead":
             return self._ahead(rng, count, middle)
         T_lrf_world = self._around(rng, count).inv()
-        if self.corner_edges:
+        if self.corner:
             return T_lrf_world
         centred = RigidTransform.from_translation(-middle)
         return T_lrf_world * RigidTransform.from_rotation(TARGET) * centred
 
     def shots(self, rng, T_camera_lrf):
         """One of each rig: the conditions that they meet by what else fails, and what is seen."""
-        draw = corner_shots if self.corner_edges else board_shots
+        draw = corner_shots if self.corner else board_shots
         return draw(self, rng, T_camera_lrf)
 
     def _ahead(self, rng, count, middle):
@@ -229,7 +229,7 @@ def board_shots(setup, rng, T_camera_lrf):
     }
 
     shown = np.where(ahead[:, None, None], true, true[ahead.argmax()])
-    boards, covariance, errors_px = seen_poses(setup, shown, rng, 1.0)
+    boards, covariance, pixels = seen_poses(setup, shown, rng, 1.0)
     noisy = ranges[:, None] + setup.range_errors(rng, hit.shape)
     homography = (
         setup.model.matrix @ true[..., [0, 1, 3]]
@@ -243,7 +243,7 @@ def board_shots(setup, rng, T_camera_lrf):
         "edges": edges,
         "boards": boards,
         "board_covariance": covariance,
-        "pattern_errors": errors_px,
+        "pattern_pixels": pixels,
         "true_boards": true,
     }
 
