@@ -32,9 +32,8 @@ SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 def solved(seed, change=lambda obs: obs, **settings):
     obs, _, rig = draw(rng(seed), 12, **settings)
-    return solve_joint(
-        change(obs), rig.T_head_lrf, sensor=SENSOR, noise="estimate", required=False
-    )
+    obs = change(replace(obs, T_head_lrf=rig.T_head_lrf))
+    return solve_joint(obs, sensor=SENSOR, noise="estimate", required=False)
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ FAR = np.radians(10.0)  # from the truth: another minimum, or nothing was determ
 BATCHED: dict[str, dict] = {
     "line_printed": {},
     "line": {},
-    "line_robust": {"method": "line", "loss": "cauchy"},
+    "line_robust": {"method": "line", "robust": True},
     "wasielewski_strauss": {},
 }
 # of planes, trial by trial; without a start value the minimal solution is searched for
@@ -45,7 +45,7 @@ PLANES: dict[str, dict] = {
     "three_planes": {
         "method": "zhang_pless",
         "T0": None,
-        "loss": "cauchy",
+        "robust": True,
         "scale": "auto",
     },
 }

@@ -44,15 +44,15 @@ def corner_shots(setup, rng, T_camera_lrf):
 def _scanned(setup, rng, T_lrf_target):
     """Where lines through the points on both plates meet, and whether there are enough points."""
     R = T_lrf_target.rotation.as_matrix()
-    origin = T_lrf_target.translation @ R  # in the frame of the target but for its place
+    origin = T_lrf_target.translation[:, None] @ R  # in the frame of the target but for its place
     rays = polar_to_points(1.0, setup.bearings())
     turned = rays @ R
     fits = []
     enough = True
     for plate in PLATES:
         normal = np.cross(plate, EDGE)
-        ranges = (origin[:, None] @ normal) / (turned @ normal)
-        on_plate = ranges[..., None] * turned - origin[:, None]
+        ranges = (origin @ normal) / (turned @ normal)
+        on_plate = ranges[..., None] * turned - origin
         away = on_plate @ plate
         hit = (ranges > 0) & (away > 0) & (away < SIZE) & (np.abs(on_plate @ EDGE) < SIZE)
         enough = enough & (hit.sum(axis=1) >= FEWEST_POINTS)
