@@ -101,16 +101,11 @@ def import_recording(args):
 
 
 def calibrate(args):
-    """Calibrate the rig of a session, on the cores of this machine or a cluster."""
+    """Calibrate the rigs of sessions, on the cores of this machine or a cluster."""
     from lrfcal_lib.report.calibrate import calibrate_session
-    from lrfcal_lib.session.cluster import workers_at
-    from lrfcal_lib.session.workers import side_by_side
+    from lrfcal_lib.report.many import each_session
 
-    if args.scheduler is None:
-        with side_by_side():
-            return calibrate_session(args.session, args.out)
-    with workers_at(args.scheduler) as executor, side_by_side(executor):
-        return calibrate_session(args.session, args.out)
+    return each_session(calibrate_session, args.sessions, args.out, args.scheduler)
 
 
 def check(args):
@@ -225,8 +220,8 @@ def _add_sessions(verbs):
     simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
     simulate.add_argument("dst", help="folder of the new session")
 
-    calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
-    calibrate.add_argument("session")
+    calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session, or of many")
+    calibrate.add_argument("sessions", nargs="+", metavar="session")
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
