@@ -12,7 +12,7 @@ from lrfcal_lib.drivers.pelco_d import SYNC, encode_extended
 from lrfcal_lib.emulators.head import ANSWERS, TURN_AROUND_S, EmulatedHead
 from lrfcal_lib.emulators.lms2xx import ACK, RESET_S, EmulatedLms
 from lrfcal_lib.emulators.lms2xx_memory import BAUD_WORD
-from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session import lms2xx_frame as frame
 
 DELAY_S = 0.7
 AWAY_S = 0.5
@@ -162,15 +162,15 @@ class FaultyLms(FaultyLine, EmulatedLms):
 
     def prepare(self, raw):
         """A reply with the faults that keep its checksum sound."""
-        with suppress(codec.TelegramError):
-            told = codec.parse_telegram(raw)
+        with suppress(frame.TelegramError):
+            told = frame.parse_telegram(raw)
             status = 0xD3 if self.hit("status") else raw[-3]
             address = 0x80 | (raw[1] + 5) % 0x80 if self.hit("address") else raw[1]
-            raw = codec.encode_telegram(
+            raw = frame.encode_telegram(
                 told.code, told.data, status=status, address=address
             )
         return (
-            codec.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
+            frame.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
         )
 
 

@@ -14,7 +14,12 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
 )
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
-from lrfcal_lib.session.lms2xx_codec import Configuration, encode_telegram
+from lrfcal_lib.session.lms2xx_codec import (
+    Configuration,
+)
+from lrfcal_lib.session.lms2xx_frame import (
+    encode_telegram,
+)
 
 
 def emulated(**options):

@@ -407,9 +407,9 @@ DAMAGE = [
     (cell("file", "..\\x.png"), OUT + r"'\.\.\\"),
     (cell("file", "images/left/0009.png"), "0009.png: No such file"),
     (cell("file", "session.json"), "neither PNG nor JPEG"),
-    (cell("camera", "up"), "no camera 'up' in session.json, which has left, right"),
+    (cell("camera", "up"), "camera is one of left, right, got 'up'"),
     (cell("purpose", "fun"), "purpose is one of intrinsics, board, scene, got 'fun'"),
-    (cell("placement", "12"), "placement 12 is not in session.json"),
+    (cell("placement", "12"), "placement is one of 1, 2, -1, got '12'"),
     (
         cell("placement", "1.5"),
         "images.csv line 2: placement is '1.5': a whole number is needed",
@@ -443,8 +443,11 @@ DAMAGE = [
         pick("left,images/left/0001.png,top,1,2,20,3"),
         "edge is one of ab, bc, ca, got 'top'",
     ),
-    (pick("left,images/left/0001.png,ab,1,2,2,3"), "too close for a direction"),
-    (pick("left,images/left/0001.png,ab,1,2,nan,3"), "u1, v1, u2, v2 must be 4 finite"),
+    (pick("left,images/left/0001.png,ab,1,2,2,3"), "give no direction: pick two"),
+    (
+        pick("left,images/left/0001.png,ab,1,2,nan,3"),
+        "give no direction: pick two that are 5 or more",
+    ),
 ]
 
 

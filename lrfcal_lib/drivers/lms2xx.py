@@ -20,7 +20,8 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
 )
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, UNITS
+from lrfcal_lib.session.lms2xx_codec import SCAN, TOP, UNITS
+from lrfcal_lib.session.lms2xx_frame import TelegramError
 
 LOG = logging.getLogger(__name__)
 # data of MODE
@@ -186,7 +187,7 @@ class LMS2xx(Closed):
                 f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does"
             )
         mode = self.configuration.measuring_mode
-        if mode not in MODES:
+        if mode not in TOP:
             raise WrongDevice(
                 f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are "
                 "no ranges that can be told from errors: state measuring_mode, 0 to 6, to have it "
@@ -205,7 +206,7 @@ class LMS2xx(Closed):
         raw = self._opened().ask(code).raw
         try:
             return parse(raw)
-        except codec.TelegramError as error:
+        except TelegramError as error:
             what = f"the reply to command {code:02X} is not that of an LMS2xx"
             raise WrongDevice(f"{self.port}: {what}: {error}") from error
 
@@ -360,7 +361,7 @@ class LMS2xx(Closed):
         unit
             Of a reading, 'cm' or 'mm'.
         measuring_mode
-            Key of `lms2xx_codec.MODES`; it tells the largest range, too.
+            Key of `lms2xx_codec.TOP`; it tells the largest range, too.
         realtime_indices
             Without them dropped and repeated scans cannot be seen.
 
@@ -377,7 +378,7 @@ class LMS2xx(Closed):
             For a wrong password, or values that the device declines.
         """
         self._need_quiet()
-        if unit not in (None, *UNITS) or measuring_mode not in (None, *MODES):
+        if unit not in (None, *UNITS) or measuring_mode not in (None, *TOP):
             raise ValueError(
                 f"unit is one of {UNITS}, measuring mode 0 to 6; got {unit!r}, {measuring_mode!r}"
             )

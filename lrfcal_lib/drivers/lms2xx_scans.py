@@ -9,6 +9,7 @@ import numpy as np
 from lrfcal_lib.drivers.lms2xx_link import FASTEST
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session.lms2xx_frame import TelegramError
 
 BURST = 508  # bytes that leave in a turn of the mirror at 500 kBd
 VARIANTS = (
@@ -212,12 +213,11 @@ class Assembler:
         configuration = self.configuration
         try:
             scan = codec.decode_scan(raw, configuration.measuring_mode)
-        except codec.TelegramError:
+        except TelegramError:
             return None
         count = scan.words.shape[1]
         index = int(scan.scan_index[0])
-        partial = int(scan.partial[0])
-        kind = (count + (partial > 0), scan.unit, index >= 0, partial >= 0)
+        kind = (count + (scan.partial > 0), scan.unit, index >= 0, scan.partial >= 0)
         indexed = configuration.realtime_indices
         if kind != (self.values, configuration.unit, indexed, self.interlaced):
             return None
@@ -229,7 +229,7 @@ class Assembler:
         if not self._first:
             self.counts["dropped"] += max(0, step // self.turns - 1)
         self._first = False
-        quarters = codec.scan_quarters(count, partial)
+        quarters = codec.scan_quarters(count, scan.partial)
         # the first turn begins at 0 deg
         times = start_s + (np.arange(count) % self.turns + quarters / 1440) * MIRROR_TURN
         reading = Reading(
@@ -243,7 +243,7 @@ class Assembler:
             telegram_index=int(scan.telegram_index[0]),
         )
         if self.interlaced:
-            return self._merged(partial, reading)
+            return self._merged(scan.partial, reading)
         return reading
 
     def _merged(self, partial, part):

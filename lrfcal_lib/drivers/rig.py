@@ -17,7 +17,7 @@ from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, Host, LineLost, NoReply
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, RigFileError
 from lrfcal_lib.drivers.video import Camera, Frame
-from lrfcal_lib.session.lms2xx_codec import METRES, MODES, encode_configuration
+from lrfcal_lib.session.lms2xx_codec import METRES, encode_configuration, largest
 from lrfcal_lib.session.stated import LrfInfo
 
 LOG = logging.getLogger(__name__)
@@ -198,7 +198,7 @@ class Rig(Closed):
             field_of_view=(math.radians(90 - view / 2), math.radians(90 + view / 2)),
             bearing_step=math.radians(step),
             range_resolution=unit,
-            max_range=MODES[configuration.measuring_mode].largest * unit,
+            max_range=largest(configuration.measuring_mode) * unit,
         )
 
     def begin_telegrams(self) -> list[bytes]:

@@ -32,8 +32,13 @@ from lrfcal_lib.emulators.lms2xx_memory import (
 )
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, encode_telegram
-from lrfcal_lib.session.lms2xx_frame import Telegram
+from lrfcal_lib.session.lms2xx_codec import SCAN, largest
+from lrfcal_lib.session.lms2xx_frame import (
+    Telegram,
+    encode_telegram,
+    parse_telegram,
+    split_stream,
+)
 
 LOG = logging.getLogger(__name__)
 ACK = b"\x06"
@@ -157,7 +162,7 @@ class EmulatedLms(SerialDevice):
         """
         self.cancel("gap")
         raw = self._buffer + data
-        stream = codec.split_stream(raw, replies=False)
+        stream = split_stream(raw, replies=False)
         self._buffer = raw[stream.pending :]
         for offset, length in zip(
             stream.offset.tolist(), stream.length.tolist(), strict=True
@@ -194,7 +199,7 @@ class EmulatedLms(SerialDevice):
             return
         self.write(ACK, at + ACK_S)
         self.requests.append((self.host.time(), raw))
-        self.obey(codec.parse_telegram(raw), at)
+        self.obey(parse_telegram(raw), at)
 
     def obey(self, telegram: Telegram, at: float) -> None:
         """Do what a telegram says, and answer it.
@@ -458,7 +463,7 @@ class EmulatedLms(SerialDevice):
         configuration = memory.configuration
         words = scan.words[self._selection.first - 1 : self._selection.last]
         if memory.mode == REFLECTIVITY:  # behind every range
-            answered = words <= MODES[ENCODED[configuration.measuring_mode]].largest
+            answered = words <= largest(ENCODED[configuration.measuring_mode])
             words = np.stack([words, WHITE * answered], axis=1)
         indices = None
         if configuration.realtime_indices:
