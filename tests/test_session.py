@@ -400,7 +400,7 @@ DAMAGE = [
     (arrays(time_s=np.zeros(2)), r"time_s has shape \(2,\)"),
     (
         lambda path: (path / SCANS).rename(path / "lrf" / "telegrams.bin"),
-        r"index\.csv: No such file.*needs this file",
+        r"index\.csv: No such file.*this file is needed",
     ),
     (cell("file", "../trip/session.json"), OUT + "'../trip/session.json'"),
     (cell("file", "/etc/passwd"), OUT + "'/etc/passwd'"),

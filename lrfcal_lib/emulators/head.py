@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,7 @@ from lrfcal_lib.simulate.rig import Platform
 REACT_S = 0.04  # from a command to the motor
 WOBBLE = 0.015  # amplitude after a stop, radians for each rad/s of speed
 WOBBLE_HZ = 4.0
-KEPT = 2000  # knots of the motion; ten times as many frames
+KEPT = 2000  # knots of the motion
 TURN_AROUND_S = 0.010  # from the end of a frame to a reply
 # to queries of pan, tilt, zoom, magnification
 ANSWERS = {0x51: 0x59, QUERY_TILT: TILT, 0x55: 0x5D, 0x61: 0x63}
@@ -248,11 +247,6 @@ class EmulatedHead(SerialDevice):
         As for :class:`EmulatedLms`.
     **habits
         Of :class:`Habits`.
-
-    Attributes
-    ----------
-    frames : deque of tuple
-        Host time, s, and sound frames to this address.
     """
 
     def __init__(
@@ -267,7 +261,6 @@ class EmulatedHead(SerialDevice):
         super().__init__(path, host, seed)
         self.head = head or Head(seed=seed)
         self.habits = Habits(**habits)
-        self.frames: deque = deque(maxlen=10 * KEPT)
         self.absolute_until = -math.inf  # an absolute move is under way
         self._buffer = b""  # bytes of a frame that is not whole
 
@@ -313,7 +306,6 @@ class EmulatedHead(SerialDevice):
         at
             Instant of its last byte, s.
         """
-        self.frames.append((self.host.time(), frame))
         if frame.command2 in ANSWERS:
             self.tell(frame.command2, at)
         elif frame.command2 == pelco_d.SET_TILT:

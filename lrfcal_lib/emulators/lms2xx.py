@@ -6,9 +6,8 @@ The orders of commands of those two programs are in ``tests/test_lms2xx_clients.
 import logging
 import math
 import os
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,7 +54,6 @@ AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 LATE_S = 1.0
 LATE_AGAIN_S = 0.1  # once it did
 POWERED_S = 60.0  # how long ago it was switched on
-KEPT = 20000  # scans and requests on record
 WHITE = 100  # reflectivity of all that answers: the simulated world states none
 # results of command 0x20
 DONE = b"\0"
@@ -63,18 +61,13 @@ WRONG = b"\1"
 FAULT = b"\2"
 
 
-@dataclass(frozen=True)
-class ScanRecord:
-    """A scan that was sent."""
+class Scan(NamedTuple):
+    """A scan that is to be sent."""
 
-    number: int  # running
     turn: int  # of the mirror since power-on, the scan's first; modulo 256 it is the scan index
-    telegram_index: int
-    time_s: float  # clock of the host at the first beam
-    beam_times_s: np.ndarray  # (B,), the same at every beam
     partial: int  # 0 to 3 for the quarters of interlaced scans, -1 for whole ones
     words: np.ndarray  # (B,) of uint16, all values of the scan, as the device counts them
-    telegram: bytes
+    times: np.ndarray  # (B,), instants of the beams
 
 
 class EmulatedLms(SerialDevice):
@@ -99,10 +92,6 @@ class EmulatedLms(SerialDevice):
 
     Attributes
     ----------
-    scans : deque of ScanRecord
-        The newest 20000.
-    requests : deque of (float, bytes)
-        Host time and sound telegrams from the host.
     telegrams : int
         Scans counted since power-on.
     """
@@ -123,8 +112,6 @@ class EmulatedLms(SerialDevice):
         self.source = source
         self.boot_s = boot_s
         self.baudrates = baudrates
-        self.scans: deque = deque(maxlen=KEPT)
-        self.requests: deque = deque(maxlen=KEPT)
         self.telegrams = 0
         self._rng = np.random.default_rng([seed, 1])
         self._late_s = LATE_S  # a stream that lags so far leaves scans out
@@ -132,7 +119,6 @@ class EmulatedLms(SerialDevice):
         self._booting = False
         self._effect: Callable | None = None  # of the command whose reply is on its way
         self._zero = host.now() - POWERED_S  # when turns of the mirror are counted from
-        self._number = 0  # of the next scan
         self._selection = Selection()
         # of the next scan of the stream
         self._turn = 0
@@ -198,7 +184,6 @@ class EmulatedLms(SerialDevice):
             self.write(NAK, at + ACK_S, self._finish)
             return
         self.write(ACK, at + ACK_S)
-        self.requests.append((self.host.time(), raw))
         self.obey(parse_telegram(raw), at)
 
     def obey(self, telegram: Telegram, at: float) -> None:
@@ -425,8 +410,7 @@ class EmulatedLms(SerialDevice):
                     axis=0
                 ),  # of a mean, too: one scan without a range leaves none
             )
-            times += self.host.time() - self.host.now()
-            scan = ScanRecord(-1, turn, -1, float(times[0]), times, partial, words, b"")
+            scan = Scan(turn, partial, words, times)
             self.at(end, lambda instant: send(scan, instant), tag)
 
         self.at(end - AHEAD_S, ahead, tag)
@@ -435,30 +419,29 @@ class EmulatedLms(SerialDevice):
         self.emit(scan, at, self._finish)
 
     def emit(
-        self, scan: ScanRecord, at: float, then: Callable[[float], None] | None = None
+        self, scan: Scan, at: float, then: Callable[[float], None] | None = None
     ) -> None:
-        """Send a scan, which is then on record.
+        """Send a scan.
 
         Parameters
         ----------
         scan
-            Without its numbers and telegram.
         at
             Instant from which it may leave, s.
         then
             ``then(instant)`` is called when the last byte is out.
         """
-        raw = self._telegram(scan)
-        index = self.telegrams % 256
-        self.scans.append(
-            replace(scan, number=self._number, telegram_index=index, telegram=raw)
-        )
+        raw = self.telegram(scan)
         self.telegrams += 1
-        self._number += 1
         self.reply(raw, at, then)
 
-    def _telegram(self, scan):
-        """What the mode tells of a scan."""
+    def telegram(self, scan: Scan) -> bytes:
+        """What the mode tells of a scan.
+
+        Parameters
+        ----------
+        scan
+        """
         memory = self.memory
         configuration = memory.configuration
         words = scan.words[self._selection.first - 1 : self._selection.last]
@@ -513,6 +496,6 @@ class EmulatedLms(SerialDevice):
             self.telegrams += 1
         else:
             self.emit(scan, at)
-        sending_s = len(self._telegram(scan)) * self.byte_s
+        sending_s = len(self.telegram(scan)) * self.byte_s
         self._turn += math.ceil(sending_s / (self._turns * MIRROR_TURN)) * self._turns
         self._plan()

@@ -161,9 +161,7 @@ def read_bytes(
         with opened(file, within, most=most) as stream:
             data = stream.read(most + 1)
     except OSError as error:
-        raise SessionError(
-            f"{file}: {error.strerror}; the session needs this file"
-        ) from error
+        raise SessionError(f"{file}: {error.strerror}; this file is needed") from error
     if len(data) > most:  # files of the system do not tell their size
         raise SessionError(f"{file}: more than {most / 1e6:.0f} MB; {SPLIT}")
     return data
@@ -186,9 +184,7 @@ def read_json(file: str | PathLike, within: str | PathLike | None) -> dict:
     with reading(file, "not JSON ({}); truncated, or edited by hand?"):
         data = json.loads(text.decode())
     if not isinstance(data, dict):
-        raise SessionError(
-            f"{file}: holds a {type(data).__name__}, expected an object with the key 'schema'"
-        )
+        raise SessionError(f"{file}: holds a {type(data).__name__}, an object is needed")
     inner = [data]
     for _ in range(DEEPEST_JSON):
         inner = [value for outer in inner for value in _inside(outer)]

@@ -452,11 +452,15 @@ def parse_configuration(raw: bytes) -> Configuration:
     Raises
     ------
     TelegramError
-        If it is damaged, another reply, or shorter than the measuring mode and the unit need.
+        If it is damaged, another reply, or shorter than the measuring mode and the unit need, or
+        of a unit that there is not.
     """
     if raw[4:5] == bytes([CONFIGURED]):
-        return Configuration(reply_data(raw, CONFIGURED, 8)[1:])
-    return Configuration(reply_data(raw, CONFIGURATION, 7))
+        configuration = Configuration(reply_data(raw, CONFIGURED, 8)[1:])
+    else:
+        configuration = Configuration(reply_data(raw, CONFIGURATION, 7))
+    unit_of(configuration.block[6:])  # raises for one that no manual lists
+    return configuration
 
 
 STATE_MODE = (CONFIGURATION, CONFIGURED, STATUS)  # codes of the replies that do
