@@ -94,7 +94,7 @@ def import_recording(args):
     """Make a session of a recording by other people."""
     from lrfcal_lib.session.importers import import_lasersetero
 
-    miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
+    miss = import_lasersetero(args.src, args.dst)
     print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
 
 
@@ -204,12 +204,6 @@ def _add_import(verbs):
         "src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png, Calib_Results_*.m"
     )
     add.add_argument("dst", help="folder of the new session")
-    add.add_argument(
-        "--intrinsics",
-        choices=("own", "published"),
-        default="own",
-        help="estimate them from the images (default), or take the authors'",
-    )
 
 
 def _add_sessions(verbs):

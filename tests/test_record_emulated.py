@@ -90,7 +90,7 @@ def emulated_rig(setup, file):
             "settle_s": 0.25,
             "poll_s": 0.05,
             "gap_s": 0.025,
-        }  # the head wobbles for 0.2 s
+        }  # the head settles for 0.2 s
         data["plan"] |= {"pitch_deg": [-20, 8, 2]}  # of the scene
         file.write_text(json.dumps(data))
 
