@@ -206,11 +206,9 @@ def test_scans_on_request_are_those_of_the_device(rate, variant):
             )
             np.testing.assert_allclose(reading.beam_times_s, truth.beam_times_s, atol=1e-4)
             assert reading.time_s == reading.beam_times_s[0]
-            assert (reading.scan_index, reading.telegram_index) == (
-                truth.turn % 256,
-                truth.telegram_index,
-            )
-            valid = reading.reasons == 0
+            assert reading.telegram_index == truth.telegram_index
+            valid = np.isfinite(reading.ranges)
+            assert valid.tolist() == (truth.words < 8183).tolist()
             np.testing.assert_array_equal(
                 np.rint(reading.ranges[valid] * 1000), truth.words[valid]
             )
@@ -293,11 +291,7 @@ def test_a_stream_comes_back_by_itself_with_the_same_settings(fault):
             device.hear(encode_telegram(0x31))
         after = device.host.time() + 0.1
         (reading,) = lms.take(1, after=after, timeout=10)
-        assert (
-            len(reading.ranges) == 201
-            and record_of(device, reading)
-            and lms.counts["reconnects"] == 1
-        )
+        assert len(reading.ranges) == 201 and record_of(device, reading)
         assert device.baudrate == 500000 and device.memory.flash_writes == 0
     assert not device.streaming
 

@@ -500,5 +500,5 @@ def test_the_writer_refuses_what_the_reader_would(tmp_path):
     for method, wrong, message in REFUSED:
         with pytest.raises(SessionError, match=message):
             getattr(writer, method)(*wrong)
-    with pytest.raises(SessionError, match="purposes intrinsics, board, scene"):
+    with pytest.raises(SessionError, match="purpose is one of intrinsics, board, scene"):
         writer.add_image("left", pixels(), purpose="fun")

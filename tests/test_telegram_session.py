@@ -19,7 +19,7 @@ from lrfcal_lib.session.lms2xx_frame import (
 )
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import LrfInfo, SessionError
-from lrfcal_lib.session.telegrams import WRONG
+from lrfcal_lib.session.telegrams import TRUNCATED, WRONG
 from lrfcal_lib.session.write import SessionWriter, finish
 
 LRF = LrfInfo(
@@ -179,12 +179,7 @@ def test_wrong_crcs_are_left_out_counted_and_named(path):
     )
     wrong = session.telegrams.offset[session.telegrams.outcome == WRONG]
     assert wrong.tolist() == [854, 3290]
-    assert session.telegrams.report()["outcomes"] == {
-        "scan": 6,
-        "other": 1,
-        "wrong CRC": 2,
-        "truncated": 0,
-    }
+    assert np.bincount(session.telegrams.outcome).tolist() == [6, 1, 2]
     wrong, behind = session.problems
     assert "2 of 9 telegrams have a wrong CRC, left out, at 854, 3290" in wrong
     assert "9 bytes after the last telegram in index.csv are not used" in behind
@@ -197,7 +192,7 @@ def test_a_truncated_last_telegram_is_left_out_and_told(path, cut):
     session = open_session(path)
     assert (
         len(session.sweep(2).ranges) == 3
-        and session.telegrams.report()["outcomes"]["truncated"] == 1
+        and (session.telegrams.outcome == TRUNCATED).sum() == 1
     )
     assert any(
         f"at {len(data) - 812}, is cut off after {812 - cut} bytes" in text

@@ -54,8 +54,8 @@ class PanTilt(port.Closed):
         self._lock = threading.Lock()
         self._line: HeadLine | None = HeadLine(path, settings, host)
         self._host = host
-        self._thread = None
-        self._error = None
+        self._thread: threading.Thread | None = None
+        self._error: DeviceError | None = None
         self.motion = Motion(self._line, settings)
         try:
             self._probe(self._line)

@@ -7,7 +7,7 @@ from threading import Thread
 
 from lrfcal_lib.drivers import lms2xx_link as wire
 from lrfcal_lib.drivers.lms2xx_link import POWER_ON, RATES, Link
-from lrfcal_lib.drivers.lms2xx_scans import VARIANTS, Assembler, Reading, ScanClock
+from lrfcal_lib.drivers.lms2xx_scans import Assembler, Reading, ScanClock
 from lrfcal_lib.drivers.port import (
     REAL,
     Closed,
@@ -20,7 +20,7 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
 )
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import TOP
+from lrfcal_lib.session.lms2xx_codec import TOP, VARIANTS
 from lrfcal_lib.session.lms2xx_frame import TelegramError
 
 LOG = logging.getLogger(__name__)
@@ -39,14 +39,13 @@ RECOVERY_S = 8.0
 # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
 REPLY_S = 0.4
 LOOK_S = 0.2  # between looks whether the reader thread lives
-COUNTS = ("dropped", "stale", "reconnects")
 
 
 class LMS2xx(Closed):
     """An LMS2xx, found at a port whatever it is doing, its stream stopped; a context manager.
 
     Every call returns or raises a DeviceError within its deadline. While the device streams, only
-    `take`, `counts`, `stop` and `close` may be called.
+    `take`, `stop` and `close` may be called.
 
     Parameters
     ----------
@@ -71,10 +70,6 @@ class LMS2xx(Closed):
         Model and order number.
     status, configuration : DeviceStatus, Configuration
         As read last.
-    counts : dict of str to int
-        'dropped': scans that the mirror made between two that came (needs real-time indices), most
-        of them because the line is slow; 'stale': scans that were not newer than the one before;
-        'reconnects'.
 
     Raises
     ------
@@ -101,7 +96,6 @@ class LMS2xx(Closed):
             known = ", ".join(map(str, sorted(RATES)))
             raise ValueError(f"an LMS2xx has {known} Bd, got {baudrate}")
         self.port = str(port)
-        self.counts = dict.fromkeys(COUNTS, 0)
         self._host = host
         self._address = address
         self._interrupted = host.event()
@@ -186,7 +180,7 @@ class LMS2xx(Closed):
                 "set"
             )
         self._settled = self.variant, self.configuration, self.baudrate
-        self._assembler = Assembler(*self._settled, interlaced, self.counts, self._clock)
+        self._assembler = Assembler(*self._settled, interlaced, self._clock)
 
     def _opened(self):
         if self._link is None:
@@ -251,7 +245,6 @@ class LMS2xx(Closed):
             self._set_rate(rate)
         self._prepare()
         self._link.deadline = math.inf
-        self.counts["reconnects"] += 1
         LOG.warning("%s: the device is back at %d Bd", self.port, rate)
 
     @property

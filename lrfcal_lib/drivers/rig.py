@@ -151,12 +151,13 @@ class Rig(Closed):
         settings = devices.lrf.model_dump(exclude_none=True, exclude={"interlaced"})
         if devices.lrf.interlaced:  # it chooses its own
             settings.pop("variant", None)
+        open_camera: Callable = camera or partial(_camera, stated)
         openers: dict[str, Callable] = {
             "head": partial(PanTilt, devices.head.port, devices.head, host=host),
             "lrf": partial(LMS2xx, host=host, **settings),
         }
         for name in stated.cameras:
-            openers[f"camera '{name}'"] = partial(camera or partial(_camera, stated), name)
+            openers[f"camera '{name}'"] = partial(open_camera, name)
         with contextlib.ExitStack() as stack:
             opened = []
             for name, opener in openers.items():

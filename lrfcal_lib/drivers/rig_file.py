@@ -333,12 +333,17 @@ class Plan(Stated):
             stops = stops_of(entry.pitch_deg or self.pitch_deg)
             if not self.placements and i % 2 == 0:
                 stops = stops[::-1]
-            stated = {"number": i, "image_pitch_deg": self.image_pitch_deg}
-            stated |= entry.model_dump(exclude_none=True)
-            images = tuple(map(math.radians, stated["image_pitch_deg"]))
-            purpose = {True: "board", False: "scene"}[entry.board]
+            images = self.image_pitch_deg
+            if entry.image_pitch_deg is not None:
+                images = entry.image_pitch_deg
             placements.append(
-                Placement(stated["number"], stops, images, purpose, entry.closing)
+                Placement(
+                    number=i if entry.number is None else entry.number,
+                    pitch=stops,
+                    image_pitch=tuple(map(math.radians, images)),
+                    purpose="board" if entry.board else "scene",
+                    closing=entry.closing,
+                )
             )
         return placements
 

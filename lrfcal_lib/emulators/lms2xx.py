@@ -3,7 +3,6 @@
 The orders of commands of those two programs are in ``tests/test_lms2xx_clients.py``.
 """
 
-import logging
 import math
 import os
 from collections.abc import Callable
@@ -39,7 +38,6 @@ from lrfcal_lib.session.lms2xx_frame import (
     split_stream,
 )
 
-LOG = logging.getLogger(__name__)
 ACK = b"\x06"
 NAK = b"\x15"
 ACK_S = 0.003  # from the last byte of a request to ACK or NAK; the manual allows 60 ms
@@ -51,8 +49,7 @@ STOP_S = 0.52
 GAP_S = 0.006  # a host that pauses longer within a telegram is not heard
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 # A stream that lags so far leaves scans out, as no host can know how late they are.
-LATE_S = 1.0
-LATE_AGAIN_S = 0.1  # once it did
+LATE_S = 0.5
 POWERED_S = 60.0  # how long ago it was switched on
 WHITE = 100  # reflectivity of all that answers: the simulated world states none
 # results of command 0x20
@@ -114,7 +111,6 @@ class EmulatedLms(SerialDevice):
         self.baudrates = baudrates
         self.telegrams = 0
         self._rng = np.random.default_rng([seed, 1])
-        self._late_s = LATE_S  # a stream that lags so far leaves scans out
         self._buffer = b""  # bytes of a request that is not whole
         self._booting = False
         self._effect: Callable | None = None  # of the command whose reply is on its way
@@ -468,15 +464,7 @@ class EmulatedLms(SerialDevice):
         """
         turns = self._turns
         late = self.host.now() - self._zero - (self._turn + turns) * MIRROR_TURN
-        if late > self._late_s:
-            if self._late_s == LATE_S:
-                LOG.warning(
-                    "%s: this machine casts scans too slowly: %.1f s of them are left out; "
-                    "choose stop-and-go",
-                    self.path,
-                    late,
-                )
-            self._late_s = LATE_AGAIN_S
+        if late > LATE_S:
             self.telegrams += 1
             self._partial = 0
             self._turn = self._turn_of(self.host.now(), turns, math.ceil)

@@ -308,26 +308,20 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
     """
     text = json.dumps(rig.rig_file(), indent=1) + "\n"
     try:
-        stream = file.open("x")
+        with file.open("x") as stream:
+            stream.write(text)
     except FileExistsError:
-        remedy = "name another file with --rig-file, or remove this one first"
         raise ValueError(
-            f"{file}: exists already, and is not written over: {remedy}"
+            f"{file}: exists already, and is not written over: name another file with --rig-file, "
+            "or remove this one first"
         ) from None
     except OSError as error:
-        remedy = "name a file in a folder that exists and can be written with --rig-file"
+        file.unlink(missing_ok=True)
         raise ValueError(
-            f"{file}: cannot be written ({error.strerror}): {remedy}"
+            f"{file}: cannot be written ({error.strerror}): name another file, in a folder that "
+            "exists and can be written, with --rig-file"
         ) from error
-    try:
-        with stream:
-            stream.write(text)
-        written = file.stat()
-    except OSError as error:
-        file.unlink()
-        raise ValueError(
-            f"{file}: cannot be written ({error.strerror}): name another file with --rig-file"
-        ) from error
+    written = file.stat()
     try:
         yield
     finally:

@@ -24,15 +24,13 @@ class Fault:
     Attributes
     ----------
     kind : str
-        'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark', 'clock'; of
+        'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark'; of
         :mod:`lrfcal_lib.judge.recording_faults` also 'camera moved', 'camera zoomed',
         'exchanged', 'numbers', 'sense', 'unit'.
     words : str
         What was found, where, and what to do about it.
     severe : bool
         Nothing that rests on it can be trusted.
-    harmless : bool
-        No estimate rests on it.
     camera : str or None
     placements : tuple of int
         Those concerned, where it is not the whole recording.
@@ -41,13 +39,12 @@ class Fault:
     kind: str
     words: str
     severe: bool = False
-    harmless: bool = False
     camera: str | None = None
     placements: tuple[int, ...] = ()
 
 
 def faults_of_files(session) -> list[Fault]:
-    """What cannot be right about a session: repetitions, ranges, bearings and times.
+    """What cannot be right about a session: repetitions, ranges and bearings.
 
     Parameters
     ----------
@@ -57,10 +54,9 @@ def faults_of_files(session) -> list[Fault]:
     Returns
     -------
     list of Fault
-        Harmless ones included.
     """
     found = repeated_images(session) + repeated_scans(session)
-    return found + ranges_beyond(session) + bearings_beyond(session) + other_clocks(session)
+    return found + ranges_beyond(session) + bearings_beyond(session)
 
 
 def repeated_images(session) -> list[Fault]:
@@ -167,45 +163,6 @@ def bearings_beyond(session) -> list[Fault]:
         "bearings if they are wrong"
     )
     return [Fault("field of view", words)]
-
-
-def other_clocks(session) -> list[Fault]:
-    """Cameras whose times put most images beside the scans of other placements."""
-    ends = {}
-    for number in session.placements:
-        time = session.scans["time_s"][session.scans["placement"] == number]
-        if np.isfinite(time).any():
-            ends[number] = (np.nanmin(time), np.nanmax(time))
-    if len(ends) < 2:
-        return []
-
-    found = []
-    first, last = np.array(list(ends.values())).T
-    numbers = np.array(list(ends))
-    for camera in session.cameras:
-        records = [
-            r
-            for r in session.images(camera)
-            if r.placement in ends and np.isfinite(r.time_s)
-        ]
-        away = []
-        for record in records:
-            outside = np.maximum(
-                np.maximum(first - record.time_s, record.time_s - last), 0.0
-            )
-            own = numbers == record.placement
-            if outside[own][0] > outside[~own].min():
-                begin, end = ends[record.placement]
-                away.append(record.time_s - (begin if record.time_s < begin else end))
-        if len(away) > len(records) / 2:
-            words = (
-                f"the times (t_s in images.csv) of {len(away)} of {len(records)} images of camera "
-                f"'{camera}' lie beside the scans of other placements, {np.median(away):+.6g} s "
-                "from their own: another clock? Placement numbers count, not these times; leave "
-                "t_s empty or set the clocks alike"
-            )
-            found.append(Fault("clock", words, harmless=True, camera=camera))
-    return found
 
 
 def brightness(image: np.ndarray) -> int:

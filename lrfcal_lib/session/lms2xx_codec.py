@@ -254,8 +254,12 @@ def decode_scans(
     return scans
 
 
-# values of a whole scan -> first bearing and step in quarters of a degree
-GRIDS = {101: (160, 4), 201: (160, 2), 401: (160, 1), 181: (0, 4), 361: (0, 2)}
+# field of view and step of whole scans, deg
+VARIANTS = ((100, 1.0), (100, 0.5), (100, 0.25), (180, 1.0), (180, 0.5))
+# number of values -> first bearing and step in quarters of a degree
+GRIDS = {
+    round(view / step) + 1: (2 * (180 - view), round(4 * step)) for view, step in VARIANTS
+}
 
 
 def scan_quarters(values: int, partial: int = -1) -> np.ndarray:

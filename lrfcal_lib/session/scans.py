@@ -128,12 +128,8 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if ranges.ndim != 2:
         raise ValueError(f"ranges must be scan lines x beams, got shape {ranges.shape}")
     lines, beams = ranges.shape
-    shapes: dict[str, tuple[int, ...]] = {
-        "bearings": (beams,),
-        "placement": (lines,),
-        "pitch": (lines,),
-        "time_s": (lines,),
-    }
+    lengths = {"bearings": beams, "placement": lines, "pitch": lines, "time_s": lines}
+    shapes: dict[str, tuple] = {key: (length,) for key, length in lengths.items()}
     if "intensities" in scans:
         shapes["intensities"] = (lines, beams)
     for key, shape in shapes.items():
@@ -165,9 +161,9 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _check_angles(name, angles, limit):
     """A ValueError where an angle is not finite, or too large to be in radians."""
-    if not np.isfinite(angles).all():
-        count = np.sum(~np.isfinite(angles))
-        raise ValueError(f"{count} values of {name} are not finite")
+    endless = np.sum(~np.isfinite(angles))
+    if endless:
+        raise ValueError(f"{endless} values of {name} are not finite")
     largest = np.abs(angles).max(initial=0)
     if largest > limit + 1e-6:
         raise ValueError(f"a {name} is {largest:g} rad: degrees? Convert to radians")

@@ -236,7 +236,9 @@ def model_to_json(model: CameraModel | None) -> dict | None:
     ----------
     model
     """
-    return model and plain({name: getattr(model, name) for name in LensStated.model_fields})
+    if model is None:
+        return None
+    return plain({name: getattr(model, name) for name in LensStated.model_fields})
 
 
 class PatternStated(BaseModel):

@@ -48,22 +48,6 @@ class TelegramLog:
     values: np.ndarray
     problems: tuple[str, ...]
 
-    def report(self) -> dict:
-        """What became of the recorded telegrams.
-
-        Returns
-        -------
-        dict
-            'telegrams' : int; 'outcomes' and 'values' : dict of str to int, by outcome and reason.
-        """
-        outcomes = np.bincount(self.outcome, minlength=len(OUTCOMES)).tolist()
-        values = self.values.sum(axis=0).tolist()
-        return {
-            "telegrams": len(self.offset),
-            "outcomes": dict(zip(OUTCOMES, outcomes, strict=True)),
-            "values": dict(zip(codec.REASONS, values, strict=True)),
-        }
-
 
 @dataclass(frozen=True)
 class Index:
