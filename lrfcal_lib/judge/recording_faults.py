@@ -158,12 +158,12 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     Returns
     -------
     list of Fault
-        Those of the files first; harmless ones are left out.
+        Those of the files first.
     """
     prepared = calibration.prepared
     joint = calibration.joint
     session = prepared.session
-    found = [fault for fault in faults_of_files(session) if not fault.harmless]
+    found = faults_of_files(session)
     found += dark_images(session)
     if hopeless(joint):
         misread = misread_recording(prepared)
@@ -391,7 +391,7 @@ def faults_of_changes(changes, cameras):
         severe = change.size_px > SEVERE_PX
         concerned = (change.after,)
         found.append(
-            Fault(kind, f"{words}; {remedy}", severe, False, change.camera, concerned)
+            Fault(kind, f"{words}; {remedy}", severe, change.camera, concerned)
         )
     return found
 
