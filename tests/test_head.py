@@ -200,7 +200,7 @@ FAILURES = [  # settings, habits, fault that lasts, call, what it raises
         None,
         to(30),
         Refused,
-        "the other way: set invert",
+        "opposite direction: change invert",
     ),
     (
         replace(FAST, absolute=True),

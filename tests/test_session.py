@@ -408,7 +408,7 @@ DAMAGE = [
     (cell("file", "images/left/0009.png"), "0009.png: No such file"),
     (cell("file", "session.json"), "neither PNG nor JPEG"),
     (cell("camera", "up"), "no camera 'up' in session.json, which has left, right"),
-    (cell("purpose", "fun"), "purpose is one of intrinsics, board, scene, got 'fun'"),
+    (cell("purpose", "fun"), "purpose must be one of intrinsics, board, scene, got 'fun'"),
     (cell("placement", "12"), "placement 12 is not in session.json"),
     (
         cell("placement", "1.5"),
@@ -441,7 +441,7 @@ DAMAGE = [
     (pick("left,../0001.png,ab,1,2,20,3"), OUT),
     (
         pick("left,images/left/0001.png,top,1,2,20,3"),
-        "edge is one of ab, bc, ca, got 'top'",
+        "edge must be one of ab, bc, ca, got 'top'",
     ),
     (pick("left,images/left/0001.png,ab,1,2,2,3"), "too close for a direction"),
     (pick("left,images/left/0001.png,ab,1,2,nan,3"), "u1, v1, u2, v2 must be 4 finite"),

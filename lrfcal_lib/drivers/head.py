@@ -82,7 +82,8 @@ class PanTilt(port.Closed):
             raise NoReply(f"{line.path} does not echo what is sent: {remedy}")
         if settings.echo is False and line.echoed:
             LOG.warning(
-                "%s echoes what is sent, against what is stated: it is removed", line.path
+                "%s echoes what is sent, unlike the rig file says: the echo is removed",
+                line.path,
             )
         if self.has_feedback:
             return

@@ -97,7 +97,7 @@ def _repeated(session, first_camera, camera, pairs):
     if first_camera != camera:
         cause = f"was the folder of camera '{first_camera}' copied?"
     words = (
-        f"{len(pairs)} of {count} images of camera '{camera}'{where} are the very pictures of "
+        f"{len(pairs)} of {count} images of camera '{camera}'{where} are identical to "
         f"others: {', '.join(examples)}{more}: {cause}; put the right images there or remove their "
         "rows from images.csv"
     )
@@ -209,7 +209,7 @@ def other_clocks(session) -> list[Fault]:
                 f"the times (t_s in images.csv) of {len(away)} of {len(records)} images of camera "
                 f"'{camera}' lie beside the scans of other placements, {np.median(away):+.6g} s "
                 "from their own: another clock? Placement numbers count, not these times; leave "
-                "t_s empty or set the clocks alike"
+                "t_s empty or synchronise the clocks"
             )
             found.append(Fault("clock", words, harmless=True, camera=camera))
     return found

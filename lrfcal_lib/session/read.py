@@ -137,7 +137,7 @@ def read_images(path, facts, unfinished=None):
                 )
             if row["purpose"] not in PURPOSES:
                 raise ValueError(
-                    f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'"
+                    f"purpose must be one of {short(PURPOSES)}, got '{row['purpose']}'"
                 )
             placement = whole_number(row["placement"], "placement")
             if placement not in (*facts["placements"], -1):
@@ -181,7 +181,7 @@ def read_edges(path, facts, records):
                     f"images.csv has no '{row['file']}' of camera '{row['camera']}'"
                 )
             if row["edge"] not in edges:
-                raise ValueError(f"edge is one of {short(edges)}, got '{row['edge']}'")
+                raise ValueError(f"edge must be one of {short(edges)}, got '{row['edge']}'")
             ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
             if not np.isfinite(ends).all():
                 raise ValueError(
