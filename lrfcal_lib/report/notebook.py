@@ -49,7 +49,9 @@ OTHER_LABELS = {  # of what is no row of METHODS
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
 _found: dict[str, list] = {"figures": [], "tables": [], "findings": [], "verdicts": []}
 NEEDS = "notebook.needs("
-_lacking: set[str] = set()  # 'section' or 'notebook': where nothing is done, for want of data
+_lacking: set[str] = (
+    set()
+)  # 'section' or 'notebook': where nothing is done, for want of data
 
 
 def set_up() -> None:
