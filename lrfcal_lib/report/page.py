@@ -10,6 +10,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import nbformat
+import pandas as pd
 from bs4 import BeautifulSoup
 from jinja2 import Environment, FileSystemLoader
 from latex2mathml.converter import convert
@@ -186,11 +187,7 @@ def turned(text):
 
 def _fits(table):
     """Whether a narrow screen shows a whole row of a table, its headings broken into words."""
-    rows = [row(["th", "td"]) for row in table("tr")]
-    longest = [0] * max(map(len, rows), default=0)
-    for number, row in enumerate(rows):
-        for column, cell in enumerate(row):
-            text = cell.get_text().strip()
-            words = text.split() if number == 0 else [text]
-            longest[column] = max([longest[column], *map(len, words)])
-    return sum(longest) + 1.5 * len(longest) <= FITTING
+    rows = [[cell.get_text().strip() for cell in row(["th", "td"])] for row in table("tr")]
+    words = [max(head.split(), key=len, default="") for head in rows[0]]
+    longest = pd.DataFrame([words, *rows[1:]]).fillna("").map(len).max()
+    return longest.sum() + 1.5 * len(longest) <= FITTING

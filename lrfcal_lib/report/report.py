@@ -369,16 +369,13 @@ def _run(path, environment):
 
 
 def _beginning(notebook):
-    """First heading and first paragraph of a notebook, '' where there is none."""
-    text = "\n\n".join(
+    """Title and thesis, the first '# ' and '> ' in the text of a notebook, '' where there is none."""
+    text = "\n".join(
         cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown"
     )
-    blocks = [block.strip() for block in re.split(r"\n\s*\n", text) if block.strip()]
-    headings = [block for block in blocks if block.startswith("#")]
-    paragraphs = [block for block in blocks if not block.startswith("#")]
-    title = headings[0].lstrip("# ").splitlines()[0] if headings else ""
-    thesis = re.sub(r"[*`>]", "", paragraphs[0]) if paragraphs else ""
-    return title, " ".join(thesis.split())
+    found = [re.search(f"^{mark} (.*)$", text, re.MULTILINE) for mark in "#>"]
+    title, thesis = (match[1] if match else "" for match in found)
+    return title, re.sub(r"[*`]", "", thesis)
 
 
 def write_pages(out, session, runs, found, seconds):
