@@ -373,7 +373,7 @@ def board_plan(ax: Axes, board: Board) -> None:
         ax.pcolormesh(
             left + pattern.square * x, low + pattern.square * y, white, cmap=PRINT
         )
-    _lengths(ax, board, outline_lines(corners)[:, :2], 0.045)
+    _lengths(ax, board, outline_lines(corners)[:, :2], 0.065)
     ax.update_datalim(np.vstack([corners - 0.09, corners + 0.09]))
     to_scale(ax, "x [m]", "y [m]")
 

@@ -369,7 +369,7 @@ def _run(path, environment):
 
 
 def _beginning(notebook):
-    """Title and thesis, the first '# ' and '> ' in the text of a notebook, '' where there is none."""
+    """Title and thesis of a notebook, the lines after '# ' and '> '; '' where there is none."""
     text = "\n".join(
         cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown"
     )
