@@ -31,6 +31,7 @@ REACH = 0.016  # of the image's width: 0.9 deg of a camera that sees 56 deg
 ALONG = 5  # pixels of a profile that are averaged
 # before anything is seen: radians and metres of a camera's pose
 SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
+HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
 WIDTHS = np.geomspace(0.3, 0.09, 12)
 OUTLIERS = 0.15  # of the clearest edge's weight
@@ -201,13 +202,12 @@ def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull |
     reach = REACH * rig.cameras[camera].model.width
     _, crease, count = np.unique(seen.number, return_inverse=True, return_counts=True)
     trust = 1 / count[crease]
-    x = np.zeros(len(poses))
-    for width in np.append(WIDTHS, np.full(8, WIDTHS[-1])) * reach:
-        share, miss = _shares(seen, by_pose @ x, width)
-        pull = trust * np.sum(share * miss, axis=1)
-        weight = trust * share.sum(axis=1)
-        H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(SPREAD**-2.0)
-        x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / SPREAD**2)
+    x, fit = _fitted(seen, by_pose, trust, reach, HONEST)
+    moved, fit_moved = _fitted(seen, by_pose, trust, reach, SPREAD)
+    # edges run beside each other: what has moved must explain more than chance finds
+    # (Schwarz's criterion)
+    if fit_moved - fit > len(poses) / 2 * np.log(len(count)):
+        x = moved
 
     share, miss = _shares(seen, by_pose @ x, WIDTHS[-1] * reach)
     weight = trust * share.sum(axis=1) / MISS**2
@@ -216,6 +216,21 @@ def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull |
     fitted = np.zeros(seen.by_unknown.shape[1])
     fitted[poses] = x
     return pull_of_groups(information, pull[:, None] * seen.by_unknown, crease, fitted)
+
+
+def _fitted(seen, by_pose, trust, reach, spread):
+    """A camera's pose (6,) that is likely to `spread` (6,), and its log likelihood but for a
+    constant.
+    """
+    x = np.zeros(len(spread))
+    for width in np.append(WIDTHS, np.full(8, WIDTHS[-1])) * reach:
+        share, miss = _shares(seen, by_pose @ x, width)
+        pull = trust * np.sum(share * miss, axis=1)
+        weight = trust * share.sum(axis=1)
+        H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(spread**-2.0)
+        x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / spread**2)
+    share, _ = _shares(seen, by_pose @ x, width)
+    return x, -float(trust @ np.log(1 - share.sum(axis=1)))
 
 
 def _shares(seen, moved, width):
