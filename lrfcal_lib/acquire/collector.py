@@ -172,7 +172,7 @@ def advise(session: Session) -> str:
     if judged.answer == YES:
         return ""
     if judged.suggestion:
-        return f"put the {judged.suggestion.words()}"
+        return judged.suggestion.sentence()
     return judged.no_suggestion
 
 
