@@ -14,15 +14,16 @@ from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate.rig import load_setup
 
 ROOM = ROOT / "data" / "room_lms221"
+SETUP = load_setup("room_lms221")
 # radians and metres, as the calibration of sim_lms221 says of itself: what the LRF leaves open errs alike in both cameras
 AXIS_SIGMA = [0.001, 0.0005, 0.002, 0.001]
 SHARED = np.array([0.0005, 0.0005, 0.0011, 0.0009, 0.0009, 0.002])
 OWN = np.array([0.0003, 0.0003, 0.0001, 0.0002, 0.0002, 0.0005])
 
 
-def room(stations, pitches=(), slip=0.0, mount="head"):
-    """The shipped room from some of its stations, images at some pitch angles (deg); the head slipped by so much."""
-    session = open_session(ROOM)
+def room(stations, pitches=(), slip=0.0, mount="head", folder=ROOM):
+    """A room from some of its stations, images at some pitch angles (deg); the head slipped by so much."""
+    session = open_session(folder)
     chosen = []
     for record in session.image_records:
         near = [abs(np.degrees(record.pitch) - pitch) < 1 for pitch in pitches]
@@ -35,9 +36,9 @@ def room(stations, pitches=(), slip=0.0, mount="head"):
     return replace(session, image_records=tuple(chosen), scans=scans, cameras=cameras)
 
 
-def true_rig(session):
+def true_rig(session, setup=SETUP):
     """The rig as it is, with the uncertainty that a good calibration states."""
-    truth = load_setup("room_lms221").rig
+    truth = setup.rig
     names = [
         "axis_out_of_scan_plane",
         "axis_in_scan_plane",
@@ -66,14 +67,15 @@ def true_rig(session):
         range_noise=0.01,
     )
     axis = KnownAxis(truth.T_head_lrf, covariance[:4, :4])
-    corrections = Corrections(range_offset=0.005, pitch_scale=0.003)
+    corrections = Corrections(truth.beam.systematic, truth.platform.stretch)
     return CalibratedRig(
         "joint", axis, corrections, cameras, session.lrf, uncertainty, session="truth"
     )
 
 
-def on_base(rig, pitch):
-    """The same cameras, fixed to the base where they are at a pitch of the head."""
+def on_base(rig, recorded):
+    """The same cameras, fixed to the base where they are at a recorded pitch of the head."""
+    pitch = (1 + rig.corrections.pitch_scale) * recorded
     cameras = {}
     for name, camera in rig.cameras.items():
         cameras[name] = CalibratedCamera(

@@ -29,9 +29,9 @@ MOST = 100_000  # creases of a station
 FEWEST = 4  # places of a crease
 REACH = 0.016  # of the image's width: 0.9 deg of a camera that sees 56 deg
 ALONG = 5  # pixels of a profile that are averaged
-CANDIDATES = 6  # edges of one profile, the clearest
 # before anything is seen: radians and metres of a camera's pose
 SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
+HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
 WIDTHS = np.geomspace(0.3, 0.09, 12)
 OUTLIERS = 0.15  # of the clearest edge's weight
@@ -109,15 +109,15 @@ class Sights:
     ----------
     by_unknown : ndarray, shape (n, c)
         How far the place moves along the normal of the crease, pixels, by the unknowns of a Pull.
-    offset, weight : ndarray, shape (n, k)
-        Of edges in the image: distance along the normal, pixels, and how clear they are, 0 to 1.
+    across, clear : ndarray, shape (n, k)
+        Distances along the normal, pixels, and how clear an edge of the image is there, 0 to 1.
     number : ndarray of int, shape (n,)
         Of the crease.
     """
 
     by_unknown: np.ndarray
-    offset: np.ndarray
-    weight: np.ndarray
+    across: np.ndarray
+    clear: np.ndarray
     number: np.ndarray
 
 
@@ -145,37 +145,32 @@ def sights(creases: Creases, view: View) -> Sights:
     tangent = np.einsum("nij,nj->ni", by_point, way)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    offset, weight = _candidates(view, pinhole(points[inside], model), tangent, normal)
+    across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
     return Sights(
         by_unknown=np.einsum("ni,nij,njk->nk", normal, by_point, J[inside]),
-        offset=offset,
-        weight=weight,
+        across=np.tile(across, (len(clear), 1)),
+        clear=clear,
         number=creases.number[inside],
     )
 
 
-def _candidates(view, edge, tangent, normal):
-    """Places and clearness (n, k) of edges about pixels (n, 2), along their normals (n, 2)."""
-    offset = np.zeros((len(edge), CANDIDATES))
-    weight = np.zeros((len(edge), CANDIDATES))
-    if not len(edge):
-        return offset, weight
+def _edges(view, places, tangent, normal):
+    """How clear an edge there is (n, k), 0 to 1, at k offsets (k,) in pixels from pixels (n, 2),
+    along their normals (n, 2).
+    """
     reach = REACH * view.model.width
     across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    side = np.arange(ALONG) - ALONG // 2
-    profile = edge[:, None] + side[:, None] * tangent[:, None]
-    away = across[:, None, None, None] * normal[:, None]
-    strips = sample(view.image, view.model, profile + away)
-    mean = strips.mean(axis=2)  # NaN outside the image
-    row, place, contrast = peaks(step_contrast(mean, SMOOTH_PX / ACROSS_STEP_PX, along=1))
-    order = np.lexsort([-contrast, row])
-    row = row[order]
-    number = np.arange(len(row)) - np.searchsorted(row, row)
-    kept = number < CANDIDATES
-    at = (row[kept], number[kept])
-    offset[at] = across[0] + ACROSS_STEP_PX * place[order][kept]
-    weight[at] = (contrast / (contrast + FULL_CONTRAST))[order][kept]
-    return offset, weight
+    clear = np.zeros((len(places), len(across)))
+    if len(places):
+        side = np.arange(ALONG) - ALONG // 2
+        profile = places[:, None] + side[:, None] * tangent[:, None]
+        away = across[:, None, None, None] * normal[:, None]
+        strips = sample(view.image, view.model, profile + away)
+        mean = strips.mean(axis=2)  # NaN outside the image
+        height = step_contrast(mean, SMOOTH_PX / ACROSS_STEP_PX, along=1)
+        row, place, contrast = peaks(height)
+        clear[row, place.round().astype(int)] = contrast / (contrast + FULL_CONTRAST)
+    return across, clear
 
 
 def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull | None:
@@ -207,13 +202,12 @@ def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull |
     reach = REACH * rig.cameras[camera].model.width
     _, crease, count = np.unique(seen.number, return_inverse=True, return_counts=True)
     trust = 1 / count[crease]
-    x = np.zeros(len(poses))
-    for width in np.append(WIDTHS, np.full(8, WIDTHS[-1])) * reach:
-        share, miss = _shares(seen, by_pose @ x, width)
-        pull = trust * np.sum(share * miss, axis=1)
-        weight = trust * share.sum(axis=1)
-        H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(SPREAD**-2.0)
-        x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / SPREAD**2)
+    x, fit = _fitted(seen, by_pose, trust, reach, HONEST)
+    moved, fit_moved = _fitted(seen, by_pose, trust, reach, SPREAD)
+    # edges run beside each other: what has moved must explain more than chance finds
+    # (Schwarz's criterion)
+    if fit_moved - fit > len(poses) / 2 * np.log(len(count)):
+        x = moved
 
     share, miss = _shares(seen, by_pose @ x, WIDTHS[-1] * reach)
     weight = trust * share.sum(axis=1) / MISS**2
@@ -224,8 +218,23 @@ def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull |
     return pull_of_groups(information, pull[:, None] * seen.by_unknown, crease, fitted)
 
 
+def _fitted(seen, by_pose, trust, reach, spread):
+    """A camera's pose (6,) that is likely to `spread` (6,), and its log likelihood but for a
+    constant.
+    """
+    x = np.zeros(len(spread))
+    for width in np.append(WIDTHS, np.full(8, WIDTHS[-1])) * reach:
+        share, miss = _shares(seen, by_pose @ x, width)
+        pull = trust * np.sum(share * miss, axis=1)
+        weight = trust * share.sum(axis=1)
+        H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(spread**-2.0)
+        x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / spread**2)
+    share, _ = _shares(seen, by_pose @ x, width)
+    return x, -float(trust @ np.log(1 - share.sum(axis=1)))
+
+
 def _shares(seen, moved, width):
     """What each edge has of its place (n, k) that has moved (n,), and how far off it is, pixels."""
-    miss = seen.offset - moved[:, None]
-    likely = seen.weight * np.exp(-0.5 * (miss / width) ** 2)
+    miss = seen.across - moved[:, None]
+    likely = seen.clear * np.exp(-0.5 * (miss / width) ** 2)
     return likely / (OUTLIERS + likely.sum(axis=1, keepdims=True)), miss
