@@ -19,10 +19,12 @@ def run(args):
         case "compare" | "reconstruct" | "merge" | "measure":
             return use_calibrations(args)
         case "simulate":
+            from lrfcal_lib.session.workers import side_by_side
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
 
-            simulate(args.dst, load_setup(args.setup), workers=args.workers)
+            with side_by_side():
+                simulate(args.dst, load_setup(args.setup))
             print(f"{args.dst}: simulated")
         case "record":
             return record(args)
@@ -222,9 +224,6 @@ def _add_sessions(verbs):
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
     simulate.add_argument("dst", help="folder of the new session")
-    simulate.add_argument(
-        "--workers", type=int, default=2, help="processes that render images (default 2)"
-    )
 
     calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
     calibrate.add_argument("session")

@@ -159,11 +159,9 @@ def test_misfit_model_error_and_noise_are_named(good):
     left_out = Problem(Stage.JOINT, ProblemKind.CONTRADICTS, "left out", 9)
     bad = replace(
         solution, misfit=solution.misfit | {3: 30.0}, excluded=(left_out,), solution=inner,
-        warnings=("the data ask for the scale of the pitch",),
     ).with_levels(face_scale=2.6)  # fmt: skip
     words = {r.kind: r.words for r in diagnose(bad)}
     assert words["misfit"].startswith("placements fit much worse than the others: 3 (5.")
-    assert words["warning"] == "the data ask for the scale of the pitch"
     assert (
         words["excluded"] == "placement 9: left out"
         and "has not converged" in words["convergence"]

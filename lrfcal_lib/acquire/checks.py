@@ -71,7 +71,7 @@ def check_placement(
         sweep = None
     scene = placement in session.scene_placements
     if scene and sweep is not None:
-        return [_check_scene(sweep)]
+        return [check_scene(sweep)]
     lights = check_scan(sweep, session.board, session.T_head_lrf, session.lrf)
     lights += check_repetition(session, placement)
     if scene:
@@ -92,14 +92,17 @@ def check_placement(
     return lights
 
 
-def _check_scene(sweep):
+def check_scene(sweep: Sweep) -> Light:
+    """The Light of a sweep over a scene: how much of it came back.
+
+    Parameters
+    ----------
+    sweep
+    """
     share = np.isfinite(sweep.ranges).mean()
-    text = (
-        f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
-    )
-    if share > LEAST_SCENE:
-        return Light("scan", "ok", text)
-    return Light("scan", "warn", text)
+    state = "ok" if share > LEAST_SCENE else "warn"
+    text = f"{len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
+    return Light("scan", state, f"scene: {text}")
 
 
 def _together(name, lights):

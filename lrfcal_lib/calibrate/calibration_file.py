@@ -47,8 +47,9 @@ FORMULAS = {
     ),
     "covariance": (
         "Of the increments [w, v] of a pose: R <- exp(w) R, t <- t + v. `trusted` is what to rely "
-        "on, `covariance` what noise alone explains; null where nothing bounds an unknown. A turn "
-        "about the tilt axis and a shift along it are as stated: no data show them."
+        "on, `covariance` what noise alone explains, `lens` the share of the intrinsics in both; "
+        "null where nothing bounds an unknown. A turn about the tilt axis and a shift along it are "
+        "as stated: no data show them."
     ),
     "uncertainty": (
         "`unseen_...` are motions of (axis: 4, pose of the camera: 6, range offset, pitch scale, "
@@ -145,6 +146,7 @@ class UncertaintyWritten(BaseModel):
     names: tuple[str, ...]
     covariance: Matrix
     trusted: Matrix
+    lens: Matrix | None = None  # files of before it was written
     unseen_of_cloud: Matrix
     unseen_of_cameras: dict[str, Matrix]
     sweep_sigma: tuple[FiniteFloat, FiniteFloat]
@@ -154,10 +156,12 @@ class UncertaintyWritten(BaseModel):
         """As a RigUncertainty."""
         count = len(self.names)
         motions = len(COLUMNS)
+        nothing = np.zeros((count, count)).tolist()
         return RigUncertainty(
             names=self.names,
             covariance=shaped("covariance", self.covariance, count, count),
             trusted=shaped("trusted", self.trusted, count, count),
+            lens=shaped("lens", self.lens or nothing, count, count),
             unseen_of_cloud=shaped("unseen_of_cloud", self.unseen_of_cloud, None, motions),
             unseen_of_cameras={
                 camera: shaped(f"unseen_of_cameras.{camera}", rows, None, motions)

@@ -286,7 +286,7 @@ def fitted(case, start, scale):
         max_iterations=ITERATIONS,
         tolerance=TOLERANCE,
     )[0]
-    hessian = linearise(evaluate(state), None, 1.0, (-2, -1))[0]
+    hessian = linearise(evaluate(state)).hessian
     return state, np.linalg.inv(hessian[0])
 
 

@@ -28,6 +28,8 @@ class RigUncertainty:
     covariance, trusted : ndarray, shape (c, c)
         Of the increments, from the noise alone and to rely on, see
         :class:`lrfcal_lib.fit.result.Solution`; not finite where nothing bounds an unknown.
+    lens : ndarray, shape (c, c)
+        What errors of the intrinsics have in both.
     unseen_of_cloud : ndarray, shape (m, 13)
         Motions of `COLUMNS` that nothing determines and that move points of the cloud.
     unseen_of_cameras : dict of str to ndarray, shape (m, 13)
@@ -41,6 +43,7 @@ class RigUncertainty:
     names: tuple[str, ...]
     covariance: np.ndarray
     trusted: np.ndarray
+    lens: np.ndarray
     unseen_of_cloud: np.ndarray
     unseen_of_cameras: dict[str, np.ndarray]
     sweep_sigma: tuple[float, float]
@@ -75,6 +78,7 @@ def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
         names=estimate.names,
         covariance=estimate.covariance,
         trusted=estimate.trusted,
+        lens=solution.lens,
         unseen_of_cloud=_unseen(information, estimate.names),
         unseen_of_cameras={
             camera: _unseen(information, estimate.names, camera)
@@ -124,6 +128,7 @@ def uncertainty_one_by_one(
         names=tuple(names),
         covariance=block_diag(*noise_only, offset),
         trusted=block_diag(*trusted, offset),
+        lens=np.zeros((len(names), len(names))),
         unseen_of_cloud=nothing,
         unseen_of_cameras=dict.fromkeys(solutions, nothing),
         sweep_sigma=sweep_sigma,

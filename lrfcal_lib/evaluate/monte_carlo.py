@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,6 @@ from scipy.stats import binom, chi2
 
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.edge_likelihood import disc_share
-from lrfcal_lib.fit.least_squares import reduced_hessian
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     polar_to_points,
@@ -26,8 +25,8 @@ from lrfcal_lib.preprocess.surfaces import row_ends
 from lrfcal_lib.simulate.draw import ShotSetup
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import in_stated_gauge
-from lrfcal_lib.solvers.joint_model import JointState, Unknowns, gather
-from lrfcal_lib.solvers.joint_residuals import named_blocks
+from lrfcal_lib.solvers.joint_model import JointState, Unknowns
+from lrfcal_lib.solvers.joint_solution import expected_information
 
 INTERVAL = 0.9
 HALF_WIDTH = 1.6448536269514722  # standard normal: 90 % of it lies within
@@ -205,23 +204,7 @@ def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.n
     DegenerateGeometry
         When the data leave a direction of the shared unknowns open.
     """
-    data = gather(obs)
-    hit = np.ones_like(data.beam["hit"])
-    all_read = replace(data, beam=data.beam | {"hit": hit})
-    none_read = replace(data, beam=data.beam | {"hit": ~hit})
-    read = named_blocks(truth, all_read, unknowns)
-    missed = named_blocks(truth, none_read, unknowns)
-    size = unknowns.shared + unknowns.own
-    hessian = np.zeros((len(obs.placements), size, size))
-    for name, block in read.items():
-        J = block.white_jacobian
-        if name == "beam":  # expected: over both readings, weighted by how likely each is
-            other = missed[name].white_jacobian
-            chance = np.exp(-np.asarray(block.cost))[..., None]
-            hessian += other.mT @ ((1 - chance) * other)
-            J = np.sqrt(chance) * J
-        hessian += J.mT @ J
-    total = np.sum(reduced_hessian(hessian, unknowns.shared), axis=0)
+    total = np.sum(expected_information(obs, truth, unknowns), axis=0)
     scale = 1 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))
     values, vectors = np.linalg.eigh(total * scale[:, None] * scale)
     if values[0] < 1e-11:

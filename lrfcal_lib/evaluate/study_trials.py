@@ -120,7 +120,7 @@ def _single(method, shots, scenario, trial, T0, obs):
             return camera, solution.solution.covariance[:6, :6], True
         planes = plane_observations(shots, scenario, trial)
         if method == "three_planes":
-            found = solve_camera(planes, "zhang_pless", loss="cauchy", scale="auto")
+            found = solve_camera(planes, "zhang_pless", robust=True)
         else:
             found = solve_camera(planes, method, T0, search=False)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:

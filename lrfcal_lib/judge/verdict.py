@@ -32,11 +32,10 @@ from lrfcal_lib.judge.weaknesses import (
     sides_elsewhere,
 )
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import DegenerateGeometry, transform_difference
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint_solution import JointSolution
-from lrfcal_lib.solvers.plane_start import rival_words
 
 FIRST = {
     YES: "This calibration can be trusted",
@@ -370,7 +369,12 @@ def _without_joint(calibration, method, doubt):
             findings.append(Finding(CARE, Kind.CAMERAS, words))
     for camera, solution in solved.items():
         if solution.rival is not None:
-            words = rival_words(camera, solution.transform, solution.rival)
+            turn, shift = transform_difference(solution.transform, solution.rival)
+            words = (
+                f"a second minimum explains the data nearly as well: camera '{camera}' "
+                f"{np.degrees(turn):.0f} deg and {1000 * shift:.0f} mm from where it is handed "
+                "over; record more placements that lean other ways"
+            )
             findings.append(Finding(NO, Kind.SECOND_MINIMUM, words))
     sweeps = any(np.ptp(scan.sweep.pitch) > LEAST_SWEEP for scan in prepared.scans.values())
     unknown = calibration.platform.problem("combined")

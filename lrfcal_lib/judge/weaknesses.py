@@ -51,7 +51,6 @@ def diagnose(solution: JointSolution) -> list[Finding]:
         *weak_pitch(solution),
         *weak_poses(solution),
         *large_residuals(solution),
-        *(Finding(CARE, Kind.WARNING, words) for words in solution.warnings),
     ]
 
 

@@ -7,9 +7,9 @@ Equations (4) to (6) and (16) to (19) at once, every board's pose unknown and el
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
+from lrfcal_lib.fit.covariance import RANK
 from lrfcal_lib.fit.least_squares import solve
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
@@ -26,7 +26,6 @@ from lrfcal_lib.solvers.joint_contradictions import (
     refuse_contradiction,
     without_blind_cameras,
     without_lost_placements,
-    without_misfits,
 )
 from lrfcal_lib.solvers.joint_lens import lens_share
 from lrfcal_lib.solvers.joint_model import (
@@ -40,7 +39,7 @@ from lrfcal_lib.solvers.joint_model import (
 from lrfcal_lib.solvers.joint_noise import estimate_noise, settled
 from lrfcal_lib.solvers.joint_residuals import MOST_STEPS, minimum, named_blocks
 from lrfcal_lib.solvers.joint_search import best_start, coarse
-from lrfcal_lib.solvers.joint_solution import RANK, JointSolution, joint_words, warnings_of
+from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words
 
 # what counts as a change by one, beside rad and m
 SCALES = {
@@ -68,7 +67,7 @@ class JointSettings:
         A rough measurement of the axis with its standard deviations. It yields where the data
         contradict it.
     axis : bool
-        False: the axis is the one of T0 (or the stated one), and known.
+        False: the axis is the stated one, and known.
     sensor : sequence of str
         Unknowns of the sensor, of :data:`lrfcal_lib.solvers.joint_model.SENSOR`; others stay zero
         (softness: 0.2).
@@ -111,14 +110,6 @@ class JointSettings:
                 raise ValueError(f"sensor unknowns are {', '.join(SENSOR)}; got {name!r}")
         if self.noise not in ("stated", "estimate"):
             raise ValueError(f"noise is 'stated' or 'estimate', got {self.noise!r}")
-        if not 0 <= self.lapse < 0.5:
-            raise ValueError(
-                f"lapse is the share of beams that say nothing, 0 to 0.5, got {self.lapse}"
-            )
-        if min(self.sweep_sigma) <= 0:
-            raise ValueError(
-                f"sweep_sigma must be positive (radians, fraction), got {self.sweep_sigma}"
-            )
 
     def unknowns(self, obs: JointObservations) -> Unknowns:
         """The unknowns for some observations."""
@@ -134,7 +125,6 @@ class JointSettings:
 
 def solve_joint(
     obs: JointObservations,
-    T0: RigidTransform | None = None,
     *,
     start: JointState | None = None,
     required: bool = True,
@@ -145,8 +135,6 @@ def solve_joint(
     Parameters
     ----------
     obs : JointObservations
-    T0 : RigidTransform, optional
-        Rough ``T_head_lrf``; closed forms are tried in any case.
     start : JointState, optional
         Skips the search for a start value.
     required : bool
@@ -167,30 +155,23 @@ def solve_joint(
     obs, left_out = without_blind_cameras(obs, required)
     unknowns = chosen.unknowns(obs)
     levels = Levels(sweep_sigma=chosen.sweep_sigma, step_sigma=chosen.step_sigma)
-    coarsely_settled = False
     if start is None:
         obs, lost = without_lost_placements(obs)
-        best = best_start(obs, unknowns, levels, T0)
+        best = best_start(obs, unknowns, levels)
         obs = best.kept
         start = best.state
-        coarsely_settled = best.settled
         left_out += lost + best.left_out
     data = gather(obs, replace(levels, prior=chosen.prior))
     # stated levels of the noise may be wrong by far: what takes many steps with them leads away
-    if chosen.prior is not None or not coarsely_settled:
-        start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
+    start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
     state = minimum(start, data, unknowns, LAST_STEP, FIRST_STEPS).state
     data = replace(data, levels=replace(data.levels, lapse=chosen.lapse))
     if chosen.noise == "estimate":
         state, data = settle(state, data, unknowns)
-        obs, state, contradicting = without_misfits(obs, state, data, unknowns)
-        if contradicting:
-            left_out += contradicting
-            state, data = settle(state, gather(obs, data.levels), unknowns)
     if chosen.noise == "estimate" or chosen.lapse:
         state = minimum(state, data, unknowns, LAST_STEP).state
     if required:  # a cause before what follows from it: edges that fit nowhere, say
-        refuse_contradiction(state, data, LAST_MISS, left_out)
+        refuse_contradiction(obs, state, LAST_MISS)
     found = finished(obs, state, data, unknowns, required)
     return replace(found, excluded=tuple(left_out))
 
@@ -280,8 +261,7 @@ def finished(obs, state, data, unknowns, required):
         lens_scale=lens.scatter,
         step=np.zeros(unknowns.shared),
     )
-    solution = with_step_error(solution)
-    return replace(solution, warnings=warnings_of(solution))
+    return with_step_error(solution)
 
 
 def with_step_error(solution: JointSolution) -> JointSolution:
