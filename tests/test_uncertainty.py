@@ -11,7 +11,7 @@ from lrfcal_lib.judge.uncertainty import Chain, beams_to, point_sigma, projectio
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.kinematics import SourceFrame
-from lrfcal_lib.simulate.draw import ShotSetup
+from lrfcal_lib.simulate.draw import Devices
 
 HEAD = RigidTransform.from_components(
     [0.0, 0.03, -0.05], Rotation.from_rotvec([0.0, 0.02, -0.03])
@@ -20,7 +20,7 @@ TURN = Rotation.from_rotvec([0.02, -0.03, 0.01]) * Rotation.from_matrix(
     [[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]
 )
 CAMERA = RigidTransform.from_components([0.1, 0.1, -0.05], TURN)
-MODEL = ShotSetup().model
+MODEL = Devices().model
 
 
 def random_chain(mount, rng, camera=CAMERA, size=1e-3):

@@ -139,6 +139,9 @@ class Calibration:
         """The rig as a method has it: its cameras, the axis that goes with them, and what is known
         to be wrong with ranges and pitch.
 
+        What single sweeps of this session are off by (`corrections.sweeps`, by placement) is good
+        for this session only; `load_calibration` reads the same rig without it.
+
         Parameters
         ----------
         method : str

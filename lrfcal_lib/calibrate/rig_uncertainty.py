@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import PlainValidator
 from scipy.linalg import block_diag
 
 from lrfcal_lib.fit.covariance import null_space
@@ -15,6 +17,25 @@ from lrfcal_lib.solvers.joint_solution import JointSolution
 
 # what may be wrong about the way of a beam: radians and metres; metres, a fraction, radians
 COLUMNS = (*AXIS_NAMES, *POSE_NAMES, "range_offset", "pitch_scale", "pitch_by_direction")
+
+
+def rows(*shape: int | None) -> PlainValidator:
+    """How pydantic makes an array of a shape, None where any size will do, of rows of numbers; null
+    is infinite.
+    """
+
+    def made(given):
+        values = np.array(given, float)
+        if not len(given):
+            values = np.zeros((0, *shape[1:]))
+        same = [
+            size in (None, found) for size, found in zip(shape, values.shape, strict=False)
+        ]
+        if values.ndim != len(shape) or not all(same):
+            raise ValueError(f"shape {values.shape} instead of {shape}")
+        return np.where(np.isnan(values), np.inf, values)
+
+    return PlainValidator(made)
 
 
 @dataclass(frozen=True)
@@ -41,11 +62,11 @@ class RigUncertainty:
     """
 
     names: tuple[str, ...]
-    covariance: np.ndarray
-    trusted: np.ndarray
-    lens: np.ndarray
-    unseen_of_cloud: np.ndarray
-    unseen_of_cameras: dict[str, np.ndarray]
+    covariance: Annotated[np.ndarray, rows(None, None)]
+    trusted: Annotated[np.ndarray, rows(None, None)]
+    lens: Annotated[np.ndarray, rows(None, None)]
+    unseen_of_cloud: Annotated[np.ndarray, rows(None, 13)]
+    unseen_of_cameras: dict[str, Annotated[np.ndarray, rows(None, 13)]]
     sweep_sigma: tuple[float, float]
     range_noise: float
 

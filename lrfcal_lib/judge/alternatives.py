@@ -38,8 +38,8 @@ FAR_SHIFT = 0.3
 ALIKE = 0.15
 LEVER = 0.2  # metres, weighs turns against shifts
 CHECK = (
-    "check its statement; bearings or pitch of the other sense, or exchanged folders of cameras "
-    "look like this"
+    "check what session.json states; reversed bearings or pitch, or exchanged camera folders, "
+    "look the same"
 )
 # of the best alternative's likelihood ratio: another one explains the data nearly as well
 AS_GOOD = 0.6
@@ -131,9 +131,9 @@ ALTERNATIVES = {
     ),
     Kind.LAG: Alternative(
         _lag,
-        "the pitch of scan lines comes {size} +- {sigma} deg {sign} in the sense of the sweep",
+        "the recorded pitch of scan lines is {size} +- {sigma} deg {sign} the sweep",
         "check the time stamps of pitch and scans, sweep slower or stop for every scan",
-        ("late", "early"),
+        ("behind", "ahead of"),
         worth=np.radians(0.05),
         unit=np.degrees(1.0),
     ),
@@ -371,7 +371,8 @@ def far_cameras(joint):
         nearest = min(apart, key=lambda name: apart[name][0] * LEVER + apart[name][1])
         if turn > FAR_TURN or shift > FAR_SHIFT:
             words = (
-                f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {CHECK}"
+                f"camera '{camera}' stands {_apart(turn, shift)} from its guess in "
+                f"session.json: {CHECK}"
             )
             far.append(Far(words, turn))
         elif nearest != camera:

@@ -22,7 +22,9 @@ SIZES = (Kind.SQUARES, Kind.RANGES)  # an error of them is one of all distances
 LARGE_SIZE = 0.02  # error of a size that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
 RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
-NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be tested"
+NOT_WEIGHED = (
+    "whether session.json states sizes, step and spot correctly could not be tested"
+)
 # statements that are falsified on purpose, as relative errors of alternatives
 LIES = {
     "as recorded": {},

@@ -359,7 +359,7 @@ def _without_joint(calibration, method, doubt):
         for camera in solved
     )
     if fewest < FEW:
-        words = f"{fewest} placements only, {FEW} or more are needed"
+        words = f"only {fewest} placements, {FEW} or more are needed"
         findings.append(Finding(NO, Kind.PLACEMENTS, words))
     for camera in prepared.views:
         if camera not in solved:

@@ -98,22 +98,21 @@ def in_words(error):
     first = error.errors(include_url=False)[0]
     where = ".".join(map(str, first["loc"])) or "it"
     kind = first["type"]
-    value = ascii(first["input"])
     if kind == "missing":
         return f"{where} is missing"
+    value = ascii(first["input"])
     found = f"{where} is {value if len(value) < 100 else value[:80] + ' ...'}"
-    found = where if isinstance(first["input"], dict) else found
+    if isinstance(first["input"], dict):
+        found = where
     if kind == "value_error":
         return f"{found}: {first['ctx']['error']}"
-    needed = (
-        "an object"
-        if kind in ("model_type", "dataclass_type")
-        else first["msg"].removeprefix("Input should be ")
-    )
-    large = kind.startswith("less_than") and re.search(
-        r"_m\b", where
-    )  # the key tells the unit
-    return f"{found}: {needed} is needed" + f"; {MILLIMETRES}" * bool(large)
+    needed = first["msg"].removeprefix("Input should be ")
+    if kind in ("model_type", "dataclass_type"):
+        needed = "an object"
+    words = f"{found}: {needed} is needed"
+    if kind.startswith("less_than") and re.search(r"_m\b", where):  # the key tells the unit
+        words += f"; {MILLIMETRES}"
+    return words
 
 
 adapter = lru_cache(pydantic.TypeAdapter)
@@ -196,9 +195,10 @@ def transform_to_json(transform: RigidTransform | None) -> dict | None:
     """
     if transform is None:
         return None
-    turn = transform.rotation.as_rotvec().tolist()
-    shift = transform.translation.tolist()
-    return {"rotation_vector_rad": turn, "translation_m": shift}
+    return {
+        "rotation_vector_rad": transform.rotation.as_rotvec().tolist(),
+        "translation_m": transform.translation.tolist(),
+    }
 
 
 Transform = Annotated[TransformStated, AfterValidator(TransformStated.made)] | None
@@ -222,10 +222,16 @@ class LensStated(BaseModel):
 
     def made(self, width, height):
         """As a CameraModel."""
-        covariance = None if self.covariance is None else np.array(self.covariance)
-        pinhole = self.fx, self.fy, self.cx, self.cy
         return CameraModel(
-            width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px
+            width,
+            height,
+            self.fx,
+            self.fy,
+            self.cx,
+            self.cy,
+            np.array(self.distortion),
+            self.covariance and np.array(self.covariance),
+            self.rms_px,
         )
 
 
@@ -270,23 +276,24 @@ class BoardStated(BaseModel):
 
     def made(self):
         """As a Board."""
-        corners = None if self.corners_m is None else np.array(self.corners_m)
+        corners = None
         if len(set(self.edges)) < len(self.edges):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
-            given = "none" if not any(self.features) else short(map(repr, self.features))
-            edges = short(self.edges)
-            needed = f"features must be two different edges of {edges}, at a right angle"
-            raise ValueError(f"{needed}; got {given}")
-        if corners is not None and len(corners) != len(self.edges):
             raise ValueError(
-                f"corners_m must be one corner for each of {len(self.edges)} edges, got "
-                f"{len(corners)}"
+                f"features must be two different edges of {short(self.edges)}, at a right angle; "
+                f"got {short(map(repr, filter(None, self.features)))}"
             )
-        if corners is not None and np.ptp(corners, axis=0).max() > LONGEST_BOARD:
-            raise ValueError(
-                f"the board is {np.ptp(corners, axis=0).max():g} m large: {MILLIMETRES}"
-            )
+        if self.corners_m is not None:
+            corners = np.array(self.corners_m)
+            size = np.ptp(corners, axis=0).max()
+            if len(corners) != len(self.edges):
+                raise ValueError(
+                    f"corners_m must be one corner for each of {len(self.edges)} edges, got "
+                    f"{len(corners)}"
+                )
+            if size > LONGEST_BOARD:
+                raise ValueError(f"the board is {size:g} m large: {MILLIMETRES}")
         return Board(self.name, self.edges, corners, self.pattern, self.features)
 
 
@@ -297,24 +304,15 @@ def board_to_json(board: Board) -> dict:
     ----------
     board
     """
-    pattern = None
-    if board.pattern is not None:
-        pattern = {
-            "kind": "chessboard",
-            "columns": board.pattern.columns,
-            "rows": board.pattern.rows,
-            "square_m": board.pattern.square,
-            "origin_m": board.pattern.origin,
-        }
-    return plain(
-        {
-            "name": board.name,
-            "edges": board.edges,
-            "features": board.features,
-            "corners_m": board.corners,
-            "pattern": pattern,
-        }
-    )
+    pattern = board.pattern and {
+        "kind": "chessboard",
+        "columns": board.pattern.columns,
+        "rows": board.pattern.rows,
+        "square_m": board.pattern.square,
+        "origin_m": board.pattern.origin,
+    }
+    stated = {"name": board.name, "edges": board.edges, "features": board.features}
+    return plain(stated | {"corners_m": board.corners, "pattern": pattern})
 
 
 def board_from_json(data: dict) -> Board:
@@ -406,12 +404,12 @@ class LrfInfo:
     @property
     def admitted_offset(self) -> float:
         """The largest range offset that the maker admits, metres: stated, or known, or assumed."""
-        known = [value for name, value in SYSTEMATIC_ERROR.items() if name in self.model]
-        if not known or self.range_resolution > 0.005:
-            known = [
-                ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)
-            ]
-        return self.systematic_error or known[0]
+        assumed = ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)
+        if self.range_resolution <= 0.005:
+            for name, value in SYSTEMATIC_ERROR.items():
+                if name in self.model:
+                    assumed = value
+        return self.systematic_error or assumed
 
     @property
     def step_sigma(self) -> float:
@@ -591,10 +589,12 @@ def parse_session(data: dict, kind: type = SessionStated) -> dict:
     found = dict(from_json(kind, data))
     rig = dict(found.pop("rig"))
     platform = rig.pop("platform")
-    sigma = platform.sigma_direction, platform.sigma_offset
-    of_platform = {
-        "T_head_lrf": platform.T_head_lrf,
-        "platform_sigma": sigma,
-        "continuous": platform.continuous,
-    }
-    return found | rig | of_platform
+    return (
+        found
+        | rig
+        | {
+            "T_head_lrf": platform.T_head_lrf,
+            "platform_sigma": (platform.sigma_direction, platform.sigma_offset),
+            "continuous": platform.continuous,
+        }
+    )

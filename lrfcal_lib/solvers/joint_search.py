@@ -64,7 +64,9 @@ def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> St
     for states in start_states(obs):
         for state in states:
             if not unknowns.axis:
-                known = obs.T_head_lrf or RigidTransform.identity()
+                known = obs.T_head_lrf
+                if known is None:
+                    known = RigidTransform.identity()
                 state = replace(state, head=pose_array(known))
             tried.append(agreeing_start(obs, state, data, unknowns))
         if min(start.badness for start in tried) < GOOD_START:
