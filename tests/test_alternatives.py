@@ -28,7 +28,7 @@ PATTERN = Chessboard(9, 5, 0.036, (0.1, 0.1))
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 
-def solved(seed, change=lambda obs: obs, step_sigma=0.0, **settings):
+def solved(seed, change=lambda obs: obs, step_sigma=0.0058, **settings):
     obs, _, rig = draw(rng(seed), 12, **settings)
     obs = change(replace(obs, T_head_lrf=rig.T_head_lrf))
     asked = {"sensor": SENSOR, "noise": "estimate", "step_sigma": step_sigma}
@@ -38,7 +38,7 @@ def solved(seed, change=lambda obs: obs, step_sigma=0.0, **settings):
 @pytest.mark.parametrize(
     ("kind", "value", "mount"),
     [("squares", 0.02, "head"), ("outline", 0.03, "platform"), ("ranges", -0.05, "head"),
-     ("bearings", 0.02, "platform"), ("lag", 0.003, "head"), *(pytest.param(k, v, "platform", marks=campaign)
+     ("bearings", 0.03, "platform"), ("lag", 0.003, "head"), *(pytest.param(k, v, "platform", marks=campaign)
       for k, v in (("squares", -0.05), ("ranges", 0.02), ("lag", -0.005)))],
 )  # fmt: skip
 def test_a_wrong_statement_is_named_with_its_size(kind, value, mount):
@@ -85,7 +85,7 @@ def test_what_the_data_say_of_squares_does_not_depend_on_the_origin(corners):
     here, there = (
         doubt_about_squares(5, np.array(by), corners) for by in ((0.0, 0.0), (0.315, 0.38))
     )
-    assert there.value == pytest.approx(here.value, abs=0.1 * here.sigma)
+    assert there.value == pytest.approx(here.value, abs=0.3 * here.sigma)
     assert there.sigma == pytest.approx(here.sigma, rel=0.2)
 
 
@@ -121,6 +121,16 @@ def test_what_errors_of_the_step_do_is_what_another_estimate_finds(mount, least)
     assert np.abs(moved / sigma).max() > least
     spread = open_step.solution.covariance - known.solution.covariance
     np.testing.assert_allclose(spread, np.outer(open_step.step, open_step.step), atol=1e-12)
+
+
+@pytest.mark.parametrize(("step_sigma", "named"), [(0.0, False), (0.0058, True)])
+def test_a_step_that_is_known_is_doubted_beyond_chance_only(step_sigma, named):
+    """Of 11 honest sessions, 2 were told that the step of their LMS was off by two standard deviations."""
+    solution = solved(3, lambda obs: obs.stretched(0.01), step_sigma=step_sigma)
+    doubts = doubtful(solution, ADMITTED)
+    assert ("bearings" in [doubt.kind for doubt in doubts]) is named
+    free = next(doubt for doubt in weigh(solution, ADMITTED) if doubt.kind == "bearings")
+    assert free.exceeds(2.0) and not free.exceeds(4.0)
 
 
 @pytest.mark.parametrize(("step_sigma", "said"), [(0.0, False), (0.0058, True)])

@@ -5,9 +5,10 @@ from collections.abc import Iterable
 import numpy as np
 import pandas as pd
 
+from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.tables import rms, unit_of
-from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors, sigmas
+from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.judge.next_placement import outline
@@ -281,28 +282,10 @@ def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:
     solution = joint.solution
     rows = []
     if joint.settings["axis"]:
-        turn, shift = axis_errors(solution.T_head_lrf, truth)
-        rows.append(
-            _error_row("tilt axis", turn, shift, solution.covariance("axis_", "offset_"))
-        )
+        covariance = solution.covariance("axis_", "offset_")
+        axis = KnownAxis(solution.T_head_lrf, covariance)
+        rows.append({"what": "tilt axis"} | axis_errors(axis, truth))
     for camera in solution.transforms:
         errors = camera_errors(solution.camera(camera), truth, camera)
-        turn = errors["rotation_error_deg"]
-        shift = errors["translation_error_mm"]
-        covariance = solution.covariance(f"{camera}_")
-        rows.append(_error_row(f"camera {camera}", turn, shift, covariance))
+        rows.append({"what": f"camera {camera}"} | errors)
     return pd.DataFrame(rows)
-
-
-def _error_row(what, turn_deg, shift_mm, covariance):
-    """Errors of a pose, or of an axis, beside the sigma of both from its covariance (2 k, 2 k)."""
-    turn_sigma, shift_sigma = sigmas(covariance) * [np.rad2deg(1.0), 1000.0]
-    return {
-        "what": what,
-        "rotation_error_deg": turn_deg,
-        "rotation_sigma_deg": turn_sigma,
-        "rotation_pull": turn_deg / turn_sigma,
-        "translation_error_mm": shift_mm,
-        "translation_sigma_mm": shift_sigma,
-        "translation_pull": shift_mm / shift_sigma,
-    }

@@ -10,7 +10,7 @@ import pandas as pd
 
 from lrfcal_lib.calibrate.cameras import PlatformCalibration
 from lrfcal_lib.calibrate.pipeline import JointCalibration
-from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors, sigmas
+from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
 from lrfcal_lib.fit.result import AXIS_NAMES, Solution
 from lrfcal_lib.model import geometry
@@ -27,6 +27,12 @@ UNITS = {  # of parameters, and the factor from radians and metres
     r"offset_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0),
     r"pitch_scale": ("%", 100.0),
     r"[fc][xy]": ("px", 1.0),
+}
+AXIS_ERRORS = {  # of an axis, and what they are called of a camera
+    "axis_direction_error_deg": "rotation_error_deg",
+    "axis_offset_error_mm": "translation_error_mm",
+    "axis_direction_pull": "rotation_pull",
+    "axis_offset_pull": "translation_pull",
 }
 SCAN_COLUMNS = (
     "placement",
@@ -183,8 +189,8 @@ def method_comparison(
     -------
     DataFrame
         camera, method, n_placements, edge_median_px, edge_rms_px, plane_rms_mm,
-        left_out_edge_rms_px, left_out_plane_rms_mm; with truth also the columns of
-        :func:`lrfcal_lib.evaluate.truth.camera_errors`.
+        left_out_edge_rms_px, left_out_plane_rms_mm; with truth also
+        rotation_error_deg, translation_error_mm, rotation_pull, translation_pull.
     """
     rows = []
     for (camera, name), solution in solutions.items():
@@ -215,7 +221,10 @@ def method_comparison(
             "left_out_edge_rms_px": rms(held_edge),
             "left_out_plane_rms_mm": 1000 * rms(held_plane),
         }
-        rows.append(row | camera_errors(solution, truth, camera))
+        if truth is not None:
+            errors = camera_errors(solution, truth, camera)
+            row |= {name: errors[name] for name in AXIS_ERRORS.values()}
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -275,15 +284,10 @@ def platform_calibration_table(
         parameters[method,] = names, [*axis.parameters, *phi, ty], sigma
     table = _parameter_table(["method"], parameters)
     if truth is not None:
-        errors = {}
-        for method, axis in platform.axes.items():
-            direction, offset = axis_errors(axis.T_head_lrf, truth)
-            direction_sigma, offset_sigma = sigmas(axis.covariance)
-            pulls = np.radians(direction) / direction_sigma, offset / (1000 * offset_sigma)
-            errors[method] = direction, offset, *pulls
-        columns = ["axis_direction_error_deg", "axis_offset_error_mm"]
-        columns += ["axis_direction_pull", "axis_offset_pull"]
-        table[columns] = [errors[method] for method in table.method]
+        axes = platform.axes.items()
+        errors = {method: axis_errors(axis, truth) for method, axis in axes}
+        for column, name in AXIS_ERRORS.items():
+            table[column] = [errors[method][name] for method in table.method]
     return table
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
@@ -103,57 +104,67 @@ def _pose(stated):
     return from_json(TransformStated, stated).made()
 
 
-def camera_errors(solution: Solution, truth: Truth | None, camera: str) -> dict[str, float]:
+def camera_errors(solution: Solution, truth: Truth, camera: str) -> dict[str, float]:
     """Errors of a camera's pose against the truth.
 
     Parameters
     ----------
     solution : Solution
         Of it.
-    truth : Truth or None
+    truth : Truth
     camera : str
 
     Returns
     -------
     dict of str to float
-        By column: rotation_error_deg, translation_error_mm, and both over their standard
-        deviations: rotation_pull, translation_pull. A pull of 1 is what a standard deviation
-        promises. Nothing without truth.
+        See :func:`beside_sigma`.
     """
-    if truth is None:
-        return {}
-    angle, distance = geometry.transform_difference(
-        solution.transform, truth.cameras[camera]
-    )
-    turn_sigma, shift_sigma = sigmas(solution.trusted[:6, :6])
-    return {
-        "rotation_error_deg": np.rad2deg(angle),
-        "translation_error_mm": 1000 * distance,
-        "rotation_pull": angle / turn_sigma,
-        "translation_pull": distance / shift_sigma,
-    }
+    apart = geometry.transform_difference(solution.transform, truth.cameras[camera])
+    return beside_sigma(*apart, solution.trusted[:6, :6])
 
 
-def sigmas(covariance: np.ndarray) -> np.ndarray:
-    """Standard deviations of the length of a turn (radians) and of a shift (metres).
+def axis_errors(axis: KnownAxis, truth: Truth) -> dict[str, float]:
+    """Errors of a tilt axis against the truth.
 
     Parameters
     ----------
+    axis : KnownAxis
+    truth : Truth
+
+    Returns
+    -------
+    dict of str to float
+        See :func:`beside_sigma`.
+    """
+    estimated = geometry.axis_of(axis.T_head_lrf)
+    apart = geometry.axis_difference(estimated, geometry.axis_of(truth.T_head_lrf))
+    return beside_sigma(*apart, axis.covariance)
+
+
+def beside_sigma(turn: float, shift: float, covariance: np.ndarray) -> dict[str, float]:
+    """A turn (radians) and a shift (metres) beside what their covariance promises.
+
+    Parameters
+    ----------
+    turn, shift : float
     covariance : ndarray, shape (2 k, 2 k)
         Of turns, then shifts.
 
     Returns
     -------
-    ndarray, shape (2,)
+    dict of str to float
+        By column: rotation_error_deg, rotation_sigma_deg, rotation_pull (error over sigma: 1 is
+        what a standard deviation promises), and the same of the translation in millimetres.
     """
-    return np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
-
-
-def axis_errors(T_head_lrf: RigidTransform, truth: Truth) -> tuple[float, float]:
-    """Direction (degrees) and offset error (millimetres) of a tilt axis."""
-    true = geometry.axis_of(truth.T_head_lrf)
-    angle, offset = geometry.axis_difference(geometry.axis_of(T_head_lrf), true)
-    return np.rad2deg(angle), 1000 * offset
+    turn_sigma, shift_sigma = np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
+    return {
+        "rotation_error_deg": np.rad2deg(turn),
+        "rotation_sigma_deg": np.rad2deg(turn_sigma),
+        "rotation_pull": turn / turn_sigma,
+        "translation_error_mm": 1000 * shift,
+        "translation_sigma_mm": 1000 * shift_sigma,
+        "translation_pull": shift / shift_sigma,
+    }
 
 
 def on_true_edges(observations: PlatformObservations, truth: Truth) -> PlatformObservations:

@@ -276,11 +276,16 @@ def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
     them as well.
 
     Beyond chance whatever they do, or preferred by the data where what is handed over would move by
-    more than its standard deviation tells. Kinds named in `faint` need the latter.
+    more than its standard deviation tells. Kinds named in `faint` need the latter; an angular step
+    that is known needs the former.
     """
     asked = []
     for doubt in weigh(solution, admitted_offset, stated):
         harmful = doubt.exceeds(PREFERRED) and doubt.moved > MOVED
+        if doubt.kind == Kind.BEARINGS and not solution.step.any():
+            harmful = (
+                False  # a step that the sensor's disc divides is off for no small reason
+            )
         certain = doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
         asks = harmful or (certain and doubt.kind not in faint)
         if asks and abs(doubt.value) < stated[doubt.kind].reach:

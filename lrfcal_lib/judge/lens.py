@@ -1,6 +1,7 @@
 """Does the model of a lens fit what its images show?"""
 
 import numpy as np
+import pandas as pd
 
 from lrfcal_lib.judge.findings import Finding, Kind, no_if
 from lrfcal_lib.model.camera import CameraModel, fold, lens_terms, project
@@ -83,15 +84,11 @@ def common_miss(views, points, model):
     expected = [project(view.T_camera_board.apply(points), model) for view in views]
     miss = uv - np.concatenate(expected)
     part = np.floor(LENS_PARTS * uv / [model.width, model.height])
-    squares = []
-    for here in np.unique(part[np.isfinite(miss).all(axis=1)], axis=0):
-        of_part = miss[(part == here).all(axis=1)]
-        if len(of_part) >= LENS_CORNERS:
-            noise = of_part.var(axis=0).sum() / len(of_part)
-            squares.append(np.sum(of_part.mean(axis=0) ** 2) - noise)
-    if not squares:
-        return 0.0
-    return np.sqrt(max(np.mean(squares), 0.0))
+    table = pd.DataFrame(np.hstack([part, miss]), columns=["column", "row", "u", "v"])
+    parts = table.dropna().groupby(["column", "row"])
+    noise = parts.var(ddof=0).div(parts.size(), axis=0)
+    squares = (parts.mean() ** 2 - noise).sum(axis=1)[parts.size() >= LENS_CORNERS]
+    return np.sqrt(max(squares.mean(), 0.0)) if len(squares) else 0.0
 
 
 def reach_of_fold(model: CameraModel) -> float:

@@ -390,9 +390,7 @@ def faults_of_changes(changes, cameras):
         )
         severe = change.size_px > SEVERE_PX
         concerned = (change.after,)
-        found.append(
-            Fault(kind, f"{words}; {remedy}", severe, change.camera, concerned)
-        )
+        found.append(Fault(kind, f"{words}; {remedy}", severe, change.camera, concerned))
     return found
 
 

@@ -83,15 +83,9 @@ SYSTEMATIC_ERROR = {
 # centimetres: so many standard deviations or steps of a range; the sheets above admit 2 to 4.2, and
 # 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
-# degrees between beams, by part of the model's name: parts of a full turn that the sensor's own
-# disc divides, so that their scale has no error
-BEARING_STEPS = {
-    "LMS1": (0.25, 0.5),
-    "LMS2": (0.25, 0.5, 1.0),
-    "LMS4": (0.1, 0.2, 0.25, 0.5, 1.0),
-    "LMS5": (1 / 6, 0.25, 1 / 3, 0.5, 2 / 3, 1.0),
-    "TiM5": (1 / 3, 1.0),
-}
+# degrees between beams of LMS and TiM: parts of a full turn that the sensor's own disc divides, so
+# that their scale has no error
+SICK_STEPS = np.array([0.1, 1 / 6, 0.2, 0.25, 1 / 3, 0.5, 2 / 3, 1.0])
 SAME_STEP = 0.001  # of a step; one that is rounded to three digits
 # standard deviation of other steps, a fraction: anything within 1 %, which nobody notices
 ASSUMED_STEP_ERROR = 0.0058
@@ -424,10 +418,10 @@ class LrfInfo:
         """
         if self.step_error is not None:
             return self.step_error
-        for name, steps in BEARING_STEPS.items():
-            ratio = np.degrees(self.bearing_step) / np.array(steps)
-            if name in self.model and np.abs(ratio - 1).min() < SAME_STEP:
-                return 0.0
+        ratio = np.degrees(self.bearing_step) / SICK_STEPS
+        same = np.abs(ratio - 1).min() < SAME_STEP
+        if same and re.search("LMS|TiM", self.model):
+            return 0.0
         return ASSUMED_STEP_ERROR
 
     def spot_radius(self, distance: ArrayLike) -> np.ndarray:
