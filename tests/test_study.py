@@ -25,7 +25,12 @@ from lrfcal_lib.evaluate.study import (
     tasks_of,
     variations,
 )
-from lrfcal_lib.evaluate.study_trials import STUDIED, crossing_observations, run_task
+from lrfcal_lib.evaluate.study_trials import (
+    BATCHED,
+    STUDIED,
+    crossing_observations,
+    run_task,
+)
 from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.session import cluster
@@ -156,6 +161,14 @@ def test_errors_fall_with_noise_and_the_joint_estimate_keeps_to_its_bound():
     joint = noisy[noisy.method == "joint"].iloc[0]
     assert joint.failed == 0 and 0.6 < joint.rmse_over_bound < 1.6
     assert joint.rotation_deg_known <= joint.rotation_deg_bound
+
+
+def test_every_method_solves_every_kind_of_target():
+    boards = run_study("indoor_lms200", n_poses=(10,), trials=2)
+    assert list(boards.method) == list(STUDIED) and (boards.failed == 0).all()
+    assert boards.rotation_deg.max() < 10 and boards.coverage.notna().all()
+    corners = run_study("corner_calib_edge", tuple(BATCHED), (20,), 2)
+    assert (corners.failed == 0).all() and corners.coverage.isna().all(), "it has no bound"
 
 
 def test_failures_are_counted_and_named():
