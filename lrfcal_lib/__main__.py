@@ -96,7 +96,7 @@ def import_recording(args):
     """Make a session of a recording by other people."""
     from lrfcal_lib.session.importers import import_lasersetero
 
-    miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
+    miss = import_lasersetero(args.src, args.dst)
     print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
 
 
@@ -125,8 +125,10 @@ def check(args):
     if count == 0 and session.scene_placements:
         print("no placement of the board: a scene, for a calibration made elsewhere")
     elif count < FEW:
-        needed = f"{FEW} or more are needed to see errors of the model"
-        print(f"warning: {count} placements of the board; {needed}")
+        print(
+            f"warning: {count} placements of the board; {FEW} or more are needed to see errors of "
+            "the model"
+        )
     if args.calibration is not None:
         from lrfcal_lib.report.holds import check_calibration
 
@@ -152,28 +154,21 @@ def record(args):
     return main(args.rig_file, args.session, **options)
 
 
-def how_many(text):
-    """A number of placements on the command line."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value}: 1 or more are needed")
-    return value
+def between(kind, least, most, what):
+    """Reads a number within limits from the command line."""
+
+    def read(text):
+        value = kind(text)
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"{value}: {least} to {most} {what}")
+        return value
+
+    return read
 
 
-def metres(text):
-    """A length on the command line."""
-    value = float(text)
-    if not 0.001 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{value} m: squares have 0.001 to 1 m")
-    return value
-
-
-def inner(text):
-    """A number of inner corners on the command line."""
-    value = int(text)
-    if not 3 <= value <= 50:
-        raise argparse.ArgumentTypeError(f"{value} inner corners: 3 to 50 are possible")
-    return value
+how_many = between(int, 1, 1000, "are possible")
+metres = between(float, 0.001, 1, "m are possible")
+inner = between(int, 3, 50, "inner corners are possible")
 
 
 def parser():
@@ -201,12 +196,6 @@ def _add_import(verbs):
         "src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png, Calib_Results_*.m"
     )
     add.add_argument("dst", help="folder of the new session")
-    add.add_argument(
-        "--intrinsics",
-        choices=("own", "published"),
-        default="own",
-        help="estimate them from the images (default), or take the authors'",
-    )
 
 
 def _add_sessions(verbs):
@@ -266,7 +255,7 @@ def _add_measure(verbs):
     measure.add_argument("--calibration", required=True, help="calibration.json")
     measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
     measure.add_argument(
-        "--station", type=int, help="whose scene.html, if there are several"
+        "--station", type=int, help="whose scene.html it was (default: that of 'merge')"
     )
     measure.add_argument(
         "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"

@@ -38,7 +38,13 @@ from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
 from lrfcal_lib.preprocess.survey import survey, views_of
 from lrfcal_lib.session.cluster import workers_at
-from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, split_stream
+from lrfcal_lib.session.lms2xx_codec import (
+    decode_scan,
+    decode_scans,
+)
+from lrfcal_lib.session.lms2xx_frame import (
+    split_stream,
+)
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import solve_joint

@@ -142,7 +142,7 @@ class Lrf:
         times = instant + (np.arange(BEAMS) / 360) * 0.0133
         ranges = np.full(BEAMS, 2.0 + pitch)
         self.readings.append(
-            Reading((telegram(pitch),), ranges, None, BEARINGS, instant, times, -1, -1)
+            Reading((telegram(pitch),), ranges, BEARINGS, instant, times, -1)
         )
         return self.readings[-1]
 

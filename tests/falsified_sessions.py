@@ -284,20 +284,6 @@ def half_size(folder):
     change_statements(folder, change)
 
 
-def other_clock(folder):
-    session = open_session(folder)
-    time = {p: float(np.nanmean(session.sweep(p).time_s)) for p in session.placements}
-    known = np.isfinite(list(time.values())).all()
-
-    def change(rows):
-        for row in rows:
-            if row["placement"]:
-                own = time[int(row["placement"])] if known else 60.0 * int(row["placement"])
-                row["t_s"] = repr(own + 7200.0)
-
-    change_rows(folder, change)
-
-
 def pattern_turned(folder):
     def change(data):
         pattern = data["board"]["pattern"]
@@ -339,10 +325,9 @@ WAYS = {
     ),
     "pitch reversed": Way(pitch_times(-1.0), ("sense", "far from stated"), "sense"),
     "images of half the size": Way(half_size, ("lens",), "image size", ("sim_lms221",)),
-    "another clock": Way(other_clock, ("clock",), "clock", ("sim_lms221",)),
     "pattern stated 6 x 8": Way(pattern_turned, (), sessions=("lms400_zed",)),
     "rows exchanged": Way(exchange_rows, ("exchanged",), "exchange them back"),
-    "numbers of images ahead": Way(numbers_ahead, ("numbers",), "ahead by one"),
+    "numbers of images ahead": Way(numbers_ahead, ("numbers",), "too large by one"),
     "pitch of images in radians": Way(
         image_pitch_in_radians, ("unit",), "images.csv is in radians", ("sim_lms221",)
     ),

@@ -3,7 +3,7 @@
 from collections import Counter
 from contextlib import suppress
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from lrfcal_lib.drivers.pelco_d import SYNC, encode_extended
 from lrfcal_lib.emulators.head import ANSWERS, TURN_AROUND_S, EmulatedHead
 from lrfcal_lib.emulators.lms2xx import ACK, RESET_S, EmulatedLms
 from lrfcal_lib.emulators.lms2xx_memory import BAUD_WORD
-from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session import lms2xx_frame as frame
 
 DELAY_S = 0.7
 AWAY_S = 0.5
@@ -130,7 +130,43 @@ class FaultyLine:
         super().reply(data, at, then)
 
 
-class FaultyLms(FaultyLine, EmulatedLms):
+@dataclass(frozen=True)
+class ScanRecord:
+    """A scan that was sent: its running number, the mirror's turn, dates of its beams, all its values, the telegram."""
+
+    number: int
+    turn: int
+    telegram_index: int
+    beam_times_s: np.ndarray
+    partial: int
+    words: np.ndarray
+    telegram: bytes
+
+    time_s = property(lambda self: float(self.beam_times_s[0]))
+
+
+class RecordingLms(EmulatedLms):
+    """An LMS2xx that notes the sound requests it hears, with their dates, and the scans it sends."""
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.scans, self.requests = [], []
+
+    def heard(self, raw, at, sound=True):
+        if sound and raw[1] in (0, self.memory.address) and not self._booting:
+            self.requests.append((self.host.time(), raw))
+        super().heard(raw, at, sound)
+
+    def emit(self, scan, at, then=None):
+        dates = scan.times + (self.host.time() - self.host.now())
+        told = (dates, scan.partial, scan.words, self.telegram(scan))
+        self.scans.append(
+            ScanRecord(len(self.scans), scan.turn, self.telegrams % 256, *told)
+        )
+        super().emit(scan, at, then)
+
+
+class FaultyLms(FaultyLine, RecordingLms):
     """An LMS2xx with faults."""
 
     known = LMS
@@ -162,15 +198,15 @@ class FaultyLms(FaultyLine, EmulatedLms):
 
     def prepare(self, raw):
         """A reply with the faults that keep its checksum sound."""
-        with suppress(codec.TelegramError):
-            told = codec.parse_telegram(raw)
+        with suppress(frame.TelegramError):
+            told = frame.parse_telegram(raw)
             status = 0xD3 if self.hit("status") else raw[-3]
             address = 0x80 | (raw[1] + 5) % 0x80 if self.hit("address") else raw[1]
-            raw = codec.encode_telegram(
+            raw = frame.encode_telegram(
                 told.code, told.data, status=status, address=address
             )
         return (
-            codec.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
+            frame.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
         )
 
 
@@ -187,6 +223,7 @@ class FaultyHead(FaultyLine, EmulatedHead):
         self, *args, confirms=False, echo=False, watchdog_s=None, invert=False, **options
     ):
         super().__init__(*args, **options)
+        self.heard = b""
         self.confirms, self.echo, self.watchdog_s, self.inverted = (
             confirms,
             echo,
@@ -195,6 +232,7 @@ class FaultyHead(FaultyLine, EmulatedHead):
         )
 
     def receive(self, data, at):
+        self.heard += data
         if self.echo:
             self.write(data, at)
         super().receive(data, at)

@@ -561,7 +561,7 @@ def _open_rig(path):
 def _import(path):
     """A message names the file that is wrong, be it in the source or in what was made of it."""
     try:
-        import_lasersetero(path, path / "made", intrinsics="published")
+        import_lasersetero(path, path / "made")
     except SessionError as error:
         assert str(path) in str(error), error
 

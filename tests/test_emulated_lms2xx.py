@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from virtual import Bench, lms
 
-from lrfcal_lib.session.lms2xx_codec import encode_telegram
+from lrfcal_lib.session.lms2xx_frame import (
+    encode_telegram,
+)
 from lrfcal_lib.simulate.beam import VARIANTS
 
 ZEROS = "00 " * 21

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import serial
 from shared import until
+from small_rigs import scaled
 
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.emulators.rig import EmulatedRig, main, written_rig_file
-from lrfcal_lib.emulators.world import scaled
 from lrfcal_lib.simulate.rig import load_setup, placements_of
 
 DEADLINE = 180.0  # s, against hanging
@@ -52,7 +52,7 @@ def test_cameras_open_as_any_stream_and_show_the_place(rig):
 
 
 def test_a_setup_that_is_not_there():
-    with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, room_lms221, sim_quick"):
+    with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, room_lms221, sim_quick, practice"):
         main("x")
 
 

@@ -66,8 +66,8 @@ def test_the_board_is_moved_by_who_records(world):
     server.start()
     data["devices"]["control"] = server.control
     driver = make_rig(data)
-    assert driver.move_board(2) and world.place.key == ("placement", 2)
-    assert driver.hold_close("left", 3) and world.place.key == ("close", "left", 3)
+    assert driver.move_board(2) and world.place == ("placement", 2)
+    assert driver.hold_close("left", 3) and world.place == ("close", "left", 3)
     for call, message in (
         (
             lambda: driver.move_board(9),
@@ -105,7 +105,7 @@ def test_no_web_page_moves_the_board(world, order):
     request = urllib.request.Request(url, method=method, headers={"Host": host})
     with pytest.raises(urllib.error.HTTPError, match="40[34]"):
         urllib.request.urlopen(request, timeout=DEADLINE)
-    assert world.place.key == ("placement", None)
+    assert world.place == ("placement", None)
     server.close()
 
 

@@ -7,9 +7,12 @@ import pytest
 from telegrams import encode_scan
 
 from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session import lms2xx_frame as frame
 from lrfcal_lib.session.lms2xx_codec import (
-    MODES,
+    TOP,
     decode_scan,
+)
+from lrfcal_lib.session.lms2xx_frame import (
     encode_telegram,
     split_stream,
 )
@@ -58,17 +61,17 @@ def random_words(rng, shape):
 
 @pytest.mark.parametrize("raw", SENT + REPLIES, ids=bytes.hex)
 def test_telegrams_are_the_verified_bytes(raw):
-    found = codec.parse_telegram(raw)
+    found = frame.parse_telegram(raw)
     data, status = (raw[5:-3], raw[-3]) if raw in REPLIES else (raw[5:-2], None)
     assert (found.code, found.data) == (raw[4], data)
     assert encode_telegram(found.code, found.data, status=status, address=raw[1]) == raw
 
 
 REFUSED = [
-    (codec.parse_telegram, b"", "begins with 02.*got none"),
-    (codec.parse_telegram, A0 + b"\0", "states 9 bytes, got 10"),
+    (frame.parse_telegram, b"", "begins with 02.*got none"),
+    (frame.parse_telegram, A0 + b"\0", "states 9 bytes, got 10"),
     (
-        codec.parse_telegram,
+        frame.parse_telegram,
         A0[:5] + b"\x01" + A0[6:],
         "CRC 0A16 sent, .* computed.*ask again",
     ),
@@ -114,7 +117,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("parse", "given", "message"), REFUSED)
 def test_what_is_no_telegram_or_another_one_is_refused(parse, given, message):
-    with pytest.raises(codec.TelegramError, match=message):
+    with pytest.raises(frame.TelegramError, match=message):
         parse(given)
 
 
@@ -130,7 +133,7 @@ def test_the_two_scans_of_the_fact_sheet():
         "larger than maximum",
         "not valid",
     ]
-    assert (scan.unit, scan.partial.tolist()) == ("cm", [-1])
+    assert (scan.unit, scan.partial) == ("cm", -1)
     assert scan.scan_index.tolist() == scan.telegram_index.tolist() == [-1]
     scan = decode_scan(second)
     np.testing.assert_allclose(scan.ranges, [[1.234, 1.234, np.nan]])
@@ -139,7 +142,7 @@ def test_the_two_scans_of_the_fact_sheet():
     assert codec.encode_words(values | np.uint16([0, 1 << 13, 0])) == second
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", TOP)
 def test_special_values_of_every_mode(mode):
     bits = {0: 13, 1: 13, 2: 13, 3: 14, 4: 14, 5: 15, 6: 15}[mode]
     top = (1 << bits) - 1
@@ -154,7 +157,7 @@ def test_special_values_of_every_mode(mode):
         np.testing.assert_allclose(scan.ranges[0], expected)
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", TOP)
 @pytest.mark.parametrize("unit", ["cm", "mm"])
 @pytest.mark.parametrize("partial", [-1, 0, 1, 2, 3])
 @pytest.mark.parametrize("indices", [None, (7, 255)])
@@ -166,7 +169,7 @@ def test_any_scan_survives_both_ways(mode, unit, partial, indices):
             words, unit=unit, partial=partial, indices=indices, status=0x51, address=0x85
         )
         scan = decode_scan(raw, mode)
-        assert (scan.unit, scan.mode, scan.partial[0]) == (unit, mode, partial)
+        assert (scan.unit, scan.mode, scan.partial) == (unit, mode, partial)
         assert (raw[-3], raw[1]) == (0x51, 0x85)
         assert (scan.scan_index[0], scan.telegram_index[0]) == (indices or (-1, -1))
         np.testing.assert_array_equal(scan.words[0], words)
@@ -174,7 +177,7 @@ def test_any_scan_survives_both_ways(mode, unit, partial, indices):
         values = codec.encode_values(
             scan.ranges[0, known], unit=unit, mode=mode, reasons=scan.reasons[0, known]
         )
-        np.testing.assert_array_equal(values, words[known] & MODES[mode].top)
+        np.testing.assert_array_equal(values, words[known] & TOP[mode])
 
 
 # ---------------------------------------------------------------------------------------------------- streams

@@ -16,6 +16,8 @@ from virtual import INDEXED, Source, lms
 
 from lrfcal_lib.session.lms2xx_codec import (
     Configuration,
+)
+from lrfcal_lib.session.lms2xx_frame import (
     crc16,
     encode_telegram,
     parse_telegram,

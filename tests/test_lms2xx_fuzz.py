@@ -7,7 +7,13 @@ from shared import STRINGS
 from telegrams import encode_scan
 
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import MODES, encode_telegram
+from lrfcal_lib.session import lms2xx_frame as frame
+from lrfcal_lib.session.lms2xx_codec import (
+    TOP,
+)
+from lrfcal_lib.session.lms2xx_frame import (
+    encode_telegram,
+)
 
 PARSERS = {0xB0: codec.decode_scan, 0xB1: codec.parse_status, 0xBA: codec.parse_type,
            0xF4: codec.parse_configuration, 0xF7: codec.parse_configuration}  # fmt: skip
@@ -64,12 +70,12 @@ def test_fuzz_streams():
     found = 0
     for seed in every:
         data = b"".join(damaged(rng, seed, STRINGS // 2 // len(every)))
-        stream = codec.split_stream(data, replies=bool(seed[1]))
+        stream = frame.split_stream(data, replies=bool(seed[1]))
         assert len(stream.offset) == len(stream.length) and stream.pending <= len(data)
         assert np.all(stream.offset[1:] >= stream.offset[:-1] + stream.length[:-1])
         assert stream.length.sum() <= stream.pending
         for group in codec.decode_scans(
-            data, stream.offset, stream.length, int(rng.choice(list(MODES)))
+            data, stream.offset, stream.length, int(rng.choice(list(TOP)))
         ):
             assert group.words.shape == group.ranges.shape == group.reasons.shape
         found += len(stream.offset)
@@ -82,11 +88,11 @@ def test_fuzz_contents():
     every = seeds(rng)
     values = 0
     for seed in every:
-        parse = PARSERS.get(seed[4], codec.parse_telegram)
+        parse = PARSERS.get(seed[4], frame.parse_telegram)
         for raw in damaged(rng, seed, STRINGS // 2 // len(every)):
             if len(raw) > 7 and raw[-1] % 4:
                 raw = encode_telegram(seed[4], raw[5:-3], status=raw[-3])
-            with suppress(codec.TelegramError):
+            with suppress(frame.TelegramError):
                 scan = parse(raw)
                 values += 1
                 assert parse is not codec.decode_scan or np.all(

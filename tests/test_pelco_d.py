@@ -111,9 +111,8 @@ FAR = encode_extended(1, pelco_d.TILT, 36000)  # no such angle
 def test_what_is_a_reply_to_what_was_sent(data, sent, found):
     received = split_replies(data, sent)
     assert (received.tilts, received.acknowledged) == found
-    for echo in (sent, sent[3:]):
-        again = split_replies(echo + data, sent)
-        assert ((again.tilts, again.acknowledged), again.echoed) == (found, len(echo))
+    again = split_replies(sent + data, sent)
+    assert ((again.tilts, again.acknowledged), again.echoed) == (found, len(sent))
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from shared import until
+from small_rigs import scaled
 
 from lrfcal_lib.emulators.rig import EmulatedRig, practice_setup, quick_file
-from lrfcal_lib.emulators.world import scaled
 from lrfcal_lib.session.read import open_session, validate
 
 DEADLINE = 120.0  # s, against hanging

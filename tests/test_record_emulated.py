@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from small_rigs import scaled
 from virtual import VirtualHost
 
 from lrfcal_lib import __main__ as command_line
@@ -21,7 +22,6 @@ from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.emulators.rig import EmulatedRig
-from lrfcal_lib.emulators.world import scaled
 from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.measure.features import flatness, largest_plane
 from lrfcal_lib.measure.scene import station_cloud
@@ -90,7 +90,7 @@ def emulated_rig(setup, file):
             "settle_s": 0.25,
             "poll_s": 0.05,
             "gap_s": 0.025,
-        }  # the head wobbles for 0.2 s
+        }  # the head settles for 0.2 s
         data["plan"] |= {"pitch_deg": [-20, 8, 2]}  # of the scene
         file.write_text(json.dumps(data))
 

@@ -400,16 +400,16 @@ DAMAGE = [
     (arrays(time_s=np.zeros(2)), r"time_s has shape \(2,\)"),
     (
         lambda path: (path / SCANS).rename(path / "lrf" / "telegrams.bin"),
-        r"index\.csv: No such file.*needs this file",
+        r"index\.csv: No such file.*this file is needed",
     ),
     (cell("file", "../trip/session.json"), OUT + "'../trip/session.json'"),
     (cell("file", "/etc/passwd"), OUT + "'/etc/passwd'"),
     (cell("file", "..\\x.png"), OUT + r"'\.\.\\"),
     (cell("file", "images/left/0009.png"), "0009.png: No such file"),
     (cell("file", "session.json"), "neither PNG nor JPEG"),
-    (cell("camera", "up"), "no camera 'up' in session.json, which has left, right"),
+    (cell("camera", "up"), "camera is one of left, right, got 'up'"),
     (cell("purpose", "fun"), "purpose is one of intrinsics, board, scene, got 'fun'"),
-    (cell("placement", "12"), "placement 12 is not in session.json"),
+    (cell("placement", "12"), "placement is one of 1, 2, -1, got '12'"),
     (
         cell("placement", "1.5"),
         "images.csv line 2: placement is '1.5': a whole number is needed",
@@ -441,10 +441,13 @@ DAMAGE = [
     (pick("left,../0001.png,ab,1,2,20,3"), OUT),
     (
         pick("left,images/left/0001.png,top,1,2,20,3"),
-        "edge is one of ab, bc, ca, got 'top'",
+        "edge must be one of ab, bc, ca, got 'top'",
     ),
-    (pick("left,images/left/0001.png,ab,1,2,2,3"), "too close for a direction"),
-    (pick("left,images/left/0001.png,ab,1,2,nan,3"), "u1, v1, u2, v2 must be 4 finite"),
+    (pick("left,images/left/0001.png,ab,1,2,2,3"), "give no direction: pick two"),
+    (
+        pick("left,images/left/0001.png,ab,1,2,nan,3"),
+        "give no direction: pick two that are 5 or more",
+    ),
 ]
 
 
@@ -497,5 +500,5 @@ def test_the_writer_refuses_what_the_reader_would(tmp_path):
     for method, wrong, message in REFUSED:
         with pytest.raises(SessionError, match=message):
             getattr(writer, method)(*wrong)
-    with pytest.raises(SessionError, match="purposes intrinsics, board, scene"):
+    with pytest.raises(SessionError, match="purpose is one of intrinsics, board, scene"):
         writer.add_image("left", pixels(), purpose="fun")

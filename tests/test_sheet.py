@@ -52,8 +52,8 @@ def test_the_command_writes_a_page_of_its_size_and_says_what_to_state(tmp_path, 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["2", "9", "0.04"], "2 inner corners: 3 to 50 are possible"),
-        (["6", "9", "40"], "40.0 m: squares have 0.001 to 1 m"),
+        (["2", "9", "0.04"], "2: 3 to 50 inner corners are possible"),
+        (["6", "9", "40"], "40.0: 0.001 to 1 m are possible"),
         (["6", "9", "0.04", "--out", "board.xyz"], "xyz"),
     ],
 )

@@ -11,12 +11,15 @@ from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.session.lms2xx_codec import (
     Configuration,
     encode_configuration,
-    encode_telegram,
     encode_values,
     encode_words,
 )
+from lrfcal_lib.session.lms2xx_frame import (
+    encode_telegram,
+)
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import LrfInfo, SessionError
+from lrfcal_lib.session.telegrams import TRUNCATED, WRONG
 from lrfcal_lib.session.write import SessionWriter, finish
 
 LRF = LrfInfo(
@@ -105,10 +108,11 @@ def test_the_field_of_view_is_that_of_the_telegrams(recorded, values, first, ste
     bearings = np.degrees(session.sweep(1).bearings)
     np.testing.assert_allclose(bearings, first + step * np.arange(values))
     last = first + step * (values - 1)
-    (problem,) = session.problems
+    (problem,) = validate(session.path)
     assert problem == (
-        f"the telegrams cover {first:g} to {last:g} deg in steps of {step:g} deg, session.json states 40 to 140 deg in "
-        "steps of 0.25 deg: the telegrams count; correct field_of_view_deg and bearing_step_deg"
+        f"the bearings of the scan lines (lrf) cover {first:g} to {last:g} deg in steps of {step:g} deg, session.json "
+        "states field_of_view_deg and bearing_step_deg as 40 to 140 deg in steps of 0.25 deg: the scan lines count; "
+        "correct session.json, or the bearings if they are wrong"
     )
 
 
@@ -173,13 +177,9 @@ def test_wrong_crcs_are_left_out_counted_and_named(path):
         3,
         401,
     )
-    assert session.telegrams.report()["wrong_crc_offsets"] == (854, 3290)
-    assert session.telegrams.report()["outcomes"] == {
-        "scan": 6,
-        "other": 1,
-        "wrong CRC": 2,
-        "truncated": 0,
-    }
+    wrong = session.telegrams.offset[session.telegrams.outcome == WRONG]
+    assert wrong.tolist() == [854, 3290]
+    assert np.bincount(session.telegrams.outcome).tolist() == [6, 1, 2]
     wrong, behind = session.problems
     assert "2 of 9 telegrams have a wrong CRC, left out, at 854, 3290" in wrong
     assert "9 bytes after the last telegram in index.csv are not used" in behind
@@ -192,7 +192,7 @@ def test_a_truncated_last_telegram_is_left_out_and_told(path, cut):
     session = open_session(path)
     assert (
         len(session.sweep(2).ranges) == 3
-        and session.telegrams.report()["outcomes"]["truncated"] == 1
+        and (session.telegrams.outcome == TRUNCATED).sum() == 1
     )
     assert any(
         f"at {len(data) - 812}, is cut off after {812 - cut} bytes" in text

@@ -193,8 +193,8 @@ def test_a_url_that_nobody_serves(server, host):
 # ---------------------------------------------------------------------------------------------------- recorded
 
 
-@pytest.mark.parametrize("pattern", ["", "*.png", "000[123].*", "video.avi"])
-def test_recorded_images_in_the_order_of_their_names(tmp_path, pattern):
+@pytest.mark.parametrize("pattern", ["%04d.png", "video.avi"])
+def test_recorded_images_in_the_order_of_their_numbers(tmp_path, pattern):
     writer = cv2.VideoWriter(
         str(tmp_path / "video.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48)
     )
@@ -202,8 +202,7 @@ def test_recorded_images_in_the_order_of_their_names(tmp_path, pattern):
         cv2.imwrite(str(tmp_path / f"{4 - number:04d}.png"), numbered(4 - number))
         writer.write(numbered(number))
     writer.release()
-    (tmp_path / "notes.txt").write_text("no image")
-    with Camera(tmp_path / pattern if pattern else tmp_path, name="right") as camera:
+    with Camera(tmp_path / pattern, name="right") as camera:
         assert camera.size == (64, 48)
         frames = [camera.newest(after=time.time()) for _ in range(3)]
         assert [(number_of(frame), frame.index) for frame in frames] == [
@@ -216,16 +215,13 @@ def test_recorded_images_in_the_order_of_their_names(tmp_path, pattern):
             camera.newest()
 
 
-@pytest.mark.parametrize(("name", "what"), [
-    ("none.avi", "there is no video"), ("text.avi", "is no video"), ("none.png", "there are no images in"),
-    ("empty", "there are no images in"), ("x*.png", "there are no images in"), ("bad.png", "bad.png is no image"),
-])  # fmt: skip
-def test_bad_files(tmp_path, name, what):
+@pytest.mark.parametrize("name", ["none.avi", "text.avi", "none%d.png", "empty"])
+def test_bad_files(tmp_path, name, capfd):
     (tmp_path / "text.avi").write_text("no video")
-    (tmp_path / "bad.png").write_text("no image")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(PortError, match=what):
-        Camera(tmp_path / name, name="right").newest()
+    with pytest.raises(PortError, match=f"{name} is no video .* numbered images such as"):
+        Camera(tmp_path / name, name="right")
+    assert capfd.readouterr() == ("", "")
 
 
 # -------------------------------------------------------------------------------------------------------- V4L2

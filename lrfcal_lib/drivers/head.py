@@ -7,7 +7,7 @@ import threading
 
 from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.motion import ASSUMED, Motion, Stopped, drawn_to_readings
-from lrfcal_lib.drivers.pelco_d import FASTEST, FRAME, HeadLine
+from lrfcal_lib.drivers.pelco_d import FRAME, HeadLine
 from lrfcal_lib.drivers.port import (
     REAL,
     DeviceError,
@@ -44,7 +44,7 @@ class PanTilt(port.Closed):
     PortError
         If the port cannot be opened.
     NoReply
-        If a head with stated feedback tells nothing, or a stated echo does not come.
+        If a head with stated feedback tells nothing.
     WrongDevice
         If something else answers.
     """
@@ -77,26 +77,15 @@ class PanTilt(port.Closed):
                 f"{line.path} sends {line.skipped} bytes that are no Pelco-D at "
                 f"{settings.baudrate} Bd: another device, another rate, or Pelco-P"
             )
-        if settings.echo is True and not line.echoed:
-            remedy = "check the adapter and its power"
-            raise NoReply(f"{line.path} does not echo what is sent: {remedy}")
-        if settings.echo is False and line.echoed:
-            LOG.warning(
-                "%s echoes what is sent, against what is stated: it is removed", line.path
-            )
         if self.has_feedback:
             return
         if settings.feedback is True:
             raise NoReply(self._silence(line))
         self.set_pitch(math.radians(settings.start_pitch_deg))
-        how = "assumed, state degrees_per_second"
-        if self.motion.calibrated:
-            how = "stated"
         LOG.warning(
-            "the head does not tell its tilt: timed moves at %g/%g deg/s (%s), from %.2f deg; its "
-            "pitch is not measured",
+            "the head does not tell its tilt: timed moves at %g/%g deg/s (state "
+            "degrees_per_second if that is not so), from %.2f deg; its pitch is not measured",
             *(settings.degrees_per_second or ASSUMED),
-            how,
             settings.start_pitch_deg,
         )
 
@@ -163,17 +152,14 @@ class PanTilt(port.Closed):
             was lost.
         """
         line = self._open_line()
-        if not self.has_feedback:
-            return self.motion.estimate(), False
-        if self.moving():
-            reading = self.motion.read()
-        else:
-            reading = self.motion.read(self.settings.retries)
-            if reading is None:
+        if self.has_feedback:
+            moving = self.moving()
+            reading = self.motion.read(0 if moving else self.settings.retries)
+            if reading is not None:
+                return reading.pitch, True
+            if not moving:
                 raise NoReply(self._silence(line))
-        if reading is None:
-            return self.motion.estimate(), False
-        return reading.pitch, True
+        return self.motion.estimate(), False
 
     def set_pitch(self, pitch: float) -> None:
         """Say where a head without feedback stands.
@@ -289,14 +275,8 @@ class PanTilt(port.Closed):
         ------
         OutOfRange
             Beyond the limits; nothing moves.
-        ValueError
-            For a speed that does not exist.
         """
         step = self.settings.tilt_speed if speed is None else speed
-        if step not in range(FASTEST + 1):
-            raise ValueError(
-                f"speed is {speed!r}: it is a byte from 0, very slow, to {FASTEST}"
-            )
         self._begin(stop_at)
 
         def run():

@@ -6,8 +6,8 @@ import os
 from threading import Thread
 
 from lrfcal_lib.drivers import lms2xx_link as wire
-from lrfcal_lib.drivers.lms2xx_link import POWER_ON, RATES, Arrival, Link
-from lrfcal_lib.drivers.lms2xx_scans import VARIANTS, Assembler, Reading, ScanClock
+from lrfcal_lib.drivers.lms2xx_link import POWER_ON, RATES, Link
+from lrfcal_lib.drivers.lms2xx_scans import Assembler, Reading, ScanClock
 from lrfcal_lib.drivers.port import (
     REAL,
     Closed,
@@ -20,13 +20,13 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
 )
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, UNITS
+from lrfcal_lib.session.lms2xx_codec import TOP, VARIANTS
+from lrfcal_lib.session.lms2xx_frame import TelegramError
 
 LOG = logging.getLogger(__name__)
 # data of MODE
-INSTALLATION = b"\x00"
-STREAM = b"\x24"
-INTERLACED = b"\x2a"
+INSTALLATION = b"\x00SICK_LMS"  # with the password of the factory
+STREAMS = {False: b"\x24", True: b"\x2a"}  # by whether scans are interlaced
 ALL_VALUES = b"\x01"  # data of VALUES
 FINE = (100, 0.25)  # variant that interlaced scans need, deg
 USUAL_RATE = 38400  # Bd; where a device is looked for first
@@ -39,14 +39,13 @@ RECOVERY_S = 8.0
 # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
 REPLY_S = 0.4
 LOOK_S = 0.2  # between looks whether the reader thread lives
-COUNTS = ("dropped", "stale", "reconnects")
 
 
 class LMS2xx(Closed):
     """An LMS2xx, found at a port whatever it is doing, its stream stopped; a context manager.
 
     Every call returns or raises a DeviceError within its deadline. While the device streams, only
-    `take`, `counts`, `stop` and `close` may be called.
+    `take`, `stop` and `close` may be called.
 
     Parameters
     ----------
@@ -56,8 +55,6 @@ class LMS2xx(Closed):
         To switch to afterwards; the one found stays by default.
     address
         Of the device; 0 reaches any.
-    password
-        Eight characters, of the installation mode; the factory's by default.
     variant
         To be set, see :meth:`set_variant`.
     find_s
@@ -73,10 +70,6 @@ class LMS2xx(Closed):
         Model and order number.
     status, configuration : DeviceStatus, Configuration
         As read last.
-    counts : dict of str to int
-        'dropped': scans that the mirror made between two that came (needs real-time indices), most
-        of them because the line is slow; 'stale': scans that were not newer than the one before;
-        'reconnects'.
 
     Raises
     ------
@@ -85,7 +78,7 @@ class LMS2xx(Closed):
     NoReply, WrongDevice
         If nothing, or something else answers, or a device in a measuring mode without ranges.
     ValueError
-        For a rate or an address that no LMS2xx has, or a password of another length.
+        For a rate that no LMS2xx has.
     """
 
     def __init__(
@@ -94,7 +87,6 @@ class LMS2xx(Closed):
         *,
         baudrate: int | None = None,
         address: int = 0,
-        password: bytes = b"SICK_LMS",
         variant: tuple[float, float] | None = None,
         find_s: float = FIND_S,
         host: Host = REAL,
@@ -103,13 +95,7 @@ class LMS2xx(Closed):
         if baudrate not in (None, *RATES):
             known = ", ".join(map(str, sorted(RATES)))
             raise ValueError(f"an LMS2xx has {known} Bd, got {baudrate}")
-        if not 0 <= address < 0x80:
-            raise ValueError(f"an address is 0 to 127, got {address}")
-        if len(password) != 8:
-            raise ValueError(f"a password has 8 bytes, got {len(password)}")
         self.port = str(port)
-        self.counts = dict.fromkeys(COUNTS, 0)
-        self._password = bytes(password)
         self._host = host
         self._address = address
         self._interrupted = host.event()
@@ -174,8 +160,9 @@ class LMS2xx(Closed):
         self._link.senders = {0x80, 0x80 | self.status.address}
         model, *rest = self._read(wire.TYPE, codec.parse_type)
         if not model.startswith("LMS2"):
-            remedy = "name the port of the LMS2xx"
-            raise WrongDevice(f"{self.port}: '{model}' answers, not an LMS2xx: {remedy}")
+            raise WrongDevice(
+                f"{self.port}: '{model}' answers, not an LMS2xx: name the port of the LMS2xx"
+            )
         self.type = "-".join([model, *rest[:1]])
         self._read_configuration()
 
@@ -186,14 +173,14 @@ class LMS2xx(Closed):
                 f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does"
             )
         mode = self.configuration.measuring_mode
-        if mode not in MODES:
+        if mode not in TOP:
             raise WrongDevice(
                 f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are "
                 "no ranges that can be told from errors: state measuring_mode, 0 to 6, to have it "
                 "set"
             )
         self._settled = self.variant, self.configuration, self.baudrate
-        self._assembler = Assembler(*self._settled, interlaced, self.counts, self._clock)
+        self._assembler = Assembler(*self._settled, interlaced, self._clock)
 
     def _opened(self):
         if self._link is None:
@@ -205,20 +192,16 @@ class LMS2xx(Closed):
         raw = self._opened().ask(code).raw
         try:
             return parse(raw)
-        except codec.TelegramError as error:
-            what = f"the reply to command {code:02X} is not that of an LMS2xx"
-            raise WrongDevice(f"{self.port}: {what}: {error}") from error
+        except TelegramError as error:
+            raise WrongDevice(
+                f"{self.port}: the reply to command {code:02X} is not that of an LMS2xx: {error}"
+            ) from error
 
     def _read_status(self):
         self.status = self._read(wire.STATUS, codec.parse_status)
 
     def _read_configuration(self):
-        def parse(raw):
-            configuration = codec.parse_configuration(raw)
-            _ = configuration.unit  # raises for one that no manual lists
-            return configuration
-
-        self.configuration = self._read(wire.CONFIGURATION, parse)
+        self.configuration = self._read(wire.CONFIGURATION, codec.parse_configuration)
 
     def _need_quiet(self):
         if self._thread is not None:
@@ -262,7 +245,6 @@ class LMS2xx(Closed):
             self._set_rate(rate)
         self._prepare()
         self._link.deadline = math.inf
-        self.counts["reconnects"] += 1
         LOG.warning("%s: the device is back at %d Bd", self.port, rate)
 
     @property
@@ -285,11 +267,9 @@ class LMS2xx(Closed):
             link.ask(wire.TYPE)
         except (NoReply, Refused) as error:
             link.find([before, *RATES], FIND_S)
-            need = "a shorter cable"
-            if rate == wire.FASTEST:
-                need = "RS-422 (a jumper in the plug of the device)"
             raise NoReply(
-                f"{self.port}: nothing comes through at {rate} Bd, which needs {need}; "
+                f"{self.port}: nothing comes through at {rate} Bd: 500000 needs RS-422 (a jumper "
+                "in the plug of the device), others a shorter cable; "
                 f"{self.baudrate} Bd now"
             ) from error
 
@@ -342,9 +322,10 @@ class LMS2xx(Closed):
             LOG.warning("%s; reading the variant", error)
         self._read_status()
         if self.variant != wanted:
-            kept = "{:g} deg in steps of {:g} deg".format(*self.variant)
-            lacks = f"the {self.type} has no variant {view:g}/{step:g}"
-            raise Refused(f"{self.port}: {lacks}; it keeps {kept}")
+            raise Refused(
+                f"{self.port}: the {self.type} has no variant {view:g}/{step:g}; it keeps "
+                "{:g} deg in steps of {:g} deg".format(*self.variant)
+            )
 
     def configure(
         self,
@@ -360,7 +341,7 @@ class LMS2xx(Closed):
         unit
             Of a reading, 'cm' or 'mm'.
         measuring_mode
-            Key of `lms2xx_codec.MODES`; it tells the largest range, too.
+            Key of `lms2xx_codec.TOP`; it tells the largest range, too.
         realtime_indices
             Without them dropped and repeated scans cannot be seen.
 
@@ -371,16 +352,10 @@ class LMS2xx(Closed):
 
         Raises
         ------
-        ValueError
-            For values that no LMS2xx has.
         Refused
             For a wrong password, or values that the device declines.
         """
         self._need_quiet()
-        if unit not in (None, *UNITS) or measuring_mode not in (None, *MODES):
-            raise ValueError(
-                f"unit is one of {UNITS}, measuring mode 0 to 6; got {unit!r}, {measuring_mode!r}"
-            )
         self._read_configuration()
         wanted = self.configuration.changed(
             unit=unit, measuring_mode=measuring_mode, realtime_indices=realtime_indices
@@ -394,9 +369,7 @@ class LMS2xx(Closed):
     def _write(self, wanted):
         """Write a configuration in installation mode, and read it back."""
         try:
-            self._mode(
-                INSTALLATION + self._password, "the password of the installation mode"
-            )
+            self._mode(INSTALLATION, "the password of the installation mode")
             self._opened().ask(wire.CONFIGURE, wanted.block)
         except NoReply as error:
             # the reply may be lost and the flash written: read it, do not write again
@@ -405,18 +378,17 @@ class LMS2xx(Closed):
             self._mode(wire.ON_REQUEST, "to leave the installation mode")
         self._read_configuration()
         if self.configuration.block != wanted.block:
-            block = wanted.block.hex(" ")
             raise Refused(
-                f"{self.port}: the device does not take the configuration {block}"
+                f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}"
             )
 
-    def request(self, timeout: float | None = None) -> Reading:
+    def request(self, timeout: float = 4.0) -> Reading:
         """One scan.
 
         Parameters
         ----------
         timeout
-            Seconds; by default what three tries need.
+            Seconds.
 
         Raises
         ------
@@ -426,27 +398,20 @@ class LMS2xx(Closed):
             If the port vanished.
         """
         self._need_quiet()
-        host = self._host
-        if timeout is None:
-            timeout = wire.TRIES * (0.5 + 2 * self._assembler.interval_s)
-        end = host.now() + timeout
+        end = self._host.now() + timeout
         for _ in range(wire.TRIES):
             link = self._opened()
-            arrival = link.ask(wire.VALUES, ALL_VALUES, limit_s=max(0.0, end - host.now()))
+            left = max(0.0, end - self._host.now())
+            arrival = link.ask(wire.VALUES, ALL_VALUES, limit_s=left)
             if arrival.time_s - link.asked_s > REPLY_S + self._assembler.duration_s:
                 continue  # nobody knows the instant of a scan that came late
-            reading = self._reading(arrival)
+            reading = self._assembler.feed(*arrival)
             if reading is not None:
                 return reading
         raise NoReply(
             f"{self.port}: scans arrive, but too late, not new, or not of the variant "
             f"{self.variant}"
         )
-
-    def _reading(self, arrival: Arrival):
-        if arrival.code != SCAN:
-            return None
-        return self._assembler.feed(arrival.raw, arrival.time_s)
 
     def start(self, interlaced: bool = False) -> None:
         """Stream: a thread reads every scan from now on.
@@ -474,10 +439,7 @@ class LMS2xx(Closed):
 
     def _stream(self):
         self._prepare(self._interlaced)
-        data = STREAM
-        if self._interlaced:
-            data = INTERLACED
-        self._mode(data, "to stream")
+        self._mode(STREAMS[self._interlaced], "to stream")
 
     def _run(self):
         """Read until the stream is to stop; whatever goes wrong with the line, find the device
@@ -516,7 +478,7 @@ class LMS2xx(Closed):
             for arrival in arrivals:
                 if arrival.code == POWER_ON:
                     raise NoReply("the device started anew")
-                reading = self._reading(arrival)
+                reading = self._assembler.feed(*arrival)
                 if reading is not None:
                     fresh.append(reading)
             if fresh:
@@ -525,10 +487,10 @@ class LMS2xx(Closed):
                 self._news.set()
                 last = host.now()
             if host.now() - last > quiet_s:
-                raise NoReply("the stream fell silent")
+                raise NoReply("the stream stopped")
 
     def take(
-        self, count: int, after: float | None = None, timeout: float | None = None
+        self, count: int, after: float | None = None, timeout: float = 10.0
     ) -> list[Reading]:
         """Consecutive scans of the stream.
 
@@ -542,7 +504,7 @@ class LMS2xx(Closed):
         after
             Date of the host, s, later than which they are; by default that of the call.
         timeout
-            Seconds; by default as long as the line needs and 2 s.
+            Seconds.
 
         Raises
         ------
@@ -556,8 +518,6 @@ class LMS2xx(Closed):
                 f"{self.port}: the device does not stream; call start() first"
             )
         host = self._host
-        if timeout is None:
-            timeout = 2 + 2 * (count + 2) * self._assembler.interval_s
         if after is None:
             after = host.time()
         end = host.now() + timeout

@@ -14,7 +14,7 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
     line_lost,
 )
-from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session.lms2xx_frame import OVERHEAD, encode_telegram, split_stream
 
 ACK = 0x06
 NAK = 0x15
@@ -165,7 +165,7 @@ class Link:
         code, data
             Of the request.
         """
-        raw = codec.encode_telegram(code, data, address=self.address)
+        raw = encode_telegram(code, data, address=self.address)
         with line_lost(self.path):
             self._port.reset_input_buffer()
             self._forget()
@@ -197,7 +197,7 @@ class Link:
             return kept
         missing = 1
         if len(self._rest) >= 4:  # a telegram has begun that states its length
-            whole = int.from_bytes(self._rest[2:4], "little") + codec.OVERHEAD
+            whole = int.from_bytes(self._rest[2:4], "little") + OVERHEAD
             missing = max(1, whole - len(self._rest))
         with line_lost(self.path):
             data = self._port.read(missing)
@@ -208,7 +208,7 @@ class Link:
         self._last = self.host.now()
         self.heard += len(data)
         data = self._rest + data
-        stream = codec.split_stream(data)
+        stream = split_stream(data)
         self._rest = data[stream.pending :]
         arrivals = []
         end = 0

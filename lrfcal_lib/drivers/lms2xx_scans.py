@@ -9,15 +9,9 @@ import numpy as np
 from lrfcal_lib.drivers.lms2xx_link import FASTEST
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session.lms2xx_frame import TelegramError
 
 BURST = 508  # bytes that leave in a turn of the mirror at 500 kBd
-VARIANTS = (
-    (100, 1.0),
-    (100, 0.5),
-    (100, 0.25),
-    (180, 1.0),
-    (180, 0.5),
-)  # of whole scans, deg
 PARTIAL = 181  # values of the first of four interlaced scans; the others have one less
 # arrivals in the last so many seconds tell the host's clock from the device's
 WINDOW_S = 2.0
@@ -65,13 +59,12 @@ class Reading:
 
     telegrams: tuple[bytes, ...]  # as sent: one, or the four of a set of interlaced scans
     ranges: np.ndarray  # (B,), metres, NaN where there is no range
-    reasons: np.ndarray  # (B,) of uint8, index into `lms2xx_codec.REASONS`, 0 for a range
     bearings: np.ndarray  # (B,), radians in the LRF frame, ascending
     time_s: float  # clock of the host at the first beam
     beam_times_s: np.ndarray  # (B,), the same for every beam
-    # of the (first) telegram, modulo 256; -1 where the device does not send them
-    scan_index: int
-    telegram_index: int
+    telegram_index: (
+        int  # of the (first) telegram, modulo 256; -1 where the device does not count
+    )
 
 
 class ScanClock:
@@ -88,8 +81,8 @@ class ScanClock:
         self._refused = 0
         self._told = -np.inf
 
-    def place(self, index: int, time_s: float) -> tuple[float | None, int]:
-        """Instant of a scan, and turns since the last one.
+    def place(self, index: int, time_s: float) -> float | None:
+        """Instant of a scan, s; it rises from scan to scan. None for a scan that is not newer.
 
         Parameters
         ----------
@@ -97,18 +90,10 @@ class ScanClock:
             Counts the turns of the mirror modulo 256; -1 where the device does not send it.
         time_s
             Instant as of its arrival, s.
-
-        Returns
-        -------
-        instant : float or None
-            Seconds; rises from scan to scan. None for a scan that is not newer.
-        turns : int
-            0 where they are not known.
         """
         if index < 0:
-            return time_s, 0
+            return time_s
         turn = index
-        step = 0
         if self._arrivals:
             elapsed_s = time_s - self._instant()
             if elapsed_s > FORGET_S or self._refused >= STUBBORN:
@@ -119,7 +104,7 @@ class ScanClock:
                 step += 256 * round((elapsed_s / MIRROR_TURN - step) / 256)
                 if step <= 0 or abs(elapsed_s - step * MIRROR_TURN) >= OFF_S:
                     self._refused += 1
-                    return None, 0
+                    return None
                 turn = last + step
         self._refused = 0
         self._arrivals.append((turn, time_s))
@@ -127,9 +112,9 @@ class ScanClock:
             self._arrivals.popleft()
         instant = self._instant()
         if instant < self._told - JITTER_S:  # the clock was found to be far ahead
-            return None, step
+            return None
         self._told = max(instant, self._told + LEAST_S)
-        return self._told, step
+        return self._told
 
     def _instant(self):
         """Of the last scan, by the earliest arrival of the window."""
@@ -149,9 +134,6 @@ class Assembler:
         Bits a second.
     interlaced
         Four partial scans of 180 deg are merged into one of 721 values.
-    counts
-        'dropped' (scans between two telegrams that were not sent or got lost) and 'stale' are
-        counted up.
     clock
         Of the scans before, where the mirror went on turning: an old telegram that comes first is
         then known as such.
@@ -170,16 +152,13 @@ class Assembler:
         configuration: codec.Configuration,
         baudrate: int,
         interlaced: bool,
-        counts: dict[str, int],
         clock: ScanClock,
     ):
         self.configuration = configuration
         self.baudrate = baudrate
         self.interlaced = interlaced
-        self.counts = counts
         self._clock = clock
         self._parts: list[Reading] = []
-        self._first = True
         view, resolution = variant
         self.values = round(view / resolution) + 1
         self.turns = round(1 / resolution)
@@ -212,38 +191,36 @@ class Assembler:
         configuration = self.configuration
         try:
             scan = codec.decode_scan(raw, configuration.measuring_mode)
-        except codec.TelegramError:
+        except TelegramError:
             return None
         count = scan.words.shape[1]
         index = int(scan.scan_index[0])
-        partial = int(scan.partial[0])
-        kind = (count + (partial > 0), scan.unit, index >= 0, partial >= 0)
-        indexed = configuration.realtime_indices
-        if kind != (self.values, configuration.unit, indexed, self.interlaced):
+        kind = (count + (scan.partial > 0), scan.unit, index >= 0, scan.partial >= 0)
+        expected = (
+            self.values,
+            configuration.unit,
+            configuration.realtime_indices,
+            self.interlaced,
+        )
+        if kind != expected:
             return None
         begun = arrival_s - transfer_s(len(raw), self.baudrate) - self.turns * MIRROR_TURN
-        start_s, step = self._clock.place(index, begun)
+        start_s = self._clock.place(index, begun)
         if start_s is None:
-            self.counts["stale"] += 1
             return None
-        if not self._first:
-            self.counts["dropped"] += max(0, step // self.turns - 1)
-        self._first = False
-        quarters = codec.scan_quarters(count, partial)
+        quarters = codec.scan_quarters(count, scan.partial)
         # the first turn begins at 0 deg
         times = start_s + (np.arange(count) % self.turns + quarters / 1440) * MIRROR_TURN
         reading = Reading(
             telegrams=(raw,),
             ranges=np.where(np.isfinite(scan.ranges[0]), scan.ranges[0], np.nan),
-            reasons=scan.reasons[0],
             bearings=np.radians(quarters / 4),
             time_s=float(times[0]),
             beam_times_s=times,
-            scan_index=index,
             telegram_index=int(scan.telegram_index[0]),
         )
         if self.interlaced:
-            return self._merged(partial, reading)
+            return self._merged(scan.partial, reading)
         return reading
 
     def _merged(self, partial, part):
@@ -266,6 +243,6 @@ class Assembler:
         self._parts = []
         order = np.argsort(np.concatenate([part.bearings for part in parts]))
         merged = {"telegrams": sum((part.telegrams for part in parts), ())}
-        for name in ("ranges", "reasons", "bearings", "beam_times_s"):
+        for name in ("ranges", "bearings", "beam_times_s"):
             merged[name] = np.concatenate([getattr(part, name) for part in parts])[order]
         return replace(parts[0], **merged)

@@ -34,6 +34,7 @@ LEAST_S = 1e-4  # of a wait worth its while
 MISSES = 3
 WRONG_WAY = math.radians(2)  # that a sweep may seem to go
 OTHER_WAY = "the head moves the other way: set invert to the contrary"
+DISOBEYS = "the head does not obey set-tilt (4D)"
 STOPPED = "the head was stopped before it arrived"
 UNKNOWN = (
     "where the head stands is unknown since its line was lost: look, and call set_pitch"
@@ -144,10 +145,8 @@ class Motion:
             raise DeviceError(UNKNOWN)
         if self._going is None:
             return self._pitch
-        if instant is None:
-            instant = self._now()
         way, step, begun = self._going
-        seconds = max(0.0, instant - max(self._known_at, begun))
+        seconds = max(0.0, (instant or self._now()) - max(self._known_at, begun))
         return self._pitch + way * self.speed(way, step) * seconds
 
     def read(self, retries=0):
@@ -179,15 +178,12 @@ class Motion:
         now = self._now()
         date = self.line.host.time()
         if reading is None:
-            here = self.estimate(now)
-            self.rows.append(TrackPoint(date, here, False, here))
-        else:
-            self._misses = 0
-            self.rows.append(
-                TrackPoint(
-                    date - (now - reading.instant), reading.pitch, True, reading.reckoned
-                )
-            )
+            pitch = self.estimate(now)
+            self.rows.append(TrackPoint(date, pitch, False, pitch))
+            return
+        self._misses = 0
+        date -= now - reading.instant
+        self.rows.append(TrackPoint(date, reading.pitch, True, reading.reckoned))
 
     # ------------------------------------------------------------------------------------------
     # start and stop
@@ -258,9 +254,7 @@ class Motion:
         settings = self.settings
         reconnects = line.reconnects
         way = math.copysign(1, goal - self.estimate())
-        bit = DOWN
-        if (way > 0) != settings.invert:
-            bit = UP
+        bit = UP if (way > 0) != settings.invert else DOWN
         asking_s = self._shortest_s + settings.reply_s + pelco_d.READ_S
 
         def left():
@@ -331,9 +325,9 @@ class Motion:
                 break
             self.pause(self.settings.poll_s)
         if resting is None:
-            remedy = "check its power and the wires"
             raise NoReply(
-                f"the head at {self.line.path} stopped telling its tilt: {remedy}"
+                f"the head at {self.line.path} stopped telling its tilt: check its power and the "
+                "wires"
             )
         raise Refused(
             f"the head does not come to rest, {math.degrees(resting):.2f} deg by now: give it more "
@@ -375,11 +369,10 @@ class Motion:
                 return pitch
         if self._obeys:
             raise _short_of(pitch, target)
-        words = "the head does not obey set-tilt (4D)"
         if settings.absolute is True:
-            raise Refused(f"{words}: state absolute false to use up and down")
+            raise Refused(f"{DISOBEYS}: state absolute false to use up and down")
         self._obeys = False
-        LOG.warning("%s: it is moved by up and down", words)
+        LOG.warning("%s: it is moved by up and down", DISOBEYS)
         return self.steer(target, deadline)
 
     def steer(self, target, deadline):
@@ -451,8 +444,10 @@ class Motion:
             """Note where the head is; what goes wrong in a sweep ends it."""
             self.note()
             if self._now() > deadline:
-                remedy = "look for an end stop, or state degrees_per_second"
-                raise Refused(f"the sweep does not get to its end: {remedy}")
+                raise Refused(
+                    "the sweep does not get to its end: look for an end stop, or state "
+                    "degrees_per_second"
+                )
             if (self.rows[-1].pitch - first) * way < -WRONG_WAY:
                 raise Refused(OTHER_WAY)
             if self.feedback and self._misses >= MISSES and not self.calibrated:
@@ -460,13 +455,10 @@ class Motion:
                     "the head is silent while it moves and its speed is unknown: state "
                     "degrees_per_second"
                 )
-            measured = [row for row in self.rows[1:] if row.measured]
-            if measured:
-                swept = abs(measured[-1].pitch - measured[0].pitch)
-                if swept >= 10 * self._tolerance:
-                    self.learn(
-                        way, step, swept / (measured[-1].time_s - measured[0].time_s)
-                    )
+            measured = [row for row in self.rows[1:] if row.measured] or self.rows[:1]
+            swept = abs(measured[-1].pitch - measured[0].pitch)
+            if swept >= 10 * self._tolerance:
+                self.learn(way, step, swept / (measured[-1].time_s - measured[0].time_s))
 
         try:
             self.run(goal, step, look=look)

@@ -166,7 +166,7 @@ def split_replies(data: bytes, sent: bytes) -> Received:
     7 bytes answer a query, so do 5 bytes, the same without sync and address; 4 bytes confirm a
     command. Every place is tried, and one that fits nothing is skipped; so are frames of other
     senders, and the single byte 01 of some heads. What looks like a confirmation may as well be the
-    beginning of an echo, and is none then; of echoes the beginning may be lost.
+    beginning of an echo, and is none then.
 
     Parameters
     ----------
@@ -176,9 +176,6 @@ def split_replies(data: bytes, sent: bytes) -> Received:
         The frame.
     """
     received = Received()
-    if not data.startswith(sent):
-        received.echoed = _end_of_echo(data, sent)
-        data = data[received.echoed :]
     while data:
         tilt, size = _tilt_reply(data, sent[1])
         if data.startswith(sent):
@@ -194,13 +191,6 @@ def split_replies(data: bytes, sent: bytes) -> Received:
             received.skipped += size
         data = data[size:]
     return received
-
-
-def _end_of_echo(data, sent):
-    """How many bytes in front are the end of the frame that was sent; 0 where they are a reply."""
-    if _tilt_reply(data, sent[1])[1] or _confirms(data, sent):
-        return 0
-    return next((n for n in range(FRAME - 1, 0, -1) if data.startswith(sent[-n:])), 0)
 
 
 def _tilt_reply(data, address):

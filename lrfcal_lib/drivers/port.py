@@ -10,13 +10,18 @@ import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 
 import serial
 from serial.tools.list_ports import comports
 
 WRITE_S = 1.0  # longest time that a write may block
 MOMENT_S = 1e-3  # shorter waits are spent awake
+SAME = {  # errors that are told alike
+    errno.ENODEV: errno.ENOENT,
+    errno.ENXIO: errno.ENOENT,
+    errno.EPERM: errno.EACCES,
+    errno.EAGAIN: errno.EBUSY,
+}
 
 
 class DeviceError(RuntimeError):
@@ -84,41 +89,22 @@ def open_port(path: str | os.PathLike, baudrate: int, *, timeout: float) -> seri
             path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True
         )
     except (OSError, ValueError, termios.error) as error:
+        present = ", ".join(sorted(port.device for port in comports())) or "none"
+        reasons = {
+            errno.ENOENT: f"there is no port {path}: check cable and power; present are {present}",
+            errno.EACCES: f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then "
+            "log in again",
+            errno.EBUSY: f"the port {path} is busy: close the program that 'fuser -v {path}' names",
+        }
         number = getattr(error, "errno", None)
         reason = f"{path} is no serial line ({error}): name the port of the device"
-        if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-            present = ", ".join(sorted(port.device for port in comports())) or "none"
-            reason = (
-                f"there is no port {path}: check cable and power; present are {present}"
-            )
-        elif number in (errno.EACCES, errno.EPERM):
-            remedy = "run 'sudo usermod -aG dialout $USER', then log in again"
-            reason = f"no permission for {path}: {remedy}"
-        elif number in (errno.EBUSY, errno.EAGAIN):
-            reason = (
-                f"the port {path} is busy, held by {_holders(path)}: close that program"
-            )
-        raise PortError(reason) from error
+        raise PortError(reasons.get(SAME.get(number, number), reason)) from error
     try:
         set_rate(port, baudrate)
     except BaseException:
         port.close()
         raise
     return port
-
-
-def _holders(path):
-    """The processes that have a port open, as far as this user may see."""
-    holders = set()
-    real = os.path.realpath(path)
-    for link in Path("/proc").glob("[0-9]*/fd/*"):
-        try:
-            if os.readlink(link) == real:
-                name = (link.parents[1] / "comm").read_text().strip()
-                holders.add(f"{name} (process {link.parts[2]})")
-        except OSError:  # that process ended, or belongs to somebody else
-            continue
-    return ", ".join(sorted(holders)) or "another program"
 
 
 def set_rate(port: serial.Serial, baudrate: int) -> None:

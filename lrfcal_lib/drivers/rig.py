@@ -17,7 +17,7 @@ from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, Host, LineLost, NoReply
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, RigFileError
 from lrfcal_lib.drivers.video import Camera, Frame
-from lrfcal_lib.session.lms2xx_codec import METRES, MODES, encode_configuration
+from lrfcal_lib.session.lms2xx_codec import METRES, encode_configuration, largest
 from lrfcal_lib.session.stated import LrfInfo
 
 LOG = logging.getLogger(__name__)
@@ -148,14 +148,13 @@ class Rig(Closed):
             If a device cannot be what is stated.
         """
         devices = stated.devices
-        skipped = {"port", "interlaced"}
+        settings = devices.lrf.model_dump(exclude_none=True, exclude={"interlaced"})
         if devices.lrf.interlaced:  # it chooses its own
-            skipped.add("variant")
-        settings = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
+            settings.pop("variant", None)
         open_camera: Callable = camera or partial(_camera, stated)
         openers: dict[str, Callable] = {
             "head": partial(PanTilt, devices.head.port, devices.head, host=host),
-            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **settings),
+            "lrf": partial(LMS2xx, host=host, **settings),
         }
         for name in stated.cameras:
             openers[f"camera '{name}'"] = partial(open_camera, name)
@@ -198,7 +197,7 @@ class Rig(Closed):
             field_of_view=(math.radians(90 - view / 2), math.radians(90 + view / 2)),
             bearing_step=math.radians(step),
             range_resolution=unit,
-            max_range=MODES[configuration.measuring_mode].largest * unit,
+            max_range=largest(configuration.measuring_mode) * unit,
         )
 
     def begin_telegrams(self) -> list[bytes]:
@@ -345,41 +344,47 @@ class Rig(Closed):
             try:
                 device.stop()
             except DeviceError as error:
-                remedy = "cut its power if it moves"
-                LOG.error("the %s could not be stopped (%s): %s", name, error, remedy)
+                LOG.error(
+                    "the %s could not be stopped (%s): cut its power if it moves",
+                    name,
+                    error,
+                )
 
     def _stop_and_go(self, placement):
-        interlaced = self.stated.devices.lrf.interlaced
         scans = placement.pitch
         images = placement.image_pitch
         alone = [image for image in images if np.abs(scans - image).min() >= SAME_STOP]
         stops = sorted([*scans.tolist(), *alone], reverse=placement.direction < 0)
-        if interlaced:
-            self.lrf.start(interlaced=True)
+        self._begin_scans()
         for number, pitch in enumerate(stops, 1):
             moved = self._move(placement.number, pitch, number, len(stops))
             yield moved
             if pitch not in alone:
-                readings = tuple(self._scans(moved.time_s, interlaced))
-                yield Scanned(
-                    placement.number, readings, np.full(len(readings), moved.pitch)
-                )
+                yield self._scanned(moved)
             if any(abs(pitch - image) < SAME_STOP for image in images):
                 yield from self._photograph(self.cameras, moved, placement.purpose)
         self.lrf.stop()
 
     def _close(self, placement):
         """Scan again in the first half of a sweep, as level as it was there: walls show most."""
-        interlaced = self.stated.devices.lrf.interlaced
         half = placement.pitch[: len(placement.pitch) // 2 + 1]
         level = float(half[np.argmin(np.abs(half))])
         moved = self._move(placement.number, level, 1, 1)
-        if interlaced:
-            self.lrf.start(interlaced=True)
-        readings = tuple(self._scans(moved.time_s, interlaced))
+        self._begin_scans()
+        scanned = self._scanned(moved)
         self.lrf.stop()
         yield moved
-        yield Scanned(placement.number, readings, np.full(len(readings), moved.pitch), 1.0)
+        yield replace(scanned, share=1.0)
+
+    def _begin_scans(self):
+        """Interlaced scans come in a stream, others one by one."""
+        if self.stated.devices.lrf.interlaced:
+            self.lrf.start(interlaced=True)
+
+    def _scanned(self, moved):
+        """What is scanned at a stop."""
+        readings = tuple(self._scans(moved.time_s, self.stated.devices.lrf.interlaced))
+        return Scanned(moved.placement, readings, np.full(len(readings), moved.pitch))
 
     def _scans(self, after, interlaced):
         """Scans of a stream, or one by one, later than an instant.
@@ -407,8 +412,9 @@ class Rig(Closed):
                 after = reading.time_s
                 end = self._now() + SCAN_S
             elif self._now() > end:
-                late = f"no scan later than the stop in {SCAN_S:g} s"
-                raise NoReply(f"the laser range finder gives {late}")
+                raise NoReply(
+                    f"the laser range finder gives no scan later than the stop in {SCAN_S:g} s"
+                )
         return readings
 
     def _move(self, placement, pitch, number, of):
@@ -442,8 +448,10 @@ class Rig(Closed):
                 heard = self._now()
                 newest = fresh[-1].time_s
             elif self._now() - heard > GAP_S:
-                remedy = "check the line of the laser range finder"
-                raise NoReply(f"no scan for {GAP_S:g} s of the sweep: {remedy}")
+                raise NoReply(
+                    f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range "
+                    "finder"
+                )
             # what is not measured may change until the next reading
             sure = [
                 point for point in self.head.track if point[2] or not self.head.has_feedback

@@ -1,6 +1,5 @@
 """The rig file (JSON): what is stated about a rig, where its devices are, what to record."""
 
-import json
 import math
 import os
 from dataclasses import dataclass, replace
@@ -9,7 +8,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     Field,
@@ -22,6 +20,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.drivers.pelco_d import FASTEST
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.session.files import SessionError, read_json
 from lrfcal_lib.session.stated import (
     CameraInfo,
     LrfInfo,
@@ -32,7 +31,6 @@ from lrfcal_lib.session.stated import (
 
 MOST_STOPS = 5000
 FINEST_DEG = 1e-3
-MOST_BYTES = 10_000_000
 MOST_PLACEMENTS = 1000
 ROUNDING_DEG = 1e-6  # by which a pitch may exceed the limits of the head
 OTHER_RATE = (
@@ -52,25 +50,14 @@ class RigFileError(ValueError):
 # ------------------------------------------------------------------------------ kinds of values
 
 
-def number(least, most, unit="", kinds=(int, float), what="a number"):
+def number(least, most):
     """A number within limits; NaN is in none, and true is no number."""
-    words = f"{what} from {least} to {most} {unit}".rstrip() + " is needed"
-
-    def wrong(value):
-        return type(value) not in kinds or not least <= value <= most
-
-    return Annotated[Any, refused(wrong, words)]
+    return Annotated[float, Field(ge=least, le=most, strict=True, allow_inf_nan=False)]
 
 
 def whole(least, most):
     """A whole number within limits."""
-    return number(least, most, kinds=(int,), what="a whole number")
-
-
-def several(kind, count):
-    """So many values of a kind."""
-    wrong = refused(lambda values: len(values) != count, f"a list of {count} is needed")
-    return Annotated[tuple[kind, ...], wrong]
+    return Annotated[int, Field(ge=least, le=most, strict=True)]
 
 
 def no_text(value):
@@ -112,29 +99,21 @@ Source = Annotated[
 Rate = Annotated[
     Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)
 ]
-Password = Annotated[
-    Text,
-    AfterValidator(str.encode),
-    refused(lambda raw: len(raw) != 8, "8 ASCII characters are needed"),
-]
 Perhaps = Literal["auto", True, False]
-Angle = number(-180, 180, "deg")
-Seconds = number(0, 60, "s")
+Angle = number(-180, 180)
+Seconds = number(0, 60)
 Limits = Annotated[
-    several(Angle, 2),
+    tuple[Angle, Angle],
     refused(lambda ends: ends[0] >= ends[1], "the lower one comes first"),
 ]
-Sweep = Annotated[several(Angle, 3), refused(lambda sweep: len(stops_of(sweep)) < 2, STOPS)]
-
-
-def both_ways(value):
-    """A speed upwards and downwards, of one number or two."""
-    if isinstance(value, tuple | list):
-        return value
-    return value, value
-
-
-Speeds = Annotated[several(number(0.01, 360, "deg/s"), 2), BeforeValidator(both_ways)]
+Sweep = Annotated[
+    tuple[Angle, Angle, Angle], refused(lambda sweep: len(stops_of(sweep)) < 2, STOPS)
+]
+Speed = number(0.01, 360)
+Speeds = Annotated[
+    tuple[Speed, Speed],
+    BeforeValidator(lambda up: up if isinstance(up, tuple | list) else (up, up)),
+]
 
 # ------------------------------------------------------------------------------------- devices
 
@@ -162,8 +141,7 @@ class LrfDevice(Stated):
     port: Text
     baudrate: Rate = None
     address: whole(0, 127) = None
-    password: Password = None
-    variant: several(number(0.25, 180, "deg"), 2) = None
+    variant: tuple[number(0.25, 180), number(0.25, 180)] = None
     unit: Literal["mm", "cm"] = None
     measuring_mode: whole(0, 6) = None
     realtime_indices: StrictBool = None
@@ -185,13 +163,10 @@ class HeadSettings(Stated):
     # Whether it obeys set-tilt (4D). "auto" tries where there is feedback; else up and down are
     # used.
     absolute: Perhaps = "auto"
-    # Whether the adapter hands sent bytes back, as two-wire RS-485 may. Echoes are always removed;
-    # true makes a missing one an error (the adapter is dead), false makes one a warning.
-    echo: Perhaps = "auto"
     # Asking for more is an error. The protocol knows no limits; typical heads tilt by -90 to 90.
     pitch_limits_deg: Limits = (-60.0, 60.0)
     # elevation that the head tells at pitch 0
-    position_zero_deg: number(-360, 360, "deg") = 0.0
+    position_zero_deg: number(-360, 360) = 0.0
     # It hangs upside down or counts the other way: its "up" lowers the view.
     invert: StrictBool = False
     tilt_speed: whole(0, FASTEST) = 0x20  # speed byte, 0 is very slow
@@ -201,16 +176,16 @@ class HeadSettings(Stated):
     # where a head without feedback stands at first: levelled by hand
     start_pitch_deg: Angle = 0.0
     # Readings that differ by less are the same: cheap encoders jitter.
-    tolerance_deg: number(1e-4, 45, "deg") = 0.1
+    tolerance_deg: number(1e-4, 45) = 0.1
     settle_s: Seconds = 0.3  # the head rests when its readings stay the same for this long
     poll_s: Seconds = 0.1  # between queries while it moves
-    reply_s: number(1e-3, 10, "s") = 0.35  # until a reply begins; 1 is needed by slow heads
+    reply_s: number(1e-3, 10) = 0.35  # until a reply begins; 1 is needed by slow heads
     # silence between frames, and time for an acknowledgement
-    gap_s: number(0, 10, "s") = 0.05
+    gap_s: number(0, 10) = 0.05
     retries: whole(0, 20) = 3  # queries repeated when no reply came
     # below 1 for heads that stop by themselves without
-    repeat_s: number(1e-3, 60, "s") = None
-    reconnect_s: number(0, 3600, "s") = 3.0  # that a call waits for a vanished port
+    repeat_s: number(1e-3, 60) = None
+    reconnect_s: number(0, 3600) = 3.0  # that a call waits for a vanished port
 
     def elevation(self, pitch: float) -> float:
         """What the head calls a pitch.
@@ -242,11 +217,10 @@ class HeadSettings(Stated):
         float
             Radians in [-pi, pi), up positive.
         """
-        turn = elevation - math.radians(self.position_zero_deg)
-        turn = (turn + math.pi) % math.tau - math.pi
+        pitch = elevation - math.radians(self.position_zero_deg)
         if self.invert:
-            return -turn
-        return turn
+            pitch = -pitch
+        return (pitch + math.pi) % math.tau - math.pi
 
 
 class HeadDevice(HeadSettings):
@@ -260,9 +234,9 @@ class CameraDevice(Stated):
     """Where a camera is, and how it is to be set."""
 
     source: Source
-    size: several(whole(1, 100_000), 2) = None
-    exposure: number(1e-6, 60, "s") = None
-    silence_s: number(0.1, 3600, "s") = None
+    size: tuple[whole(1, 100_000), whole(1, 100_000)] = None
+    exposure: number(1e-6, 60) = None
+    silence_s: number(0.1, 3600) = None
 
 
 class Devices(Stated):
@@ -356,20 +330,21 @@ class Plan(Stated):
         listed = self.placements or [ListedPlacement()] * (count or self.count)
         placements = []
         for i, entry in enumerate(listed[:count], 1):
-            number = i
-            if entry.number is not None:
-                number = entry.number
             stops = stops_of(entry.pitch_deg or self.pitch_deg)
             if not self.placements and i % 2 == 0:
                 stops = stops[::-1]
             images = self.image_pitch_deg
             if entry.image_pitch_deg is not None:
                 images = entry.image_pitch_deg
-            purpose = "scene"
-            if entry.board:
-                purpose = "board"
-            pitches = tuple(map(math.radians, images))
-            placements.append(Placement(number, stops, pitches, purpose, entry.closing))
+            placements.append(
+                Placement(
+                    number=i if entry.number is None else entry.number,
+                    pitch=stops,
+                    image_pitch=tuple(map(math.radians, images)),
+                    purpose="board" if entry.board else "scene",
+                    closing=entry.closing,
+                )
+            )
         return placements
 
 
@@ -445,26 +420,16 @@ def read_rig_file(path: str | os.PathLike) -> RigFile:
     RigFileError
         With the file, the key and the value, for anything that cannot be used.
     """
-    path = Path(path)
     try:
-        usable = path.stat().st_size <= MOST_BYTES and path.is_file()
-        content = path.read_bytes() if usable else b""
-    except OSError as error:
-        hint = "'python -m lrfcal_lib emulate --rig-file' writes an example"
-        raise RigFileError(f"{path}: {error.strerror}; {hint}") from error
-    if not usable:
-        remedy = "name a rig file"
+        data = read_json(path, None)
+    except SessionError as error:
         raise RigFileError(
-            f"{path}: no file, or one of more than {MOST_BYTES} bytes: {remedy}"
-        )
-    try:
-        data = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise RigFileError(f"{path}: not JSON ({error})") from error
-    return rig_of(data, path)
+            f"{error}; 'python -m lrfcal_lib emulate --rig-file' writes an example"
+        ) from error
+    return rig_of(data, Path(path))
 
 
-def rig_of(data: Any, path: Path = Path("rig.json")) -> RigFile:
+def rig_of(data: dict, path: Path = Path("rig.json")) -> RigFile:
     """The rig file that parsed JSON makes.
 
     Parameters
@@ -480,13 +445,11 @@ def rig_of(data: Any, path: Path = Path("rig.json")) -> RigFile:
         With the path, the key and the value, for anything that cannot be used.
     """
     try:
-        if not isinstance(data, dict):
-            raise ValueError(f"the file is {ascii(data)[:80]}: an object is needed")
         present = {key: value for key, value in data.items() if value is not None}
         unsaid = {"name": "rig", "licence": "", "source": "", "simulated": False}
         stated = parse_session(unsaid | present | {"placements": ()}, RigFileStated)
         _check_cameras(stated["devices"].cameras, stated["cameras"])
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise RigFileError(f"{path}: {error}") from error
     about = {key: stated[key] for key in ("licence", "source", "simulated")}
     rest = ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras", "devices", "plan")
@@ -503,8 +466,7 @@ def _check_cameras(devices, cameras):
     for name, info in cameras.items():
         size = devices[name].size
         if size not in (None, (info.width, info.height)):
-            stated = [info.width, info.height]
             raise ValueError(
-                f"devices.cameras.{name}.size is {list(size)}, rig.cameras.{name} states {stated}: "
-                "leave it out"
+                f"devices.cameras.{name}.size is {list(size)}, rig.cameras.{name} states "
+                f"{[info.width, info.height]}: leave it out"
             )

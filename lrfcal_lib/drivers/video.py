@@ -3,14 +3,12 @@
 import contextlib
 import glob
 import logging
+import math
 import os
 import re
 import select
 import threading
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -31,7 +29,6 @@ MANUAL = 1  # exposure mode of V4L2
 SAME_EXPOSURE = 0.05  # share by which that of a camera may differ from what was asked for
 WIDTH = cv2.CAP_PROP_FRAME_WIDTH
 HEIGHT = cv2.CAP_PROP_FRAME_HEIGHT
-IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm"}
 AGAIN_S = 0.25  # between attempts to find a lost device
 CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
 # We say once that a camera is lost: FFmpeg and OpenCV would at every attempt to find it.
@@ -59,8 +56,8 @@ class Camera(Closed):
     Parameters
     ----------
     source
-        V4L2 index or path (/dev/video0), URL, video file, image, folder of images, or pattern such
-        as ``"images/*.png"``.
+        V4L2 index or path (/dev/video0), URL, video file, or images as OpenCV counts them, such as
+        ``"images/%04d.png"``.
     name
         For messages.
     size
@@ -136,9 +133,7 @@ class Camera(Closed):
 
         def fresh():
             frame = self._frame
-            if frame is None or (after is not None and frame.time_s <= after):
-                return None
-            return frame
+            return frame is not None and frame.time_s > (after or -math.inf)
 
         with self._new:
             if self._thread is not None:
@@ -147,9 +142,8 @@ class Camera(Closed):
                 raise DeviceError(f"camera {self.name} is closed: open it again")
             if self._thread is None:
                 return self._next()
-            frame = fresh()
-            if frame is not None:
-                return frame
+            if fresh():
+                return self._frame
         if self.lost:
             raise LineLost(f"camera {self.name} is lost: {self._remedy}")
         raise NoReply(
@@ -191,16 +185,13 @@ class Camera(Closed):
     def _read_back(self, exposure):
         """The size that it gives; an exposure that is not as asked for is logged."""
         capture = self._capture
-        given = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
-        self.size = None
-        if all(given):
-            self.size = given
+        self.size = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
+        if min(self.size) <= 0:
+            self.size = None
         if exposure is None:
             return
-        given_s = 0.0
-        if cv2.CAP_PROP_EXPOSURE in self._taken:
-            given_s = capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
-        if given_s <= 0:
+        given_s = capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
+        if cv2.CAP_PROP_EXPOSURE not in self._taken or given_s <= 0:
             LOG.warning("camera %s: exposure cannot be set, asked %s", self.name, exposure)
         elif abs(given_s - exposure) > SAME_EXPOSURE * exposure:
             LOG.warning("camera %s: exposure is %s, asked %s", self.name, given_s, exposure)
@@ -217,8 +208,10 @@ class Camera(Closed):
         """The next image of a recorded source."""
         self.lost = not self._capture.grab() or not self._keep(REAL.time())
         if self.lost:
-            end = f"at the end of its {self._count} recorded images"
-            raise LineLost(f"camera {self.name} is {end}: open it again")
+            raise LineLost(
+                f"camera {self.name} is at the end of its {self._count} recorded images: open it "
+                "again"
+            )
         return self._frame
 
     def _grab(self):
@@ -228,12 +221,10 @@ class Camera(Closed):
                 self._lose()
                 continue
             now = REAL.time()
-            instant = now
-            if not getattr(self._capture, "waited", True):
-                instant = (
-                    self._before
-                )  # it may have come at any time since the frame before
-            self._keep(instant)
+            if getattr(self._capture, "waited", True):
+                self._keep(now)
+            else:  # it may have come at any time since the frame before
+                self._keep(self._before)
             self._before = now
         self._release()
 
@@ -294,7 +285,7 @@ def open_source(path: str, silence_s: float):
 
     Returns
     -------
-    cv2.VideoCapture or Images
+    cv2.VideoCapture or MjpegStream
         Either is read like the first.
 
     Raises
@@ -306,14 +297,11 @@ def open_source(path: str, silence_s: float):
         return _open_stream(path, silence_s)
     if path.startswith("/dev/"):
         return _open_device(path)
-    exists = os.path.exists(path)
-    pattern = glob.has_magic(path) and not exists
-    if os.path.isdir(path) or pattern or Path(path).suffix.lower() in IMAGES:
-        return Files(path)
-    if not exists:
-        remedy = "name a file, a device, a folder of images or a URL"
-        raise PortError(f"there is no video {path}: {remedy}")
-    return _opened(f"{path} is no video that OpenCV can read", path)
+    return _opened(
+        f"{path} is no video that OpenCV can read: name a device, a URL, a video file, or numbered "
+        "images such as images/%04d.png",
+        path,
+    )
 
 
 def _opened(message, *arguments):
@@ -330,12 +318,14 @@ def _open_device(path):
         present = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
         raise PortError(f"there is no camera {path}: check its plug; present are {present}")
     if not os.access(path, os.R_OK | os.W_OK):
-        remedy = "run 'sudo usermod -aG video $USER', then log in again"
-        raise PortError(f"no permission for {path}: {remedy}")
-    busy = (
-        f"{path} gives no video: close other programs that use it, or name another device"
+        raise PortError(
+            f"no permission for {path}: run 'sudo usermod -aG video $USER', then log in again"
+        )
+    return _opened(
+        f"{path} gives no video: close other programs that use it, or name another device",
+        path,
+        cv2.CAP_V4L2,
     )
-    return _opened(busy, path, cv2.CAP_V4L2)
 
 
 def _open_stream(path, silence_s):
@@ -351,54 +341,8 @@ def _open_stream(path, silence_s):
     return _opened(f"{path} gives no video: {remedy_of(path)}", path, cv2.CAP_FFMPEG, waits)
 
 
-class Images(ABC):
-    """Encoded images that are read like cv2.VideoCapture."""
-
-    def __init__(self):
-        self._image = b""
-        self._held = False
-
-    @abstractmethod
-    def take(self) -> bytes | None:
-        """The next one; None at the end."""
-
-    def grab(self) -> bool:
-        """Take the next image, if there is one."""
-        if not self._held:
-            self._image = self.take()
-        self._held = False
-        return self._image is not None
-
-    def retrieve(self) -> tuple[bool, Any]:
-        """Decode the image grabbed last: whether it is one, and its pixels."""
-        image = None
-        if self._image:
-            image = cv2.imdecode(np.frombuffer(self._image, np.uint8), cv2.IMREAD_COLOR)
-        return image is not None, image
-
-    def get(self, key: int) -> float:
-        """Size of the image grabbed last, or of the first, which is kept for the next grab.
-
-        Parameters
-        ----------
-        key
-            ``cv2.CAP_PROP_FRAME_WIDTH`` or ``cv2.CAP_PROP_FRAME_HEIGHT``.
-
-        Returns
-        -------
-        float
-            Pixels; 0 for what is unknown.
-        """
-        if self._image == b"":
-            self._held = self.grab()
-        done, image = self.retrieve()
-        if not done:
-            return 0.0
-        return float(image.shape[(HEIGHT, WIDTH).index(key)])
-
-
-class MjpegStream(Images):
-    """Images of an MJPEG stream.
+class MjpegStream:
+    """Images of an MJPEG stream, which are read like cv2.VideoCapture.
 
     Parameters
     ----------
@@ -421,8 +365,9 @@ class MjpegStream(Images):
     """
 
     def __init__(self, url: str, timeout: float):
-        super().__init__()
         self._buffer = b""
+        self._image = b""
+        self._held = False  # the image is the next one
         self.waited = False
         session = requests.Session()
         session.trust_env = False  # no proxy: cameras are near
@@ -430,20 +375,47 @@ class MjpegStream(Images):
             self._answer = session.get(url, stream=True, timeout=timeout).raw
         except ValueError as error:  # names that no host can have
             raise OSError(f"no address of a stream: {error}") from error
-        kind = self._answer.headers.get("Content-Type", "")
-        self.multipart = self._answer.status == 200 and kind.lower().startswith(
-            "multipart/"
-        )
+        kind = self._answer.headers.get("Content-Type", "").lower()
+        self.multipart = self._answer.status == 200 and kind.startswith("multipart/")
         self.release = self._answer.close
 
     def grab(self) -> bool:
         """Take the next image; False at the end of the stream, or after a silence."""
-        self.waited = False
-        return super().grab()
+        if not self._held:
+            self.waited = False
+            self._image = self._next()
+        self._held = False
+        return bool(self._image)
 
-    def take(self) -> bytes | None:
+    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+        """Decode the image grabbed last: whether it is one, and its pixels."""
+        image = None
+        if self._image:
+            image = cv2.imdecode(np.frombuffer(self._image, np.uint8), cv2.IMREAD_COLOR)
+        return image is not None, image
+
+    def get(self, key: int) -> float:
+        """Size of the first image, which is kept for the next grab.
+
+        Parameters
+        ----------
+        key
+            ``cv2.CAP_PROP_FRAME_WIDTH`` or ``cv2.CAP_PROP_FRAME_HEIGHT``.
+
+        Returns
+        -------
+        float
+            Pixels; 0 for what is unknown.
+        """
+        self._held = self._held or self.grab()
+        _, image = self.retrieve()
+        if image is None:
+            return 0.0
+        return float(image.shape[(HEIGHT, WIDTH).index(key)])
+
+    def _next(self):
         """The next whole image: as long as is stated before it (it may hold another one), else up
-        to its end.
+        to its end; b'' where there is none any more.
         """
         while True:
             begin = self._buffer.find(BEGIN)
@@ -455,59 +427,12 @@ class MjpegStream(Images):
                 self._buffer = self._buffer[end:]
                 return image
             if self._answer.closed or len(self._buffer) > LONGEST:
-                # at its end or after a silence
-                return None
+                return b""
             try:
                 self.waited |= not select.select([self._answer], [], [], 0)[0]
                 more = self._answer.read1(CHUNK)
             except (OSError, ValueError, HTTPError):  # ValueError: the answer was closed
-                return None
+                return b""
             if not more:
-                return None
+                return b""
             self._buffer += more
-
-
-class Files(Images):
-    """Image files in the order of their names.
-
-    Parameters
-    ----------
-    path
-        Of a folder, or a pattern.
-
-    Raises
-    ------
-    PortError
-        If there are none.
-    """
-
-    def __init__(self, path: str):
-        super().__init__()
-        names = glob.glob(path)
-        if os.path.isdir(path):
-            names = [os.path.join(path, name) for name in os.listdir(path)]
-        files = [
-            Path(name) for name in sorted(names) if Path(name).suffix.lower() in IMAGES
-        ]
-        if not files:
-            raise PortError(
-                f"there are no images in {path}: name a folder or pattern with some"
-            )
-        self._left = iter(files)
-
-    def take(self) -> bytes | None:
-        """Content of the next file."""
-        self._path = next(self._left, None)
-        if self._path is None:
-            return None
-        return self._path.read_bytes()
-
-    def retrieve(self) -> tuple[bool, Any]:
-        """Decode it: True and its pixels. PortError if it is no image."""
-        done, image = super().retrieve()
-        if not done:
-            raise PortError(f"{self._path} is no image that OpenCV can read")
-        return done, image
-
-    def release(self) -> None:
-        """Nothing is open."""

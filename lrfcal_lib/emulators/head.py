@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +13,7 @@ from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.simulate.rig import Platform
 
 REACT_S = 0.04  # from a command to the motor
-WOBBLE = 0.015  # amplitude after a stop, radians for each rad/s of speed
-WOBBLE_HZ = 4.0
-KEPT = 2000  # knots of the motion; ten times as many frames
+KEPT = 2000  # knots of the motion
 TURN_AROUND_S = 0.010  # from the end of a frame to a reply
 # to queries of pan, tilt, zoom, magnification
 ANSWERS = {0x51: 0x59, QUERY_TILT: TILT, 0x55: 0x5D, 0x61: 0x63}
@@ -63,7 +60,7 @@ class Head:
     def _run(self, instant, goal, speed):
         now = float(self.motor(instant))
         goal = float(np.clip(goal, *self.limits))
-        dragged = float(self._dragged(instant))
+        dragged = float(self.pitch(instant))
         knots = [(instant, now, dragged)]
         if speed and goal != now:
             arrives = instant + abs((goal - now) / speed)
@@ -108,28 +105,6 @@ class Head:
         """
         return np.interp(instant, self._knots[:, 0], self._knots[:, 1])
 
-    def resting(self, instant: float) -> tuple[float, float]:
-        """Whether the motor rests.
-
-        Parameters
-        ----------
-        instant
-            Seconds.
-
-        Returns
-        -------
-        since : float
-            Seconds since the motor came to rest, negative while it runs.
-        speed : float
-            That it had, radians a second.
-        """
-        times, motor, _ = self._knots.T
-        row = max(0, int(np.searchsorted(times, instant, side="right")) - 1)
-        speeds = [0.0, *np.diff(motor) / np.diff(times), 0.0]
-        if speeds[row + 1]:
-            return instant - times[row + 1], speeds[row + 1]
-        return instant - times[row], speeds[row]
-
     def moving(self, instant: float) -> bool:
         """Whether the motor runs, or is about to.
 
@@ -141,7 +116,7 @@ class Head:
         return bool(instant < self._knots[-1, 0])
 
     def settled(self, instant: float, rest_s: float = 0.0) -> bool:
-        """Whether the head is at rest, its wobble included.
+        """Whether the head has been at rest for the time in which it settles.
 
         Parameters
         ----------
@@ -150,11 +125,10 @@ class Head:
         rest_s
             For so long, seconds.
         """
-        since, _ = self.resting(instant)
-        return not self.moving(instant) and since >= self.platform.settle + rest_s
+        return bool(instant >= self._knots[-1, 0] + self.platform.settle + rest_s)
 
     def pitch(self, instant: float | np.ndarray) -> np.ndarray:
-        """True pitch; after a stop it wobbles until it settled.
+        """True pitch: where the gear, which has some play, has dragged the head.
 
         Parameters
         ----------
@@ -166,17 +140,9 @@ class Head:
         ndarray
             Radians.
         """
-        instant = np.asarray(instant, float)
-        pitch = self._dragged(instant)
-        settle = self.platform.settle
-        latest = np.max(instant)
-        since, speed = self.resting(float(latest))
-        if not 0 < since < settle + np.ptp(instant) or not settle:
-            return pitch
-        after = np.clip(since - (latest - instant), 0, None)
-        amplitude = WOBBLE * speed * np.exp(-5 * after / settle)
-        swing = amplitude * np.sin(2 * np.pi * WOBBLE_HZ * after)
-        return pitch + np.where(after < settle, swing, 0.0)
+        # between two knots the motor goes one way
+        row = np.searchsorted(self._knots[:, 0], instant, side="right") - 1
+        return self._with_play(self._knots[np.maximum(row, 0), 2], self.motor(instant))
 
     def measured(self, instant: float) -> float:
         """What the encoder says; it sits on the motor and is late.
@@ -196,14 +162,6 @@ class Head:
         if not step:
             return angle
         return round(angle / step) * step
-
-    def _dragged(self, instant):
-        """Where the gear, which has some play, has dragged the head.
-
-        Between two knots the motor goes one way.
-        """
-        row = np.searchsorted(self._knots[:, 0], instant, side="right") - 1
-        return self._with_play(self._knots[np.maximum(row, 0), 2], self.motor(instant))
 
     def _with_play(self, dragged, motor):
         """The head stays where it was until the motor is half the play ahead of it."""
@@ -248,11 +206,6 @@ class EmulatedHead(SerialDevice):
         As for :class:`EmulatedLms`.
     **habits
         Of :class:`Habits`.
-
-    Attributes
-    ----------
-    frames : deque of tuple
-        Host time, s, and sound frames to this address.
     """
 
     def __init__(
@@ -267,7 +220,6 @@ class EmulatedHead(SerialDevice):
         super().__init__(path, host, seed)
         self.head = head or Head(seed=seed)
         self.habits = Habits(**habits)
-        self.frames: deque = deque(maxlen=10 * KEPT)
         self.absolute_until = -math.inf  # an absolute move is under way
         self._buffer = b""  # bytes of a frame that is not whole
 
@@ -313,7 +265,6 @@ class EmulatedHead(SerialDevice):
         at
             Instant of its last byte, s.
         """
-        self.frames.append((self.host.time(), frame))
         if frame.command2 in ANSWERS:
             self.tell(frame.command2, at)
         elif frame.command2 == pelco_d.SET_TILT:

@@ -258,13 +258,6 @@ class Terminal(threading.Thread):
         if event & select.POLLIN:
             with contextlib.suppress(OSError):
                 self._device.hear(os.read(self._master, 4096))
-        # a port forgets what nobody read when it is closed
-        if self.open and event & select.POLLHUP:
-            with contextlib.suppress(OSError, termios.error):
-                near = os.readlink(self._device.path)
-                slave = os.open(near, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-                termios.tcflush(slave, termios.TCIFLUSH)
-                os.close(slave)
         self.open = not event & select.POLLHUP
 
     def put(self, data: bytes) -> None:

@@ -3,12 +3,10 @@
 The orders of commands of those two programs are in ``tests/test_lms2xx_clients.py``.
 """
 
-import logging
 import math
 import os
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,10 +30,14 @@ from lrfcal_lib.emulators.lms2xx_memory import (
 )
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, encode_telegram
-from lrfcal_lib.session.lms2xx_frame import Telegram
+from lrfcal_lib.session.lms2xx_codec import SCAN, largest
+from lrfcal_lib.session.lms2xx_frame import (
+    Telegram,
+    encode_telegram,
+    parse_telegram,
+    split_stream,
+)
 
-LOG = logging.getLogger(__name__)
 ACK = b"\x06"
 NAK = b"\x15"
 ACK_S = 0.003  # from the last byte of a request to ACK or NAK; the manual allows 60 ms
@@ -47,10 +49,8 @@ STOP_S = 0.52
 GAP_S = 0.006  # a host that pauses longer within a telegram is not heard
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 # A stream that lags so far leaves scans out, as no host can know how late they are.
-LATE_S = 1.0
-LATE_AGAIN_S = 0.1  # once it did
+LATE_S = 0.5
 POWERED_S = 60.0  # how long ago it was switched on
-KEPT = 20000  # scans and requests on record
 WHITE = 100  # reflectivity of all that answers: the simulated world states none
 # results of command 0x20
 DONE = b"\0"
@@ -58,18 +58,13 @@ WRONG = b"\1"
 FAULT = b"\2"
 
 
-@dataclass(frozen=True)
-class ScanRecord:
-    """A scan that was sent."""
+class Scan(NamedTuple):
+    """A scan that is to be sent."""
 
-    number: int  # running
     turn: int  # of the mirror since power-on, the scan's first; modulo 256 it is the scan index
-    telegram_index: int
-    time_s: float  # clock of the host at the first beam
-    beam_times_s: np.ndarray  # (B,), the same at every beam
     partial: int  # 0 to 3 for the quarters of interlaced scans, -1 for whole ones
     words: np.ndarray  # (B,) of uint16, all values of the scan, as the device counts them
-    telegram: bytes
+    times: np.ndarray  # (B,), instants of the beams
 
 
 class EmulatedLms(SerialDevice):
@@ -94,10 +89,6 @@ class EmulatedLms(SerialDevice):
 
     Attributes
     ----------
-    scans : deque of ScanRecord
-        The newest 20000.
-    requests : deque of (float, bytes)
-        Host time and sound telegrams from the host.
     telegrams : int
         Scans counted since power-on.
     """
@@ -118,16 +109,12 @@ class EmulatedLms(SerialDevice):
         self.source = source
         self.boot_s = boot_s
         self.baudrates = baudrates
-        self.scans: deque = deque(maxlen=KEPT)
-        self.requests: deque = deque(maxlen=KEPT)
         self.telegrams = 0
         self._rng = np.random.default_rng([seed, 1])
-        self._late_s = LATE_S  # a stream that lags so far leaves scans out
         self._buffer = b""  # bytes of a request that is not whole
         self._booting = False
         self._effect: Callable | None = None  # of the command whose reply is on its way
         self._zero = host.now() - POWERED_S  # when turns of the mirror are counted from
-        self._number = 0  # of the next scan
         self._selection = Selection()
         # of the next scan of the stream
         self._turn = 0
@@ -157,7 +144,7 @@ class EmulatedLms(SerialDevice):
         """
         self.cancel("gap")
         raw = self._buffer + data
-        stream = codec.split_stream(raw, replies=False)
+        stream = split_stream(raw, replies=False)
         self._buffer = raw[stream.pending :]
         for offset, length in zip(
             stream.offset.tolist(), stream.length.tolist(), strict=True
@@ -193,8 +180,7 @@ class EmulatedLms(SerialDevice):
             self.write(NAK, at + ACK_S, self._finish)
             return
         self.write(ACK, at + ACK_S)
-        self.requests.append((self.host.time(), raw))
-        self.obey(codec.parse_telegram(raw), at)
+        self.obey(parse_telegram(raw), at)
 
     def obey(self, telegram: Telegram, at: float) -> None:
         """Do what a telegram says, and answer it.
@@ -420,8 +406,7 @@ class EmulatedLms(SerialDevice):
                     axis=0
                 ),  # of a mean, too: one scan without a range leaves none
             )
-            times += self.host.time() - self.host.now()
-            scan = ScanRecord(-1, turn, -1, float(times[0]), times, partial, words, b"")
+            scan = Scan(turn, partial, words, times)
             self.at(end, lambda instant: send(scan, instant), tag)
 
         self.at(end - AHEAD_S, ahead, tag)
@@ -430,35 +415,34 @@ class EmulatedLms(SerialDevice):
         self.emit(scan, at, self._finish)
 
     def emit(
-        self, scan: ScanRecord, at: float, then: Callable[[float], None] | None = None
+        self, scan: Scan, at: float, then: Callable[[float], None] | None = None
     ) -> None:
-        """Send a scan, which is then on record.
+        """Send a scan.
 
         Parameters
         ----------
         scan
-            Without its numbers and telegram.
         at
             Instant from which it may leave, s.
         then
             ``then(instant)`` is called when the last byte is out.
         """
-        raw = self._telegram(scan)
-        index = self.telegrams % 256
-        self.scans.append(
-            replace(scan, number=self._number, telegram_index=index, telegram=raw)
-        )
+        raw = self.telegram(scan)
         self.telegrams += 1
-        self._number += 1
         self.reply(raw, at, then)
 
-    def _telegram(self, scan):
-        """What the mode tells of a scan."""
+    def telegram(self, scan: Scan) -> bytes:
+        """What the mode tells of a scan.
+
+        Parameters
+        ----------
+        scan
+        """
         memory = self.memory
         configuration = memory.configuration
         words = scan.words[self._selection.first - 1 : self._selection.last]
         if memory.mode == REFLECTIVITY:  # behind every range
-            answered = words <= MODES[ENCODED[configuration.measuring_mode]].largest
+            answered = words <= largest(ENCODED[configuration.measuring_mode])
             words = np.stack([words, WHITE * answered], axis=1)
         indices = None
         if configuration.realtime_indices:
@@ -480,15 +464,7 @@ class EmulatedLms(SerialDevice):
         """
         turns = self._turns
         late = self.host.now() - self._zero - (self._turn + turns) * MIRROR_TURN
-        if late > self._late_s:
-            if self._late_s == LATE_S:
-                LOG.warning(
-                    "%s: this machine casts scans too slowly: %.1f s of them are left out; "
-                    "choose stop-and-go",
-                    self.path,
-                    late,
-                )
-            self._late_s = LATE_AGAIN_S
+        if late > LATE_S:
             self.telegrams += 1
             self._partial = 0
             self._turn = self._turn_of(self.host.now(), turns, math.ceil)
@@ -508,6 +484,6 @@ class EmulatedLms(SerialDevice):
             self.telegrams += 1
         else:
             self.emit(scan, at)
-        sending_s = len(self._telegram(scan)) * self.byte_s
+        sending_s = len(self.telegram(scan)) * self.byte_s
         self._turn += math.ceil(sending_s / (self._turns * MIRROR_TURN)) * self._turns
         self._plan()

@@ -5,12 +5,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, UNITS, Configuration
+from lrfcal_lib.session.lms2xx_codec import SCAN, TOP, UNITS, Configuration
 from lrfcal_lib.simulate.beam import VARIANTS
 
 BAUD_WORD = {9600: 0x8067, 19200: 0x8033, 38400: 0x8019, 500000: 0x8001}
-BAUD_COMMAND = {0x40: 38400, 0x41: 19200, 0x42: 9600, 0x48: 500000}
+BAUD_COMMAND = {command: rate for rate, command in RATES.items()}
 # operating modes
 INSTALLATION = 0x00
 DIAGNOSIS = 0x10
@@ -36,7 +37,7 @@ STREAMED = {STREAM: SCAN, MEAN: 0xB6, PART: 0xB7, INTERLACED: SCAN, REFLECTIVITY
 SCANS = range(2, 251)  # of a mean
 LAST = 401  # value that can be asked for; there may be fewer
 # as which mode a measuring mode encodes ranges; 13 and 14, remission, are those that CARMEN sets
-ENCODED = dict(zip(MODES, MODES, strict=True)) | {13: 0, 14: 0}
+ENCODED = {mode: mode for mode in TOP} | {13: 0, 14: 0}
 
 
 @dataclass(frozen=True)

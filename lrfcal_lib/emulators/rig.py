@@ -16,7 +16,7 @@ from lrfcal_lib.drivers.lms2xx_link import FASTEST
 from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.head import EmulatedHead
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
-from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
+from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld
 from lrfcal_lib.session import stated
 from lrfcal_lib.simulate.rig import PLACES, Placement, Setup, load_setup, pairs, random
 
@@ -24,7 +24,6 @@ from lrfcal_lib.simulate.rig import PLACES, Placement, Setup, load_setup, pairs,
 SILENCE_S = 600.0
 LOOK_S = 0.5
 PRACTICE = "practice"
-SMALL = 400  # pixels of an image's width of the practice rig: its chessboard is still found at 2 m
 MARGIN = np.radians(1.0)  # of a sweep beyond the board
 
 
@@ -176,34 +175,16 @@ class EmulatedRig:
 
 
 def practice_setup() -> tuple[Setup, list[Placement]]:
-    """A rig and placements that are recorded in a minute.
-
-    Its sweeps are coarse, its images small, its intrinsics stated.
-    """
-    quick = load_setup("sim_quick")
-    rig = scaled(quick.rig, SMALL)
-    rig = replace(
-        rig,
-        cameras=tuple(
-            replace(c, exposure=replace(c.exposure, samples=2)) for c in rig.cameras
-        ),
-        platform=replace(rig.platform, settle=0.0),
+    """A rig and placements that are recorded in a minute."""
+    setup = load_setup(PRACTICE)
+    cameras = tuple(
+        replace(camera, exposure=replace(camera.exposure, samples=2))
+        for camera in setup.rig.cameras
     )
-    setup = replace(
-        quick,
-        name=PRACTICE,
-        rig=rig,
-        pairs=3,
-        distances=(1.3, 1.7),
-        step=np.radians(1.0),
-        intrinsics_views=0,
-        room_sweep=(),
-        room_images=(),
-    )
+    setup = replace(setup, rig=replace(setup.rig, cameras=cameras))
+    rng = random(setup, PLACES)
     placements = []
-    for placement in pairs(
-        rig, setup.pairs, setup.distances, random(setup, PLACES), MARGIN
-    ):
+    for placement in pairs(setup.rig, setup.pairs, setup.distances, rng, MARGIN):
         images = placement.image_pitch
         placements.append(replace(placement, image_pitch=(images[0], images[-1])))
     return setup, placements
@@ -327,26 +308,20 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
     """
     text = json.dumps(rig.rig_file(), indent=1) + "\n"
     try:
-        stream = file.open("x")
+        with file.open("x") as stream:
+            stream.write(text)
     except FileExistsError:
-        remedy = "name another file with --rig-file, or remove this one first"
         raise ValueError(
-            f"{file}: exists already, and is not written over: {remedy}"
+            f"{file}: exists already, and is not written over: name another file with --rig-file, "
+            "or remove this one first"
         ) from None
     except OSError as error:
-        remedy = "name a file in a folder that exists and can be written with --rig-file"
+        file.unlink(missing_ok=True)
         raise ValueError(
-            f"{file}: cannot be written ({error.strerror}): {remedy}"
+            f"{file}: cannot be written ({error.strerror}): name another file, in a folder that "
+            "exists and can be written, with --rig-file"
         ) from error
-    try:
-        with stream:
-            stream.write(text)
-        written = file.stat()
-    except OSError as error:
-        file.unlink()
-        raise ValueError(
-            f"{file}: cannot be written ({error.strerror}): name another file with --rig-file"
-        ) from error
+    written = file.stat()
     try:
         yield
     finally:

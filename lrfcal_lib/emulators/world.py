@@ -10,18 +10,16 @@ import secrets
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.head import Head
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import close_views, world_of
-from lrfcal_lib.simulate.rig import Placement, Rig, Setup, placements_of
+from lrfcal_lib.simulate.rig import Placement, Setup, placements_of
 from lrfcal_lib.simulate.scene import Imager
 
 STILL = 1e-7  # radians within which a scan at rest is cast once
@@ -29,18 +27,6 @@ LOOK_S = 0.05
 QUALITY = 97  # of JPEG
 FPS = 8.0  # most images a second of a camera
 SERVE_S = 0.2  # between looks whether the server is to end
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where the board is; places are told apart by their key."""
-
-    key: tuple
-    # None: no board, a table with things
-    T_platform_board: RigidTransform | None = field(default=None, compare=False)
-    # on its stand, or held by nothing close to a camera
-    stand: bool = field(default=True, compare=False)
-    T_room_platform: RigidTransform | None = field(default=None, compare=False)
 
 
 class EmulatedWorld:
@@ -60,7 +46,8 @@ class EmulatedWorld:
     Attributes
     ----------
     current : tuple
-        Where the board is, a Place, and the world with it.
+        Where the board is, ('placement', number or None) or ('close', camera, view), and the world
+        with it.
     """
 
     def __init__(
@@ -81,7 +68,7 @@ class EmulatedWorld:
         self.put(None)
 
     @property
-    def place(self) -> Place:
+    def place(self) -> tuple:
         """Where the board is."""
         return self.current[0]
 
@@ -98,18 +85,18 @@ class EmulatedWorld:
         ValueError
             For a placement that the setup does not have.
         """
-        place = Place(("placement", number))
-        if number is not None:
-            if number not in self.placements:
-                known = ", ".join(map(str, self.placements))
-                raise ValueError(f"no placement {number}; there are {known}, and none")
-            placement = self.placements[number]
-            place = replace(
-                place,
-                T_platform_board=placement.T_platform_board,
-                T_room_platform=placement.T_room_platform,
-            )
-        self._set(place)
+        if number is None:
+            self._show(("placement", None))
+            return
+        if number not in self.placements:
+            known = ", ".join(map(str, self.placements))
+            raise ValueError(f"no placement {number}; there are {known}, and none")
+        placement = self.placements[number]
+        self._show(
+            ("placement", number),
+            placement.T_platform_board,
+            T_room_platform=placement.T_room_platform,
+        )
 
     def hold_close(self, camera: str, view: int) -> None:
         """Hold the board close to a camera, in one of the views for its intrinsics.
@@ -132,16 +119,13 @@ class EmulatedWorld:
             known = f"0 to {count - 1} of {', '.join(names)}"
             raise ValueError(f"no view {view} of camera '{camera}'; there are {known}")
         pose = close_views(self.setup, names.index(camera))[view]
-        self._set(Place(("close", camera, view), pose, stand=False))
+        self._show(("close", camera, view), pose, stand=False)
 
-    def _set(self, place):
+    def _show(self, place, T_platform_board=None, stand=True, T_room_platform=None):
+        """Put the board somewhere, on its stand or held by nothing; None: a table with things."""
         # in one go, as a scan may be cast meanwhile
-        self.current = (
-            place,
-            world_of(
-                self.setup, place.T_platform_board, place.stand, place.T_room_platform
-            ),
-        )
+        world = world_of(self.setup, T_platform_board, stand, T_room_platform)
+        self.current = (place, world)
 
     def scan(
         self, turn: int, quarters: np.ndarray, times: np.ndarray
@@ -169,7 +153,7 @@ class EmulatedWorld:
         pitch = np.broadcast_to(self.head.pitch(times), times.shape)
         key = None
         if np.ptp(pitch) < STILL:  # a head at rest sees the same again and again
-            key = place.key, len(quarters), quarters[0], round(float(pitch[0]) / STILL)
+            key = place, len(quarters), quarters[0], round(float(pitch[0]) / STILL)
         if self._still is None or key is None or self._still_key != key:
             self._still_key = key
             bearings = np.radians(quarters / 4)
@@ -177,33 +161,6 @@ class EmulatedWorld:
                 rig.beam, world, bearings, pitch, rig.T_head_lrf
             )
         return lrf.measured(rig.beam, self._still, self._rng)
-
-
-def scaled(rig: Rig, width: int) -> Rig:
-    """The rig with smaller images of the same field of view.
-
-    Parameters
-    ----------
-    rig
-        Simulated.
-    width
-        Of the images, pixels.
-    """
-    cameras = []
-    for camera in rig.cameras:
-        m = camera.model
-        scale = width / m.width
-        model = replace(
-            m,
-            width=width,
-            height=round(m.height * scale),
-            fx=m.fx * scale,
-            fy=m.fy * scale,
-            cx=(m.cx + 0.5) * scale - 0.5,
-            cy=(m.cy + 0.5) * scale - 0.5,
-        )
-        cameras.append(replace(camera, model=model))
-    return replace(rig, cameras=tuple(cameras))
 
 
 class CameraServer:

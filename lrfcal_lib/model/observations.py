@@ -378,6 +378,14 @@ class JointObservations(_Grouped):
             view_placement=np.searchsorted(kept, out.view_placement),
         )
 
+    def stretched(self, share: float):
+        """The observations with bearings stretched by a share about the middle one, pi / 2."""
+        return replace(
+            self,
+            face_bearing=np.pi / 2 + (self.face_bearing - np.pi / 2) * (1 + share),
+            beam_bearing=np.pi / 2 + (self.beam_bearing - np.pi / 2) * (1 + share),
+        )
+
     def with_cameras(self, names):
         """The observations of some cameras only."""
         kept = [i for i, name in enumerate(self.cameras) if name in names]

@@ -168,7 +168,9 @@ def median_filter(
         Metres; NaN outside the mask and where there is no return.
     """
     if width < 1 or width % 2 == 0:
-        raise ValueError(f"the width of a median filter is odd and positive, got {width}")
+        raise ValueError(
+            f"the width of a median filter must be odd and positive, got {width}"
+        )
     half = width // 2
     taken = np.where(mask, ranges, np.nan)
     padded = np.pad(taken, ((0, 0), (half, half)), constant_values=np.nan)

@@ -13,7 +13,7 @@ import hashlib
 import os
 import pickle
 import stat
-from functools import lru_cache, wraps
+from functools import wraps
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
@@ -21,10 +21,11 @@ import cv2
 import numpy as np
 import scipy
 
-from lrfcal_lib.session.stated import opened
+from lrfcal_lib.session.cluster import source_digest
+from lrfcal_lib.session.files import opened
 
 VARIABLE = "LRFCAL_CACHE"
-REMEDY = "and what lies there is run; chmod go-w, or name a folder of your own"
+REMEDY = "and files in it are executed; use chmod go-w, or name a folder of your own"
 LARGEST_RESULT = 4_000_000_000  # bytes that are read; the largest are clouds of some 100 MB
 
 
@@ -54,11 +55,10 @@ def cached(stage):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         _refuse_shared(folder)
         session = getattr(getattr(of, "prepared", of), "session", of)
-        key = hashlib.sha256(
-            pickle.dumps((stage.__qualname__, of, args, sorted(options.items())))
-        )
-        for file in (Path(record.file) for record in session.image_records):
-            key.update(file.read_bytes() if file.is_file() else b"missing")
+        call = (stage.__qualname__, of, args, sorted(options.items()))
+        key = hashlib.sha256(pickle.dumps(call))
+        for record in session.image_records:
+            key.update(record.file.read_bytes() if record.file.is_file() else b"missing")
         key.update(library())
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
@@ -98,12 +98,7 @@ def _refuse_others(place, status):
         raise ValueError(f"{VARIABLE}: {may}, {REMEDY}")
 
 
-@lru_cache
 def library():
     """What stands for this library and those it works out its results with."""
-    digest = hashlib.sha256(
-        "".join(module.__version__ for module in (np, scipy, cv2)).encode()
-    )
-    for file in sorted(Path(__file__).parents[1].rglob("*.py")):
-        digest.update(file.read_bytes())
-    return digest.digest()
+    versions = (module.__version__ for module in (np, scipy, cv2))
+    return "".join((source_digest(), *versions)).encode()

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lrfcal_lib.session import stated
-from lrfcal_lib.session.telegrams import other_than_stated
+from lrfcal_lib.session.files import read_bytes, short
 
 MANY = 0.2  # share of a camera's images: where more are wrong nothing can rest on them
 # quantile of the grey levels that the brightest surface of an image has at least
@@ -15,7 +14,7 @@ WHITE = 0.995
 # grey levels of 255; a white square of a chessboard has more in every image that is of use
 DARK = 30
 BEYOND = 0.001  # share of ranges beyond the largest one: single readings may be mirrors or the sun
-SHOWN = 3  # examples in a sentence
+SHOWN = 3  # images of a camera that are looked at
 
 
 @dataclass(frozen=True)
@@ -25,15 +24,13 @@ class Fault:
     Attributes
     ----------
     kind : str
-        'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark', 'clock'; of
+        'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark'; of
         :mod:`lrfcal_lib.judge.recording_faults` also 'camera moved', 'camera zoomed',
         'exchanged', 'numbers', 'sense', 'unit'.
     words : str
         What was found, where, and what to do about it.
     severe : bool
         Nothing that rests on it can be trusted.
-    harmless : bool
-        No estimate rests on it.
     camera : str or None
     placements : tuple of int
         Those concerned, where it is not the whole recording.
@@ -42,13 +39,12 @@ class Fault:
     kind: str
     words: str
     severe: bool = False
-    harmless: bool = False
     camera: str | None = None
     placements: tuple[int, ...] = ()
 
 
 def faults_of_files(session) -> list[Fault]:
-    """What cannot be right about a session: repetitions, ranges, bearings and times.
+    """What cannot be right about a session: repetitions, ranges and bearings.
 
     Parameters
     ----------
@@ -58,10 +54,9 @@ def faults_of_files(session) -> list[Fault]:
     Returns
     -------
     list of Fault
-        Harmless ones included.
     """
     found = repeated_images(session) + repeated_scans(session)
-    return found + ranges_beyond(session) + bearings_beyond(session) + other_clocks(session)
+    return found + ranges_beyond(session) + bearings_beyond(session)
 
 
 def repeated_images(session) -> list[Fault]:
@@ -73,7 +68,7 @@ def repeated_images(session) -> list[Fault]:
     groups = defaultdict(list)
     for records in by_size.values():
         for record in records if len(records) > 1 else ():
-            content = stated.read_bytes(record.file, session.path)
+            content = read_bytes(record.file, session.path)
             groups[hashlib.blake2b(content).digest()].append(record)
 
     pairs = defaultdict(list)
@@ -86,20 +81,18 @@ def repeated_images(session) -> list[Fault]:
 def _repeated(session, first_camera, camera, pairs):
     """The Fault of images of one camera that are images of another one, or of itself, again."""
     count = len(session.images(camera))
-    examples = [
+    examples = short(
         f"{other.file.relative_to(session.path)} is {first.file.relative_to(session.path)}"
-        for first, other in pairs[:SHOWN]
-    ]
-    more = f" and {len(pairs) - SHOWN} more" if len(pairs) > SHOWN else ""
+        for first, other in pairs
+    )
     placements = sorted({other.placement for _, other in pairs} - {-1})
-    where = f" (in placements: {stated.short(placements)})" if placements else ""
     cause = "a camera that stood still, or a copy"
     if first_camera != camera:
         cause = f"was the folder of camera '{first_camera}' copied?"
     words = (
-        f"{len(pairs)} of {count} images of camera '{camera}'{where} are the very pictures of "
-        f"others: {', '.join(examples)}{more}: {cause}; put the right images there or remove their "
-        "rows from images.csv"
+        f"{len(pairs)} of {count} images of camera '{camera}' (in placements: "
+        f"{short(placements)}) are the very pictures of others: {examples}: {cause}; put the right "
+        "images there or remove their rows from images.csv"
     )
     severe = len(pairs) > MANY * count
     return Fault(
@@ -151,68 +144,25 @@ def bearings_beyond(session) -> list[Fault]:
     """Bearings, or steps between them, that are not those which session.json states."""
     lrf = session.lrf
     bearings = session.scans["bearings"]
-    if session.telegrams is not None:
-        return [
-            Fault("field of view", words) for words in other_than_stated(session.scans, lrf)
-        ]
-    if len(bearings) < 2:
+    gaps = len(bearings) - 1
+    if gaps == 0:
         return []
-    step = (bearings[-1] - bearings[0]) / (len(bearings) - 1)
-    first, last = sorted(lrf.field_of_view)
+    step = (bearings[-1] - bearings[0]) / gaps
+    first, last = lrf.field_of_view
     half = lrf.bearing_step / 2
     inside = first - half <= bearings[0] and bearings[-1] <= last + half
-    same_step = abs(step - lrf.bearing_step) * (len(bearings) - 1) <= half
-    if inside and same_step:
+    if inside and abs(step - lrf.bearing_step) * gaps <= half:
         return []
     has, says = (
         "{:.5g} to {:.5g} deg in steps of {:.4g} deg".format(*np.degrees(values))
         for values in ((bearings[0], bearings[-1], step), (first, last, lrf.bearing_step))
     )
     words = (
-        f"the bearings of the scan lines (lrf/scans.npz) cover {has}, session.json states "
-        f"field_of_view_deg and bearing_step_deg as {says}: the scan lines count; correct "
-        "session.json, or the bearings if they are wrong"
+        f"the bearings of the scan lines (lrf) cover {has}, session.json states field_of_view_deg "
+        f"and bearing_step_deg as {says}: the scan lines count; correct session.json, or the "
+        "bearings if they are wrong"
     )
     return [Fault("field of view", words)]
-
-
-def other_clocks(session) -> list[Fault]:
-    """Cameras whose times put most images beside the scans of other placements."""
-    ends = {}
-    for number in session.placements:
-        time = session.scans["time_s"][session.scans["placement"] == number]
-        if np.isfinite(time).any():
-            ends[number] = (np.nanmin(time), np.nanmax(time))
-    if len(ends) < 2:
-        return []
-
-    found = []
-    first, last = np.array(list(ends.values())).T
-    numbers = np.array(list(ends))
-    for camera in session.cameras:
-        records = [
-            r
-            for r in session.images(camera)
-            if r.placement in ends and np.isfinite(r.time_s)
-        ]
-        away = []
-        for record in records:
-            outside = np.maximum(
-                np.maximum(first - record.time_s, record.time_s - last), 0.0
-            )
-            own = numbers == record.placement
-            if outside[own][0] > outside[~own].min():
-                begin, end = ends[record.placement]
-                away.append(record.time_s - (begin if record.time_s < begin else end))
-        if len(away) > len(records) / 2:
-            words = (
-                f"the times (t_s in images.csv) of {len(away)} of {len(records)} images of camera "
-                f"'{camera}' lie beside the scans of other placements, {np.median(away):+.6g} s "
-                "from their own: another clock? Placement numbers count, not these times; leave "
-                "t_s empty or set the clocks alike"
-            )
-            found.append(Fault("clock", words, harmless=True, camera=camera))
-    return found
 
 
 def brightness(image: np.ndarray) -> int:
@@ -247,36 +197,19 @@ def dark_images(session) -> list[Fault]:
     found = []
     for camera in session.cameras:
         records = session.images(camera, purpose="board")
-        looked_at = records[:: max(len(records) // SHOWN, 1)][:SHOWN]
-        dark = [record for record in looked_at if dark_image(session.read_image(record))]
-        if len(dark) > len(looked_at) / 2:
-            found.append(
-                too_dark(session, dark, f"{len(dark)} of {len(looked_at)} looked at")
+        records = records[:: max(len(records) // SHOWN, 1)][:SHOWN]
+        levels = [brightness(session.read_image(record)) for record in records]
+        dark = [
+            record for record, level in zip(records, levels, strict=True) if level < DARK
+        ]
+        if len(dark) > len(records) / 2:
+            words = (
+                f"images of camera '{camera}' are too dark ({len(dark)} of {len(records)} looked "
+                f"at): the brightest surfaces of {dark[0].file.relative_to(session.path)} have "
+                f"{min(levels)} of 255 grey levels, a white square needs {DARK} and more; more "
+                "light, a longer exposure, or, where other values were stored (10 or 12 bits), "
+                "convert the images"
             )
+            placements = tuple(sorted({record.placement for record in dark}))
+            found.append(Fault("dark", words, camera=camera, placements=placements))
     return found
-
-
-def faults_of_dark(session, dark) -> list[Fault]:
-    """The Faults of all dark images (ImageRecords) of a session, one a camera."""
-    found = []
-    for camera in session.cameras:
-        records = [record for record in dark if record.camera == camera]
-        if records:
-            count = f"{len(records)} of {len(session.images(camera))}"
-            found.append(too_dark(session, records, count))
-    return found
-
-
-def too_dark(session, records, how_many: str) -> Fault:
-    """The Fault of dark images of one camera."""
-    first = records[0]
-    name = first.file.relative_to(session.path)
-    brightest = brightness(session.read_image(first))
-    words = (
-        f"images of camera '{first.camera}' are too dark ({how_many}): the brightest surfaces of "
-        f"{name} have {brightest} of 255 grey levels, a white square needs {DARK} and more; more "
-        "light, a longer exposure, or, where other values were stored (10 or 12 bits), convert "
-        "the images"
-    )
-    placements = tuple(sorted({record.placement for record in records} - {-1}))
-    return Fault("dark", words, camera=first.camera, placements=placements)

@@ -13,14 +13,7 @@ from lrfcal_lib.session.shown import printable
 
 LARGEST_FILE = 64_000_000  # bytes of any file of a session
 SPLIT = "split the recording into several sessions"
-KINDS = {
-    "l": "a link",
-    "d": "a folder",
-    "p": "a named pipe",
-    "s": "a socket",
-    "b": "a device",
-    "c": "a device",
-}
+KINDS = {"l": "a link", "d": "a folder", "-": "a file", "p": "a named pipe"}
 
 
 class SessionError(ValueError):
@@ -40,7 +33,7 @@ def checked(file: str | PathLike, within: str | PathLike, make: bool = False) ->
         where /= part
         if make:
             where.mkdir(exist_ok=True)
-        _refuse_other(where, where.lstat(), "d", "a folder")
+        _refuse_other(where, where.lstat(), "d")
     return Path(file)
 
 
@@ -78,7 +71,7 @@ def opened(
         flags |= os.O_NOFOLLOW
     with suppress(FileNotFoundError):  # a device is not even opened
         found = os.stat(file, follow_symlinks=within is None)
-        _refuse_other(file, found, "-", "a file")
+        _refuse_other(file, found, "-")
         if not writes and found.st_size > most:
             raise SessionError(
                 f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}"
@@ -90,18 +83,20 @@ def opened(
     stream = os.fdopen(inner, mode)
     if writes and os.fstat(inner).st_nlink > 1:
         stream.close()
-        remedy = "copy the session's folder and write to the copy"
-        raise SessionError(f"{file}: has another name elsewhere (a hard link); {remedy}")
+        raise SessionError(
+            f"{file}: has another name elsewhere (a hard link); copy the session's folder and "
+            "write to the copy"
+        )
     return stream
 
 
-def _refuse_other(file, status, kind, wanted):
+def _refuse_other(file, status, kind):
     """Refuse what is no plain file (or folder), such as a link."""
-    if (found := stat.filemode(status.st_mode)[0]) != kind:
-        what = KINDS.get(found, "a file")
+    found = stat.filemode(status.st_mode)[0]
+    if found != kind:
         raise SessionError(
-            f"{file}: is {what}, not {wanted}: a session holds plain files; put {wanted} in its "
-            "place"
+            f"{file}: is {KINDS.get(found, 'a device')}, not {KINDS[kind]}: a session holds plain "
+            f"files; put {KINDS[kind]} in its place"
         )
 
 
@@ -161,9 +156,7 @@ def read_bytes(
         with opened(file, within, most=most) as stream:
             data = stream.read(most + 1)
     except OSError as error:
-        raise SessionError(
-            f"{file}: {error.strerror}; the session needs this file"
-        ) from error
+        raise SessionError(f"{file}: {error.strerror}; this file is needed") from error
     if len(data) > most:  # files of the system do not tell their size
         raise SessionError(f"{file}: more than {most / 1e6:.0f} MB; {SPLIT}")
     return data
@@ -186,9 +179,7 @@ def read_json(file: str | PathLike, within: str | PathLike | None) -> dict:
     with reading(file, "not JSON ({}); truncated, or edited by hand?"):
         data = json.loads(text.decode())
     if not isinstance(data, dict):
-        raise SessionError(
-            f"{file}: holds a {type(data).__name__}, expected an object with the key 'schema'"
-        )
+        raise SessionError(f"{file}: holds a {type(data).__name__}, an object is needed")
     inner = [data]
     for _ in range(DEEPEST_JSON):
         inner = [value for outer in inner for value in _inside(outer)]

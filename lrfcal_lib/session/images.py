@@ -12,12 +12,11 @@ FRAMES = {*range(0xC0, 0xD0)} - {
     0xC8,
     0xCC,
 }  # second bytes of the markers of frame headers
-# markers, which do not occur within coded pixels
-SCAN = b"\xff\xda"
-REMARK = b"\xff\xe1"
-MOST_SCANS = 100  # of a JPEG, each up to 30 ms at 30 megapixels; programs write about ten
 # of a JPEG; programs write about twenty, and large remarks may hold the marker by chance
 MOST_SEGMENTS = 10_000
+# by marker, which does not occur within coded pixels; each scan takes up to 30 ms at 30 megapixels,
+# programs write about ten
+LIMITS = {b"\xff\xda": (100, "scans"), b"\xff\xe1": (MOST_SEGMENTS, "segments of remarks")}
 
 
 def image_size(file: str | PathLike, data: bytes) -> tuple[int, int]:
@@ -42,15 +41,12 @@ def image_size(file: str | PathLike, data: bytes) -> tuple[int, int]:
             size = struct.unpack(">II", data[16:24])
         end = b"IEND"
     elif data.startswith(JPEG):
-        limits = (
-            (SCAN, MOST_SCANS, "scans"),
-            (REMARK, MOST_SEGMENTS, "segments of remarks"),
-        )
-        for mark, most, things in limits:
+        for mark, (most, things) in LIMITS.items():
             count = data.count(mark)
             if count > most:
-                found = f"a JPEG of {count} {things}, more than {most}"
-                raise SessionError(f"{file}: {found}; write the image again")
+                raise SessionError(
+                    f"{file}: a JPEG of {count} {things}, more than {most}; write the image again"
+                )
         size = _jpeg_size(data)
         end = b"\xff\xd9"
     else:
@@ -103,8 +99,7 @@ def check_image_size(
     """
     width, height = size or image_size(file, data)
     if (width, height) != (camera.width, camera.height):
-        found = (
-            f"{width} x {height} pixels, but camera '{camera.name}' has {camera.width} x "
-            f"{camera.height}"
+        raise SessionError(
+            f"{file}: {width} x {height} pixels, but camera '{camera.name}' has {camera.width} x "
+            f"{camera.height}; intrinsics hold for one image size only"
         )
-        raise SessionError(f"{file}: {found}; intrinsics hold for one image size only")

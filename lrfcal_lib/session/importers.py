@@ -9,21 +9,19 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
-from lrfcal_lib.model.camera import INTRINSIC_NAMES, CameraModel
+from lrfcal_lib.model.camera import INTRINSIC_NAMES
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.session.images import image_size
-from lrfcal_lib.session.stated import (
+from lrfcal_lib.session.files import (
     LARGEST_TEXT,
-    CameraInfo,
-    LrfInfo,
     SessionError,
     check_amount,
     naming,
     read_bytes,
     reading,
     short,
-    transform_to_json,
 )
+from lrfcal_lib.session.images import image_size
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, transform_to_json
 from lrfcal_lib.session.write import SessionWriter
 
 # LaserSeteroCalibration (https://github.com/suijingfeng/LaserSeteroCalibration), folder
@@ -75,16 +73,8 @@ NOTE = (
 LINE_JUMP = 1e-4
 # metres between published points and those rebuilt from what was recovered
 LARGEST_MISS = 1e-5
-KEYS = {
-    "fc": 2,
-    "cc": 2,
-    "kc": 5,
-    "fc_error": 2,
-    "cc_error": 2,
-    "kc_error": 5,
-    "nx": 1,
-    "ny": 1,
-}
+# of a Calib_Results.m, and how many numbers each has: focal lengths, principal point, lens
+KEYS = {"fc": 2, "cc": 2, "kc": 5, "fc_error": 2, "cc_error": 2, "kc_error": 5}
 
 
 @dataclass(frozen=True)
@@ -109,18 +99,11 @@ class Recovered:
     miss: float
 
 
-@dataclass(frozen=True)
-class BouguetCamera:
-    """A camera by Bouguet's toolbox; `reference`: intrinsics and board poses as JSON has them."""
-
-    model: CameraModel
-    reference: dict
-
-
-def import_lasersetero(
-    src: str | PathLike, dst: str | PathLike, *, intrinsics: str = "own"
-) -> float:
+def import_lasersetero(src: str | PathLike, dst: str | PathLike) -> float:
     """Make a session of the public LMS400 + ZED recording.
+
+    The intrinsics stay open, so that they are estimated from the session's images; the published
+    ones are kept in the session's reference.
 
     Parameters
     ----------
@@ -129,10 +112,6 @@ def import_lasersetero(
         ``Calib_Results_{left,right}.m``.
     dst
         The session's.
-    intrinsics
-        'own' leaves the intrinsics open, so that they are estimated from the session's images;
-        'published' takes them from the Bouguet results. Either way the published ones are kept in
-        the session's reference.
 
     Returns
     -------
@@ -146,8 +125,6 @@ def import_lasersetero(
         For missing or truncated files, an existing target, or if rebuilding misses by more than
         0.01 mm.
     """
-    if intrinsics not in ("own", "published"):
-        raise SessionError(f"intrinsics is 'own' or 'published', got '{intrinsics}'")
     clouds = numbered(src, "plane_*.pcd")
     published = {}
     images = {}
@@ -157,14 +134,15 @@ def import_lasersetero(
         images[name] = numbered(src, f"{name}_*.png")
         first = next(iter(images[name].values()))
         width, height = image_size(first, read_bytes(first))
-        model = published[name].model if intrinsics == "published" else None
-        cameras.append(CameraInfo(name, "platform", width, height, model))  # type: ignore[arg-type]
+        cameras.append(CameraInfo(name, "platform", width, height))
     reference = {
         "note": NOTE,
         "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
         "T_left_platform": transform_to_json(T_LEFT_CLOUD * LASERSETERO_CLOUD),
-        "cameras": {name: camera.reference for name, camera in published.items()},
+        "cameras": published,
     }
+    misses = []
+    values = 0
     with SessionWriter(
         dst,
         BOARD,
@@ -176,24 +154,16 @@ def import_lasersetero(
         reference=reference,
         platform_sigma=LASERSETERO_PLATFORM_SIGMA,
     ) as writer:
-        miss = _add_sweeps(writer, clouds)
+        for placement, file in clouds.items():
+            sweep = recover_polar(read_pcd(file), file)
+            values += sweep.ranges.size
+            with naming(file):
+                check_amount(values)
+            writer.add_sweep(placement, sweep.ranges, sweep.bearings, sweep.pitch)
+            misses.append(sweep.miss)
         for name, files in images.items():
             for placement, file in files.items():
                 writer.add_image(name, file, placement, purpose="board")
-    return miss
-
-
-def _add_sweeps(writer, clouds):
-    """Write the scan lines of clouds (files by placement); the largest miss, metres."""
-    misses = []
-    values = 0
-    for placement, file in clouds.items():
-        sweep = recover_polar(read_pcd(file), file)
-        values += sweep.ranges.size
-        with naming(file):
-            check_amount(values)
-        writer.add_sweep(placement, sweep.ranges, sweep.bearings, sweep.pitch)
-        misses.append(sweep.miss)
     return max(misses)
 
 
@@ -258,13 +228,15 @@ def recover_polar(points: np.ndarray, name: str | PathLike = "points") -> Recove
     )
     miss = float(np.linalg.norm(rebuilt - p_platform, axis=1).max())
     if not miss <= LARGEST_MISS:
-        limit = f"more than {1000 * LARGEST_MISS:g} mm; not points of this rig?"
         raise SessionError(
-            f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, {limit}"
+            f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, more than "
+            f"{1000 * LARGEST_MISS:g} mm; not points of this rig?"
         )
     if steps.min() < FIRST or steps.max() > LAST:
-        reach = f"{STEP_DEG * steps.min():.1f} .. {STEP_DEG * steps.max():.1f} deg"
-        raise SessionError(f"{name}: bearings reach {reach}, the LMS400 sees 55 .. 125 deg")
+        raise SessionError(
+            f"{name}: bearings reach {STEP_DEG * steps.min():.1f} .. "
+            f"{STEP_DEG * steps.max():.1f} deg, the LMS400 sees 55 .. 125 deg"
+        )
     grid = np.arange(FIRST, LAST + 1)
     with naming(name):
         check_amount(len(pitch) * len(grid))  # scan lines of few points are long as well
@@ -285,66 +257,55 @@ def read_pcd(file: str | PathLike) -> np.ndarray:
     states.
     """
     head, _, body = source_text(file).partition("DATA ascii")
-    count = re.search(r"^POINTS (.*)$", head, re.MULTILINE)
-    if (
-        not body
-        or not count
-        or not re.search(r"^FIELDS\s+x\s+y\s+z\s*$", head, re.MULTILINE)
-    ):
+    stated = re.search(r"^FIELDS\s+x\s+y\s+z\s*$.*^POINTS (.*?)$", head, re.M | re.S)
+    if not body or not stated:
         raise SessionError(f"{file}: expected an ASCII PCD file with the fields x y z")
     with reading(file, "{}; damaged?"):
         points = np.array(body.split(), dtype=float)
-        promised = int(count[1])
+        promised = int(stated[1])
     if points.size != 3 * promised or points.size == 0:
-        found = f"{points.size / 3:g} points, the header states {promised}"
-        raise SessionError(f"{file}: {found}; truncated?")
+        raise SessionError(
+            f"{file}: {points.size / 3:g} points, the header states {promised}; truncated?"
+        )
     if not np.isfinite(points).all():
         raise SessionError(f"{file}: holds coordinates that are not finite; damaged?")
     return points.reshape(-1, 3)
 
 
-def read_bouguet(file: str | PathLike) -> BouguetCamera:
-    """A camera of a ``Calib_Results.m`` of Bouguet's toolbox; SessionError if something is missing.
+def read_bouguet(file: str | PathLike) -> dict:
+    """Intrinsics and board poses of a ``Calib_Results.m`` of Bouguet's toolbox, as JSON has them;
+    SessionError if something is missing.
 
-    The toolbox prints three standard deviations, which the model's covariance holds squared.
-    ``T_camera_board`` by image number is in metres, not millimetres.
+    The toolbox prints three standard deviations. ``T_camera_board`` by image number is in metres,
+    not millimetres.
     """
     assigned = re.findall(
-        r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;",
-        source_text(file),
-        re.MULTILINE,
+        r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.M
     )
     with naming(file):
-        values = {}
-        for key, many, one in assigned:
-            values[key] = np.array((many or one).replace(";", " ").split(), float)
-        return _from_bouguet(values)
-
-
-def _from_bouguet(values):
-    """A BouguetCamera of arrays by name; ValueError for a wrong one."""
-    lacking = [key for key, length in KEYS.items() if len(values.get(key, ())) != length]
-    if lacking:
-        raise ValueError(f"no value of {', '.join(lacking)}; is this a Calib_Results.m?")
-    endless = [key for key, array in values.items() if not np.isfinite(array).all()]
-    if endless:
-        raise ValueError(f"values of {short(endless)} are not finite; damaged?")
-    intrinsics = np.concatenate([values["fc"], values["cc"], values["kc"]])
-    errors = np.concatenate([values["fc_error"], values["cc_error"], values["kc_error"]])
-    sigma = errors / 3
-    model = CameraModel(
-        int(values["nx"][0]), int(values["ny"][0]), *intrinsics[:4].tolist(), intrinsics[4:]
-    ).with_parameters(intrinsics, np.diag(sigma**2))
-    poses = {}
-    for key in values:
-        number = key.removeprefix("omc_")
-        if number.isdecimal() and f"Tc_{number}" in values:
-            turn = Rotation.from_rotvec(values[key])
-            shift = values[f"Tc_{number}"] / 1000
-            poses[number] = transform_to_json(RigidTransform.from_components(shift, turn))
-    reference = {
-        "intrinsics": dict(zip(INTRINSIC_NAMES, intrinsics.tolist(), strict=True)),
-        "intrinsics_sigma": dict(zip(INTRINSIC_NAMES, sigma.tolist(), strict=True)),
-        "T_camera_board": poses,
-    }
-    return BouguetCamera(model, reference)
+        values = {
+            key: np.array((many or one).replace(";", " ").split(), float)
+            for key, many, one in assigned
+        }
+        lacking = [key for key, n in KEYS.items() if len(values.get(key, ())) != n]
+        if lacking:
+            raise ValueError(f"no value of {short(lacking)}; is this a Calib_Results.m?")
+        endless = [key for key, array in values.items() if not np.isfinite(array).all()]
+        if endless:
+            raise ValueError(f"values of {short(endless)} are not finite; damaged?")
+        intrinsics = np.concatenate([values["fc"], values["cc"], values["kc"]])
+        errors = [values["fc_error"], values["cc_error"], values["kc_error"]]
+        sigma = np.concatenate(errors) / 3
+        poses = {}
+        for key in values:
+            number = key.removeprefix("omc_")
+            if number.isdecimal() and f"Tc_{number}" in values:
+                turn = Rotation.from_rotvec(values[key])
+                shift = values[f"Tc_{number}"] / 1000
+                pose = RigidTransform.from_components(shift, turn)
+                poses[number] = transform_to_json(pose)
+        return {
+            "intrinsics": dict(zip(INTRINSIC_NAMES, intrinsics.tolist(), strict=True)),
+            "intrinsics_sigma": dict(zip(INTRINSIC_NAMES, sigma.tolist(), strict=True)),
+            "T_camera_board": poses,
+        }

@@ -1,40 +1,20 @@
 """Telegrams of the SICK LMS2xx: bytes to values and back, without a port."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.session.lms2xx_frame import (
-    CHUNK,
     DEVICE,
-    OVERHEAD,
-    STX,
-    Telegram,
     TelegramError,
     alike,
-    check_crc,
-    crc16,
     cut,
     encode_telegram,
     parse_telegram,
-    split_stream,
     word,
 )
-
-__all__ = [  # of the frame, beside all that is below
-    "DEVICE",
-    "OVERHEAD",
-    "STX",
-    "Telegram",
-    "TelegramError",
-    "check_crc",
-    "crc16",
-    "encode_telegram",
-    "parse_telegram",
-    "split_stream",
-    "word",
-]
 
 SCAN = 0xB0
 METRES = {"cm": 0.01, "mm": 0.001}
@@ -50,36 +30,35 @@ REASONS = (
     "reserved",
 )
 BEYOND = REASONS.index("larger than maximum")
-# index: how far a value is below the largest one its bits can hold
-REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND], np.uint8)
-# the other way
-BELOW_TOP = np.array(
-    [np.argmax(REASON_BELOW_TOP == reason) for reason in range(1 + BEYOND)]
-)
+# by how far a value is below the largest one its bits can hold
+REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND])
+# Largest number that the range bits of a value hold, by measuring mode. The bits above are flags:
+# in modes 0, 2, 4 and 6 hits of the fields A, B and C (0: A, B, dazzled), in the others the level
+# of a reflector.
+TOP = {mode: (1 << bits) - 1 for mode, bits in enumerate((13, 13, 13, 14, 14, 15, 15))}
 
 
-@dataclass(frozen=True)
-class Mode:
-    """How a measuring mode shares the 16 bits of a value: the lower `bits` are the range, the upper
-    ones flags.
+def largest(mode: int) -> int:
+    """The largest number that is a range in a measuring mode; the nine above are special.
+
+    Parameters
+    ----------
+    mode
+        Key of `TOP`.
     """
-
-    bits: int
-
-    @property
-    def top(self):
-        """Largest number the range bits hold: 'not valid'."""
-        return (1 << self.bits) - 1
-
-    @property
-    def largest(self):
-        """Largest number that is a range; the nine above are special."""
-        return self.top - 9
+    return TOP[mode] - len(REASON_BELOW_TOP)
 
 
-# flags of modes 0, 2, 4 and 6: hits of the fields A, B and C (0: A, B, dazzled); of the others:
-# level of a reflector
-MODES = dict(enumerate(map(Mode, (13, 13, 13, 14, 14, 15, 15))))
+@lru_cache
+def meanings(mode, unit):
+    """What each of the 65536 values means: ranges (metres) and reasons why there is none."""
+    counts = np.arange(1 << 16) & TOP[mode]
+    special = counts > largest(mode)
+    reasons = np.zeros(len(counts), np.uint8)
+    reasons[special] = REASON_BELOW_TOP[TOP[mode] - counts[special]]
+    ranges = counts * METRES[unit]
+    ranges[special] = np.where(reasons[special] == BEYOND, np.inf, np.nan)
+    return ranges, reasons
 
 
 @dataclass(frozen=True)
@@ -94,7 +73,7 @@ class Scans:
         As sent, flags included.
     ranges : ndarray, shape (n, B)
         Metres; inf where the device says larger than its maximum, NaN for all other special values.
-    partial : ndarray of int, shape (n,)
+    partial : int
         Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
     scan_index, telegram_index : ndarray of int, shape (n,)
         Real-time indices, modulo 256; -1 where the device does not send them.
@@ -105,25 +84,14 @@ class Scans:
     ranges: np.ndarray
     unit: str
     mode: int
-    partial: np.ndarray
+    partial: int
     scan_index: np.ndarray
     telegram_index: np.ndarray
 
     @property
     def reasons(self):
         """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
-        reasons = np.zeros(self.words.shape, np.uint8)
-        special, reasons[special] = special_values(self.words, self.mode)
-        return reasons
-
-
-def special_values(words, mode):
-    """Where values are no ranges, and why; they are few."""
-    mode = MODES[mode]
-    counts = words & np.uint16(mode.top)
-    # ten times as fast as nonzero
-    special = np.unravel_index(np.flatnonzero(counts > mode.largest), counts.shape)
-    return special, REASON_BELOW_TOP[mode.top - counts[special]]
+        return meanings(self.mode, self.unit)[1][self.words]
 
 
 def encode_values(
@@ -149,13 +117,14 @@ def encode_values(
         Of the shape of the ranges.
     """
     ranges = np.asarray(ranges, float)
-    top = MODES[mode].top
     counts = np.rint(np.nan_to_num(ranges, nan=0, posinf=1e9) / METRES[unit])
-    why = np.where(counts > MODES[mode].largest, BEYOND, 0)
+    why = np.where(counts > largest(mode), BEYOND, 0)
     why[np.isnan(ranges)] = REASONS.index("not valid")
     if reasons is not None:
         why = np.where(reasons, reasons, why)
-    return np.where(why, top - BELOW_TOP[why], counts).astype(np.uint16)
+    # of reasons that have several values the first
+    below = np.argmax(REASON_BELOW_TOP == why[..., None], axis=-1)
+    return np.where(why, TOP[mode] - below, counts).astype(np.uint16)
 
 
 def encode_words(
@@ -248,11 +217,11 @@ def decode_scans(
     Returns
     -------
     list of Scans
-        One for each number of values, unit, and kind (whole or partial, with or without indices).
+        One for each number of values, unit, and kind (whole or a part, with indices or without).
         Telegrams with another code, or with a length that does not fit the number of values, are in
         none of them.
     """
-    if mode not in MODES:  # others send no range with special values
+    if mode not in TOP:  # others send no range with special values
         raise ValueError(
             f"measuring mode {mode:#04x} is none of 0x00 to 0x06: set one of those (command 77)"
         )
@@ -265,38 +234,32 @@ def decode_scans(
     sound = np.isin(extra, (0, 2)) & (head < 1 << 15)
     rows = rows[sound]
     head = head[sound]
-    indexed = extra[sound] > 0
+    extra = extra[sound]  # bytes of indices
     scans = []
-    for group in alike(head & 0xE3FF, indexed):
+    for group in alike(head, extra):
         chosen = rows[group]
         begin = offset[chosen] + 7
-        scans.append(_decoded(data, chosen, begin, head[group], indexed[group[0]], mode))
+        first = head[group[0]]
+        size = 2 * (first & 0x3FF)  # bytes of the values
+        words = cut(data, begin, size).view("<u2")
+        unit = UNITS[first >> 14]
+        partial = -1
+        if first >> 13 & 1:
+            partial = int(first >> 11 & 3)
+        indices = np.full((len(chosen), 2), -1)
+        if extra[group[0]]:
+            indices[:] = cut(data, begin + size, 2)
+        ranges = meanings(mode, unit)[0][words]
+        scans.append(Scans(chosen, words, ranges, unit, mode, partial, *indices.T))
     return scans
 
 
-def _decoded(data, rows, at, head, indexed, mode):
-    """Scans of the same number of values, which begin at these places of a stream."""
-    values = int(head[0] & 0x3FF)
-    unit = UNITS[head[0] >> 14]
-    words = np.empty((len(at), values), np.uint16)
-    ranges = np.empty((len(at), values))
-    for first in range(0, len(at), CHUNK):
-        chunk = slice(first, first + CHUNK)
-        words[chunk] = cut(data, at[chunk], 2 * values).view("<u2")
-        np.multiply(
-            words[chunk] & np.uint16(MODES[mode].top), METRES[unit], out=ranges[chunk]
-        )
-        special, reasons = special_values(words[chunk], mode)
-        ranges[chunk][special] = np.where(reasons == BEYOND, np.inf, np.nan)
-    partial = np.where(head >> 13 & 1, head >> 11 & 3, -1)
-    indices = np.full((2, len(at)), -1)
-    if indexed:
-        indices[:] = cut(data, at + 2 * values, 2).T
-    return Scans(rows, words, ranges, unit, mode, partial, *indices)
-
-
-# values of a whole scan -> first bearing and step in quarters of a degree
-GRIDS = {101: (160, 4), 201: (160, 2), 401: (160, 1), 181: (0, 4), 361: (0, 2)}
+# field of view and step of whole scans, deg
+VARIANTS = ((100, 1.0), (100, 0.5), (100, 0.25), (180, 1.0), (180, 0.5))
+# number of values -> first bearing and step in quarters of a degree
+GRIDS = {
+    round(view / step) + 1: (2 * (180 - view), round(4 * step)) for view, step in VARIANTS
+}
 
 
 def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
@@ -385,7 +348,7 @@ class Configuration:
 
     @property
     def measuring_mode(self):
-        """Key of `MODES`."""
+        """Key of `TOP`."""
         return self.block[5]
 
     @property
@@ -405,7 +368,7 @@ class Configuration:
         Parameters
         ----------
         measuring_mode
-            Key of `MODES`.
+            Key of `TOP`.
         unit
             'cm' or 'mm'.
         realtime_indices
@@ -493,8 +456,33 @@ def parse_configuration(raw: bytes) -> Configuration:
     Raises
     ------
     TelegramError
-        If it is damaged, another reply, or shorter than the measuring mode and the unit need.
+        If it is damaged, another reply, or shorter than the measuring mode and the unit need, or
+        of a unit that there is not.
     """
     if raw[4:5] == bytes([CONFIGURED]):
-        return Configuration(reply_data(raw, CONFIGURED, 8)[1:])
-    return Configuration(reply_data(raw, CONFIGURATION, 7))
+        configuration = Configuration(reply_data(raw, CONFIGURED, 8)[1:])
+    else:
+        configuration = Configuration(reply_data(raw, CONFIGURATION, 7))
+    unit_of(configuration.block[6:])  # raises for one that no manual lists
+    return configuration
+
+
+STATE_MODE = (CONFIGURATION, CONFIGURED, STATUS)  # codes of the replies that do
+
+
+def parse_mode(raw: bytes) -> int:
+    """Measuring mode out of a reply that states it.
+
+    Parameters
+    ----------
+    raw
+        One of `STATE_MODE`.
+
+    Raises
+    ------
+    TelegramError
+        If it is damaged, or too short.
+    """
+    if raw[4] == STATUS:
+        return parse_status(raw).measuring_mode
+    return parse_configuration(raw).measuring_mode

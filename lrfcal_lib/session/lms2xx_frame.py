@@ -1,7 +1,6 @@
 """Telegrams of the SICK LMS2xx as bytes: their frame, checksum, and where they are in a stream."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -11,7 +10,8 @@ HOST = 0x00
 DEVICE = 0x80
 LONGEST = 812 + 2  # bytes of the longest reply, 401 values, with real-time indices
 OVERHEAD = 6  # start, address, length, CRC
-CHUNK = 512  # telegrams worked on at once: what fits into the cache of a processor
+CHUNK = 4096  # telegrams worked on at once: a few MB
+FEW = 40  # telegrams whose checksums are as fast one by one
 
 
 class TelegramError(ValueError):
@@ -37,7 +37,7 @@ class Stream:
     ----------
     offset, length : ndarray, shape (n,)
         Of whole telegrams with the right CRC.
-    rejected : ndarray of int, shape (m,)
+    rejected : list of int
         Offsets outside of those where a telegram seems to begin whose CRC is wrong.
     pending : int
         Where a telegram may begin whose end has not come yet (the bytes from there on must be
@@ -46,52 +46,27 @@ class Stream:
 
     offset: np.ndarray
     length: np.ndarray
-    rejected: np.ndarray
+    rejected: list
     pending: int
 
 
 def crc16(data):
-    """The device's checksum of one byte string (int), or of each row of an array of uint8, shape
-    (n, L).
+    """The device's checksum of a byte string, or of many of the same length: then `data` has shape
+    (L, n), of uint16, and the result (n,).
 
     Notes
     -----
     One shift for each byte, which enters together with the byte before it: ``crc <- x crc + (b[k-1]
-    << 8 | b[k])`` modulo ``x^16 + x^15 + x^2 + 1`` over GF(2). That is linear, ``crc = sum_k
-    x^(L-1-k) w_k``, so the words before the last h (h a power of two) are multiplied by ``x^h`` and
-    added to those, until one word is left. It is weaker than other checksums of 16 bits: bit j of
-    byte k enters as ``x^(L-1-k+j) (x^7 + 1)``, the same as bit j + 1 of the next byte, so two flips
-    on such a diagonal go unseen (one in L of all pairs or so).
+    << 8 | b[k])`` modulo ``x^16 + x^15 + x^2 + 1`` over GF(2). It is weaker than other checksums of
+    16 bits: bit j of byte k enters as ``x^(L-1-k+j) (x^7 + 1)``, the same as bit j + 1 of the next
+    byte, so two flips on such a diagonal go unseen (one in L of all pairs or so).
     """
-    if not isinstance(data, np.ndarray):
-        return int(crc16(np.frombuffer(data, np.uint8)[None])[0])
-    if data.shape[1] == 0:
-        return np.zeros(len(data), np.uint16)
-    # zeros in front change nothing
-    raw = np.zeros((len(data), 1 + data.shape[1] + data.shape[1] % 2), np.uint8)
-    raw[:, raw.shape[1] - data.shape[1] :] = data
-    high, low = (
-        np.ascontiguousarray(part).view(">u2").astype(np.uint16)
-        for part in (raw[:, :-1], raw[:, 1:])
-    )
-    # neighbours, by shifts: twice as fast
-    words = high << 1 ^ (high >> 15) * np.uint16(0x8005) ^ low
-    while (n := words.shape[1]) > 1:
-        last = 1 << ((n - 1).bit_length() - 1)
-        rest = words[:, n - last :].copy()
-        rest[:, 2 * last - n :] ^= times_power(2 * last)[words[:, : n - last]]
-        words = rest
-    return words[:, 0]
-
-
-@lru_cache
-def times_power(power):
-    """Table of every 16-bit polynomial times ``x^power``, shape (65536,); for powers of two."""
-    if power > 1:
-        root = times_power(power // 2)
-        return root[root]
-    table = np.arange(1 << 16, dtype=np.uint16)
-    return (table << 1) ^ np.where(table & 0x8000, 0x8005, 0).astype(np.uint16)
+    crc = 0
+    before = 0
+    for byte in data:
+        crc = (crc << 1 & 0xFFFF) ^ (crc >> 15) * 0x8005 ^ (before << 8) ^ byte
+        before = byte
+    return crc
 
 
 def encode_telegram(
@@ -115,12 +90,14 @@ def encode_telegram(
     ValueError
         For numbers that are no bytes.
     """
-    if address is None:
-        address = HOST if status is None else DEVICE
     body = bytes([code, *data])
+    sender = HOST
     if status is not None:
         body += bytes([status])
-    raw = bytes([STX, address]) + len(body).to_bytes(2, "little") + body
+        sender = DEVICE
+    if address is not None:
+        sender = address
+    raw = bytes([STX, sender]) + len(body).to_bytes(2, "little") + body
     return raw + crc16(raw).to_bytes(2, "little")
 
 
@@ -136,7 +113,6 @@ def parse_telegram(raw: bytes) -> Telegram:
     TelegramError
         If start, length or CRC is wrong.
     """
-    raw = bytes(raw)
     if len(raw) < OVERHEAD + 1 or raw[0] != STX:
         raise TelegramError(
             f"a telegram begins with 02 and has 7 or more bytes, got {raw[:8].hex(' ') or 'none'}"
@@ -158,7 +134,7 @@ def parse_telegram(raw: bytes) -> Telegram:
     return Telegram(raw[4], data)
 
 
-def split_stream(data: bytes | np.ndarray, *, replies: bool = True) -> Stream:
+def split_stream(data: bytes, *, replies: bool = True) -> Stream:
     """Find the telegrams in a byte stream, whatever lies between them.
 
     Parameters
@@ -176,31 +152,37 @@ def split_stream(data: bytes | np.ndarray, *, replies: bool = True) -> Stream:
     Every place that looks like a beginning is checked by its CRC; of overlapping ones the first
     counts. By chance one in 65536 of the places inside other bytes passes.
     """
-    data = np.frombuffer(data, np.uint8)
-    offset = np.flatnonzero(data[: max(len(data) - 3, 0)] == STX)
-    offset = offset[(data[offset + 1] >= DEVICE) == replies]
-    length = word(data, offset + 2) + OVERHEAD
+    raw = np.frombuffer(data, np.uint8)
+    offset = np.flatnonzero(raw[:-3] == STX)
+    offset = offset[(raw[offset + 1] >= DEVICE) == replies]
+    length = word(raw, offset + 2) + OVERHEAD
     plausible = (length > OVERHEAD) & (length <= LONGEST)
     offset = offset[plausible]
     length = length[plausible]
-    ends = offset + length
-    whole = ends <= len(data)
+    whole = offset + length <= len(raw)
     good = np.zeros(len(offset), bool)
-    good[whole] = check_crc(data, offset[whole], length[whole])
-    if np.any(offset[good][1:] < ends[good][:-1]):  # seldom
-        free = 0
-        for row in np.flatnonzero(good):
-            good[row] = offset[row] >= free
-            if good[row]:
-                free = ends[row]
-    used = ends[good].max(initial=0)
-    before = np.searchsorted(offset[good], offset, side="right") - 1
-    inside = (before >= 0) & (offset < np.append(ends[good], 0)[before])
-    begun = offset[~whole & (offset >= used)]
-    tail = max(len(data) - 3, int(used))  # too few bytes to state a length
-    begun = np.r_[begun, tail + np.flatnonzero(data[tail:] == STX), len(data)]
-    rejected = whole & ~good & ~inside
-    return Stream(offset[good], length[good], offset[rejected], int(begun[0]))
+    good[whole] = check_crc(raw, offset[whole], length[whole])
+
+    sound = []
+    rejected = []
+    begun = []
+    free = 0  # behind the last sound telegram
+    for row, begin in enumerate(offset.tolist()):
+        if begin < free:
+            continue
+        if good[row]:
+            sound.append(row)
+            free = begin + int(length[row])
+            begun = []
+        elif whole[row]:
+            rejected.append(begin)
+        else:
+            begun.append(begin)
+    # too few bytes to state a length
+    last = data.find(STX, max(free, len(data) - 3))
+    if last >= 0:
+        begun.append(last)
+    return Stream(offset[sound], length[sound], rejected, min(begun, default=len(data)))
 
 
 def word(data, at):
@@ -215,19 +197,20 @@ def check_crc(data, offset, length):
         for first in range(0, len(rows), CHUNK):
             chunk = rows[first : first + CHUNK]
             raw = cut(data, offset[chunk], length[rows[0]])
-            good[chunk] = crc16(raw[:, :-2]) == word(raw.T, -2)
+            if len(chunk) < FEW:
+                crc = [crc16(telegram) for telegram in raw[:, :-2].tolist()]
+            else:
+                crc = crc16(raw[:, :-2].T.astype(np.uint16))
+            good[chunk] = crc == word(raw.T, -2)
     return good
 
 
 def alike(*keys):
     """Rows with the same keys, each group in order."""
-    if not len(keys[0]):
-        return []
-    if all((key == key[0]).all() for key in keys):
-        return [np.arange(len(keys[0]))]
     _, group = np.unique(np.stack(keys), axis=1, return_inverse=True)
     order = np.argsort(group.ravel(), kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(group.ravel()[order])) + 1)
+    ends = np.cumsum(np.bincount(group.ravel()))
+    return np.split(order, ends[:-1])[: len(ends)]
 
 
 def cut(data, offset, length):

@@ -2,8 +2,9 @@
 
 import math
 import os
+import re
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -11,30 +12,27 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session import stated
-from lrfcal_lib.session.faults import dark_image, faults_of_dark, faults_of_files
-from lrfcal_lib.session.images import check_image_size
-from lrfcal_lib.session.scans import read_scans
-from lrfcal_lib.session.shown import printable
-from lrfcal_lib.session.stated import (
-    CameraInfo,
-    LrfInfo,
+from lrfcal_lib.session.faults import dark_images, faults_of_files
+from lrfcal_lib.session.files import (
     SessionError,
     naming,
+    read_bytes,
+    read_json,
     reading,
     short,
 )
+from lrfcal_lib.session.images import check_image_size
+from lrfcal_lib.session.scans import read_scans
+from lrfcal_lib.session.shown import printable
+from lrfcal_lib.session.stated import SCHEMA, CameraInfo, LrfInfo, parse_session
 from lrfcal_lib.session.tables import read_table, whole_number
-from lrfcal_lib.session.telegrams import (
-    INDEX_COLUMNS,
-    TelegramLog,
-    other_than_stated,
-)
+from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
 EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
 PLATFORM_COLUMNS = ("t_s", "commanded_deg", "measured_deg")
 PURPOSES = ("intrinsics", "board", "scene")
+CLOSEST = 5  # pixels between the two of a pick
 DROPPED = "dropped"  # purpose of an image of a placement that was recorded again, or never finished
 
 
@@ -68,43 +66,35 @@ class EdgePick:
     ends: np.ndarray
 
 
-def missing_parts(placements, scans, records, cameras, unfinished=None):
+# begin names that lead out of a folder, on any system: absolute ones, and those with ``..``
+OUTSIDE = re.compile(r"[/\\]|\w:|(.*[/\\])?\.\.([/\\]|$)")
+
+
+def missing_parts(placements, scans, records, cameras, unfinished):
     """What a session states and does not hold, as sentences; the rest can be used."""
     scanned = set(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)].tolist())
     shot = {(record.camera, record.placement) for record in records}
-    unfinished = unfinished or ()
-    problems = []
     for placement in placements:
         if placement not in scanned:
-            problems.append(f"placement {placement}: no scan line with a range")
+            yield f"placement {placement}: no scan line with a range"
     for placement in unfinished:
-        again = (
-            "its recording was not finished, ignored; 'record --resume' records it again"
+        yield (
+            f"placement {placement}: its recording was not finished, ignored; 'record --resume' "
+            "records it again"
         )
-        problems.append(f"placement {placement}: {again}")
     for placement in sorted(scanned - {*placements, *unfinished}):
-        unknown = "in the scan lines but not in session.json, ignored"
-        problems.append(f"placement {placement}: {unknown}")
+        yield f"placement {placement}: in the scan lines but not in session.json, ignored"
     for placement in placements:
         for camera in cameras:
             if (camera, placement) not in shot:
-                problems.append(f"placement {placement}: no image of camera '{camera}'")
-    return tuple(problems)
+                yield f"placement {placement}: no image of camera '{camera}'"
 
 
 def inside(path, name, where):
     """The file a session names; it must lie inside the session's folder (no ``..`` or absolute
     path).
     """
-    windows = PureWindowsPath(name)
-    posix = PurePosixPath(name)
-    if (
-        windows.drive
-        or windows.root
-        or posix.is_absolute()
-        or ".." in windows.parts
-        or not posix.parts
-    ):
+    if OUTSIDE.match(name):
         raise SessionError(
             f"{path}: {where} must stay inside the session's folder, got '{name}'"
         )
@@ -113,7 +103,24 @@ def inside(path, name, where):
     return path / name
 
 
-def read_images(path, facts, unfinished=None):
+def known(value, values, what):
+    """A value that must be one of some; ValueError in words otherwise."""
+    if value not in values:
+        raise ValueError(f"{what} is one of {short(values)}, got '{value}'")
+    return value
+
+
+def once(lines, number, *values):
+    """ValueError for values that stand in an earlier line of a table already."""
+    first = lines.setdefault(values, number)
+    if first < number:
+        text = ", ".join(map(str, values))
+        raise ValueError(
+            f"{text} stands in line {first} already; remove one of the two rows"
+        )
+
+
+def read_images(path, facts, unfinished):
     """The records of images.csv; every image must exist, be complete and have its camera's size.
 
     Images of unfinished placements and dropped ones are left out, and a last row that is cut off
@@ -131,36 +138,19 @@ def read_images(path, facts, unfinished=None):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
             continue
         with naming(f"{file} line {number}"):
-            if row["camera"] not in cameras:
-                raise ValueError(
-                    f"no camera '{row['camera']}' in session.json, which has {short(cameras)}"
-                )
-            if row["purpose"] not in PURPOSES:
-                raise ValueError(
-                    f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'"
-                )
             placement = whole_number(row["placement"], "placement")
-            if placement not in (*facts["placements"], -1):
-                raise ValueError(f"placement {placement} is not in session.json")
-            pitch, time = (float(row[k] or "nan") for k in ("pitch_deg", "t_s"))
-            target = inside(path, row["file"], "images.csv: file")
-            first = lines.setdefault(target, number)
-            if first < number:
-                already = f"stands in line {first} already; remove one of the two rows"
-                raise ValueError(f"'{row['file']}' {already}")
-            out.append(
-                ImageRecord(
-                    row["camera"],
-                    target,
-                    placement,
-                    math.radians(pitch),
-                    time,
-                    row["purpose"],
-                )
+            record = ImageRecord(
+                camera=known(row["camera"], cameras, "camera"),
+                file=inside(path, row["file"], "images.csv: file"),
+                placement=known(placement, (*facts["placements"], -1), "placement"),
+                pitch=math.radians(float(row["pitch_deg"] or "nan")),
+                time_s=float(row["t_s"] or "nan"),
+                purpose=known(row["purpose"], PURPOSES, "purpose"),
             )
-            check_image_size(
-                target, stated.read_bytes(target, path), cameras[row["camera"]]
-            )
+            once(lines, number, record.file.relative_to(path))
+            content = read_bytes(record.file, path)
+            check_image_size(record.file, content, cameras[record.camera])
+        out.append(record)
     return tuple(out)
 
 
@@ -170,40 +160,33 @@ def read_edges(path, facts, records):
     if not os.path.lexists(file):
         return ()
     out = []
-    known = {(record.camera, record.file) for record in records}
-    edges = facts["board"].edges
-    rows = read_table(file, EDGE_COLUMNS, path)[0]
-    for number, row in enumerate(rows, start=2):
+    lines = {}  # in which each edge of an image stands
+    images = {(record.camera, record.file) for record in records}
+    for number, row in enumerate(read_table(file, EDGE_COLUMNS, path)[0], start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
-            if (row["camera"], target) not in known:
+            if (row["camera"], target) not in images:
                 raise ValueError(
                     f"images.csv has no '{row['file']}' of camera '{row['camera']}'"
                 )
-            if row["edge"] not in edges:
-                raise ValueError(f"edge is one of {short(edges)}, got '{row['edge']}'")
+            edge = known(row["edge"], facts["board"].edges, "edge")
+            once(lines, number, row["camera"], target.relative_to(path), edge)
             ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
-            if not np.isfinite(ends).all():
+            if not np.linalg.norm(ends[1] - ends[0]) >= CLOSEST or np.isinf(ends).any():
                 raise ValueError(
-                    f"u1, v1, u2, v2 must be 4 finite numbers, got {ends.ravel().tolist()}"
+                    f"the two pixels {ends.tolist()} give no direction: pick two that are "
+                    f"{CLOSEST} or more pixels apart"
                 )
-            if np.linalg.norm(ends[1] - ends[0]) < 5:
-                raise ValueError(
-                    f"the two pixels {ends.tolist()} are too close for a direction: pick them "
-                    "far apart"
-                )
-            out.append(EdgePick(row["camera"], target, row["edge"], ends))
+            out.append(EdgePick(row["camera"], target, edge, ends))
     return tuple(out)
 
 
 # radians from the first to the last quarter of a sweep; 0.006 deg, below the step of any head
 SMALLEST_MOVE = 1e-4
-# tables of a session: columns, rows of the same ... follow each other in time, ... stands there
-# once
-ORDERED = {
-    "lrf/index.csv": (INDEX_COLUMNS, ("placement",), ("offset",)),
-    "images.csv": (IMAGE_COLUMNS, ("camera", "placement", "purpose"), ("file",)),
-    "edges.csv": (EDGE_COLUMNS, (), ("camera", "file", "edge")),
+# tables with times: columns, and those whose values rows share that follow each other in time
+TIMED = {
+    "lrf/index.csv": (INDEX_COLUMNS, ("placement",)),
+    "images.csv": (IMAGE_COLUMNS, ("camera", "placement", "purpose")),
 }
 
 
@@ -335,16 +318,11 @@ class Session:
         purpose
             'board', 'intrinsics' or 'scene'.
         """
-        records = []
-        for record in self.image_records:
-            if camera not in (None, record.camera) or placement not in (
-                None,
-                record.placement,
-            ):
-                continue
-            if purpose in (None, record.purpose):
-                records.append(record)
-        return tuple(records)
+        asked = {"camera": camera, "placement": placement, "purpose": purpose}
+        asked = {key: value for key, value in asked.items() if value is not None}
+        return tuple(
+            record for record in self.image_records if asked.items() <= vars(record).items()
+        )
 
     def read_image(self, record: ImageRecord) -> np.ndarray:
         """The pixels of an image.
@@ -364,7 +342,7 @@ class Session:
             If the file cannot be decoded or has another size than the camera.
         """
         camera = self.cameras[record.camera]
-        data = stated.read_bytes(record.file, self.path)
+        data = read_bytes(record.file, self.path)
         check_image_size(record.file, data, camera)
         with reading(
             record.file,
@@ -423,31 +401,32 @@ def open_session(path: str | os.PathLike) -> Session:
         only takes a part away (a placement without scan lines) is in `Session.problems`.
     """
     path = Path(path)
-    data = stated.read_json(path / "session.json", path)
+    data = read_json(path / "session.json", path)
     with naming(path / "session.json"):
-        if data.get("schema") != stated.SCHEMA:
+        if data.get("schema") != SCHEMA:
             raise ValueError(
-                f"schema is {data.get('schema')!r}, this version reads '{stated.SCHEMA}'"
+                f"schema is {data.get('schema')!r}, this version reads '{SCHEMA}'"
             )
-        facts = stated.parse_session(data)
+        facts = parse_session(data)
         unfinished = facts.pop("unfinished")
     scans, log = read_scans(path)
     records = read_images(path, facts, unfinished)
-    picks = read_edges(path, facts, records)
-    problems = missing_parts(
-        facts["placements"], scans, records, facts["cameras"], unfinished
+    problems = [
+        *missing_parts(
+            facts["placements"], scans, records, facts["cameras"], unfinished or ()
+        )
+    ]
+    if log is not None:
+        problems += log.problems
+    return Session(
+        path=path,
+        image_records=records,
+        picks=read_edges(path, facts, records),
+        problems=tuple(problems),
+        scans=scans,
+        telegrams=log,
+        **facts,
     )
-    problems += (
-        () if log is None else (*log.problems, *other_than_stated(scans, facts["lrf"]))
-    )
-    found = {
-        "image_records": records,
-        "picks": picks,
-        "problems": problems,
-        "scans": scans,
-        "telegrams": log,
-    }
-    return Session(path=path, **found, **facts)
 
 
 def validate(path: str | os.PathLike) -> list[str]:
@@ -467,55 +446,41 @@ def validate(path: str | os.PathLike) -> list[str]:
         session = open_session(path)
     except SessionError as error:
         return [str(error)]
-    found = [*session.problems, *_disorder(session)]
-    found += [fault.words for fault in faults_of_files(session) if fault.words not in found]
-    dark = []
+    found = [*session.problems, *_times_back(session)]
+    found += [fault.words for fault in faults_of_files(session)]
+    broken = []
     for record in session.image_records:
         try:
-            if dark_image(session.read_image(record)):
-                dark.append(record)
+            session.read_image(record)
         except SessionError as error:
-            found.append(str(error))
-    found += [fault.words for fault in faults_of_dark(session, dark)]
-    return [printable(problem) for problem in found]
+            broken.append(str(error))
+    if not broken:
+        found += [fault.words for fault in dark_images(session)]
+    return [printable(problem) for problem in found + broken]
 
 
-def _disorder(session):
-    """What two writers, or hands, do to tables."""
-    for name, (columns, group, once) in ORDERED.items():
+def _times_back(session):
+    """Sentences about times that run back between rows, as where two write at once."""
+    for name, (columns, group) in TIMED.items():
         file = session.path / name
-        if os.path.lexists(file):
-            rows = read_table(file, columns, session.path, torn=True)[0]
-            yield from _rows_twice(file, rows, once)
-            yield from _times_back(file, rows, group)
-
-
-def _rows_twice(file, rows, once):
-    """Sentences about rows whose values of the columns `once` stand in a table already."""
-    first = {}
-    for line, row in enumerate(rows, start=2):
-        values = tuple(row[key] for key in once)
-        if values in first:
-            already = f"stands in line {first[values]} already; remove one of them"
-            yield f"{file} line {line}: {', '.join(values)} {already}"
-        first.setdefault(values, line)
-
-
-def _times_back(file, rows, group):
-    """Sentences about times that run back between rows of one `group`, by these columns."""
-    last = {}
-    for line, row in enumerate(rows, start=2):
-        if not row.get("t_s") or not row["placement"] or row.get("purpose") == DROPPED:
+        if not os.path.lexists(file):
             continue
-        try:
-            time = float(row["t_s"])
-        except (
-            ValueError
-        ):  # of a placement that was not finished: no other reader looks at it
-            yield f"{file} line {line}: t_s is {row['t_s']!r}: a number of seconds is needed"
-            continue
-        values = tuple(row[key] for key in group)
-        if time < last.get(values, -math.inf):
-            back = f"t_s runs back from {last[values]:.9g} to {time:.9g}"
-            yield f"{file} line {line}: {back}: two writers at once? Record the placement again"
-        last[values] = time
+        last = {}
+        rows = read_table(file, columns, session.path, torn=True)[0]
+        for line, row in enumerate(rows, start=2):
+            if not row["t_s"] or not row["placement"] or row.get("purpose") == DROPPED:
+                continue
+            try:
+                time = float(row["t_s"])
+            except (
+                ValueError
+            ):  # of a placement that was not finished: nobody else looks at it
+                yield f"{file} line {line}: t_s is {row['t_s']!r}: a number of seconds is needed"
+                continue
+            values = tuple(map(row.get, group))
+            if time < last.get(values, -math.inf):
+                yield (
+                    f"{file} line {line}: t_s runs back from {last[values]:.9g} to {time:.9g}: two "
+                    "writers at once? Record the placement again"
+                )
+            last[values] = time

@@ -2,14 +2,21 @@
 
 import math
 import os
-from functools import partial
 from io import BytesIO
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 
-from lrfcal_lib.session import stated
-from lrfcal_lib.session.stated import SessionError, naming, opened, reading, short
+from lrfcal_lib.session.files import (
+    SessionError,
+    check_amount,
+    checked,
+    naming,
+    read_bytes,
+    reading,
+    short,
+)
+from lrfcal_lib.session.stated import MILLIMETRES
 from lrfcal_lib.session.telegrams import read_telegrams
 
 SOURCES = ("lrf/scans.npz", "lrf/telegrams.bin")
@@ -38,37 +45,34 @@ def read_scans(path):
         with naming(telegrams):
             return check_scans(scans), log
     if os.path.lexists(path / "lrf") and parts_of(path):
-        remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
-        raise SessionError(f"{path}: the recording was interrupted; {remedy}")
+        raise SessionError(
+            f"{path}: the recording was interrupted; lrfcal_lib.session.write.finish('{path}') "
+            "completes it"
+        )
     raise SessionError(f"{arrays}: no such file; a session needs the scan lines")
 
 
 def parts_of(path):
     """Files of a session's sweeps in their order, until it is finished."""
-    return sorted(stated.checked(path / "lrf" / "any", path).parent.glob("part_*.npz"))
+    return sorted(checked(path / "lrf" / "any", path).parent.glob("part_*.npz"))
 
 
 def read_npz(file, within):
     """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is
     unpacked.
     """
-    with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream:
-        _check_entries(file, stream)
-        with ZipFile(stream) as archive:
+    content = read_bytes(file, within)
+    entries = content.count(ENTRY)
+    if entries > MOST_ENTRIES:  # ZipFile would make objects of all
+        raise SessionError(
+            f"{file}: holds {entries} files, more than {MOST_ENTRIES}; write it again with the "
+            f"arrays {short(ARRAYS)} only"
+        )
+    with reading(file, "cannot be read ({}); truncated?"):
+        with ZipFile(BytesIO(content)) as archive:
             scans = _read_arrays(file, archive)
     with naming(file):
         return check_scans(scans)
-
-
-def _check_entries(file, stream):
-    """Refuse an archive with a long table of contents, of which ZipFile makes objects at once."""
-    parts = iter(partial(stream.read, 1_000_000), b"")
-    entries = sum(part.count(ENTRY) for part in parts)
-    if entries > MOST_ENTRIES:
-        remedy = f"write it again with the arrays {short(ARRAYS)} only"
-        raise SessionError(
-            f"{file}: holds {entries} files, more than {MOST_ENTRIES}; {remedy}"
-        )
 
 
 def _read_arrays(file, archive):
@@ -80,25 +84,22 @@ def _read_arrays(file, archive):
         if name not in archive.namelist():
             continue
         if archive.getinfo(name).compress_type not in PACKED:
-            remedy = "write it again with numpy.savez_compressed"
             raise SessionError(
-                f"{file}: {key} is packed in another way than numpy does; {remedy}"
+                f"{file}: {key} is packed in another way than numpy does; write it again with "
+                "numpy.savez_compressed"
             )
         with archive.open(name) as member:
             beginning = BytesIO(member.read(LONGEST_HEADER))
-        old = np.lib.format.read_magic(beginning) == (1, 0)
-        header = (
-            np.lib.format.read_array_header_1_0
-            if old
-            else np.lib.format.read_array_header_2_0
-        )
-        shape, _, kind = header(beginning)
+        np.lib.format.read_magic(beginning)
+        shape, _, kind = np.lib.format.read_array_header_1_0(beginning)
         if kind.kind not in "fiub" or kind.itemsize > 8:
-            words = f"it holds {kind}, not numbers; write it without pickles"
-            raise SessionError(f"{file}: {key} cannot be read: {words}")
+            raise SessionError(
+                f"{file}: {key} cannot be read: it holds {kind}, not numbers; write it without "
+                "pickles"
+            )
         values += abs(math.prod(shape))
         with naming(file):
-            stated.check_amount(values)
+            check_amount(values)
         with archive.open(name) as member:
             scans[key] = np.lib.format.read_array(member, allow_pickle=False)
     return scans
@@ -127,13 +128,10 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if ranges.ndim != 2:
         raise ValueError(f"ranges must be scan lines x beams, got shape {ranges.shape}")
     lines, beams = ranges.shape
-    shapes: dict[str, tuple[int, ...]] = {
-        "bearings": (beams,),
-        "placement": (lines,),
-        "pitch": (lines,),
-        "time_s": (lines,),
-    }
-    shapes |= {"intensities": (lines, beams)} if "intensities" in scans else {}
+    lengths = {"bearings": beams, "placement": lines, "pitch": lines, "time_s": lines}
+    shapes: dict[str, tuple] = {key: (length,) for key, length in lengths.items()}
+    if "intensities" in scans:
+        shapes["intensities"] = (lines, beams)
     for key, shape in shapes.items():
         if scans[key].shape != shape:
             raise ValueError(
@@ -146,8 +144,7 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if seen.size == 0:
         raise ValueError(f"no range in {lines} scan lines (all NaN): nothing was recorded")
     if np.median(seen) > LONGEST_MEDIAN_RANGE:
-        units = "millimetres? Divide by 1000; inches? Multiply by 0.0254"
-        raise ValueError(f"the median range is {np.median(seen):g} m: {units}")
+        raise ValueError(f"the median range is {np.median(seen):g} m: {MILLIMETRES}")
     if seen.min() < 0:
         raise ValueError(
             f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN"
@@ -164,9 +161,9 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _check_angles(name, angles, limit):
     """A ValueError where an angle is not finite, or too large to be in radians."""
-    if not np.isfinite(angles).all():
-        count = np.sum(~np.isfinite(angles))
-        raise ValueError(f"{count} values of {name} are not finite")
+    endless = np.sum(~np.isfinite(angles))
+    if endless:
+        raise ValueError(f"{endless} values of {name} are not finite")
     largest = np.abs(angles).max(initial=0)
     if largest > limit + 1e-6:
         raise ValueError(f"a {name} is {largest:g} rad: degrees? Convert to radians")

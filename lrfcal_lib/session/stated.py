@@ -83,6 +83,18 @@ SYSTEMATIC_ERROR = {
 # centimetres: so many standard deviations or steps of a range; the sheets above admit 2 to 4.2, and
 # 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
+# degrees between beams, by part of the model's name: parts of a full turn that the sensor's own
+# disc divides, so that their scale has no error
+BEARING_STEPS = {
+    "LMS1": (0.25, 0.5),
+    "LMS2": (0.25, 0.5, 1.0),
+    "LMS4": (0.1, 0.2, 0.25, 0.5, 1.0),
+    "LMS5": (1 / 6, 0.25, 1 / 3, 0.5, 2 / 3, 1.0),
+    "TiM5": (1 / 3, 1.0),
+}
+SAME_STEP = 0.001  # of a step; one that is rounded to three digits
+# standard deviation of other steps, a fraction: anything within 1 %, which nobody notices
+ASSUMED_STEP_ERROR = 0.0058
 # metres; only the unit of the edge bias where nobody stated the spot
 ASSUMED_SPOT_RADIUS = 0.005
 
@@ -92,22 +104,21 @@ def in_words(error):
     first = error.errors(include_url=False)[0]
     where = ".".join(map(str, first["loc"])) or "it"
     kind = first["type"]
-    value = ascii(first["input"])
     if kind == "missing":
         return f"{where} is missing"
+    value = ascii(first["input"])
     found = f"{where} is {value if len(value) < 100 else value[:80] + ' ...'}"
-    found = where if isinstance(first["input"], dict) else found
+    if isinstance(first["input"], dict):
+        found = where
     if kind == "value_error":
         return f"{found}: {first['ctx']['error']}"
-    needed = (
-        "an object"
-        if kind in ("model_type", "dataclass_type")
-        else first["msg"].removeprefix("Input should be ")
-    )
-    large = kind.startswith("less_than") and re.search(
-        r"_m\b", where
-    )  # the key tells the unit
-    return f"{found}: {needed} is needed" + f"; {MILLIMETRES}" * bool(large)
+    needed = first["msg"].removeprefix("Input should be ")
+    if kind in ("model_type", "dataclass_type"):
+        needed = "an object"
+    words = f"{found}: {needed} is needed"
+    if kind.startswith("less_than") and re.search(r"_m\b", where):  # the key tells the unit
+        words += f"; {MILLIMETRES}"
+    return words
 
 
 adapter = lru_cache(pydantic.TypeAdapter)
@@ -190,9 +201,10 @@ def transform_to_json(transform: RigidTransform | None) -> dict | None:
     """
     if transform is None:
         return None
-    turn = transform.rotation.as_rotvec().tolist()
-    shift = transform.translation.tolist()
-    return {"rotation_vector_rad": turn, "translation_m": shift}
+    return {
+        "rotation_vector_rad": transform.rotation.as_rotvec().tolist(),
+        "translation_m": transform.translation.tolist(),
+    }
 
 
 Transform = Annotated[TransformStated, AfterValidator(TransformStated.made)] | None
@@ -216,10 +228,16 @@ class LensStated(BaseModel):
 
     def made(self, width, height):
         """As a CameraModel."""
-        covariance = None if self.covariance is None else np.array(self.covariance)
-        pinhole = self.fx, self.fy, self.cx, self.cy
         return CameraModel(
-            width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px
+            width,
+            height,
+            self.fx,
+            self.fy,
+            self.cx,
+            self.cy,
+            np.array(self.distortion),
+            self.covariance and np.array(self.covariance),
+            self.rms_px,
         )
 
 
@@ -264,23 +282,24 @@ class BoardStated(BaseModel):
 
     def made(self):
         """As a Board."""
-        corners = None if self.corners_m is None else np.array(self.corners_m)
+        corners = None
         if len(set(self.edges)) < len(self.edges):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
-            given = "none" if not any(self.features) else short(map(repr, self.features))
-            edges = short(self.edges)
-            needed = f"features must be two different edges of {edges}, at a right angle"
-            raise ValueError(f"{needed}; got {given}")
-        if corners is not None and len(corners) != len(self.edges):
             raise ValueError(
-                f"corners_m must be one corner for each of {len(self.edges)} edges, got "
-                f"{len(corners)}"
+                f"features must be two different edges of {short(self.edges)}, at a right angle; "
+                f"got {short(map(repr, filter(None, self.features)))}"
             )
-        if corners is not None and np.ptp(corners, axis=0).max() > LONGEST_BOARD:
-            raise ValueError(
-                f"the board is {np.ptp(corners, axis=0).max():g} m large: {MILLIMETRES}"
-            )
+        if self.corners_m is not None:
+            corners = np.array(self.corners_m)
+            size = np.ptp(corners, axis=0).max()
+            if len(corners) != len(self.edges):
+                raise ValueError(
+                    f"corners_m must be one corner for each of {len(self.edges)} edges, got "
+                    f"{len(corners)}"
+                )
+            if size > LONGEST_BOARD:
+                raise ValueError(f"the board is {size:g} m large: {MILLIMETRES}")
         return Board(self.name, self.edges, corners, self.pattern, self.features)
 
 
@@ -291,24 +310,15 @@ def board_to_json(board: Board) -> dict:
     ----------
     board
     """
-    pattern = None
-    if board.pattern is not None:
-        pattern = {
-            "kind": "chessboard",
-            "columns": board.pattern.columns,
-            "rows": board.pattern.rows,
-            "square_m": board.pattern.square,
-            "origin_m": board.pattern.origin,
-        }
-    return plain(
-        {
-            "name": board.name,
-            "edges": board.edges,
-            "features": board.features,
-            "corners_m": board.corners,
-            "pattern": pattern,
-        }
-    )
+    pattern = board.pattern and {
+        "kind": "chessboard",
+        "columns": board.pattern.columns,
+        "rows": board.pattern.rows,
+        "square_m": board.pattern.square,
+        "origin_m": board.pattern.origin,
+    }
+    stated = {"name": board.name, "edges": board.edges, "features": board.features}
+    return plain(stated | {"corners_m": board.corners, "pattern": pattern})
 
 
 def board_from_json(data: dict) -> Board:
@@ -375,6 +385,8 @@ class LrfInfo:
         maker's data sheet.
     systematic_error : float or None
         Largest offset of all ranges that the maker admits, metres.
+    step_error : float or None
+        Standard deviation of the stated angular step, a fraction of it.
     """
 
     model: str
@@ -385,6 +397,9 @@ class LrfInfo:
     range_resolution: Annotated[FiniteFloat, Field(alias="range_resolution_m")] = 0.001
     max_range: Annotated[Endless, Field(alias="max_range_m")] = math.inf
     systematic_error: Annotated[Positive | None, Field(alias="systematic_error_m")] = None
+    step_error: Annotated[
+        FiniteFloat | None, Field(alias="angular_step_relative", ge=0, le=0.1)
+    ] = None
     spot_exit: Annotated[FiniteFloat | None, Field(alias="spot_exit_m", gt=0, le=0.2)] = (
         None
     )
@@ -395,12 +410,25 @@ class LrfInfo:
     @property
     def admitted_offset(self) -> float:
         """The largest range offset that the maker admits, metres: stated, or known, or assumed."""
-        known = [value for name, value in SYSTEMATIC_ERROR.items() if name in self.model]
-        if not known or self.range_resolution > 0.005:
-            known = [
-                ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)
-            ]
-        return self.systematic_error or known[0]
+        assumed = ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)
+        if self.range_resolution <= 0.005:
+            for name, value in SYSTEMATIC_ERROR.items():
+                if name in self.model:
+                    assumed = value
+        return self.systematic_error or assumed
+
+    @property
+    def step_sigma(self) -> float:
+        """Standard deviation of the angular step, a fraction: stated, or none where the model has
+        such a step, or assumed.
+        """
+        if self.step_error is not None:
+            return self.step_error
+        for name, steps in BEARING_STEPS.items():
+            ratio = np.degrees(self.bearing_step) / np.array(steps)
+            if name in self.model and np.abs(ratio - 1).min() < SAME_STEP:
+                return 0.0
+        return ASSUMED_STEP_ERROR
 
     def spot_radius(self, distance: ArrayLike) -> np.ndarray:
         """Radius of the spot, metres; ASSUMED_SPOT_RADIUS everywhere where the spot is not stated.
@@ -567,10 +595,12 @@ def parse_session(data: dict, kind: type = SessionStated) -> dict:
     found = dict(from_json(kind, data))
     rig = dict(found.pop("rig"))
     platform = rig.pop("platform")
-    sigma = platform.sigma_direction, platform.sigma_offset
-    of_platform = {
-        "T_head_lrf": platform.T_head_lrf,
-        "platform_sigma": sigma,
-        "continuous": platform.continuous,
-    }
-    return found | rig | of_platform
+    return (
+        found
+        | rig
+        | {
+            "T_head_lrf": platform.T_head_lrf,
+            "platform_sigma": (platform.sigma_direction, platform.sigma_offset),
+            "continuous": platform.continuous,
+        }
+    )

@@ -4,7 +4,7 @@ import csv
 from os import PathLike
 from pathlib import Path
 
-from lrfcal_lib.session.stated import LARGEST_TEXT, SPLIT, SessionError, read_bytes, reading
+from lrfcal_lib.session.files import LARGEST_TEXT, SPLIT, SessionError, read_bytes, reading
 
 MOST_ROWS = 200_000
 WHOLE_COLUMNS = {"placement", "offset", "length"}  # of tables, which hold whole numbers
@@ -39,9 +39,10 @@ def read_table(
                 f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}"
             )
         rows = list(csv.reader(lines))
-    if not rows or tuple(rows[0]) != columns:
-        got = ", ".join(rows[0]) if rows else "an empty file"
-        if rows and tuple(rows[0]) == ("", *columns):
+    header = tuple(rows[0]) if rows else ("an empty file",)
+    if header != columns:
+        got = ", ".join(header)
+        if header == ("", *columns):
             got = (
                 "a first column without a name: write the table without row numbers (index=False "
                 "in pandas)"

@@ -7,7 +7,6 @@ import math
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import cv2
@@ -32,17 +31,6 @@ def new_session_path() -> Path:
     return Path(folder, time.strftime("%Y-%m-%d_%H%M%S")).absolute()
 
 
-@dataclass(frozen=True)
-class About:
-    """What a session says besides its rig, see :class:`lrfcal_lib.session.read.Session`."""
-
-    name: str | None = None  # that of its folder by default
-    licence: str = ""
-    source: str = ""
-    simulated: bool = False
-    reference: dict = field(default_factory=dict)
-
-
 class SessionWriter:
     """Write a session so that a crash loses at most what was being written.
 
@@ -58,7 +46,8 @@ class SessionWriter:
     board, lrf, cameras, T_head_lrf, platform_sigma, continuous
         See :class:`lrfcal_lib.session.read.Session`.
     **about
-        Fields of :class:`About`.
+        What a Session says besides its rig: name (by default that of its folder), licence, source,
+        simulated, reference.
 
     Raises
     ------
@@ -89,12 +78,19 @@ class SessionWriter:
         self.parts = 0  # files of sweeps so far
         self.shots = dict.fromkeys(self.cameras, 0)  # images so far, by camera
         self.telegrams = self.path / "lrf" / "telegrams.bin"
-        words = asdict(About(**about))
-        reference = words.pop("reference") or {}
+        words = {
+            "name": self.path.resolve().name,
+            "licence": "",
+            "source": "",
+            "simulated": False,
+            "reference": {},
+        }
+        if not about.keys() <= words.keys():
+            raise TypeError(f"a session has {short(words)}, got {short(about)}")
         self.data = {
             "schema": stated.SCHEMA,
             **words,
-            "name": words["name"] or self.path.resolve().name,
+            **about,
             "board": stated.board_to_json(board),
             "rig": {
                 "lrf": stated.lrf_to_json(lrf),
@@ -104,7 +100,6 @@ class SessionWriter:
                 },
             },
             "placements": [],
-            "reference": reference,
         }
         with naming(self.path):
             stated.parse_session(json.loads(json.dumps(self.data)))
@@ -302,11 +297,9 @@ class SessionWriter:
         SessionError
             For an unknown camera or purpose, or an image of another size than the camera's.
         """
-        if camera not in self.cameras or purpose not in read.PURPOSES:
-            known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
-            raise SessionError(
-                f"{self.path}: camera '{camera}', purpose '{purpose}': {known}"
-            )
+        with naming(self.path):
+            read.known(camera, self.cameras, "camera")
+            read.known(purpose, read.PURPOSES, "purpose")
         what: str | os.PathLike = f"camera '{camera}'"
         if isinstance(image, np.ndarray):
             content = cv2.imencode(".png", image)[1].tobytes()
@@ -321,8 +314,8 @@ class SessionWriter:
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
         self._write(name, content)
         self._note_placement(placement)
-        number = number_cell(placement)
-        row = [cell(time_s), camera, name, number, cell(math.degrees(pitch)), purpose]
+        angle = cell(math.degrees(pitch))
+        row = [cell(time_s), camera, name, number_cell(placement), angle, purpose]
         self._append_rows("images.csv", [row])
 
 

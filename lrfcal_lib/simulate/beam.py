@@ -9,7 +9,7 @@ from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.geometry import tilt
-from lrfcal_lib.session.lms2xx_codec import MODES, REASONS, encode_values
+from lrfcal_lib.session.lms2xx_codec import REASONS, encode_values, largest
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.scene import World, need
 
@@ -105,7 +105,7 @@ class Beam:
             math.radians(self.resolution / 100),
             self.sigma_range,
             range_resolution=self.unit,
-            max_range=MODES[0].largest * self.unit,
+            max_range=largest(0) * self.unit,
             spot_exit=self.spot_exit,
             spot_divergence=self.divergence,
         )

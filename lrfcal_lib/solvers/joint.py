@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
+from lrfcal_lib.fit.covariance import RANK
 from lrfcal_lib.fit.least_squares import solve
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
@@ -51,6 +52,7 @@ FIRST_STEPS = 60
 NOISE_ROUNDS = 10
 ROUND_STEPS = 10
 LAST_STEP = 1e-4  # standard deviations: a shorter step ends the whole
+STEP = 1e-4  # of the numeric derivative by the angular step, a fraction of it
 # a direction whose standard deviation exceeds this (rad, m) is called unobservable
 UNSEEN = 0.5
 
@@ -78,6 +80,9 @@ class JointSettings:
         Their expected standard deviations, radians and fraction.
     lapse : float
         Share of edge beams expected to say nothing.
+    step_sigma : float
+        Standard deviation of the angular step of the beams, a fraction of it. It is no unknown; the
+        covariance has what it does to the result.
     noise : {'stated', 'estimate'}
         Estimate the noise levels (ranges, images, pitch, sides, repetition of errors among
         neighbours) from the residuals, and leave out placements and images that contradict all
@@ -96,6 +101,7 @@ class JointSettings:
     sweep: str = "none"
     sweep_sigma: tuple[float, float] = Levels.sweep_sigma
     lapse: float = 0.0
+    step_sigma: float = 0.0
     noise: str = "stated"
 
     def __post_init__(self):
@@ -148,7 +154,7 @@ def solve_joint(
         raise DegenerateGeometry("no placement to calibrate with")
     obs, left_out = without_blind_cameras(obs, required)
     unknowns = chosen.unknowns(obs)
-    levels = Levels(sweep_sigma=chosen.sweep_sigma)
+    levels = Levels(sweep_sigma=chosen.sweep_sigma, step_sigma=chosen.step_sigma)
     if start is None:
         obs, lost = without_lost_placements(obs)
         best = best_start(obs, unknowns, levels)
@@ -244,7 +250,7 @@ def finished(obs, state, data, unknowns, required):
         covariance_placements=by_placements,
     )
     squares = misfits(named_blocks(found.state, data, unknowns), data)
-    return JointSolution(
+    solution = JointSolution(
         found,
         obs,
         data,
@@ -253,7 +259,32 @@ def finished(obs, state, data, unknowns, required):
         misfit=dict(zip(obs.placements.tolist(), squares.tolist(), strict=True)),
         lens=lens.covariance,
         lens_scale=lens.scatter,
+        step=np.zeros(unknowns.shared),
     )
+    return with_step_error(solution)
+
+
+def with_step_error(solution: JointSolution) -> JointSolution:
+    """The solution with what errors of the angular step do to it in its covariances."""
+    sigma = solution.data.levels.step_sigma
+    if sigma == 0:
+        return solution
+    changed = gather(solution.observations.stretched(STEP), solution.data.levels)
+    here = solution.score()
+    pull = replace(solution, data=changed).score().gradient - here.gradient
+    free = np.linalg.pinv(here.information.sum(axis=0), rcond=RANK, hermitian=True)
+    moved = -free @ pull.sum(axis=0) / STEP * sigma
+    spread = np.outer(moved, moved)
+    estimate = solution.solution
+    by_placements = estimate.covariance_placements
+    if by_placements is not None:
+        by_placements = by_placements + spread
+    estimate = replace(
+        estimate,
+        covariance=estimate.covariance + spread,
+        covariance_placements=by_placements,
+    )
+    return replace(solution, solution=estimate, step=moved)
 
 
 def parameters_of(state: JointState, unknowns: Unknowns) -> np.ndarray:

@@ -141,6 +141,8 @@ class Levels:
         Scale of the sides' deviations of the log odds, Student's t.
     prior : PlatformPrior or None
         The stated platform, which yields where the data contradict it.
+    step_sigma : float
+        Standard deviation of the angular step of the beams, a fraction of it.
     """
 
     face_scale: float = 1.0
@@ -152,6 +154,7 @@ class Levels:
     sweep_sigma: tuple[float, float] = (np.radians(0.5), 0.05)
     side_sigma: float = 0.35
     prior: PlatformPrior | None = None
+    step_sigma: float = 0.0
 
 
 @dataclass(frozen=True)

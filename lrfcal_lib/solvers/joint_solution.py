@@ -76,6 +76,9 @@ class JointSolution:
     lens_scale : float
         By how much errors of the intrinsics let board poses in images scatter, in stated standard
         deviations.
+    step : ndarray, shape (c,)
+        What one standard deviation of the angular step does to the shared unknowns; in the
+        covariances.
     """
 
     solution: Solution
@@ -86,6 +89,7 @@ class JointSolution:
     misfit: dict[int, float]
     lens: np.ndarray
     lens_scale: float
+    step: np.ndarray
 
     @property
     def excluded_placements(self) -> dict[int, str]:
