@@ -14,9 +14,9 @@ def run(args):
             return import_recording(args)
         case "check":
             return check(args)
-        case "calibrate":
-            return calibrate(args)
-        case "compare" | "reconstruct" | "merge" | "measure":
+        case "calibrate" | "reconstruct" | "merge":
+            return use_sessions(args)
+        case "compare" | "measure":
             return use_calibrations(args)
         case "simulate":
             from lrfcal_lib.session.workers import side_by_side
@@ -29,6 +29,8 @@ def run(args):
         case "record":
             return record(args)
         case "report":
+            if args.scheduler is not None:
+                return use_sessions(args)
             from lrfcal_lib.report.report import main
 
             return main(args.sessions, args.out, args.jobs, args.store)
@@ -51,16 +53,6 @@ def use_calibrations(args):
             from lrfcal_lib.report.compare import compare_files
 
             return compare_files(args.calibrations, args.figure)
-        case "reconstruct":
-            from lrfcal_lib.report.reconstruct import reconstruct_session
-
-            return reconstruct_session(
-                args.session, args.calibration, args.out, args.untrusted
-            )
-        case "merge":
-            from lrfcal_lib.report.merge import merge_session
-
-            return merge_session(args.session, args.calibration, args.out, args.untrusted)
         case "measure":
             from lrfcal_lib.report.measure import measure_session
 
@@ -100,12 +92,24 @@ def import_recording(args):
     print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
 
 
-def calibrate(args):
-    """Calibrate the rigs of sessions, on the cores of this machine or a cluster."""
-    from lrfcal_lib.report.calibrate import calibrate_session
+def use_sessions(args):
+    """Do what a verb asks for with each of some sessions, here or on a cluster."""
+    from functools import partial
+
     from lrfcal_lib.report.many import each_session
 
-    return each_session(calibrate_session, args.sessions, args.out, args.scheduler)
+    match args.verb:
+        case "calibrate":
+            from lrfcal_lib.report.calibrate import calibrate_session as work
+        case "report":
+            from lrfcal_lib.report.report import report_session as work
+        case "reconstruct":
+            from lrfcal_lib.report.reconstruct import reconstruct_session as work
+        case "merge":
+            from lrfcal_lib.report.merge import merge_session as work
+    if args.verb in ("reconstruct", "merge"):
+        work = partial(work, calibration=args.calibration, untrusted=args.untrusted)
+    return each_session(work, args.sessions, args.out, args.scheduler)
 
 
 def check(args):
@@ -209,7 +213,9 @@ def _add_sessions(verbs):
     simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
     simulate.add_argument("dst", help="folder of the new session")
 
-    calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session, or of many")
+    calibrate = verbs.add_parser(
+        "calibrate", help="calibrate the rig of a session, or of many"
+    )
     calibrate.add_argument("sessions", nargs="+", metavar="session")
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
@@ -234,7 +240,9 @@ def _add_sessions(verbs):
 
 def _add_scene(verb):
     """What the use of a calibration on a scene takes."""
-    verb.add_argument("session", help="as 'record --scene' recorded it")
+    verb.add_argument(
+        "sessions", nargs="+", metavar="session", help="as 'record --scene' recorded it"
+    )
     verb.add_argument("--calibration", required=True, help="calibration.json")
     verb.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
@@ -244,6 +252,7 @@ def _add_scene(verb):
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",
     )
+    _add_scheduler(verb)
 
 
 def _add_measure(verbs):
@@ -342,8 +351,9 @@ def _add_report(verbs):
     report.add_argument(
         "--store",
         action="store_true",
-        help="store the executed notebooks instead of a report",
+        help="store the executed notebooks instead of a report, always here",
     )
+    _add_scheduler(report)
 
 
 def _add_study(verbs):

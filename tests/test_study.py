@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import binom
 from shared import QUICK, ROOT
 
 from lrfcal_lib.__main__ import main
@@ -25,7 +26,12 @@ from lrfcal_lib.evaluate.study import (
     tasks_of,
     variations,
 )
-from lrfcal_lib.evaluate.study_trials import STUDIED, crossing_observations, run_task
+from lrfcal_lib.evaluate.study_trials import (
+    BATCHED,
+    STUDIED,
+    crossing_observations,
+    run_task,
+)
 from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.session import cluster
@@ -158,6 +164,14 @@ def test_errors_fall_with_noise_and_the_joint_estimate_keeps_to_its_bound():
     assert joint.rotation_deg_known <= joint.rotation_deg_bound
 
 
+def test_every_method_solves_every_kind_of_target():
+    boards = run_study("indoor_lms200", n_poses=(10,), trials=2)
+    assert list(boards.method) == list(STUDIED) and (boards.failed == 0).all()
+    assert boards.rotation_deg.max() < 10 and boards.coverage.notna().all()
+    corners = run_study("corner_calib_edge", tuple(BATCHED), (20,), 2)
+    assert (corners.failed == 0).all() and corners.coverage.isna().all(), "it has no bound"
+
+
 def test_failures_are_counted_and_named():
     rows = pd.DataFrame(
         [
@@ -260,12 +274,62 @@ def test_a_file_that_is_of_no_study_is_refused(small, tmp_path):
         study_to_file(small, tmp_path / "a.csv")
 
 
-def test_what_is_stored_is_of_the_scenarios_that_there_are():
-    table = pd.read_csv(ROOT / "data" / "studies" / "methods.csv")
-    assert set(table.scenario) <= set(FILE) and set(table.method) == set(STUDIED)
-    assert (
-        table.groupby(["scenario", "method"]).n_poses.agg(list).map(tuple) == COUNTS
-    ).all()
+# what is stored
+
+
+def stored(name):
+    return pd.read_csv(ROOT / "data" / "studies" / f"{name}.csv")
+
+
+def test_what_is_stored_is_of_the_scenarios_and_methods_that_there_are():
+    table = stored("methods")
+    assert set(table.scenario) < set(FILE) and len(set(table.scenario)) == 7
+    assert set(table.method) == set(STUDIED)
+    assert (table.groupby(["scenario", "method"]).n_poses.agg(tuple) == COUNTS).all()
+
+
+def test_the_stored_joint_estimates_keep_to_the_bound_in_every_scenario():
+    """With ten placements and more, within the scatter of so many trials."""
+    table = stored("methods").query("method == 'joint' and n_poses > 5")
+    for name, part in table.groupby("scenario"):
+        square = part.rmse_over_bound**2
+        scatter = (part.rmse_over_bound_high**2 - square).pow(2).sum() ** 0.5 / len(part)
+        assert square.mean() - 1.5 * scatter < 1.05**2, name
+        count = 3 * part.trials.sum()  # six numbers of a pose are worth about three
+        least, most = binom.ppf([0.001, 0.999], count, [0.86, 0.94]) / count
+        assert least <= part.coverage.mean() <= most, name
+
+
+PUBLISHED = [  # medians of the stored trials of 2015, from 20 poses on
+    ("methods", "corner_calib_2015", "zhang_pless_printed",
+     {20: (0.621, 13.7), 50: (0.401, 8.1), 100: (0.278, 5.05)}),
+    ("corner_calib_edge", "corner_calib_edge", "line_printed",
+     {20: (1.206, 50.3), 50: (0.615, 22.7), 100: (0.398, 14.7)}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("file", "scenario", "method", "published"), PUBLISHED)
+def test_stored_medians_are_within_a_quarter_of_the_published_ones(
+    file, scenario, method, published
+):
+    rows = stored(file).query("scenario == @scenario and method == @method")
+    for count, theirs in published.items():
+        ours = rows.set_index("n_poses").loc[count]
+        for column, value in zip(("rotation_deg", "translation_mm"), theirs, strict=True):
+            assert ours[f"{column}_low"] < 1.25 * value, (count, column)
+            assert ours[f"{column}_high"] > 0.75 * value, (count, column)
+
+
+def test_the_stored_orientation_of_2004_is_within_a_quarter_of_a_degree():
+    ours = stored("zhang_pless_2004").set_index("n_poses").rotation_deg_mean
+    for count, published in {10: 1.39, 15: 1.03, 20: 0.87, 24: 0.76}.items():
+        assert abs(ours[count] - published) < 0.25
+
+
+def test_a_large_triangle_beats_the_best_of_2015():
+    one, ten = stored("corner_calib_triangle").sort_values("scenario").itertuples()
+    assert one.rotation_deg <= 0.18 and one.translation_mm <= 6
+    assert ten.rotation_deg < 0.22 and ten.translation_mm < 3.7
 
 
 # a cluster

@@ -46,7 +46,6 @@ PLANES: dict[str, dict] = {
         "method": "zhang_pless",
         "T0": None,
         "robust": True,
-        "scale": "auto",
     },
 }
 STUDIED = (*BATCHED, *PLANES, "joint")

@@ -1,6 +1,7 @@
 """What a command does with sessions, here or on a cluster."""
 
 import io
+import os
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from functools import partial
@@ -22,8 +23,7 @@ def each_session(
     Parameters
     ----------
     work : callable
-        ``work(session, out=folder)``, an exit code; None for the usual folder, ``reports/<name>``
-        under the current one.
+        ``work(session, out=folder)``, an exit code.
     sessions : sequence of path-like
         Workers of a cluster see them, and write, under the same path as this machine.
     out : path-like, optional
@@ -47,22 +47,24 @@ def each_session(
     if scheduler is None:
         with side_by_side():
             return max(work(session, out=out) for session in sessions)
-    paths = [Path(session).resolve() for session in sessions]
-    folders = [Path(out or Path("reports") / path.name).resolve() for path in paths]
+    if not sessions:
+        raise ValueError("name the sessions that the cluster works on")
     worst = 0
     with workers_at(scheduler) as executor:
-        for code, words in executor.map(partial(_said, work), paths, folders):
+        there = partial(_said, partial(work, out=out), Path.cwd())
+        for code, words in executor.map(there, sessions):
             print(words, end="", flush=True)
             worst = max(worst, code)
     return worst
 
 
-def _said(work, path, folder):
-    """The exit code of a session and what was printed."""
+def _said(work, folder, session):
+    """The exit code of a session and what was printed, as in a folder."""
+    os.chdir(folder)
     with redirect_stdout(io.StringIO()) as words:
-        print(f"{path}:")
+        print(f"{session}:")
         try:
-            code = work(path, out=folder)
+            code = work(session)
         except ValueError as error:
             print(f"error: {error}")
             code = 1

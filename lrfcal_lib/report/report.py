@@ -216,7 +216,7 @@ def main(sessions=(), out=None, jobs=2, stored=False):
     try:
         sessions = [Path(path) for path in sessions] or [SHIPPED]
         return max(
-            _store_all(session) if stored else _report(session, out, jobs)
+            _store_all(session) if stored else report_session(session, out, jobs)
             for session in sessions
         )
     except SessionError as problem:
@@ -241,8 +241,12 @@ def _stop(number, frame):
     raise KeyboardInterrupt(number)
 
 
-def _report(session, out, jobs):
+def report_session(
+    session: str | Path, out: str | Path | None = None, jobs: int = 2
+) -> int:
+    """Write the report of a session and say so: 0, or 1 if a notebook failed."""
     begin = time.monotonic()
+    session = Path(session)
     out = Path(out or ROOT / "reports" / session.resolve().name).resolve()
     runs = make_report(session, out, jobs)
     failed = [run for run in runs if run.error]
