@@ -484,7 +484,7 @@ REFUSED = [
     (
         "add_image",
         ("up", pixels()),
-        "camera 'up', purpose 'board': cameras are left, right",
+        "camera is one of left, right, got 'up'",
     ),
     (
         "add_image",
