@@ -80,28 +80,34 @@ data: setup
 	rmdir data/.new
 	cd data && find $(SIMULATED) -type f | LC_ALL=C sort | xargs sha256sum > SHA256SUMS
 
-# one or two things varied of a set-up, twenty placements
+# one or two things varied of a set-up at twenty placements, published set-ups, and the study of all methods
 STUDY := $(RUN) -m lrfcal_lib study
-OUTDOOR := $(STUDY) outdoor_lms221 --poses 20 --methods line zhang_pless joint --trials 10
-MAP := $(STUDY) --poses 20 --methods line_printed line zhang_pless joint --trials 10 \
-	--vary spot_mm=4,16,48 --vary step_deg=0.125,0.25,0.5,1
+AT_20 := $(STUDY) --poses 20 --trials 20
+OUTDOOR := $(AT_20) outdoor_lms221 --methods line zhang_pless joint
+RULES := --methods line_printed line zhang_pless joint
+MAP := --vary spot_mm=4,16,48 --vary step_deg=0.125,0.25,0.5,1
 studies: setup
-	$(STUDY) zhang_pless_2004 --poses 6 10 15 20 24 --methods zhang_pless_printed zhang_pless --trials 60 \
+	$(STUDY) zhang_pless_2004 --poses 6 10 15 20 24 --methods zhang_pless_printed --trials 400 \
 		--out data/studies/zhang_pless_2004.csv
-	$(STUDY) corner_calib_2015 --poses 10 20 50 --methods zhang_pless_printed zhang_pless --trials 60 \
-		--out data/studies/corner_calib_2015.csv
-	$(MAP) paper_rig --out data/studies/map_paper_rig.csv
-	$(MAP) outdoor_lms221 --out data/studies/map_outdoor_lms221.csv
+	$(STUDY) corner_calib_edge --methods line_printed --trials 200 --out data/studies/corner_calib_edge.csv
+	$(STUDY) corner_calib_triangle corner_calib_triangle_scans --poses 20 --methods joint --trials 100 \
+		--out data/studies/corner_calib_triangle.csv
+	$(AT_20) outdoor_lms221 $(RULES) --vary step_deg=0.25,0.5 --vary bias=-0.5,-0.25,0,0.25,0.5 \
+		--out data/studies/edge_rules.csv
+	$(AT_20) paper_rig outdoor_lms221 $(RULES) --vary spread=0,0.3 --vary step_deg=0.25,0.5,1 \
+		--out data/studies/backgrounds.csv
+	$(AT_20) paper_rig $(RULES) $(MAP) --out data/studies/map_paper_rig.csv
+	$(AT_20) outdoor_lms221 $(RULES) $(MAP) --out data/studies/map_outdoor_lms221.csv
 	$(OUTDOOR) --vary range_noise_mm=2.5,10,40 --out data/studies/range_noise.csv
 	$(OUTDOOR) --vary pixel_noise_px=0.1,0.5,2 --out data/studies/pixel_noise.csv
 	$(OUTDOOR) --vary step_deg=0.125,0.25,0.5 --out data/studies/step.csv
 	$(OUTDOOR) --vary spot_mm=5,20,60 --out data/studies/spot.csv
 	$(OUTDOOR) --vary board_scale=0.7,1,2 --out data/studies/board_size.csv
 	$(OUTDOOR) --vary lean_deg=5,15,35 --out data/studies/pose_spread.csv
-	$(STUDY) outdoor_lms221 --poses 20 --methods line zhang_pless three_planes --trials 20 \
-		--vary start_deg=1,10,20,40,80 --out data/studies/start_error.csv
-	$(STUDY) paper_rig zhang_pless_2004 corner_calib_2015 indoor_lms200 outdoor_lms221 hokuyo_head pan_scanner \
-		--poses 5 10 20 50 --trials 10 --out data/studies/methods.csv
+	$(AT_20) outdoor_lms221 --methods line zhang_pless three_planes --vary start_deg=1,10,20,40,80 \
+		--out data/studies/start_error.csv
+	$(STUDY) paper_rig zhang_pless_2004 corner_calib_2015 indoor_lms200 outdoor_lms221 hokuyo_head pan_scanner --trials 200 \
+		--out data/studies/methods.csv
 
 picture: export TESTS := 1
 picture: setup

@@ -19,10 +19,12 @@ def run(args):
         case "compare" | "reconstruct" | "merge" | "measure":
             return use_calibrations(args)
         case "simulate":
+            from lrfcal_lib.session.workers import side_by_side
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
 
-            simulate(args.dst, load_setup(args.setup), workers=args.workers)
+            with side_by_side():
+                simulate(args.dst, load_setup(args.setup))
             print(f"{args.dst}: simulated")
         case "record":
             return record(args)
@@ -99,16 +101,11 @@ def import_recording(args):
 
 
 def calibrate(args):
-    """Calibrate the rig of a session, on the cores of this machine or a cluster."""
+    """Calibrate the rigs of sessions, on the cores of this machine or a cluster."""
     from lrfcal_lib.report.calibrate import calibrate_session
-    from lrfcal_lib.session.cluster import workers_at
-    from lrfcal_lib.session.workers import side_by_side
+    from lrfcal_lib.report.many import each_session
 
-    if args.scheduler is None:
-        with side_by_side():
-            return calibrate_session(args.session, args.out)
-    with workers_at(args.scheduler) as executor, side_by_side(executor):
-        return calibrate_session(args.session, args.out)
+    return each_session(calibrate_session, args.sessions, args.out, args.scheduler)
 
 
 def check(args):
@@ -211,12 +208,9 @@ def _add_sessions(verbs):
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
     simulate.add_argument("dst", help="folder of the new session")
-    simulate.add_argument(
-        "--workers", type=int, default=2, help="processes that render images (default 2)"
-    )
 
-    calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
-    calibrate.add_argument("session")
+    calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session, or of many")
+    calibrate.add_argument("sessions", nargs="+", metavar="session")
     calibrate.add_argument(
         "--out", help="folder of its files (default reports/<session> under this folder)"
     )
@@ -259,7 +253,7 @@ def _add_measure(verbs):
     _add_scene(measure, "CSV with the lengths (default reports/<session>/lengths.csv)")
     measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
     measure.add_argument(
-        "--station", type=int, help="whose scene.html, if there are several"
+        "--station", type=int, help="whose scene.html it was (default: that of 'merge')"
     )
 
 

@@ -59,6 +59,7 @@ def true_rig(session):
         names=tuple(names),
         covariance=covariance,
         trusted=covariance,
+        lens=np.zeros_like(covariance),
         unseen_of_cloud=nothing,
         unseen_of_cameras=dict.fromkeys(cameras, nothing),
         sweep_sigma=(0.0, 0.0),

@@ -1,5 +1,6 @@
 """The notebooks, and how tests run them under nbval."""
 
+import ast
 import contextlib
 import io
 import os
@@ -17,7 +18,8 @@ import pandas as pd
 import pytest
 from shared import ROOT, stages
 
-from lrfcal_lib.report.notebook import asked, report_file, save
+from lrfcal_lib.report import notebook
+from lrfcal_lib.report.notebook import report_file, save
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.write import RECORDINGS
 
@@ -97,15 +99,10 @@ def run_nbval(path, report):
 def run_plainly(path, session, folder, report, *, drawn=True):
     """Run the cells of a notebook on a session in this process, without a kernel; what it printed.
 
-    After them the solutions of its exercises. Where nothing else can be asked it ends there. Its figures, if they are
+    After them the solutions of its exercises. Its figures, if they are
     drawn, must be legible, with titles and units. Of its files only the tables are written.
     """
-    ended = []
     complaints = []
-
-    def heard(possible, why, *, rest=False):
-        ended.extend([why] * bool(rest and not possible))
-        return asked(possible, why)
 
     def tables_only(name):
         return report_file(name) if name.startswith("tables/") else None
@@ -128,15 +125,17 @@ def run_plainly(path, session, folder, report, *, drawn=True):
             if drawn
             else lambda fig, *args, **options: plt.close(fig)
         )
+        patch.setattr("lrfcal_lib.report.notebook._lacking", set())
         patch.setattr("lrfcal_lib.report.notebook.save", shown)
-        patch.setattr("lrfcal_lib.report.notebook.asked", heard)
         patch.setattr("lrfcal_lib.report.notebook.report_file", tables_only)
-        for number, cell in enumerate(code_cells(read(path))):
-            if ended:
-                break
-            exec(compile(cell.source, f"{path.stem}, code cell {number}", "exec"), names)
-        for number, code in enumerate([] if ended else solutions(path), start=1):
-            exec(compile(code, f"{path.stem}, solution {number}", "exec"), names)
+        codes = {
+            f"code cell {n}": cell.source for n, cell in enumerate(code_cells(read(path)))
+        }
+        codes |= {f"solution {n}": code for n, code in enumerate(solutions(path), start=1)}
+        sections = notebook.Sections()
+        for name, code in codes.items():
+            tree = sections.visit(ast.parse(code))
+            exec(compile(tree, f"{path.stem}, {name}", "exec"), names)
     assert not complaints, "\n".join(complaints)
     return told.getvalue()
 

@@ -9,14 +9,12 @@ from joint_draws import draw, rng
 from scipy.spatial.transform import Rotation
 from shared import campaign
 
-from lrfcal_lib.judge import alternatives
+from lrfcal_lib.evaluate.monte_carlo import state_errors
 from lrfcal_lib.judge.alternatives import (
     ALTERNATIVES,
-    HELD,
     alternatives_of,
     doubtful,
-    not_an_offset,
-    step_not_told,
+    step_words,
     weigh,
 )
 from lrfcal_lib.judge.lens import lens_findings
@@ -30,11 +28,11 @@ PATTERN = Chessboard(9, 5, 0.036, (0.1, 0.1))
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 
-def solved(seed, change=lambda obs: obs, **settings):
+def solved(seed, change=lambda obs: obs, step_sigma=0.0, **settings):
     obs, _, rig = draw(rng(seed), 12, **settings)
-    return solve_joint(
-        change(obs), rig.T_head_lrf, sensor=SENSOR, noise="estimate", required=False
-    )
+    obs = change(replace(obs, T_head_lrf=rig.T_head_lrf))
+    asked = {"sensor": SENSOR, "noise": "estimate", "step_sigma": step_sigma}
+    return solve_joint(obs, required=False, **asked)
 
 
 @pytest.mark.parametrize(
@@ -104,46 +102,31 @@ def test_an_outline_that_the_images_measured_is_no_statement():
 
 @pytest.mark.parametrize(("value", "mount"), [(0.03, "head"), (-0.03, "platform")])
 def test_an_angular_step_that_is_off_is_no_range_offset(value, mount):
-    solution = solved(
-        7, lambda obs: ALTERNATIVES["bearings"].change(obs, value), mount=mount
+    best = doubtful(solved(7, lambda obs: obs.stretched(value), mount=mount), ADMITTED)[0]
+    assert best.kind == "bearings" and "check the angular step" in best.words
+    assert best.value == pytest.approx(-value, abs=5 * best.sigma)
+
+
+@pytest.mark.parametrize(("mount", "least"), [("head", 1.5), ("platform", 0.5)])
+def test_what_errors_of_the_step_do_is_what_another_estimate_finds(mount, least):
+    obs, _, rig = draw(rng(1), 12, mount=mount)
+    obs = replace(obs, T_head_lrf=rig.T_head_lrf)
+    known, open_step, stretched = (
+        solve_joint(at, sensor=SENSOR, step_sigma=sigma)
+        for at, sigma in ((obs, 0.0), (obs, 0.004), (obs.stretched(0.004), 0.0))
     )
-    found = not_an_offset(solution, ADMITTED)
-    assert found.value == pytest.approx(-value, abs=0.25 * abs(value) + 5 * found.sigma)
-    assert (
-        "check the angular step" in found.words
-        and "instead of a range offset" in found.words
-    )
+    moved = state_errors(stretched.state, known.state, known.unknowns)
+    sigma = known.solution.sigma
+    np.testing.assert_allclose(open_step.step / sigma, moved / sigma, atol=0.1)
+    assert np.abs(moved / sigma).max() > least
+    spread = open_step.solution.covariance - known.solution.covariance
+    np.testing.assert_allclose(spread, np.outer(open_step.step, open_step.step), atol=1e-12)
 
 
-@pytest.mark.parametrize(("offset", "mount"), [(0.03, "platform"), (0.06, "head")])
-def test_a_range_offset_is_no_angular_step(offset, mount):
-    solution = solved(
-        7, lambda obs: replace(obs, face_range=obs.face_range + offset), mount=mount
-    )
-    assert not_an_offset(solution, ADMITTED) is None
-
-
-@pytest.mark.parametrize(("mount", "told"), [("head", False), ("platform", True)])
-def test_a_step_that_the_data_cannot_tell_is_said_where_the_result_hangs_on_it(mount, told):
-    """Cameras on the head: 1 % is off by six standard deviations, and explained as well by an offset of 11 mm."""
-    words = step_not_told(solved(1, mount=mount), ADMITTED)
-    assert (words == "") is told
-    assert told or "taken as stated: these data determine it only to " in words
-
-
-def test_what_bearings_explain_alone_must_not_be_contradicted_where_both_are_free(
-    monkeypatch,
-):
-    """An offset of 18 mm that a maker admits looked like bearings 1.4 % too large in 2 of 24 honest sessions."""
-    solution = solved(7, lambda obs: ALTERNATIVES["bearings"].change(obs, 0.03))
-    told = weigh(solution, ADMITTED)
-    free = next(doubt for doubt in told if doubt.kind == "bearings")
-    away = replace(free, value=free.value + 0.02, sigma=0.004)
-    answers = {ADMITTED: [away], HELD: weigh(solution, HELD)}
-    monkeypatch.setattr(
-        alternatives, "weigh", lambda solution, admitted, stated: answers[admitted]
-    )
-    assert not_an_offset(solution, ADMITTED) is None
+@pytest.mark.parametrize(("step_sigma", "said"), [(0.0, False), (0.0058, True)])
+def test_a_step_that_makes_up_most_of_the_errors_is_said(step_sigma, said):
+    words = step_words(solved(1, step_sigma=step_sigma))
+    assert ("angular_step_relative" in words) is said
 
 
 def fisheye_views(field_deg, count, rng, size=(640, 480)):

@@ -29,7 +29,6 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.model.camera import line_distance, project, undistort
 from lrfcal_lib.preprocess.board_in_image import (
     BoardView,
-    mirrored_pose,
     order_scores,
     pose_with_edges,
     view_board,
@@ -86,23 +85,6 @@ def test_corners_and_edges_together_are_better_and_know_how_much():
         assert smaller or turned(view.T_camera_board, pose) > 0.05
     assert 0.5 < np.mean(chi2) < 1.5
     assert np.all(np.median(both, axis=0) < np.median(alone, axis=0))
-
-
-def test_edges_tell_a_pose_from_its_mirror_in_depth():
-    wrong = mirrored_pose(FAR, PATTERN)
-    assert turned(wrong, FAR) > 0.2
-    np.testing.assert_allclose(
-        mirrored_pose(wrong, PATTERN).as_matrix(), FAR.as_matrix(), atol=1e-12
-    )
-    view = replace(
-        far_view(0.05, 1), T_camera_board=wrong, covariance=np.diag([1e-4] * 3 + [1e-6] * 3)
-    )
-    assert (
-        turned(
-            pose_with_edges(replace(view, edges=noisy_edges(FAR, 2)), SHEET, MODEL)[0], FAR
-        )
-        < 0.05
-    )
 
 
 def test_an_edge_that_contradicts_the_corners_is_left_out():

@@ -101,7 +101,7 @@ DAMAGED = {  # what stands in the file: where, value, what is said
     "a session": (("kind",), None, "is no calibration"),
     "a skewed rotation": (("cameras", "left", "matrix", 0, 0), 0.5, "no rotation"),
     "a mirrored rotation": (("cameras", "left", "matrix"), np.diag([1, 1, -1, 1]).tolist(), "no rotation"),
-    "a hole in a covariance": (("uncertainty", "trusted", 0), [1.0], "trusted has"),
+    "a hole in a covariance": (("uncertainty", "trusted", 0), [1.0], "trusted is|covariances are not"),
     "motions of another camera": (("uncertainty", "unseen_of_cameras"), {}, "other cameras"),
     "a word for a number": (("corrections", "range_offset_m"), "far", "range_offset_m is 'far'"),
     "no focal length": (("cameras", "right", "lens", "fx"), 0, "fx is 0"),
@@ -148,9 +148,9 @@ RIGS = {  # what another rig has, what is said
     "other cameras": (lambda rig: replace(rig, cameras={"top": rig.cameras["left"]}), "cameras are"),
     "another mount": (
         lambda rig: replace(rig, cameras=rig.cameras | {"left": replace(rig.cameras["left"], mount="platform")}),
-        "'left' is fixed to the head, not to the platform",
+        "'left' is fixed to the head, not platform",
     ),
-    "other beams": (lambda rig: other_lrf(rig, bearing_step=0.1), "deg apart"),
+    "other beams": (lambda rig: other_lrf(rig, bearing_step=0.1), "its beams are"),
     "another view": (lambda rig: other_lrf(rig, field_of_view=(0.0, 1.0)), "range finder sees"),
 }  # fmt: skip
 

@@ -72,6 +72,30 @@ def test_a_calibration_does_not_differ_from_itself(days):
     assert np.abs(found.cloud.off).max() < 1e-12
 
 
+def with_lens(rig, shift=0.0):
+    """A rig whose intrinsics are not exact, and the first focal length longer."""
+    known = rig.uncertainty
+    lens = 1e-4 * np.eye(len(known.names))
+    known = replace(
+        known, covariance=known.covariance + lens, trusted=known.trusted + lens, lens=lens
+    )
+    left = rig.cameras["left"]
+    left = replace(left, model=replace(left.model, fx=left.model.fx + shift))
+    return replace(rig, uncertainty=known, cameras=rig.cameras | {"left": left})
+
+
+def test_errors_of_intrinsics_that_both_were_told_do_not_count(days):
+    exact = compare(*days[:2])
+    alike = compare(*(with_lens(rig) for rig in days[:2]))
+    assert alike.whole.chi2 == pytest.approx(exact.whole.chi2, rel=1e-6)
+    claimed = [[a.claimed for a in pair.parts[2].amounts] for pair in (exact, alike)]
+    np.testing.assert_allclose(*claimed, rtol=1e-6)
+    assert "same intrinsics" in alike.sentence()
+    apart = compare(with_lens(days[0]), with_lens(days[1], 1e-6))
+    assert apart.whole.chi2 < exact.whole.chi2 / 2
+    assert "same intrinsics" not in apart.sentence()
+
+
 def test_what_no_data_show_does_not_count(days):
     """The platform of one stated another zero of the pitch, and another place along the axis."""
     rig = days[0]

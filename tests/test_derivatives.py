@@ -56,7 +56,8 @@ def camera_methods():
         here = block(np.zeros(6))
         r = here.white
         J = here.white_jacobian  # with what the weights change
-        yield J.T @ r, lambda s: 0.5 * np.sum(block(s).white ** 2), 6
+        if here.corrected is not None:
+            yield J.T @ r, lambda s: 0.5 * np.sum(block(s).white ** 2), 6
 
 
 def board_planes():

@@ -19,16 +19,14 @@ def test_lengths_between_features_know_how_good_they_are(quick):
         left = rows[x < np.median(x)]
         right = rows[x >= np.median(x)]
         planes = [fit_feature(cloud, half, rig) for half in (left, right)]
-        length, sigma = length_between(fit_feature(cloud, rows, rig), planes[0])
-        offs.append(length / sigma)
+        between = length_between(fit_feature(cloud, rows, rig), planes[0])
+        offs.append(between.metres / between.sigma)
         points = [fit_feature(cloud, half, rig, plane=False) for half in (left, right)]
-        length, sigma = length_between(*points)
-        assert (
-            length == pytest.approx(np.linalg.norm(points[1].centre - points[0].centre))
-            and 0 < sigma < 0.01
-        )
-        length, sigma = length_between(points[0], planes[1])
-        assert length < 5 * sigma
+        between = length_between(*points)
+        straight = np.linalg.norm(points[1].centre - points[0].centre)
+        assert between.metres == pytest.approx(straight) and 0 < between.sigma < 0.01
+        between = length_between(points[0], planes[1])
+        assert between.metres < 5 * between.sigma
     assert 0.1 < np.sqrt(np.mean(np.square(offs))) < 3
     with pytest.raises(DegenerateGeometry, match="no point"):
         fit_feature(cloud, [], rig)

@@ -201,7 +201,7 @@ FAILURES = [  # settings, habits, fault that lasts, call, what it raises
         None,
         to(30),
         Refused,
-        "the other way: set invert",
+        "opposite direction: change invert",
     ),
     (
         replace(FAST, absolute=True),
@@ -214,7 +214,7 @@ FAILURES = [  # settings, habits, fault that lasts, call, what it raises
     (FAST, {}, "deaf", PanTilt.pitch, NoReply, "address 1 and 38400 Bd"),
     (FAST, {}, "deaf", TEN, NoReply, "address 1 and 38400 Bd"),
     (FAST, PARTIAL, None, swept(50), NoReply, "speed is unknown: state degrees_per_second"),
-    (FAST, {"head": Contrary}, None, swept(50), Refused, "the other way"),
+    (FAST, {"head": Contrary}, None, swept(50), Refused, "opposite direction"),
     (SLOW, {}, "stall", swept(20), Refused, "the sweep does not get to its end"),
     (FAST, {}, None, PanTilt.finish_sweep, DeviceError, "there was no sweep"),
 ]

@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from holds_draws import any_way, changed, erring, on_base, room, true_rig
+from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
-from lrfcal_lib.measure.holds import Answer, holds, passes_of
-from lrfcal_lib.report.holds import held_in_words
+from lrfcal_lib.calibrate.cloud import join
+from lrfcal_lib.calibrate.reconstruct import reconstruct
+from lrfcal_lib.measure.features import largest_plane
+from lrfcal_lib.measure.holds import Answer, Passes, holds, passes_of, wall_of
 
 TURN = np.radians(0.3)
 MOVE = 0.008
@@ -19,19 +22,24 @@ def seen():
     return room([1, 3], (-15, -4))
 
 
-def test_an_honest_calibration_holds_and_says_what_it_rests_on(seen):
-    held = holds(seen, true_rig(seen))
+@pytest.fixture(scope="module")
+def held(seen):
+    return holds(seen, true_rig(seen))
+
+
+def test_an_honest_calibration_holds_and_says_what_it_rests_on(held):
     assert held.answer is Answer.HOLDS and held.culprit is None
     assert all(wall.bend < 2 * wall.allowed for wall in held.walls)
-    words = held_in_words(held)
+    words = held.sentences()
     assert words[0] == "the calibration: holds"
+    assert held.creases > 8
     assert any("only turns the whole cloud" in line for line in words)
 
 
 def test_a_turned_camera_is_named(seen):
     held = holds(seen, changed(true_rig(seen), "left", [0.0, TURN, 0.0, 0.0, 0.0, 0.0]))
     assert held.answer is Answer.MOVED and held.culprit.camera == "left"
-    assert "camera 'left' has moved: recalibrate" in held_in_words(held)[0]
+    assert "camera 'left' has moved: recalibrate" in held.sentences()[0]
     np.testing.assert_allclose(held.culprit.change[1], TURN, atol=TURN / 2)
 
 
@@ -43,7 +51,7 @@ def test_too_little_to_see_is_not_called_holding(seen):
     )
     held = holds(replace(blank, image_records=first), rig)
     assert held.answer is Answer.UNKNOWN
-    assert "cannot be told here" in held_in_words(held)[0]
+    assert "cannot be told here" in held.sentences()[0]
 
 
 @pytest.mark.parametrize("slip", [0.0, np.radians(0.1), -np.radians(0.2)])
@@ -62,6 +70,30 @@ def test_two_passes_over_one_place_tell_the_slip_between_them(seen, slip):
     session = replace(seen, placements=(1, 2), scans=seen.scans | both | times)
     (passes,) = passes_of(session)
     assert abs(passes.slip - slip) < 4 * passes.sigma + np.radians(0.01)
+
+
+def test_walls_and_passes_belong_into_the_verdict(held):
+    """A head that hangs back between two passes, and planes that all bend, are named."""
+    hanging = Passes((1, 2), np.radians(0.4), np.radians(0.02))
+    slipped = replace(held, passes=(hanging,))
+    assert slipped.answer is Answer.MOVED and "between two passes" in slipped.sentences()[0]
+    chance = replace(hanging, slip=np.radians(0.05))
+    assert replace(held, passes=(chance,)).answer is Answer.HOLDS
+    bent = tuple(replace(wall, bend=0.03) for wall in held.walls)
+    assert "range finder on the axis" in replace(held, walls=bent).sentences()[0]
+    one = (bent[0], *held.walls[1:])
+    assert replace(held, walls=one).answer is Answer.HOLDS
+
+
+@pytest.mark.parametrize(("degrees", "bent"), [(0.0, False), (6.0, True)])
+def test_a_range_finder_that_was_turned_on_its_axis_bends_walls(seen, degrees, bent):
+    rig = true_rig(seen)
+    turn = Rotation.from_euler("z", degrees, degrees=True)
+    turned = rig.T_head_lrf * RigidTransform.from_rotation(turn)
+    rig = replace(rig, axis=replace(rig.axis, T_head_lrf=turned))
+    sweep = seen.sweep(1)
+    cloud = join(reconstruct(sweep, [], rig.T_head_lrf, rig.corrections, lrf=seen.lrf))
+    assert wall_of(cloud.rows(largest_plane(cloud)), rig, 1).bent == bent
 
 
 def test_images_of_no_camera_of_the_rig_are_refused(seen):

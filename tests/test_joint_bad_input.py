@@ -110,30 +110,6 @@ def test_contradictory_noise_is_repaired_from_the_data(kind, factor, mount):
     assert np.allclose(found.solution.sigma[:4], honest(mount), rtol=0.15)
 
 
-@pytest.mark.parametrize(
-    ("kind", "factor", "words"),
-    [("face", 0.1, "ranges scatter"), ("view", 10.0, "camera 'left' scatter"),
-     pytest.param("face", 1e3, "ranges scatter", marks=campaign),
-     pytest.param("view", 1e-3, "camera 'left' scatter", marks=campaign)],
-)  # fmt: skip
-def test_contradictory_noise_is_said_when_it_is_kept(kind, factor, words):
-    obs, *_ = draw(rng())
-    found = solve_joint(mis_stated(obs, kind, factor), required=False)
-    assert any(
-        words in warning and "noise='estimate'" in warning for warning in found.warnings
-    )
-
-
-@MOUNTS
-def test_sound_recordings_need_no_warning(mount):
-    """Cameras on the base hardly show the axis of a small board's sweep, which may be said; nothing else."""
-    for seed in range(2):
-        found = solve_joint(draw(rng(seed), 12, mount=mount, pitch_step=np.radians(0.5))[0])
-        assert all(
-            mount == "platform" and "weakly known" in words for words in found.warnings
-        )
-
-
 def mis_stated(obs, kind, factor):
     """Observations whose stated standard deviations are wrong by a factor."""
     field, power = {"face": ("face_sigma", 1), "view": ("view_covariance", 2)}[kind]
@@ -152,26 +128,13 @@ def test_too_few_placements_are_named(count):
 @MOUNTS
 def test_a_placement_that_no_image_shows_is_left_out_by_name(mount):
     obs, truth, _ = draw(rng(), mount=mount)
-    found = solve_joint(
-        obs.keep(view=obs.view_placement != 4, beam=obs.beam_placement != 4)
-    )
+    found = solve_joint(obs.keep(view=obs.view_placement != 4))
     (lost,) = found.excluded
-    assert (
-        lost.placement == 5
-        and "no image shows the board and scans cross 0 edges" in str(lost)
-    )
+    assert lost.placement == 5 and "no image shows the board" in str(lost)
     assert (
         5 not in found.observations.placements
         and worst(found, replace_boards(truth, 4)) < 4.5
     )
-    with pytest.raises(
-        DegenerateGeometry, match="placement 1: no image .*placement 10: no image"
-    ):
-        solve_joint(
-            obs.keep(
-                view=np.zeros(len(obs.view_pitch), bool), beam=obs.beam_edge == 0
-            ).with_cameras([])
-        )
 
 
 def replace_boards(truth, out):
@@ -199,19 +162,6 @@ def test_one_wrong_image_of_several_costs_the_image_not_the_placement(mount, num
     (words,) = map(str, found.excluded)
     assert "placement 3: image of " in words and "the image is left out" in words
     assert worst(found, truth) < 4.5
-
-
-@pytest.mark.parametrize(("mount", "shift"), [("head", 0.02), ("platform", 0.1)])
-def test_an_image_that_is_off_within_the_boards_plane_is_left_out(mount, shift):
-    """No range tells; held, it would raise the noise level of all images thirty times."""
-    obs, truth, _ = draw(rng(), mount=mount)
-    pose = obs.view_pose.copy()
-    row = np.flatnonzero(obs.view_placement == 2)[1]
-    pose[row, :3, 3] += shift * pose[row, :3, 0]
-    found = solve_joint(replace(obs, view_pose=pose), noise="estimate")
-    (words,) = map(str, found.excluded)
-    assert f"image of 'left' at {np.degrees(obs.view_pitch[row]):.1f} deg" in words
-    assert found.noise["view_scale"] < 1.5 and worst(found, truth) < 4.5
 
 
 def test_an_edge_bias_that_only_what_is_usual_bounds_leaves_cameras_that_planes_fix():

@@ -134,7 +134,7 @@ def other_session(quick, **changes):
 
 
 BAD = {
-    "images without a known pitch": (lambda c: other_session(c, pitch=np.nan), "joint", "of none is the pitch known"),
+    "images without a known pitch": (lambda c: other_session(c, pitch=np.nan), "joint", "the pitch of none is known"),
     "a method that was not run": (lambda c: c, "line_printed", "'line_printed' poses no camera"),
     "another rig's cameras": (
         lambda c: other_session(c, camera="top"), "joint",

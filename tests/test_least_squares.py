@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
+import scipy.special
 
 from lrfcal_lib.fit.covariance import placement_covariance, pseudo_inverse
 from lrfcal_lib.fit.least_squares import (
@@ -72,21 +73,18 @@ def test_too_small_stated_noise_inflates_the_covariance_and_too_large_never_shri
 def test_robust_result_matches_scipy(data):
     x, y = data
     y = y + 3.0 * (np.arange(40) % 9 == 0)
-    ours = fit(line_problem(x, y, 0.1), np.zeros(2), loss="cauchy")
-    options = {"loss": "cauchy", "f_scale": 2.385, "xtol": 1e-15, "gtol": 1e-15}
+    ours = fit(line_problem(x, y, 0.1), np.zeros(2), robust=True)
+    level = np.median(np.abs(ours.residuals)) / np.sqrt(scipy.special.chdtri(1, 0.5))
+    options = {"loss": "cauchy", "f_scale": 2.385 * level, "xtol": 1e-15, "gtol": 1e-15}
     theirs = scipy.optimize.least_squares(
         lambda p: (p[0] * x + p[1] - y) / 0.1, [0, 0], **options
     )
     np.testing.assert_allclose(ours.parameters, theirs.x, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("start", "options", "words"),
-    [(0.0, {"loss": "tukey"}, "unknown loss 'tukey'"), (np.nan, {}, "not finite")],
-)
-def test_bad_settings_are_refused(data, start, options, words):
-    with pytest.raises(ValueError, match=words):
-        fit(line_problem(*data), np.array([start, 0.0]), **options)
+def test_a_start_value_that_is_not_finite_is_refused(data):
+    with pytest.raises(ValueError, match="not finite"):
+        fit(line_problem(*data), np.array([np.nan, 0.0]))
 
 
 def test_schur_complement_equals_the_dense_solution():

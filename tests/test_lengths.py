@@ -5,10 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.spatial.transform import RigidTransform
+from drawn_rooms import simulate_room
+from scipy.spatial.transform import RigidTransform, Rotation
+from shared import DATA
 
+from lrfcal_lib import __main__ as command_line
+from lrfcal_lib.calibrate.calibration_file import load_calibration
+from lrfcal_lib.evaluate.true_lengths import true_picks
 from lrfcal_lib.measure import features, lengths
-from lrfcal_lib.measure.edges import edges_of, nearest_edge
+from lrfcal_lib.measure.edges import edges_of
+from lrfcal_lib.measure.lengths import nearest_edge
+from lrfcal_lib.measure.scene import stations_of
+from lrfcal_lib.measure.stations import join_stations
+from lrfcal_lib.session.read import open_session
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +35,7 @@ def pick(kind, place, number):
 
 def length(scene, first, second):
     row = {"name": "it"} | pick(*first, 1) | pick(*second, 2)
-    return lengths.measure(scene, pd.DataFrame([row])).iloc[0]
+    return lengths.measure({1: scene}, pd.DataFrame([row])).iloc[0]
 
 
 def parallel(found):
@@ -45,9 +54,7 @@ def test_a_scene_is_flat_surfaces_and_edges_on_them(scene):
         assert np.median(np.abs(off)) < 0.02
     for edge in scene.edges:
         first, last = edge.ends
-        assert edge.feature.axis @ (last - first) == pytest.approx(
-            np.linalg.norm(last - first)
-        )
+        assert edge.axis @ (last - first) == pytest.approx(np.linalg.norm(last - first))
         assert nearest_edge(scene.edges, (first + last) / 2)[1] < 1e-9
 
 
@@ -71,9 +78,9 @@ def test_points_of_one_scan_err_together(scene):
     first, second = scene.planes[i], scene.planes[j]
     nothing = np.zeros((6, 6))
     whole = [replace(plane, noise=nothing) for plane in (first, second)]
-    _, together = features.length_between(*whole)
+    together = features.length_between(*whole).sigma
     free = replace(whole[1], jacobian=np.zeros_like(whole[1].jacobian))
-    _, apart = features.length_between(whole[0], free)
+    apart = features.length_between(whole[0], free).sigma
     assert 0 < together < 0.01 and 0 < apart < 0.1
 
 
@@ -98,14 +105,14 @@ def test_derivatives_of_an_edge_are_those_of_the_edge_of_a_moved_camera(quick, s
     after = edges_of(scene.cloud, surfaces, moved, pitches)
     column = list(rig.uncertainty.names).index(f"{name}_tx")
     changes = []
+    of_camera = {view.number for view in views if view.camera == name}
     for edge in scene.edges:
         nearest, away = nearest_edge(after, edge.ends.mean(axis=0))
-        same = after[nearest].image == edge.image and away < 3 * step
-        if edge.feature.camera == name and same:
-            other = after[nearest].feature
-            across = np.linalg.svd(edge.feature.axis[None])[2][1:]
-            told = across @ edge.feature.jacobian[:3, column] * step
-            changes.append([across @ (other.centre - edge.feature.centre), told])
+        same = nearest.image == edge.image and away < 3 * step
+        if edge.image in of_camera and same:
+            across = np.linalg.svd(edge.axis[None])[2][1:]
+            told = across @ edge.jacobian[:3, column] * step
+            changes.append([across @ (nearest.centre - edge.centre), told])
     change, told = np.moveaxis(np.array(changes), 1, 0)
     assert len(changes) > 5 and np.median(np.abs(told).max(axis=1)) > 0.5 * step
     assert np.median(np.abs(change - told)) < 0.01 * step
@@ -131,13 +138,107 @@ def test_a_list_that_is_none_is_refused_with_the_reason(tmp_path, what):
     assert words in str(refused.value) and str(file) in str(refused.value)
 
 
-def test_places_where_nothing_is_are_refused(scene):
+def test_places_where_nothing_is_are_named(scene):
     inside = ("point", scene.cloud.points[0])
     for kind, reach in (("plane", 100), ("edge", 10), ("point", 100)):
-        with pytest.raises(ValueError, match=f"'it', place 2: no {kind} within {reach} mm"):
-            length(scene, inside, (kind, [0.0, -50.0, 0.0]))
+        row = length(scene, inside, (kind, [0.0, -50.0, 0.0]))
+        assert row.problem.startswith(f"place 2: no {kind} within {reach} mm")
+        assert np.isnan(row.length_m) and row.stations == ""
     axes = np.array([plane.axis for plane in scene.planes])
     i, j = np.argwhere(np.abs(axes @ axes.T) < 0.5)[0]
     ends = [("plane", scene.cloud.points[scene.of_point == k][0]) for k in (i, j)]
-    with pytest.raises(ValueError, match="deg from parallel"):
-        length(scene, *ends)
+    assert "deg from parallel" in length(scene, *ends).problem
+
+
+def seen_from(scene, T_station_scene, shift):
+    """The same scene from another station, whose surfaces are off by a shift along their normals."""
+    turn = T_station_scene.rotation
+
+    def moved(feature):
+        centre = T_station_scene.apply(feature.centre) + shift * turn.apply(feature.axis)
+        both = np.kron(np.eye(2), turn.as_matrix())
+        return replace(
+            feature,
+            centre=centre,
+            axis=turn.apply(feature.axis),
+            noise=both @ feature.noise @ both.T,
+            jacobian=both @ feature.jacobian,
+            ends=T_station_scene.apply(feature.ends),
+            placement=9,
+        )
+
+    points = T_station_scene.apply(scene.cloud.points)
+    return replace(
+        scene,
+        cloud=replace(scene.cloud, points=points),
+        planes=[moved(plane) for plane in scene.planes],
+        edges=[moved(edge) for edge in scene.edges],
+    )
+
+
+def test_a_length_of_two_stations_is_one_and_their_shared_errors_stay(scene):
+    """The weighted mean; noise averages out, what the calibration has wrong does not."""
+    i, j = parallel(scene.planes)
+    ends = [("plane", scene.cloud.points[scene.of_point == k][0]) for k in (i, j)]
+    turn = Rotation.from_rotvec([0.1, -0.2, 0.9])
+    T_scene_station = RigidTransform.from_components([1.0, -2.0, 0.3], turn)
+    other = seen_from(scene, T_scene_station.inv(), 0.002)
+    row = {"name": "it"} | pick(*ends[0], 1) | pick(*ends[1], 2)
+    poses = {1: RigidTransform.identity(), 9: T_scene_station}
+    one = length(scene, *ends)
+    both = lengths.measure({1: scene, 9: other}, pd.DataFrame([row]), poses)
+    assert len(both) == 1 and both.stations[0] == "1 9"
+    each = [features.length_between(s.planes[i], s.planes[j]) for s in (scene, other)]
+    assert both.length_m[0] == pytest.approx(np.mean([each[0].metres, each[1].metres]))
+    assert each[0].sigma == pytest.approx(each[1].sigma) == pytest.approx(one.sigma_m)
+    shared = each[0].sigma ** 2 - each[0].noise
+    assert both.sigma_m[0] ** 2 == pytest.approx(shared + each[0].noise / 2)
+    # a surface that stands elsewhere by more than stations disagree is another one
+    far = seen_from(scene, T_scene_station.inv(), 0.02)
+    apart = lengths.measure({1: scene, 9: far}, pd.DataFrame([row]), poses)
+    assert len(apart.stations[0].split()) == 1
+
+
+def test_places_that_no_station_shows_together_are_named(scene):
+    i, j = parallel(scene.planes)
+    ends = [("plane", scene.cloud.points[scene.of_point == k][0]) for k in (i, j)]
+    halves = {}
+    for number, (gone, _) in zip((1, 9), ((i, 0), (j, 0)), strict=True):
+        of_point = np.where(scene.of_point == gone, -1, scene.of_point)
+        halves[number] = replace(scene, of_point=of_point)
+    row = {"name": "it"} | pick(*ends[0], 1) | pick(*ends[1], 2)
+    table = lengths.measure(halves, pd.DataFrame([row]))
+    assert table.problem[0].startswith("no station shows both places")
+
+
+@pytest.mark.campaign
+def test_lengths_in_three_rooms_nobody_tuned_on(tmp_path):
+    """60 lengths, each once, from four joined stations of each room."""
+    rig = load_calibration(calibrated(tmp_path))
+    tables = []
+    for seed in (501, 502, 503):
+        simulate_room(tmp_path / str(seed), seed)
+        room = open_session(tmp_path / str(seed))
+        scenes = {n: lengths.features_of_station(room, rig, n) for n in stations_of(room)}
+        clouds = {n: features.with_sigma(each.cloud, rig) for n, each in scenes.items()}
+        poses = join_stations(clouds, rig).T_world_station
+        assert len(poses) == 4
+        picks = true_picks(room, rig, scenes, poses)
+        assert len(picks) == 20
+        tables.append(lengths.measure(scenes, picks, poses))
+    table = pd.concat(tables)
+    found = table[table.problem == ""]
+    error = (found.length_m - found.true_m).abs()
+    assert len(found) >= 48
+    assert error[found.kind_1 == "plane"].mean() < 0.0015
+    assert error[found.kind_1 == "edge"].mean() < 0.004
+    assert 0.83 < np.mean(error < lengths.NINETY * found.sigma_m) <= 0.96
+
+
+def calibrated(folder):
+    """The calibration.json of the shipped session."""
+    assert (
+        command_line.main(["calibrate", str(DATA / "sim_lms221"), "--out", str(folder)])
+        == 0
+    )
+    return folder / "calibration.json"

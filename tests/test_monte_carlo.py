@@ -54,7 +54,6 @@ def test_correct_errors_pass_every_limit():
         table[name].between(table[f"{name}_low"], table[f"{name}_high"]).all()
         for name in ("coverage", "nees")
     )
-    assert np.allclose(table.stated_over_crb, 1.0)
     assert table.rmse_over_crb.iloc[-1] == pytest.approx(1.0, abs=0.1)
 
 
@@ -98,16 +97,6 @@ def test_refused_draws_are_counted_not_hidden():
         monte_carlo(lambda rng: draw(rng, 2)[:2], refuse, [0])
 
 
-def test_unknowns_may_not_change_between_draws():
-    switch = iter([SENSOR, SENSOR[:1]])
-    with pytest.raises(ValueError, match="seed 1 estimates"):
-        monte_carlo(
-            lambda rng: draw(rng, 6)[:2],
-            lambda obs: solve_joint(obs, sensor=next(switch)),
-            [0, 1],
-        )
-
-
 # the bound
 
 
@@ -121,13 +110,13 @@ def test_what_leaves_no_bound_is_named():
 
 
 def test_neither_rule_for_the_edge_point_suits_every_bias_and_the_better_one_beats_planes_on_the_average():
-    """In the draws of notebook 08."""
+    """In the stored draws that notebook 08 shows."""
     table = pd.read_csv(GOLDEN / "sim_lms221" / "single_shots.csv").set_index(
         ["step_deg", "bias", "method"]
     )
-    rotation = table.rotation_median_deg.unstack("method")
-    rules = rotation[["line_last_beam", "line"]]
-    assert set(rules.idxmin(axis=1)) == {"line_last_beam", "line"}
+    rotation = table.rotation_deg.unstack("method")
+    rules = rotation[["line_printed", "line"]]
+    assert set(rules.idxmin(axis=1)) == {"line_printed", "line"}
     assert rotation.zhang_pless.mean() > 1.5 * rules.min(axis=1).mean()
 
 

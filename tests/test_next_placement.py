@@ -58,6 +58,6 @@ def test_suggestions_refuse_bad_input(good):
 def test_a_pitch_is_named_once():
     place = (1.0, -10, 0, 180, 0)
     near = Suggestion(None, place, np.radians([-6.1, -6.0, -5.9]), 0.1, 0.0)
-    assert near.words().endswith("; images at pitch -6 deg")
+    assert "; images at pitch -6 deg. " in near.sentence()
     far = Suggestion(None, place, np.radians([-10.0, 0.0, 10.0]), 0.1, 0.0)
-    assert far.words().endswith("; images at pitch -10, +0 and +10 deg")
+    assert "; images at pitch -10, +0, +10 deg. " in far.sentence()

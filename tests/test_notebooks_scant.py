@@ -43,7 +43,7 @@ SAYS = {
     ("lines", "07"): "half of them do not determine the rig",
     ("wall", "04"): "the images do not agree on the top edge",
     ("wall", "05"): "no placement has sides",
-    ("edges", "07"): "placements only, 6 or more are needed",
+    ("edges", "07"): "placements, 6 or more are needed",
     ("blind", "01"): "this session has no images",
     ("blind", "04"): "no camera could be calibrated",
     (

@@ -35,9 +35,7 @@ def angles_to_sight(pose, obs):
 
 
 ROW = Method(
-    variant="half_step",
     uses="crossing",
-    fewest=6,
     label="angles to sight",
     residual=angles_to_sight,
 )

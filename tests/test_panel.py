@@ -323,3 +323,34 @@ def test_a_calibration_that_does_not_fit_is_said(panel, tmp_path):
     assert "of 100 x 80" in panel._overlaid("left", image, view)[1]
     assert "does not know" in panel._overlaid("top", image, view)[1]
     assert chosen(panel, "") == ""
+
+
+def test_what_check_says_of_the_calibration_is_marked(panel, fake, tmp_path, monkeypatch):
+    """With a fresh recording, in words and about the image of the camera that has moved."""
+    culprit = SimpleNamespace(camera="left")
+    words = ["the calibration: camera 'left' has moved: recalibrate", "by 3 px"]
+    held = SimpleNamespace(
+        answer=page.Answer.MOVED, culprit=culprit, sentences=lambda name: words
+    )
+    monkeypatch.setattr(page, "holds", lambda session, rig: held)
+    image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    view = SimpleNamespace(ranges=np.ones(3), bearings=np.full(3, 1.5), pitch=0.0)
+    scenes = [{"number": number, "board": False} for number in (1, 2)]
+    panel.parts.rig.value = str(fake(placements=scenes))
+    chosen(panel, a_calibration(tmp_path / "c.json"))
+    assert panel.parts.held.value == "", "nothing is recorded yet"
+    pressed(panel, "connect")
+    pressed(panel, "capture")
+    assert "has moved: recalibrate" in panel.parts.held.value
+    marked, remark = panel._overlaid("left", image, view)
+    assert (marked[0, 0] == page.RED).all() and "has moved" in remark
+    other, remark = panel._overlaid("right", image, view)
+    assert not other[0, 0].any() and "moved" not in remark
+
+    def refused(session, rig):
+        raise ValueError("no placement has a sweep")
+
+    monkeypatch.setattr(page, "holds", refused)
+    pressed(panel, "capture")
+    assert "cannot be told here: no placement has a sweep" in panel.parts.held.value
+    assert chosen(panel, "") == "" == panel.parts.held.value

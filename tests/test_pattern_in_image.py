@@ -96,16 +96,10 @@ def test_corners_run_clockwise_also_in_a_mirrored_image():
     assert x[0] * y[1] - x[1] * y[0] > 0
 
 
-@pytest.mark.parametrize(("shape", "kind", "message"), [
-    *[(shape, np.uint8, "6 x 4 inner corners") for shape in ((480, 640, 3), (1, 1), (1, 5000), (8, 8))],
-    *[(shape, np.uint8, "must be uint8") for shape in ((4, 4, 3, 1), (0, 0))],
-    ((4, 4), float, "must be uint8"),
-])  # fmt: skip
-def test_no_pattern_and_no_image(shape, kind, message):  # OpenCV refuses narrow ones
-    with pytest.raises(
-        PatternNotFound if "corners" in message else ValueError, match=message
-    ):
-        find_pattern(np.full(shape, 90, kind))
+@pytest.mark.parametrize("shape", [(480, 640, 3), (1, 1), (1, 5000), (8, 8)])
+def test_no_pattern(shape):  # OpenCV refuses narrow ones
+    with pytest.raises(PatternNotFound, match="6 x 4 inner corners"):
+        find_pattern(np.full(shape, 90, np.uint8))
 
 
 @pytest.mark.parametrize("roll", [1.7, -1.4])

@@ -67,7 +67,6 @@ def test_exact_data_are_recovered(solve, faces, T0):
     obs = make(2)
     found = solve(obs if faces else without_faces(obs), T0)
     assert found.solution.converged and (miss(found) < 1e-9).all()
-    assert np.abs(found.skew).max() < 1e-9 and np.abs(found.gap).max() < 1e-9
     assert found.solution.unobservable == () and (
         found.skipped == {} or solve is solve_projected
     )

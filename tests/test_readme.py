@@ -35,8 +35,13 @@ METHODS_PAGE = (ROOT / "notebooks" / "METHODS.md").read_text()
 RIG_PAGE = (ROOT / "notebooks" / "RIG_FILE.md").read_text()
 RESULTS_PAGE = (ROOT / "notebooks" / "RESULTS.md").read_text()
 FILE_PAGE = (ROOT / "notebooks" / "CALIBRATION_FILE.md").read_text()
+STUDIES_PAGE = (ROOT / "notebooks" / "STUDIES.md").read_text()
 SENSORS_PAGE = (ROOT / "notebooks" / "OTHER_SENSORS.md").read_text()
 WORKFLOW = (ROOT / ".github" / "workflows" / "test.yml").read_text()
+
+
+def test_a_visitor_reads_it_in_one_go():
+    assert len(README.splitlines()) <= 130
 
 
 def blocks(kind, page=README):
@@ -52,7 +57,15 @@ def test_notebooks_methods_functions_and_files_are_all_there():
     assert [method for method in METHODS if f"| `{method}` |" not in METHODS_PAGE] == []
     links = re.findall(r"\]\(([^)#:]+)\)", README + CONTRIBUTING)
     pages = "".join(
-        [README, CONTRIBUTING, METHODS_PAGE, RIG_PAGE, RESULTS_PAGE, SENSORS_PAGE]
+        [
+            README,
+            CONTRIBUTING,
+            METHODS_PAGE,
+            RIG_PAGE,
+            RESULTS_PAGE,
+            SENSORS_PAGE,
+            STUDIES_PAGE,
+        ]
     )
     files = re.findall(r"`((?:lrfcal_lib|tests|data|notebooks)/[\w/.]+)`", pages)
     assert (
@@ -72,7 +85,12 @@ def test_notebooks_methods_functions_and_files_are_all_there():
 def commands():
     """Every command of README, CONTRIBUTING and the workflow, a list of words each."""
     lines = "\n".join(
-        [*blocks("sh"), *blocks("sh", SENSORS_PAGE), re.sub(r"- run: |run: ", "", WORKFLOW)]
+        [
+            *blocks("sh"),
+            *blocks("sh", SENSORS_PAGE),
+            *blocks("sh", STUDIES_PAGE),
+            re.sub(r"- run: |run: ", "", WORKFLOW),
+        ]
     ).splitlines()
     lines += re.findall(
         r"`((?:make|\.venv/bin/python|python -m) [^`]+)`", README + CONTRIBUTING

@@ -421,7 +421,7 @@ def test_main_returns_what_a_shell_needs(session, tmp_path, monkeypatch, capsys)
     assert report.main([session], tmp_path / "a", jobs=1) == 0
     begun, *done = capsys.readouterr().err.splitlines()
     assert begun == "lrfcal: 2 notebooks begun"
-    assert re.fullmatch(r"lrfcal: 1 of 2 done after .* \(01_good, about .* left\)", done[0])
+    assert re.fullmatch(r"lrfcal: 1 of 2 done after .* \(01_good\)", done[0])
     assert re.fullmatch(r"lrfcal: 2 of 2 done after .* \(00_good\)", done[1])
     (tmp_path / "01_good.ipynb").unlink()
     write_notebook(tmp_path / "00_good.ipynb", "1 / 0")

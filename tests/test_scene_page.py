@@ -84,7 +84,7 @@ def measuring(scene, tmp_path_factory):
     """A page with it."""
     file = tmp_path_factory.mktemp("page") / "scene.html"
     cloud = scene.cloud
-    data = for_page(scene)
+    data = for_page({scene.planes[0].placement: scene})
     interactive.scene_page(
         file, cloud.points, cloud.colors, cloud.seen, {}, title="A room", measuring=data
     )
@@ -97,20 +97,20 @@ def test_the_browser_computes_what_python_computes(scene, measuring, browser):
     view.goto(measuring.as_uri())
     view.wait_for_selector("#measure", state="attached")
     between = "([i, j]) => { const m = measuring.measurer; return m.between(m.feature(i), m.feature(j)) }"
-    found = [*scene.planes, *(edge.feature for edge in scene.edges)]
+    found = [*scene.planes, *scene.edges]
     rng = np.random.default_rng(0)
     compared = 0
     for i, j in rng.integers(0, len(found), (150, 2)).tolist():
         told = view.evaluate(between, [i, j])
         try:
-            length, sigma = length_between(found[i], found[j])
+            expected = length_between(found[i], found[j])
         except DegenerateGeometry:
             assert "from parallel" in told
             continue
-        if length > 0.01 and sigma < 0.1:
+        if expected.metres > 0.01 and expected.sigma < 0.1:
             compared += 1
-            assert told["length"] == pytest.approx(length, abs=1e-5)
-            assert told["sigma"] == pytest.approx(sigma, rel=1e-2, abs=1e-5)
+            assert told["length"] == pytest.approx(expected.metres, abs=1e-5)
+            assert told["sigma"] == pytest.approx(expected.sigma, rel=1e-2, abs=1e-5)
     assert compared > 20
 
     seen = np.flatnonzero(scene.cloud.seen)
@@ -122,7 +122,7 @@ def test_the_browser_computes_what_python_computes(scene, measuring, browser):
     saved.write_text(view.evaluate("measuring.csv()"))
     view.close()
     told = pd.read_csv(saved).iloc[0]
-    expected = measure(scene, read_picks(saved)).iloc[0]
+    expected = measure({1: scene}, read_picks(saved)).iloc[0]
     for column in ("length_m", "low_m", "high_m"):
         assert told[column] == pytest.approx(expected[column], abs=1e-4)
 

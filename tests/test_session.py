@@ -441,7 +441,7 @@ DAMAGE = [
     (pick("left,../0001.png,ab,1,2,20,3"), OUT),
     (
         pick("left,images/left/0001.png,top,1,2,20,3"),
-        "edge is one of ab, bc, ca, got 'top'",
+        "edge must be one of ab, bc, ca, got 'top'",
     ),
     (pick("left,images/left/0001.png,ab,1,2,2,3"), "give no direction: pick two"),
     (

@@ -24,7 +24,6 @@ from lrfcal_lib.session.stated import LrfInfo
 def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers):
     """Millimetres; of as much of a joint calibration as tells it. By as much all ranges may be wrong."""
     monkeypatch.setattr(statements, "doubtful", lambda *arguments, **options: [])
-    monkeypatch.setattr(statements, "not_an_offset", lambda *arguments: None)
     seen = SimpleNamespace(face_range=np.array([2.0]))
     sensor = {"range_offset": offset / 1000, "pitch_scale": 0.0}
     level = {

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shared import DATA
 
 from lrfcal_lib.measure.features import flatness, with_sigma
-from lrfcal_lib.measure.pose_graph import Edge, connected, solved
+from lrfcal_lib.measure.pose_graph import connected, solved
 from lrfcal_lib.measure.stations import (
     Joined,
     Pair,
@@ -21,6 +21,8 @@ from lrfcal_lib.measure.stations import (
 )
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.report import merge
+from lrfcal_lib.report.reconstruct import SceneAsked
+from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate.scene import World
 
 IN_PLACE = RigidTransform.identity()
@@ -42,11 +44,10 @@ def pair_of(first, second, off=None):
     step = np.zeros(6) if off is None else np.array(off)
     turn = Rotation.from_rotvec(step[:3]) * T.rotation
     T = RigidTransform.from_components(T.translation + step[3:], turn)
-    return Pair(first, second, T, 1e-6 * np.eye(6), np.zeros((6, 13)), 0.7, 0.0, 0.005)
-
-
-def edges(pairs):
-    return [Edge(p.first, p.second, p.T_first_second, p.covariance) for p in pairs]
+    along = np.array([1.0, 0.0, 0.0])
+    return Pair(
+        first, second, T, 1e-6 * np.eye(6), np.zeros((6, 13)), 0.7, 0.005, along, 0.1
+    )
 
 
 def joined_of(pairs):
@@ -64,11 +65,11 @@ def test_noise_free_pairs_give_the_poses_and_close_every_loop():
 
 def test_poses_answer_a_change_of_a_pair_as_stated():
     names = ((1, 2), (2, 3), (3, 4), (1, 3), (1, 4))
-    _, response = solved(edges(pair_of(*each) for each in names), 1)
+    _, response = solved([pair_of(*each) for each in names], 1)
     assert response.shape == (24, 30) and np.all(response[:6] == 0)
     step = 1e-4 * np.random.default_rng(5).standard_normal(6)
     changed = [pair_of(*each, off=step if each == (1, 4) else None) for each in names]
-    poses, _ = solved(edges(changed), 1)
+    poses, _ = solved(changed, 1)
     for i, number in enumerate(PLACES):
         turn = (poses[number].rotation * PLACES[number].rotation.inv()).as_rotvec()
         shift = poses[number].translation - PLACES[number].translation
@@ -101,8 +102,8 @@ def test_pairs_that_nothing_checks_are_advised():
     assert sentence.startswith("Nothing checks how stations 3 and 4 lie")
 
 
-def test_edges_lead_from_any_station():
-    poses = connected(edges([pair_of(1, 2), pair_of(2, 4)]), 4)
+def test_pairs_lead_from_any_station():
+    poses = connected([pair_of(1, 2), pair_of(2, 4)], 4)
     assert list(poses) == [4, 1, 2]
     T = poses[1].inv() * poses[2]
     np.testing.assert_allclose(
@@ -266,21 +267,26 @@ def corridor_cloud():
     return world, rooms.pose(rng, places[1], 0), rng
 
 
-def test_merge_writes_one_cloud_and_a_figure(tmp_path, rig, monkeypatch, capsys):
+def test_merge_writes_one_cloud_and_a_page(tmp_path, rig, monkeypatch, capsys):
     room = DATA / "room_lms221"
-    monkeypatch.setattr(merge, "load_calibration", lambda path: rig)
-    monkeypatch.setattr(merge, "require_same_rig", lambda rig, session: None)
-    monkeypatch.setattr(merge, "stations_of", lambda session: (1, 3))
+    asked = SceneAsked(open_session(room), rig, (1, 3), tmp_path)
+    monkeypatch.setattr(merge, "open_scene", lambda *scene: asked)
     monkeypatch.setattr(merge, "write_scene", lambda folder, *rest: [folder / "scene.ply"])
     assert merge.merge_session(room, "calibration.json", tmp_path) == 0
     said = capsys.readouterr().out
     assert "platform frame of station 1" in said
     assert "Nothing checks how stations 1 and 3 lie" in said
-    assert (tmp_path / "stations.png").read_bytes().startswith(b"\x89PNG")
+    page = (tmp_path / "stations.html").read_text()
+    assert "UNTRUSTED" not in page and asked.about in page
+    for words in (
+        "Nothing checks how stations 1 and 3 lie",
+        "<td>1 and 3</td>",
+        "image/png",
+    ):
+        assert words in page
     monkeypatch.setattr(merge, "join_stations", lambda clouds, rig: lonely())
     with pytest.raises(ValueError, match="room_lms221: no two stations can be joined"):
-        merge.merge_session(room, "calibration.json", tmp_path / "new")
-    assert not (tmp_path / "new").exists()
+        merge.merge_session(room, "calibration.json")
 
 
 def lonely():

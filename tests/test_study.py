@@ -1,6 +1,9 @@
 """Studies: the same numbers whoever works, nothing lost or counted twice, and what cannot be asked is refused."""
 
 import os
+import shutil
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -8,24 +11,27 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
-from shared import ROOT
+from shared import QUICK, ROOT
 
+from lrfcal_lib.__main__ import main
 from lrfcal_lib.evaluate import study
 from lrfcal_lib.evaluate.study import (
+    COUNTS,
     finished,
-    median_interval,
+    resampled,
     run_study,
     study_to_file,
     summary,
     tasks_of,
     variations,
 )
-from lrfcal_lib.evaluate.study_trials import run_task
+from lrfcal_lib.evaluate.study_trials import STUDIED, crossing_observations, run_task
+from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.session import cluster
 from lrfcal_lib.session.cluster import checked, refuse_others, workers_at
-from lrfcal_lib.simulate.draw import draw_shots
 from lrfcal_lib.simulate.scenarios import FILE, load_scenario, varied
+from lrfcal_lib.simulate.shots import draw_shots
 
 FAST = ("line", "zhang_pless")
 
@@ -40,21 +46,19 @@ def small(monkeypatch):
 # scenarios
 
 
-@pytest.mark.parametrize("name", FILE)
+BOARDS = [name for name in FILE if not load_scenario(name).corner]
+QUIET = {"sigma_range": 1e-9, "sigma_px": 1e-9}
+
+
+@pytest.mark.parametrize("name", BOARDS)
 def test_a_scenario_shows_boards_that_agree_with_its_sensors(name):
     """Without noise the readings lie on the board that the camera sees, and their ends near the edges."""
-    scenario = replace(
-        load_scenario(name),
-        sigma_range=1e-9,
-        sigma_px=1e-9,
-        bias=0.0,
-        softness=0.0,
-        floor=0.0,
-    )
+    scenario = replace(load_scenario(name), bias=0.0, softness=0.0, floor=0.0, **QUIET)
     shots = draw_shots(scenario, np.random.default_rng(5), 1, 6)
     T = shots["T_camera_lrf"][0]
     bearings = scenario.bearings()
-    for ranges, board in zip(shots["ranges"][0], shots["true_boards"][0], strict=True):
+    ranges_of_boards = shots["ranges"][0, :, 0]
+    for ranges, board in zip(ranges_of_boards, shots["true_boards"][0], strict=True):
         hit = np.isfinite(ranges)
         rays = np.column_stack([np.cos(bearings), np.sin(bearings), 0 * bearings])
         in_camera = (ranges[:, None] * rays)[hit] @ T[:, :3].T + T[:, 3]
@@ -64,6 +68,52 @@ def test_a_scenario_shows_boards_that_agree_with_its_sensors(name):
             on_board[:, :2] @ scenario.board.lines()[:, :2].T + scenario.board.lines()[:, 2]
         )
         assert outside.max() < 1e-6
+
+
+def test_the_named_edge_is_the_one_that_the_scan_line_leaves_the_board_by():
+    """Not the one nearest to the last beam: beams of 2004 are 4 cm apart on the board."""
+    scenario = replace(load_scenario("zhang_pless_2004"), softness=0.0, floor=0.0, **QUIET)
+    shots = draw_shots(scenario, np.random.default_rng(3), 3, 30)
+    bearings = scenario.bearings()
+    rays = np.column_stack([np.cos(bearings), np.sin(bearings), 0 * bearings])
+    lines = scenario.board.lines()
+    nearest = []
+    for trial, T in enumerate(shots["T_camera_lrf"]):
+        for number, board in enumerate(shots["true_boards"][trial]):
+            ranges = shots["ranges"][trial, number, 0]
+            hit = np.flatnonzero(np.isfinite(ranges))
+            in_camera = (ranges[hit, None] * rays[hit]) @ T[:, :3].T + T[:, 3]
+            on_board = ((in_camera - board[:, 3]) @ board[:, :3])[:, :2]
+            for end, inner, edge in zip(
+                (0, -1), (1, -2), shots["edges"][trial, number], strict=True
+            ):
+                inside = on_board[end] @ lines[:, :2].T + lines[:, 2]
+                rate = (on_board[end] - on_board[inner]) @ lines[:, :2].T
+                steps = np.where(rate > 0, -inside / np.where(rate > 0, rate, 1), np.inf)
+                assert steps.argmin() == edge
+                nearest.append(inside.argmax() == edge)
+    assert np.mean(nearest) < 0.98, "else this shows nothing"
+
+
+def test_scans_of_a_placement_are_of_one_board():
+    scenario = replace(load_scenario("paper_rig"), scans=3, sigma_range=0.001)
+    shots = draw_shots(scenario, np.random.default_rng(0), 2, 4)
+    ranges = shots["ranges"]
+    assert ranges.shape[:3] == (2, 4, 3)
+    spread = ranges.std(axis=2)  # NaN where one of the scans misses
+    assert 0.0005 < np.nanmedian(spread) < 0.001, "drawn anew, about the same board"
+
+
+def test_a_corner_without_noise_is_where_its_image_shows_it():
+    scenario = replace(load_scenario("corner_calib_edge"), **QUIET)
+    shots = draw_shots(scenario, np.random.default_rng(0), 2, 5)
+    obs = crossing_observations(shots, scenario)
+    T = shots["T_camera_lrf"][:, None]
+    seen = np.matvec(T[..., :3], obs.crossing_points) + T[..., 3]
+    u, v = np.moveaxis(pinhole(seen, scenario.model), -1, 0)
+    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
+    assert np.abs(np.vecdot(obs.crossing_lines, pixels)).max() < 1e-5
+    assert len(np.unique(obs.crossing_placement)) == obs.crossing_points.shape[1] == 5
 
 
 def test_published_rigs_are_as_published():
@@ -79,10 +129,8 @@ def test_what_is_varied_changes_and_is_told():
     assert 2000 * scenario.radius(2.0) == pytest.approx(30)
     big = varied(load_scenario("outdoor_lms221"), "board_scale", 2.0)
     assert np.allclose(big.board.corners, 2 * load_scenario("outdoor_lms221").board.corners)
-    assert [s.name for s in variations(["paper_rig"], ["step_deg=0.5,1"])] == [
-        "paper_rig step_deg=0.5",
-        "paper_rig step_deg=1",
-    ]
+    told = [s.varied for s in variations(["paper_rig"], ["step_deg=0.5,1", "bias=-0.5"])]
+    assert told == [{"step_deg": 0.5, "bias": -0.5}, {"step_deg": 1.0, "bias": -0.5}]
 
 
 # the study
@@ -132,9 +180,10 @@ def test_failures_are_counted_and_named():
 
 def test_the_interval_of_a_median_holds_it():
     values = np.random.default_rng(0).normal(size=101)
-    low, high = median_interval(values)
+    low, high = (resampled(values, share) for share in (0.05, 0.95))
     assert low < np.median(values) < high and high - low < 0.6
-    assert (low, high) == median_interval(values[::-1])
+    assert low == resampled(values[::-1], 0.05)
+    assert np.isnan(resampled(np.array([np.nan]), 0.05))
 
 
 def test_a_killed_study_goes_on(small, tmp_path, monkeypatch):
@@ -153,11 +202,11 @@ def test_a_killed_study_goes_on(small, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         study_to_file(small, out)
     part = tmp_path / "study.csv.part"
-    assert len(part.read_text().splitlines()) == 3 and not out.exists()
+    assert part.read_text().count("task") == 2 and not out.exists()
     with part.open("a") as file:
-        file.write('{"task": "paper_rig/8/0", "ro')  # the end of a line is missing
+        file.write('\n{"task": "0123", "ro')  # the end of a line is missing
     with pytest.raises(ValueError, match="belongs to another study"):
-        study_to_file(small[:2], out)
+        study_to_file(small[2:], out)
     done = []
     monkeypatch.setattr(
         study, "run_task", lambda task: done.append(task.key) or run_task(task)
@@ -178,6 +227,7 @@ def test_a_killed_study_goes_on(small, tmp_path, monkeypatch):
         ((["paper_rig"], (), (6,), 4), "no method"),
         ((["paper_rig"], FAST, (6,), 0), "0 trials"),
         ((["paper_rig"], FAST, (2,), 4), "3 or more"),
+        ((["corner_calib_edge"], FAST, (6,), 4), "shows no board: use line_printed, line,"),
     ],
 )
 def test_what_cannot_be_asked_is_refused(arguments, words):
@@ -204,16 +254,18 @@ def test_poses_that_cannot_be_drawn_name_the_condition():
         run_study(far, ("line",), (3,), 1)
 
 
-def test_a_file_that_is_no_part_is_refused(small, tmp_path):
+def test_a_file_that_is_of_no_study_is_refused(small, tmp_path):
     (tmp_path / "a.csv.part").write_text("nonsense\n")
-    with pytest.raises(ValueError, match="no part of a study"):
+    with pytest.raises(ValueError, match="belongs to another study"):
         study_to_file(small, tmp_path / "a.csv")
 
 
 def test_what_is_stored_is_of_the_scenarios_that_there_are():
     table = pd.read_csv(ROOT / "data" / "studies" / "methods.csv")
-    assert set(table.scenario) == set(FILE)
-    assert (table.groupby(["scenario", "method"]).n_poses.count() == 4).all()
+    assert set(table.scenario) <= set(FILE) and set(table.method) == set(STUDIED)
+    assert (
+        table.groupby(["scenario", "method"]).n_poses.agg(list).map(tuple) == COUNTS
+    ).all()
 
 
 # a cluster
@@ -229,34 +281,69 @@ def die_once(marker, task):
     return run_task(task)
 
 
-@pytest.fixture(scope="module")
-def dask():
-    """Two worker processes of this machine."""
-    from distributed import LocalCluster
+# what runs as a process of its own, because a cluster leaves threads behind
+CLUSTER = """
+import sys
+from distributed import LocalCluster
 
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as local:
+        print(local.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """Of a cluster with two worker processes."""
+    script = tmp_path_factory.mktemp("cluster") / "cluster.py"
+    script.write_text(CLUSTER)
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
+    with subprocess.Popen(
+        [sys.executable, script],
+        env=environment,
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as local:
-        yield local
+        yield local.stdout.readline().strip()
 
 
 def test_a_worker_that_dies_loses_nothing_and_nothing_counts_twice(
-    dask, small, tmp_path, monkeypatch
+    address, small, tmp_path, monkeypatch
 ):
     alone = study_to_file(small, tmp_path / "alone.csv")
     monkeypatch.setattr(study, "run_task", partial(die_once, str(tmp_path / "marker")))
-    with workers_at(dask.scheduler_address) as executor:
+    with workers_at(address) as executor:
         shared = study_to_file(small, tmp_path / "shared.csv", executor)
     assert (tmp_path / "marker").exists(), "a worker died"
     pd.testing.assert_frame_equal(alone, shared)
     assert (tmp_path / "alone.csv").read_bytes() == (tmp_path / "shared.csv").read_bytes()
 
 
-def test_a_worker_with_another_version_is_refused(dask, monkeypatch):
+def test_sessions_are_calibrated_on_a_cluster_as_here(
+    address, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    quick = shutil.copytree(QUICK, tmp_path / QUICK.name)
+    assert main(["calibrate", str(quick), "--out", "here"]) == 0
+    assert capsys.readouterr().out.count("Handed over") == 1
+    assert main(["calibrate", str(quick), "nowhere", "--scheduler", address]) == 1
+    out = capsys.readouterr().out
+    assert "Handed over" in out and "nowhere/session.json: No such file" in out
+    for name in ("cloud.ply", "scene.ply"):
+        elsewhere = tmp_path / "reports" / quick.name / name
+        assert elsewhere.read_bytes() == (tmp_path / "here" / name).read_bytes()
+    assert main(["calibrate", "a", "b", "--out", "here"]) == 1
+    assert "one session" in capsys.readouterr().err
+
+
+def test_a_worker_with_another_version_is_refused(address, monkeypatch):
     monkeypatch.setattr(cluster, "source_digest", lambda: "0123")
     with (
         pytest.raises(ValueError, match=r"worker tcp.* another version of lrfcal_lib"),
-        workers_at(dask.scheduler_address),
+        workers_at(address),
     ):
         pass
     with pytest.raises(ValueError, match="joined later has another version"):

@@ -34,6 +34,19 @@ def test_what_the_maker_admits_is_stated_or_known_of_the_model(stated, admitted)
     )
 
 
+@pytest.mark.parametrize(("model", "step_deg", "stated", "sigma"), [
+    ("LMS221-30206 (simulated)", 0.5, None, 0.0), ("LMS221-30206", 0.505, None, 0.0058),
+    ("SICK LMS400", 0.1, None, 0.0), ("TiM561", 0.3333, None, 0.0), ("home-made", 0.5, None, 0.0058),
+    ("home-made", 0.5, 0.0, 0.0), ("LMS221-30206", 0.5, 0.001, 0.001),
+])  # fmt: skip
+def test_the_angular_step_is_known_as_stated_or_as_of_the_model(
+    model, step_deg, stated, sigma
+):
+    lrf = LrfInfo(model, (0.9, 2.2), np.radians(step_deg), 0.005, step_error=stated)
+    assert lrf.step_sigma == sigma
+    assert from_json(LrfInfo, lrf_to_json(lrf)).step_sigma == sigma
+
+
 @campaign
 @pytest.mark.parametrize("length", [0.375, 0.415])
 def test_an_edge_stated_wrong_is_named_by_a_whole_session(length, tmp_path):

@@ -83,8 +83,8 @@ WEAK = {
     "parallel": (parallel, {}, "with care", "all boards are parallel"),
     "distance": (lambda poses: board_poses(np.random.default_rng(8), 8, (1.5, 1.52)), {}, "with care",
                  "all boards stand at one distance"),
-    "placements": (lambda poses: poses[:4], {}, "with care", "4 placements only, 6 or more are needed"),
-    "cameras": (lambda poses: poses[:2], {}, "with care", "camera 'right' sees the board in 2 placements only"),
+    "placements": (lambda poses: poses[:4], {}, "with care", "only 4 placements, 6 or more are needed"),
+    "cameras": (lambda poses: poses[:2], {}, "with care", "camera 'right' sees the board in only 2 placements"),
 }  # fmt: skip
 
 
@@ -106,7 +106,7 @@ def test_weak_recordings_are_named(good, kind):
     )
     if kind == "pitch":
         assert (
-            "the recorded pitch ranges over 1.0 deg only within a placement"
+            "the recorded pitch spans only 1.0 deg within a placement"
             in found.sentences()[0]
         )
         assert found.errors[2.0].cloud_mm > 10 and found.suggestion.gain > 0.5
@@ -159,11 +159,9 @@ def test_misfit_model_error_and_noise_are_named(good):
     left_out = Problem(Stage.JOINT, ProblemKind.CONTRADICTS, "left out", 9)
     bad = replace(
         solution, misfit=solution.misfit | {3: 30.0}, excluded=(left_out,), solution=inner,
-        warnings=("the data ask for the scale of the pitch",),
     ).with_levels(face_scale=2.6)  # fmt: skip
     words = {r.kind: r.words for r in diagnose(bad)}
     assert words["misfit"].startswith("placements fit much worse than the others: 3 (5.")
-    assert words["warning"] == "the data ask for the scale of the pitch"
     assert (
         words["excluded"] == "placement 9: left out"
         and "has not converged" in words["convergence"]

@@ -29,7 +29,7 @@ BLURRED_PX = 3.5  # rise of a chessboard's edges from 10 to 90 %; 2 to 3 in a sh
 LEAST_SQUARE_PX = 24  # with fewer OpenCV finds no edges; smaller ones are enlarged
 CLIPPED = 250  # grey levels of a white square
 LOW_CONTRAST = 25  # grey levels between white and dark squares
-DARKNESS = "too dark, more light or a longer exposure"
+DARKNESS = "too dark: use more light or a longer exposure"
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def check_placement(
         sweep = None
     scene = placement in session.scene_placements
     if scene and sweep is not None:
-        return [_check_scene(sweep)]
+        return [check_scene(sweep)]
     lights = check_scan(sweep, session.board, session.T_head_lrf, session.lrf)
     lights += check_repetition(session, placement)
     if scene:
@@ -92,14 +92,17 @@ def check_placement(
     return lights
 
 
-def _check_scene(sweep):
+def check_scene(sweep: Sweep) -> Light:
+    """The Light of a sweep over a scene: how much of it came back.
+
+    Parameters
+    ----------
+    sweep
+    """
     share = np.isfinite(sweep.ranges).mean()
-    text = (
-        f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
-    )
-    if share > LEAST_SCENE:
-        return Light("scan", "ok", text)
-    return Light("scan", "warn", text)
+    state = "ok" if share > LEAST_SCENE else "warn"
+    text = f"{len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
+    return Light("scan", state, f"scene: {text}")
 
 
 def _together(name, lights):
@@ -232,13 +235,13 @@ def check_image(
     rise /= scale
     faults = []
     if rise > BLURRED_PX:
-        faults.append("blurred, hold the board still and focus")
+        faults.append("blurred: hold the board still, and focus")
     if white < DARK:
         faults.append(DARKNESS)
     if white > CLIPPED:
-        faults.append("overexposed, less light or a shorter exposure")
+        faults.append("overexposed: use less light or a shorter exposure")
     if white - dark < LOW_CONTRAST:
-        faults.append("little contrast, avoid glare")
+        faults.append("little contrast: avoid glare")
     text = f"pattern found, edges rise in {rise:.1f} px, squares {dark:.0f} and {white:.0f} of 255"
     if not faults:
         return Light(name, "ok", text)

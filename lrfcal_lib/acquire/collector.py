@@ -33,6 +33,7 @@ from lrfcal_lib.solvers import CANDIDATES
 PRACTICE_RIGS = ("practice", "sim_quick", "sim_lms221")
 ADVICE_FROM = 3  # placements, below which every other one helps
 WAIT_S = 3.0  # for a look at the rig to end
+POSE_UNITS = np.repeat([np.degrees(1.0), 1000.0], 3)  # degrees and mm
 AGAIN_S = 0.1  # between stops, until whoever moves the head has noticed
 RECONNECT_S = 2.0
 GUIDE = (
@@ -100,23 +101,14 @@ def next_task(recording: Recording, advice: str = "") -> Task | None:
 
 
 @dataclass(frozen=True)
-class Pose:
-    """Where a camera is, as people read it: degrees and millimetres, three of each."""
-
-    turn: np.ndarray  # rotation vector
-    shift: np.ndarray
-    turn_sigma: np.ndarray
-    shift_sigma: np.ndarray
-
-
-@dataclass(frozen=True)
 class Result:
     """A calibration."""
 
     answer: str  # whether to trust it: yes, with care, no
     sentences: tuple[str, ...]
     method: str  # whose poses are handed over; '' where none is
-    poses: dict[str, Pose]  # by camera
+    # by camera: rotation vector (degrees) and translation (mm), each with its sigma
+    poses: dict[str, tuple[str, ...]]
     file: Path | None  # calibration.json
     calibration: Calibration
 
@@ -146,13 +138,10 @@ def calibrate_recording(path: Path) -> Result:
     poses = {}
     for (camera, name), solution in calibration.solutions.items():
         if name == method:
-            sigma = solution.trusted_sigma
-            pose: Any = solution.transform
-            poses[camera] = Pose(
-                turn=np.degrees(pose.rotation.as_rotvec()),
-                shift=1000 * pose.translation,
-                turn_sigma=np.degrees(sigma[:3]),
-                shift_sigma=1000 * sigma[3:6],
+            values = POSE_UNITS * solution.parameters[:6]
+            sigma = POSE_UNITS * solution.trusted_sigma[:6]
+            poses[camera] = tuple(
+                f"{v:.2f} ± {s:.2f}" for v, s in zip(values, sigma, strict=True)
             )
     file = path.with_name(f"{path.name}_calibration") / "calibration.json"
     write_calibration(file, calibration_record(calibration, method, judged))
@@ -183,7 +172,7 @@ def advise(session: Session) -> str:
     if judged.answer == YES:
         return ""
     if judged.suggestion:
-        return f"put the {judged.suggestion.words()}"
+        return judged.suggestion.sentence()
     return judged.no_suggestion
 
 

@@ -6,10 +6,13 @@ import os
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import ipywidgets as w
 import numpy as np
 from jinja2 import Environment, FileSystemLoader
@@ -17,18 +20,13 @@ from markupsafe import Markup
 
 from lrfcal_lib.acquire.checks import Light
 from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted, Result
-from lrfcal_lib.acquire.pictures import (
-    WIDTH,
-    jpeg,
-    png,
-    scan_picture,
-    sweep_picture,
-    with_scan,
-)
+from lrfcal_lib.acquire.pictures import WIDTH, jpeg, scan_picture, sweep_picture, with_scan
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.calibrate.calibration_file import load_calibration
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.drivers.port import Closed, DeviceError
+from lrfcal_lib.measure.holds import Answer, holds
+from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.shown import escape
 from lrfcal_lib.session.write import new_session_path
 
@@ -37,18 +35,26 @@ DRIVERS = logging.getLogger("lrfcal_lib")
 # errors whose messages say what to do
 EXPECTED = (DeviceError, RecordingError, Busy, Interrupted, ValueError, OSError)
 LOOK_S = 0.3  # between looks at the rig
+RED = (0, 0, 255)  # frame of a camera that has moved
+CHECKED = 2  # scenes, the newest, that a chosen calibration is checked with
 NOTES = 4  # lines of what drivers report
 FOLLOWS = "three placements and more; the recording can go on afterwards"
 PLAIN = "The data collection panel: it appears here while this notebook runs in JupyterLab."
-BUTTONS = (
-    "connect",
-    "close",
-    "stop",
-    "go",
-    "capture",
-    "again",
-    "calibrate",
-)  # methods of Panel
+BUTTONS = {  # methods of Panel: label, what it does, style, icon
+    "connect": ("Connect", "open all devices and the session", "primary", "plug"),
+    "close": ("Close", "finish the session and close all devices", "", "power-off"),
+    "stop": ("STOP", "stop the head at once, and what is under way", "danger", "stop"),
+    "go": ("Go", "move the head to the target", "", "arrows-v"),
+    "capture": ("Capture", "record this placement", "success", "camera"),
+    "again": ("Again", "take the last placement back, to record it again", "", "undo"),
+    "calibrate": (
+        "Save & calibrate",
+        "calibrate what is recorded so far",
+        "info",
+        "check",
+    ),
+}
+SIGNS = {Answer.HOLDS: "ok", Answer.UNKNOWN: "warn", Answer.MOVED: "bad"}
 HERE = Path(__file__).parent
 STYLE = f"<style>\n{HERE.joinpath('panel.css').read_text()}</style>"
 
@@ -71,45 +77,50 @@ HTML: Any = (  # macros that make parts of the panel
     .get_template("panel.html.jinja")
     .module
 )
+TEXTS = {  # what they say at first
+    "state": HTML.state("off"),
+    "lights": HTML.lights("Quality", ()),
+    "result": HTML.soft(FOLLOWS),
+    **dict.fromkeys(
+        (
+            "places",
+            "error",
+            "overlay",
+            "held",
+            "trouble",
+            "notes",
+            "pitch",
+            "task",
+            "doing",
+        ),
+        "",
+    ),
+}
 
 
-def named(name, widget):
+def named(name: str, widget: Any) -> Any:
     """A widget that is found in the page by the class ``lrfcal-<name>``."""
     widget.add_class(f"lrfcal-{name}")
     return widget
 
 
-def text(name, content=""):
-    """A text."""
-    return named(name, w.HTML(content))
-
-
-def button(name, label, tip, *, style="", icon="", width="auto"):
-    """A button; `tip` says what it does."""
-    look = {"button_style": style, "icon": icon, "layout": {"width": width}}
-    return named(name, w.Button(description=label, tooltip=tip, **look))
-
-
 def card(*children, grow=1, basis="300px"):
     """A framed part."""
-    framed = w.VBox(children, layout=w.Layout(flex=f"{grow} 1 {basis}", min_width="0"))
-    framed.add_class("lrfcal-card")
-    return framed
+    framed = w.VBox(children, layout={"flex": f"{grow} 1 {basis}", "min_width": "0"})
+    return named("card", framed)
 
 
 def row(*children, **layout):
     """Widgets side by side, wrapped where the window is narrow."""
-    layout = {"grid_gap": "10px", "flex_flow": "row wrap", **layout}
-    return w.HBox(children, layout=w.Layout(**layout))
+    return w.HBox(children, layout={"grid_gap": "10px", "flex_flow": "row wrap", **layout})
 
 
 class Picture:
     """A picture with a heading and a remark under it."""
 
     def __init__(self, name, heading, kind="png"):
-        layout = w.Layout(width="100%", max_width=f"{WIDTH}px")
-        self.image = w.Image(format=kind, layout=layout)
-        self.image.add_class(f"lrfcal-picture-{name}")
+        layout = {"width": "100%", "max_width": f"{WIDTH}px"}
+        self.image = named(f"picture-{name}", w.Image(format=kind, layout=layout))
         self.remark = w.HTML()
         self.box = card(w.HTML(HTML.title(heading)), self.image, self.remark, basis="220px")
 
@@ -119,135 +130,48 @@ class Picture:
         self.remark.value = HTML.soft(remark)
 
 
-class Parts:
+class Parts(SimpleNamespace):
     """All widgets by their names; `root` is shown."""
 
     def __init__(self, rig, session):
-        self._make_fields(rig, session)
-        self._make_buttons()
-        self._make_texts()
-        self.pictures = {}
-        self.views = row()
-
+        fields = _fields(rig, session)
+        texts = {name: w.HTML(content) for name, content in TEXTS.items()}
+        buttons = {}
+        for name, (label, tip, style, icon) in BUTTONS.items():
+            buttons[name] = w.Button(
+                description=label, tooltip=tip, button_style=style, icon=icon
+            )
+        everything = {**fields, **texts, **buttons}
+        super().__init__(
+            **{name: named(name, widget) for name, widget in everything.items()},
+            pictures={},
+            views=row(),
+        )
         # what starts and what stops a recording stand side by side, on screen together at any size
         title = w.HTML("<b style='font-size:16px'>Data collection</b>")
-        buttons = row(self.capture, self.again, self.stop)
+        pressed = row(self.capture, self.again, self.stop)
         spread = {"justify_content": "space-between", "align_items": "center"}
-        self.top = named("top", row(title, self.state, buttons, **spread))
-
-        fields = row(self.rig, self.session, self.connect, self.close)
+        self.top = named("top", row(title, self.state, pressed, **spread))
         head = card(w.HTML(HTML.title("Head")), self.pitch, self.slider, row(self.go))
         task = card(self.task, self.progress, self.doing)
         lights = card(self.lights, grow=2, basis="420px")
-        result = card(
-            w.HTML(HTML.title("Result")), row(self.calibrate), self.result, basis="auto"
-        )
-        below = [self.views, row(head, task, lights), result, self.notes]
+        title = w.HTML(HTML.title("Result"))
         parts = [
             w.HTML(STYLE),
             self.top,
-            fields,
+            row(self.rig, self.session, self.connect, self.close),
             self.calibration,
             self.places,
             self.overlay,
+            self.held,
             self.error,
             self.trouble,
-            *below,
+            self.views,
+            row(head, task, lights),
+            card(title, row(self.calibrate), self.result, basis="auto"),
+            self.notes,
         ]
-        self.root = named("panel", w.VBox(parts, layout=w.Layout(grid_gap="10px")))
-
-    def _make_fields(self, rig, session):
-        style = {"description_width": "62px"}
-        self.rig = w.Combobox(
-            value=rig,
-            options=PRACTICE_RIGS,
-            placeholder="rig file or emulated rig",
-            description="rig",
-            style=style,
-            layout=w.Layout(flex="1 1 260px"),
-        )
-        self.session = w.Text(
-            value=session,
-            description="session",
-            style=style,
-            layout=w.Layout(flex="2 1 320px"),
-        )
-        self.calibration = w.Text(
-            placeholder="calibration.json: shows the scan in the images",
-            description="calibration",
-            continuous_update=False,
-            style={"description_width": "80px"},
-            layout=w.Layout(width="100%"),
-        )
-        self.slider = w.FloatSlider(
-            min=-60,
-            max=60,
-            step=0.5,
-            readout_format="+.1f",
-            description="target",
-            style=style,
-            layout=w.Layout(width="100%"),
-        )
-        self.progress = w.FloatProgress(
-            min=0, max=1, description="", style=style, layout=w.Layout(width="100%")
-        )
-        for name in ("rig", "session", "calibration", "slider", "progress"):
-            named(name, getattr(self, name))
-
-    def _make_buttons(self):
-        self.connect = button(
-            "connect",
-            "Connect",
-            "open all devices and the session",
-            style="primary",
-            icon="plug",
-        )
-        self.close = button(
-            "close", "Close", "finish the session and close all devices", icon="power-off"
-        )
-        self.stop = button(
-            "stop",
-            "STOP",
-            "stop the head at once, and what is under way",
-            style="danger",
-            icon="stop",
-            width="130px",
-        )
-        self.go = button("go", "Go", "move the head to the target", icon="arrows-v")
-        self.capture = button(
-            "capture",
-            "Capture",
-            "record this placement",
-            style="success",
-            icon="camera",
-            width="140px",
-        )
-        self.again = button(
-            "again",
-            "Again",
-            "take the last placement back, to record it again",
-            icon="undo",
-        )
-        self.calibrate = button(
-            "calibrate",
-            "Save & calibrate",
-            "calibrate what is recorded so far",
-            style="info",
-            icon="check",
-        )
-
-    def _make_texts(self):
-        self.state = text("state", HTML.state("off"))
-        self.places = text("places")
-        self.error = text("error")
-        self.overlay = text("overlay")
-        self.trouble = text("trouble")
-        self.notes = text("notes")
-        self.pitch = text("pitch")
-        self.task = text("task")
-        self.doing = text("doing")
-        self.lights = text("lights", HTML.lights("Quality", ()))
-        self.result = text("result", HTML.soft(FOLLOWS))
+        self.root = named("panel", w.VBox(parts, layout={"grid_gap": "10px"}))
 
     def show_pictures(self, cameras):
         """Make room for the pictures of a rig."""
@@ -267,6 +191,45 @@ class Parts:
             part.disabled = busy or not connected
         for part in (self.again, self.calibrate):
             part.disabled = busy or not (connected and recorded)
+
+
+def _fields(rig, session):
+    """Widgets of what can be entered, by name."""
+    wide = {"width": "100%"}
+    narrow = {"description_width": "62px"}
+    return {
+        "rig": w.Combobox(
+            value=rig,
+            options=PRACTICE_RIGS,
+            placeholder="rig file or emulated rig",
+            description="rig",
+            style=narrow,
+            layout={"flex": "1 1 260px"},
+        ),
+        "session": w.Text(
+            value=session,
+            description="session",
+            style=narrow,
+            layout={"flex": "2 1 320px"},
+        ),
+        "calibration": w.Text(
+            placeholder="calibration.json: shows the scan in the images",
+            description="calibration",
+            continuous_update=False,
+            style={"description_width": "80px"},
+            layout=wide,
+        ),
+        "slider": w.FloatSlider(
+            min=-60,
+            max=60,
+            step=0.5,
+            readout_format="+.1f",
+            description="target",
+            style=narrow,
+            layout=wide,
+        ),
+        "progress": w.FloatProgress(min=0, max=1, layout=wide),
+    }
 
 
 class Notes(logging.Handler):
@@ -330,7 +293,8 @@ class Panel(Closed):
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="panel")
         self._live: threading.Thread | None = None  # keeps looking
         self._quit = threading.Event()
-        self._sweep = None  # field of view, ends of the pitch and its step, radians
+        self._sweep: tuple[float, float] | None = None  # ends of the pitch, radians
+        self._moved: str | None = None  # camera that the chosen calibration has elsewhere
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         for name in ("rig", "session"):
@@ -363,6 +327,29 @@ class Panel(Closed):
                 if self._calibrated.answer == "no":
                     words = f"cannot be trusted: {'; '.join(self._calibrated.reasons)}"
         self.parts.overlay.value = HTML.error("calibration", words)
+        self._check_calibration()
+
+    def _check_calibration(self):
+        """Say whether the chosen calibration still holds for the scenes recorded last."""
+        self._moved = None
+        self.parts.held.value = ""
+        if self._calibrated is None or not self.collector.finished:
+            return
+        session = open_session(self.session)
+        scenes = session.scene_placements[-CHECKED:]
+        if not scenes:
+            return
+        try:
+            held = holds(replace(session, placements=scenes), self._calibrated)
+        except ValueError as error:
+            sentences = [f"cannot be told here: {error}"]
+            sign = "warn"
+        else:
+            sentences = held.sentences("the calibration")
+            sign = SIGNS[held.answer]
+            if held.culprit is not None:
+                self._moved = held.culprit.camera
+        self.parts.held.value = HTML.held(sign, sentences)
 
     def show(self) -> None:
         """Display the panel."""
@@ -415,6 +402,7 @@ class Panel(Closed):
             lights = self.collector.capture(self._show_progress)
             title = task.title.lower() if task else ""
             self.parts.lights.value = HTML.lights(f"Quality of {title}", lights)
+            self._check_calibration()
         return lights
 
     def again(self) -> int:
@@ -500,14 +488,9 @@ class Panel(Closed):
     def _begin_sweep(self, task):
         """An empty picture of the sweep to come."""
         self._sweep = None
-        if task is None or task.placement is None:
-            return
-        rig = self.collector.rig
-        pitch = task.placement.pitch
-        step = np.radians(rig.stated.plan.pitch_deg[2])
-        if len(pitch) >= 3:
-            step = np.median(np.abs(np.diff(pitch)))
-        self._sweep = rig.lrf_info.field_of_view, (pitch.min(), pitch.max()), step
+        if task is not None and task.placement is not None:
+            pitch = task.placement.pitch
+            self._sweep = pitch.min(), pitch.max()
 
     def _keep_looking(self):
         field_of_view = self.collector.rig.lrf_info.field_of_view
@@ -527,18 +510,14 @@ class Panel(Closed):
         self.parts.pitch.value = f"<b>{np.degrees(view.pitch):+.2f}°</b> {HTML.soft(how)}"
 
         if view.ranges is not None:
-            known = view.ranges[np.isfinite(view.ranges)]
-            nearest = "no range at all"
-            if len(known):
-                nearest = f"nearest {known.min():.2f} m"
+            known = np.isfinite(view.ranges).sum()
             picture = scan_picture(view.ranges, view.bearings, field_of_view)
-            pictures["scan"].show(png(picture), f"{len(known)} beams, {nearest}")
-        sweep = self._sweep
-        if sweep is not None:
+            pictures["scan"].show(picture, f"{known} beams came back")
+        if self._sweep is not None:
             rows = dict(view.rows)  # a copy: the recording goes on
-            picture = sweep_picture(rows, view.bearings, *sweep)
+            picture = sweep_picture(rows, view.bearings, self._sweep)
             words = f"{len(rows)} scan lines; near is bright, white is no range"
-            pictures["sweep"].show(png(picture), words)
+            pictures["sweep"].show(picture, words)
         for name, frame in dict(view.frames).items():
             image, words = self._overlaid(name, frame.image, view)
             pictures[name].show(jpeg(image, WIDTH), words)
@@ -559,4 +538,8 @@ class Panel(Closed):
             return image, f"{words}; the calibration is of {model.width} x {model.height}"
         pixels = rig.project_scan(name, view.ranges, view.bearings, view.pitch)
         image = with_scan(image, pixels, view.ranges)
-        return image, f"{words}; dots: the scan, near is bright"
+        words = f"{words}; dots: the scan, near is bright"
+        if name == self._moved:
+            cv2.rectangle(image, (0, 0), (width - 1, height - 1), RED, round(width / 50))
+            words = f"{words}; has moved since it was calibrated"
+        return image, words

@@ -1,37 +1,27 @@
 """Pictures of the data collection panel: a scan from above, a sweep as it grows, camera images."""
 
+import io
+
 import cv2
+import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.colors import COLORS
+from lrfcal_lib.plots.recording import range_image
+from lrfcal_lib.session.read import Sweep
 
 WIDTH = 400  # of a picture, pixels
-HEIGHT = 300
-REACHES = (2.0, 4.0, 8.0, 12.0, 20.0, 40.0, 80.0, 120.0)  # of the top view, metres
-RINGS = 4  # of the top view
-SHIFT = 4  # binary digits of a pixel's fraction, as OpenCV counts them
-MARGIN = 1.1  # a picture is so many times larger than what it shows
-# of a sweep in its picture, pixels
-LEFT = 44
-TOP = 12
-RIGHT = 388
-BOTTOM = 255
-
-# greys and colours, blue first
-SECTOR = (246, 246, 246)
-CIRCLE = (217, 217, 217)
-GREY = (138, 138, 138)
-DARK = (51, 51, 51)
-EMPTY = (238, 238, 238)  # where there is no range
-DOT = tuple(reversed(bytes.fromhex(COLORS["lrf"][1:])))
+REACHES = np.array([2.0, 4.0, 8.0, 12.0, 20.0, 40.0, 80.0])  # of the top view, metres
+SIZE = {"figsize": (4, 3), "dpi": 100}
+NEAR_IS_BRIGHT = "viridis_r"
 
 
 def scan_picture(
     ranges: ArrayLike, bearings: ArrayLike, field_of_view: tuple[float, float]
-) -> np.ndarray:
-    """A scan from above, the laser range finder below.
+) -> bytes:
+    """A scan from above, the laser range finder below, as a PNG file.
 
     Parameters
     ----------
@@ -41,57 +31,23 @@ def scan_picture(
         (B,), radians.
     field_of_view
         First and last bearing, radians.
-
-    Returns
-    -------
-    ndarray of uint8, shape (300, 400, 3)
-        Blue, green, red.
     """
-    points = polar_to_points(np.asarray(ranges, float), bearings)[:, :2]
-    points = points[np.isfinite(points).all(axis=1)]
-    far = 0.0  # of nine of ten points
-    if len(points):
-        far = np.percentile(np.linalg.norm(points, axis=1), 90)
-    reach = next((reach for reach in REACHES if reach >= far), REACHES[-1])
-    border = polar_to_points(np.full(91, reach), np.linspace(*field_of_view, 91))[:, :2]
-
-    low = min(0.0, border[:, 1].min())
-    high = border[:, 1].max()
-    across = 2 * np.abs(border[:, 0]).max()
-    scale = min(HEIGHT / (high - low), WIDTH / across) / MARGIN  # pixels a metre
-    origin = np.array([WIDTH, HEIGHT + scale * (low + high)]) / 2 - 0.5
-
-    def pixels(points):
-        """Fixed-point pixels of points in metres."""
-        return np.rint((origin + [scale, -scale] * points) * 2**SHIFT).astype(int)
-
-    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    cv2.fillPoly(
-        image, [pixels(np.vstack([np.zeros(2), border]))], SECTOR, cv2.LINE_AA, SHIFT
-    )
-    for share in np.linspace(0, 1, RINGS + 1)[1:]:
-        ring = pixels(share * border)
-        cv2.polylines(image, [ring], False, CIRCLE, 1, cv2.LINE_AA, SHIFT)
-        if share < 1:
-            u, v = ring[0] / 2**SHIFT
-            write(image, f"{share * reach:g} m", u + 14, v + 8)
-    arrow = pixels(np.array([(-6, -5), (6, -5), (0, 7)]) / scale)
-    cv2.fillPoly(image, [arrow], DARK, cv2.LINE_AA, SHIFT)
-    for pixel in pixels(points).tolist():
-        cv2.circle(image, pixel, 2 << SHIFT, DOT, -1, cv2.LINE_AA, SHIFT)
-    return image
+    figure = Figure(**SIZE)
+    ax = figure.add_axes((0.1, 0.1, 0.8, 0.85), projection="polar")
+    ax.plot(bearings, ranges, ".", color=COLORS["lrf"], markersize=3)
+    known = np.ravel(ranges)[np.isfinite(ranges)]
+    far = np.percentile(known, 90) if len(known) else 0.0
+    ax.set_rlim(0, REACHES[min(np.searchsorted(REACHES, far), len(REACHES) - 1)])
+    ax.set_thetalim(*field_of_view)
+    ax.set_rorigin(0)
+    figure.text(0.5, 0.03, "range [m]", ha="center")
+    return _png(figure)
 
 
 def sweep_picture(
-    rows: dict[float, np.ndarray],
-    bearings: np.ndarray,
-    field_of_view: tuple[float, float],
-    pitch: tuple[float, float],
-    step: float,
-) -> np.ndarray:
-    """A sweep as it grows: ranges as colours, near is bright, grey where there is none.
-
-    Bearing grows to the left as in the scene, pitch upwards.
+    rows: dict[float, np.ndarray], bearings: np.ndarray, pitch: tuple[float, float]
+) -> bytes:
+    """A sweep as it grows: ranges as colours, near is bright; a PNG file.
 
     Parameters
     ----------
@@ -99,36 +55,20 @@ def sweep_picture(
         Ranges (B,), metres, by pitch, radians.
     bearings
         (B,), radians; not used without rows.
-    field_of_view, pitch
-        Their ends, radians.
-    step
-        Radians between scan lines, of a continuous sweep the most between two.
-
-    Returns
-    -------
-    ndarray of uint8, shape (300, 400, 3)
-        Blue, green, red.
+    pitch
+        Its ends, radians.
     """
-    half = np.degrees(step) / 2
-    right, left = np.sort(np.degrees(field_of_view))
-    low, high = np.sort(np.degrees(pitch)) + [-half, half]
-    across = (left, right)
-    down = (high, low)
-    image = _axes(across, down)
-    if not rows:
-        return image
-
-    shades = _shades(np.array(list(rows.values())))
-    bearing = np.linspace(*across, RIGHT - LEFT)
-    beam = np.rint(
-        np.interp(bearing, np.degrees(bearings), np.arange(len(bearings)))
-    ).astype(int)
-    at = np.linspace(*down, BOTTOM - TOP)
-    away = np.abs(at[:, None] - np.degrees(list(rows)))
-    covered = away.min(axis=1) <= half + (high - low) / len(at)
-    nearest = away.argmin(axis=1)[covered]
-    image[TOP:BOTTOM, LEFT:RIGHT][covered] = shades[nearest][:, beam]
-    return image
+    figure = Figure(**SIZE)
+    ax = figure.add_axes((0.17, 0.17, 0.81, 0.79))
+    if len(rows) > 1:
+        known = np.array(list(rows))
+        sweep = Sweep(
+            0, np.array(list(rows.values())), bearings, known, np.zeros(len(known))
+        )
+        with matplotlib.rc_context({"image.cmap": NEAR_IS_BRIGHT}):
+            range_image(ax, sweep, limits=(None, None))
+    ax.set(ylim=np.degrees(np.sort(pitch)), aspect="auto")
+    return _png(figure)
 
 
 def with_scan(image: np.ndarray, pixels: np.ndarray, ranges: np.ndarray) -> np.ndarray:
@@ -152,70 +92,20 @@ def with_scan(image: np.ndarray, pixels: np.ndarray, ranges: np.ndarray) -> np.n
     height, width = image.shape[:2]
     radius = max(2, round(width / WIDTH * 2))
     inside = np.all((pixels >= 0) & (pixels < (width, height)), axis=1)
-    colours = _shades(ranges[None])[0]
-    for pixel, colour in zip(
-        pixels[inside].round().astype(int), colours[inside], strict=True
-    ):
-        cv2.circle(drawn, pixel.tolist(), radius, colour.tolist(), -1, cv2.LINE_AA)
+    low, high = np.nanpercentile(ranges, [2, 90])
+    near = np.clip((high - ranges[inside]) / max(high - low, 0.1), 0, 1)
+    colours = cv2.applyColorMap((255 * near).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    middles = pixels[inside].round().astype(int).tolist()
+    for pixel, colour in zip(middles, colours.reshape(-1, 3).tolist(), strict=True):
+        cv2.circle(drawn, pixel, radius, colour, -1, cv2.LINE_AA)
     return drawn
 
 
-def write(image: np.ndarray, text: str, u: float, v: float) -> None:
-    """Write small and grey.
-
-    Parameters
-    ----------
-    image
-        To be written to.
-    text
-        In plain letters.
-    u, v
-        Middle of the text, pixels.
-    """
-    font = cv2.FONT_HERSHEY_SIMPLEX
-    scale = 0.36
-    (width, height), _ = cv2.getTextSize(text, font, scale, 1)
-    corner = round(u - width / 2), round(v + height / 2)
-    cv2.putText(image, text, corner, font, scale, GREY, 1, cv2.LINE_AA)
-
-
-def _axes(across, down):
-    """The empty picture of a sweep, with the bearings and pitches (degrees) of its ends."""
-    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    image[TOP:BOTTOM, LEFT:RIGHT] = EMPTY
-    bearings = np.linspace(*across, 3)
-    for bearing, u in zip(bearings, np.linspace(LEFT, RIGHT, 3), strict=True):
-        write(image, f"{bearing:.0f}", u, BOTTOM + 12)
-    pitches = np.linspace(*down, 3)
-    for pitch, v in zip(pitches, np.linspace(TOP, BOTTOM, 3), strict=True):
-        write(image, f"{pitch:.0f}", LEFT - 18, v)
-    write(image, "bearing [deg]", (LEFT + RIGHT) / 2, BOTTOM + 30)
-    write(image, "pitch [deg]", 32, BOTTOM + 30)
-    return image
-
-
-def _shades(ranges):
-    """Colours (L, B, 3) of ranges (L, B): near is bright, none is grey."""
-    known = np.isfinite(ranges)
-    low = 0.0
-    high = 1.0
-    if known.any():
-        low, high = np.percentile(ranges[known], [2, 90])
-    scaled = (np.nan_to_num(ranges, nan=high) - low) / max(high - low, 0.1)
-    brightness = (255 * (1 - np.clip(scaled, 0, 1))).astype(np.uint8)
-    colours = cv2.applyColorMap(brightness, cv2.COLORMAP_VIRIDIS).reshape(*ranges.shape, 3)
-    return np.where(known[..., None], colours, np.uint8(EMPTY))
-
-
-def png(image: np.ndarray) -> bytes:
-    """Content of a PNG file.
-
-    Parameters
-    ----------
-    image
-        (height, width, 3), BGR.
-    """
-    return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+def _png(figure):
+    """Content of a PNG file."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()
 
 
 def jpeg(image: np.ndarray, width: int) -> bytes:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lrfcal_lib.acquire.checks import LEAST_SCENE, Light
+from lrfcal_lib.acquire.checks import Light, check_scene
 from lrfcal_lib.acquire.record import Boards, ask_before
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -98,26 +98,10 @@ class Stations(Boards):
         """How good a station is: share of returns, share with a colour, whether it moved."""
         if self.rig is not None:
             require_same_rig(self.rig, session)
-        ranges = session.sweep(number).ranges
-        back = float(np.isfinite(ranges).mean())
-        text = f"{len(ranges)} scan lines, {100 * back:.0f} % of the beams came back"
-        lights = [Light("returns", _state(back > LEAST_SCENE), text)]
+        lights = [check_scene(session.sweep(number))]
         if self.rig is not None:
             lights.append(self._colors(session, number))
-        closing = closing_of(session.sweep(number))
-        if closing is None:
-            still = Light(
-                "stood still", "warn", "not known: too little came back to compare"
-            )
-        else:
-            text = (
-                f"back at a pitch that it had, ranges differ by {1000 * closing.apart:.0f} mm, "
-                f"by {1000 * closing.expected:.0f} mm between neighbouring scan lines"
-            )
-            still = Light("stood still", "ok", text)
-            if closing.moved:
-                still = Light("stood still", "bad", f"{text}: it moved, record it again")
-        return [*lights, still]
+        return [*lights, _still(session.sweep(number))]
 
     def _colors(self, session, number):
         """The Light of the share of points that get a colour."""
@@ -126,11 +110,20 @@ class Stations(Boards):
         share = sum(cloud.seen.sum() for cloud in clouds)
         share = float(share / max(1, sum(len(cloud.seen) for cloud in clouds)))
         text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
-        return Light("colour", _state(share > EXPECTED * self.share), text)
+        state = "ok" if share > EXPECTED * self.share else "warn"
+        return Light("colour", state, text)
 
 
-def _state(good):
-    """Of a Light."""
-    if good:
-        return "ok"
-    return "warn"
+def _still(sweep):
+    """The Light of whether a station stood still."""
+    closing = closing_of(sweep)
+    if closing is None:
+        text = "not known: too little came back to compare"
+        return Light("stood still", "warn", text)
+    text = (
+        f"back at a pitch that it had, ranges differ by {1000 * closing.apart:.0f} mm, "
+        f"by {1000 * closing.expected:.0f} mm between neighbouring scan lines"
+    )
+    if closing.moved:
+        return Light("stood still", "bad", f"{text}: it moved, record it again")
+    return Light("stood still", "ok", text)

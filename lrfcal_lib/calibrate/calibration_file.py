@@ -4,11 +4,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, FiniteFloat
+from pydantic import BaseModel, BeforeValidator, Field, FiniteFloat, PlainValidator
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty
+from lrfcal_lib.calibrate.rig_uncertainty import RigUncertainty, rows
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections
@@ -47,8 +48,9 @@ FORMULAS = {
     ),
     "covariance": (
         "Of the increments [w, v] of a pose: R <- exp(w) R, t <- t + v. `trusted` is what to rely "
-        "on, `covariance` what noise alone explains; null where nothing bounds an unknown. A turn "
-        "about the tilt axis and a shift along it are as stated: no data show them."
+        "on, `covariance` what noise alone explains, `lens` the share of the intrinsics in both; "
+        "null where nothing bounds an unknown. A turn about the tilt axis and a shift along it are "
+        "as stated: no data show them."
     ),
     "uncertainty": (
         "`unseen_...` are motions of (axis: 4, pose of the camera: 6, range offset, pitch scale, "
@@ -59,32 +61,29 @@ FORMULAS = {
 ROUND = 1e-9  # a rotation's matrix may be off by so much
 
 
-Four = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
-Unbounded = Annotated[
+def _pose(matrix):
+    """A RigidTransform to the last bit."""
+    whole = np.array(matrix, float)
+    if whole.shape != (4, 4):
+        raise ValueError(f"it has the shape {whole.shape}, not (4, 4)")
+    R = whole[:3, :3]
+    proper = np.abs(R @ R.T - np.eye(3)).max() < ROUND and np.linalg.det(R) > 0
+    if not proper or whole[3].tolist() != [0, 0, 0, 1]:
+        raise ValueError("it is no rotation and translation")
+    return pose_transform(whole[:3], proper=True)
+
+
+Pose = Annotated[RigidTransform, PlainValidator(_pose)]
+Endless = Annotated[
     float, BeforeValidator(lambda value: np.inf if value is None else value)
 ]
-Matrix = list[list[Unbounded]]
 
 
-class PoseWritten(BaseModel):
-    """A transform, by its matrix."""
-
-    matrix: tuple[Four, Four, Four, Four]
-
-    def made(self):
-        """As a RigidTransform, to the last bit."""
-        whole = np.array(self.matrix)
-        R = whole[:3, :3]
-        proper = np.abs(R @ R.T - np.eye(3)).max() < ROUND and np.linalg.det(R) > 0
-        if not proper or whole[3].tolist() != [0, 0, 0, 1]:
-            raise ValueError(f"matrix {whole.tolist()} is no rotation and translation")
-        return pose_transform(whole[:3], proper=True)
-
-
-class PlatformWritten(PoseWritten):
+class PlatformWritten(BaseModel):
     """The tilt axis."""
 
-    axis_covariance: Matrix
+    matrix: Pose
+    axis_covariance: Annotated[np.ndarray, rows(4, 4)]
 
 
 class LensWritten(BaseModel):
@@ -96,22 +95,15 @@ class LensWritten(BaseModel):
     fy: Annotated[FiniteFloat, Field(gt=0)]
     cx: FiniteFloat
     cy: FiniteFloat
-    distortion: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
-    covariance: Matrix | None
+    distortion: Annotated[np.ndarray, rows(5)]
+    covariance: Annotated[np.ndarray, rows(9, 9)] | None
     rms_px: FiniteFloat | None
 
-    def made(self):
-        """As a CameraModel."""
-        values = dict(self)
-        values["distortion"] = np.array(self.distortion)
-        if self.covariance is not None:
-            values["covariance"] = shaped("lens.covariance", self.covariance, 9, 9)
-        return CameraModel(**values)
 
-
-class CameraWritten(PoseWritten):
+class CameraWritten(BaseModel):
     """A camera."""
 
+    matrix: Pose
     mount: Literal["head", "platform"]
     lens: LensWritten
 
@@ -125,8 +117,9 @@ class LrfWritten(BaseModel):
     sigma_range: FiniteFloat
     sigma_bearing: FiniteFloat
     range_resolution: FiniteFloat
-    max_range: Unbounded
+    max_range: Endless
     systematic_error: FiniteFloat | None
+    step_error: FiniteFloat | None = None
     spot_exit: FiniteFloat | None
     spot_divergence: FiniteFloat | None
 
@@ -136,35 +129,6 @@ class CorrectionsWritten(BaseModel):
 
     range_offset_m: FiniteFloat
     pitch_scale: FiniteFloat
-
-
-class UncertaintyWritten(BaseModel):
-    """What :class:`RigUncertainty` has."""
-
-    names: tuple[str, ...]
-    covariance: Matrix
-    trusted: Matrix
-    unseen_of_cloud: Matrix
-    unseen_of_cameras: dict[str, Matrix]
-    sweep_sigma: tuple[FiniteFloat, FiniteFloat]
-    range_noise: FiniteFloat
-
-    def made(self):
-        """As a RigUncertainty."""
-        count = len(self.names)
-        motions = len(COLUMNS)
-        return RigUncertainty(
-            names=self.names,
-            covariance=shaped("covariance", self.covariance, count, count),
-            trusted=shaped("trusted", self.trusted, count, count),
-            unseen_of_cloud=shaped("unseen_of_cloud", self.unseen_of_cloud, None, motions),
-            unseen_of_cameras={
-                camera: shaped(f"unseen_of_cameras.{camera}", rows, None, motions)
-                for camera, rows in self.unseen_of_cameras.items()
-            },
-            sweep_sigma=self.sweep_sigma,
-            range_noise=self.range_noise,
-        )
 
 
 class ReasonWritten(BaseModel):
@@ -191,7 +155,7 @@ class CalibrationFile(BaseModel):
     cameras: dict[str, CameraWritten]
     corrections: CorrectionsWritten
     lrf: LrfWritten
-    uncertainty: UncertaintyWritten | None
+    uncertainty: RigUncertainty | None
 
 
 def rig_record(rig: CalibratedRig) -> dict[str, Any]:
@@ -233,17 +197,6 @@ def pose_record(transform) -> dict[str, list]:
         "rotvec_rad": transform.rotation.as_rotvec().tolist(),
         "translation_m": transform.translation.tolist(),
     }
-
-
-def shaped(name: str, rows: list[list[float]], count: int | None, width: int) -> np.ndarray:
-    """Rows of numbers as an array (count, width); ValueError where they are of another shape."""
-    if any(len(row) != width for row in rows) or len(rows) != (count or len(rows)):
-        lengths = sorted({len(row) for row in rows})
-        raise ValueError(
-            f"{name} has {len(rows)} rows of {lengths} numbers, expected {count or 'any'} of "
-            f"{width}"
-        )
-    return np.array(rows, float).reshape(len(rows), width)
 
 
 def load_calibration(path: str | Path) -> CalibratedRig:
@@ -291,25 +244,26 @@ def load_calibration(path: str | Path) -> CalibratedRig:
 
 def _made(file):
     """The CalibratedRig of a CalibrationFile."""
-    cameras = {
-        name: CalibratedCamera(camera.made(), camera.mount, camera.lens.made())
-        for name, camera in file.cameras.items()
-    }
-    uncertainty = None
-    if file.uncertainty is not None:
-        uncertainty = file.uncertainty.made()
-        if set(uncertainty.unseen_of_cameras) != set(cameras):
+    cameras = {}
+    for name, camera in file.cameras.items():
+        model = CameraModel(**dict(camera.lens))
+        cameras[name] = CalibratedCamera(camera.matrix, camera.mount, model)
+    known = file.uncertainty
+    if known is not None:
+        if set(known.unseen_of_cameras) != set(cameras):
             raise ValueError("uncertainty.unseen_of_cameras is of other cameras")
-    axis_covariance = shaped("axis_covariance", file.platform.axis_covariance, 4, 4)
+        size = (len(known.names),) * 2
+        if any(C.shape != size for C in (known.covariance, known.trusted, known.lens)):
+            raise ValueError(f"uncertainty: its covariances are not of {size[0]} names")
     return CalibratedRig(
         method=file.method,
-        axis=KnownAxis(file.platform.made(), axis_covariance),
+        axis=KnownAxis(file.platform.matrix, file.platform.axis_covariance),
         corrections=Corrections(
             file.corrections.range_offset_m, file.corrections.pitch_scale
         ),
         cameras=cameras,
         lrf=LrfInfo(**dict(file.lrf)),
-        uncertainty=uncertainty,
+        uncertainty=known,
         session=file.session,
         answer=file.verdict.answer,
         reasons=tuple(reason.words for reason in file.verdict.reasons),
@@ -344,46 +298,31 @@ def require_same_rig(rig: CalibratedRig, other: Session | CalibratedRig) -> None
     rig : CalibratedRig
     other : Session or CalibratedRig
     """
-    name = other.name
-    sizes: dict[str, Any] = dict(other.cameras)
-    if isinstance(other, CalibratedRig):
-        sizes = {key: camera.model for key, camera in other.cameras.items()}
-    mounts = {key: camera.mount for key, camera in other.cameras.items()}
-    differences = [
-        *_other_cameras(rig, sizes, mounts),
-        *_other_lrf(rig.lrf, other.lrf),
-    ]
+    known = set(rig.cameras)
+    recorded = set(other.cameras)
+    differences = []
+    if recorded and not (known <= recorded or recorded <= known):
+        differences.append(f"its cameras are {sorted(recorded)}, not {sorted(known)}")
+    expected = _facts(rig)
+    for what, value in _facts(other).items():
+        if value != expected.get(what, value):
+            differences.append(f"{what} {value}, not {expected[what]}")
     if differences:
         raise ValueError(
-            f"{name} is of another rig than the calibration of '{rig.session}': "
+            f"{other.name} is of another rig than the calibration of '{rig.session}': "
             f"{'; '.join(differences)}"
         )
 
 
-def _other_cameras(rig, sizes, mounts):
-    """What tells the cameras of another rig from a calibrated one's, in words.
-
-    `sizes` has a width and a height by name, `mounts` what a camera is fixed to.
-    """
-    known = set(rig.cameras)
-    other = set(mounts)
-    if other and not (known <= other or other <= known):
-        yield f"its cameras are {sorted(other)}, not {sorted(known)}"
-    for name in sorted(known & other):
-        camera = rig.cameras[name]
-        size = f"{sizes[name].width} x {sizes[name].height}"
-        expected = f"{camera.model.width} x {camera.model.height}"
-        if size != expected:
-            yield f"images of '{name}' have {size} pixels, not {expected}"
-        if mounts[name] != camera.mount:
-            yield f"'{name}' is fixed to the {mounts[name]}, not to the {camera.mount}"
-
-
-def _other_lrf(lrf, other):
-    """What tells another range finder from a calibrated one, in words."""
-    step, expected = np.degrees([other.bearing_step, lrf.bearing_step]).round(6)
-    if step != expected:
-        yield f"its beams are {step:g} deg apart, not {expected:g}"
-    view, expected = np.degrees([other.field_of_view, lrf.field_of_view]).round(4).tolist()
-    if view != expected:
-        yield f"its range finder sees {view} deg, not {expected}"
+def _facts(rig):
+    """What must be alike in a session and a calibration of the same rig: words by words."""
+    low, high = np.degrees(rig.lrf.field_of_view).round(4)
+    facts = {
+        "its beams are, in deg,": f"{np.degrees(rig.lrf.bearing_step):.6f} apart",
+        "its range finder sees": f"{low} to {high} deg",
+    }
+    for name, camera in rig.cameras.items():
+        model = getattr(camera, "model", None) or camera
+        facts[f"images of '{name}' have"] = f"{model.width} x {model.height} pixels"
+        facts[f"'{name}' is fixed to the"] = camera.mount
+    return facts

@@ -149,7 +149,7 @@ def _why_unposed(records, rig):
     """Why a rig poses none of these images."""
     of = {record.camera for record in records}
     if of & set(rig.cameras):
-        return "of none is the pitch known: state pitch_deg in images.csv"
+        return "the pitch of none is known: state pitch_deg in images.csv"
     known = ", ".join(rig.cameras) or "no camera"
     return (
         f"they are of {', '.join(sorted(of))}, the calibration by '{rig.method}' poses {known}: "

@@ -33,7 +33,9 @@ FEWEST_CELLS = 8  # beams about a side that no image shows
 FAR = (10.0, 1.0)
 # information roots of what moves board and sides together, which changes no length
 STILL = 1e5
-ALONG = np.linspace(0.0, 1.0, 9)  # places along the stretch of an image edge
+# metres along a side about its middle; any two places are worth the same, because their errors
+# are those of one line
+PLACES = np.array([-0.1, 0.1])
 SCALE_ROUNDS = 4  # of weighing image edges by how well they fit
 LEAST_SCALE = 0.1
 UNKNOWN = 1e6  # variance of what nothing determines
@@ -46,14 +48,13 @@ TOLERANCE = 0.02  # sigma
 
 class ImageSide(NamedTuple):
     """A side of the board in an image: the row of the image's view, the number of the side, the
-    edge and its lens, and where along the side (metres) it begins and ends.
+    edge and its lens.
     """
 
     row: int
     number: int
     edge: ImageEdge
     model: CameraModel
-    reach: np.ndarray
 
 
 class State(NamedTuple):
@@ -209,10 +210,7 @@ def case_of(joint, observations, placement):
     for row, view in enumerate(posed):
         for edge in view.edges:
             number = edges.index(edge.name)
-            flat = (sides[edge.name] - board[:3, 3]) @ board[:3, :2]
-            places = flat @ along(lines[number])
-            reach = np.array([places.min(), places.max()])
-            images.append(ImageSide(row, number, edge, prepared.models[view.camera], reach))
+            images.append(ImageSide(row, number, edge, prepared.models[view.camera]))
     obs = obs.keep(beam=np.isin(obs.beam_edge, [edges.index(name) for name in sides]))
     state = replace(
         solution.state,
@@ -250,20 +248,12 @@ def edges_in_cloud(solution, prepared, placement, face):
         height = (plane[:3, 3] - centre) @ normal
         for edge in view.edges:
             a = edge.line[:2]
-            first, last = edge.ends - np.outer(edge.ends @ a + edge.line[2], a)
-            uv = first + ALONG[:, None] * (last - first)
-            x, y = ((uv - [lens.cx, lens.cy]) / [lens.fx, lens.fy]).T
-            sight = T_platform_camera.rotation.apply(
-                np.column_stack([x, y, np.ones(len(x))])
-            )
+            uv = edge.ends - np.outer(edge.ends @ a + edge.line[2], a)
+            rays = np.insert(uv, 2, 1.0, axis=1) @ np.linalg.inv(lens.matrix).T
+            sight = T_platform_camera.rotation.apply(rays)
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
     return {name: np.concatenate(points) for name, points in sides.items()}
-
-
-def along(line):
-    """Direction (2,) of a line."""
-    return np.array([-line[1], line[0]])
 
 
 def whitener_of(covariance):
@@ -296,7 +286,7 @@ def fitted(case, start, scale):
         max_iterations=ITERATIONS,
         tolerance=TOLERANCE,
     )[0]
-    hessian = linearise(evaluate(state), None, 1.0, (-2, -1))[0]
+    hessian = linearise(evaluate(state)).hessian
     return state, np.linalg.inv(hessian[0])
 
 
@@ -376,10 +366,12 @@ def image_block(state, case, scale):
     residuals = []
     jacobians = []
     for image in case.images:
-        line = state.lines[image.number]
-        ends = np.zeros((1, 2, 3))
-        ends[0, :, :2] = -line[2] * line[:2] + np.outer(image.reach, along(line))
-        misses, by_pose = line_misses([image.edge], ends, image.model, poses[0, image.row])
+        a, b, c = state.lines[image.number]
+        places = np.zeros((1, 2, 3))
+        places[0, :, :2] = [-c * a, -c * b] + np.outer(PLACES, [-b, a])
+        misses, by_pose = line_misses(
+            [image.edge], places, image.model, poses[0, image.row]
+        )
         J = by_pose[0] @ by_all[image.row]
         by_sides = side_columns(J, np.full(2, image.number), state, case)
         residuals.append(misses[0] / scale)

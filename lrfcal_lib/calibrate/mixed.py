@@ -160,22 +160,20 @@ class _Planes:
         to.
         """
         number = np.maximum(sums[:, 0, 0], 1e-9)
-        mean = (sums[:, 0, 1:] / number[:, None]).T
-        scatter = np.moveaxis(sums[:, 1:, 1:], 0, -1) - number * mean[:, None] * mean
+        mean = sums[:, 0, 1:] / number[:, None]
+        scatter = sums[:, 1:, 1:] - np.einsum("n,ni,nj->nij", number, mean, mean)
+        by_place = scatter[:, :2, 2]
         # a single line has no slope across
-        (xx, xy, xr), (_, yy, yr), (*_, rr) = (
-            scatter + np.diag([1e-6, 1e-6, 0.0])[..., None]
-        )
-        area = xx * yy - xy**2
-        slope = np.stack([yy * xr - xy * yr, xx * yr - xy * xr]) / area
-        x, y = np.array(at) - mean[:2]
-        inverse = mean[2] + slope[0] * x + slope[1] * y
-        square = rr - slope[0] * xr - slope[1] * yr
+        known = np.linalg.inv(scatter[:, :2, :2] + 1e-6 * np.eye(2))
+        slope = np.matvec(known, by_place)
+        away = np.transpose(at) - mean[:, :2]
+        inverse = mean[:, 2] + np.vecdot(slope, away)
+        square = scatter[:, 2, 2] - np.vecdot(slope, by_place)
         rms = np.sqrt(np.maximum(square, 0.0) / np.maximum(number - 3, 1))
-        lever = 1 / number + (yy * x**2 - 2 * xy * x * y + xx * y**2) / area
+        lever = 1 / number + np.vecdot(away, np.matvec(known, away))
         good = (number >= 4) & (inverse > 0) & (rms < rough * self.sigma * inverse**2)
         there = 1 / np.where(inverse > 0, inverse, np.nan)
-        return slope, there, good & (lever < FARTHEST)
+        return slope.T, there, good & (lever < FARTHEST)
 
     def hold(self, readings, at, share):
         """Which readings (n,) at (line, beam) lie on a plane of a window about them, of which that

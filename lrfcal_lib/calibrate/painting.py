@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate import colouring
-from lrfcal_lib.fit.robust import TUKEY, robust_sigma
 from lrfcal_lib.model.camera import CameraModel, fold, project
 from lrfcal_lib.model.geometry import pose_array
 
@@ -17,9 +16,8 @@ SHARE = 1 << 15  # points that a thread takes at a time
 WORKERS = min(os.cpu_count() or 1, 8)
 LEAST_CELL = 2.0  # pixels of a depth buffer
 LEVELS = (12.0, 230.0)  # of grey: between these the exposures of images are compared
-EXPOSURE_ROUNDS = 4
-LEAST_SCATTER = 1e-3  # of the logarithm of a brightness
-HELD = 1e-3  # points' worth of a gain of one where no point compares
+EXPOSURE_ROUNDS = 50
+LARGEST_MISS = 0.1  # of the logarithm of a brightness: more is another surface
 
 
 @dataclass(frozen=True)
@@ -147,17 +145,15 @@ class Painter:
         """Estimate gain and fall-off towards the corners of every image from points that several
         images see.
 
-        The log of a brightness is that of the surface, plus one number an image, plus one a camera
-        times the squared distance from the principal point. Robust least squares; the gains are one
-        in the mean.
+        The log of a brightness is that of the surface, plus one number an image, plus one for all
+        times the squared distance from the principal point. Each is found from what the others
+        leave, in turn; the gains are one in the mean.
         """
-        if len(self.views) < 2 or not len(points):
+        if len(self.views) < 2:
             return
-        _, camera = np.unique([view.camera for view in self.views], return_inverse=True)
-        shape = (len(self.views), len(points))
-        logs = np.full(shape, np.nan)
-        radii = np.full(shape, np.nan)
         darkest, brightest = LEVELS
+        logs = np.full((len(self.views), len(points)), np.nan)
+        radii = np.zeros(logs.shape)
         for k, view in enumerate(self.views):
             colors, _, _ = self.paint(points, normals, slice(k, k + 1))
             grey = colors.mean(axis=1)
@@ -166,43 +162,32 @@ class Painter:
             uv = project(view.T_camera_platform.apply(points), model)
             corner = 0.25 * (model.width**2 + model.height**2)
             radii[k] = np.sum((uv - [model.cx, model.cy]) ** 2, axis=1) / corner
-        gain, falloff = _compared(logs, radii, camera)
+        gain, falloff = _compared(logs, radii)
         self.exposures[:, 0] = gain - gain.mean()
-        self.exposures[:, 1] = np.minimum(falloff, 0.0)[camera]
+        self.exposures[:, 1] = min(falloff, 0.0)
 
 
-def _compared(logs, radii, camera):
-    """Gain (v,) of images and fall-off (c,) of cameras that bring the logs (v, n) of the same
-    points together.
+def _compared(logs, radii):
+    """Gain (v,) of images and their common fall-off that bring the logs (v, n) of the same points
+    together.
 
-    `radii` (v, n) are squared distances from the middle, `camera` (v,) is the number of an image's
-    camera. What no point compares is zero.
+    `radii` (v, n) are squared distances from the middle. What no point compares is zero.
     """
-    images = len(logs)
-    use = np.isfinite(logs)
+    shared = np.isfinite(logs).sum(axis=0) > 1
+    gain = np.zeros(len(logs))
+    falloff = 0.0
+    if not shared.any():
+        return gain, falloff
+    logs = logs[:, shared]
+    radii = np.where(np.isfinite(logs), radii[:, shared], np.nan)
+    apart = np.nan_to_num(radii - np.nanmean(radii, axis=0))
     for _ in range(EXPOSURE_ROUNDS):
-        use &= use.sum(axis=0) > 1
-        image, point = np.nonzero(use)
-        row = np.arange(len(image))
-        design = np.zeros((len(image), images + camera.max() + 1))
-        design[row, image] = 1.0
-        design[row, images + camera[image]] = radii[use]
-        J = _about_means(design, point)
-        y = _about_means(logs[use][:, None], point)[:, 0]
-        unknowns = np.linalg.solve(J.T @ J + HELD * np.eye(J.shape[1]), J.T @ y)
-        miss = y - J @ unknowns
-        if len(miss):
-            use[use] = np.abs(miss) < TUKEY * robust_sigma(miss, least=LEAST_SCATTER)
-    return unknowns[:images], unknowns[images:]
-
-
-def _about_means(rows, group):
-    """Rows (m, k) without the mean of their group: the brightness of a surface is nobody's
-    concern.
-    """
-    count = np.maximum(np.bincount(group), 1)
-    sums = np.stack([np.bincount(group, column) for column in rows.T], axis=1)
-    return rows - (sums / count[:, None])[group]
+        light = logs - gain[:, None] - falloff * radii
+        miss = np.nan_to_num(light - np.nanmean(light, axis=0), nan=0.0)
+        miss = np.clip(miss, -LARGEST_MISS, LARGEST_MISS)
+        gain += np.sum(miss, axis=1) / np.maximum(np.isfinite(logs).sum(axis=1), 1)
+        falloff += np.sum(miss * apart) / max(np.sum(apart**2), 1e-9)
+    return gain, falloff
 
 
 def _single(array):

@@ -139,6 +139,9 @@ class Calibration:
         """The rig as a method has it: its cameras, the axis that goes with them, and what is known
         to be wrong with ranges and pitch.
 
+        What single sweeps of this session are off by (`corrections.sweeps`, by placement) is good
+        for this session only; `load_calibration` reads the same rig without it.
+
         Parameters
         ----------
         method : str
@@ -361,6 +364,7 @@ def joint_settings(prepared: Prepared, observations: JointObservations) -> dict:
         "lapse": LAPSE,
         "sides": sides >= LEAST_SIDES,
         "axis": sweeps,
+        "step_sigma": session.lrf.step_sigma,
     }
     if noise.offset:
         settings["sweep"] = "offset_stretch" if noise.stretch else "offset"

@@ -25,9 +25,7 @@ KEPT = (
 WINDOW = 4  # beams and scan lines on either side of a point that make its normal
 MARGIN = 4 * WINDOW  # scan lines about a block that its normals and mixed pixels need
 GAIN_POINTS = 30_000  # that compare the exposures of images
-SYMMETRIC = np.array(
-    [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
-)  # places of a matrix in its upper half
+LEAST_SPREAD = 1e-12  # square metres: points on a line span no plane
 BEHIND = 5.0  # sigma: between the farthest and the nearest of a few points of a wall
 
 
@@ -258,15 +256,20 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
         centre = np.nanmean(points[valid], axis=0)
     p = np.where(valid[..., None], points - centre, 0.0)
     width = 2 * WINDOW + 1
-    size = (width, width, 1)
-    share = uniform_filter(valid.astype(float)[..., None], size, mode="constant")
-    whole = np.maximum(share, 0.5 / width**2)
-    mean = uniform_filter(p, size, mode="constant") / whole
-    i, j = np.triu_indices(3)
-    square = uniform_filter(p[..., i] * p[..., j], size, mode="constant") / whole
-    upper = np.moveaxis(square - mean[..., i] * mean[..., j], -1, 0)
-    least, middle, across = flattest(upper[SYMMETRIC])
-    known = (share[..., 0] > 1 / 3) & (middle > 0)
+
+    def sums(values):
+        """Means over all windows, where nothing is counts as zero."""
+        size = (width, width) + (1,) * (values.ndim - 2)
+        return uniform_filter(values, size, mode="constant")
+
+    share = sums(valid.astype(float))
+    whole = np.maximum(share, 0.5 / width**2)[..., None]
+    mean = sums(p) / whole
+    square = sums(p[..., :, None] * p[..., None, :]) / whole[..., None]
+    spread = square - mean[..., :, None] * mean[..., None, :]
+    variances, directions = np.linalg.eigh(spread)
+    least, middle, _ = np.moveaxis(variances, -1, 0)
+    known = (share > 1 / 3) & (middle > LEAST_SPREAD)
     rough = np.where(known, np.maximum(least, 0.0), np.inf)
     # the middles of the nine windows, (2, 9, l, b)
     shifts = WINDOW * (np.indices((3, 3)).reshape(2, 9, 1, 1) - 1)
@@ -276,40 +279,8 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     chosen = np.argmin(flat, axis=0)[None]
     best = np.take_along_axis(flat, chosen, axis=0)[0]
     line, beam = np.take_along_axis(places, chosen[None], axis=1)[:, 0]
-    normals = np.moveaxis(across, 0, -1)[line, beam]
+    normals = directions[..., 0][line, beam]
     sign = np.where(np.isfinite(best), 1.0, np.nan)
     sign[np.sum(normals * (points - origins), axis=-1) > 0] = -1.0
     scatter = np.sqrt(np.where(np.isfinite(best), best, np.nan))
     return sign[..., None] * normals, scatter
-
-
-def flattest(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The least and the middle eigenvalue (...) of covariances of points (3, 3, ...), and the
-    direction (3, ...) of the least.
-
-    In closed form, many times as fast as LAPACK on as many small matrices (Smith 1961).
-    """
-    eye = np.eye(3)[..., None, None]
-    mean = np.trace(covariance) / 3
-    D = covariance - mean * eye
-    size = np.maximum(np.sqrt(np.sum(D**2, axis=(0, 1)) / 6), 1e-100)
-    half = np.sum(D[0] * _cross(D[1], D[2]), axis=0) / (2 * size**3)
-    turn = np.arccos(np.clip(half, -1, 1)) / 3
-    most = 2 * size * np.cos(turn)
-    least = 2 * size * np.cos(turn + 2 * np.pi / 3)
-    # columns of the adjugate of the matrix without it all point across; the longest is the most
-    # precise
-    A = D - least * eye
-    columns = np.stack([_cross(A[1], A[2]), _cross(A[2], A[0]), _cross(A[0], A[1])])
-    longest = np.argmax(np.sum(columns**2, axis=1), axis=0)
-    across = np.take_along_axis(columns, longest[None, None], axis=0)[0]
-    across /= np.maximum(np.sqrt(np.sum(across**2, axis=0)), 1e-300)
-    to_all_digits = np.einsum("i...,ij...,j...->...", across, covariance, across)
-    return to_all_digits, mean - most - least, across
-
-
-def _cross(a, b):
-    """Cross products of vectors (3, ...)."""
-    return np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )

@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import PlainValidator
 from scipy.linalg import block_diag
 
 from lrfcal_lib.fit.covariance import null_space
@@ -17,6 +19,25 @@ from lrfcal_lib.solvers.joint_solution import JointSolution
 COLUMNS = (*AXIS_NAMES, *POSE_NAMES, "range_offset", "pitch_scale", "pitch_by_direction")
 
 
+def rows(*shape: int | None) -> PlainValidator:
+    """How pydantic makes an array of a shape, None where any size will do, of rows of numbers; null
+    is infinite.
+    """
+
+    def made(given):
+        values = np.array(given, float)
+        if not len(given):
+            values = np.zeros((0, *shape[1:]))
+        same = [
+            size in (None, found) for size, found in zip(shape, values.shape, strict=False)
+        ]
+        if values.ndim != len(shape) or not all(same):
+            raise ValueError(f"shape {values.shape} instead of {shape}")
+        return np.where(np.isnan(values), np.inf, values)
+
+    return PlainValidator(made)
+
+
 @dataclass(frozen=True)
 class RigUncertainty:
     """How well everything that a rig shares is known, radians and metres.
@@ -28,6 +49,8 @@ class RigUncertainty:
     covariance, trusted : ndarray, shape (c, c)
         Of the increments, from the noise alone and to rely on, see
         :class:`lrfcal_lib.fit.result.Solution`; not finite where nothing bounds an unknown.
+    lens : ndarray, shape (c, c)
+        What errors of the intrinsics have in both.
     unseen_of_cloud : ndarray, shape (m, 13)
         Motions of `COLUMNS` that nothing determines and that move points of the cloud.
     unseen_of_cameras : dict of str to ndarray, shape (m, 13)
@@ -39,10 +62,11 @@ class RigUncertainty:
     """
 
     names: tuple[str, ...]
-    covariance: np.ndarray
-    trusted: np.ndarray
-    unseen_of_cloud: np.ndarray
-    unseen_of_cameras: dict[str, np.ndarray]
+    covariance: Annotated[np.ndarray, rows(None, None)]
+    trusted: Annotated[np.ndarray, rows(None, None)]
+    lens: Annotated[np.ndarray, rows(None, None)]
+    unseen_of_cloud: Annotated[np.ndarray, rows(None, 13)]
+    unseen_of_cameras: dict[str, Annotated[np.ndarray, rows(None, 13)]]
     sweep_sigma: tuple[float, float]
     range_noise: float
 
@@ -75,6 +99,7 @@ def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
         names=estimate.names,
         covariance=estimate.covariance,
         trusted=estimate.trusted,
+        lens=solution.lens,
         unseen_of_cloud=_unseen(information, estimate.names),
         unseen_of_cameras={
             camera: _unseen(information, estimate.names, camera)
@@ -124,6 +149,7 @@ def uncertainty_one_by_one(
         names=tuple(names),
         covariance=block_diag(*noise_only, offset),
         trusted=block_diag(*trusted, offset),
+        lens=np.zeros((len(names), len(names))),
         unseen_of_cloud=nothing,
         unseen_of_cameras=dict.fromkeys(solutions, nothing),
         sweep_sigma=sweep_sigma,

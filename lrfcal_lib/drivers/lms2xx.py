@@ -487,7 +487,7 @@ class LMS2xx(Closed):
                 self._news.set()
                 last = host.now()
             if host.now() - last > quiet_s:
-                raise NoReply("the stream fell silent")
+                raise NoReply("the stream stopped")
 
     def take(
         self, count: int, after: float | None = None, timeout: float = 10.0

@@ -254,8 +254,9 @@ def _estimate_from(joint, placements):
 
 def _predicted(solution, camera):
     """Root mean square difference of two halves of the placements as sigma predicts it."""
-    lens = np.diag(solution.lens)[solution.columns(f"{camera}_")]
-    variances = solution.camera(camera).trusted_sigma ** 2 - lens
+    common = np.diag(solution.lens) + solution.step**2
+    variances = solution.camera(camera).trusted_sigma ** 2
+    variances -= common[solution.columns(f"{camera}_")]
     turn, shift = np.split(2 * np.sqrt(np.maximum(variances, 0.0)), 2)
     return {
         "predicted_rotation_deg": np.rad2deg(np.linalg.norm(turn)),

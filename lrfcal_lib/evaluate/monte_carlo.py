@@ -1,33 +1,21 @@
-"""Monte-Carlo trials of the joint estimate and of single shots, beside bound and truth."""
+"""Monte-Carlo trials of the joint estimate, beside bound and truth."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import logit
 from scipy.stats import binom, chi2
 
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.edge_likelihood import disc_share
-from lrfcal_lib.fit.least_squares import reduced_hessian
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    polar_to_points,
-    pose_array,
-    pose_transform,
-)
-from lrfcal_lib.model.observations import CameraObservations, JointObservations
-from lrfcal_lib.preprocess.board_in_scan import fit_lines
-from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
-from lrfcal_lib.preprocess.surfaces import row_ends
-from lrfcal_lib.simulate.draw import ShotSetup
-from lrfcal_lib.solvers import solve_camera
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_transform
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint import in_stated_gauge
-from lrfcal_lib.solvers.joint_model import JointState, Unknowns, gather
-from lrfcal_lib.solvers.joint_residuals import named_blocks
+from lrfcal_lib.solvers.joint_model import JointState, Unknowns
+from lrfcal_lib.solvers.joint_solution import expected_information
 
 INTERVAL = 0.9
 HALF_WIDTH = 1.6448536269514722  # standard normal: 90 % of it lies within
@@ -44,7 +32,6 @@ GROUPS = {  # unknowns by name: what they are together, the unit of that and the
     r"(.+)_r[xyz]": (r"\1 rotation", "deg", np.degrees(1.0)),
     r"(.+)_t[xyz]": (r"\1 translation", "mm", 1000.0),
 }
-FACE = 24  # face points a placement
 
 
 @dataclass(frozen=True)
@@ -130,7 +117,7 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
     Raises
     ------
     ValueError
-        When every draw was refused, or the unknowns differ between draws.
+        When every draw was refused.
     """
     rows = []
     failed = {}
@@ -142,10 +129,6 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
         except DegenerateGeometry as error:
             failed[int(seed)] = str(error)
             continue
-        if names and names != joint.solution.names:
-            raise ValueError(
-                f"seed {seed} estimates {joint.solution.names}, earlier ones {names}"
-            )
         names = joint.solution.names
         errors = state_errors(joint.state, truth, joint.unknowns)
         limit = bound(obs, truth, joint.unknowns)
@@ -205,23 +188,7 @@ def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.n
     DegenerateGeometry
         When the data leave a direction of the shared unknowns open.
     """
-    data = gather(obs)
-    hit = np.ones_like(data.beam["hit"])
-    all_read = replace(data, beam=data.beam | {"hit": hit})
-    none_read = replace(data, beam=data.beam | {"hit": ~hit})
-    read = named_blocks(truth, all_read, unknowns)
-    missed = named_blocks(truth, none_read, unknowns)
-    size = unknowns.shared + unknowns.own
-    hessian = np.zeros((len(obs.placements), size, size))
-    for name, block in read.items():
-        J = block.white_jacobian
-        if name == "beam":  # expected: over both readings, weighted by how likely each is
-            other = missed[name].white_jacobian
-            chance = np.exp(-np.asarray(block.cost))[..., None]
-            hessian += other.mT @ ((1 - chance) * other)
-            J = np.sqrt(chance) * J
-        hessian += J.mT @ J
-    total = np.sum(reduced_hessian(hessian, unknowns.shared), axis=0)
+    total = np.sum(expected_information(obs, truth, unknowns), axis=0)
     scale = 1 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))
     values, vectors = np.linalg.eigh(total * scale[:, None] * scale)
     if values[0] < 1e-11:
@@ -274,7 +241,7 @@ def consistency(trials: Trials) -> pd.DataFrame:
     -------
     DataFrame
         Columns group, unit, rmse, crb (root of the mean trace of the bounds), rmse_over_crb,
-        stated_over_crb, coverage of 90 % intervals, nees (mean normalised squared error by number
+        coverage of 90 % intervals, nees (mean normalised squared error by number
         of unknowns), limits of chance of three of them (_low, _high), trials, failed. The last row
         pools all unknowns, each by its own bound.
 
@@ -317,7 +284,6 @@ def _judge(trials, index, factor):
     C = scale * C
     B = scale * B
     crb = np.sqrt(np.mean(np.trace(B, axis1=1, axis2=2)))
-    stated = np.sqrt(np.mean(np.trace(C, axis1=1, axis2=2)))
     rmse = np.sqrt(np.mean(np.sum(e**2, axis=1)))
     free = len(e) * _freedom(np.mean(B, axis=0))
     half_width = HALF_WIDTH * np.sqrt(np.diagonal(C, axis1=1, axis2=2))
@@ -326,7 +292,6 @@ def _judge(trials, index, factor):
         "rmse": rmse,
         "crb": crb,
         "rmse_over_crb": rmse / crb,
-        "stated_over_crb": stated / crb,
         "coverage": np.mean(np.abs(e) < half_width),
         "nees": np.mean(np.vecdot(e, normalised)) / len(index),
     }
@@ -341,129 +306,3 @@ def _judge(trials, index, factor):
 def _freedom(C):
     """Independent numbers in a sum of squares of errors with covariance C (Satterthwaite)."""
     return np.trace(C) ** 2 / np.sum(C * C)
-
-
-def observations(
-    shots: dict, setup: ShotSetup, last_beam: bool = False
-) -> CameraObservations:
-    """Drawn shots as the preprocessing makes CameraObservations of a scan line, trials first.
-
-    Parameters
-    ----------
-    shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
-    setup : ShotSetup
-        What they were drawn from.
-    last_beam : bool
-        Crossings are at the last beams on the board instead of half a beam step outside.
-
-    Returns
-    -------
-    CameraObservations
-        Of t trials with two crossings and `FACE` face points a placement.
-    """
-    ranges = shots["ranges"]
-    bearings = setup.bearings()
-    t, p, _ = ranges.shape
-    points, covariance = _crossing_points(ranges.reshape(t * p, -1), setup, last_beam)
-    face, face_covariance = _face_points(ranges, bearings, setup.sigma_range)
-    return CameraObservations(
-        setup.model,
-        crossing_points=points.reshape(t, 2 * p, 3),
-        crossing_covariance=covariance.reshape(t, 2 * p, 3, 3),
-        crossing_line_sigma=np.full((t, 2 * p), setup.sigma_px),
-        crossing_lines=shots["lines"].reshape(t, 2 * p, 3),
-        crossing_placement=np.repeat(np.arange(p), 2),
-        plane_points=face.reshape(t, -1, 3),
-        plane_covariance=face_covariance.reshape(t, -1, 3, 3),
-        plane_placement=np.repeat(np.arange(p), FACE),
-        board_poses=shots["boards"],
-        board_covariance=shots["board_covariance"],
-    )
-
-
-def _crossing_points(ranges, setup, last_beam):
-    """Where the lines fitted to scan lines (n, B) end, (n, 2, 3), and their covariances."""
-    bearings = setup.bearings()
-    lines, information = fit_lines(ranges, bearings)
-    _, first, last = row_ends(np.isfinite(ranges))
-    ends = bearings[np.stack([first, last], axis=1)]
-    if not last_beam:
-        ends = ends + np.array([-0.5, 0.5]) * setup.step
-    ray = polar_to_points(1.0, ends)
-    across = np.cross([0.0, 0.0, 1.0], ray)
-    u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
-    r = 1 / np.vecdot(u, ray)  # to the fitted line u . p = 1
-    by_bearing = -(r**2) * np.vecdot(u, across)  # the range's change
-    turned = r[..., None] * across + by_bearing[..., None] * ray
-    of_line = np.linalg.inv(information) * setup.sigma_range**2
-    flat_ray = ray[..., :2]
-    variance = r**4 * np.vecdot(flat_ray @ of_line, flat_ray)
-    spacing = _outer(turned * setup.step * UNIFORM)
-    return r[..., None] * ray, variance[..., None, None] * _outer(ray) + spacing
-
-
-def _face_points(ranges, bearings, sigma_range):
-    """Evenly chosen points on the boards, (t, p, FACE, 3), and their covariances."""
-    hit = np.isfinite(ranges)
-    count = hit.sum(axis=-1)
-    on_board = np.argsort(~hit, axis=-1, kind="stable")
-    share = np.linspace(0, 1, FACE)
-    pick = (share * (count[..., None] - 1)).round().astype(int)
-    beam = np.take_along_axis(on_board, pick, axis=-1)
-    ray = polar_to_points(1.0, bearings[beam])
-    repeats = np.maximum(FACE / count, 1.0)  # short lines give some twice
-    points = np.take_along_axis(ranges, beam, axis=-1)[..., None] * ray
-    variance = sigma_range**2 * repeats
-    return points, _outer(ray) * variance[..., None, None, None] + 1e-10 * np.eye(3)
-
-
-def _outer(v):
-    return v[..., :, None] * v[..., None, :]
-
-
-def shots_table(shots: dict, setup: ShotSetup, rng: np.random.Generator) -> pd.DataFrame:
-    """Errors of lines by both rules for the edge point, and of planes, over drawn single shots.
-
-    Parameters
-    ----------
-    shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
-    setup : ShotSetup
-        What they were drawn from.
-    rng : numpy.random.Generator
-        Draws the start values, some degrees and centimetres off the truth.
-
-    Returns
-    -------
-    DataFrame
-        Columns method, rotation_median_deg, translation_median_mm, nees (mean normalised squared
-        error of the pose over 6).
-    """
-    true = shots["T_camera_lrf"]
-    near = pose_transform(true)
-    turn = Rotation.from_rotvec(rng.normal(0, 0.05, (len(true), 3)))
-    shift = rng.normal(0, 0.05, (len(true), 3))
-    T0 = RigidTransform.from_components(near.translation + shift, turn * near.rotation)
-    half = observations(shots, setup)
-    solutions = {
-        "line_last_beam": solve_camera(
-            observations(shots, setup, last_beam=True), "line", T0
-        ),
-        "line": solve_camera(half, "line", T0),
-        "zhang_pless": solve_camera(half, "zhang_pless", T0),
-    }
-    rows = []
-    for method, solution in solutions.items():
-        error = pose_errors(pose_array(solution.transform), true)
-        normalised = np.linalg.solve(solution.covariance, error[..., None])[..., 0]
-        row = {
-            "method": method,
-            "rotation_median_deg": np.degrees(
-                np.median(np.linalg.norm(error[:, :3], axis=1))
-            ),
-            "translation_median_mm": 1000 * np.median(np.linalg.norm(error[:, 3:], axis=1)),
-            "nees": np.mean(np.vecdot(error, normalised)) / 6,
-        }
-        rows.append(row)
-    return pd.DataFrame(rows)

@@ -1,27 +1,36 @@
 """Studies: methods beside one another and beside the Cramer-Rao bound, on set-ups by name."""
 
-import hashlib
 import json
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, as_completed
-from dataclasses import asdict
-from functools import partial
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.evaluate.study_trials import STUDIED, Task, run_task
-from lrfcal_lib.session.cluster import checked, source_digest
+from lrfcal_lib.evaluate.study_trials import BATCHED, STUDIED, Task, run_task
 from lrfcal_lib.session.write import whole
-from lrfcal_lib.simulate.scenarios import Scenario, load_scenario, varied
+from lrfcal_lib.simulate.scenarios import load_scenario, varied
+from lrfcal_lib.simulate.shots import Scenario
 
 COUNTS = (5, 10, 20, 50, 100)  # placements
 CHUNK = 10  # trials of a task: some seconds, of which handing it over takes a thousandth
-INTERVAL = (0.05, 0.95)  # of the bootstrap
+INTERVAL = {"low": 0.05, "high": 0.95}  # of the bootstrap
 RESAMPLES = 1000
 UNITS = {"rotation": ("deg", 180 / np.pi), "translation": ("mm", 1000.0)}
+NUMBERS = (
+    "rotation",
+    "translation",
+    "bound_rotation",
+    "bound_translation",
+    "known_rotation",
+    "known_translation",
+    "over_bound",
+    "nees",
+    "covered",
+)  # of a trial, where there is an estimate and a bound
 
 
 def run_study(
@@ -85,12 +94,15 @@ def tasks_of(scenarios, methods, n_poses, trials, seed=0) -> list[Task]:
         raise ValueError(f"{trials} trials: 1 or more are needed")
     if not n_poses or min(n_poses) < 3:
         raise ValueError(f"{list(n_poses)} placements: 3 or more are needed for a camera")
+    known = [s if isinstance(s, Scenario) else load_scenario(s) for s in scenarios]
+    for scenario in known:
+        if scenario.corner and not BATCHED.keys() >= set(methods):
+            raise ValueError(f"{scenario.name} shows no board: use {', '.join(BATCHED)}")
     tasks = []
-    for given in scenarios:
-        scenario = given if isinstance(given, Scenario) else load_scenario(given)
-        for count in n_poses:
-            for first in range(0, trials, CHUNK):
-                number = min(CHUNK, trials - first)
+    for first in range(0, trials, CHUNK):
+        number = min(CHUNK, trials - first)
+        for scenario in known:
+            for count in sorted(n_poses, reverse=True):  # the longest first
                 tasks.append(Task(scenario, tuple(methods), count, seed, first, number))
     return tasks
 
@@ -103,8 +115,7 @@ def finished(
         for task in tasks:
             yield task, run_task(task)
         return
-    work = partial(checked, source_digest(), run_task)
-    futures = {executor.submit(work, task): task for task in tasks}
+    futures = {executor.submit(run_task, task): task for task in tasks}
     try:
         for future in as_completed(futures):
             yield futures[future], future.result()
@@ -134,72 +145,66 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
         interval (``_low``, ``_high``) and the mean over all trials that gave an estimate, the root
         mean square (``_rmse``) over those that did not fail, and Cramer-Rao bounds with unknown
         (``_bound``) and known (``_known``) sensor; of trials that did not fail rmse_over_bound,
-        nees and coverage of the six numbers of the pose.
+        with its interval, nees and coverage of the six numbers of the pose.
     """
-    keys = ["scenario", "n_poses", "method"]
-    rows = rows.reindex(
-        columns=list(dict.fromkeys([*rows.columns, "rotation", "translation"]))
-    )
+    settings = list(rows.columns[: rows.columns.get_loc("n_poses") + 1])
+    keys = [*settings, "method"]
+    rows = rows.reindex(columns=list(dict.fromkeys([*rows.columns, *NUMBERS])))
+    rows = rows.assign(method=pd.Categorical(rows.method, STUDIED))
     rows = rows.sort_values([*keys, "trial"])
-    parts = []
-    for key, part in rows.groupby(keys, sort=True):
-        parts.append(dict(zip(keys, key, strict=True)) | _summed_up(part))
-    table = pd.DataFrame(parts)
-    order = {method: number for number, method in enumerate(STUDIED)}
-    table = table.assign(order=table.method.map(order))
-    table = table.sort_values(["scenario", "n_poses", "order"]).drop(columns="order")
-    settings = table.scenario.str.findall(r"(\w+)=(\S+)").map(dict)
-    table["scenario"] = table.scenario.str.replace(r" \w+=\S+", "", regex=True)
-    for key in sorted({key for row in settings for key in row}, reverse=True):
-        table.insert(
-            1, key, [float(row[key]) if key in row else np.nan for row in settings]
-        )
-    settings_and_keys = [*table.columns[: table.columns.get_loc("n_poses") + 1]]
-    return table.sort_values(settings_and_keys, kind="stable").reset_index(drop=True)
-
-
-def _summed_up(part):
-    """One row of the table."""
-    bad = part.outcome[part.outcome != "ok"].value_counts().sort_index()
-    good = part[part.outcome == "ok"]
-    row = {"trials": len(part), "failed": int(bad.sum())}
-    row["failures"] = "; ".join(f"{count} {words}" for words, count in bad.items())
+    every = rows.groupby(keys, observed=True)
+    good = rows[rows.outcome == "ok"].groupby(keys, observed=True)
+    table = pd.DataFrame({"trials": every.size()})
+    table["failed"] = every.outcome.agg(lambda words: int((words != "ok").sum()))
+    table["failures"] = every.outcome.agg(_reasons)
     for name, (unit, factor) in UNITS.items():
-        errors = part[name].dropna().to_numpy() * factor
-        low, high = median_interval(errors)
         column = f"{name}_{unit}"
-        row[column] = np.median(errors) if len(errors) else np.nan
-        row[f"{column}_mean"] = np.mean(errors) if len(errors) else np.nan
-        row[f"{column}_low"] = low
-        row[f"{column}_high"] = high
-        if len(good):
-            row[f"{column}_rmse"] = factor * _root_mean_square(good[name])
-            row[f"{column}_bound"] = factor * _root_mean_square(good[f"bound_{name}"])
-            row[f"{column}_known"] = factor * _root_mean_square(good[f"known_{name}"])
-    if len(good):
-        row["rmse_over_bound"] = np.sqrt(good.over_bound.mean())
-        row["nees"] = good.nees.mean()
-        row["coverage"] = good.covered.mean()
-    return row
+        table[column] = factor * every[name].median()
+        table[f"{column}_mean"] = factor * every[name].mean()
+        for end, share in INTERVAL.items():
+            table[f"{column}_{end}"] = factor * every[name].agg(resampled, share=share)
+        for end, of in {
+            "rmse": name,
+            "bound": f"bound_{name}",
+            "known": f"known_{name}",
+        }.items():
+            table[f"{column}_{end}"] = factor * good[of].agg(_root_mean_square)
+    table["rmse_over_bound"] = np.sqrt(good.over_bound.mean())
+    for end, share in INTERVAL.items():
+        squares = good.over_bound.agg(resampled, share=share, statistic=np.mean)
+        table[f"rmse_over_bound_{end}"] = np.sqrt(squares)
+    table["nees"] = good.nees.mean()
+    table["coverage"] = good.covered.mean()
+    return table.reset_index().astype({"method": str})
+
+
+def _reasons(outcomes):
+    """Why trials failed, and how often."""
+    counts = outcomes[outcomes != "ok"].value_counts().sort_index()
+    return "; ".join(f"{count} {words}" for words, count in counts.items())
 
 
 def _root_mean_square(values):
-    return float(np.sqrt(np.mean(np.square(values))))
+    return np.sqrt(np.mean(np.square(values)))
 
 
-def median_interval(values: np.ndarray) -> tuple[float, float]:
-    """90 % bootstrap interval of the median, the same for the same values; NaN for none.
+def resampled(values: np.ndarray, share: float, statistic=np.median) -> float:
+    """Bound of the bootstrap interval of a statistic, the same for the same values; NaN for none.
 
     Parameters
     ----------
-    values : ndarray, shape (n,)
+    values : array_like, shape (n,)
+        NaN counts for nothing.
+    share : float
+        Of the resamples below the bound.
+    statistic : callable
     """
+    values = np.sort(np.asarray(values, float))
+    values = values[np.isfinite(values)]
     if len(values) == 0:
-        return np.nan, np.nan
-    rng = np.random.default_rng(0)
-    drawn = rng.choice(np.sort(values), (RESAMPLES, len(values)))
-    low, high = np.quantile(np.median(drawn, axis=1), INTERVAL)
-    return float(low), float(high)
+        return np.nan
+    drawn = np.random.default_rng(0).choice(values, (RESAMPLES, len(values)))
+    return float(np.quantile(statistic(drawn, axis=1), share))
 
 
 def study_to_file(tasks: Sequence[Task], out: str | os.PathLike, executor=None, bar=None):
@@ -227,14 +232,14 @@ def study_to_file(tasks: Sequence[Task], out: str | os.PathLike, executor=None, 
         When what is there is of another study, or cannot be written.
     """
     part = Path(f"{out}.part")
-    header = {"study": [_stated(task) for task in tasks], "source": source_digest()}
-    kept = _read_part(part, header)
+    kept = _kept(part, {task.key for task in tasks})
     bar = bar or (lambda count: None)
     bar(len(kept))
     missing = [task for task in tasks if task.key not in kept]
     with part.open("a") as file:
         for task, rows in finished(missing, executor):
-            file.write(json.dumps({"task": task.key, "rows": rows}) + "\n")
+            # what was being written when a study was killed ends before the next line
+            file.write("\n" + json.dumps({"task": task.key, "rows": rows}))
             file.flush()
             kept[task.key] = rows
             bar(1)
@@ -269,36 +274,22 @@ def variations(scenarios: Sequence[str], settings: Sequence[str]) -> list[Scenar
     return out
 
 
-def _stated(task):
-    """What a task is, in JSON: two studies are one if all of theirs are alike."""
-    words = repr(asdict(task.scenario)).encode()
-    return [task.key, list(task.methods), task.seed, task.trials, _digest(words)]
-
-
-def _digest(data):
-    return hashlib.sha256(data).hexdigest()[:16]
-
-
-def _read_part(part, header):
-    """Rows of the finished tasks by key; a line that was being written is cut off."""
+def _kept(part, keys):
+    """Rows of the finished tasks by key, of these and no others."""
+    kept = {}
     try:
         part.parent.mkdir(parents=True, exist_ok=True)
-        lines = part.read_bytes().splitlines(keepends=True) if part.exists() else []
-        complete = [line for line in lines if line.endswith(b"\n")]
-        if not complete:
-            part.write_text(json.dumps(header) + "\n")
-            return {}
-        found = json.loads(complete[0])
-        rows = [json.loads(line) for line in complete[1:]]
-        if len(complete) < len(lines):
-            part.write_bytes(b"".join(complete))
-    except ValueError as error:
-        raise ValueError(f"{part} is no part of a study: remove it ({error})") from error
+        part.touch()
+        text = part.read_text()
     except OSError as error:
         raise ValueError(f"{part}: {error.strerror}; name another file") from error
-    if found != header:
+    for line in text.splitlines():
+        with suppress(ValueError, TypeError, KeyError):
+            record = json.loads(line)
+            kept[record["task"]] = record["rows"]
+    if not keys.issuperset(kept) or (text and not kept):
         raise ValueError(
             f"{part} belongs to another study, or to another version of this library: remove it, "
             "or name another file"
         )
-    return {line["task"]: line["rows"] for line in rows}
+    return kept

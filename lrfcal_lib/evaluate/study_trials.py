@@ -1,5 +1,6 @@
 """Trials of a study: the same drawn single shots to every method, errors against the truth."""
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,6 @@ from lrfcal_lib.evaluate.monte_carlo import (
     HALF_WIDTH,
     bound,
     joint_truth,
-    observations,
     pose_errors,
 )
 from lrfcal_lib.model.geometry import (
@@ -19,19 +19,37 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
 )
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
+from lrfcal_lib.preprocess.board_in_scan import fit_lines
+from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
 from lrfcal_lib.preprocess.surfaces import row_ends
-from lrfcal_lib.simulate.draw import REACH, draw_shots
-from lrfcal_lib.simulate.scenarios import Scenario
+from lrfcal_lib.session.cluster import source_digest
+from lrfcal_lib.simulate.draw import REACH
+from lrfcal_lib.simulate.shots import Scenario, draw_shots
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Unknowns
 
 FAR = np.radians(10.0)  # from the truth: another minimum, or nothing was determined
-# of crossings: solved as one batch; whether the edge point is at the last beam
-BATCHED = {"line_printed": True, "line": False, "wasielewski_strauss": False}
-PLANES = ("zhang_pless_printed", "zhang_pless")
-STUDIED = (*BATCHED, *PLANES, "three_planes", "joint")
-DIGITS = 9
+# of crossings, solved as one batch: options of `solve_camera`
+BATCHED: dict[str, dict] = {
+    "line_printed": {},
+    "line": {},
+    "line_robust": {"method": "line", "robust": True},
+    "wasielewski_strauss": {},
+}
+# of planes, trial by trial; without a start value the minimal solution is searched for
+PLANES: dict[str, dict] = {
+    "zhang_pless_printed": {},
+    "zhang_pless": {},
+    "zhang_pless_k": {},
+    "three_planes": {
+        "method": "zhang_pless",
+        "T0": None,
+        "robust": True,
+        "scale": "auto",
+    },
+}
+STUDIED = (*BATCHED, *PLANES, "joint")
 LEAST_RANGE = 0.05  # metres: noise may make a near one negative
 
 
@@ -48,8 +66,8 @@ class Task:
 
     @property
     def key(self):
-        """What tells it from the others of a study."""
-        return f"{self.scenario.name}/{self.n_poses}/{self.first}"
+        """Tells it from any other, and from the same with another version of this library."""
+        return hashlib.sha256(f"{source_digest()} {self}".encode()).hexdigest()[:24]
 
 
 def run_task(task: Task) -> list[dict]:
@@ -62,11 +80,11 @@ def run_task(task: Task) -> list[dict]:
     Returns
     -------
     list of dict
-        A row for every trial and method: scenario, n_poses, trial, method, outcome ('ok', or why
-        it failed), and where there is an estimate rotation (radians) and translation (metres)
-        errors, the same as bound with unknown and with known sensor, and of the six numbers of the
-        pose the mean squared error over the bound, and over the stated covariance, and how many lie
-        in their 90 % intervals.
+        A row for every trial and method: scenario, what was varied of it, n_poses, trial, method,
+        outcome ('ok', or why it failed), and where there is an estimate rotation (radians) and
+        translation (metres) errors; where boards are looked at the same as bound with unknown and
+        with known sensor, and of the six numbers of the pose the mean squared error over the bound,
+        and over the stated covariance, and how many lie in their 90 % intervals.
     """
     rng = np.random.default_rng([task.seed, task.n_poses, task.first])
     shots = draw_shots(task.scenario, rng, task.trials, task.n_poses)
@@ -76,9 +94,12 @@ def run_task(task: Task) -> list[dict]:
     shift = shift_sigma * rng.standard_normal((task.trials, 3))
     T0 = RigidTransform.from_components(true.translation + shift, turn * true.rotation)
 
-    sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
-    sensor = task.scenario.sensor
-    bounds = [bounds_of_camera(obs, truth, sensor) for obs, truth in sessions]
+    sessions = []
+    bounds = [None] * task.trials
+    if not task.scenario.corner:
+        sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
+        sensor = task.scenario.sensor
+        bounds = [bounds_of_camera(obs, truth, sensor) for obs, truth in sessions]
     rows = []
     for method in task.methods:
         if method in BATCHED:
@@ -91,6 +112,7 @@ def run_task(task: Task) -> list[dict]:
         for t, estimate in enumerate(estimates):
             row = {
                 "scenario": task.scenario.name,
+                **task.scenario.varied,
                 "n_poses": task.n_poses,
                 "trial": task.first + t,
                 "method": method,
@@ -101,9 +123,9 @@ def run_task(task: Task) -> list[dict]:
 
 def _batch(method, shots, scenario, T0):
     """Pose, covariance and what went wrong, of every trial."""
-    obs = observations(shots, scenario, last_beam=BATCHED[method])
+    obs = crossing_observations(shots, scenario, last_beam=method == "line_printed")
     try:
-        solution = solve_camera(obs, method, T0)
+        solution = solve_camera(obs, **{"method": method, "T0": T0} | BATCHED[method])
     except DegenerateGeometry as error:
         return [str(error)] * len(T0)
     poses = pose_array(solution.transform)
@@ -118,14 +140,12 @@ def _single(method, shots, scenario, trial, T0, obs):
             solution = solve_joint(obs, axis=False, sensor=scenario.sensor)
             camera = solution.state.cameras[0]
             return camera, solution.solution.covariance[:6, :6], True
-        planes = plane_observations(shots, scenario, trial)
-        if method == "three_planes":
-            found = solve_camera(planes, "zhang_pless", loss="cauchy", scale="auto")
-        else:
-            found = solve_camera(planes, method, T0, search=False)
+        planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
+        options = {"method": method, "T0": T0} | PLANES[method]
+        found = solve_camera(planes, search=False, **options)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:
         return str(error)
-    return pose_array(found.transform), found.covariance, bool(found.converged)
+    return pose_array(found.transform), found.covariance[:6, :6], bool(found.converged)
 
 
 def _judged(estimate, true, bounds):
@@ -136,17 +156,18 @@ def _judged(estimate, true, bounds):
     error = pose_errors(pose[None], true[None])[0]
     if not (np.isfinite(error).all() and np.isfinite(covariance).all()):
         return {"outcome": "not finite"}
-    unknown, known = bounds
     turn = np.linalg.norm(error[:3])
     outcome = "ok"
     if turn > FAR:
         outcome = "more than 10 deg from the truth"
     elif not converged:
         outcome = "not converged"
+    numbers = {"rotation": turn, "translation": np.linalg.norm(error[3:])}
+    if bounds is None:
+        return {"outcome": outcome} | numbers
+    unknown, known = bounds
     interval = HALF_WIDTH * np.sqrt(np.maximum(np.diagonal(covariance), 0))
-    numbers = {
-        "rotation": turn,
-        "translation": np.linalg.norm(error[3:]),
+    numbers |= {
         "bound_rotation": np.sqrt(np.trace(unknown[:3, :3])),
         "bound_translation": np.sqrt(np.trace(unknown[3:, 3:])),
         "known_rotation": np.sqrt(np.trace(known[:3, :3])),
@@ -155,34 +176,99 @@ def _judged(estimate, true, bounds):
         "nees": error @ np.linalg.pinv(covariance) @ error / 6,
         "covered": np.mean(np.abs(error) < interval),
     }
-    rounded = {key: float(f"{value:.{DIGITS}g}") for key, value in numbers.items()}
-    return {"outcome": outcome} | rounded
+    return {"outcome": outcome} | numbers
 
 
-def plane_observations(shots: dict, scenario: Scenario, trial: int) -> CameraObservations:
-    """All readings on the boards of one trial, as points of planes.
+def crossing_observations(
+    shots: dict, scenario: Scenario, last_beam: bool = False
+) -> CameraObservations:
+    """Where scan lines meet edges of boards, or of corners, trials first.
 
     Parameters
     ----------
     shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
+        Of :func:`lrfcal_lib.simulate.shots.draw_shots`.
     scenario : Scenario
-    trial : int
+    last_beam : bool
+        Crossings are at the last beams on the board instead of half a beam step outside.
     """
-    ranges = shots["ranges"][trial]
-    placement, beam = np.nonzero(np.isfinite(ranges))
-    rays = polar_to_points(1.0, scenario.bearings()[beam])
-    along = rays[:, :, None] * rays[:, None, :]
-    boards = np.tile(np.eye(4), (len(ranges), 1, 1))
-    boards[:, :3] = shots["boards"][trial]
+    if scenario.corner:
+        lines = shots["lines"][:, :, None]
+        points = shots["points"][:, :, None]
+        noise = scenario.sigma_range**2 * np.eye(3)
+        covariance = np.broadcast_to(noise, (*points.shape, 3))
+    else:
+        lines = np.tile(shots["lines"], (1, 1, scenario.scans, 1))
+        points, covariance = _ends_of_lines(shots["ranges"], scenario, last_beam)
+    t, p, each = points.shape[:3]
+    shape = (t, p * each)
     return CameraObservations(
         scenario.model,
-        plane_points=ranges[placement, beam, None] * rays,
-        plane_covariance=scenario.sigma_range**2 * along + 1e-10 * np.eye(3),
-        plane_placement=placement,
-        placements=np.arange(len(ranges)),
-        board_poses=boards,
-        board_covariance=shots["board_covariance"][trial],
+        crossing_points=points.reshape(*shape, 3),
+        crossing_covariance=covariance.reshape(*shape, 3, 3),
+        crossing_lines=lines.reshape(*shape, 3),
+        crossing_line_sigma=np.full(shape, scenario.sigma_px),
+        crossing_placement=np.repeat(np.arange(p), each),
+    )
+
+
+def _ends_of_lines(ranges, setup, last_beam):
+    """Where the lines fitted to scan lines (t, p, s, B) end, (t, p, 2 s, 3), and their
+    covariances.
+    """
+    bearings = setup.bearings()
+    t, p, scans, beams = ranges.shape
+    ranges = ranges.reshape(-1, beams)
+    lines, information = fit_lines(ranges, bearings)
+    _, first, last = row_ends(np.isfinite(ranges))
+    ends = bearings[np.stack([first, last], axis=1)]
+    if not last_beam:
+        ends = ends + np.array([-0.5, 0.5]) * setup.step
+    ray = polar_to_points(1.0, ends)
+    across = np.cross([0.0, 0.0, 1.0], ray)
+    u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
+    r = 1 / np.vecdot(u, ray)  # to the fitted line u . p = 1
+    by_bearing = -(r**2) * np.vecdot(u, across)  # the range's change
+    turned = r[..., None] * across + by_bearing[..., None] * ray
+    of_line = np.linalg.inv(information) * setup.sigma_range**2
+    flat_ray = ray[..., :2]
+    variance = r**4 * np.vecdot(flat_ray @ of_line, flat_ray)
+    spacing = _outer(turned * setup.step * UNIFORM)
+    points = r[..., None] * ray
+    covariance = variance[..., None, None] * _outer(ray) + spacing
+    shape = (t, p, 2 * scans)
+    return points.reshape(*shape, 3), covariance.reshape(*shape, 3, 3)
+
+
+def _outer(v):
+    return v[..., :, None] * v[..., None, :]
+
+
+def plane_observations(
+    obs: JointObservations, pixels, scenario: Scenario
+) -> CameraObservations:
+    """All readings of a session as points of planes, and its pattern corners.
+
+    Parameters
+    ----------
+    obs : JointObservations
+        Of :func:`joint_session`.
+    pixels : ndarray, shape (p, c, 2)
+        Of the pattern's corners.
+    scenario : Scenario
+    """
+    rays = polar_to_points(1.0, obs.face_bearing)
+    return CameraObservations(
+        scenario.model,
+        pattern_points=scenario.board.pattern.points(),
+        pattern_pixels=pixels,
+        pattern_sigma_px=scenario.sigma_px,
+        plane_points=obs.face_range[:, None] * rays,
+        plane_covariance=scenario.sigma_range**2 * _outer(rays) + 1e-10 * np.eye(3),
+        plane_placement=obs.face_placement,
+        placements=np.arange(len(obs.placements)),
+        board_poses=obs.view_pose,
+        board_covariance=obs.view_covariance,
     )
 
 
@@ -194,7 +280,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     Parameters
     ----------
     shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
+        Of :func:`lrfcal_lib.simulate.shots.draw_shots`.
     scenario : Scenario
     trial : int
     """
@@ -233,31 +319,35 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
 def _readings(shots, scenario, trial):
     """Readings of the boards, and the beams about the ends of their scan lines."""
     ranges = shots["ranges"][trial]
+    placements, scans, beams = ranges.shape
+    of_line = np.repeat(np.arange(placements), scans)
+    edges = np.repeat(shots["edges"][trial], scans, axis=0)
+    ranges = ranges.reshape(-1, beams)
     bearings = scenario.bearings()
     hit = np.isfinite(ranges)
-    placement, beam = np.nonzero(hit)
+    line, beam = np.nonzero(hit)
     _, first, last = row_ends(hit)
     near = np.arange(2 * REACH) - REACH  # beams about the end of a scan line
-    beams = np.stack([first[:, None] + near, last[:, None] + 1 + near], axis=1)
-    beams = np.clip(beams, 0, len(bearings) - 1)
-    shape = beams.shape
+    window = np.stack([first[:, None] + near, last[:, None] + 1 + near], axis=1)
+    window = np.clip(window, 0, beams - 1)
+    shape = window.shape
     which = np.broadcast_to(np.arange(len(ranges))[:, None, None], shape).ravel()
     ends = np.take_along_axis(ranges, np.stack([first, last], axis=1), axis=1)
     at_end = np.broadcast_to(np.maximum(ends, LEAST_RANGE)[..., None], shape).ravel()
     return {
-        "face_range": ranges[placement, beam],
+        "face_range": ranges[line, beam],
         "face_bearing": bearings[beam],
         "face_pitch": np.zeros(len(beam)),
         "face_sigma": np.full(len(beam), scenario.sigma_range),
-        "face_placement": placement,
-        "beam_bearing": bearings[beams].ravel(),
+        "face_placement": of_line[line],
+        "beam_bearing": bearings[window].ravel(),
         "beam_pitch": np.zeros(len(which)),
-        "beam_hit": hit[which, beams.ravel()],
-        "beam_edge": np.broadcast_to(shots["edges"][trial][..., None], shape).ravel(),
+        "beam_hit": hit[which, window.ravel()],
+        "beam_edge": np.broadcast_to(edges[..., None], shape).ravel(),
         "beam_radius": scenario.radius(at_end),
         "beam_background": np.zeros(len(which)),
         "beam_step": scenario.step * at_end,
-        "beam_placement": which,
+        "beam_placement": of_line[which],
     }
 
 

@@ -1,14 +1,20 @@
-"""The tilt axis as four numbers: two angles and two offsets, and what is stated about them."""
+"""The tilt axis as four numbers: two angles and two offsets, and what is stated about them.
+
+Equations (1) and (2) in the unknowns that data can show.
+"""
+
+from collections.abc import Callable
 
 import numpy as np
 
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import hat, move_pose, pose_transform
+from lrfcal_lib.model.geometry import move_pose, pose_transform
 
 PRIOR_FREEDOM = 3.0  # of Student's t: what is stated about the axis yields to the data
 # of the increments [w, v] of T_head_lrf: what the gauge leaves
 AXIS_COLUMNS = np.array([1, 2, 4, 5])
+SMALL = 1e-6  # of the differences that stand for derivatives: radians, metres
 
 
 def chart_parameters(head: np.ndarray) -> np.ndarray:
@@ -47,20 +53,36 @@ def prior_terms(head: np.ndarray, prior: PlatformPrior) -> tuple[np.ndarray, np.
         Radians and metres.
     jacobian : ndarray, shape (4, 4)
     """
-    reference = geometry.pose_array(
-        geometry.head_from_axis(geometry.axis_of(prior.T_head_lrf))
-    )
-    turn = reference[:, :3] @ head[:, :3].T
-    along = turn[:, 0]
-    arm = np.array([0.0, head[1, 3], head[2, 3]])
-    r = np.r_[along[2], -along[1], (turn @ arm)[1:] - reference[1:, 3]]
-    J = np.zeros((4, 4))
-    # of R^T e_x and R^T t by w_y, w_z
-    by_turn = turn @ hat(np.array([[1.0, 0.0, 0.0], arm]))[..., 1:]
-    J[:2, :2] = by_turn[0, [2, 1]] * [[1.0], [-1.0]]
-    J[2:, :2] = by_turn[1, 1:]
-    J[2:, 2:] = turn[1:, 1:]
-    return r, J
+    axis = geometry.axis_of(prior.T_head_lrf)
+    reference = geometry.pose_array(geometry.head_from_axis(axis))
+
+    def differences(heads):
+        """Those of heads (k, 3, 4), shape (k, 4)."""
+        turn = reference[:, :3] @ heads[..., :3].mT
+        arm = heads[..., 3] * [0.0, 1.0, 1.0]
+        away = np.matvec(turn, arm) - reference[:, 3]
+        return np.column_stack([turn[:, 2, 0], -turn[:, 1, 0], away[:, 1:]])
+
+    return by_chart(differences, head)
+
+
+def by_chart(function: Callable, head: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values at a head pose, and their derivatives by the chart from differences.
+
+    Parameters
+    ----------
+    function : callable
+        Of heads (k, 3, 4), shape (k, m).
+    head : ndarray, shape (3, 4)
+
+    Returns
+    -------
+    values : ndarray, shape (m,)
+    derivatives : ndarray, shape (m, 4)
+    """
+    steps = SMALL * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
+    here, ahead, behind = np.split(function(move_head(head, steps)), [1, 5])
+    return here[0], (ahead - behind).T / (2 * SMALL)
 
 
 def move_head(head: np.ndarray, step: np.ndarray) -> np.ndarray:

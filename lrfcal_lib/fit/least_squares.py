@@ -13,7 +13,7 @@ weights are frozen while a step is judged and renewed for the next one.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from lrfcal_lib.fit.covariance import (
     null_space,
     placement_covariance,
 )
-from lrfcal_lib.fit.padding import medians, pad
+from lrfcal_lib.fit.padding import medians
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
@@ -97,25 +97,41 @@ class Block:
         return self.whitened(self.jacobian if self.corrected is None else self.corrected)
 
 
-def _weigh(block, loss, scale, axes):
-    """Robust weights (..., n) of a block at its own state, None without, and half the loss summed
-    over the trial.
-    """
+def _roots(block, axes):
+    """Roots of Cauchy's weights of residuals, or of groups of them, that are judged together."""
     if block.cost is not None:
-        return None, block.cost.sum(axis=axes)
-    r = block.white
-    if loss is None:
-        return None, 0.5 * (r * r).sum(axis=axes)
-    d = block.size
-    squares = np.sum(r.reshape(r.shape[:-1] + (-1, d)) ** 2, axis=-1)
-    count = np.asarray(d if block.count is None else block.count, float)
+        return np.ones(())
+    groups = block.white.reshape(*block.white.shape[:-1], -1, block.size)
+    squares = np.sum(groups**2, axis=-1)
+    count = np.asarray(block.size if block.count is None else block.count, float)
     count = np.broadcast_to(count, squares.shape)
-    z = np.sqrt(squares / count)  # sizes of groups of residuals that are judged together
-    if scale == "auto":
-        scale = _level(z, count, block, axes)
-    square = (z / scale / CAUCHY) ** 2
-    value = np.sum(count * scale**2 * CAUCHY**2 * np.log1p(square), axis=axes)
-    return np.repeat(1 / (1 + square), d, axis=-1), 0.5 * value
+    z = np.sqrt(squares / count)
+    return (1 + (z / _level(z, count, block, axes) / CAUCHY) ** 2) ** -0.5
+
+
+def _times(blocks, roots):
+    """Blocks with the roots of their weights in their whiteners."""
+    weighted = []
+    for block, root in zip(blocks, roots, strict=True):
+        whole = block.size > 1 and root.ndim > 0
+        factor = root[..., None, None] if whole else root
+        weighted.append(replace(block, whitener=block.whitener * factor))
+    return weighted
+
+
+def _weighted(evaluate, robust, axes):
+    """A problem whose blocks have robust weights: given ones, or those of the state."""
+
+    def problem(state, roots=None):
+        """Blocks at a state, and the roots of their weights."""
+        blocks = _blocks(evaluate, state)
+        if not robust:
+            return blocks, None
+        if roots is None:
+            roots = [_roots(block, axes) for block in blocks]
+        return _times(blocks, roots), roots
+
+    return problem
 
 
 def _level(z, count, block, axes):
@@ -139,58 +155,38 @@ def _blocks(evaluate, state):
 
 
 class Linearised(NamedTuple):
-    """Whitened, robustly weighted blocks at a state.
-
-    Normal equations (..., k, k) and (..., k), the cost, and of each block the roots of its weights
-    (None without).
-    """
+    """Normal equations (..., k, k) and (..., k) of whitened blocks at a state, and the cost."""
 
     hessian: np.ndarray
     gradient: np.ndarray
     cost: np.ndarray
-    roots: list
 
 
-def linearise(blocks: Iterable[Block], loss=None, scale=1.0, axes=(-2, -1)) -> Linearised:
+def linearise(blocks: Iterable[Block], axes=(-2, -1)) -> Linearised:
     """Normal equations of blocks with the placement as leading axis, or of trials.
 
     Parameters
     ----------
     blocks : iterable of Block
-    loss, scale
-        See :func:`minimise`.
     axes : int or tuple of int
         Over which the cost is summed: placements and residuals, or -1 for residuals of trials.
     """
     hessian = gradient = cost = np.zeros(())
-    roots = []
     for block in blocks:
-        weights, value = _weigh(block, loss, scale, axes)
-        r = block.white
         J = block.white_jacobian
-        root = None
-        if weights is not None:
-            root = np.sqrt(weights)
-            r = root * r
-            J = root[..., None] * J
-        roots.append(root)
         transposed = J.swapaxes(-1, -2)
         hessian = hessian + transposed @ J
-        gradient = gradient + (transposed @ r[..., None])[..., 0]
-        cost = cost + value
-    return Linearised(hessian, gradient, cost, roots)
+        gradient = gradient + (transposed @ block.white[..., None])[..., 0]
+        cost = cost + _cost(block, axes)
+    return Linearised(hessian, gradient, cost)
 
 
-def _frozen_cost(blocks, roots, axes):
-    """Half the sum of squares with the robust weights of an earlier state."""
-    total = 0.0
-    for block, root in zip(blocks, roots, strict=True):
-        if block.cost is not None:
-            total = total + block.cost.sum(axis=axes)
-            continue
-        r = block.white if root is None else root * block.white
-        total = total + 0.5 * (r * r).sum(axis=axes)
-    return total
+def _cost(block, axes):
+    """Half the sum of squares, or the negative log likelihood."""
+    cost = block.cost
+    if cost is None:
+        cost = 0.5 * block.white**2
+    return cost.sum(axis=axes)
 
 
 def eliminate(
@@ -285,8 +281,7 @@ def minimise(
     retract: Callable,
     *,
     shared: int | None = None,
-    loss: str | None = None,
-    scale: float | str = 1.0,
+    robust: bool = False,
     max_iterations: int = 60,
     tolerance: float = 1e-8,
 ) -> Minimum:
@@ -301,44 +296,41 @@ def minimise(
         ``(state, step) -> state``; with `shared` the step is the pair (common (c,), own (p, l)).
     shared : int, optional
         Number of unknowns common to all entries of the leading axis.
-    loss : {None, 'cauchy'}
-    scale : float or 'auto'
-        Unit of the loss in standard deviations; 'auto' takes it from the median of the residuals in
-        every iteration.
+    robust : bool
+        Cauchy's loss, in units of the median of the residuals in every iteration.
     max_iterations : int
     tolerance : float
         A trial has converged when a step is shorter than this many standard deviations of the
         estimate.
     """
-    if loss not in (None, "cauchy"):
-        raise ValueError(f"unknown loss {loss!r}: use None or 'cauchy'")
     axes = -1 if shared is None else (-2, -1)
-    blocks = _blocks(evaluate, state)
-    at = linearise(blocks, loss, scale, axes)
+    problem = _weighted(evaluate, robust, axes)
+    blocks, roots = problem(state)
+    at = linearise(blocks, axes)
     history = [at.cost]
     converged = np.zeros(np.shape(at.cost), bool)
     damping = np.full(np.shape(at.cost), FIRST_DAMPING)
     while len(history) <= max_iterations and not converged.all():
         step, length, promised = _step(at.hessian, at.gradient, damping, shared)
         trial = retract(state, step)
-        tried = _blocks(evaluate, trial)
-        before = at.cost if loss is None else _frozen_cost(blocks, at.roots, axes)
-        after = _frozen_cost(tried, at.roots, axes)
-        accepted = after <= before * (1 + 1e-12) + 1e-26
-        small = (length < tolerance**2) | (length < 1e-14 * before)
+        tried, _ = problem(trial, roots)
+        after = sum(_cost(block, axes) for block in tried)
+        accepted = after <= at.cost * (1 + 1e-12) + 1e-26
+        small = (length < tolerance**2) | (length < 1e-14 * at.cost)
         converged = converged | (small & np.isfinite(after) & (damping < SMALL_DAMPING))
+        gain = np.ones_like(at.cost)
+        np.divide(at.cost - after, promised, out=gain, where=promised > 3e-15 * at.cost)
+        damping = _next_damping(damping, gain, accepted)
         if accepted.all():
             state = trial
             blocks = tried
         elif accepted.any():
             chosen = accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim))
             state = np.where(chosen, trial, state)
-            blocks = _blocks(evaluate, state)
-        at = linearise(blocks, loss, scale, axes)
+        if robust or not accepted.all():
+            blocks, roots = problem(state)
+        at = linearise(blocks, axes)
         history.append(at.cost)
-        gain = np.ones_like(before)
-        np.divide(before - after, promised, out=gain, where=promised > 3e-15 * before)
-        damping = _next_damping(damping, gain, accepted)
     if converged.ndim == 0:
         converged = converged[()]
     return Minimum(state, converged, len(history) - 1, np.array(history))
@@ -358,7 +350,7 @@ def _next_damping(damping, gain, accepted):
 
 def minimise_in_rounds(
     freeze: Callable, state: Any, retract: Callable, rounds: int, **options
-) -> tuple[Callable, Any, list[np.ndarray]]:
+) -> tuple[Callable, Any]:
     """Minimise a few times with what depends on the state frozen anew (weights, say).
 
     Parameters
@@ -377,14 +369,10 @@ def minimise_in_rounds(
         The problem that is left to solve.
     state
         Where to begin.
-    earlier : list of ndarray
-        Cost histories so far.
     """
-    earlier = []
     for number in range(rounds):
-        state, _, _, history = minimise(freeze(state, number), state, retract, **options)
-        earlier.append(history)
-    return freeze(state, rounds), state, earlier
+        state = minimise(freeze(state, number), state, retract, **options).state
+    return freeze(state, rounds), state
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -417,7 +405,7 @@ class Question:
     names: Sequence[str]
     method: str
     read: Callable
-    scales: ArrayLike | None = None
+    scales: ArrayLike = 1.0
     limit: float = 1.0
     words: Callable | None = None
     groups: np.ndarray | None = None
@@ -447,21 +435,19 @@ def solve(
     retract: Callable,
     *,
     shared: int | None = None,
-    loss: str | None = None,
-    scale: float | str = 1.0,
-    earlier: Sequence[np.ndarray] = (),
+    robust: bool = False,
+    max_iterations: int = 60,
+    tolerance: float = 1e-8,
     **asked,
 ) -> Solution:
     """Minimise, then report covariances and what was not observed.
 
     Parameters
     ----------
-    evaluate, start, retract, shared, loss, scale
+    evaluate, start, retract, shared, robust, max_iterations, tolerance
         See :func:`minimise`.
-    earlier : sequence of ndarray
-        Cost histories of earlier rounds.
     **asked
-        Fields of :class:`Question`; `max_iterations` and `tolerance` of :func:`minimise`.
+        Fields of :class:`Question`.
 
     Raises
     ------
@@ -470,36 +456,29 @@ def solve(
     ValueError
         When residuals at the start are not finite.
     """
-    steps = {
-        name: asked.pop(name) for name in ("max_iterations", "tolerance") if name in asked
-    }
     question = Question(**asked)
-    last = [None, None]
-
-    def once(state):
-        """Blocks at a state; those of the last state are kept."""
-        if last[0] is not state:
-            last[:] = state, _blocks(evaluate, state)
-        return last[1]
-
-    if not all(np.isfinite(block.residuals).all() for block in once(start)):
+    if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
         raise ValueError(
             f"{question.method}: residuals at the start value are not finite: check the "
             "observations and T0"
         )
-    options: dict[str, Any] = {"shared": shared, "loss": loss, "scale": scale}
-    minimum = minimise(once, start, retract, **options, **steps)
-    costs = [costs[:-1] for costs in earlier]
-    minimum = minimum._replace(
-        iterations=minimum.iterations + sum(map(len, costs)),
-        cost_history=np.concatenate([*costs, minimum.cost_history]),
+    minimum = minimise(
+        evaluate,
+        start,
+        retract,
+        shared=shared,
+        robust=robust,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
     )
-    blocks = once(minimum.state)
+    blocks = _blocks(evaluate, minimum.state)
     axes = -1 if shared is None else (-2, -1)
     weights = []
     for block in blocks:
-        of_block = _weigh(block, loss, scale, axes)[0]
-        weights.append(np.ones_like(block.white) if of_block is None else of_block)
+        weight = np.ones_like(block.white)
+        if robust and block.cost is None:
+            weight = np.repeat(_roots(block, axes) ** 2, block.size, axis=-1)
+        weights.append(weight)
     return _solution(question, minimum, blocks, np.concatenate(weights, axis=-1), shared)
 
 
@@ -507,25 +486,17 @@ def _by_placement(r, J, weights, groups, shared):
     """Normal equations of the reported unknowns by placement (one group where they are not told
     apart).
     """
-    weighted = weights[..., None] * J
-    if groups is not None:  # rows of a placement together, padded with what counts nothing
-        rows = np.arange(r.shape[-1])
-        placement = np.repeat(
-            np.unique(groups, return_inverse=True)[1], len(rows) // len(groups)
-        )
-        together = pad({"row": rows, "placement": placement}, placement.max() + 1)
-        index = together["row"]
-        r = r[..., index]
-        J = J[..., index, :]
-        weighted = weighted[..., index, :] * together["used"][..., None]
-    weighted = weighted.swapaxes(-1, -2)
-    hessians = weighted @ J
-    scores = (weighted @ r[..., None])[..., 0]
+    weighted = (weights[..., None] * J).mT
     if shared is not None:
-        return reduced_hessian(hessians, shared), scores[:, :shared]
-    if groups is None:
-        return hessians[..., None, :, :], scores[..., None, :]
-    return hessians, scores
+        scores = np.matvec(weighted, r)
+        return reduced_hessian(weighted @ J, shared), scores[:, :shared]
+    index = (
+        np.zeros(1, int) if groups is None else np.unique(groups, return_inverse=True)[1]
+    )
+    index = np.repeat(index, r.shape[-1] // len(index))
+    member = index == np.arange(index.max() + 1)[:, None]
+    weighted = weighted[..., None, :, :] * member[:, None]
+    return weighted @ J[..., None, :, :], np.matvec(weighted, r[..., None, :])
 
 
 def _solution(question, minimum, blocks, weights, shared):
@@ -534,9 +505,7 @@ def _solution(question, minimum, blocks, weights, shared):
     J = np.concatenate([block.white_jacobian for block in blocks], axis=-2)
     hessians, scores = _by_placement(r, J, weights, question.groups, shared)
     hessian = np.sum(hessians, axis=-3)
-    scales = np.ones(hessian.shape[-1])
-    if question.scales is not None:
-        scales = np.asarray(question.scales)
+    scales = np.broadcast_to(question.scales, hessian.shape[-1:])
     motions = question.open_motions(hessian, scales)
     chi2 = (
         np.sum(weights * r**2, axis=-1 if shared is None else (-2, -1)) + question.chi2_rest

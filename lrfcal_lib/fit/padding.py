@@ -1,4 +1,4 @@
-"""Rows of placements as padded rectangles."""
+"""Rows of placements as padded rectangles. No equations."""
 
 import numpy as np
 

@@ -216,7 +216,6 @@ def noise_correction(
     gradient: np.ndarray,
     shift: np.ndarray,
     factor: np.ndarray,
-    pinhole: bool = True,
 ) -> np.ndarray:
     """What errors in the points take from Jacobian rows by the pose: ``factor`` times half the
     change of the variance.
@@ -226,25 +225,21 @@ def noise_correction(
     rotated, point : ndarray, shape (..., n, 3)
         ``R p`` and ``R p + t``, metres.
     gradient : ndarray, shape (..., n, 3)
-        Of a scalar by the moved point.
+        Of a scalar ``l . pinhole(q)`` by the moved point q.
     shift : ndarray, shape (..., n, 3)
         The direction in which the noise pulls the point, see :func:`moved_noise`.
     factor : ndarray, shape (..., n)
         The weighted residual.
-    pinhole : bool
-        The scalar is ``l . pinhole(q)``; otherwise ``m . q``.
 
     Returns
     -------
     ndarray, shape (..., n, 6)
     """
-    by_turn = cross(shift, gradient)
-    by_shift = np.zeros_like(by_turn)
-    if pinhole:  # the gradient itself changes with the depth
-        depth = point[..., 2:]
-        by_shift = -gradient * shift[..., 2:] / depth
-        by_shift[..., 2] -= np.vecdot(gradient, shift) / depth[..., 0]
-        by_turn = by_turn + cross(rotated, by_shift)
+    # the gradient itself changes with the depth
+    depth = point[..., 2:]
+    by_shift = -gradient * shift[..., 2:] / depth
+    by_shift[..., 2] -= np.vecdot(gradient, shift) / depth[..., 0]
+    by_turn = cross(shift, gradient) + cross(rotated, by_shift)
     return factor[..., None] * np.concatenate([by_turn, by_shift], axis=-1)
 
 

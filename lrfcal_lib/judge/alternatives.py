@@ -17,19 +17,18 @@ from lrfcal_lib.model.geometry import (
     axis_of,
     transform_difference,
 )
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.solvers.joint_model import SENSOR
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
-MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement, whatever it does
 # so many are exceeded by chance once in 20 times; enough where it does harm:
 PREFERRED = 2.0
 MOVED = 2.0  # standard deviations by which what is handed over would move
-HELD = 0.001  # metres, of a range offset that is asked whether bearings may stand for it
-INSTEAD = 6.0  # standard deviations beyond which they do
+LARGE_SHARE = 0.9  # of a standard deviation, due to the angular step
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 # of a camera from its guess
@@ -39,8 +38,8 @@ FAR_SHIFT = 0.3
 ALIKE = 0.15
 LEVER = 0.2  # metres, weighs turns against shifts
 CHECK = (
-    "check its statement; bearings or pitch of the other sense, or exchanged folders of cameras "
-    "look like this"
+    "check what session.json states; reversed bearings or pitch, or exchanged camera folders, "
+    "look the same"
 )
 # of the best alternative's likelihood ratio: another one explains the data nearly as well
 AS_GOOD = 0.6
@@ -88,15 +87,6 @@ def _views_and_outline(obs, s):
     return replace(_views(obs, s), corners=obs.corners * (1 + s))
 
 
-def _bearings(obs, s):
-    """Bearings stretched by s about the middle."""
-    return replace(
-        obs,
-        face_bearing=MIDDLE + (obs.face_bearing - MIDDLE) * (1 + s),
-        beam_bearing=MIDDLE + (obs.beam_bearing - MIDDLE) * (1 + s),
-    )
-
-
 def _lag(obs, s):
     """The pitch of scan lines later by s (radians) in the sense of the sweep."""
     return replace(
@@ -127,7 +117,7 @@ ALTERNATIVES = {
         ),
     ),
     Kind.BEARINGS: Alternative(
-        _bearings,
+        JointObservations.stretched,
         "bearings are {size} +- {sigma} % too {sign}",
         "check the angular step that session.json states",
         ("small", "large"),
@@ -141,9 +131,9 @@ ALTERNATIVES = {
     ),
     Kind.LAG: Alternative(
         _lag,
-        "the pitch of scan lines comes {size} +- {sigma} deg {sign} in the sense of the sweep",
+        "the recorded pitch of scan lines is {size} +- {sigma} deg {sign} the sweep",
         "check the time stamps of pitch and scans, sweep slower or stop for every scan",
-        ("late", "early"),
+        ("behind", "ahead of"),
         worth=np.radians(0.05),
         unit=np.degrees(1.0),
     ),
@@ -262,12 +252,9 @@ def doubt_about(kind, alternative, solution, admitted_offset):
     sigma = float(np.sqrt(max(noise, scatter)))
 
     handed = [i for i, name in enumerate(names) if name not in SENSOR]
-    moves = (
-        covariance[handed, -1]
-        / max(noise, 1e-300)
-        * value
-        / solution.solution.trusted_sigma[handed]
-    )
+    # what the accuracy of the angular step may do must not hide that it is wrong
+    spread = np.sqrt(solution.solution.trusted_sigma**2 - solution.step**2)[handed]
+    moves = covariance[handed, -1] / max(noise, 1e-300) * value / spread
     words = alternative.words.format(
         size=f"{abs(value) * alternative.unit:.2g}",
         sigma=f"{sigma * alternative.unit:.2g}",
@@ -294,59 +281,28 @@ def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
     asked = []
     for doubt in weigh(solution, admitted_offset, stated):
         harmful = doubt.exceeds(PREFERRED) and doubt.moved > MOVED
-        certain = doubt.kind not in faint and _certain(doubt, stated)
-        if abs(doubt.value) < stated[doubt.kind].reach and (harmful or certain):
+        certain = doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
+        asks = harmful or (certain and doubt.kind not in faint)
+        if asks and abs(doubt.value) < stated[doubt.kind].reach:
             asked.append(doubt)
     return [doubt for doubt in asked if doubt.ratio > AS_GOOD * asked[0].ratio]
 
 
-def _certain(doubt, stated):
-    """Whether the data contradict a statement beyond chance, by as much as is worth a word."""
-    return doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
+def step_words(solution: JointSolution) -> str:
+    """In words, where the accuracy of the angular step makes up much of the expected errors; else
+    ''.
 
-
-def step_not_told(solution, admitted_offset, stated=ALTERNATIVES):
-    """In words, where the data cannot tell whether the angular step is stated rightly and what is
-    handed over hangs on it; else ''.
-
-    With cameras on the head, a step that is off and a range offset that the maker admits stretch
-    the cloud nearly alike.
+    Parameters
+    ----------
+    solution
     """
-    told = weigh(solution, admitted_offset, {"bearings": stated["bearings"]})
-    for doubt in told:
-        moved = doubt.moved * doubt.sigma / abs(doubt.value)
-        if moved > MOVED:
-            return (
-                "The angular step is taken as stated: these data determine it only to "
-                f"{100 * doubt.sigma:.1f} %. An error of that size would move axis or cameras by "
-                f"{moved:.1f} of their standard deviations. Boards at more different distances "
-                "determine it better."
-            )
-    return ""
-
-
-def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):
-    """The Doubt about bearings where they explain the data far better than the range offset found
-    does, or None.
-
-    Both stretch the cloud sideways, so that each can stand for the other; bearings are asked with
-    the offset held. Where both are free, what the data say of bearings must not contradict it.
-    """
-    offset = solution.sensor["range_offset"]
-    sigma = solution.sigma.get("range_offset")
-    if sigma is None or abs(offset) < ASKED * sigma:
-        return None
-    best = weigh(solution, HELD, stated)[0]
-    far_better = best.ratio > max((offset / sigma) ** 2 / AS_GOOD, INSTEAD**2)
-    if best.kind != Kind.BEARINGS or not far_better:
-        return None
-    for free in weigh(solution, admitted_offset, stated):
-        if free.kind == Kind.BEARINGS and abs(best.value - free.value) > ASKED * free.sigma:
-            return None
-    if best.moved < MOVED and not _certain(best, stated):
-        return None
-    return replace(
-        best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)"
+    share = np.max(np.abs(solution.step) / solution.solution.trusted_sigma)
+    if share < LARGE_SHARE:
+        return ""
+    return (
+        f"The angular step is taken to be known to {100 * solution.data.levels.step_sigma:.2g} %, "
+        "which makes up most of the errors of axis or cameras: state angular_step_relative in "
+        "session.json where it is known better."
     )
 
 
@@ -415,7 +371,8 @@ def far_cameras(joint):
         nearest = min(apart, key=lambda name: apart[name][0] * LEVER + apart[name][1])
         if turn > FAR_TURN or shift > FAR_SHIFT:
             words = (
-                f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {CHECK}"
+                f"camera '{camera}' stands {_apart(turn, shift)} from its guess in "
+                f"session.json: {CHECK}"
             )
             far.append(Far(words, turn))
         elif nearest != camera:
@@ -448,23 +405,3 @@ def _seat(solution, camera):
 
 def _apart(angle, distance):
     return f"{np.degrees(angle):.1f} deg and {1000 * distance:.0f} mm"
-
-
-def places_of_cameras(solution: JointSolution) -> list[str]:
-    """Where the cameras stand, in words: who mixed up their folders sees it here.
-
-    Parameters
-    ----------
-    solution
-    """
-    sentences = []
-    for camera in solution.transforms:
-        x, y, z = 1000 * _seat(solution, camera)
-        side = by_sign(x, "right", "left")
-        before = by_sign(y, "in front of", "behind")
-        above = by_sign(z, "above", "below")
-        sentences.append(
-            f"Seen along the middle beam, camera '{camera}' is {abs(x):.0f} mm to the {side} of, "
-            f"{abs(y):.0f} mm {before} and {abs(z):.0f} mm {above} the range finder."
-        )
-    return sentences

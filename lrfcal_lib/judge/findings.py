@@ -23,7 +23,6 @@ class Kind(StrEnum):
     CONVERGENCE = "convergence"
     UNOBSERVABLE = "unobservable"
     SECOND_MINIMUM = "second minimum"
-    WARNING = "warning"
     ERROR = "error"
     # the recorded placements
     PLACEMENTS = "placements"

@@ -59,8 +59,8 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
         other_size = np.abs(middle - 0.5).max() > OFF_MIDDLE
         if other_size:
             faults.append(
-                f"its middle ({model.cx:.0f}, {model.cy:.0f}) is far from the image's, as with "
-                "intrinsics of another image size"
+                f"its principal point ({model.cx:.0f}, {model.cy:.0f}) is far from the "
+                "image's centre, as with intrinsics of another image size"
             )
         if faults:
             remedy = REMEDY

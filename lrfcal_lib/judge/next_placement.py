@@ -9,7 +9,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
@@ -40,15 +39,12 @@ PLACES = (
     range(len(LEANS)),
 )
 FIELD_OF_VIEW = (np.radians(40), np.radians(140))  # bearings, of the paper's LMS 200
-PITCH_LIMITS = (
-    np.radians(-30),
-    np.radians(30),
-)  # of a head that is asked to look at a board
-LATTICE = np.linspace(*PITCH_LIMITS, 41)  # pitch angles that images are tried at
+LARGEST_PITCH = np.radians(30)  # of a head that is asked to look at a board
+# pitch angles that images are tried at
+LATTICE = np.linspace(-LARGEST_PITCH, LARGEST_PITCH, 41)
 # of each camera on the head, spread over the pitch angles at which all see the board
 IMAGES = 3
 MARGIN = 0.04  # of the image, that a board keeps from its border, distortion included
-STEEPEST = np.radians(60.0)  # incidence of beams and of lines of sight
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
 
 
@@ -74,34 +70,22 @@ class Suggestion:
     gain: float
     median_gain: float
 
-    def words(self) -> str:
-        """The pose in words, like ``board 1.5 m ahead, 20 deg to the left, upright``."""
-        distance, bearing, elevation, turn, lean = self.place
-        parts = [f"board {distance:.1f} m ahead"]
-        if bearing:
-            parts.append(
-                f"{abs(bearing):.0f} deg to the {by_sign(bearing, 'left', 'right')}"
-            )
-        if elevation:
-            parts.append(f"{abs(elevation):.0f} deg {by_sign(elevation, 'up', 'down')}")
-        if turn:
-            parts.append(f"turned by {turn:.0f} deg in its plane")
-        words = ", ".join([*parts, list(LEANS)[int(lean)]])
-        if len(self.pitches):
-            # a board so near fills the image at one pitch only
-            *most, last = dict.fromkeys(
-                f"{pitch:+.0f}" for pitch in np.degrees(self.pitches)
-            )
-            angles = f"{', '.join(most)} and {last}" if most else last
-            words += f"; images at pitch {angles} deg"
-        return words
-
     def sentence(self) -> str:
         """What to record next and what it brings."""
+        distance, bearing, elevation, turn, lean = self.place
+        words = (
+            f"Record next: board {distance:.1f} m ahead, {bearing:+.0f} deg to the left, "
+            f"{elevation:+.0f} deg up, turned by {turn:.0f} deg in its plane, "
+            f"{list(LEANS)[int(lean)]}"
+        )
+        if len(self.pitches):
+            # a board so near fills the image at one pitch only
+            angles = dict.fromkeys(f"{pitch:+.0f}" for pitch in np.degrees(self.pitches))
+            words += f"; images at pitch {', '.join(angles)} deg"
         return (
-            f"Record next: {self.words()}. The standard deviations of axis and cameras would "
-            f"shrink by about {100 * self.gain:.0f} %; a placement chosen at random would "
-            f"bring {100 * self.median_gain:.0f} %."
+            f"{words}. The standard deviations of axis and cameras would shrink by about "
+            f"{100 * self.gain:.0f} %; a placement chosen at random would bring "
+            f"{100 * self.median_gain:.0f} %."
         )
 
 
@@ -133,13 +117,11 @@ def suggest_placement(
     pitches = pitches_of_images(boards, solution, models, field_of_view)
     seen = np.isfinite(pitches[:, 0])
     if not seen.any():
-        low, high = np.degrees(PITCH_LIMITS)
         raise DegenerateGeometry(
             f"none of {len(grid)} board poses lies wholly in the view of the LRF and of all "
-            f"cameras at a pitch from {low:.0f} to {high:.0f} deg: check the field of view and "
-            "the calibration"
+            f"cameras at a pitch within {np.degrees(LARGEST_PITCH):.0f} deg: check the field of "
+            "view and the calibration"
         )
-    grid = grid[seen]
     boards = boards[seen]
     pitches = pitches[seen]
     known = solution.information().sum(axis=0)
@@ -151,7 +133,7 @@ def suggest_placement(
         pitches = pitches[:, :0]
     return Suggestion(
         T_platform_board=geometry.pose_transform(boards[best]),
-        place=tuple(grid[best].tolist()),
+        place=tuple(grid[seen][best].tolist()),
         pitches=pitches[best],
         gain=float(1 - after[best] / before),
         median_gain=float(1 - np.median(after) / before),
@@ -234,34 +216,27 @@ def board_poses(solution, grid):
 def pitches_of_images(boards, solution, models, field_of_view):
     """Pitch angles (n, k) of images in which all cameras see whole boards (n, 3, 4), radians.
 
-    NaN for boards that the LRF or a camera does not see wholly, or a camera too much from the side.
+    NaN for boards that the LRF or a camera does not see wholly.
     """
     points = geometry.apply_pose(boards, outline(solution))
     bearing, pitch, _ = beams_to(points, solution.T_head_lrf)
     inside = (bearing > field_of_view[0]) & (bearing < field_of_view[1])
-    inside &= (pitch > PITCH_LIMITS[0]) & (pitch < PITCH_LIMITS[1])
+    inside &= np.abs(pitch) < LARGEST_PITCH
     visible = np.tile(inside.all(axis=1), (len(LATTICE), 1))
     for name in solution.transforms:
+        size = np.array([models[name].width, models[name].height])
         for row, pitch in enumerate(LATTICE):
             T_camera_platform = solution.camera_at(name, pitch)
             p_camera = T_camera_platform.apply(points.reshape(-1, 3)).reshape(points.shape)
-            normals = T_camera_platform.rotation.apply(boards[:, :, 2])
-            visible[row] &= wholly_in_image(p_camera, normals, models[name])
+            # far outside the image a lens model would fold back
+            uv = pinhole(p_camera, models[name])
+            inside = (uv > MARGIN * size) & (uv < size - MARGIN * size)
+            visible[row] &= np.all(inside & (p_camera[..., 2:] > 0), axis=(1, 2))
 
     first = LATTICE[np.argmax(visible, axis=0)]
     last = LATTICE[len(LATTICE) - 1 - np.argmax(visible[::-1], axis=0)]
     pitches = np.linspace(first, last, IMAGES, axis=1)
     return np.where(visible.any(axis=0)[:, None], pitches, np.nan)
-
-
-def wholly_in_image(p_camera, normals, model):
-    """Which boards, by corners (n, e, 3) and normals (n, 3) in a camera's frame, are in view."""
-    size = np.array([model.width, model.height])
-    uv = pinhole(p_camera, model)  # far outside the image a lens model would fold back
-    inside = (uv > MARGIN * size) & (uv < size - MARGIN * size) & (p_camera[..., 2:] > 0)
-    towards = -np.vecdot(p_camera, normals[:, None])
-    facing = towards > np.cos(STEEPEST) * np.linalg.norm(p_camera, axis=-1)
-    return np.all(inside.all(axis=-1) & facing, axis=1)
 
 
 def candidate_information(boards, pitches, solution, models):

@@ -98,24 +98,24 @@ SENSES = (
     MIRRORED,
     Reading(
         "sense",
-        "bearings count in the other sense (turn the columns of the ranges round)",
+        "bearings are counted in the opposite direction (reverse the columns of the ranges)",
         turned_round=True,
     ),
     Reading(
         "sense",
-        "the pitch counts in the other sense (positive lifts the view: change its sign)",
+        "the pitch has the opposite sign (positive pitch lifts the view: change the sign)",
         pitch=-1.0,
     ),
 )
 IMAGES = (
     Reading(
         "numbers",
-        "the images' placement numbers (images.csv) are ahead by one: take 1 off them",
+        "the images' placement numbers (images.csv) are too large by one: subtract 1",
         ahead=1,
     ),
     Reading(
         "numbers",
-        "the images' placement numbers (images.csv) are behind by one: add 1 to them",
+        "the images' placement numbers (images.csv) are too small by one: add 1",
         ahead=-1,
     ),
     Reading(
@@ -125,7 +125,7 @@ IMAGES = (
     ),
     Reading(
         "sense",
-        "pitch_deg in images.csv counts in the other sense than that of the scans",
+        "pitch_deg in images.csv has the opposite sign to the pitch of the scans",
         image_pitch=-1.0,
     ),
 )
@@ -356,8 +356,8 @@ def _misread(prepared, fitting, stated):
     likely.sort(key=lambda r: (_far_from_guess(prepared, fitting[r]), _worst(fitting[r])))
     causes = "; or ".join(reading.words for reading in likely)
     words = (
-        f"{causes}; read so, scans lie {1000 * _worst(fitting[likely[0]]):.0f} mm from the boards "
-        f"in the images; as recorded, {1000 * _worst(stated):.0f} mm"
+        f"{causes}; once this is corrected, scans lie {1000 * _worst(fitting[likely[0]]):.0f} mm "
+        f"from the boards in the images, as recorded {1000 * _worst(stated):.0f} mm"
     )
     return Fault(likely[0].kind, words, severe=True)
 

@@ -8,11 +8,9 @@ import pandas as pd
 
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.judge.alternatives import (
-    Doubt,
     alternatives_of,
     doubtful,
     far_from_stated,
-    not_an_offset,
 )
 from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, by_sign, no_if
 from lrfcal_lib.judge.weaknesses import ABSURD
@@ -24,7 +22,9 @@ SIZES = (Kind.SQUARES, Kind.RANGES)  # an error of them is one of all distances
 LARGE_SIZE = 0.02  # error of a size that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
 RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
-NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be tested"
+NOT_WEIGHED = (
+    "whether session.json states sizes, step and spot correctly could not be tested"
+)
 # statements that are falsified on purpose, as relative errors of alternatives
 LIES = {
     "as recorded": {},
@@ -55,7 +55,10 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
         words = f"{NOT_WEIGHED}: the estimate has not converged"
         return [Finding(NO, Kind.NOT_WEIGHED, words)], 0.0
     findings = []
-    doubts, instead = contradictions(joint)
+    stated = alternatives_of(joint.prepared)
+    admitted = joint.prepared.session.lrf.admitted_offset
+    # a spot that is no evenly lit disc looks like one of another size, which does no harm
+    doubts = doubtful(solution, admitted, stated, faint=(Kind.SPOT,))
     level = solution.noise["face_scale"]
     if doubts:
         findings.append(finding_of(doubts))
@@ -66,30 +69,14 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
     range_doubt = max(sizes, default=0.0) * float(
         np.median(solution.observations.face_range)
     )
-    beyond = []
-    if instead not in doubts:
-        beyond = list(beyond_admitted(joint))
-    if beyond or instead in doubts:
+    beyond = list(beyond_admitted(joint))
+    if beyond:
         range_doubt = max(range_doubt, abs(solution.sensor["range_offset"]))
     findings += [*beyond, *beyond_spot(solution), *pitch_turns_otherwise(solution)]
     for far in far_from_stated(joint):
         severe = far.angle > np.pi / 2
         findings.append(Finding(no_if(severe), Kind.FAR_FROM_STATED, far.words))
     return findings, range_doubt
-
-
-def contradictions(joint) -> tuple[list[Doubt], Doubt | None]:
-    """Statements that the data contradict, and one that stands for a range offset, which may be of
-    them.
-    """
-    stated = alternatives_of(joint.prepared)
-    admitted = joint.prepared.session.lrf.admitted_offset
-    # a spot that is no evenly lit disc looks like one of another size, which does no harm
-    doubts = doubtful(joint.solution, admitted, stated, faint=(Kind.SPOT,))
-    instead = not_an_offset(joint.solution, admitted, stated)
-    if instead and (not doubts or doubts[0].kind == instead.kind):
-        return [instead], instead
-    return doubts, instead
 
 
 def finding_of(doubts):

@@ -167,7 +167,7 @@ def point_sigma(
     distances: ArrayLike,
     *,
     reference: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> np.ndarray:
     """How far off a reconstructed point may be, over the field of view.
 
     Relative to the head at the pitch `reference`: a turn of the whole cloud does not count. Errors
@@ -187,15 +187,13 @@ def point_sigma(
     -------
     ndarray, shape (d, r, c)
         Metres; inf where a motion that matters is not determined.
-    ndarray, shape (d, r, c)
-        What errors of single sweeps contribute, metres.
     """
     away = np.reshape(distances, (-1, 1, 1))
     _, by_link, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
     offset, stretch = chain.sweep_sigma
     sigma_pitch = np.hypot(offset, stretch * (pitches - reference))[:, None]
     by_sweep = sigma_pitch * np.linalg.norm(by_pitch, axis=-1)
-    return np.hypot(spread(chain, by_link), by_sweep), by_sweep
+    return np.hypot(spread(chain, by_link), by_sweep)
 
 
 def root_mean_square(sigma: np.ndarray) -> float:

@@ -6,25 +6,22 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.rig import joint_rig
-from lrfcal_lib.judge.alternatives import places_of_cameras, step_not_told
+from lrfcal_lib.judge.alternatives import step_words
 from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief, no_if
 from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_placement
 from lrfcal_lib.judge.recording_faults import explained, recording_faults
 from lrfcal_lib.judge.statements import contradicts_stated
 from lrfcal_lib.judge.uncertainty import (
-    COLUMNS,
-    Chain,
     chain_of,
     point_sigma,
     projection_sigma,
-    range_noise,
     root_mean_square,
+    uncertainty_of,
 )
 from lrfcal_lib.judge.weaknesses import (
     FEW,
@@ -35,11 +32,10 @@ from lrfcal_lib.judge.weaknesses import (
     sides_elsewhere,
 )
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.model.geometry import DegenerateGeometry, transform_difference
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint_solution import JointSolution
-from lrfcal_lib.solvers.plane_start import rival_words
 
 FIRST = {
     YES: "This calibration can be trusted",
@@ -120,9 +116,6 @@ class Verdict:
         empty where nothing is handed over.
     range_noise_mm : float
         Of every single point, on top.
-    sweep_mm : float
-        What the pitch error that every sweep has of its own adds to the cloud at 2 m; 0 where not
-        estimated.
     suggestion : Suggestion or None
     no_suggestion : str
         Why there is none.
@@ -134,7 +127,6 @@ class Verdict:
     reasons: tuple[Finding, ...]
     errors: dict[float, ExpectedError]
     range_noise_mm: float
-    sweep_mm: float
     suggestion: Suggestion | None = None
     no_suggestion: str = ""
     notes: tuple[str, ...] = ()
@@ -164,11 +156,6 @@ class Verdict:
                 "These errors are single standard deviations of the calibration. They include "
                 "errors of the model as far as placements disagree about them. Each range has "
                 f"{brief(self.range_noise_mm)} mm of noise of its own."
-            )
-        if self.sweep_mm:
-            sentences.append(
-                f"Errors of the pitch of single sweeps contribute {brief(self.sweep_mm)} mm to the "
-                f"error of the cloud at {WORKING:g} m."
             )
         sentences.append(
             self.suggestion.sentence() if self.suggestion else self.no_suggestion
@@ -209,7 +196,6 @@ def judge(
         findings.append(Finding(no_if(fault.severe), fault.kind, fault.words))
     findings += lens_findings(prepared)
     doubt = 0.0
-    contradictions: list[Finding] = []
     # also where the joint estimate is not handed over: a wrong size may be why
     if joint is not None and not explained(faults):
         contradictions, doubt = contradicts_stated(joint)
@@ -231,22 +217,18 @@ def judge(
         kept = [reason for reason in judged.reasons if reason.kind != Kind.EXCLUDED]
         judged = replace(judged, reasons=tuple(kept))
     findings += sides_elsewhere(prepared)
-    notes = _notes(calibration, method, lost.note, not contradictions)
+    notes = _notes(calibration, method, lost.note)
     return replace(judged.because(findings), notes=notes)
 
 
-def _notes(calibration, method, lost, as_stated):
+def _notes(calibration, method, lost):
     """What is handed over, where the cameras are, what was left out, and what is not known."""
     axis = calibration.platform.axis_with(method)
     notes = [f"Handed over: the cameras of the method '{method}' and the axis '{axis}'."]
     if method != "joint" or calibration.joint is None:
         return tuple(filter(None, [*notes, lost]))
     solution = calibration.joint.solution
-    notes += [*places_of_cameras(solution), lost]
-    if as_stated:
-        admitted = calibration.prepared.session.lrf.admitted_offset
-        notes.append(step_not_told(solution, admitted))
-    notes.append(_scatter_note(len(solution.boards)))
+    notes += [lost, step_words(solution), _scatter_note(len(solution.boards))]
     return tuple(filter(None, notes))
 
 
@@ -274,13 +256,9 @@ def verdict(
     field_of_view
         Bearings that the LRF measures, radians.
     """
-    rig = joint_rig(solution, models)
-    cameras = {camera: chain_of(rig, camera) for camera in rig.cameras}
-    pitch = np.concatenate(
-        [solution.observations.face_pitch, solution.observations.beam_pitch]
-    )
-    ways = Ways(chain_of(rig), cameras, pitch)
-    judged = _expected(ways.doubted(doubt), models, range_noise(rig))
+    obs = solution.observations
+    pitch = np.concatenate([obs.face_pitch, obs.beam_pitch])
+    judged = _expected(joint_rig(solution, models), pitch, doubt)
     judged = judged.because(diagnose(solution))
     if not suggest:
         return judged
@@ -291,47 +269,24 @@ def verdict(
     return replace(judged, suggestion=suggestion)
 
 
-@dataclass(frozen=True)
-class Ways:
-    """How well a calibration knows the ways of beams to the cloud and to images.
-
-    Attributes
-    ----------
-    cloud : Chain
-    cameras : dict of str to Chain
-    pitch : ndarray, shape (n,)
-        Of the recorded scan lines, radians.
+def _expected(rig, pitch, doubt):
+    """A Verdict by the errors that are to be expected of a rig over the recorded pitch (n,), not a
+    narrow strip, where all ranges may be wrong by `doubt` (metres) beside what is known.
     """
-
-    cloud: Chain
-    cameras: dict[str, Chain]
-    pitch: np.ndarray
-
-    def doubted(self, doubt: float) -> "Ways":
-        """The same where all ranges may be wrong by so many metres beside what is known."""
-        cameras = {camera: chain.doubted(doubt) for camera, chain in self.cameras.items()}
-        return Ways(self.cloud.doubted(doubt), cameras, self.pitch)
-
-
-def _expected(ways, models, noise):
-    """A Verdict by the errors that are to be expected over the recorded pitch, not a narrow strip.
-
-    `noise` is that of single ranges, metres.
-    """
-    low = high = 0.0
-    if len(ways.pitch):
-        low, high = ways.pitch.min(), ways.pitch.max()
-    middle = (low + high) / 2
+    low = pitch.min(initial=np.inf)
+    high = pitch.max(initial=-np.inf)
+    middle = (low + high) / 2 if len(pitch) else 0.0
     field = (min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD))
     middle = sum(field) / 2
     pitches = np.linspace(*field, PITCHES)
-    cloud, sweeps = point_sigma(ways.cloud, BEARINGS, pitches, DISTANCES, reference=middle)
-    images = {
-        camera: projection_sigma(
-            chain, models[camera], DISTANCES, PIXELS, image_pitch=middle, pitches=field
+    chain = chain_of(rig).doubted(doubt)
+    cloud = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
+    images = {}
+    for name, camera in rig.cameras.items():
+        chain = chain_of(rig, name).doubted(doubt)
+        images[name] = projection_sigma(
+            chain, camera.model, DISTANCES, PIXELS, image_pitch=middle, pitches=field
         )
-        for camera, chain in ways.cameras.items()
-    }
     errors = {}
     for i, distance in enumerate(DISTANCES):
         pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
@@ -341,8 +296,7 @@ def _expected(ways, models, noise):
         YES,
         (),
         errors,
-        range_noise_mm=1000 * float(noise),
-        sweep_mm=1000 * root_mean_square(sweeps[DISTANCES.index(WORKING)]),
+        range_noise_mm=1000 * uncertainty_of(rig).range_noise,
     )
     large = errors[WORKING].words(POOR_MM, POOR_PX)
     if not large:
@@ -374,7 +328,7 @@ def _refused(calibration, findings):
     if prepared.problems:
         lost = [str(problem) for problem in prepared.problems]
         notes = (f"Left out: {len(lost)} ({'; '.join(lost)}).",)
-    judged = Verdict(NO, (), {}, np.nan, 0.0, no_suggestion=RECORD, notes=notes)
+    judged = Verdict(NO, (), {}, np.nan, no_suggestion=RECORD, notes=notes)
     return judged.because([*findings, refused])
 
 
@@ -397,16 +351,15 @@ def _without_joint(calibration, method, doubt):
     for (camera, name), solution in calibration.solutions.items():
         if name == method:
             solved[camera] = solution
-    ways = _ways_of_platform(calibration, solved)
-    noise = np.median([board.sigma_range for board in prepared.scans.values()])
-    judged = _expected(ways.doubted(doubt), prepared.models, noise)
+    pitch = np.concatenate([scan.sweep.pitch for scan in prepared.scans.values()])
+    judged = _expected(calibration.rig(method), pitch, doubt)
     findings = [_not_joint(calibration)]
     fewest = min(
         len(calibration.observations[camera, "half_step"].all_placements)
         for camera in solved
     )
     if fewest < FEW:
-        words = f"{fewest} placements only, {FEW} or more are needed"
+        words = f"only {fewest} placements, {FEW} or more are needed"
         findings.append(Finding(NO, Kind.PLACEMENTS, words))
     for camera in prepared.views:
         if camera not in solved:
@@ -416,13 +369,18 @@ def _without_joint(calibration, method, doubt):
             findings.append(Finding(CARE, Kind.CAMERAS, words))
     for camera, solution in solved.items():
         if solution.rival is not None:
-            words = rival_words(camera, solution.transform, solution.rival)
+            turn, shift = transform_difference(solution.transform, solution.rival)
+            words = (
+                f"a second minimum explains the data nearly as well: camera '{camera}' "
+                f"{np.degrees(turn):.0f} deg and {1000 * shift:.0f} mm from where it is handed "
+                "over; record more placements that lean other ways"
+            )
             findings.append(Finding(NO, Kind.SECOND_MINIMUM, words))
     sweeps = any(np.ptp(scan.sweep.pitch) > LEAST_SWEEP for scan in prepared.scans.values())
     unknown = calibration.platform.problem("combined")
     if unknown is not None and sweeps:
         findings.append(Finding(NO, Kind.FAR_FROM_STATED, unknown.words))
-    return replace(judged.because(findings), sweep_mm=0.0)
+    return judged.because(findings)
 
 
 def _not_joint(calibration):
@@ -441,25 +399,3 @@ def _not_joint(calibration):
     return Finding(
         answer, Kind.HANDED_OVER, f"the joint estimate is not handed over ({why})"
     )
-
-
-def _ways_of_platform(calibration, solved):
-    """The Ways of cameras that were calibrated one by one (Solutions by name)."""
-    prepared = calibration.prepared
-    platform = calibration.platform
-    head = pose_array(platform.transform("combined"))
-    unseen = np.zeros((0, len(COLUMNS)))
-    sweep_sigma = (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)
-    # the range offset of the cloud may be what the maker admits
-    of_axis = platform.axes["combined"].covariance
-    offset = np.diag([prepared.session.lrf.admitted_offset**2, 0.0, 0.0])
-    covariance = block_diag(of_axis, np.zeros((6, 6)), offset)
-    cloud = Chain(head, None, True, (covariance,), unseen, sweep_sigma)
-    cameras = {}
-    for camera, solution in solved.items():
-        covariance = block_diag(of_axis, solution.trusted[:6, :6], np.zeros((3, 3)))
-        on_head = prepared.session.cameras[camera].mount == "head"
-        pose = pose_array(solution.transform)
-        cameras[camera] = Chain(head, pose, on_head, (covariance,), unseen, sweep_sigma)
-    pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
-    return Ways(cloud, cameras, pitch)

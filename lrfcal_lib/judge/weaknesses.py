@@ -51,7 +51,6 @@ def diagnose(solution: JointSolution) -> list[Finding]:
         *weak_pitch(solution),
         *weak_poses(solution),
         *large_residuals(solution),
-        *(Finding(CARE, Kind.WARNING, words) for words in solution.warnings),
     ]
 
 
@@ -65,7 +64,7 @@ def weak_estimate(solution) -> Iterator[Finding]:
     for number, camera in enumerate(obs.cameras):
         count = len(np.unique(obs.view_placement[obs.view_camera == number]))
         if count < FEWEST:
-            words = f"camera '{camera}' sees the board in {count} placements only"
+            words = f"camera '{camera}' sees the board in only {count} placements"
             yield Finding(CARE, Kind.CAMERAS, words)
     if solution.unobservable:
         words = f"the data do not determine {'; '.join(solution.unobservable)}"
@@ -77,7 +76,7 @@ def weak_placements(solution) -> Iterator[Finding]:
     count = len(solution.boards)
     if count < FEW:
         words = (
-            f"{count} placements only, {FEW} or more are needed to see errors of the model"
+            f"only {count} placements, {FEW} or more are needed to see errors of the model"
         )
         yield Finding(no_if(count < FEWEST), Kind.PLACEMENTS, words)
 
@@ -99,7 +98,7 @@ def weak_pitch(solution) -> Iterator[Finding]:
     span = largest_range(pitch, placement)
     if span < SMALL_PITCH:
         words = (
-            f"the recorded pitch ranges over {np.degrees(span):.1f} deg only{where}: the tilt axis "
+            f"the recorded pitch spans only {np.degrees(span):.1f} deg{where}: the tilt axis "
             "is hardly determined"
         )
         yield Finding(NO, Kind.PITCH, words)
@@ -291,24 +290,18 @@ class LeftOut:
     @property
     def words(self) -> str:
         """The placements that are left out, counted, with their reasons."""
-        why = ", ".join(
-            f"{placement} ({words})" for placement, words in self.placements.items()
-        )
-        return f"{len(self.placements)} of {self.recorded} placements are left out: {why}"
+        why = [f"{placement} ({words})" for placement, words in self.placements.items()]
+        return f"{len(why)} of {self.recorded} placements are left out: {', '.join(why) or 'none'}"
 
     @property
     def note(self) -> str:
         """What became of all placements, as far as it is no finding."""
         notes = []
-        if not self.placements:
-            notes.append(f"All {self.recorded} placements were used.")
-        elif not self.many:
+        if not self.many:
             notes.append(f"{self.words}.")
         if self.parts:
             parts = "; ".join(self.parts)
-            notes.append(
-                f"Parts left out beside whole placements: {len(self.parts)} ({parts})."
-            )
+            notes.append(f"Parts left out beside them: {len(self.parts)} ({parts}).")
         return " ".join(notes)
 
 

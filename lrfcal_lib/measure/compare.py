@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,12 @@ PIXELS = (12, 9)  # columns and rows of the image
 BEARINGS = 13  # of the field of view
 PITCHES = np.radians(np.linspace(-15, 15, 9))
 CHANCE = 0.01  # below it two calibrations are said to differ
+UNITS = {  # of amounts: factor and name
+    "turn": (np.degrees(1.0), "deg"),
+    "shift": (1000.0, "mm"),
+    "scale": (100.0, "%"),
+    "all": (1.0, ""),
+}
 TOLD = 1e-9  # share of the largest eigenvalue: less is no freedom of its own
 
 
@@ -121,6 +128,8 @@ class Comparison:
         By camera.
     cloud : Shifts
         Of points relative to the head at pitch 0.
+    one_lens : bool
+        Both use the same intrinsics, whose errors are not in what is claimed.
     """
 
     first: CalibratedRig
@@ -129,6 +138,7 @@ class Comparison:
     whole: Part
     images: dict[str, Shifts]
     cloud: Shifts
+    one_lens: bool
 
     @property
     def within(self) -> bool:
@@ -138,6 +148,8 @@ class Comparison:
     def sentence(self) -> str:
         """The answer."""
         odds = f"honest calibrations differ more in {_percent(self.whole.p)} of cases"
+        if self.one_lens:
+            odds = f"{odds}; both use the same intrinsics, whose errors do not count"
         names = f"'{self.first.session}' and '{self.second.session}'"
         if self.within:
             return f"{names} differ within what both claim ({odds})."
@@ -155,15 +167,15 @@ def _percent(share):
     """A share in words."""
     if share < 1e-4:
         return "less than 0.01 %"
-    return f"{100 * share:.{0 if share > 0.1 else 2}f} %"
+    return f"{100 * share:.2g} %"
 
 
 def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
     """Compare two calibrations of a rig.
 
-    A turn about the tilt axis and a shift along it, which no data show, do not count. Errors that
-    both share, as of intrinsics or of a board that both were told of, make them agree better than
-    they claim.
+    A turn about the tilt axis and a shift along it, which no data show, do not count, nor do errors
+    of intrinsics that both were told alike. Others that both share, as of a board, make them agree
+    better than they claim.
 
     Parameters
     ----------
@@ -181,20 +193,76 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
     """
     require_same_rig(first, second)
     shared = [name for name in first.cameras if name in second.cameras]
+    one_lens = all(_same_lens(first, second, name) for name in shared)
+    if one_lens:
+        first = _without_lens(first)
+        second = _without_lens(second)
     second_there = in_gauge_of(first, second)
     steps = dict(_steps(first, second_there, shared))
-    test = _Test(steps, _covariance(first, list(steps)) + _covariance(second, list(steps)))
+    names = list(steps)
+    covariance = _covariance(first, names) + _covariance(second, names)
     images = {name: image_shifts(first, second_there, name) for name in shared}
     cloud = cloud_shifts(first, second_there)
     parts = [
-        test.part("axis", AXIS_NAMES[:2], AXIS_NAMES[2:]),
-        test.part("sensor", ("pitch_scale",), ("range_offset",)),
+        _part("axis", steps, covariance, turn=AXIS_NAMES[:2], shift=AXIS_NAMES[2:]),
+        _part("sensor", steps, covariance, scale=["pitch_scale"], shift=["range_offset"]),
     ]
     for name in shared:
-        names = [f"{name}_{pose}" for pose in POSE_NAMES]
-        parts.append(test.part(name, names[:3], names[3:], images[name].amount("px")))
-    whole = test.part("everything", (), (), cloud.amount("mm in the cloud", 1000))
-    return Comparison(first, second, tuple(parts), whole, images, cloud)
+        pose = [f"{name}_{part}" for part in POSE_NAMES]
+        part = _part(name, steps, covariance, turn=pose[:3], shift=pose[3:])
+        amounts = (*part.amounts, images[name].amount("px"))
+        parts.append(replace(part, amounts=amounts))
+    whole = _part("everything", steps, covariance, all=names)
+    whole = replace(whole, amounts=(cloud.amount("mm in the cloud", 1000),))
+    return Comparison(first, second, tuple(parts), whole, images, cloud, one_lens)
+
+
+def _part(name, steps, covariance, **groups):
+    """The Part of differences by name: turns, shifts, a scale, or all of them."""
+    names = np.array(list(steps))
+    step = np.array(list(steps.values()))
+    amounts = []
+    for what, members in groups.items():
+        scale, unit = UNITS[what]
+        rows = np.isin(names, members)
+        value = np.linalg.norm(step[rows])
+        claimed = np.sqrt(covariance.diagonal()[rows].sum())
+        amounts.append(Amount(what, scale * float(value), scale * float(claimed), unit))
+    mine = np.isin(names, np.concatenate(list(groups.values())))
+    *_, p_of_others = _chi2(step, covariance, ~mine)
+    return Part(name, tuple(amounts), *_chi2(step, covariance, mine), p_of_others)
+
+
+def _same_lens(first, second, camera):
+    """Whether both rigs have a camera's intrinsics from the same place: equal to the last bit."""
+    one = first.cameras[camera].model
+    return np.array_equal(one.parameters, second.cameras[camera].model.parameters)
+
+
+def _without_lens(rig):
+    """A rig whose intrinsics are exact."""
+    known = uncertainty_of(rig)
+    trusted = known.trusted - known.lens
+    known = replace(known, covariance=known.covariance - known.lens, trusted=trusted)
+    return replace(rig, uncertainty=known)
+
+
+def _chi2(step, covariance, rows):
+    """Chi-square of some differences, its degrees of freedom, and how often chance exceeds it.
+
+    Without what nothing bounds, or one of the two took as it is.
+    """
+    variance = np.diag(covariance)
+    index = np.flatnonzero(rows & np.isfinite(variance) & (variance > 0))
+    if not len(index):
+        return 0.0, 0, 1.0
+    sigma = np.sqrt(variance[index])
+    z = step[index] / sigma
+    correlation = covariance[np.ix_(index, index)] / np.outer(sigma, sigma)
+    inverse = np.linalg.pinv(correlation, rcond=TOLD, hermitian=True)
+    chi2 = float(z @ inverse @ z)
+    freedom = int(np.linalg.matrix_rank(inverse, hermitian=True))
+    return chi2, freedom, float(chdtrc(freedom, chi2))
 
 
 def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
@@ -249,70 +317,6 @@ def _covariance(rig, names):
     return covariance
 
 
-@dataclass(frozen=True)
-class _Test:
-    """Differences by name, and their covariance."""
-
-    steps: dict[str, float]
-    covariance: np.ndarray
-
-    def part(self, name, turns, shifts, *more):
-        """The Part of some turns and shifts; of everything where there are none."""
-        amounts = []
-        if turns:
-            scale, unit = (100, "%") if name == "sensor" else (np.degrees(1.0), "deg")
-            amounts.append(
-                self._amount("scale" if unit == "%" else "turn", turns, scale, unit)
-            )
-        if shifts:
-            amounts.append(self._amount("shift", shifts, 1000, "mm"))
-        names = [*turns, *shifts] or list(self.steps)
-        chi2, freedom = self._chi2(names)
-        others = self._chi2([other for other in self.steps if other not in names])
-        p = _exceeds(chi2, freedom)
-        return Part(name, (*amounts, *more), chi2, freedom, p, _exceeds(*others))
-
-    def _amount(self, what, names, scale, unit):
-        index = self._index(names)
-        value = np.linalg.norm([self.steps[name] for name in names])
-        claimed = np.sqrt(np.trace(self.covariance[np.ix_(index, index)]))
-        return Amount(what, scale * float(value), scale * float(claimed), unit)
-
-    def _index(self, names):
-        return [list(self.steps).index(name) for name in names]
-
-    def _chi2(self, names):
-        """Chi-square of the differences and its degrees of freedom.
-
-        Without what nothing bounds, or one of the two took as it is.
-        """
-        index = np.array(self._index(names), int)
-        variance = np.diag(self.covariance)[index]
-        index = index[np.isfinite(variance) & (variance > 0)]
-        sigma = np.sqrt(np.diag(self.covariance)[index])
-        z = np.array(list(self.steps.values()))[index] / sigma
-        correlation = self.covariance[np.ix_(index, index)] / np.outer(sigma, sigma)
-        inverse = np.linalg.pinv(correlation, rcond=TOLD, hermitian=True)
-        return float(z @ inverse @ z), int(np.linalg.matrix_rank(inverse, hermitian=True))
-
-
-def _exceeds(chi2, freedom):
-    """How often chance exceeds a chi-square; always, where nothing is free."""
-    return float(chdtrc(freedom, chi2)) if freedom else 1.0
-
-
-def recorded_by(rig: CalibratedRig, pitch, distance):
-    """What a rig records of beams of some true pitch (radians) and length (metres)."""
-    by_scale = 1 + rig.corrections.pitch_scale
-    return np.asarray(pitch) / by_scale, np.asarray(distance) + rig.corrections.range_offset
-
-
-def true_beams(rig: CalibratedRig, pitch, distance):
-    """Inverse of :func:`recorded_by`."""
-    by_scale = 1 + rig.corrections.pitch_scale
-    return np.asarray(pitch) * by_scale, np.asarray(distance) - rig.corrections.range_offset
-
-
 def image_shifts(first: CalibratedRig, second: CalibratedRig, name: str) -> Shifts:
     """How the second rig shifts points of scans in the image of a camera, taken at pitch 0.
 
@@ -325,22 +329,13 @@ def image_shifts(first: CalibratedRig, second: CalibratedRig, name: str) -> Shif
     """
     model = first.cameras[name].model
     pixels = pixel_grid(model, PIXELS)
-    chain = chain_of(first, name)
-    bearing, pitch = beams_of_pixels(chain, model, pixels, DISTANCE, 0.0)
-    variance = _squares(chain, model, bearing, pitch, DISTANCE)
-    recorded = recorded_by(first, pitch, DISTANCE)
-    there = true_beams(second, *recorded)
-    other = chain_of(second, name)
-    points, *_ = carried(other, bearing, *there)
-    there_model = second.cameras[name].model
-    variance = variance + _squares(other, there_model, bearing, *there)
-    return Shifts(pixels, project(points, there_model) - pixels, np.sqrt(variance))
+    beams = beams_of_pixels(chain_of(first, name), model, pixels, DISTANCE, 0.0)
 
+    def shown(rig, points, by_link):
+        there = rig.cameras[name].model
+        return project(points, there), project_jacobians(points, there)[0] @ by_link
 
-def _squares(chain, model, bearing, pitch, distance):
-    """Variances (...) in px^2 of the ends of beams in an image at pitch 0."""
-    points, by_link, _ = carried(chain, bearing, pitch, distance)
-    return spread(chain, project_jacobians(points, model)[0] @ by_link) ** 2
+    return _shifts(first, second, beams, pixels, name, shown)
 
 
 def cloud_shifts(first: CalibratedRig, second: CalibratedRig) -> Shifts:
@@ -353,14 +348,26 @@ def cloud_shifts(first: CalibratedRig, second: CalibratedRig) -> Shifts:
     """
     bearings = np.linspace(*first.lrf.field_of_view, BEARINGS)
     at = np.stack(np.meshgrid(bearings, PITCHES), axis=-1)
-    bearing, pitch = np.moveaxis(at, -1, 0)
+    return _shifts(first, second, np.moveaxis(at, -1, 0), at)
+
+
+def _shifts(first, second, beams, at, camera=None, shown=lambda rig, *point: point):
+    """The Shifts of the ends of beams (bearing, pitch) that are `DISTANCE` long by the first rig.
+
+    `shown(rig, points, by_link)` is what counts of a point, and its derivative.
+    """
+    bearing, pitch = beams
+    recorded = pitch / (1 + first.corrections.pitch_scale)
     ends = []
     variance = np.zeros(bearing.shape)
     for rig in (first, second):
-        chain = chain_of(rig)
-        points, by_link, _ = carried(chain, bearing, *true_beams(rig, pitch, DISTANCE))
-        ends.append(points)
-        variance = variance + spread(chain, by_link) ** 2
+        chain = chain_of(rig, camera)
+        true = recorded * (1 + rig.corrections.pitch_scale)
+        length = DISTANCE + first.corrections.range_offset - rig.corrections.range_offset
+        points, by_link, _ = carried(chain, bearing, true, length)
+        end, derivative = shown(rig, points, by_link)
+        ends.append(end)
+        variance = variance + spread(chain, derivative) ** 2
     return Shifts(at, ends[1] - ends[0], np.sqrt(variance))
 
 
@@ -394,4 +401,4 @@ def history(rigs: Sequence[CalibratedRig]) -> list[Comparison]:
     ----------
     rigs : sequence of CalibratedRig
     """
-    return [compare(*pair) for pair in zip(rigs[:-1], rigs[1:], strict=True)]
+    return [compare(*pair) for pair in pairwise(rigs)]

@@ -4,7 +4,6 @@ import errno
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -13,13 +12,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
-from lrfcal_lib.model.camera import CameraModel, fold, undistort
 
 AT_ONCE = 1 << 18  # points that are handed over to the library
 PIXEL = 5e-6  # metres; E57 wants a focal length in metres, of which only the ratio counts
 QUALITY = 95  # of JPEG
-OUTSIDE = -2.0  # a pixel of no image
-LARGEST = 2.0  # times the width and height of an image without its distortion
+WIDER = 1.15  # times as wide and high as the recorded one is an image without distortion
 COLORS = ("colorRed", "colorGreen", "colorBlue")
 COLOR_LIMITS = {
     f"{name}{end}": level
@@ -52,7 +49,6 @@ class E57Writer:
 
         self.about = about
         self._file = pye57.E57(str(path), "w")
-        self._lenses: dict[str, FlatLens] = {}  # by camera
 
     def __enter__(self):
         return self
@@ -152,13 +148,17 @@ class E57Writer:
             Its pixels and intrinsics.
         """
         libe57, image_file = self._library()
-        if view.camera not in self._lenses:
-            self._lenses[view.camera] = flat_lens(view.model)
-        lens = self._lenses[view.camera]
+        size = (view.model.width, view.model.height)
+        lens = (view.model.matrix, view.model.distortion)
+        # all of the image, and room for it
+        wide = tuple(round(WIDER * side) for side in size)
+        matrix, _ = cv2.getOptimalNewCameraMatrix(*lens, size, 1.0, wide)
+        maps = cv2.initUndistortRectifyMap(*lens, None, matrix, wide, cv2.CV_32FC2)[0]
+        flat = cv2.remap(view.image, maps, None, cv2.INTER_LINEAR)
         quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-        jpeg = cv2.imencode(".jpg", lens.of(view.image), quality)[1].ravel()
+        jpeg = cv2.imencode(".jpg", flat, quality)[1].ravel()
         blob = libe57.BlobNode(image_file, len(jpeg))
-        representation = self._node(_pinhole(lens.model))
+        representation = self._node(_pinhole(matrix, wide))
         representation.set("jpegImage", blob)
         node = self._node(
             {
@@ -208,69 +208,21 @@ def _pose(T):
     return {"rotation": {"w": w, "x": x, "y": y, "z": z}, "translation": translation}
 
 
-def _pinhole(model):
-    """Intrinsics as a structure; E57 counts pixels from the corner of the image."""
-    focal = PIXEL * model.fy
+def _pinhole(matrix, size):
+    """Intrinsics (3, 3) of an image as a structure; E57 counts pixels from the image's corner."""
+    width, height = size
+    focal = PIXEL * matrix[1, 1]
     return {
-        "imageWidth": int(model.width),
-        "imageHeight": int(model.height),
+        "imageWidth": width,
+        "imageHeight": height,
         "focalLength": focal,
-        "pixelWidth": focal / model.fx,
+        "pixelWidth": focal / matrix[0, 0],
         "pixelHeight": PIXEL,
-        "principalPointX": model.cx + 0.5,
-        "principalPointY": model.cy + 0.5,
+        "principalPointX": matrix[0, 2] + 0.5,
+        "principalPointY": matrix[1, 2] + 0.5,
     }
 
 
 def new_guid() -> str:
     """A name that nothing else has."""
     return f"{{{uuid.uuid4()}}}"
-
-
-@dataclass(frozen=True)
-class FlatLens:
-    """How images of a camera become those of a pinhole camera of the same focal lengths.
-
-    Attributes
-    ----------
-    model : CameraModel
-        Of the pinhole camera, whose image has room for all that the camera sees, up to `LARGEST`
-        times its width and height.
-    maps : ndarray of float32, shape (height, width, 2)
-        The pixel of the recorded image that each of its pixels shows; outside where none does.
-    """
-
-    model: CameraModel
-    maps: np.ndarray
-
-    def of(self, image: np.ndarray) -> np.ndarray:
-        """The image without its distortion, black where the camera sees nothing."""
-        return cv2.remap(image, self.maps, None, cv2.INTER_LINEAR)
-
-
-def flat_lens(model: CameraModel) -> FlatLens:
-    """What takes the distortion out of the images of a camera."""
-    v, u = np.indices((model.height, model.width))
-    rim = (u == 0) | (u == model.width - 1) | (v == 0) | (v == model.height - 1)
-    straight = undistort(np.stack([u[rim], v[rim]], axis=1), model)
-    recorded = np.array([model.width, model.height])
-    spare = (LARGEST - 1) / 2 * recorded
-    low = np.ceil(np.clip(-straight.min(axis=0), 0, spare))
-    high = np.ceil(np.clip(straight.max(axis=0) - recorded + 1, 0, spare))
-    width, height = (recorded + low + high).astype(int).tolist()
-    flat = replace(
-        model,
-        width=width,
-        height=height,
-        cx=model.cx + low[0],
-        cy=model.cy + low[1],
-        distortion=np.zeros(5),
-    )
-    size = (width, height)
-    maps = cv2.initUndistortRectifyMap(
-        model.matrix, model.distortion, None, flat.matrix, size, cv2.CV_32FC2
-    )[0]
-    x = (np.arange(width) - flat.cx) / flat.fx
-    y = (np.arange(height) - flat.cy) / flat.fy
-    maps[np.add.outer(y**2, x**2) >= fold(model)] = OUTSIDE
-    return FlatLens(flat, maps)

@@ -1,9 +1,11 @@
 """Points, planes and edges of a scanned cloud, lengths between them, and how good each is."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -22,9 +24,11 @@ AT_ONCE = 1 << 16  # points
 ALIKE = np.radians(15.0)  # between normals of one plane
 SURE = 1e-12  # a variance of what has none
 STEP = 1e-6  # of numerical derivatives: metres, radians
-# metres by which a surface may be off as a whole: what lies on it, and slanted spots beside things
-# (the table and the seat of the shipped session)
+# metres by which a surface may be off as a whole, for every station alike: what lies on it, and
+# slanted spots beside things (the table and the seat of the shipped session)
 SYSTEMATIC = 0.001
+UNBOUNDED = 1.0  # variance (m2, rad2) of an unknown of the rig that nothing bounds
+NINETY = 1.645  # standard deviations to either side that hold 90 %
 PATCH = 40  # points that average the noise out of a patch of a wall
 
 
@@ -124,26 +128,27 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Feature:
-    """A point, a plane or an edge of a scene, and how good it is.
+    """A point, a plane or an edge that one station shows, and how good it is.
 
     Attributes
     ----------
     kind : Kind
     centre : ndarray, shape (3,)
-        Metres.
+        Platform frame, metres.
     axis : ndarray, shape (3,)
         Normal of a plane, direction of an edge; zeros for a point.
     noise : ndarray, shape (6, 6)
-        Covariance of centre and axis from the range noise (or the points' scatter about the
-        plane) and from that of image edges.
-    jacobian : ndarray, shape (6, c + 2)
-        Of centre and axis by what may be wrong with all points of a scan alike: the rig's unknowns,
-        in the order of its uncertainty, and offset and stretch of the pitch of the sweep.
+        Covariance of centre and axis from the scatter of the points and that of image edges.
+    jacobian : ndarray, shape (6, c + 3)
+        Of centre and axis by the c unknowns of the rig in the order of its uncertainty, by offset
+        and stretch of the sweep's pitch, and by what the surface is off as a whole.
     rig : CalibratedRig
     placement : int
         The sweep.
-    camera : str or None
-        Whose image shows an edge.
+    ends : ndarray, shape (2, 3)
+        Of the stretch of an edge that an image shows; the centre twice for others.
+    image : int
+        Number of the image that shows an edge, -1 for others.
     """
 
     kind: Kind
@@ -153,27 +158,120 @@ class Feature:
     jacobian: np.ndarray
     rig: CalibratedRig
     placement: int
-    camera: str | None = None
+    ends: np.ndarray
+    image: int = -1
+
+    def foot(self, place: np.ndarray) -> np.ndarray:
+        """The place (3,) on the plane or the line of an edge that is nearest to another."""
+        away = place - self.centre
+        along = (away @ self.axis) * self.axis
+        if self.kind == Kind.PLANE:
+            return place - along
+        return self.centre + along
 
 
-def by_all_unknowns(
-    rig: CalibratedRig,
-    camera: str | None,
-    by_link: np.ndarray,
-    by_offset: np.ndarray,
-    by_stretch: np.ndarray,
-) -> np.ndarray:
-    """Derivatives (..., 13) by the links to a camera as the columns of `Feature.jacobian`.
+@dataclass(frozen=True)
+class Length:
+    """A length and how well it is known.
 
-    `by_offset` and `by_stretch` (...) are those by the pitch of the sweep.
+    Attributes
+    ----------
+    metres : float
+    noise : float
+        Variance from what no other station has wrong, its sweep included, m2.
+    shared : ndarray, shape (c + 2,)
+        Derivatives by what all stations have wrong alike: the unknowns of the rig, and what the
+        surfaces at both ends are off as a whole.
+    rig : CalibratedRig
     """
+
+    metres: float
+    noise: float
+    shared: np.ndarray
+    rig: CalibratedRig
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation, metres."""
+        surfaces = SYSTEMATIC**2 * np.eye(2)
+        variance = []
+        for of_rig in shared_covariances(self.rig):
+            C = block_diag(of_rig, surfaces)
+            variance.append(self.shared @ C @ self.shared)
+        return float(np.sqrt(self.noise + max(variance)))
+
+
+def mean_length(lengths: Sequence[Length]) -> Length:
+    """One length of what several stations measured, each weighted by how well it knows it.
+
+    What all stations have wrong alike does not become less.
+
+    Parameters
+    ----------
+    lengths : sequence of Length
+        With the same rig.
+
+    Returns
+    -------
+    Length
+    """
+    weight = np.array([1 / length.sigma**2 for length in lengths])
+    weight /= weight.sum()
+    return Length(
+        metres=float(weight @ [length.metres for length in lengths]),
+        noise=float(weight**2 @ [length.noise for length in lengths]),
+        shared=weight @ np.array([length.shared for length in lengths]),
+        rig=lengths[0].rig,
+    )
+
+
+def shared_covariances(rig: CalibratedRig) -> list[np.ndarray]:
+    """Covariances (c, c) of a rig's unknowns, of which the one that gives more counts."""
     known = uncertainty_of(rig)
-    index = columns_of(known.names, camera)
-    out = np.zeros((*by_link.shape[:-1], len(known.names) + 2))
-    out[..., index[index >= 0]] = by_link[..., index >= 0]
-    out[..., -2] = by_offset
-    out[..., -1] = by_stretch
-    return out
+    covariances = []
+    for whole in (known.covariance, known.trusted):
+        unbounded = ~np.isfinite(np.diag(whole))
+        bounded = np.where(np.isfinite(whole), whole, 0.0)
+        covariances.append(bounded + UNBOUNDED * np.diag(unbounded))
+    return covariances
+
+
+def beams_moved(
+    rig: CalibratedRig,
+    beams: Sequence[np.ndarray],
+    camera: str | None = None,
+    image_pitch: float = 0.0,
+) -> np.ndarray:
+    """Derivatives (..., 3, c + 3) of the ends of beams as the columns of `Feature.jacobian`.
+
+    Parameters
+    ----------
+    rig : CalibratedRig
+    beams : sequence of ndarray, shape (...)
+        Bearing, pitch (radians) and range (metres).
+    camera : str, optional
+        In whose frame the ends are, with the head at `image_pitch`; the platform's unless given.
+    image_pitch : float
+        Radians.
+    """
+    names = uncertainty_of(rig).names
+    chain = chain_of(rig, camera)
+    _, by_link, by_pitch = carried(chain, *beams, image_pitch)
+    turn = beams[1]
+    by_offset = by_pitch
+    if camera is None:
+        R = chain.head[:, :3]
+        by_link = R @ by_link
+        by_pitch = by_offset = by_pitch @ R.T
+    elif chain.on_head:
+        turn = turn - image_pitch
+        by_offset = 0 * by_pitch
+    index = columns_of(names, camera)
+    moved = np.zeros((*by_pitch.shape, len(names) + 3))
+    moved[..., index[index >= 0]] = by_link[..., index >= 0]
+    moved[..., -3] = by_offset
+    moved[..., -2] = turn[..., None] * by_pitch
+    return moved
 
 
 def fit_feature(
@@ -203,56 +301,38 @@ def fit_feature(
     count = len(part.points)
     if not count:
         raise DegenerateGeometry("no point of the cloud was chosen")
-    chain = chain_of(rig)
-    noise = range_noise(rig)
-    R = chain.head[:, :3]
-    _, J, by_pitch = carried(chain, part.bearing, part.pitch, part.range)
-    beams = -J[..., COLUMNS.index("range_offset")] @ R.T
-    by_pitch = by_pitch @ R.T
-    stretched = by_pitch * part.pitch[:, None]
-    moved = by_all_unknowns(rig, None, R @ J, by_pitch, stretched)
+    moved = beams_moved(rig, (part.bearing, part.pitch, part.range))
+    centre = part.points.mean(axis=0)
     normal = np.zeros(3)
-    covariance = np.zeros((6, 6))
+    noise = np.zeros((6, 6))
     jacobian = np.zeros((6, moved.shape[-1]))
     jacobian[:3] = moved.mean(axis=0)
-    centre = part.points.mean(axis=0)
-    covariance[:3, :3] = noise**2 * beams.T @ beams / count**2
     if plane:
         normal, _, rough = fit_plane(part.points)
-        variance = max(noise**2 * np.mean((beams @ normal) ** 2), rough**2) / count
         size, axes = np.linalg.eigh(np.cov(part.points.T, bias=True))
-        variance *= _bent(part.points - centre, axes, size)
         # of the normal by the mean of products of places and heights
         turned = -(axes[:, 1:] / size[1:]) @ axes[:, 1:].T
         jacobian[3:] = turned @ (part.points - centre).T @ (normal @ moved) / count
-        covariance[:3, :3] = (variance + SYSTEMATIC**2) * np.outer(normal, normal)
-        covariance[3:, 3:] = -variance * turned
-    kind = Kind.PLANE if plane else Kind.POINT
-    placement = int(part.placement[0])
-    return Feature(kind, centre, normal, covariance, jacobian, rig, placement)
+        jacobian[:3, -1] = normal
+        noise[:3, :3] = rough**2 / count * np.outer(normal, normal)
+        noise[3:, 3:] = -(rough**2) / count * turned
+    else:
+        beams = part.points / np.linalg.norm(part.points, axis=1, keepdims=True)
+        noise[:3, :3] = range_noise(rig) ** 2 * beams.T @ beams / count**2
+    return Feature(
+        kind=Kind.PLANE if plane else Kind.POINT,
+        centre=centre,
+        axis=normal,
+        noise=noise,
+        jacobian=jacobian,
+        rig=rig,
+        placement=int(part.placement[0]),
+        ends=np.array([centre, centre]),
+    )
 
 
-def _bent(off, axes, size):
-    """By how much more a plane varies than by the noise of its points, at least 1.
-
-    Readings of one part of a surface may err alike: the sandwich of its nine parts. `off` (n, 3) is
-    from the centre, `axes` and `size` are the principal ones.
-    """
-    height, *along = (off @ axes).T
-    part = np.zeros(len(off), int)
-    for flat in along:
-        third = (flat - flat.min()) / max(np.ptp(flat), SURE) * 3
-        part = 3 * part + np.minimum(third.astype(int), 2)
-    design = np.column_stack([np.ones(len(off)), *along]) / np.sqrt([1.0, *size[1:]])
-    scores = np.zeros((9, 3))
-    np.add.at(scores, part, design * height[:, None])
-    parts = len(np.unique(part))
-    square = np.sum(scores**2) / 3 * parts / max(parts - 3, 1)
-    return max(1.0, square / max(len(off) * size[0], SURE))
-
-
-def length_between(first: Feature, second: Feature) -> tuple[float, float]:
-    """Length between two features and its standard deviation, metres.
+def length_between(first: Feature, second: Feature) -> Length:
+    """Length between two features.
 
     Along the normal of a plane, else across the direction of an edge, else from point to point; of
     two planes or edges their mean counts, each weighted by how well it is known. What the
@@ -265,7 +345,7 @@ def length_between(first: Feature, second: Feature) -> tuple[float, float]:
 
     Returns
     -------
-    length, sigma : float
+    Length
 
     Raises
     ------
@@ -275,19 +355,22 @@ def length_between(first: Feature, second: Feature) -> tuple[float, float]:
     _refuse_askew(first, second)
     kind, weights = _axes(first, second)
     place = np.concatenate([first.centre, first.axis, second.centre, second.axis])
-    length = _length(place, kind, weights)
-    steps = STEP * np.eye(12)
-    higher = np.array([_length(place + step, kind, weights) for step in steps])
-    lower = np.array([_length(place - step, kind, weights) for step in steps])
-    by_first, by_second = np.split((higher - lower) / (2 * STEP), 2)
-    variance = by_first @ first.noise @ by_first + by_second @ second.noise @ by_second
-    moved = [by_first @ first.jacobian, by_second @ second.jacobian]
-    by_sweep = np.array([change[-2:] for change in moved])
+    gradient = []
+    for step in STEP * np.eye(12):
+        change = _length(place + step, kind, weights) - _length(place - step, kind, weights)
+        gradient.append(change / (2 * STEP))
+    noise = 0.0
+    moved = []
+    for feature, by in zip((first, second), np.split(np.array(gradient), 2), strict=True):
+        noise += by @ feature.noise @ by
+        moved.append(by @ feature.jacobian)
+    by_sweep = np.array(moved)[:, -3:-1]
     if first.placement == second.placement:
-        by_sweep = by_sweep.sum(axis=0, keepdims=True)
-    sweep = by_sweep * uncertainty_of(first.rig).sweep_sigma
-    common = _spread_of_rig(first, second, (moved[0] + moved[1])[:-2])
-    return length, float(np.sqrt(variance + np.sum(sweep**2) + common**2))
+        by_sweep = by_sweep.sum(axis=0)
+    noise += np.sum((by_sweep * uncertainty_of(first.rig).sweep_sigma) ** 2)
+    by_rig = (moved[0] + moved[1])[:-3]
+    shared = np.append(by_rig, [moved[0][-1], moved[1][-1]])
+    return Length(_length(place, kind, weights), float(noise), shared, first.rig)
 
 
 def _refuse_askew(first, second):
@@ -326,37 +409,3 @@ def _length(place, kind, weights):
     if kind == Kind.PLANE:
         return float(abs(along @ way))
     return float(np.linalg.norm(way - (way @ along) * along))
-
-
-def _spread_of_rig(first, second, by_unknowns):
-    """Standard deviation of a length from all unknowns of the rig, of which it has derivatives
-    (c,); inf where a motion that nothing determines matters.
-    """
-    rig = first.rig
-    unseen = [unseen_motions(rig, feature.camera) for feature in (first, second)]
-    chain = replace(
-        chain_of(rig), covariances=shared_covariances(rig), unseen=np.concatenate(unseen)
-    )
-    return float(spread(chain, by_unknowns[None]))
-
-
-def shared_covariances(rig: CalibratedRig) -> tuple[np.ndarray, np.ndarray]:
-    """Covariances (c, c) of a rig's unknowns, of which the one that gives more counts; zero where
-    nothing bounds them, see :func:`unseen_motions`.
-    """
-    known = uncertainty_of(rig)
-    noise_only = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
-    trusted = np.where(np.isfinite(known.trusted), known.trusted, 0.0)
-    return noise_only, trusted
-
-
-def unseen_motions(rig: CalibratedRig, camera: str | None) -> np.ndarray:
-    """Motions (m, c) of a rig's unknowns that nothing determines, and that move points of the cloud
-    or what a camera sees.
-    """
-    known = uncertainty_of(rig)
-    motions = known.unseen_of_cloud
-    if camera is not None:
-        motions = known.unseen_of_cameras[camera]
-    still = np.zeros(len(motions))
-    return by_all_unknowns(rig, camera, motions, still, still)[:, :-2]

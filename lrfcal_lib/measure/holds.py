@@ -1,23 +1,24 @@
-"""Does a calibration still hold? What a new recording of any scene says, as numbers."""
+"""Does a calibration still hold? What a new recording of any scene says, as numbers and words."""
 
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import interp1d
 from scipy.special import chdtrc
 
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
+from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.cloud import join as join_clouds
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
-from lrfcal_lib.measure.depth_jumps import depth_jumps
-from lrfcal_lib.measure.edge_shift import edges_pull, join, sights
+from lrfcal_lib.measure.creases import Sights, creases_of, creases_pull, sights
 from lrfcal_lib.measure.features import flatness, largest_plane
-from lrfcal_lib.measure.image_pairs import STIFF, pairs_pull, patches_of
-from lrfcal_lib.measure.pulls import Pull, views_of_station
+from lrfcal_lib.measure.image_pairs import STIFF, pairs_pull
+from lrfcal_lib.measure.pulls import Pull, poses_of, views_of_station
+from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.model.camera import pinhole_jacobian
 from lrfcal_lib.model.geometry import fit_plane, hat
 from lrfcal_lib.session.read import Session
@@ -27,22 +28,24 @@ from lrfcal_lib.session.read import Session
 # recorded (both found from honest simulated rooms)
 OWN = np.array([*np.radians([0.03, 0.03, 0.03]), 0.001, 0.001, 0.001])
 COMMON = np.array([*np.radians([0.12, 0.04, 0.04]), 0.002, 0.002, 0.002])
-# of the variance of rims: reflectivities bias all those of one side alike, by 0.1 deg of the pitch
-# in honest simulated rooms
-RIM_DOUBT = 20.0
 PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
 LEVEL = 0.01  # probability of an alarm for nothing, of a recording; 0.05 is asked for
 UNEVEN = 0.003  # metres, of real walls
+BENT = 3.0  # times what is allowed, of a wall
 FEWEST_POINTS = 200  # of a wall, or of two passes
 STEEP = 3.0  # metres a radian, by which ranges grow with the pitch on a smooth surface
 SAME_PLACE = 0.5  # of the readings agree where two sweeps are of one place
-FEWEST_GROUPS = 8  # rims, or regions of patches, that must speak
+FEWEST_GROUPS = 8  # creases, or regions of patches, that must speak
 WANTED = np.radians(0.3)  # a turn that must not pass unseen
+SURE = 3.0  # sigma, of two passes
+# of sigma: a turn that is so large raises an alarm in 9 of 10 cases (2.9 of LEVEL, 1.3 more)
+SHOWS = 4.2
 AWAY = 3.0  # metres, where shifts are stated
+FURNITURE = "record a room with furniture and pictures, 1 to 4 m away"
 
 
 class Answer(Enum):
-    """What can be said about a camera, or a rig."""
+    """What can be said about a rig."""
 
     HOLDS = "holds"
     MOVED = "has moved"
@@ -60,13 +63,10 @@ class Shift:
     change, sigma : ndarray, shape (6,) or (1,)
         Of the camera's pose ``[w, v]`` (radians, metres) or of the pitch (radians), if nothing else
         has moved.
-    pixels, pixels_sigma : ndarray, shape (3,)
-        To the right, down (pixels) and a turn (radians) in the middle of the image, 3 m away; NaN
-        for the head.
+    pixels, pixels_sigma : ndarray, shape (2,)
+        To the right and down in the middle of the image, 3 m away; NaN for the head.
     p_value : float
         Probability of as much where nothing has moved.
-    told : bool
-        Whether a turn of 0.3 deg would show.
     """
 
     camera: str | None
@@ -75,18 +75,58 @@ class Shift:
     pixels: np.ndarray
     pixels_sigma: np.ndarray
     p_value: float
-    told: bool
+
+    @property
+    def name(self) -> str:
+        """Of the suspect."""
+        return "the head" if self.camera is None else f"camera '{self.camera}'"
+
+    @property
+    def told(self) -> bool:
+        """Whether a turn of 0.3 deg would show."""
+        return bool(SHOWS * self.sigma[:3].max() < WANTED)
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is more than nothing."""
+        return self.camera is not None or bool(abs(self.change[0]) > WANTED / 4)
+
+    def sentence(self) -> str:
+        """What was found."""
+        chance = f"by chance with a probability of {self.p_value:.2g}"
+        turn, sigma = np.degrees([self.change, self.sigma])
+        if self.camera is None:
+            amount = f"by {turn[0]:+.2f} +- {sigma[0]:.2f} deg"
+            return f"{self.name}, if only it slipped: {amount}; {chance}"
+        (right, down), (of_right, of_down) = self.pixels, self.pixels_sigma
+        return (
+            f"{self.name}, if only it moved: image {right:+.2f} +- {of_right:.2f} px to the right, "
+            f"{down:+.2f} +- {of_down:.2f} px down (3 m away), turned by {turn[2]:+.2f} +- "
+            f"{sigma[2]:.2f} deg; {chance}"
+        )
 
 
 @dataclass(frozen=True)
 class Wall:
-    """The largest plane of a scene: how flat it is, and how flat the calibration would have it,
+    """The largest plane of a station: how flat it is, and how flat the calibration would have it,
     metres.
     """
 
     placement: int
     bend: float
     allowed: float
+
+    @property
+    def bent(self) -> bool:
+        """Whether the axis or the ranges are not what the calibration says, or the wall bends."""
+        return self.bend > BENT * self.allowed
+
+    def sentence(self) -> str:
+        """What was found."""
+        return (
+            f"placement {self.placement}: the largest plane is flat to {1000 * self.bend:.1f} mm "
+            f"({1000 * self.allowed:.1f} mm are allowed)"
+        )
 
 
 @dataclass(frozen=True)
@@ -97,6 +137,17 @@ class Passes:
     slip: float
     sigma: float
 
+    @property
+    def slipped(self) -> bool:
+        """Whether the head hangs back or slips, by more than chance and more than nothing."""
+        return abs(self.slip) > max(SURE * self.sigma, WANTED / 2)
+
+    def sentence(self) -> str:
+        """What was found."""
+        first, second = self.placements
+        slip, sigma = np.degrees([self.slip, self.sigma])
+        return f"placements {first} and {second}, up and down: {slip:+.3f} +- {sigma:.3f} deg apart"
+
 
 @dataclass(frozen=True)
 class Held:
@@ -104,34 +155,100 @@ class Held:
 
     Attributes
     ----------
-    answer : Answer
     culprit : Shift or None
-        What has moved.
+        The camera, or the head under cameras on the base, that has moved.
     shifts : tuple of Shift
         Of all cameras, and of the head where cameras stand on the base.
     walls : tuple of Wall
+        Of stations with one.
     passes : tuple of Passes
-    rims, regions : float
-        That told it: rims of depth against edges, and regions of surfaces that two images show.
+    creases, regions : float
+        That told it: creases against edges, and regions of surfaces that two images show.
     all_on_head : bool
         A slip of the head would only turn the whole cloud.
     """
 
-    answer: Answer
     culprit: Shift | None
     shifts: tuple[Shift, ...]
     walls: tuple[Wall, ...]
     passes: tuple[Passes, ...]
-    rims: float
+    creases: float
     regions: float
     all_on_head: bool
+
+    @property
+    def moved(self) -> tuple[str, ...]:
+        """What is no longer where the calibration has it."""
+        moved = []
+        if self.culprit is not None:
+            moved.append(self.culprit.name)
+        elif any(passes.slipped for passes in self.passes):
+            moved.append("the head, between two passes,")
+        # one wall alone may bend
+        if self.walls and all(wall.bent for wall in self.walls):
+            moved.append("the range finder on the axis of the head (or no wall is flat)")
+        return tuple(moved)
+
+    @property
+    def answer(self) -> Answer:
+        """The verdict."""
+        if self.moved:
+            return Answer.MOVED
+        if self.missing():
+            return Answer.UNKNOWN
+        return Answer.HOLDS
+
+    def missing(self) -> str:
+        """What a scene lacks to tell it; '' where nothing."""
+        if not self.shifts:
+            return (
+                "no image shows where surfaces meet, or a surface that another image shows"
+            )
+        unsure = [shift.name for shift in self.shifts if not shift.told]
+        if unsure:
+            who = " or ".join(unsure)
+            more = f"{FURNITURE}, from two places or more"
+            return f"a turn of 0.3 deg of {who} would not show; {more}"
+        if max(self.creases, self.regions) < FEWEST_GROUPS:
+            number = f"{self.creases:.0f} creases and {self.regions:.0f} regions"
+            return f"{number} are too few; {FURNITURE}"
+        return ""
+
+    def sentences(self, name: str = "the calibration") -> list[str]:
+        """The verdict first, then what it rests on.
+
+        Parameters
+        ----------
+        name : str
+            Of the calibration.
+        """
+        first = {
+            Answer.HOLDS: "holds",
+            Answer.MOVED: f"{' and '.join(self.moved)} has moved: recalibrate",
+            Answer.UNKNOWN: f"cannot be told here: {self.missing()}",
+        }
+        on_head = ""
+        if self.all_on_head:
+            on_head = (
+                "; all cameras are on the head: a slip of the head only turns the whole cloud, "
+                "nothing here can show it"
+            )
+        basis = (
+            f"from {self.creases:.0f} creases, where surfaces meet, against edges of images, and "
+            f"{self.regions:.0f} regions of surfaces that two images show{on_head}"
+        )
+        lines = [f"{name}: {first[self.answer]}"]
+        lines += [shift.sentence() for shift in self.shifts]
+        lines += [wall.sentence() for wall in self.walls]
+        lines += [passes.sentence() for passes in self.passes]
+        return [*lines, basis]
 
 
 def holds(session: Session, rig: CalibratedRig) -> Held:
     """Ask a recording of any scene whether a calibration still holds.
 
-    Rims, where the depth of a sweep jumps, against edges of images; surfaces that two images show
-    against each other; flatness of walls; passes of the head over one place.
+    Creases, where flat surfaces of a scan meet, against edges of images; surfaces that two images
+    show against each other; flatness of walls; passes of the head over one place.
 
     Parameters
     ----------
@@ -147,33 +264,36 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         camera of the rig, or images of another size.
     """
     uncertainty_of(rig)
-    stations = _stations(session, rig)
-    pulls = []
-    rims = 0.0
-    regions = 0.0
-    for placement in stations:
-        of_edges, of_pairs = _station_pulls(session, rig, placement)
-        pulls += [*of_edges, *of_pairs]
-        rims += sum(pull.groups for pull in of_edges)
-        regions += sum(pull.groups for pull in of_pairs)
+    of_creases: dict[str, list[Sights]] = {camera: [] for camera in rig.cameras}
+    stations = []
+    walls = []
+    for placement in _stations(session, rig):
+        cloud = _cloud(session, rig, placement)
+        planes, of_point = planes_of(cloud, rig)
+        wall = cloud.rows(largest_plane(cloud))
+        if len(wall.points) > FEWEST_POINTS:
+            walls.append(wall_of(wall, rig, placement))
+        views = views_of_station(session, rig, placement)
+        creases = creases_of(cloud, planes, of_point, placement)
+        for view in views:
+            of_creases[view.camera].append(sights(creases, view))
+        stations.append((cloud.rows(of_point >= 0), views))
+    by_camera = [creases_pull(parts, rig, camera) for camera, parts in of_creases.items()]
+    by_camera = [pull for pull in by_camera if pull is not None]
+    of_pairs = [pairs_pull(*station, by_camera) for station in stations]
+    of_pairs = [pull for pull in of_pairs if pull is not None]
+    pulls = [*by_camera, *of_pairs]
     shifts = []
     if pulls:
         shifts = suspects(pulls, rig)
-    alarms = [s for s in shifts if s.p_value < LEVEL / len(shifts) and _matters(s)]
-    culprit = min(alarms, key=lambda s: s.p_value, default=None)
-    answer = Answer.UNKNOWN
-    if culprit is not None:
-        answer = Answer.MOVED
-    elif shifts and max(rims, regions) >= FEWEST_GROUPS and all(s.told for s in shifts):
-        answer = Answer.HOLDS
+    alarms = [s for s in shifts if s.p_value < LEVEL / len(shifts) and s.matters]
     return Held(
-        answer=answer,
-        culprit=culprit,
+        culprit=min(alarms, key=lambda s: s.p_value, default=None),
         shifts=tuple(shifts),
-        walls=tuple(wall_of(session, rig, placement) for placement in stations),
+        walls=tuple(walls),
         passes=tuple(passes_of(session)),
-        rims=rims,
-        regions=regions,
+        creases=sum(pull.groups for pull in by_camera),
+        regions=sum(pull.groups for pull in of_pairs),
         all_on_head=all(c.mount == "head" for c in rig.cameras.values()),
     )
 
@@ -194,59 +314,38 @@ def _stations(session, rig):
     return stations
 
 
-def _station_pulls(session, rig, placement):
-    """What a station says, by rims and edges, and by pairs of images: two lists of Pull."""
+def _cloud(session, rig, placement) -> Cloud:
+    """The points of a station; what the calibration knows of single sweeps is of other ones."""
+    clean = replace(rig.corrections, sweeps={})
     sweep = session.sweep(placement)
-    views = views_of_station(session, rig, placement)
-    jumps = depth_jumps(sweep, rig, session.lrf, session.continuous)
-    of_edges = []
-    for camera in dict.fromkeys(view.camera for view in views):
-        mine = [view for view in views if view.camera == camera]
-        seen = join([sights(jumps, view) for view in mine])
-        if len(seen.rim):
-            pull = edges_pull(seen, mine[0].pose_columns, mine[0].model.width)
-            weaker = replace(pull, information=pull.information / RIM_DOUBT)
-            of_edges.append(weaker)
-    of_pairs = []
-    if len(views) > 1:
-        patches = patches_of(sweep, rig, session.lrf, session.continuous)
-        pair = pairs_pull(patches, views)
-        if pair is not None:
-            of_pairs.append(pair)
-    return of_edges, of_pairs
+    continuous = session.continuous
+    head = rig.T_head_lrf
+    return join_clouds(
+        reconstruct(sweep, [], head, clean, lrf=session.lrf, continuous=continuous)
+    )
 
 
-def wall_of(session: Session, rig: CalibratedRig, placement: int) -> Wall:
-    """How flat the largest plane of a station is, beside what the calibration's errors do to it.
+def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
+    """How flat a wall is, beside what the calibration's errors do to it.
 
     Parameters
     ----------
-    session : Session
+    wall : Cloud
     rig : CalibratedRig
     placement : int
     """
-    sweep = session.sweep(placement)
-    clean = replace(rig.corrections, sweeps={})
-    blocks = reconstruct(
-        sweep, [], rig.T_head_lrf, clean, lrf=session.lrf, continuous=session.continuous
-    )
-    cloud = join_clouds(blocks)
-    wall = cloud.rows(largest_plane(cloud))
-    if len(wall.points) < FEWEST_POINTS:
-        return Wall(placement, np.nan, np.nan)
-    _, bend = flatness(wall.points)
     normal, _, _ = fit_plane(wall.points)
     chain = chain_of(rig)
-    pitch = clean.pitch(placement, wall.pitch)
-    _, J, _ = carried(chain, wall.bearing, pitch, wall.range)
+    _, J, _ = carried(
+        chain, wall.bearing, rig.corrections.pitch(-1, wall.pitch), wall.range
+    )
     by_link = np.einsum("i,nij->nj", normal @ chain.head[:, :3], J)
     # a plane turns and shifts with the errors: only what bends it shows
     plane = np.column_stack([np.ones(len(by_link)), wall.points - wall.points.mean(axis=0)])
     by_link -= plane @ np.linalg.lstsq(plane, by_link, rcond=None)[0]
-    variance = max(
-        np.mean(np.sum(by_link @ C * by_link, axis=1)) for C in chain.covariances
-    )
-    return Wall(placement, bend, float(np.sqrt(variance + UNEVEN**2)))
+    squares = [np.mean(np.sum(by_link @ C * by_link, axis=1)) for C in chain.covariances]
+    allowed = np.sqrt(max(squares) + UNEVEN**2)
+    return Wall(placement, flatness(wall.points)[1], float(allowed))
 
 
 def passes_of(session: Session) -> list[Passes]:
@@ -258,33 +357,26 @@ def passes_of(session: Session) -> list[Passes]:
     ----------
     session : Session
     """
-    found = []
+    passes = []
     swept = [p for p in session.placements if (session.scans["placement"] == p).any()]
-    for first, second in pairwise(swept):
-        ways = [session.sweep_direction(placement) for placement in (first, second)]
-        if ways[0] * ways[1] < 0:
-            one, other = session.sweep(first), session.sweep(second)
+    for pair in pairwise(swept):
+        one, other = (session.sweep(placement) for placement in pair)
+        if session.sweep_direction(pair[0]) * session.sweep_direction(pair[1]) < 0:
             slip = _slip_between(one, other, session.lrf.sigma_range)
             if slip is not None:
-                found.append(Passes((first, second), *slip))
-    return found
+                passes.append(Passes(pair, *slip))
+    return passes
 
 
 def _slip_between(one, other, noise):
     """By how much more the second of two sweeps says its pitch is than the first, and sigma,
     radians; None where they are of different places.
     """
-    order = np.argsort(other.pitch)
-    inside = (one.pitch >= other.pitch.min()) & (one.pitch <= other.pitch.max())
-    if inside.sum() < 3:
+    if min(len(one.pitch), len(other.pitch)) < 2:
         return None
-    at = np.interp(one.pitch[inside], other.pitch[order], np.arange(len(order)))
-    low = np.clip(at.astype(int), 0, len(order) - 2)
-    share = (at - low)[:, None]
-    sorted_ranges = other.ranges[order]
-    met = (1 - share) * sorted_ranges[low] + share * sorted_ranges[low + 1]
-    growth = np.gradient(one.ranges[inside], one.pitch[inside], axis=0)
-    miss = met - one.ranges[inside]
+    at_pitch = interp1d(other.pitch, other.ranges, axis=0, bounds_error=False)
+    miss = at_pitch(one.pitch) - one.ranges
+    growth = np.gradient(one.ranges, one.pitch, axis=0)
     with np.errstate(invalid="ignore"):
         smooth = (np.abs(growth) < STEEP) & (np.abs(miss) < STEEP * WANTED * 3)
     if smooth.sum() < max(FEWEST_POINTS, SAME_PLACE * np.isfinite(miss).sum()):
@@ -303,39 +395,21 @@ def suspects(pulls: list[Pull], rig: CalibratedRig) -> list[Shift]:
     Parameters
     ----------
     pulls : list of Pull
-        Of every station.
     rig : CalibratedRig
     """
     names = rig.uncertainty.names
-    slope = 0.0
-    information = 0.0
-    for pull in pulls:
-        of_station, tensor = _without_stops(pull, rig)
-        slope = slope + of_station
-        information = information + tensor
+    information = np.sum([pull.information for pull in pulls], axis=0)
+    slope = np.sum([pull.slope for pull in pulls], axis=0)
     C = _allowed(rig)
     both = np.eye(len(C)) + information @ C
     score = np.linalg.solve(both, slope)
     sharp = np.linalg.solve(both, information)
-    found = []
+    shifts = []
     for camera in rig.cameras:
-        columns = columns_of(names, camera)[4:10]
-        found.append(_shift(camera, columns, score, sharp, rig))
+        shifts.append(_shift(camera, poses_of(rig, camera), score, sharp, rig))
     if any(camera.mount == "platform" for camera in rig.cameras.values()):
-        found.append(_shift(None, np.array([len(names)]), score, sharp, rig))
-    return found
-
-
-def _without_stops(pull, rig):
-    """Slope (c,) and information (c, c) of a Pull about what stations share: the pitch of an image
-    is another one at each.
-    """
-    kept = len(rig.uncertainty.names) + 1
-    L = pull.information
-    g = L @ pull.change
-    known = L[kept:, kept:] + np.eye(len(g) - kept) / PITCH_NOISE**2
-    gain = np.linalg.solve(known, L[kept:, :kept]).T
-    return g[:kept] - gain @ g[kept:], L[:kept, :kept] - gain @ L[kept:, :kept]
+        shifts.append(_shift(None, np.array([len(names)]), score, sharp, rig))
+    return shifts
 
 
 def _allowed(rig):
@@ -346,7 +420,7 @@ def _allowed(rig):
     C[:count, :count] = np.where(np.isfinite(known.trusted), known.trusted, 0.0)
     common = np.zeros((len(C), 6))
     for name, camera in rig.cameras.items():
-        columns = columns_of(known.names, name)[4:10]
+        columns = poses_of(rig, name)
         C[columns, columns] += OWN**2
         if camera.mount == "head":
             common[columns, np.arange(6)] = COMMON
@@ -362,28 +436,17 @@ def _shift(camera, columns, score, sharp, rig):
     covariance = np.linalg.inv(known + np.diag(likely**-2.0))
     change = covariance @ score[columns]
     # the score test, of what is known at all
-    square = (
-        score[columns] @ np.linalg.pinv(known, rcond=1e-6, hermitian=True) @ score[columns]
-    )
-    pixels = np.full(3, np.nan)
-    spread = pixels
-    sigma = np.sqrt(np.diag(covariance))
-    told = bool(sigma[:3].max() < WANTED / 2)
+    inverse = np.linalg.pinv(known, rcond=1e-6, hermitian=True)
+    square = score[columns] @ inverse @ score[columns]
+    motion = np.full((2, len(columns)), np.nan)
     if camera:
-        model = rig.cameras[camera].model
-        motion = np.zeros((3, 6))
-        motion[:2] = pinhole_jacobian([0.0, 0.0, AWAY], model) @ np.hstack(
-            [-hat([0.0, 0.0, AWAY]), np.eye(3)]
-        )
-        motion[2, 2] = 1.0
-        pixels = motion @ change
-        spread = np.sqrt(np.diag(motion @ covariance @ motion.T))
-    p_value = float(chdtrc(len(columns), square))
-    return Shift(camera, change, sigma, pixels, spread, p_value, told)
-
-
-def _matters(shift):
-    """Whether a shift is more than nothing."""
-    if shift.camera is None:
-        return bool(abs(shift.change[0]) > WANTED / 4)
-    return True
+        by_point = pinhole_jacobian([0.0, 0.0, AWAY], rig.cameras[camera].model)
+        motion = by_point @ np.hstack([-hat([0.0, 0.0, AWAY]), np.eye(3)])
+    return Shift(
+        camera=camera,
+        change=change,
+        sigma=np.sqrt(np.diag(covariance)),
+        pixels=motion @ change,
+        pixels_sigma=np.sqrt(np.diag(motion @ covariance @ motion.T)),
+        p_value=float(chdtrc(len(columns), square)),
+    )

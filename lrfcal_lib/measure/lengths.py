@@ -1,12 +1,12 @@
 """Lengths in a scene between picked places, with their 90 % intervals."""
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud, join
 from lrfcal_lib.calibrate.clouds import views_of
@@ -14,16 +14,19 @@ from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
-from lrfcal_lib.judge.uncertainty import SEEN, chain_of, uncertainty_of
-from lrfcal_lib.measure.edges import SceneEdge, edges_of, nearest_edge
+from lrfcal_lib.judge.uncertainty import chain_of, uncertainty_of
+from lrfcal_lib.measure.edges import edges_of
 from lrfcal_lib.measure.features import (
     ALIKE,
+    NINETY,
+    SYSTEMATIC,
     Feature,
     Kind,
+    Length,
     fit_feature,
     length_between,
+    mean_length,
     shared_covariances,
-    unseen_motions,
 )
 from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.model.geometry import DegenerateGeometry
@@ -31,14 +34,16 @@ from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 
-REACH = 0.1  # metres from a picked place to its plane, and from a click to its edge
-ON_EDGE = 0.01  # metres from a picked place to its edge: a click moves onto it
+REACH = (
+    0.1  # metres from a picked place to points of its plane, and from a click to its edge
+)
+ON_IT = 0.01  # metres from a place on a feature of one station to the same one of another
 ABOUT = 9  # points whose middle a picked point is
-NINETY = 1.645  # standard deviations to either side that hold 90 %
 PLACE = ("x", "y", "z")
 PICKED = tuple(
     f"{what}_{number}" for number in (1, 2) for what in ("kind", "x_m", "y_m", "z_m")
 )
+IN_PLACE = RigidTransform.identity()
 
 
 @dataclass(frozen=True)
@@ -53,54 +58,44 @@ class SceneFeatures:
     planes : list of Feature
     of_point : ndarray of int, shape (n,)
         The number of the plane that a point lies on, -1 for none.
-    edges : list of SceneEdge
+    edges : list of Feature
     """
 
     cloud: Cloud
     rig: CalibratedRig
     planes: list[Feature]
     of_point: np.ndarray
-    edges: list[SceneEdge]
+    edges: list[Feature]
 
-    def at(self, kind: str, place: np.ndarray) -> Feature:
-        """The feature of a kind at a picked place.
-
-        Parameters
-        ----------
-        kind : {'point', 'edge', 'plane'}
-        place : ndarray, shape (3,)
-            Platform frame, metres.
-
-        Returns
-        -------
-        Feature
-
-        Raises
-        ------
-        DegenerateGeometry
-            If there is none within `REACH`, of an edge `ON_EDGE`.
+    def at(self, kind: str, place: np.ndarray) -> tuple[Feature | None, float]:
+        """The feature of a kind that is nearest to a place (3,), platform frame, and how near its
+        points or the edge are, metres; None where there is no such feature.
         """
         if kind == Kind.EDGE:
-            number, away = nearest_edge(self.edges, place)
-            _refuse_far(kind, away, ON_EDGE)
-            return self.edges[number].feature
+            return nearest_edge(self.edges, place)
         away = np.linalg.norm(self.cloud.points - place, axis=1)
-        if kind == Kind.PLANE:
-            away[self.of_point < 0] = np.inf
-        _refuse_far(kind, away.min(initial=np.inf), REACH)
+        if kind == Kind.POINT:
+            about = np.argsort(away)[:ABOUT]
+            return fit_feature(self.cloud, about, self.rig, plane=False), away.min()
+        away[self.of_point < 0] = np.inf
         nearest = int(np.argmin(away))
-        if kind == Kind.PLANE:
-            return self.planes[self.of_point[nearest]]
-        about = np.argsort(away)[:ABOUT]
-        return fit_feature(self.cloud, about, self.rig, plane=False)
+        if not self.planes:
+            return None, np.inf
+        return self.planes[self.of_point[nearest]], away[nearest]
 
 
-def _refuse_far(kind, away, reach):
-    """DegenerateGeometry where the feature is too far from what was picked."""
-    if away > reach:
-        raise DegenerateGeometry(
-            f"no {kind} within {1000 * reach:.0f} mm of it: pick another place, or a point"
-        )
+def nearest_edge(
+    edges: Sequence[Feature], place: np.ndarray
+) -> tuple[Feature | None, float]:
+    """The edge that passes closest to a place (3,), and how close, metres."""
+    if not edges:
+        return None, np.inf
+    first, last = np.moveaxis(np.array([edge.ends for edge in edges]), 1, 0)
+    way = last - first
+    along = np.vecdot(place - first, way) / np.vecdot(way, way)
+    foot = first + np.clip(along, 0, 1)[:, None] * way
+    away = np.linalg.norm(foot - place, axis=1)
+    return edges[np.argmin(away)], float(away.min())
 
 
 def features_of(
@@ -163,66 +158,99 @@ def features_of_station(
     return features_of(cloud, rig, views, pitches)
 
 
-def measure(scene: SceneFeatures, picks: pd.DataFrame) -> pd.DataFrame:
+def measure(
+    scenes: Mapping[int, SceneFeatures],
+    picks: pd.DataFrame,
+    poses: Mapping[int, RigidTransform] | None = None,
+) -> pd.DataFrame:
     """Lengths between pairs of picked places.
 
+    A length that several stations show is one: the mean of theirs, each weighted by how well it
+    knows it. What the calibration has wrong is common to all of them, and does not become less.
+
     Parameters
     ----------
-    scene : SceneFeatures
+    scenes : dict of int to SceneFeatures
+        By station.
     picks : DataFrame
         A row a length: name, and kind, x_m, y_m, z_m of both places, as :func:`read_picks` gives.
+    poses : dict of int to RigidTransform, optional
+        ``T_scene_platform`` of each station, in whose frame the places are; unless given they are
+        in that of the only one.
 
     Returns
     -------
     DataFrame
-        The same, with length_m, sigma_m and the ends of the 90 % interval, low_m and high_m.
-
-    Raises
-    ------
-    ValueError
-        For a place without such a feature, or two that are not parallel; it names the row.
+        The same, with length_m, sigma_m, the ends of the 90 % interval, low_m and high_m, the
+        stations, and problem: why there is no length, NaN then, or ''.
     """
-    return pd.DataFrame([_measured(scene, row) for row in picks.to_dict("records")])
-
-
-def measure_all(scene: SceneFeatures, picks: pd.DataFrame) -> pd.DataFrame:
-    """The same as :func:`measure` without the rows of which it would complain.
-
-    Parameters
-    ----------
-    scene : SceneFeatures
-    picks : DataFrame
-
-    Returns
-    -------
-    DataFrame
-    """
+    poses = poses or dict.fromkeys(scenes, IN_PLACE)
     rows = []
     for row in picks.to_dict("records"):
-        with suppress(ValueError):
-            rows.append(_measured(scene, row))
+        length, sigma = np.nan, np.nan
+        stations: list[int] = []
+        problem = ""
+        try:
+            lengths = _lengths(scenes, poses, row)
+        except DegenerateGeometry as error:
+            problem = str(error)
+        else:
+            stations = list(lengths)
+            mean = mean_length(list(lengths.values()))
+            length, sigma = mean.metres, mean.sigma
+        row |= {
+            "length_m": length,
+            "sigma_m": sigma,
+            "low_m": max(length - NINETY * sigma, 0.0),
+            "high_m": length + NINETY * sigma,
+            "stations": " ".join(map(str, stations)),
+            "problem": problem,
+        }
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _measured(scene, row):
-    """A row of picks with its length."""
+def _lengths(scenes, poses, row) -> dict[int, Length]:
+    """A row of picks as each station measures it that shows both places."""
     ends = []
     for number in (1, 2):
         place = np.array([row[f"{axis}_m_{number}"] for axis in PLACE], float)
         try:
-            ends.append(scene.at(row[f"kind_{number}"], place))
+            ends.append(_shown(scenes, poses, row[f"kind_{number}"], place))
         except DegenerateGeometry as problem:
-            raise ValueError(f"'{row['name']}', place {number}: {problem}") from None
-    try:
-        length, sigma = length_between(*ends)
-    except DegenerateGeometry as problem:
-        raise ValueError(f"'{row['name']}': {problem}") from None
-    return row | {
-        "length_m": length,
-        "sigma_m": sigma,
-        "low_m": max(length - NINETY * sigma, 0.0),
-        "high_m": length + NINETY * sigma,
-    }
+            raise DegenerateGeometry(f"place {number}: {problem}") from None
+    first, second = ends
+    both = [station for station in first if station in second]
+    if not both:
+        raise DegenerateGeometry(
+            "no station shows both places: pick places that one of them shows"
+        )
+    return {s: length_between(first[s], second[s]) for s in both}
+
+
+def _shown(scenes, poses, kind, place) -> dict[int, Feature]:
+    """The features that stations show at a place; a point is of the station that is nearest."""
+    near = {}
+    for number, scene in scenes.items():
+        near[number] = scene.at(kind, poses[number].inv().apply(place))
+    clicked = min(near, key=lambda number: near[number][1])
+    feature, away = near[clicked]
+    reach = ON_IT if kind == Kind.EDGE else REACH
+    if away > reach:
+        raise DegenerateGeometry(
+            f"no {kind} within {1000 * reach:.0f} mm of it: pick another place, or a point"
+        )
+    if kind == Kind.POINT:
+        return {clicked: feature}
+    foot = poses[clicked].apply(feature.foot(poses[clicked].inv().apply(place)))
+    shown = {clicked: feature}
+    for number, scene in scenes.items():
+        there = poses[number].inv().apply(foot)
+        other, away = scene.at(kind, there)
+        if number != clicked and away < REACH:
+            if np.linalg.norm(other.foot(there) - there) < ON_IT:
+                shown[number] = other
+    return shown
 
 
 def read_picks(path: str | PathLike) -> pd.DataFrame:
@@ -251,25 +279,24 @@ def read_picks(path: str | PathLike) -> pd.DataFrame:
     if missing or table.empty:
         lack = f"no column {', '.join(missing)}" if missing else "no length in it"
         raise ValueError(f"{path}: {lack}: {remedy}")
-    table = table[["name", *PICKED]]
-    for row in table.to_dict("records"):
-        for column in PICKED:
-            value = row[column]
-            known = [str(kind) for kind in Kind]
-            if column.startswith("kind"):
-                good = value in known
-                allowed = "one of " + ", ".join(known)
-            else:
-                good = isinstance(value, int | float) and np.isfinite(value)
-                allowed = "a number"
-            if not good:
-                raise ValueError(
-                    f"{path}, '{row['name']}': {column} is '{value}', not {allowed}: {remedy}"
-                )
-    return table
+    for column in PICKED:
+        values = table[column]
+        allowed = "a number"
+        good = np.isfinite(pd.to_numeric(values, errors="coerce"))
+        if column.startswith("kind"):
+            allowed = "one of " + ", ".join(Kind)
+            good = values.isin(list(Kind))
+        for row in table[~good].to_dict("records"):
+            raise ValueError(
+                f"{path}, '{row['name']}': {column} is '{row[column]}', not {allowed}: {remedy}"
+            )
+    return table[["name", *PICKED]]
 
 
-def for_page(scene: SceneFeatures) -> dict:
+def for_page(
+    scenes: Mapping[int, SceneFeatures],
+    poses: Mapping[int, RigidTransform] | None = None,
+) -> dict:
     """What a page needs to measure by clicks, see :func:`lrfcal_lib.plots.interactive.scene_page`.
 
     Every plane and edge with its derivatives by the unknowns that all share, and the covariances of
@@ -277,43 +304,52 @@ def for_page(scene: SceneFeatures) -> dict:
 
     Parameters
     ----------
-    scene : SceneFeatures
+    scenes : dict of int to SceneFeatures
+        Whose points, station by station, are those of the page.
+    poses : dict of int to RigidTransform, optional
+        As in :func:`measure`.
 
     Returns
     -------
     dict
         Of what JSON holds, and arrays.
     """
-    rig = scene.rig
-    cameras = [None, *rig.cameras]
-    features = [*scene.planes, *(edge.feature for edge in scene.edges)]
-    rows = [
-        np.concatenate([f.centre, f.axis, f.noise.ravel(), f.jacobian.ravel()])
-        for f in features
-    ]
-    chain = chain_of(rig)
+    poses = poses or dict.fromkeys(scenes, IN_PLACE)
+    features: list[Feature] = []
+    of_point = []
+    lines = []
+    for number, scene in scenes.items():
+        of_point.append(np.where(scene.of_point < 0, -1, scene.of_point + len(features)))
+        features += [*scene.planes, *scene.edges]
+        lines += [poses[number].apply(edge.ends) for edge in scene.edges]
+    rows = []
+    for f in features:
+        parts = (f.centre, f.axis, f.ends.ravel(), f.noise.ravel(), f.jacobian.ravel())
+        rows.append(np.concatenate(parts))
+    frames = {}
+    for number, T in poses.items():
+        R = T.rotation.as_matrix().tolist()
+        frames[number] = {"R": R, "t": T.translation.tolist()}
+    rig = next(iter(scenes.values())).rig
     known = uncertainty_of(rig)
-    stations = np.unique(scene.cloud.placement).tolist()
-    still = {"R": np.eye(3).tolist(), "t": [0.0, 0.0, 0.0]}
     return {
-        "kinds": [str(feature.kind) for feature in features],
-        "cameras": [cameras.index(feature.camera) for feature in features],
+        "kinds": [feature.kind for feature in features],
         "placements": [feature.placement for feature in features],
         "features": np.array(rows),
-        "ends": np.array([edge.ends for edge in scene.edges]).reshape(-1, 6),
-        "plane_of_point": scene.of_point,
-        "station_of_point": scene.cloud.placement,
-        "poses": dict.fromkeys(stations, still),
+        "lines": np.array(lines).reshape(-1, 2, 3),
+        "plane_of_point": np.concatenate(of_point),
+        "station_of_point": np.concatenate([s.cloud.placement for s in scenes.values()]),
+        "poses": frames,
         "unknowns": len(known.names),
         "columns": columns_of(known.names).tolist(),
         "covariances": shared_covariances(rig),
-        "unseen": [unseen_motions(rig, camera).tolist() for camera in cameras],
         "sweep_sigma": known.sweep_sigma,
         "range_noise": known.range_noise,
-        "head": chain.head.tolist(),
+        "systematic": SYSTEMATIC,
+        "head": chain_of(rig).head.tolist(),
         "alike": ALIKE,
-        "least": SEEN,
         "reach": REACH,
+        "on_it": ON_IT,
         "about": ABOUT,
         "ninety": NINETY,
     }

@@ -5,8 +5,10 @@ give the turns, the correlation of all surfaces gives the shifts. Every start th
 refined, and judged by what overlaps and by what stands where the other station looked through.
 """
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import permutations, product
 
 import numpy as np
 import small_gicp
@@ -17,6 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
 
 # metres, side of the cells whose points make one patch of a surface: for a start, for the fit
@@ -44,10 +47,7 @@ LOOK = np.radians(1.0)  # side of a cell of what a station saw
 CLEAR = 0.15  # metres before a surface; a patch there stands where the other looked through
 CLOSER = (0.1, 0.05, 0.05, 0.05)  # metres within which a fit takes patches for the same
 COMMON = 0.002  # metres, error of a patch that its neighbours have too
-TUKEY = 4.685  # sigma beyond which a patch counts for nothing (Beaton and Tukey 1974)
-NEIGHBOURS = (
-    0.5  # metres; the errors of patches nearer together are not taken as independent
-)
+NEIGHBOURS = 0.5  # metres; errors of patches nearer together are not taken as independent
 ACROSS = 0.35  # cosine between a normal and a direction from which a patch holds it
 
 
@@ -61,10 +61,9 @@ class Surface:
         Means of the points of a patch, platform frame, metres; unit vectors.
     sigma : ndarray, shape (n,)
         Standard deviation of a mean along the normal, metres.
-    by_rig : ndarray, shape (n, 13)
-        Motion of a patch along its normal by what the calibration may have wrong, see `COLUMNS`.
-    by_sweep : ndarray, shape (n, 2)
-        The same by one sigma of the sweep's own offset and stretch of the pitch.
+    moves : ndarray, shape (n, 15)
+        Motion of a patch along its normal by what the calibration may have wrong, see `COLUMNS`,
+        and by one sigma of the sweep's own offset and stretch of the pitch.
     nearest : ndarray, shape (k, l)
         Range by azimuth and height about the platform, metres; 0 where it saw nothing.
     """
@@ -72,8 +71,7 @@ class Surface:
     points: np.ndarray
     normals: np.ndarray
     sigma: np.ndarray
-    by_rig: np.ndarray
-    by_sweep: np.ndarray
+    moves: np.ndarray
     nearest: np.ndarray
     gicp: small_gicp.PointCloud
     gicp_tree: small_gicp.KdTree
@@ -119,13 +117,11 @@ def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> S
     gicp = small_gicp.PointCloud(points)
     gicp_tree = small_gicp.KdTree(gicp)
     small_gicp.estimate_normals_covariances(gicp, gicp_tree, AROUND)
-    moves = mean(_moves(whole, rig))[flat]
     return Surface(
         points=points,
         normals=normals[flat] / length[flat, None],
         sigma=sigma[flat],
-        by_rig=moves[:, :-2],
-        by_sweep=moves[:, -2:],
+        moves=mean(_moves(whole, rig))[flat],
         nearest=_look(cloud.points),
         gicp=gicp,
         gicp_tree=gicp_tree,
@@ -194,7 +190,7 @@ def candidates(first: Surface, second: Surface) -> list[Candidate]:
     Returns
     -------
     list of Candidate
-        All different; empty where the stations have no two directions of walls in common.
+        All different.
     """
     ended: list[RigidTransform] = []
     for start in starts(first, second):
@@ -242,25 +238,19 @@ def _directions(surface):
 def _turns(first, second):
     """Turns of the second station by which two of its directions fall on two of the first."""
     found: list[Rotation] = []
-    for a, b in _two_of(first):
-        for c, d in _two_of(second):
-            if abs(np.arccos(a @ b) - np.arccos(c @ d)) > SAME_ANGLE:
-                continue
-            turn = Rotation.align_vectors([a, b], [c, d])[0]
-            upright = turn.as_matrix()[2, 2] > UPRIGHT
-            if upright and not any(
-                (turn * other.inv()).magnitude() < SAME_TURN for other in found
-            ):
-                found.append(turn)
+    for (a, b), (c, d) in product(_two_of(first), _two_of(second)):
+        if abs(np.arccos(a @ b) - np.arccos(c @ d)) > SAME_ANGLE:
+            continue
+        turn = Rotation.align_vectors([a, b], [c, d])[0]
+        new = all((turn * other.inv()).magnitude() >= SAME_TURN for other in found)
+        if new and turn.as_matrix()[2, 2] > UPRIGHT:
+            found.append(turn)
     return found
 
 
-def _two_of(directions) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _two_of(directions):
     """Ordered pairs of directions that are neither parallel nor opposite."""
-    for a in directions:
-        for b in directions:
-            if abs(a @ b) < FACING:
-                yield a, b
+    return [(a, b) for a, b in permutations(directions, 2) if abs(a @ b) < FACING]
 
 
 def _shifts(first, second, turn):
@@ -342,33 +332,52 @@ def _before(surface, points):
 
 
 @dataclass(frozen=True)
-class Fit:
-    """The pose of a second station that fits best, and how well it is known.
+class Pair:
+    """Two stations beside each other, and how well it is known how they stand.
 
     Attributes
     ----------
+    first, second : int
     T_first_second : RigidTransform
     covariance : ndarray, shape (6, 6)
-        Of a turn and a shift in the first station's frame, without errors of the calibration.
+        Of its turn and shift in the first one's frame, without errors of the calibration.
     by_rig : ndarray, shape (6, 13)
         Turn and shift by what the calibration may have wrong, see `COLUMNS`.
+    overlap : float
+        Share of the surfaces of the station that saw less which the other saw too.
     rms : float
-        Of the distances between the surfaces of both, metres.
+        Of the distances between their surfaces, metres.
     loose : ndarray, shape (3,)
         Direction in the first station's frame along which the least holds the second.
     held : float
         Share of the patches that hold it there.
     """
 
+    first: int
+    second: int
     T_first_second: RigidTransform
     covariance: np.ndarray
     by_rig: np.ndarray
+    overlap: float
     rms: float
     loose: np.ndarray
     held: float
 
+    @cached_property
+    def whiten(self) -> np.ndarray:
+        """What makes a miss one of unit covariance, (6, 6)."""
+        return np.linalg.cholesky(np.linalg.inv(self.covariance)).T
 
-def fitted(first: Surface, second: Surface, start: RigidTransform) -> Fit:
+    def miss(self, poses: Mapping[int, RigidTransform]) -> np.ndarray:
+        """Turn and shift (6,) by which poses of the stations differ from it."""
+        T = poses[self.first].inv() * poses[self.second]
+        turn = (T.rotation * self.T_first_second.rotation.inv()).as_rotvec()
+        return np.append(turn, T.translation - self.T_first_second.translation)
+
+
+def fitted(
+    names: tuple[int, int], first: Surface, second: Surface, start: RigidTransform
+) -> Pair:
     """The pose of a second station by all patches of both, each by its sigma.
 
     The distance of a patch from the nearest one of the other station, along the normal. What few
@@ -377,6 +386,8 @@ def fitted(first: Surface, second: Surface, start: RigidTransform) -> Fit:
 
     Parameters
     ----------
+    names : tuple of int
+        Of the stations.
     first, second : Surface
         In patches of `FINE`.
     start : RigidTransform
@@ -384,34 +395,34 @@ def fitted(first: Surface, second: Surface, start: RigidTransform) -> Fit:
 
     Returns
     -------
-    Fit
+    Pair
     """
     T = start
     for width in CLOSER:
         here, there = matches(first, second, T, width)
         J, r = _distances(first, second, T, here, there)
         sigma = np.sqrt(first.sigma[here] ** 2 + second.sigma[there] ** 2 + COMMON**2)
-        scale = max(1.0, 1.4826 * float(np.median(np.abs(r / sigma))))
-        share = np.clip(np.abs(r / sigma) / (TUKEY * scale), 0, 1)
-        weight = (1 - share**2) ** 2 / (scale * sigma) ** 2
-        H = np.einsum("ni,n,nj->ij", J, weight, J)
-        step = -np.linalg.pinv(H, rcond=1e-12) @ (J.T @ (weight * r))
-        T = _moved(T, step)
+        sigma *= robust_sigma(r / sigma, least=1.0)
+        weight = biweight(r, sigma) / sigma**2
+        inverse = np.linalg.pinv(J.T @ (weight[:, None] * J), rcond=1e-12)
+        step = -inverse @ (J.T @ (weight * r))
+        T = moved(T, step)
     pulls = J * (weight * (r + J @ step))[:, None]
     cells = np.floor(first.points[here] / NEIGHBOURS).astype(int)
     _, group = np.unique(cells, axis=0, return_inverse=True)
     sums = np.stack([np.bincount(group, column) for column in pulls.T], axis=1)
-    inverse = np.linalg.pinv(H, rcond=1e-12)
     gain = -inverse @ (J * weight[:, None]).T
-    by_sweeps = np.hstack([gain @ first.by_sweep[here], gain @ second.by_sweep[there]])
-    # what the data say about the shift once the turn is eliminated
-    turn = np.linalg.pinv(H[:3, :3], rcond=1e-12)
-    shift = H[3:, 3:] - H[3:, :3] @ turn @ H[:3, 3:]
-    loose = np.linalg.eigh(shift)[1][:, 0]
-    return Fit(
+    by_first = gain @ first.moves[here]
+    by_second = gain @ second.moves[there]
+    by_sweeps = np.hstack([by_first[:, -2:], by_second[:, -2:]])
+    # the loosest direction of the shift, whatever the turn
+    loose = np.linalg.eigh(inverse[3:, 3:])[1][:, -1]
+    return Pair(
+        *names,
         T_first_second=T,
         covariance=inverse @ (sums.T @ sums) @ inverse + by_sweeps @ by_sweeps.T,
-        by_rig=gain @ (second.by_rig[there] - first.by_rig[here]),
+        by_rig=(by_second - by_first)[:, :-2],
+        overlap=agreement(first, second, T).overlap,
         rms=float(np.sqrt(np.sum(weight * r**2) / np.sum(weight))),
         loose=loose,
         held=float(np.mean(np.abs(J[:, 3:] @ loose) > ACROSS)),
@@ -427,7 +438,7 @@ def _distances(first, second, T, here, there):
     return np.hstack([np.cross(turned, normals), normals]), r
 
 
-def _moved(T, step):
-    """A pose after a turn and a shift."""
+def moved(T: RigidTransform, step: np.ndarray) -> RigidTransform:
+    """A pose after a turn and a shift (6,): R <- exp(w) R, t <- t + v."""
     turn = Rotation.from_rotvec(step[:3]) * T.rotation
     return RigidTransform.from_components(T.translation + step[3:], turn)

@@ -1,41 +1,21 @@
 """Poses of stations that agree best with all pairs of them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.gauss_newton import gauss_newton
-
-SMALL = 1e-6  # of differences that stand for derivatives: radians, metres
-
-
-class Edge:
-    """What one pair says: ``T_first_second`` and the (6, 6) covariance of its turn and shift."""
-
-    def __init__(
-        self, first: int, second: int, T: RigidTransform, covariance: np.ndarray
-    ) -> None:
-        self.first = first
-        self.second = second
-        self.T = T
-        self.covariance = covariance
-        self.whiten = np.linalg.cholesky(np.linalg.inv(covariance)).T
-
-    def miss(self, poses: Mapping[int, RigidTransform]) -> np.ndarray:
-        """Turn and shift (6,) by which poses of the stations differ from it."""
-        T = poses[self.first].inv() * poses[self.second]
-        turn = (T.rotation * self.T.rotation.inv()).as_rotvec()
-        return np.concatenate([turn, T.translation - self.T.translation])
+from lrfcal_lib.measure.pairs import Pair, moved
 
 
-def connected(edges: Iterable[Edge], station: int) -> dict[int, RigidTransform]:
-    """Rough poses of all stations that edges lead to, in the frame of one, along the best edges.
+def connected(pairs: Iterable[Pair], station: int) -> dict[int, RigidTransform]:
+    """Rough poses of all stations that pairs lead to, in the frame of one, along the best pairs.
 
     Parameters
     ----------
-    edges : iterable of Edge
+    pairs : iterable of Pair
     station : int
 
     Returns
@@ -43,29 +23,27 @@ def connected(edges: Iterable[Edge], station: int) -> dict[int, RigidTransform]:
     dict of int to RigidTransform
         The one itself first.
     """
-    left = sorted(edges, key=lambda edge: np.trace(edge.covariance))
+    left = sorted(pairs, key=lambda pair: np.trace(pair.covariance))
     poses = {station: RigidTransform.identity()}
-    grown = True
-    while grown:
-        grown = False
-        for edge in left:
-            if (edge.first in poses) == (edge.second in poses):
-                continue
-            if edge.first in poses:
-                poses[edge.second] = poses[edge.first] * edge.T
-            else:
-                poses[edge.first] = poses[edge.second] * edge.T.inv()
-            grown = True
-            break
-    return {n: poses[n] for n in sorted(poses, key=lambda n: (n != station, n))}
+    while True:
+        leads_on = [
+            pair for pair in left if (pair.first in poses) != (pair.second in poses)
+        ]
+        if not leads_on:
+            return {n: poses[n] for n in sorted(poses, key=lambda n: (n != station, n))}
+        pair = leads_on[0]
+        if pair.first in poses:
+            poses[pair.second] = poses[pair.first] * pair.T_first_second
+        else:
+            poses[pair.first] = poses[pair.second] * pair.T_first_second.inv()
 
 
-def solved(edges: list[Edge], station: int) -> tuple[dict[int, RigidTransform], np.ndarray]:
-    """The poses that make the misses of all edges small, each by its covariance.
+def solved(pairs: list[Pair], station: int) -> tuple[dict[int, RigidTransform], np.ndarray]:
+    """The poses that make the misses of all pairs small, each by its covariance.
 
     Parameters
     ----------
-    edges : list of Edge
+    pairs : list of Pair
         Between stations that they connect.
     station : int
         Whose frame the poses are in.
@@ -74,35 +52,25 @@ def solved(edges: list[Edge], station: int) -> tuple[dict[int, RigidTransform], 
     -------
     poses : dict of int to RigidTransform
     response : ndarray, shape (6 n, 6 e)
-        Of turn and shift of each, in the order of `poses`, to those of the edges; zeros for
+        Of turn and shift of each, in the order of `poses`, to those of the pairs; zeros for
         `station`.
     """
-    start = connected(edges, station)
-    free = [number for number in start if number != station]
-
-    def residuals(poses):
-        misses = [edge.whiten @ edge.miss(poses) for edge in edges]
-        return np.concatenate([np.zeros(0), *misses])
-
-    def move(poses, step):
-        """Poses with increments ``[w, v]`` of the free stations: R <- exp(w) R, t <- t + v."""
-        moved = dict(poses)
-        for number, part in zip(free, step.reshape(-1, 6), strict=True):
-            turn = Rotation.from_rotvec(part[:3]) * poses[number].rotation
-            shift = poses[number].translation + part[3:]
-            moved[number] = RigidTransform.from_components(shift, turn)
-        return moved
-
-    size = 6 * len(free)
-    response = np.zeros((size + 6, 6 * len(edges)))
-    if not free:
+    start = connected(pairs, station)
+    size = 6 * len(start) - 6
+    response = np.zeros((size + 6, 6 * len(pairs)))
+    if not size:
         return start, response
-    poses, _ = gauss_newton(residuals, move, start, size)
-    columns = []
-    for step in SMALL * np.eye(size):
-        change = residuals(move(poses, step)) - residuals(move(poses, -step))
-        columns.append(change / (2 * SMALL))
-    J = np.stack(columns, axis=1)
-    whiten = block_diag(*(edge.whiten for edge in edges))
-    response[6:] = np.linalg.pinv(J) @ whiten
-    return poses, response
+
+    def after(steps):
+        """The poses after turns and shifts of all but the first."""
+        parts = np.append(np.zeros(6), steps).reshape(-1, 6)
+        return {n: moved(start[n], part) for n, part in zip(start, parts, strict=True)}
+
+    def residuals(steps):
+        poses = after(steps)
+        return np.concatenate([pair.whiten @ pair.miss(poses) for pair in pairs])
+
+    best = least_squares(residuals, np.zeros(size), jac="3-point", x_scale="jac")
+    whiten = block_diag(*(pair.whiten for pair in pairs))
+    response[6:] = np.linalg.pinv(best.jac) @ whiten
+    return after(best.x), response

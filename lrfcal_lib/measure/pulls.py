@@ -1,19 +1,15 @@
-"""What observations say about all unknowns of a calibrated rig: a change, and its information."""
+"""What observations say about all unknowns of a calibrated rig: a slope, and its information."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.calibrate.reconstruct import after_middle
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
-from lrfcal_lib.judge.uncertainty import Chain, chain_of
-from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.session.read import Session, Sweep
-from lrfcal_lib.session.stated import LrfInfo
+from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
+from lrfcal_lib.session.read import Session
 
 
 @dataclass(frozen=True)
@@ -22,79 +18,77 @@ class View:
 
     Attributes
     ----------
+    rig : CalibratedRig
     camera : str
-    chain : Chain
-        To the camera.
-    model : CameraModel
     pitch : float
-        True one of the head, radians.
-    T_camera_platform : RigidTransform
+        True one of the head, radians; 0 for a camera on the base.
     image : ndarray of uint8, shape (h, w, 3)
-    columns : ndarray of int, shape (15,)
-        Where the chain's columns, the sweep's pitch and the image's stand among the unknowns; -1
-        for none.
-    count : int
-        Of unknowns.
     """
 
+    rig: CalibratedRig
     camera: str
-    chain: Chain
-    model: CameraModel
     pitch: float
-    T_camera_platform: RigidTransform
     image: np.ndarray
-    columns: np.ndarray
-    count: int
+
+    @property
+    def model(self):
+        """Of the camera."""
+        return self.rig.cameras[self.camera].model
 
     @property
     def fixed(self):
         """Whether the camera stands on the base."""
-        return not self.chain.on_head
+        return self.rig.cameras[self.camera].mount == "platform"
 
     @property
-    def pose_columns(self):
-        """Of the camera's pose among the unknowns, (6,)."""
-        return self.columns[4:10]
+    def rotation(self):
+        """From the platform to the camera."""
+        return self.rig.camera_at(self.camera, self.pitch).rotation
 
     @cached_property
     def grey(self):
         """The image in grey, (h, w), float."""
         return cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
 
-    def links(self, by_link, by_pitch):
-        """Derivatives (..., 3, 15) of points by the links of the chain, the pitch of the sweep, and
-        that of the image.
+    def carried(self, points):
+        """Scanned points (n, 3) in the camera frame, and their derivatives (n, 3, c) by the
+        unknowns of a Pull.
         """
-        by_both = [by_pitch[..., None], -by_pitch[..., None] * self.chain.on_head]
-        return np.concatenate([by_link, *by_both], axis=-1)
-
-    def spread(self, by_link):
-        """Derivatives (..., 15) by links as those by all unknowns (..., c)."""
-        out = np.zeros((*by_link.shape[:-1], self.count))
-        known = self.columns >= 0
-        out[..., self.columns[known]] = by_link[..., known]
-        return out
+        beams = beams_to(points, self.rig.T_head_lrf)
+        chain = chain_of(self.rig, self.camera)
+        p_camera, by_link, by_pitch = carried(chain, *beams, self.pitch)
+        names = self.rig.uncertainty.names
+        columns = columns_of(names, self.camera)
+        known = columns >= 0
+        J = np.zeros((*p_camera.shape, len(names) + 1))
+        J[..., columns[known]] = by_link[..., known]
+        J[..., -1] = by_pitch
+        return p_camera, J
 
 
 @dataclass(frozen=True)
 class Pull:
-    """What observations say about the unknowns of a rig.
-
-    These are those of its uncertainty, then the pitch of the sweep, then that of every image.
+    """What observations say about the unknowns of a rig: those of its uncertainty, then the pitch
+    of sweeps.
 
     Attributes
     ----------
     information : ndarray, shape (c, c)
         Inverse of a covariance, zero where they say nothing.
-    change : ndarray, shape (c,)
-        By which they differ from the calibration, radians and metres.
+    slope : ndarray, shape (c,)
+        Information times the change of the unknowns that they ask for.
     groups : float
         Of observations that err together.
     """
 
     information: np.ndarray
-    change: np.ndarray
+    slope: np.ndarray
     groups: float
+
+
+def poses_of(rig: CalibratedRig, camera: str) -> np.ndarray:
+    """Where the pose of a camera stands among the unknowns, (6,)."""
+    return columns_of(rig.uncertainty.names, camera)[4:10]
 
 
 def views_of_station(session: Session, rig: CalibratedRig, placement: int) -> list[View]:
@@ -107,63 +101,43 @@ def views_of_station(session: Session, rig: CalibratedRig, placement: int) -> li
         That knows its uncertainty.
     placement : int
     """
-    records = [r for r in session.images(placement=placement) if r.camera in rig.cameras]
-    names = rig.uncertainty.names
-    recorded = [record.pitch for record in records]
-    stops, stop = np.unique(np.round(np.nan_to_num(recorded), 5), return_inverse=True)
-    views = []
-    taken = set()
-    for record, number in zip(records, stop, strict=True):
-        camera = rig.cameras[record.camera]
+    views = {}
+    for record in session.images(placement=placement):
+        if record.camera not in rig.cameras:
+            continue
         pitch = record.pitch * (1 + rig.corrections.pitch_scale)
-        own = [len(names), len(names) + 1 + number]
-        if camera.mount == "platform":
+        if rig.cameras[record.camera].mount == "platform":
             pitch = 0.0
         # a camera on the base sees the same again
-        if not np.isfinite(pitch) or (record.camera, pitch) in taken:
-            continue
-        taken.add((record.camera, pitch))
-        view = View(
-            camera=record.camera,
-            chain=chain_of(rig, record.camera),
-            model=camera.model,
-            pitch=float(pitch),
-            T_camera_platform=rig.camera_at(record.camera, pitch),
-            image=session.read_image(record),
-            columns=np.append(columns_of(names, record.camera), own),
-            count=len(names) + 1 + len(stops),
-        )
-        views.append(view)
-    return views
+        if np.isfinite(pitch) and (record.camera, pitch) not in views:
+            image = session.read_image(record)
+            views[record.camera, pitch] = View(rig, record.camera, pitch, image)
+    return list(views.values())
 
 
-def directions(
-    sweep: Sweep, rig: CalibratedRig, lrf: LrfInfo, continuous: bool
-) -> np.ndarray:
-    """Bearing and true pitch of every beam, (l, b, 2), radians."""
-    pitch = np.repeat(sweep.pitch[:, None], len(sweep.bearings), axis=1)
-    if continuous and len(sweep.pitch) > 1:
-        rate = np.gradient(sweep.pitch, sweep.time_s)
-        pitch = pitch + rate[:, None] * after_middle(sweep.bearings, lrf)
-    pitch = pitch * (1 + rig.corrections.pitch_scale)
-    return np.stack([np.broadcast_to(sweep.bearings, pitch.shape), pitch], axis=-1)
-
-
-def pull_of_groups(information, by_row, group, change, fitted):
+def pull_of_groups(
+    information: np.ndarray, by_row: np.ndarray, group: np.ndarray, x: np.ndarray
+) -> Pull:
     """A Pull whose information is what the scatter of groups leaves of it.
 
-    `by_row` (n, c) are the slopes that rows, of groups (n,), have left at `change`, which was
-    `fitted` in some of its places.
+    Parameters
+    ----------
+    information : ndarray, shape (c, c)
+    by_row : ndarray, shape (n, c)
+        Slopes that observations have left at `x`.
+    group : ndarray of int, shape (n,)
+        Those of one group err together.
+    x : ndarray, shape (c,)
+        Change of the unknowns, of which those that are not 0 were fitted.
     """
     _, group = np.unique(group, return_inverse=True)
-    sums = np.zeros((group.max() + 1, len(change)))
+    sums = np.zeros((group.max() + 1, len(x)))
     np.add.at(sums, group, by_row)
     load = np.bincount(group, np.linalg.norm(by_row, axis=1))
     groups = float(load.sum() ** 2 / np.sum(load**2))
-    own = information[np.ix_(fitted, fitted)]
-    scatter = sums[:, fitted].T @ sums[:, fitted]
-    excess = np.trace(np.linalg.pinv(own, rcond=1e-9, hermitian=True) @ scatter) / len(
-        fitted
-    )
+    fitted = np.flatnonzero(x)
+    own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
+    excess = np.trace(own @ sums[:, fitted].T @ sums[:, fitted]) / len(fitted)
     few = groups / max(groups - len(fitted), 1.0)
-    return Pull(information / max(excess * few, 1e-12), change, groups)
+    scale = 1 / max(excess * few, 1e-12)
+    return Pull(scale * information, scale * (information @ x + sums.sum(axis=0)), groups)

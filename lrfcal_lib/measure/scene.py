@@ -3,7 +3,7 @@
 A station is one place where the rig stood: a sweep and the images taken there.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.cloud_files import write_pcd
 from lrfcal_lib.measure.e57 import E57Writer, new_guid
 from lrfcal_lib.measure.features import with_sigma
-from lrfcal_lib.measure.lengths import features_of_station, for_page
+from lrfcal_lib.measure.lengths import SceneFeatures, features_of_station, for_page
 from lrfcal_lib.plots.interactive import MOST_POINTS, rig_lines, scene_page
 from lrfcal_lib.preprocess.closing_scan import closing_of, without_closing
 from lrfcal_lib.session.faults import repeated_scans
@@ -203,8 +203,7 @@ def write_scene(
     session : Session
     rig : CalibratedRig
     poses : dict of int to RigidTransform
-        ``T_scene_platform`` of the stations by their number; the identity for a single one, in
-        whose page one can measure.
+        ``T_scene_platform`` of the stations by their number; the identity for a single one.
     about : str
         Where it is from and whether to trust it, for every file.
     told : callable
@@ -223,7 +222,7 @@ def write_scene(
     ply, pcd, e57, page = (
         folder / f"scene.{kind}" for kind in ("ply", "pcd", "e57", "html")
     )
-    thinned: list[Cloud] = []
+    thinned: dict[int, list[Cloud]] = {number: [] for number in poses}
     with ExitStack() as stack:
         page_draft, e57_draft = (stack.enter_context(whole(file)) for file in (page, e57))
         writer = E57Writer(e57_draft, about)
@@ -231,27 +230,55 @@ def write_scene(
             blocks = _written(writer, session, rig, poses, thinned, told)
             write_ply(ply, blocks, [about])
         write_pcd(pcd, ply, [about])
-        shown = join(thinned)
-        cameras = {
-            name: (rig.camera_at(name, 0.0), camera.model)
-            for name, camera in rig.cameras.items()
+        title = f"{session.name}, station {', '.join(map(str, poses))}"
+        scenes = {
+            number: features_of_station(session, rig, number, join(blocks))
+            for number, blocks in thinned.items()
         }
-        lines = rig_lines(rig.T_head_lrf, cameras)
-        measuring = None
-        if len(poses) == 1:
-            (number,) = poses
-            measuring = for_page(features_of_station(session, rig, number, shown))
-        scene_page(
-            page_draft,
-            shown.points,
-            shown.colors,
-            shown.seen,
-            lines,
-            note=about,
-            title=f"{session.name}, station {', '.join(map(str, poses))}",
-            measuring=measuring,
-        )
+        measuring_page(page_draft, scenes, poses, title=title, note=about)
     return [ply, pcd, e57, page]
+
+
+def measuring_page(
+    path: Path,
+    scenes: Mapping[int, SceneFeatures],
+    poses: Mapping[int, RigidTransform],
+    title: str,
+    note: str = "",
+) -> None:
+    """Write the page on which two clicks give a length, see :func:`scene_page`.
+
+    Parameters
+    ----------
+    path : Path
+    scenes : dict of int to SceneFeatures
+        By station.
+    poses : dict of int to RigidTransform
+        ``T_scene_platform`` of each.
+    title, note : str
+    """
+    rig = next(iter(scenes.values())).rig
+    cameras = {
+        name: (rig.camera_at(name, 0.0), camera.model)
+        for name, camera in rig.cameras.items()
+    }
+    shown = join(_placed(scene.cloud, poses[number]) for number, scene in scenes.items())
+    scene_page(
+        path,
+        shown.points,
+        shown.colors,
+        shown.seen,
+        rig_lines(rig.T_head_lrf, cameras),
+        note=note,
+        title=title,
+        measuring=for_page(scenes, poses),
+    )
+
+
+def _placed(cloud, pose):
+    """A Cloud in the frame of the scene."""
+    normals = pose.rotation.apply(cloud.normals)
+    return replace(cloud, points=pose.apply(cloud.points), normals=normals)
 
 
 def _written(writer, session, rig, poses, thinned, told):
@@ -266,14 +293,9 @@ def _written(writer, session, rig, poses, thinned, told):
             for colored in colored_blocks(session, rig, station):
                 cloud = with_sigma(colored, rig)
                 write(cloud)
-                placed = replace(
-                    cloud,
-                    points=pose.apply(cloud.points),
-                    normals=pose.rotation.apply(cloud.normals),
-                )
-                thinned.append(placed.rows(np.arange(0, len(cloud.points), every)))
+                thinned[number].append(cloud.rows(slice(None, None, every)))
                 told(len(cloud.points))
-                yield placed
+                yield _placed(cloud, pose)
         for view in station.views:
             name = f"station {number}, {view.camera}, image {view.number}"
             writer.image(name, guid, pose * view.T_camera_platform.inv(), view)

@@ -21,13 +21,13 @@ from lrfcal_lib.judge.uncertainty import COLUMNS, chain_of
 from lrfcal_lib.measure.pairs import (
     COARSE,
     FINE,
+    Pair,
     Surface,
-    agreement,
     candidates,
     fitted,
     surface_of,
 )
-from lrfcal_lib.measure.pose_graph import Edge, connected, solved
+from lrfcal_lib.measure.pose_graph import connected, solved
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 
 # Of pairs that were drawn (tests/rooms.py, other seeds than any test): right ones have an overlap
@@ -40,36 +40,6 @@ LEAST_HELD = 0.03  # share of patches that hold a station in its loosest directi
 MOST_SIGMA = (np.radians(0.3), 0.015)  # of the turn and shift of a pair that is joined
 GREATEST_MISS = 5.0  # sigma of a pair in a loop
 ALLOWED_MISS = (np.radians(0.2), 0.01)  # and at least, of turn and shift
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Two stations that were joined.
-
-    Attributes
-    ----------
-    first, second : int
-    T_first_second : RigidTransform
-    covariance : ndarray, shape (6, 6)
-        Of its turn and shift in the first one's frame, without errors of the calibration.
-    by_rig : ndarray, shape (6, 13)
-        What errors of the calibration do to it, see :class:`pairs.Fit`.
-    overlap : float
-        Share of the surfaces of the station that saw less which the other saw too.
-    against : float
-        Share of surfaces that stand where the other looked through.
-    rms : float
-        Of the distances between their surfaces, metres.
-    """
-
-    first: int
-    second: int
-    T_first_second: RigidTransform
-    covariance: np.ndarray
-    by_rig: np.ndarray
-    overlap: float
-    against: float
-    rms: float
 
 
 @dataclass(frozen=True)
@@ -98,7 +68,7 @@ class Joined:
 
         That is the error which loops through it leave there; 0 without loops.
         """
-        miss = _edge(pair).miss(self.T_world_station)
+        miss = pair.miss(self.T_world_station)
         return float(np.linalg.norm(miss[:3])), float(np.linalg.norm(miss[3:]))
 
     def covariance_of(self, station: int) -> np.ndarray:
@@ -174,66 +144,46 @@ def join_pair(
     """
     tried = candidates(*coarse)
     good = [c for c in tried if c.overlap > LEAST_OVERLAP and c.against < MOST_AGAINST]
+    if not tried:
+        words = "they have no two directions of walls in common"
+        return _problem(names, ProblemKind.NO_OVERLAP, words)
     if not good:
-        return _apart(names, tried)
+        best = max(tried, key=lambda c: c.overlap)
+        return _problem(
+            names,
+            ProblemKind.NO_OVERLAP,
+            f"they do not overlap enough: at best {100 * best.overlap:.0f} % of the surfaces fall "
+            f"together, while {100 * best.against:.0f} % of what one saw stands where the other "
+            "looked through",
+        )
     best = good[0]
     for other in tried:
         as_much = other.overlap > RIVAL * best.overlap and other.against < DOUBTFUL
         if other is not best and as_much:
-            return _ambiguous(names, best, other)
-    fit = fitted(fine[0], fine[1], best.T_first_second)
-    sigma = np.sqrt(np.linalg.eigvalsh(fit.covariance[3:, 3:])[-1])
-    turn_sigma = np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1])
-    if fit.held < LEAST_HELD or turn_sigma > MOST_SIGMA[0] or sigma > MOST_SIGMA[1]:
-        return _loose(names, fit)
-    final = agreement(fine[0], fine[1], fit.T_first_second)
-    return Pair(
-        first=names[0],
-        second=names[1],
-        T_first_second=fit.T_first_second,
-        covariance=fit.covariance,
-        by_rig=fit.by_rig,
-        overlap=final.overlap,
-        against=final.against,
-        rms=fit.rms,
-    )
-
-
-def _apart(names, tried):
-    """The Problem of two stations whose surfaces fall together nowhere."""
-    kind = ProblemKind.NO_OVERLAP
-    if not tried:
-        return _problem(names, kind, "they have no two directions of walls in common")
-    best = max(tried, key=lambda c: c.overlap)
-    words = (
-        f"they do not overlap enough: at best {100 * best.overlap:.0f} % of the surfaces fall "
-        f"together, while {100 * best.against:.0f} % of what one saw stands where the other "
-        "looked through"
-    )
-    return _problem(names, kind, words)
-
-
-def _ambiguous(names, best, other):
-    """The Problem of two stations that fit together in two ways."""
-    apart = best.T_first_second.inv() * other.T_first_second
-    words = (
-        f"they fit together in two ways, {np.linalg.norm(apart.translation):.2f} m and "
-        f"{np.degrees(apart.rotation.magnitude()):.0f} deg apart (overlap "
-        f"{100 * best.overlap:.0f} % and {100 * other.overlap:.0f} %): the scene repeats itself "
-        "or is symmetric"
-    )
-    return _problem(names, ProblemKind.AMBIGUOUS, words)
-
-
-def _loose(names, fit):
-    """The Problem of two stations of which nothing holds one in some direction."""
-    x, y, z = fit.loose
-    words = (
-        f"nothing holds the second along ({x:.2f}, {y:.2f}, {z:.2f}) of the first, where "
-        f"{100 * fit.held:.1f} % of the surfaces stand across: a corridor, or too little of both "
-        "in view"
-    )
-    return _problem(names, ProblemKind.AMBIGUOUS, words)
+            apart = best.T_first_second.inv() * other.T_first_second
+            return _problem(
+                names,
+                ProblemKind.AMBIGUOUS,
+                f"they fit together in two ways, {np.linalg.norm(apart.translation):.2f} m and "
+                f"{np.degrees(apart.rotation.magnitude()):.0f} deg apart (overlap "
+                f"{100 * best.overlap:.0f} % and {100 * other.overlap:.0f} %): the scene repeats "
+                "itself or is symmetric",
+            )
+    pair = fitted(names, *fine, best.T_first_second)
+    sigma = [
+        np.linalg.eigvalsh(C)[-1] ** 0.5
+        for C in (pair.covariance[:3, :3], pair.covariance[3:, 3:])
+    ]
+    if pair.held < LEAST_HELD or np.any(np.array(sigma) > MOST_SIGMA):
+        x, y, z = pair.loose
+        return _problem(
+            names,
+            ProblemKind.AMBIGUOUS,
+            f"nothing holds the second along ({x:.2f}, {y:.2f}, {z:.2f}) of the first, where "
+            f"{100 * pair.held:.1f} % of the surfaces stand across: a corridor, or too little of "
+            "both in view",
+        )
+    return pair
 
 
 def _problem(names, kind, words):
@@ -241,19 +191,14 @@ def _problem(names, kind, words):
     return Problem(Stage.STATIONS, kind, f"stations {first} and {second}: {words}")
 
 
-def _edge(pair):
-    """A Pair as the pose graph has it."""
-    return Edge(pair.first, pair.second, pair.T_first_second, pair.covariance)
-
-
 def _joined(numbers, pairs, problems, of_rig):
     """The Joined of the largest group of stations, without pairs that loops contradict."""
-    groups = [connected(map(_edge, pairs), number) for number in numbers]
+    groups = [connected(pairs, number) for number in numbers]
     largest = max(groups, key=len)
     reference = min(largest)
     pairs = [pair for pair in pairs if pair.first in largest]
     while True:
-        poses, response = solved([_edge(pair) for pair in pairs], reference)
+        poses, response = solved(pairs, reference)
         covariance = _covariance(pairs, response, of_rig)
         joined = Joined(poses, covariance, tuple(pairs), tuple(problems))
         worst = max(pairs, key=lambda pair: _excess(joined, pair), default=None)
@@ -267,7 +212,7 @@ def _joined(numbers, pairs, problems, of_rig):
         )
         names = (worst.first, worst.second)
         problems.append(_problem(names, ProblemKind.CONTRADICTS, words))
-        if len(connected(map(_edge, pairs), reference)) < len(poses):
+        if len(connected(pairs, reference)) < len(poses):
             return _joined(numbers, pairs, problems, of_rig)
     for number in sorted(set(numbers) - set(poses)):
         words = (
@@ -289,7 +234,7 @@ def _covariance(pairs, response, of_rig):
 
 def _excess(joined, pair):
     """By how much a pair misses the poses of all, as a share of what is allowed."""
-    miss = _edge(pair).miss(joined.T_world_station)
+    miss = pair.miss(joined.T_world_station)
     allowed = GREATEST_MISS * np.sqrt(np.diag(pair.covariance))
     allowed = np.maximum(allowed, np.repeat(ALLOWED_MISS, 3))
     return float(np.max(np.abs(miss) / allowed))
@@ -310,7 +255,7 @@ def advice(joined: Joined) -> list[str]:
             "both see, at most 1 m and 40 deg from each."
         )
     for pair in joined.pairs:
-        others = [_edge(other) for other in joined.pairs if other is not pair]
+        others = [other for other in joined.pairs if other is not pair]
         if pair.second not in connected(others, pair.first):
             sentences.append(
                 f"Nothing checks how stations {pair.first} and {pair.second} lie: record one more "

@@ -1,10 +1,10 @@
 """Flat surfaces of a scanned cloud: planes that grow cell by cell as long as they stay flat."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import binary_erosion, label
-from scipy.spatial import KDTree
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -14,9 +14,8 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane
 
 SEED = 0.15  # metres about a point, where a plane begins
 CELL = 0.1  # metres, side of the cells by which it grows
-BENT = (
-    0.003  # metres by which a cell may be off, beside its noise: a picture stands 10 mm out
-)
+# metres by which a cell may be off, beside its noise: a picture stands 10 mm out
+BENT = 0.003
 LIMIT = 3.0  # standard deviations of the mean of a cell
 FEWEST = 60  # points of a surface
 IN_CELL = 3  # points that make a cell
@@ -42,62 +41,64 @@ def planes_of(cloud: Cloud, rig: CalibratedRig) -> tuple[list[Feature], np.ndarr
         The number of the plane that a point lies on, -1 for none.
     """
     of_point = np.full(len(cloud.points), -1)
-    tree = KDTree(cloud.points)
     planes: list[Feature] = []
-    for seed in range(0, len(cloud.points), max(1, len(cloud.points) // SEEDS)):
-        if of_point[seed] >= 0 or not np.isfinite(cloud.normals[seed]).all():
+    smooth = np.isfinite(cloud.normals).all(axis=1)
+    free = np.flatnonzero(smooth)
+    points = cloud.points[free]
+    normals = cloud.normals[free]
+    for seed in range(0, len(of_point), max(1, len(of_point) // SEEDS)):
+        if of_point[seed] >= 0 or not smooth[seed]:
             continue
-        try:
-            surface = _grown(cloud, tree, seed, of_point < 0)
-        except DegenerateGeometry:
-            continue
+        surface = free[_grown(points, normals, cloud.points[seed], cloud.normals[seed])]
         if len(surface) >= FEWEST:
             of_point[surface] = len(planes)
             planes.append(_fitted(cloud, surface, rig))
+            free = free[of_point[free] < 0]
+            points = cloud.points[free]
+            normals = cloud.normals[free]
     return planes, of_point
 
 
-def _grown(cloud, tree, seed, free):
-    """Rows of the free points of the flat surface about a point."""
-    start = np.array(tree.query_ball_point(cloud.points[seed], SEED))
-    alike = cloud.normals[start] @ cloud.normals[seed] > np.cos(ALIKE)
-    surface = start[alike & free[start]]
-    for _ in range(ROUNDS):
-        if len(surface) < FEWEST / 2:
-            return surface
-        inner = cloud.points[_inner(cloud, surface)]
-        normal, offset, _ = fit_plane(inner)
-        miss = cloud.points @ normal - offset
-        sigma = robust_sigma(inner @ normal - offset)
-        facing = np.abs(cloud.normals @ normal) > np.cos(ALIKE)
-        near = np.flatnonzero(free & facing & (np.abs(miss) < TUKEY * sigma))
-        before = surface
-        points = np.vstack([cloud.points[near], cloud.points[seed]])
-        surface = near[_connected(points, normal, miss[near], sigma)]
-        if len(surface) == len(before):
-            break
+def _grown(points, normals, seed, facing):
+    """Rows of the flat surface about a point (3,) with this normal (3,)."""
+    alike = normals @ facing > np.cos(ALIKE)
+    near = np.linalg.norm(points - seed, axis=1) < SEED
+    surface = np.flatnonzero(alike & near)
+    with suppress(DegenerateGeometry):
+        for _ in range(ROUNDS):
+            if len(surface) < FEWEST / 2:
+                break
+            inner = points[_inner(points, surface)]
+            normal, offset, _ = fit_plane(inner)
+            sigma = robust_sigma(inner @ normal - offset)
+            miss = points @ normal - offset
+            alike = np.abs(normals @ normal) > np.cos(ALIKE)
+            near = np.flatnonzero(alike & (np.abs(miss) < TUKEY * sigma))
+            with_seed = np.vstack([points[near], seed])
+            before = len(surface)
+            surface = near[_connected(with_seed, normal, miss[near], sigma)]
+            if len(surface) == before:
+                break
     return surface
 
 
 def _connected(points, normal, miss, sigma):
-    """Which points (n, 3) near a plane, the last of them the seed, are in the cells about the seed
+    """Which points (n, 3) near a plane, without the last of them, are in the cells about the last
     that lie on the plane; `miss` is (n - 1,).
     """
-    place, count = _cells(points, normal)
-    seed = tuple(place[-1])
-    place = tuple(place[:-1].T)
-    count[seed] -= 1
-    total = np.zeros(count.shape)
-    np.add.at(total, place, miss)
-    mean = total / np.maximum(count, 1)
-    allowed = BENT + LIMIT * sigma / np.sqrt(np.maximum(count, 1))
-    numbers, _ = label((count >= IN_CELL) & (np.abs(mean) < allowed))
-    return (numbers[place] == numbers[seed]) & (numbers[seed] > 0)
+    cell, shape = _cells(points, normal)
+    size = np.prod(shape)
+    count = np.maximum(np.bincount(cell[:-1], minlength=size), 1)
+    mean = np.bincount(cell[:-1], miss, minlength=size) / count
+    allowed = BENT + LIMIT * sigma / np.sqrt(count)
+    flat = (count >= IN_CELL) & (np.abs(mean) < allowed)
+    part = label(flat.reshape(shape))[0].ravel()[cell]
+    return (part[:-1] == part[-1]) & (part[-1] > 0)
 
 
 def _fitted(cloud, surface, rig):
     """The plane of a surface, less certain where it is all rim."""
-    inner = _inner(cloud, surface)
+    inner = _inner(cloud.points, surface)
     plane = fit_feature(cloud, inner, rig)
     if len(inner) < len(surface):
         return plane
@@ -106,22 +107,24 @@ def _fitted(cloud, surface, rig):
     return replace(plane, noise=noise)
 
 
-def _inner(cloud, surface):
+def _inner(points, surface):
     """Rows of a surface without the cells at its rim, where the spot meets what is beside it; all
     where little would be left.
     """
-    points = cloud.points[surface]
-    place, count = _cells(points, fit_plane(points)[0])
-    inside = binary_erosion(np.pad(count, 1) >= IN_CELL, np.ones((3, 3)))[1:-1, 1:-1]
-    inner = surface[inside[tuple(place.T)]]
+    part = points[surface]
+    cell, shape = _cells(part, fit_plane(part)[0])
+    full = np.bincount(cell, minlength=np.prod(shape)) >= IN_CELL
+    inside = binary_erosion(full.reshape(shape), np.ones((3, 3)))
+    inner = surface[inside.ravel()[cell]]
     return inner if len(inner) >= FEWEST else surface
 
 
 def _cells(points, normal):
-    """Cells (n, 2) of points (n, 3) along a plane, and how many points are in each."""
+    """Numbers (n,) of the cells of points (n, 3) along a plane, and how many cells there are in
+    both directions.
+    """
     across = np.linalg.svd(normal[None])[2][1:]
     cell = np.rint(points @ across.T / CELL).astype(int)
     cell -= cell.min(axis=0)
-    count = np.zeros(cell.max(axis=0) + 1, int)
-    np.add.at(count, tuple(cell.T), 1)
-    return cell, count
+    shape = tuple(cell.max(axis=0) + 1)
+    return np.ravel_multi_index(tuple(cell.T), shape), shape

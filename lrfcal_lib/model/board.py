@@ -106,12 +106,11 @@ def outline_lines(corners: ArrayLike) -> np.ndarray:
         Row i from corner i to i + 1.
     """
     corners = np.asarray(corners, float)
-    following = np.roll(corners, -1, axis=0)
-    along = following - corners
-    twice_area = np.sum(corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1])
-    normal = np.sign(twice_area) * np.stack([along[:, 1], -along[:, 0]], axis=1)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return np.column_stack([normal, -np.sum(normal * corners, axis=1)])
+    points = np.column_stack([corners, np.ones(len(corners))])
+    lines = cross(points, np.roll(points, -1, axis=0))
+    twice_area = lines[:, 2].sum()
+    length = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    return -np.sign(twice_area) * lines / length
 
 
 def corners_of_lines(lines: ArrayLike) -> np.ndarray:

@@ -1,9 +1,8 @@
 """Pinhole camera with lens distortion: projection, undistortion, straight lines in pixels."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -67,13 +66,9 @@ class CameraModel:
         covariance : ndarray, shape (9, 9), optional
         rms_px : float, optional
         """
-        matrix: dict[str, Any] = dict(
-            zip(INTRINSIC_NAMES[:4], map(float, values[:4]), strict=True)
-        )
-        distortion = np.asarray(values[4:9], float)
-        return replace(
-            self, **matrix, distortion=distortion, covariance=covariance, rms_px=rms_px
-        )
+        fx, fy, cx, cy, *distortion = map(float, values)
+        size = self.width, self.height
+        return CameraModel(*size, fx, fy, cx, cy, np.array(distortion), covariance, rms_px)
 
 
 def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
@@ -90,11 +85,14 @@ def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2)
         NaN where z <= 0.
     """
-    x, y, z = np.moveaxis(np.asarray(p_camera, float), -1, 0)
-    z = np.where(z > 0, z, np.nan)
-    u = model.fx * x / z + model.cx
-    v = model.fy * y / z + model.cy
-    return np.stack([u, v], axis=-1)
+    return _before(p_camera) * [model.fx, model.fy] + [model.cx, model.cy]
+
+
+def _before(p_camera):
+    """Normalised coordinates ``(x / z, y / z)`` of points, NaN where z <= 0."""
+    p_camera = np.asarray(p_camera, float)
+    z = p_camera[..., 2:]
+    return p_camera[..., :2] / np.where(z > 0, z, np.nan)
 
 
 def pinhole_jacobian(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
@@ -206,9 +204,7 @@ def project(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2)
         NaN where z <= 0.
     """
-    p_camera = np.asarray(p_camera, float)
-    z = np.where(p_camera[..., 2:] > 0, p_camera[..., 2:], np.nan)
-    distorted = distort(p_camera[..., :2] / z, model.distortion)
+    distorted = distort(_before(p_camera), model.distortion)
     return distorted * [model.fx, model.fy] + [model.cx, model.cy]
 
 

@@ -92,26 +92,25 @@ class SourceFrame:
         metres.
         """
         p_platform = lrf_to_platform(p_lrf, self._turn(pitch), self.T_head_lrf)
-        if self.mount == "platform":
-            return p_platform
-        return self.T_head_lrf.inv().apply(p_platform)
+        return self._from_platform.apply(p_platform)
 
     def rotation(self, pitch: np.ndarray) -> np.ndarray:
         """Rotation matrices (n, 3, 3) from the LRF at some true pitch (n,) to this frame."""
-        head = self.T_head_lrf.rotation
         turn = Rotation.from_rotvec(np.multiply.outer(self._turn(pitch), TILT_AXIS))
-        R_platform_lrf = (turn * head).as_matrix()
-        if self.mount == "platform":
-            return R_platform_lrf
-        return head.as_matrix().T @ R_platform_lrf
+        R_platform_lrf = turn * self.T_head_lrf.rotation
+        return (self._from_platform.rotation * R_platform_lrf).as_matrix()
 
     def by_pitch(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
         """Derivative (n, 3) of :meth:`apply` by the pitch, metres a radian."""
         p_platform = tilt(self.T_head_lrf.apply(p_lrf), self._turn(pitch))
-        velocity = np.cross(TILT_AXIS, p_platform)
+        return self._from_platform.rotation.apply(np.cross(TILT_AXIS, p_platform))
+
+    @property
+    def _from_platform(self):
+        """The transform to this frame while the head stands at the pitch of the image."""
         if self.mount == "platform":
-            return velocity
-        return self.T_head_lrf.rotation.apply(velocity, inverse=True)
+            return RigidTransform.identity()
+        return self.T_head_lrf.inv()
 
     def _turn(self, pitch):
         """By how much the head turns from where the points of this frame are taken to be seen."""

@@ -9,6 +9,7 @@ from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
+Array = np.ndarray
 LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 ROUGH_NOISE = 1e-4 * np.eye(
     3
@@ -22,63 +23,56 @@ def thin(rows: np.ndarray, count: int) -> np.ndarray:
     return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
 
 
-def check_finite(record, whose="", missing=()):
-    """Refuse a record with a NaN or an infinity in an array; those named in `missing` may."""
-    for name, value in vars(record).items():
-        if name in missing or not isinstance(value, np.ndarray) or value.dtype.kind != "f":
-            continue
-        bad = ~np.isfinite(value)
-        if bad.any():
-            row = np.argwhere(bad)[0, 0]
-            raise ValueError(
-                f"{name}{whose} holds {bad.sum()} values that are not finite, the first in row "
-                f"{row} ({value[row].ravel()[:3]}): leave such observations out"
-            )
+def rows(group: str, *shape: int, default=0.0):
+    """A field of arrays with a row for each member of a group, which is as long as its first field.
 
-
-def rows(*shape, of, each=0.0):
-    """A field of arrays with a row for each member of a group.
-
-    `each` row is this by default, None: its number. Of groups of which nothing is given there are
-    no rows.
+    Where it is not given, every row is the default; None: the row's number.
     """
-    return field(default=None, metadata={"shape": shape, "of": of, "each": each})
+    metadata = {"group": group, "shape": shape, "default": default}
+    return field(default=None, metadata=metadata)
 
 
-class _Groups:
-    """Arrays in groups of equal length; the first word of a field's name tells its group."""
+class _Grouped:
+    """Arrays in groups of equal length; every field of :func:`rows` says which one is its."""
 
-    def fill(self, **counts):
-        """Give every array that is missing its default, for so many members of each group."""
+    def complete(self, whose="", gaps=()):
+        """Give missing arrays their default, and refuse what is not finite but in `gaps`."""
+        counts: dict[str, int] = {}
         for f in fields(self):
-            if f.metadata and getattr(self, f.name) is None:
-                shape, of, each = f.metadata.values()
-                n = counts.get(of, 0)
-                value = np.arange(n)
-                if each is not None:
-                    value = np.broadcast_to(each, (n, *shape)).copy()
+            if not f.metadata:
+                continue
+            group, shape, default = f.metadata.values()
+            value = getattr(self, f.name)
+            if value is None:
+                count = counts.get(group, 0)
+                value = np.arange(count)
+                if default is not None:
+                    value = np.broadcast_to(default, (count, *shape)).copy()
                 object.__setattr__(self, f.name, value)
-
-    def group(self, name):
-        """Fields of one group of observations: dict of arrays without the group's prefix."""
-        prefix = f"{name}_"
-        out = {}
-        for f in fields(self):
-            if f.name.startswith(prefix):
-                out[f.name.removeprefix(prefix)] = getattr(self, f.name)
-        return out
+            counts.setdefault(group, value.shape[value.ndim - len(shape) - 1])
+        for name, value in vars(self).items():
+            if name in gaps or not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+                continue
+            bad = ~np.isfinite(value)
+            if bad.any():
+                row = np.argwhere(bad)[0, 0]
+                raise ValueError(
+                    f"{name}{whose} holds {bad.sum()} values that are not finite, the first in row "
+                    f"{row} ({value[row].ravel()[:3]}): leave such observations out"
+                )
 
     def keep(self, **masks):
         """The observations with some rows of groups left out, e.g. ``keep(view=mask)``."""
         changed = {}
-        for name, mask in masks.items():
-            for key, value in self.group(name).items():
-                changed[f"{name}_{key}"] = value[mask]
+        for f in fields(self):
+            group = f.metadata.get("group")
+            if group in masks:
+                changed[f.name] = getattr(self, f.name)[masks[group]]
         return replace(self, **changed)
 
 
 @dataclass(frozen=True)
-class CameraObservations(_Groups):
+class CameraObservations(_Grouped):
     """Paired observations of the board by the LRF and one camera, stacked over all placements.
 
     Points are in the *source* frame, the frame the camera is fixed to as seen from the LRF:
@@ -160,43 +154,37 @@ class CameraObservations(_Groups):
     model: CameraModel
     camera: str = "camera"
     source: str = "lrf"
-    crossing_points: np.ndarray = rows(3, of="crossing")
-    crossing_covariance: np.ndarray = rows(3, 3, of="crossing", each=ROUGH_NOISE)
-    crossing_lines: np.ndarray = rows(3, of="nothing")
-    crossing_line_sigma: np.ndarray = rows(of="crossing", each=0.5)
-    crossing_placement: np.ndarray = rows(of="crossing", each=None)
-    crossing_edge: np.ndarray = rows(of="crossing", each="")
-    crossing_pitch: np.ndarray = rows(of="crossing")
-    crossing_across: np.ndarray = rows(of="crossing", each=False)
-    crossing_radius: np.ndarray = rows(of="crossing", each=0.005)
-    crossing_background: np.ndarray = rows(of="crossing")
-    plane_points: np.ndarray = rows(3, of="plane")
-    plane_covariance: np.ndarray = rows(3, 3, of="plane", each=ROUGH_NOISE)
-    plane_placement: np.ndarray = rows(of="plane", each=None)
-    plane_pitch: np.ndarray = rows(of="plane")
-    placements: np.ndarray = rows(of="board", each=None)
-    board_poses: np.ndarray = rows(4, 4, of="board")
-    board_covariance: np.ndarray = rows(6, 6, of="board")
-    pattern_points: np.ndarray = rows(3, of="pattern")
-    pattern_pixels: np.ndarray = None
+    crossing_points: Array = rows("crossing", 3)
+    crossing_covariance: Array = rows("crossing", 3, 3, default=ROUGH_NOISE)
+    crossing_lines: Array = rows("crossing", 3, default=np.nan)
+    crossing_line_sigma: Array = rows("crossing", default=0.5)
+    crossing_placement: Array = rows("crossing", default=None)
+    crossing_edge: Array = rows("crossing", default="")
+    crossing_pitch: Array = rows("crossing")
+    crossing_across: Array = rows("crossing", default=False)
+    crossing_radius: Array = rows("crossing", default=0.005)
+    crossing_background: Array = rows("crossing")
+    plane_points: Array = rows("plane", 3)
+    plane_covariance: Array = rows("plane", 3, 3, default=ROUGH_NOISE)
+    plane_placement: Array = rows("plane", default=None)
+    plane_pitch: Array = rows("plane")
+    board_poses: Array = rows("board", 4, 4)
+    placements: Array = rows("board", default=None)
+    board_covariance: Array = rows("board", 6, 6)
+    pattern_points: Array = rows("pattern", 3)
+    pattern_pixels: Array = rows("board", default=np.nan)
     pattern_sigma_px: float = 0.2
-    scene_points: np.ndarray = rows(3, of="scene")
-    scene_covariance: np.ndarray = rows(3, 3, of="scene", each=ROUGH_NOISE)
-    scene_pixels: np.ndarray = rows(2, of="nothing")
-    scene_sigma_px: np.ndarray = rows(of="scene", each=0.5)
-    scene_placement: np.ndarray = rows(of="scene", each=None)
+    scene_points: Array = rows("scene", 3)
+    scene_covariance: Array = rows("scene", 3, 3, default=ROUGH_NOISE)
+    scene_pixels: Array = rows("scene", 2, default=np.nan)
+    scene_sigma_px: Array = rows("scene", default=0.5)
+    scene_placement: Array = rows("scene", default=None)
 
     def __post_init__(self):
-        counts = {}
-        for group in ("crossing", "plane", "pattern", "scene"):
-            points = getattr(self, f"{group}_points")
-            counts[group] = 0 if points is None else points.shape[-2]
-        boards = 0 if self.board_poses is None else self.board_poses.shape[-3]
-        self.fill(board=boards, **counts)
-        if self.pattern_pixels is None:
-            unseen = np.full((self.board_poses.shape[-3], counts["pattern"], 2), np.nan)
+        self.complete(f" of camera '{self.camera}'", gaps=("pattern_pixels",))
+        if self.pattern_pixels.ndim == 1:  # none was seen
+            unseen = np.full((len(self.placements), len(self.pattern_points), 2), np.nan)
             object.__setattr__(self, "pattern_pixels", unseen)
-        check_finite(self, f" of camera '{self.camera}'", missing=("pattern_pixels",))
 
     @property
     def all_placements(self):
@@ -233,23 +221,16 @@ class CameraObservations(_Groups):
     def select(self, placements):
         """The observations of some placements (numbers) only."""
         wanted = list(placements)
-        out = self.keep(
+        return self.keep(
             crossing=np.isin(self.crossing_placement, wanted),
             plane=np.isin(self.plane_placement, wanted),
             scene=np.isin(self.scene_placement, wanted),
-        )
-        known = np.isin(self.placements, wanted)
-        return replace(
-            out,
-            placements=self.placements[known],
-            board_poses=self.board_poses[known],
-            board_covariance=self.board_covariance[known],
-            pattern_pixels=self.pattern_pixels[known],
+            board=np.isin(self.placements, wanted),
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlatformObservations(_Groups):
+class PlatformObservations(_Grouped):
     """Edge points and face points of boards swept by the pitching LRF.
 
     Attributes
@@ -264,19 +245,18 @@ class PlatformObservations(_Groups):
         1 or 2: the two perpendicular edges of equations (7) to (14).
     """
 
-    edge_points: np.ndarray = rows(3, of="edge")
-    edge_covariance: np.ndarray = rows(3, 3, of="edge")
-    edge_pitch: np.ndarray = rows(of="edge")
-    edge_placement: np.ndarray = rows(of="edge", each=0)
-    edge_number: np.ndarray = rows(of="edge", each=1)
-    face_points: np.ndarray = rows(3, of="face")
-    face_covariance: np.ndarray = rows(3, 3, of="face")
-    face_pitch: np.ndarray = rows(of="face")
-    face_placement: np.ndarray = rows(of="face", each=0)
+    edge_points: Array = rows("edge", 3)
+    edge_covariance: Array = rows("edge", 3, 3)
+    edge_pitch: Array = rows("edge")
+    edge_placement: Array = rows("edge", default=0)
+    edge_number: Array = rows("edge", default=1)
+    face_points: Array = rows("face", 3)
+    face_covariance: Array = rows("face", 3, 3)
+    face_pitch: Array = rows("face")
+    face_placement: Array = rows("face", default=0)
 
     def __post_init__(self):
-        self.fill()
-        check_finite(self)
+        self.complete()
         if not np.isin(self.edge_number, (1, 2)).all():
             found = np.unique(self.edge_number)
             raise ValueError(
@@ -284,11 +264,8 @@ class PlatformObservations(_Groups):
             )
 
 
-GROUPS = ("face", "beam", "view")
-
-
 @dataclass(frozen=True, kw_only=True)
-class JointObservations(_Groups):
+class JointObservations(_Grouped):
     """Ranges on boards, beams about their edges and board poses in images, of all placements.
 
     Every group has an array `<group>_placement` of indices into `placements`. Any group may be
@@ -335,45 +312,46 @@ class JointObservations(_Groups):
         Of the intrinsics of every camera. Zeros (exactly known) by default.
     """
 
-    placements: np.ndarray
-    direction: np.ndarray
-    middle: np.ndarray
-    face_range: np.ndarray = rows(of="face")
-    face_bearing: np.ndarray = rows(of="face")
-    face_pitch: np.ndarray = rows(of="face")
-    face_sigma: np.ndarray = rows(of="face")
-    face_placement: np.ndarray = rows(of="face", each=0)
-    beam_bearing: np.ndarray = rows(of="beam")
-    beam_pitch: np.ndarray = rows(of="beam")
-    beam_hit: np.ndarray = rows(of="beam", each=False)
-    beam_edge: np.ndarray = rows(of="beam", each=0)
-    beam_radius: np.ndarray = rows(of="beam")
-    beam_background: np.ndarray = rows(of="beam")
-    beam_step: np.ndarray = rows(of="beam")
-    beam_placement: np.ndarray = rows(of="beam", each=0)
-    view_camera: np.ndarray = rows(of="view", each=0)
-    view_pitch: np.ndarray = rows(of="view")
-    view_pose: np.ndarray = rows(4, 4, of="view")
-    view_covariance: np.ndarray = rows(6, 6, of="view")
-    view_placement: np.ndarray = rows(of="view", each=0)
+    placements: Array
+    direction: Array
+    middle: Array
+    face_range: Array = rows("face")
+    face_bearing: Array = rows("face")
+    face_pitch: Array = rows("face")
+    face_sigma: Array = rows("face")
+    face_placement: Array = rows("face", default=0)
+    beam_bearing: Array = rows("beam")
+    beam_pitch: Array = rows("beam")
+    beam_hit: Array = rows("beam", default=False)
+    beam_edge: Array = rows("beam", default=0)
+    beam_radius: Array = rows("beam")
+    beam_background: Array = rows("beam")
+    beam_step: Array = rows("beam")
+    beam_placement: Array = rows("beam", default=0)
+    view_pose: Array = rows("view", 4, 4)
+    view_camera: Array = rows("view", default=0)
+    view_pitch: Array = rows("view")
+    view_covariance: Array = rows("view", 6, 6)
+    view_placement: Array = rows("view", default=0)
     edges: tuple
-    corners: np.ndarray
+    corners: Array
     cameras: tuple
     mounts: tuple
     T_head_lrf: RigidTransform | None = None
-    view_lens: np.ndarray = rows(6, 9, of="view")
-    lens_covariance: np.ndarray = rows(9, 9, of="camera")
+    view_lens: Array = rows("view", 6, 9)
+    lens_covariance: Array = rows("camera", 9, 9)
 
     def __post_init__(self):
-        views = 0 if self.view_pose is None else len(self.view_pose)
-        self.fill(view=views, camera=len(self.cameras))
-        check_finite(self)
+        self.complete()
+        if len(self.lens_covariance) != len(self.cameras):
+            exact = np.zeros((len(self.cameras), LENS, LENS))
+            object.__setattr__(self, "lens_covariance", exact)
         count = len(self.placements)
-        for group in GROUPS:
-            place = getattr(self, f"{group}_placement")
+        for name in ("face_placement", "beam_placement", "view_placement"):
+            place = getattr(self, name)
             if len(place) and not 0 <= place.min() <= place.max() < count:
                 raise ValueError(
-                    f"{group}_placement are indices below {count}, got up to {place.max()}"
+                    f"{name} are indices below {count}, got up to {place.max()}"
                 )
         if len(self.face_sigma) and self.face_sigma.min() <= 0:
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
@@ -400,14 +378,21 @@ class JointObservations(_Groups):
             view_placement=np.searchsorted(kept, out.view_placement),
         )
 
+    def stretched(self, share: float):
+        """The observations with bearings stretched by a share about the middle one, pi / 2."""
+        return replace(
+            self,
+            face_bearing=np.pi / 2 + (self.face_bearing - np.pi / 2) * (1 + share),
+            beam_bearing=np.pi / 2 + (self.beam_bearing - np.pi / 2) * (1 + share),
+        )
+
     def with_cameras(self, names):
         """The observations of some cameras only."""
         kept = [i for i, name in enumerate(self.cameras) if name in names]
-        out = self.keep(view=np.isin(self.view_camera, kept))
+        out = self.keep(view=np.isin(self.view_camera, kept), camera=kept)
         return replace(
             out,
             view_camera=np.searchsorted(kept, out.view_camera),
-            lens_covariance=self.lens_covariance[kept],
             cameras=tuple(self.cameras[i] for i in kept),
             mounts=tuple(self.mounts[i] for i in kept),
         )

@@ -1,12 +1,10 @@
-"""Figures of calibrations beside each other: where they differ, and how a rig changed."""
-
-from collections.abc import Sequence
+"""Figures of calibrations beside each other: where they differ."""
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 
-from lrfcal_lib.plots.colors import COLORS, series
+from lrfcal_lib.plots.colors import COLORS
 
 LONGEST = 0.08  # of the image's width, the arrow of the largest shift
 LEAST = 0.01  # pixels that such an arrow stands for
@@ -66,36 +64,3 @@ def field_shifts(ax: Axes, at: np.ndarray, off: np.ndarray) -> QuadMesh:
     ax.set(xlabel="bearing [deg] (0: right)", ylabel="pitch [deg]")
     ax.invert_xaxis()  # as the rig sees it
     return drawn
-
-
-def beside_claims(
-    ax: Axes,
-    labels: Sequence[str],
-    values: np.ndarray,
-    claimed: np.ndarray,
-    *,
-    unit: str,
-    names: Sequence[str],
-) -> None:
-    """Differences as dots over bars of what is claimed, a group a label.
-
-    Parameters
-    ----------
-    ax
-    labels
-        Of m groups.
-    values, claimed
-        Shape (n, m): a row for each of n comparisons, the earliest to the left.
-    unit
-    names
-        Of the comparisons.
-    """
-    count = len(values)
-    for row in range(count):
-        x = np.arange(len(labels)) + (row - (count - 1) / 2) * 0.8 / count
-        bar = np.where(np.isfinite(claimed[row]), claimed[row], 0.0)
-        ax.bar(x, bar, 0.7 / count, color=COLORS["raw"], alpha=0.6)
-        ax.plot(x, values[row], "o", color=series(row), label=names[row])
-    ax.set(xticks=np.arange(len(labels)), xticklabels=labels, ylabel=f"difference [{unit}]")
-    ax.set_ylim(bottom=0)
-    ax.grid(False, axis="x")

@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle
 from scipy.special import ndtr
 
 from lrfcal_lib.plots.colors import COLORS
@@ -29,29 +29,26 @@ def plane_constraint(
     normal, distance
         Of the plane n . p = d, camera frame: a unit vector (3,), metres.
     """
-    sign = np.sign(distance) or 1.0
-    up = sign * np.asarray(normal)
+    up = np.sign(distance) * np.asarray(normal)
+    height = abs(distance)
     across = points.mean(axis=0) - origin
     across = across - up * (up @ across)
-    across = across / np.linalg.norm(across)
-    section = np.stack([across, up])
+    section = np.stack([across / np.linalg.norm(across), up])
     flat = points @ section.T
     lrf = section @ origin
-    height = sign * distance
-    first, last = flat[:, 0].min() - 0.15, flat[:, 0].max() + 0.15
+    first = flat[:, 0].min() - 0.15
+    last = flat[:, 0].max() + 0.15
     ax.plot([first, last], [height, height], color=COLORS["truth"], linewidth=2)
-    ax.text(last, height + ABOVE, "plane of the board", va="bottom", ha="right")
-    for x, y in flat[:: max(1, len(flat) // BEAMS)]:
-        ax.plot([lrf[0], x], [lrf[1], y], color=COLORS["lrf"], linewidth=0.5, alpha=0.6)
+    ax.hlines(height, 0, first, COLORS["truth"], linewidth=0.6, linestyle=":")
+    beams = np.array([[lrf, point] for point in flat[:: max(1, len(flat) // BEAMS)]])
+    ax.plot(*beams.T, color=COLORS["lrf"], linewidth=0.5, alpha=0.6)
     ax.plot(*flat.T, ".", color=COLORS["lrf"], markersize=3)
-    ax.annotate("", (0, height), (0, 0), arrowprops={"arrowstyle": "->"})
-    ax.plot(
-        [0, first], [height, height], color=COLORS["truth"], linewidth=0.6, linestyle=":"
-    )
-    ax.text(-ABOVE, height / 2, f"n, d = {height:.2f} m", va="center", ha="right")
-    ax.plot(0, 0, "s", color=COLORS["left"], markersize=8)
-    ax.text(-ABOVE, 0, "camera", va="center", ha="right", color=COLORS["left"])
     ax.plot(*lrf, "o", color=COLORS["lrf"], markersize=8)
+    ax.plot(0, 0, "s", color=COLORS["left"], markersize=8)
+    ax.annotate("", (0, height), (0, 0), arrowprops={"arrowstyle": "->"})
+    ax.text(last, height + ABOVE, "plane of the board", ha="right")
+    ax.text(-ABOVE, height / 2, f"n, d = {height:.2f} m", ha="right")
+    ax.text(-ABOVE, 0, "camera", va="center", ha="right", color=COLORS["left"])
     ax.text(lrf[0] + ABOVE, lrf[1], "LRF", va="center", color=COLORS["lrf"])
     ax.set(xlabel="along the board [m]", ylabel="along its normal [m]", aspect="equal")
     ax.set_xlim(min(0.0, first, lrf[0]) - ROOM * height, max(last, lrf[0] + ROOM * height))
@@ -67,24 +64,23 @@ def spot_over_edge(ax: Axes, radius: float, bias: float) -> None:
         Of the spot, and how far outside the edge its centre lies where the reading flips, metres.
     """
     r = 1000 * radius
+    b = 1000 * bias
     reach = ABOUT * r
-    places = {"reads the board": -0.9 * r, "flips": 1000 * bias, "reads beyond": 0.9 * r}
-    colors = (COLORS["lrf"], COLORS["fit"], COLORS["platform"])
-    height = 2.3 * r
-    ax.add_patch(Rectangle((-reach, -height / 2), reach, 3 * height, color="#d9dee3"))
+    ax.axvspan(-reach, 0, color="#d9dee3")
     ax.axvline(0, color=COLORS["truth"])
-    for row, ((words, u), color) in enumerate(zip(places.items(), colors, strict=True)):
-        at = (2 - row) * height
+    spots = (("reads beyond", 0.9 * r, "platform"), ("flips", b, "fit"))
+    for row, (words, u, role) in enumerate((*spots, ("reads the board", -0.9 * r, "lrf"))):
+        at = 2.3 * row * r
+        color = COLORS[role]
         ax.add_patch(Circle((u, at), r, color=color, alpha=0.3, linewidth=0))
         ax.plot(u, at, "+", color=color, markersize=9, markeredgewidth=1.6)
         ax.text(1.1 * reach, at, words, va="center", color=color)
-    ax.text(-0.97 * reach, 2.3 * height, "board", va="center")
-    ax.text(0.97 * reach, 2.3 * height, "beyond", va="center", ha="right")
-    ax.annotate(
-        "b", (1000 * bias, 0.5 * height), ha="center", va="center", color=COLORS["fit"]
-    )
-    ax.plot([0, 1000 * bias], [0.38 * height] * 2, color=COLORS["fit"], linewidth=2)
-    ax.set(xlim=(-reach, 2.6 * reach), ylim=(-0.6 * height, 2.6 * height), aspect="equal")
+    top = 6.2 * r
+    ax.text(-0.97 * reach, top, "board", va="center")
+    ax.text(0.97 * reach, top, "beyond", va="center", ha="right")
+    ax.plot([0, b], [0.9 * r, 0.9 * r], color=COLORS["fit"], linewidth=2)
+    ax.text(b / 2, 1.15 * r, "b", ha="center", va="center", color=COLORS["fit"])
+    ax.set(xlim=(-reach, 2.6 * reach), ylim=(-1.4 * r, 6.8 * r), aspect="equal")
     ax.set(xlabel="distance u of the beam from the edge [mm]", yticks=[])
     ax.grid(False)
 
@@ -104,13 +100,13 @@ def reading_by_distance(
     """
     u = 1000 * np.asarray(distance)
     b = 1000 * bias
-    s = 1000 * sigma
     x = np.linspace(u.min(), u.max(), 400)
-    ax.plot(x, ndtr((b - x) / s), color=COLORS["fit"], label="expected, Φ((b - u) / σ)")
-    for read, color in ((True, COLORS["lrf"]), (False, COLORS["platform"])):
-        chosen = u[hit == read]
-        words = "beams that read the board" if read else "beams that read beyond"
-        ax.plot(chosen, np.full(len(chosen), float(read)), "|", color=color, label=words)
+    expected = ndtr((b - x) / (1000 * sigma))
+    ax.plot(x, expected, color=COLORS["fit"], label="expected, Φ((b - u) / σ)")
+    label = "beams that read the board"
+    ax.plot(u[hit], 0 * u[hit] + 1, "|", color=COLORS["lrf"], label=label)
+    label = "beams that read beyond"
+    ax.plot(u[~hit], 0 * u[~hit], "|", color=COLORS["platform"], label=label)
     ax.axvline(0, color=COLORS["truth"])
     ax.axvline(b, color=COLORS["fit"], linestyle=":")
     ax.text(b, 0.5, f" b = {b:.1f} mm", color=COLORS["fit"])

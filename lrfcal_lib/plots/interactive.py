@@ -70,7 +70,7 @@ def scene_page(
     data = "null"
     if measuring is not None:
         data = json.dumps(_packed(measuring, list(shown.values()), len(traces)))
-        traces += _measured_traces(measuring)
+        traces += _measured_traces(measuring["lines"])
     layout = _layout(title, note)
     # unchecked: a check looks at every colour, 5 s
     script = f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});"
@@ -113,8 +113,8 @@ def _layout(title, note):
 def _packed(measuring, shown, first_trace):
     """What scene.js needs, as JSON holds it: arrays of numbers as text."""
     data = dict(measuring)
-    for name in ("features", "ends"):
-        data[name] = _text(measuring[name])
+    del data["lines"]
+    data["features"] = _text(measuring["features"])
     data["covariances"] = [_text(C) for C in measuring["covariances"]]
     for name in ("plane_of_point", "station_of_point"):
         data[name] = [_text(measuring[name][rows]) for rows in shown]
@@ -123,21 +123,23 @@ def _packed(measuring, shown, first_trace):
     return data
 
 
-def _measured_traces(measuring):
-    """Edges that can be picked, and the lengths that were."""
-    ends = np.asarray(measuring["ends"]).reshape(-1, 2, 3)
-    broken = np.full((len(ends), 3, 3), np.nan)
-    broken[:, :2] = ends
+def _measured_traces(lines):
+    """Edges (n, 2, 3) that can be picked, and the lengths that were."""
+    broken = np.full((len(lines), 3, 3), np.nan)
+    broken[:, :2] = lines
     edges = _trace(
         "edges", broken.reshape(-1, 3), "lines", line={"color": COLORS["fit"], "width": 3}
     )
     edges |= {"visible": "legendonly", "hoverinfo": "skip"}
-    lengths = _trace("lengths", np.zeros((0, 3)), "lines+markers")
-    lengths |= {
-        "line": {"color": "#d00", "width": 6},
-        "marker": {"color": "#d00", "size": 4},
-        "hoverinfo": "skip",
-    }
+    red = "#d00"
+    lengths = _trace(
+        "lengths",
+        np.zeros((0, 3)),
+        "lines+markers",
+        line={"color": red, "width": 6},
+        marker={"color": red, "size": 4},
+        hoverinfo="skip",
+    )
     return [edges, lengths]
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
-from matplotlib.patches import Rectangle
+from matplotlib.colors import ListedColormap
 
 from lrfcal_lib.model.board import Board, outline_lines
 from lrfcal_lib.model.camera import CameraModel, distort
@@ -24,6 +24,7 @@ BRIGHT = 150  # grey level: a picture whose brightest hundredth is darker is bri
 GAIN = 5.0  # by this factor at most
 STRETCH = 61  # points of an edge as the lens bends it
 CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}  # text about its place
+PRINT = ListedColormap(["#333333", "white"])  # of a board
 DARK = {"facecolor": "#333333", "edgecolor": "none"}  # behind white text in a picture
 
 
@@ -49,43 +50,34 @@ def range_image(
     """
     bearing = np.degrees(sweep.bearings)
     order = np.argsort(sweep.pitch, kind="stable")
-    height = np.arange(len(sweep.pitch))
-    ax.set(xlabel="bearing [deg]", ylabel="scan line", aspect="auto")
-    if np.ptp(sweep.pitch) > 0:
-        height = np.degrees(sweep.pitch)
-        ax.set(ylabel="pitch [deg]", aspect="equal")
-    drawn = ax.pcolormesh(
-        bearing, height[order], sweep.ranges[order], shading="nearest", rasterized=True
-    )
+    ranges = sweep.ranges[order]
+    height = np.degrees(sweep.pitch[order])
+    ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
+    if np.ptp(height) == 0:
+        height = np.arange(len(height))
+        ax.set(ylabel="scan line", aspect="auto")
+    drawn = ax.pcolormesh(bearing, height, ranges, shading="nearest", rasterized=True)
     if limits is None:
         ax.figure.colorbar(drawn, ax=ax, label="range [m]", shrink=0.9)
     else:
         drawn.set(clim=limits, cmap=drawn.cmap.with_extremes(over=BEYOND, under=BEYOND))
-
-    shown = np.isfinite(sweep.ranges).any(axis=0)
+    shown = np.isfinite(ranges)
+    about = bearing[1] - bearing[0]
     if mask is not None and mask.any():
-        _outlined(ax, bearing, height[order], mask[order])
-        rows = height[mask.any(axis=1)]
-        rim = [rows.min() - ABOUT, rows.max() + ABOUT]
-        if len(height) > 1:
-            ax.set_ylim(np.clip(rim, height.min(), height.max()))
-        board = bearing[mask.any(axis=0)]
-        shown &= np.abs(bearing - board.mean()) < np.ptp(board) / 2 + ABOUT
-    if shown.any():
-        step = np.ptp(bearing) / max(len(bearing) - 1, 1)
-        ax.set_xlim(bearing[shown].max() + step, bearing[shown].min() - step)
+        shown = mask[order]
+        about = ABOUT
+    lines, beams = np.nonzero(shown)
+    if len(beams):
+        ax.set_xlim(bearing[beams].max() + about, bearing[beams].min() - about)
+    if about == ABOUT and len(height) > 1:
+        on_board = shown.astype(float)
+        ax.contour(
+            bearing, height, on_board, [0.5], colors=COLORS["outlier"], linewidths=1.5
+        )
+        rim = [height[lines].min() - about, height[lines].max() + about]
+        ax.set_ylim(np.clip(rim, height[0], height[-1]))
     ax.grid(False)
     return drawn
-
-
-def _outlined(ax, bearing, height, mask):
-    """Draw the border of a mask (L, B) over bearing and height in red; of one line its beams."""
-    if len(mask) == 1:
-        on = bearing[mask[0]]
-        ax.plot(on, np.repeat(height, len(on)), ".", color=COLORS["truth"], markersize=2)
-    else:
-        looks = {"levels": [0.5], "colors": COLORS["outlier"], "linewidths": 1.5}
-        ax.contour(bearing, height, mask.astype(float), **looks)
 
 
 def scan_line(
@@ -135,7 +127,7 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
     end
         +1 for the end at the larger bearings, -1 for the other one.
     edges : sequence of ScanEdges
-        Their crossings of this line and end are drawn as upright lines.
+        One or two, whose crossings of this line and end are drawn as upright lines.
 
     Raises
     ------
@@ -147,29 +139,24 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
         where = f"scan line {line} is on the board of placement {scan.placement}"
         raise ValueError(f"no beam of {where}")
     last = on[-1] if end > 0 else on[0]
-    beams = np.arange(scan.mask.shape[1])
-    near = np.abs(beams - last) <= BESIDE
-    board = near & scan.mask[line]
-    bearing = np.degrees(scan.sweep.bearings)
-    raw = scan.sweep.ranges[line]
-    filtered = scan.filtered[line]
-    fitted = scan.fitted[line]
-    top = np.nanmax(fitted[board]) + HEADROOM
-    shown = near & (raw < top)
-    farther = near & (raw >= top)
+    near = slice(max(last - BESIDE, 0), last + BESIDE + 1)
+    bearing = np.degrees(scan.sweep.bearings[near])
+    raw = scan.sweep.ranges[line, near]
+    board = scan.mask[line, near]
+    top = scan.fitted[line, near][board].max() + HEADROOM
+    shown = raw < top
     ax.plot(bearing[shown], raw[shown], "o", color=COLORS["raw"], markersize=6, label="raw")
+    farther = raw >= top
     if farther.any():
         words = f"raw, farther: {raw[farther].min():.2f} to {raw[farther].max():.2f} m"
-        edge = np.full(farther.sum(), top)
-        ax.plot(
-            bearing[farther], edge, "^", color=COLORS["raw"], clip_on=False, label=words
-        )
-    ax.plot(bearing[board], filtered[board], "x", color=COLORS["truth"], label="filtered")
-    ax.plot(
-        bearing[board], fitted[board], color=COLORS["fit"], label="line fitted to the board"
-    )
-    for index, crossed in enumerate(edges):
-        style = ("--", "-", ":")[index % 3]
+        edge = 0 * raw[farther] + top
+        looks = {"color": COLORS["raw"], "clip_on": False, "label": words}
+        ax.plot(bearing[farther], edge, "^", **looks)
+    filtered = scan.filtered[line, near][board]
+    fitted = scan.fitted[line, near][board]
+    ax.plot(bearing[board], filtered, "x", color=COLORS["truth"], label="filtered")
+    ax.plot(bearing[board], fitted, color=COLORS["fit"], label="line fitted to the board")
+    for crossed, style in zip(edges, ("--", "-"), strict=False):
         label = crossed.variant.replace("_", " ")
         here = (crossed.line == line) & (crossed.end == end)
         for x, y, _ in crossed.points[here]:
@@ -177,7 +164,7 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
             ax.axvline(at, color=COLORS["lrf"], linestyle=style, label=label)
     ax.invert_xaxis()
     ax.set(xlabel="bearing [deg]", ylabel="range [m]")
-    ax.set_ylim(np.nanmin(raw[near]) - HEADROOM / 4, top)
+    ax.set_ylim(np.nanmin(raw) - HEADROOM / 4, top)
     ax.legend()
 
 
@@ -247,20 +234,14 @@ def picture(ax: Axes, image: np.ndarray) -> None:
     """
     brightest = max(np.quantile(image[::4, ::4], 0.99), 1.0)
     gain = np.clip(BRIGHT / brightest, 1.0, GAIN)
-    shown = gain * image
+    shown = np.clip(gain * image, 0, 255).astype(np.uint8)
     if image.ndim == 3:
-        shown = np.clip(shown[..., ::-1], 0, 255).astype(np.uint8)
+        shown = shown[..., ::-1]
     ax.imshow(shown, cmap="gray", interpolation="antialiased", vmin=0, vmax=255)
     if gain > 1:
-        ax.text(
-            0.01,
-            0.015,
-            f"brightened {gain:.1f} times",
-            color="white",
-            va="bottom",
-            bbox=DARK | {"pad": 2},
-            transform=ax.transAxes,
-        )
+        words = f"brightened {gain:.1f} times"
+        box = DARK | {"pad": 2}
+        ax.text(0.01, 0.015, words, color="white", bbox=box, transform=ax.transAxes)
     ax.set_axis_off()
 
 
@@ -286,30 +267,14 @@ def board_view(
     color = color_of(view.camera)
     drawn = []
     if view.pixels is not None:
-        ax.plot(
-            *view.pixels.T, "+", color=COLORS["filtered"], markersize=4, markeredgewidth=0.8
-        )
+        ax.plot(*view.pixels.T, "+", color=COLORS["filtered"], markersize=4, mew=0.8)
         drawn.append(view.pixels)
-    box = {
-        "facecolor": color,
-        "edgecolor": "none",
-        "boxstyle": "round,pad=0.2",
-        "alpha": 0.85,
-    }
+    box = {"facecolor": color, "edgecolor": "none", "boxstyle": "round,pad=0.2"}
+    looks: dict[str, Any] = {"color": "white", "fontsize": 8, "bbox": box, "clip_on": True}
     for edge in view.edges:
         stretch = stretch_in_image(edge, model)
-        middle = stretch.mean(axis=0)
-        ax.plot(*stretch.T, "-", color=color, linewidth=1.6)
-        ax.text(
-            middle[0],
-            middle[1],
-            edge.name,
-            color="white",
-            fontsize=8,
-            bbox=box,
-            clip_on=True,
-            **CENTRED,
-        )
+        ax.plot(*stretch.T, color=color, linewidth=1.6)
+        ax.text(*stretch.mean(axis=0), edge.name, **looks, **CENTRED)
         drawn.append(stretch)
     title = f"{view.camera}, placement {view.placement}"
     if view.rejected:
@@ -326,7 +291,7 @@ def seen_points(
     model: CameraModel,
     points: dict[str, np.ndarray],
     margin: float = 60,
-    styles: Sequence[str] = ("o", "x", "s", "+", "d", "^"),
+    styles: Sequence[str] = ("o", "x", "s"),
 ) -> None:
     """LRF points by method beside the edges of the board in the image of a view, figure 7.
 
@@ -347,19 +312,13 @@ def seen_points(
     """
     picture(ax, image)
     edges = [stretch_in_image(edge, model) for edge in view.edges]
-    label: str | None = "edge in the image"
     for stretch in edges:
-        ax.plot(*stretch.T, "-", color="white", linewidth=1.0, label=label)
-        label = None  # once
+        ax.plot(*stretch.T, color="white", linewidth=1.0)
+    if edges:
+        ax.lines[-1].set_label("edge in the image")
+    looks = {"markersize": 4.5, "markerfacecolor": "none"}
     for index, (method, uv) in enumerate(points.items()):
-        ax.plot(
-            *uv.T,
-            styles[index % len(styles)],
-            color=series(index + 1),
-            markersize=4.5,
-            markerfacecolor="none",
-            label=method,
-        )
+        ax.plot(*uv.T, styles[index], color=series(index + 1), label=method, **looks)
     ax.legend(frameon=True, framealpha=0.8, labelcolor="white", **DARK)
     _cut(ax, [*points.values(), *edges], image, margin)
     ax.set_title(f"{view.camera}, placement {view.placement}")
@@ -378,15 +337,19 @@ def _cut(ax, drawn, image, margin):
     """Limit the axes to what is drawn in them, and to the image."""
     points = np.concatenate([*drawn, np.zeros((0, 2))])
     points = points[np.isfinite(points).all(axis=1)]
-    first = np.array([-0.5, -0.5])
-    last = np.array(image.shape[1::-1]) - 0.5
     if len(points):
-        left, top = np.clip(points.min(axis=0) - margin, first, last)
-        right, bottom = np.clip(points.max(axis=0) + margin, first, last)
-    else:
-        left, top = first
-        right, bottom = last
-    ax.set(xlim=(left, right), ylim=(bottom, top))
+        last = np.array(image.shape[1::-1]) - 0.5
+        left, top = np.clip(points.min(axis=0) - margin, -0.5, last)
+        right, bottom = np.clip(points.max(axis=0) + margin, -0.5, last)
+        ax.set(xlim=(left, right), ylim=(bottom, top))
+
+
+def _lengths(ax, board, outwards, away):
+    """The lengths of a board's edges, written so many metres `away` along `outwards` (n, 2)."""
+    around = closed(board.known_corners())
+    middles = (around[1:] + around[:-1]) / 2 + away * outwards
+    for (name, length), at in zip(board.lengths().items(), middles, strict=True):
+        ax.text(*at, f"{name.upper()}\n{1000 * length:.1f} mm", **CENTRED)
 
 
 def board_plan(ax: Axes, board: Board) -> None:
@@ -399,24 +362,19 @@ def board_plan(ax: Axes, board: Board) -> None:
         With known corners.
     """
     corners = board.known_corners()
-    around = closed(corners)
-    outwards = outline_lines(corners)[:, :2]
-    ax.fill(*corners.T, color="#333333", linewidth=0)
-    if board.pattern is not None:
-        size = board.pattern.square
-        start = np.subtract(board.pattern.origin, size)
-        for row, column in np.ndindex(board.pattern.rows + 1, board.pattern.columns + 1):
-            if (row + column) % 2:
-                x, y = start + size * np.array([column, row])
-                ax.add_patch(Rectangle((x, y), size, size, color="white", linewidth=0))
-    for index, (name, length) in enumerate(board.lengths().items()):
-        ends = around[index : index + 2]
-        at = ends.mean(axis=0) + 0.03 * outwards[index]
-        x, y = ends[1] - ends[0]
-        upright = (np.degrees(np.arctan2(y, x)) + 90) % 180 - 90
-        text = f"{name.upper()} {1000 * length:.1f} mm"
-        ax.text(at[0], at[1], text, rotation=upright, rotation_mode="anchor", **CENTRED)
-    ax.update_datalim(np.vstack([corners - 0.06, corners + 0.06]))
+    ax.fill(*corners.T, color=PRINT.colors[0], linewidth=0)
+    pattern = board.pattern
+    if pattern is not None:
+        rows = np.arange(-1, pattern.rows + 1)
+        columns = np.arange(-1, pattern.columns + 1)
+        x, y = np.meshgrid(columns, rows)
+        left, low = pattern.origin
+        white = (x + y)[:-1, :-1] % 2
+        ax.pcolormesh(
+            left + pattern.square * x, low + pattern.square * y, white, cmap=PRINT
+        )
+    _lengths(ax, board, outline_lines(corners)[:, :2], 0.065)
+    ax.update_datalim(np.vstack([corners - 0.09, corners + 0.09]))
     to_scale(ax, "x [m]", "y [m]")
 
 
@@ -432,16 +390,14 @@ def outline(ax: Axes, measured, exaggerate: float = 20) -> None:
     """
     board = measured.board
     around = closed(board.known_corners())
-    ax.plot(*around.T, "-", color=COLORS["truth"])
-    for index, (name, length) in enumerate(board.lengths().items()):
+    ax.plot(*around.T, color=COLORS["truth"])
+    outwards = measured.lines[:, :2]
+    for index, spread in enumerate(measured.line_sd):
         ends = around[index : index + 2]
-        normal = measured.lines[index, :2]
-        if np.isfinite(measured.line_sd[index]):
-            away = exaggerate * measured.line_sd[index] * normal
-            band = np.vstack([ends - away, ends[::-1] + away])
-            ax.fill(*band.T, color=COLORS["fit"], alpha=0.25, linewidth=0)
-        at = ends.mean(axis=0) - 0.09 * normal
-        ax.text(at[0], at[1], f"{name}\n{1000 * length:.1f} mm", fontsize=8, **CENTRED)
+        away = exaggerate * np.nan_to_num(spread) * outwards[index]
+        band = np.vstack([ends - away, ends[::-1] + away])
+        ax.fill(*band.T, color=COLORS["fit"], alpha=0.25, linewidth=0)
+    _lengths(ax, board, outwards, -0.09)
     if board.pattern is not None:
         points = board.pattern.points()[:, :2]
         ax.plot(*points.T, "+", color=COLORS["raw"], markersize=4)

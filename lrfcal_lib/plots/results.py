@@ -10,7 +10,7 @@ from matplotlib.collections import PathCollection
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.plots.colors import COLORS, SERIES, color_of, series
+from lrfcal_lib.plots.colors import COLORS, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
 SPREAD: dict[str, Any] = {
@@ -60,16 +60,14 @@ def residual_strips(
         The quantity with its unit.
     color
     """
-    names = np.unique(placement)
-    for column, name in enumerate(names):
-        values = residuals[placement == name]
+    names, columns = np.unique(placement, return_inverse=True)
+    for column in range(len(names)):
+        values = residuals[columns == column]
         rms = np.sqrt(np.mean(values**2))
         ax.bar(column, 2 * rms, 0.8, -rms, color=color, alpha=0.2, linewidth=0)
         at = column + 0.6 * _side_by_side(len(values))
         ax.plot(at, values, ".", color=color, markersize=2.5)
     by_placement(ax, names.tolist(), label)
-    limit = 1.08 * max(np.abs(residuals).max(), 1e-12)
-    ax.set_ylim(-limit, limit)
 
 
 def pitch_offsets(
@@ -93,25 +91,13 @@ def pitch_offsets(
     """
     offset = np.degrees(offset)
     sigma = np.degrees(sigma)
-    kinds = {
-        1: (SERIES[0], "upwards"),
-        -1: (SERIES[1], "downwards"),
-        0: (COLORS["raw"], "unknown"),
-    }
-    for sign, (color, label) in kinds.items():
+    kinds = {1: "upwards", -1: "downwards", 0: "unknown"}
+    for index, (sign, label) in enumerate(kinds.items()):
         rows = np.flatnonzero(np.equal(direction, sign))
-        if rows.size:
-            values = offset[rows]
-            ax.bar(rows, values, 0.75, yerr=sigma[rows], color=color, label=label, **SPREAD)
-            ax.axhline(np.median(values), color=color, linestyle=":", linewidth=1)
+        looks = {"color": series(index), "label": label} | SPREAD
+        ax.bar(rows, offset[rows], 0.75, yerr=sigma[rows], **looks)
     by_placement(ax, placement, "pitch offset [deg]")
-    ax.legend(
-        title="head moved",
-        ncols=3,
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        borderaxespad=0.2,
-    )
+    ax.legend(title="head moved", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
 
 
 def parameter_comparison(
@@ -179,25 +165,16 @@ def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
         Of its values, with their unit.
     """
     values = table.pivot(index="method", columns="camera", values=column)
-    methods = table.method.unique()
-    cameras = table.camera.unique()
-    rows = np.arange(len(methods))
-    height = 0.8 / len(cameras)
-    for i, camera in enumerate(cameras):
-        part = values.loc[methods, camera]
-        ax.barh(
-            rows + i * height, part, 0.95 * height, label=camera, color=color_of(camera, i)
-        )
-    middle = height * (len(cameras) - 1) / 2
-    ax.set(yticks=rows + middle, yticklabels=methods, xlabel=label)
-    ax.set_ylim(len(methods) - 0.5 * height, -height)
-    mean = values.loc[methods].mean(axis=1)
+    values = values.loc[table.method.unique(), table.camera.unique()]
+    colors = [color_of(camera, i) for i, camera in enumerate(values)]
+    values.plot.barh(ax=ax, width=0.8, color=colors, xlabel=label, ylabel="")
+    ax.invert_yaxis()
+    mean = values.mean(axis=1)
     title = "no method could be judged"
     if mean.notna().any():
         title = f"smallest: {mean.idxmin()}"
+        ax.set_xlim(0, ROOM * values.max(axis=None))
     ax.set_title(title)
-    if mean.notna().any():
-        ax.set_xlim(0, ROOM * np.nanmax(values))
     ax.legend(loc="center right")
 
 
@@ -210,18 +187,20 @@ def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     misfit
         By placement; those above `WORST` times the median are drawn as outliers.
     """
-    values = np.array(list(misfit.values()))
-    rows = np.arange(len(values))
-    bad = values > WORST * max(np.median(values), 1.0)
-    ax.bar(rows, values, 0.75, color=np.where(bad, COLORS["outlier"], COLORS["lrf"]))
+    values = pd.Series(misfit)
+    bad = values > WORST * max(values.median(), 1.0)
+    colors = np.where(bad, COLORS["outlier"], COLORS["lrf"])
+    values.plot.bar(ax=ax, width=0.75, color=colors, rot=0)
     ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
-    by_placement(ax, list(misfit), "chi-square per degree of freedom")
+    ax.set(xlabel="placement", ylabel="chi-square per degree of freedom")
+    ax.grid(False, axis="x")
     if len(misfit) > 15:
-        ax.set_xticks(rows[::2], [str(name) for name in list(misfit)[::2]])
-    title = f"all placements fit alike, the worst {values.max():.1f}"
+        ax.set_xticks(ax.get_xticks()[::2])
+    ax.set_title(f"All placements fit alike, the worst {values.max():.1f}")
     if bad.any():
-        title = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
-    ax.set(ylim=(0, 1.1 * max(values.max(), 1.2)), title=title)
+        ax.set_title(
+            f"{bad.sum()} of {len(values)} placements fit much worse than the others"
+        )
 
 
 def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> None:
@@ -235,26 +214,18 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> N
     distance, residual
         Metres, shape (n,).
     """
-    residual = 1000 * np.asarray(residual)
-    ax.plot(distance, residual, ",", color=COLORS["raw"], zorder=0)
-    bins = pd.qcut(distance, BINS, labels=False, duplicates="drop")
-    parts = pd.DataFrame({"distance": distance, "residual": residual}).groupby(bins)
-    means = parts.mean()
-    error = parts.residual.std(ddof=0) / np.sqrt(parts.size())
-    ax.errorbar(
-        means.distance,
-        means.residual,
-        error,
-        fmt="o-",
-        color=COLORS["lrf"],
-        capsize=2.5,
-        label="mean and its standard error",
-    )
+    points = pd.DataFrame({"distance": distance, "residual": 1000 * np.asarray(residual)})
+    ax.plot(points.distance, points.residual, ",", color=COLORS["raw"], zorder=0)
+    bins = points.groupby(pd.qcut(points.distance, BINS, duplicates="drop"), observed=True)
+    means = bins.mean()
+    looks = {"fmt": "o-", "color": COLORS["lrf"], "capsize": 2.5}
+    error = bins.residual.sem()
+    label = "mean and its standard error"
+    ax.errorbar(means.distance, means.residual, error, label=label, **looks)
     _zero(ax.axhline)
-    limit = 1.05 * max(np.quantile(np.abs(residual), 0.995), 1e-9)
-    rms = np.sqrt(np.mean(residual**2))
+    limit = 1.05 * points.residual.abs().quantile(0.995)
     ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit))
-    ax.set_title(f"ranges: {rms:.2g} mm rms")
+    ax.set_title(f"Ranges: {np.sqrt(points.residual.pow(2).mean()):.2g} mm rms")
     ax.legend()
 
 
@@ -275,23 +246,14 @@ def residuals_by_region(
     name
         Of the camera, which tells the colour.
     """
-    length = np.linalg.norm(shift, axis=1)
     title = f"{name}: no board in any image"
     if len(uv):
-        longest = max(length.max(), 1e-9)
-        drawn = ax.quiver(
-            *uv.T,
-            *shift.T,
-            angles="xy",
-            scale_units="xy",
-            scale=longest / (model.width / 8),
-            width=0.005,
-            color=color_of(name),
-        )
-        unit = float(f"{longest / 2:.1g}")
-        ax.quiverkey(
-            drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S", coordinates="axes"
-        )
+        length = np.linalg.norm(shift, axis=1)
+        unit = float(f"{length.max() / 2:.1g}")
+        scale = length.max() / (model.width / 8)
+        looks = {"angles": "xy", "scale_units": "xy", "width": 0.005}
+        drawn = ax.quiver(*uv.T, *shift.T, scale=scale, color=color_of(name), **looks)
+        ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S")
         title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
     ax.set(xlim=(0, model.width), ylim=(model.height, 0), aspect="equal")
     ax.set(xlabel="u [px]", ylabel="v [px]", title=title)

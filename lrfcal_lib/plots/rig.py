@@ -1,136 +1,20 @@
-"""Drawings in space, and coloured clouds as a camera sees them."""
+"""Coloured clouds as a camera sees them."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from mpl_toolkits.mplot3d.axes3d import Axes3D
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.geometry import fit_plane
-from lrfcal_lib.plots.colors import COLORS, closed
+from lrfcal_lib.plots.colors import COLORS
 from lrfcal_lib.plots.recording import CENTRED
 
-SURFACE = {"color": COLORS["left"], "alpha": 0.15, "linewidth": 0}
 NEAREST = 1e-6  # metres: what is nearer, or behind a camera, is not seen
 PARALLEL = 1e-9  # sine of an angle below which two directions are one
 FAR = 4.0  # widths of a part from which it is looked at, so that it is hardly distorted
 COVER = 0.75  # half the width of a drawn point, of the usual spacing: scattered points leave gaps
 Vector = Sequence[float] | np.ndarray
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-
-
-def polygon(ax: Axes3D, corners: np.ndarray, color: str = COLORS["truth"]) -> None:
-    """A flat polygon in space, for instance a board.
-
-    Parameters
-    ----------
-    ax
-    corners
-        Shape (n, 3), metres.
-    color
-    """
-    ax.add_collection3d(
-        Poly3DCollection([corners], facecolors=color, edgecolors=color, alpha=0.15)
-    )
-    ax.plot(*closed(corners).T, color=color, linewidth=1.2)
-
-
-def space(
-    ax: Axes3D,
-    points: np.ndarray,
-    elev: float = 22.0,
-    azim: float = -60.0,
-    zoom: float = 1.0,
-    labels: bool = True,
-) -> None:
-    """Equal scales and a view for axes in space.
-
-    Parameters
-    ----------
-    ax
-    points
-        Those to show, shape (n, 3), metres.
-    elev, azim
-        From where one looks, degrees.
-    zoom
-        Matplotlib leaves wide margins around flat scenes.
-    labels
-        Otherwise the axes are not drawn at all.
-    """
-    low = np.min(points, axis=0)
-    high = np.max(points, axis=0)
-    limits = np.stack([low, high], axis=1)
-    for axis, (first, last) in zip("xyz", limits, strict=True):
-        ax.set(**{f"{axis}lim": (first, last), f"{axis}label": f"{axis} [m]"})
-    ax.set_box_aspect(np.maximum(high - low, 1e-6), zoom=zoom)
-    ax.view_init(elev=elev, azim=azim)
-    if not labels:
-        ax.set_axis_off()
-
-
-def sphere(ax: Axes3D, centre: np.ndarray, radius: float) -> None:
-    """The set a point allows, figure 3 (a): the surface of a sphere.
-
-    Parameters
-    ----------
-    ax
-    centre, radius
-        Shape (3,) and a number, metres.
-    """
-    u, v = np.mgrid[0 : 2 * np.pi : 36j, 0 : np.pi : 19j]
-    ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
-    _surface(ax, np.asarray(centre) + radius * ball)
-
-
-def cylinder(
-    ax: Axes3D, point: np.ndarray, direction: np.ndarray, radius: float, half_length: float
-) -> None:
-    """The set a line allows, figure 3 (b): a cylinder around it.
-
-    Parameters
-    ----------
-    ax
-    point, direction
-        Of the line, shape (3,): metres, a unit vector.
-    radius, half_length
-        Metres.
-    """
-    first, second = across(direction)
-    u, s = np.mgrid[0 : 2 * np.pi : 36j, -half_length:half_length:9j][..., None]
-    ring = radius * (np.cos(u) * first + np.sin(u) * second)
-    _surface(ax, point + ring + s * direction)
-    line = point + np.outer([-half_length, half_length], direction)
-    ax.plot(*line.T, color=COLORS["truth"])
-
-
-def slab(
-    ax: Axes3D, point: np.ndarray, normal: np.ndarray, thickness: float, half_width: float
-) -> None:
-    """The set a plane allows, figure 3 (c): from it to its parallel near the sensor.
-
-    Parameters
-    ----------
-    ax
-    point, normal
-        Of the plane, shape (3,): metres, a unit vector.
-    thickness, half_width
-        Metres.
-    """
-    square = half_width * SQUARE @ across(normal) + point
-    polygon(ax, square)
-    polygon(ax, square + thickness * np.asarray(normal), COLORS["left"])
-
-
-def across(direction: ArrayLike) -> np.ndarray:
-    """Two unit vectors (2, 3) at right angles to a direction and to each other."""
-    return np.linalg.svd(np.atleast_2d(direction))[2][1:]
-
-
-def _surface(ax, points):
-    """A grid of points (n, m, 3) as a surface that one sees through."""
-    ax.plot_surface(*np.moveaxis(points, -1, 0), antialiased=True, shade=True, **SURFACE)
 
 
 def render(

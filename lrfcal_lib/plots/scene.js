@@ -30,54 +30,82 @@ class Measurer {
     this.width = this.rows.length / Math.max(data.kinds.length, 1);
     this.unknowns = data.unknowns;
     this.covariances = data.covariances.map(unpacked);
-    this.ends = unpacked(data.ends);
-    this.firstEdge = data.kinds.indexOf("edge");
+    this.stations = Object.keys(data.poses).map(Number);
   }
 
-  // A plane or an edge by its number: centre, axis, covariance (6 x 6), derivatives by all that points share.
+  // Places between the frame of the page and that of a station's platform.
+  inStation(station, p) {
+    const pose = this.data.poses[station];
+    return applied(transposed(pose.R), minus(p, pose.t));
+  }
+
+  inPage(station, p) {
+    const pose = this.data.poses[station];
+    return plus(applied(pose.R, p), pose.t);
+  }
+
+  // A plane or an edge by its number, in the frame of its station: as lrfcal_lib.measure.features.Feature.
   feature(number) {
     const row = this.rows.subarray(number * this.width, (number + 1) * this.width);
-    const m = this.unknowns + 2;
+    const m = this.unknowns + 3;
+    const part = (from, count) => Array.from(row.subarray(from, from + count));
     const jacobian = [];
-    for (let i = 0; i < 6; i++) jacobian.push(Array.from(row.subarray(42 + i * m, 42 + (i + 1) * m)));
+    for (let i = 0; i < 6; i++) jacobian.push(part(48 + i * m, m));
     return {
-      kind: this.data.kinds[number], camera: this.data.cameras[number], placement: this.data.placements[number],
-      centre: Array.from(row.subarray(0, 3)), axis: Array.from(row.subarray(3, 6)), noise: row.subarray(6, 42), jacobian,
+      kind: this.data.kinds[number], placement: this.data.placements[number], centre: part(0, 3), axis: part(3, 3),
+      ends: [part(6, 3), part(9, 3)], noise: row.subarray(12, 48), jacobian,
     };
   }
 
-  // The number of the edge that passes closest to a place, and how close, metres.
-  nearestEdge(place) {
-    let best = { number: -1, away: Infinity };
-    for (let i = 0; i < this.ends.length / 6; i++) {
-      const first = Array.from(this.ends.subarray(6 * i, 6 * i + 3));
-      const way = minus(Array.from(this.ends.subarray(6 * i + 3, 6 * i + 6)), first);
-      const along = Math.min(Math.max(dot(minus(place, first), way) / dot(way, way), 0), 1);
-      const foot = plus(first, way, along);
-      const away = norm(minus(place, foot));
-      if (away < best.away) best = { number: this.firstEdge + i, away, foot };
-    }
+  // The place on a plane, or on the line of an edge, that is nearest to another.
+  foot(feature, place) {
+    const along = times(feature.axis, dot(feature.axis, minus(place, feature.centre)));
+    return feature.kind === "plane" ? minus(place, along) : plus(feature.centre, along);
+  }
+
+  // The edge of a station that passes closest to a place in its frame, and how close, metres.
+  nearestEdge(station, place) {
+    let best = { away: Infinity };
+    this.data.kinds.forEach((kind, number) => {
+      if (kind !== "edge" || this.data.placements[number] !== station) return;
+      const feature = this.feature(number);
+      const way = minus(feature.ends[1], feature.ends[0]);
+      const along = Math.min(Math.max(dot(minus(place, feature.ends[0]), way) / dot(way, way), 0), 1);
+      const away = norm(minus(plus(feature.ends[0], way, along), place));
+      if (away < best.away) best = { away, feature };
+    });
     return best;
   }
 
-  // The middle of some points of one scan.
+  // The features by station that are one with the clicked one: `nearest` gives a station's next to a place.
+  shown(clicked, place, nearest) {
+    const foot = this.foot(clicked, this.inStation(clicked.placement, place));
+    const there = this.inPage(clicked.placement, foot);
+    const features = { [clicked.placement]: clicked };
+    for (const station of this.stations) {
+      if (station === clicked.placement) continue;
+      const own = this.inStation(station, there);
+      const { away, feature } = nearest(station, own);
+      if (away < this.data.reach && norm(minus(this.foot(feature, own), own)) < this.data.on_it) features[station] = feature;
+    }
+    return { place: there, features };
+  }
+
+  // The middle of some points of one scan, in the frame of its platform.
   point(points, placement) {
-    const m = this.unknowns + 2;
-    const pose = this.data.poses[placement];
+    const m = this.unknowns + 3;
     const jacobian = Array.from({ length: 6 }, () => new Array(m).fill(0));
     const noise = new Float64Array(36);
     const centre = times(points.reduce((sum, p) => plus(sum, p), [0, 0, 0]), 1 / points.length);
     for (const p of points) {
-      const moved = this.beam(applied(transposed(pose.R), minus(p, pose.t)));
-      moved.columns.forEach((column, k) => {
-        const by = applied(pose.R, column.by);
-        for (let i = 0; i < 3; i++) jacobian[i][column.at] += by[i] / points.length;
+      const moved = this.beam(p);
+      moved.columns.forEach((column) => {
+        for (let i = 0; i < 3; i++) jacobian[i][column.at] += column.by[i] / points.length;
       });
-      const beam = applied(pose.R, moved.beam);
       for (let i = 0; i < 3; i++) for (let j = 0; j < 3; j++)
-        noise[6 * i + j] += (this.data.range_noise / points.length) ** 2 * beam[i] * beam[j];
+        noise[6 * i + j] += (this.data.range_noise / points.length) ** 2 * moved.beam[i] * moved.beam[j];
     }
-    return { kind: "point", camera: 0, placement, centre, axis: [0, 0, 0], noise, jacobian };
+    return { kind: "point", placement, centre, axis: [0, 0, 0], noise, jacobian };
   }
 
   // What moves the end of a beam, in the frame of its platform: see judge.uncertainty.carried and beams_to.
@@ -107,14 +135,15 @@ class Measurer {
     return { beam, columns };
   }
 
-  // Length between two features and its standard deviation, metres; a text where there is none.
+  // Length between two features of a station, the variance of what only this station has wrong, and derivatives by
+  // what all have wrong alike; a text where there is none.
   between(first, second) {
     const order = ["point", "edge", "plane"];
     const kind = order[Math.max(order.indexOf(first.kind), order.indexOf(second.kind))];
     if (first.kind !== "point" && second.kind !== "point") {
       let angle = Math.acos(Math.min(Math.abs(dot(first.axis, second.axis)), 1));
       if (first.kind !== second.kind) angle = Math.PI / 2 - angle;
-      if (angle > this.data.alike) return `${first.kind} and ${second.kind} are ${(angle * 57.2958).toFixed(0)} deg from parallel`;
+      if (angle > this.data.alike) return `${first.kind} and ${second.kind} are ${(angle * 57.2958).toFixed(0)} deg from parallel: pick two that are, or points of them`;
     }
     const weights = [first, second].map((f) =>
       f.kind === kind && kind !== "point" ? 1 / Math.max(f.noise[21] + f.noise[28] + f.noise[35], 1e-12) : 0);
@@ -142,11 +171,35 @@ class Measurer {
       const square = first.placement === second.placement ? (a + b) ** 2 : a * a + b * b;
       variance += square * this.data.sweep_sigma[k] ** 2;
     }
-    const shared = plus(moved[0], moved[1]).slice(0, n);
-    for (const motion of [...this.data.unseen[first.camera], ...this.data.unseen[second.camera]])
-      if (Math.abs(dot(shared, motion)) > this.data.least * norm(shared) * norm(motion)) variance = Infinity;
-    variance += Math.max(...this.covariances.map((C) => quadratic(shared, C)));
-    return { length: lengthOf(place), sigma: Math.sqrt(variance) };
+    const shared = [...plus(moved[0], moved[1]).slice(0, n), moved[0][n + 2], moved[1][n + 2]];
+    return this.known({ length: lengthOf(place), noise: variance, shared });
+  }
+
+  // The same with its standard deviation.
+  known(length) {
+    const n = this.unknowns;
+    const surfaces = this.data.systematic ** 2 * (length.shared[n] ** 2 + length.shared[n + 1] ** 2);
+    const ofRig = Math.max(...this.covariances.map((C) => quadratic(length.shared.slice(0, n), C)));
+    return { ...length, sigma: Math.sqrt(length.noise + surfaces + ofRig) };
+  }
+
+  // One length of what several stations measured, each weighted by how well it knows it.
+  mean(lengths) {
+    const total = lengths.reduce((sum, each) => sum + each.sigma ** -2, 0);
+    const weights = lengths.map((each) => each.sigma ** -2 / total);
+    const sum = (of) => lengths.reduce((all, each, i) => all + of(each, weights[i]), 0);
+    return this.known({
+      length: sum((each, w) => w * each.length), noise: sum((each, w) => w * w * each.noise),
+      shared: lengths[0].shared.map((_, k) => sum((each, w) => w * each.shared[k])),
+    });
+  }
+
+  // The length between the features of two picks; a text where there is none.
+  measured(first, second) {
+    const both = Object.keys(first.features).filter((station) => station in second.features);
+    if (!both.length) return "no station shows both places: pick places that one of them shows";
+    const lengths = both.map((station) => this.between(first.features[station], second.features[station]));
+    return lengths.find((each) => typeof each === "string") || this.mean(lengths);
   }
 }
 
@@ -204,38 +257,49 @@ function panel(page, data) {
   box.querySelectorAll("input").forEach((input) => input.addEventListener("change", () =>
     Plotly.restyle(page, { visible: mode() === "edge" ? true : "legendonly" }, [data.edges_trace])));
 
-  function at(kind, place, curve, number) {
-    if (kind === "plane") {
-      const plane = planes[curve][number];
-      if (plane < 0) return "no flat surface here: pick an edge or a point";
-      return { kind, place, feature: measurer.feature(plane) };
-    }
-    if (kind === "edge") {
-      const edge = measurer.nearestEdge(place);
-      if (edge.away > data.reach) return "no edge within 10 cm: pick another place, or a point";
-      return { kind, place: edge.foot, feature: measurer.feature(edge.number) };
-    }
-    const own = stations[curve][number];
-    const near = [];
+  // All points of the page with their station and plane, nearest first, of those within reach that fit.
+  function near(place, fits) {
+    const found = [];
     page.data.slice(0, 2).forEach((trace, k) => {
       const [x, y, z] = ["x", "y", "z"].map((axis) => unpacked(trace[axis].bdata));
       for (let i = 0; i < x.length; i++) {
-        const away = (x[i] - place[0]) ** 2 + (y[i] - place[1]) ** 2 + (z[i] - place[2]) ** 2;
-        if (away < data.reach ** 2 && stations[k][i] === own) near.push({ away, p: [x[i], y[i], z[i]] });
+        const away = Math.hypot(x[i] - place[0], y[i] - place[1], z[i] - place[2]);
+        if (away < data.reach && fits(stations[k][i], planes[k][i])) found.push({ away, plane: planes[k][i], p: [x[i], y[i], z[i]] });
       }
     });
-    near.sort((a, b) => a.away - b.away);
-    return { kind, place, feature: measurer.point(near.slice(0, data.about).map((each) => each.p), own) };
+    return found.sort((a, b) => a.away - b.away);
+  }
+
+  function at(kind, place, curve, number) {
+    const own = stations[curve][number];
+    if (kind === "plane") {
+      const plane = planes[curve][number];
+      if (plane < 0) return "no flat surface here: pick an edge or a point";
+      return measurer.shown(measurer.feature(plane), place, (station, there) => {
+        const [first] = near(measurer.inPage(station, there), (s, number) => s === station && number >= 0);
+        return first ? { away: first.away, feature: measurer.feature(first.plane) } : { away: Infinity };
+      });
+    }
+    if (kind === "edge") {
+      const nearest = (station, there) => measurer.nearestEdge(station, there);
+      const edges = measurer.stations.map((station) => nearest(station, measurer.inStation(station, place)));
+      const edge = edges.reduce((a, b) => (b.away < a.away ? b : a));
+      if (edge.away > data.reach) return "no edge within 10 cm: pick another place, or a point";
+      return measurer.shown(edge.feature, place, nearest);
+    }
+    const points = near(place, (station) => station === own).slice(0, data.about);
+    const feature = measurer.point(points.map((each) => measurer.inStation(own, each.p)), own);
+    return { place, features: { [own]: feature } };
   }
 
   function pick(kind, place, curve, number) {
     const found = at(kind, place, curve, number);
     if (typeof found === "string") return say(found);
-    picked.push(found);
+    picked.push({ kind, ...found });
     say(`${kind} at ${inWords(found.place)}: now the second`);
     if (picked.length === 2) {
-      const result = measurer.between(picked[0].feature, picked[1].feature);
-      if (typeof result === "string") say(`${result}: pick two that are, or points`);
+      const result = measurer.measured(...picked);
+      if (typeof result === "string") say(result);
       else {
         const half = data.ninety * result.sigma;
         list.push({ name: `length ${list.length + 1}`, picks: picked, length: result.length,

@@ -3,12 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines
-from lrfcal_lib.model.camera import CameraModel, line_distance, project, undistort
+from lrfcal_lib.model.board import Board, corners_of_lines
+from lrfcal_lib.model.camera import CameraModel, line_distance, undistort
 from lrfcal_lib.model.geometry import pose_array
-from lrfcal_lib.preprocess.bundle import SIGMA_FLOOR_PX
 from lrfcal_lib.preprocess.edges_in_image import (
     FULL_CONTRAST,
     EdgeNotSeen,
@@ -19,7 +18,7 @@ from lrfcal_lib.preprocess.edges_in_image import (
     sample,
     step_contrast,
 )
-from lrfcal_lib.preprocess.intrinsics import board_pose, raised_points
+from lrfcal_lib.preprocess.intrinsics import board_pose
 from lrfcal_lib.preprocess.outline_poses import find_polygon, outline_poses
 from lrfcal_lib.preprocess.pose_from_lines import line_residuals, pose_from_edges
 
@@ -128,7 +127,7 @@ def view_board(
     view = _view_pattern(view, image, board, model, picks, lines, relief)
     if board.corners is None:
         return view
-    pose, covariance = pose_with_edges(view, board, model, relief)
+    pose, covariance = pose_with_edges(view, board, model)
     return replace(view, T_camera_board=pose, covariance=covariance)
 
 
@@ -166,16 +165,13 @@ def order_scores(
     return np.median(of_profiles, axis=2).sum(axis=1)
 
 
-def pose_with_edges(
-    view, board, model: CameraModel, relief: np.ndarray | None = None
-) -> tuple[RigidTransform, np.ndarray]:
+def pose_with_edges(view, board, model: CameraModel) -> tuple[RigidTransform, np.ndarray]:
     """Pose of a board from the corners of its pattern and its edges, weighted by their covariances.
 
     Least squares of ``|d|^2_P + sum_e |r_e|^2_S``: `d` is the increment from the pose of the
     corners (covariance P), `r_e` the distances of the edge's two board corners from its image line;
     their covariance holds the systematic part of 0.1 px, so a sharp edge does not outweigh all
-    corners. Edges that the corners contradict stay out. The same starts from the pose mirrored in
-    depth, and the pose that explains everything better is taken.
+    corners. Edges that the corners contradict stay out.
 
     Parameters
     ----------
@@ -184,8 +180,6 @@ def pose_with_edges(
     board : Board
         With a pattern.
     model : CameraModel
-    relief : ndarray, shape (k,), optional
-        Heights of the corners, metres.
 
     Returns
     -------
@@ -193,57 +187,17 @@ def pose_with_edges(
         ``T_camera_board``.
     covariance : ndarray, shape (6, 6)
     """
+    pose = view.T_camera_board
+    covariance = view.covariance
     if not view.edges:
-        return view.T_camera_board, view.covariance
-    visible = np.isfinite(view.pixels).all(axis=1)
-    points = raised_points(board.pattern, relief)
-
-    def squares(pose):
-        off = (view.pixels - project(pose.apply(points), model))[visible]
-        return float(np.nan_to_num(np.sum(off**2), nan=np.inf))
-
-    mirrored = mirrored_pose(view.T_camera_board, board.pattern)
-    other, other_covariance, _ = board_pose(
-        view.pixels, board.pattern, model, relief, start=mirrored
-    )
-    starts = (view.T_camera_board, view.covariance), (other, other_covariance)
-    fits = np.array([squares(pose) for pose, _ in starts])
-    variance = max(fits.min() / (2 * visible.sum()), SIGMA_FLOOR_PX**2)
-    # no agreement of the edges makes up for corners that fit worse than this
-    most = fits.min() + AGREE_CHI2 * len(view.edges) * variance
-    best = starts[0]
-    least = np.inf
-    for fit, (pose, covariance) in zip(fits, starts, strict=True):
-        if fit > most:
-            continue
-        misses, by_pose = line_residuals(view.edges, board, model, pose_array(pose))
-        expected = np.eye(2) + by_pose @ covariance @ np.swapaxes(by_pose, 1, 2)
-        chi2 = np.sum(misses * np.linalg.solve(expected, misses[..., None])[..., 0], axis=1)
-        agreeing = [view.edges[i] for i in np.flatnonzero(chi2 < AGREE_CHI2)]
-        if agreeing:
-            pose, covariance, _ = pose_from_edges(agreeing, board, model, pose, covariance)
-        misses, _ = line_residuals(view.edges, board, model, pose_array(pose))
-        off = np.minimum(np.sum(misses**2, axis=1), AGREE_CHI2)
-        cost = squares(pose) / variance + off.sum()
-        if cost < least:
-            best = pose, covariance
-            least = cost
-    return best
-
-
-def mirrored_pose(pose: RigidTransform, pattern: Chessboard) -> RigidTransform:
-    """The pose that shows nearly the same picture from far away.
-
-    Every point is mirrored in depth about the middle of the pattern.
-    """
-    middle = pattern.points().mean(axis=0)
-    at = pose.apply(middle)
-    sight = at / np.linalg.norm(at)
-    mirror = np.eye(3) - 2 * np.outer(sight, sight)
-    rotation = Rotation.from_matrix(
-        mirror @ pose.rotation.as_matrix() @ np.diag([1.0, 1.0, -1.0])
-    )
-    return RigidTransform.from_components(at - rotation.apply(middle), rotation)
+        return pose, covariance
+    misses, by_pose = line_residuals(view.edges, board, model, pose_array(pose))
+    expected = np.eye(2) + by_pose @ covariance @ np.swapaxes(by_pose, 1, 2)
+    chi2 = np.sum(misses * np.linalg.solve(expected, misses[..., None])[..., 0], axis=1)
+    agreeing = [view.edges[i] for i in np.flatnonzero(chi2 < AGREE_CHI2)]
+    if not agreeing:
+        return pose, covariance
+    return pose_from_edges(agreeing, board, model, pose, covariance)[:2]
 
 
 def _view_pattern(view, image, board, model, picks, lines, relief):
@@ -262,19 +216,17 @@ def _view_pattern(view, image, board, model, picks, lines, relief):
         if name in picks:
             edges.append(picked_edge(name, undistort(picks[name], model), inner))
             continue
-        start = corners[i]
-        end = corners[(i + 1) % len(corners)]
+        start, end = corners[[i, (i + 1) % len(corners)]]
         inset = CORNER_INSET * (end - start)
         middle = (start + end) / 2
         beside = middle + WINDOW * lines[i, :2]
         uv = on_board(np.stack([start + inset, end - inset, middle, beside]), pose, model)
-        scale = np.linalg.norm(uv[3] - uv[2]) / WINDOW  # pixels a metre
-        reach = np.clip(scale * WINDOW, LEAST_REACH_PX, MOST_REACH_PX)
-        prior = max(scale * PREDICTION_SIGMA, 1.0)
+        window = np.linalg.norm(uv[3] - uv[2])
+        reach = np.clip(window, LEAST_REACH_PX, MOST_REACH_PX)
+        prior = max(window / WINDOW * PREDICTION_SIGMA, 1.0)
+        outward = uv[2] - inner
         try:
-            edges.append(
-                refine_edge(image, model, name, uv[0], uv[1], uv[2] - inner, reach, prior)
-            )
+            edges.append(refine_edge(image, model, name, *uv[:2], outward, reach, prior))
         except EdgeNotSeen as error:
             rejected.append((name, str(error)))
     return replace(view, edges=tuple(edges), rejected=tuple(rejected))
@@ -290,18 +242,13 @@ def _view_plain(view, image, board, model, picks):
     views = []
     for found in outline_poses(sides, board, model):
         inner = np.mean([edge.centre for edge in found.edges], axis=0)
-        edges = []
-        agree = True
-        for edge in found.edges:
-            if edge.name in ends:
-                agree &= (
-                    np.abs(line_distance(ends[edge.name], edge.line)).max() < SAME_NAMES_PX
-                )
-                edge = picked_edge(edge.name, ends[edge.name], inner)
-            edges.append(edge)
-        if agree:
-            pose = {"T_camera_board": found.T_camera_board, "covariance": found.covariance}
-            views.append(replace(view, edges=tuple(edges), **pose))
+        edges = {edge.name: edge for edge in found.edges}
+        off = [line_distance(uv, edges[name].line) for name, uv in ends.items()]
+        if off and np.abs(off).max() >= SAME_NAMES_PX:
+            continue
+        edges |= {name: picked_edge(name, uv, inner) for name, uv in ends.items()}
+        pose = {"T_camera_board": found.T_camera_board, "covariance": found.covariance}
+        views.append(replace(view, edges=tuple(edges.values()), **pose))
     if not views:
         reason = f"no pose of board '{board.name}' explains the outline in the image"
         return replace(view, reason=reason)

@@ -26,6 +26,7 @@ OUTLYING = 4  # standard deviations of a range about its line
 # spot radii from the last beam on the board that see its face alone; share of a row
 CLEAR = 2.0
 MOST_MARGIN = 1 / 3
+MARGIN = 0.06  # of a row, left out at either end
 SHORTEST_ROW = 6  # beams, of which an outer part is left out
 SMALLEST_PIECE = 2  # beams; a smaller piece beside the board is a mixed pixel
 
@@ -120,10 +121,10 @@ def find_board(
     lines, information = fit_lines(filtered, sweep.bearings)
     fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
     residuals = np.where(mask, sweep.ranges - fitted, np.nan)
-    residuals[np.abs(residuals) > PLANE_NOISE * 2] = np.nan
-    if not np.isfinite(residuals).any():
+    residuals = residuals[np.abs(residuals) <= PLANE_NOISE * 2]
+    if not len(residuals):
         raise BoardNotFound(f"no scan line has {FEWEST_BEAMS} beams on the board")
-    sigma = float(np.sqrt(np.nanmean(residuals**2)))
+    sigma = float(np.sqrt(np.mean(residuals**2)))
     spot = 0.0
     if lrf is not None and lrf.spot_exit is not None:
         reach = float(np.nanmedian(fitted))
@@ -167,7 +168,9 @@ def median_filter(
         Metres; NaN outside the mask and where there is no return.
     """
     if width < 1 or width % 2 == 0:
-        raise ValueError(f"the width of a median filter is odd and positive, got {width}")
+        raise ValueError(
+            f"the width of a median filter must be odd and positive, got {width}"
+        )
     half = width // 2
     taken = np.where(mask, ranges, np.nan)
     padded = np.pad(taken, ((0, 0), (half, half)), constant_values=np.nan)
@@ -229,11 +232,10 @@ def row_median(values: np.ndarray) -> np.ndarray:
     `numpy.nanmedian` says the same, thirty times as slowly.
     """
     ordered = np.sort(values, axis=1)
-    count = np.isfinite(ordered).sum(axis=1)
-    low = np.maximum(count - 1, 0) // 2
-    high = np.minimum(count // 2, values.shape[1] - 1)
-    rows = np.arange(len(values))
-    return (ordered[rows, low] + ordered[rows, high]) / 2
+    count = np.isfinite(ordered).sum(axis=1, keepdims=True)
+    middle = np.hstack([np.maximum(count - 1, 0) // 2, count // 2])
+    last = values.shape[1] - 1
+    return np.take_along_axis(ordered, np.minimum(middle, last), axis=1).mean(axis=1)
 
 
 def jump_points(ranges: np.ndarray, fitted: np.ndarray, sigma_range: float) -> np.ndarray:
@@ -257,8 +259,7 @@ def jump_points(ranges: np.ndarray, fitted: np.ndarray, sigma_range: float) -> n
     """
     on = np.isfinite(fitted)
     threshold = max(OUTLYING * sigma_range, PLANE_NOISE)
-    with np.errstate(invalid="ignore"):
-        inside = on & (np.abs(ranges - fitted) > threshold)
+    inside = on & (np.abs(ranges - fitted) > threshold)
     pieces = segments(ranges, jump=threshold)
     size = np.bincount(pieces[pieces >= 0], minlength=1)
     small = (pieces >= 0) & (size[pieces] <= SMALLEST_PIECE)
@@ -266,41 +267,20 @@ def jump_points(ranges: np.ndarray, fitted: np.ndarray, sigma_range: float) -> n
     return inside | (small & beside)
 
 
-def count_jump_points(scan: BoardScan) -> tuple[int, int]:
-    """Number of jump points as recorded and after a median filter (figure 5).
-
-    The filter runs over the board's returns and the jump points among and beside them, without the
-    background: what step (i) of the paper leaves.
-
-    Parameters
-    ----------
-    scan : BoardScan
-
-    Returns
-    -------
-    recorded, filtered : int
-    """
-    jumps = jump_points(scan.sweep.ranges, scan.fitted, scan.sigma_range)
-    filtered = median_filter(scan.sweep.ranges, scan.mask | jumps)
-    return scan.n_jump_points, int(
-        jump_points(filtered, scan.fitted, scan.sigma_range).sum()
-    )
-
-
 def face_points(
-    scan: BoardScan, count: int = 1000, margin: float = 0.06
+    scan: BoardScan, count: int = 1000
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points on the face of the board, away from its edges, evenly thinned.
+
+    At either end of a scan line and of a column 6 % of it are left out; never less than two beams,
+    nor than a spot that reaches over the edge: it reads the mean of its part on the board, and a
+    slanted board would seem less so.
 
     Parameters
     ----------
     scan : BoardScan
     count : int
         At most.
-    margin : float
-        What is left out at either end of a scan line and of a column, as a fraction of it; never
-        less than two beams, nor than a spot that reaches over the edge: it reads the mean of its
-        part on the board, and a slanted board would seem less so.
 
     Returns
     -------
@@ -312,18 +292,16 @@ def face_points(
     covariance : ndarray, shape (m, 3, 3)
     """
     sweep = scan.sweep
-    with np.errstate(invalid="ignore"):
-        miss = np.abs(sweep.ranges - scan.fitted)
-        good = scan.mask & (miss < OUTLYING * scan.sigma_range)
+    miss = np.abs(sweep.ranges - scan.fitted)
+    good = scan.mask & (miss < OUTLYING * scan.sigma_range)
     along = CLEAR * scan.spot / max(median_step(sweep.bearings), 1e-6)
     down = CLEAR * scan.spot / max(median_step(sweep.pitch), 1e-6)
-    good &= _interior(scan.mask, margin, along)
-    good &= _interior(scan.mask.T, margin, down).T
+    good &= _interior(scan.mask, along)
+    good &= _interior(scan.mask.T, down).T
     line, beam = np.nonzero(good)
     if len(line) > count:
         keep = np.linspace(0, len(line) - 1, count).round().astype(int)
-        line = line[keep]
-        beam = beam[keep]
+        line, beam = np.stack([line, beam])[:, keep]
     ranges = sweep.ranges[line, beam]
     bearings = sweep.bearings[beam]
     # keeps the covariance regular; bearings are all but exact
@@ -334,15 +312,13 @@ def face_points(
 
 def median_step(angles: np.ndarray) -> float:
     """Median step between neighbouring angles; infinite for a single one."""
-    if len(angles) < 2:
-        return np.inf
-    return np.median(np.abs(np.diff(angles)))
+    return np.median(np.abs(np.diff(angles))) if len(angles) > 1 else np.inf
 
 
 def _line_ranges(lines, bearings):
     """Ranges (L, B) of the fitted lines (L, 2): every line in every direction."""
     along = lines @ np.stack([np.cos(bearings), np.sin(bearings)])
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore"):
         return np.where(along > 0, 1 / along, np.nan)
 
 
@@ -360,8 +336,8 @@ def _span(mask, trim=0):
     return span
 
 
-def _interior(mask, margin, spot):
-    """Without the outer part of each row: a fraction `margin`, and `spot` cells.
+def _interior(mask, spot):
+    """Without the outer part of each row: a share of it, and `spot` cells.
 
     The latter where that leaves half of the row. A row too short for that (a sweep of one line,
     seen by columns) stays.
@@ -369,5 +345,5 @@ def _interior(mask, margin, spot):
     _, first, last = row_ends(mask)
     size = last - first
     least = np.maximum(2, np.minimum(spot, MOST_MARGIN * size))
-    trim = np.maximum(least, margin * size).astype(int)
+    trim = np.maximum(least, MARGIN * size).astype(int)
     return _span(mask, np.where(size < SHORTEST_ROW, 0, trim))

@@ -6,9 +6,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block, minimise
-from lrfcal_lib.model.camera import CameraModel, project, project_jacobians
+from lrfcal_lib.model.camera import CameraModel, project_jacobians
 from lrfcal_lib.model.geometry import (
-    apply_pose,
     gradient_by_pose,
     move_pose,
     pose_array,
@@ -19,7 +18,7 @@ from lrfcal_lib.model.geometry import (
 SIGMA_FLOOR_PX = 0.05  # corner detectors are never better than this on real prints
 OUTLIER_SIGMAS = 4.5
 RAYLEIGH_MEDIAN = 1.1774  # median of the length of a vector (2,) of normal variables
-ROBUST_ROUNDS = 6
+ROBUST_ROUNDS = 7
 UP = np.array([0.0, 0.0, 1.0])
 LENS = 9  # fx, fy, cx, cy, k1..k5
 POSE = 6  # [w, v]
@@ -84,33 +83,33 @@ class Bundle:
         raised = points + (basis @ self.shape)[:, None] * UP
         turned = rotate_points(self.poses, raised)
         p_first = turned + self.poses[:, None, :, 3]
-        corners = (len(self.lenses), *p_first.shape[:-1], 2)
-        pixels = np.zeros(corners)
-        jacobian = np.zeros((*corners, self.ends[-1]))
-        lens_end, mount_end, pose_end, _ = self.ends
-        for i, (lens, mount) in enumerate(zip(self.lenses, self.mounting, strict=True)):
+        views = np.eye(len(self.poses))[:, None, None, :, None]
+        pixels = []
+        jacobian = []
+        for lens, mount, own in zip(
+            self.lenses, self.mounting, np.eye(len(self.lenses)), strict=True
+        ):
             mounted = rotate_points(mount, p_first)
+            p_camera = mounted + mount[:, 3]
             fx, fy, cx, cy = lens[:4]
             model = CameraModel(1, 1, fx, fy, cx, cy, lens[4:])
-            by_point, by_lens = project_jacobians(mounted + mount[:, 3], model)
-            # the derivatives by fx and fy are the distorted normalised coordinates themselves
-            distorted = np.stack([by_lens[..., 0, 0], by_lens[..., 1, 1]], axis=-1)
-            pixels[i] = lens[:2] * distorted + lens[2:4]
+            by_point, by_lens = project_jacobians(p_camera, model)
             by_first = by_point @ mount[:, :3]
+            by_mount = gradient_by_pose(mounted[..., None, :], by_point)
             by_pose = gradient_by_pose(turned[..., None, :], by_first)
             by_height = np.einsum("vkij,vj->vki", by_first, self.poses[:, :, 2])
-            J = jacobian[i]
-            J[..., LENS * i : LENS * (i + 1)] = by_lens
-            if i > 0:
-                start = lens_end + POSE * (i - 1)
-                J[..., start : start + POSE] = gradient_by_pose(
-                    mounted[..., None, :], by_point
-                )
-            for view in range(len(self.poses)):
-                start = mount_end + POSE * view
-                J[view, ..., start : start + POSE] = by_pose[view]
-            J[..., pose_end:] = by_height[..., None] * basis[:, None]
-        return pixels, jacobian
+            parts = (
+                by_lens[..., None, :] * own[:, None],
+                by_mount[..., None, :] * own[1:, None],
+                by_pose[..., None, :] * views,
+                by_height[..., None] * basis[:, None],
+            )
+            rows = [part.reshape(*by_height.shape, -1) for part in parts]
+            jacobian.append(np.concatenate(rows, axis=-1))
+            # the derivatives by fx and fy are the distorted normalised coordinates themselves
+            distorted = np.stack([by_lens[..., 0, 0], by_lens[..., 1, 1]], axis=-1)
+            pixels.append(lens[:2] * distorted + lens[2:4])
+        return np.stack(pixels), np.stack(jacobian)
 
 
 @dataclass(frozen=True)
@@ -131,6 +130,8 @@ class Adjustment:
         Of ``[w, v]``.
     relief : ndarray, shape (k,)
         Heights of the corners over the sheet's mean plane, metres.
+    predicted : ndarray, shape (cameras, views, k, 2)
+        Pixels of all corners.
     residuals : ndarray, shape (cameras, views, k, 2)
         Recorded minus predicted pixels, NaN where a corner was not used.
     sigma_px : float
@@ -145,6 +146,7 @@ class Adjustment:
     poses: RigidTransform
     pose_covariance: np.ndarray
     relief: np.ndarray
+    predicted: np.ndarray
     residuals: np.ndarray
     sigma_px: float
     bic: float
@@ -220,9 +222,8 @@ def adjust(
 
     def evaluate(bundle):
         predicted, jacobian = bundle.predict(points, basis)
-        misses = np.where(visible, predicted - pixels, 0.0).ravel()
-        jacobian = jacobian.reshape(misses.size, -1)[:, free]
-        return Block(misses, jacobian, visible.ravel().astype(float))
+        misses = (predicted - pixels)[visible]
+        return Block(misses, jacobian[visible][:, free], np.ones(len(misses)))
 
     def retract(bundle, step):
         whole = np.zeros(len(free))
@@ -230,10 +231,8 @@ def adjust(
         return bundle.moved(whole)
 
     bundle = minimise(evaluate, start, retract)[0]
-    adjustment = _adjustment(bundle, evaluate(bundle), visible, free, models, basis)
-    if not intrinsics:
-        adjustment = replace(adjustment, models=tuple(models))
-    return adjustment
+    adjusted = _adjusted(bundle, evaluate(bundle), pixels, points, basis, free, models)
+    return adjusted if intrinsics else replace(adjusted, models=tuple(models))
 
 
 def adjust_robust(pixels, points, models, poses, mounting=None, **options) -> Adjustment:
@@ -251,26 +250,20 @@ def adjust_robust(pixels, points, models, poses, mounting=None, **options) -> Ad
     -------
     Adjustment
     """
-    result = adjust(pixels, points, models, poses, mounting, **options)
-    used = np.isfinite(result.residuals)
+    used = np.isfinite(pixels)
     for _ in range(ROBUST_ROUNDS):
-        raised = points + result.relief[:, None] * UP
-        misses = np.empty(pixels.shape)
-        for i, model in enumerate(result.models):
-            p_camera = apply_pose(pose_array(result.mounting[i] * result.poses), raised)
-            misses[i] = pixels[i] - project(p_camera, model)
-        distance = np.linalg.norm(misses, axis=-1)
+        kept = np.where(used, pixels, np.nan)
+        result = adjust(kept, points, models, poses, mounting, **options)
+        models = result.models
+        poses = result.poses
+        mounting = result.mounting
+        distance = np.linalg.norm(pixels - result.predicted, axis=-1)
         sigma = max(np.nanmedian(distance) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX)
         before = used
-        used = np.broadcast_to(
-            (distance <= OUTLIER_SIGMAS * sigma)[..., None], pixels.shape
-        )
+        near = distance <= OUTLIER_SIGMAS * sigma
+        used = np.broadcast_to(near[..., None], pixels.shape)
         if np.array_equal(used, before):
             break
-        kept = np.where(used, pixels, np.nan)
-        result = adjust(
-            kept, points, result.models, result.poses, result.mounting, **options
-        )
     return result
 
 
@@ -292,12 +285,33 @@ def better(result: Adjustment, pixels, points, **options) -> Adjustment:
     return other if other.bic < result.bic else result
 
 
-def _adjustment(bundle, block, visible, free, models, basis):
+def _adjusted(bundle, block, pixels, points, basis, free, models):
     """The Adjustment that a solved bundle is."""
-    count = int(visible.sum())
+    predicted = bundle.predict(points, basis)[0]
+    residuals = pixels - predicted
+    count = len(block.residuals)
     error = block.residuals @ block.residuals
     variance = max(error / max(count - free.sum(), 1), 1e-18)
-    jacobian = block.jacobian[visible.ravel()]
+    lens, mount, pose, _ = _covariances(bundle, variance, block.jacobian, free)
+    rms = np.sqrt(2 * np.nanmean(residuals**2, axis=(1, 2, 3)))  # as OpenCV counts it
+    adjusted = zip(models, bundle.lenses, lens, rms.tolist(), strict=True)
+    penalty = free.sum() * np.log(count)
+    return Adjustment(
+        models=tuple(model.with_parameters(*values) for model, *values in adjusted),
+        mounting=pose_transform(bundle.mounting),
+        mounting_covariance=mount,
+        poses=pose_transform(bundle.poses),
+        pose_covariance=pose,
+        relief=basis @ bundle.shape,
+        predicted=predicted,
+        residuals=residuals,
+        sigma_px=float(np.sqrt(variance)),
+        bic=float(count * np.log(max(error, 1e-300) / count) + penalty),
+    )
+
+
+def _covariances(bundle, variance, jacobian, free):
+    """Of every lens, mounting and pose (n, k, k), and of the shape; those that are `free`."""
     normal = jacobian.T @ jacobian
     # pixels, radians and metres mix safely
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -305,30 +319,8 @@ def _adjustment(bundle, block, visible, free, models, basis):
     inverse = np.linalg.pinv(normal * scale, hermitian=True)
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(free, free)] = variance * inverse * scale
-
-    def blocks(start, end, size):
-        """Those of the unknowns from start to end, size by size."""
-        rows = np.arange(start, end).reshape(-1, size)
-        return covariance[rows[:, :, None], rows[:, None]]
-
-    lens_end, mount_end, pose_end, _ = bundle.ends
-    residuals = np.where(visible, -block.residuals.reshape(visible.shape), np.nan)
-    adjusted = []
-    spreads = blocks(0, lens_end, LENS)
-    for model, lens, spread, misses in zip(
-        models, bundle.lenses, spreads, residuals, strict=True
-    ):
-        rms = float(np.sqrt(2 * np.nanmean(misses**2)))  # of distances, as OpenCV counts it
-        adjusted.append(model.with_parameters(lens, spread, rms))
-    penalty = free.sum() * np.log(count)
-    return Adjustment(
-        models=tuple(adjusted),
-        mounting=pose_transform(bundle.mounting),
-        mounting_covariance=blocks(lens_end, mount_end, POSE),
-        poses=pose_transform(bundle.poses),
-        pose_covariance=blocks(mount_end, pose_end, POSE),
-        relief=basis @ bundle.shape,
-        residuals=residuals,
-        sigma_px=float(np.sqrt(variance)),
-        bic=float(count * np.log(max(error, 1e-300) / count) + penalty),
-    )
+    kinds = np.split(np.arange(len(free)), bundle.ends[:-1])
+    sizes = (LENS, POSE, POSE, max(len(bundle.shape), 1))
+    for unknowns, size in zip(kinds, sizes, strict=True):
+        rows = unknowns.reshape(-1, size)
+        yield covariance[rows[:, :, None], rows[:, None]]

@@ -56,15 +56,13 @@ def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
     """
     pitch = sweep.pitch
     count = len(pitch)
-    way = np.sign(
-        np.median(pitch[-(count // 4 + 1) :]) - np.median(pitch[: count // 4 + 1])
-    )
+    quarter = count // 4 + 1
+    way = np.sign(np.median(pitch[-quarter:]) - np.median(pitch[:quarter]))
     turn = int(np.argmax(way * pitch)) + 1
-    back = np.arange(turn, count)
     far = np.abs(pitch[turn:] - pitch[0]) < FIRST * np.ptp(pitch)
-    if not far.any() or len(back) > max(1, FEW * count):
+    if not far.any() or len(far) > max(1, FEW * count):
         return sweep, None
-    return _lines(sweep, slice(0, turn)), _lines(sweep, back[far])
+    return _lines(sweep, slice(0, turn)), _lines(sweep, turn + np.flatnonzero(far))
 
 
 def _lines(sweep, which):

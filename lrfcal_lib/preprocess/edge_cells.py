@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import ndimage
 
-from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.model.geometry import lrf_to_platform, plane_axes, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
     BORDER,
@@ -13,7 +13,7 @@ from lrfcal_lib.preprocess.edges_in_scan import (
     beyond,
     plane_range,
 )
-from lrfcal_lib.preprocess.surfaces import DEPTH_NOISE, plane_axes
+from lrfcal_lib.preprocess.surfaces import DEPTH_NOISE
 from lrfcal_lib.session.stated import LrfInfo
 
 REACH = 2  # beams (or scan lines) on either side of a boundary
@@ -53,10 +53,9 @@ def edge_cells(
     """
     ways = [edges for edges in (along, swept) if edges is not None]
     sweep = scan.sweep
-    line = np.concatenate([edges.line[edges.side >= 0] for edges in ways])
-    beam = np.concatenate([edges.beam[edges.side >= 0] for edges in ways])
-    step = np.concatenate([edges.step[edges.side >= 0] for edges in ways])
-    side = np.concatenate([edges.side[edges.side >= 0] for edges in ways])
+    ends = [np.column_stack([e.line, e.beam, e.step, e.side])[e.side >= 0] for e in ways]
+    line, beam, up, along_line, side = np.concatenate(ends).T
+    step = np.stack([up, along_line], axis=1)
     rays = polar_to_points(1.0, sweep.bearings)
     board, cosine = plane_range(scan, rays, sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
@@ -65,12 +64,9 @@ def edge_cells(
     behind = beyond(scan, line, beam, step)
     visible = np.isfinite(behind)
     mixed = behind - here < MIXING
-    close = len(visible) == 0 or np.mean(visible) < 0.5 or np.mean(mixed) >= 0.5
-    odds = np.zeros(len(here))
-    usable = np.arange(len(here))
-    if not close:
-        odds = background_odds(here, behind)
-        usable = np.flatnonzero(visible & ~mixed)
+    close = 2 * visible.sum() < len(visible) or 2 * mixed.sum() >= len(mixed)
+    odds = np.where(close, 0.0, background_odds(here, behind))
+    usable = np.flatnonzero(close | (visible & ~mixed))
 
     row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape)
     cells = line, beam
@@ -92,13 +88,9 @@ def edge_cells(
         "across": across,
         "step": np.where(across, median_step(sweep.pitch), median_step(sweep.bearings)),
     }
-    return _records(columns)[keep]
-
-
-def _records(columns):
-    """Columns by name as a recarray."""
-    arrays = [*columns.values()]
-    return np.rec.fromarrays(arrays, names=",".join(columns))  # type: ignore[call-overload]
+    arrays = [column[keep] for column in columns.values()]
+    names = ",".join(columns)
+    return np.rec.fromarrays(arrays, names=names)  # type: ignore[call-overload]
 
 
 def _readings(scan, cells, k, board, radius, close):
@@ -140,21 +132,15 @@ def _within_a_spot(mixing, size, gaps):
 
 def _neighbours(usable, line, beam, step, shape):
     """Cells about boundaries, each once: number of the nearest, step k from it, line and beam."""
-    k, row = np.meshgrid(np.arange(1 - REACH, REACH + 1), usable, indexing="ij")
-    k = k.ravel()
-    row = row.ravel()
-    order = np.argsort(np.abs(k - 0.5), kind="stable")
-    k = k[order]
-    row = row[order]
-    boundary = np.stack([line, beam], axis=1)
-    cell = boundary[row] + k[:, None] * step[row]
+    steps = sorted(range(1 - REACH, REACH + 1), key=lambda k: abs(k - 0.5))
+    k = np.repeat(steps, len(usable))
+    row = np.tile(usable, len(steps))
+    cell = np.stack([line, beam], axis=1)[row] + k[:, None] * step[row]
     margin = np.where(step[row] != 0, BORDER, 0)
     inside = np.all((cell >= margin) & (cell < shape - margin), axis=1)
-    k = k[inside]
-    row = row[inside]
-    line, beam = cell[inside].T
-    _, first = np.unique(line * shape[1] + beam, return_index=True)
-    return row[first], k[first], line[first], beam[first]
+    rows = np.column_stack([row, k, cell])[inside]
+    _, first = np.unique(rows[:, 2:], axis=0, return_index=True)
+    return rows[first].T
 
 
 def _on_one_side(scan, cells, board, reach, sides, side):

@@ -122,8 +122,6 @@ def refine_edge(
         With the reason.
     """
     length = np.linalg.norm(end - start)
-    if min(*start, *end) <= BEHIND:
-        raise EdgeNotSeen("it passes behind the camera")
     if not LEAST_PROFILES <= length < LONGEST * max(image.shape):
         raise EdgeNotSeen(f"its predicted length is {length:.0f} px")
     along = (end - start) / length
@@ -134,7 +132,7 @@ def refine_edge(
     across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
     on_edge = start + columns[None, :, None] * along
     strip = sample(image, model, on_edge + across[:, None, None] * normal)
-    visible = int(np.isfinite(strip[np.abs(across) <= NEAR_PX, :, 0]).all(axis=0).sum())
+    visible = np.isfinite(strip[np.abs(across) <= NEAR_PX, :, 0]).all(axis=0).sum()
     if visible < max(LEAST_PROFILES, LEAST_SHARE * len(columns)):
         share = 100 * visible / len(columns)
         raise EdgeNotSeen(f"cut by the image border: {share:.0f}% of it inside the image")
@@ -217,19 +215,18 @@ def step_contrast(strip, sigma, along=AVERAGED_PROFILES):
     0 where it leaves the image. Derivative of a Gaussian of `sigma` samples across the edge, of
     `along` averaged profiles, norm over the colours.
     """
-    gone = np.isnan(strip[..., 0])
     wide = int(4 * sigma + 0.5)
     places = np.arange(-wide, wide + 1)
     bell = np.exp(-0.5 * (places / sigma) ** 2)
     slope = places / sigma * bell / bell.sum() * np.sqrt(2 * np.pi)
     mean = np.full(along, 1 / along)
-    filled = np.where(gone[..., None], np.float32(0), strip)
+    filled = np.nan_to_num(strip)
     steps = cv2.sepFilter2D(filled, cv2.CV_32F, mean, slope, borderType=cv2.BORDER_REFLECT)
     height = np.linalg.norm(steps.reshape(strip.shape), axis=-1)
+    gone = np.isnan(strip[..., 0]).astype(np.uint8)
     reach = int(np.ceil(2 * sigma))
-    kernel = np.ones((2 * reach + 1, along), np.uint8)
-    near_gone = cv2.dilate(gone.astype(np.uint8), kernel) > 0
-    return np.where(near_gone, 0, height)
+    height[cv2.dilate(gone, np.ones((2 * reach + 1, along), np.uint8)) > 0] = 0
+    return height
 
 
 def peaks(height, least=LEAST_CONTRAST):
@@ -237,16 +234,11 @@ def peaks(height, least=LEAST_CONTRAST):
 
     The place is that of a parabola through three samples.
     """
-    low = height[:-2]
-    mid = height[1:-1]
-    high = height[2:]
-    highest = (mid >= low) & (mid > high) & (mid > least)
-    column, row = np.nonzero(highest.T)
-    a = low[row, column]
-    b = mid[row, column]
-    c = high[row, column]
-    bend = np.minimum(a - 2 * b + c, -1e-12)
-    return column, row + 1 + 0.5 * (a - c) / bend, b
+    windows = np.stack([height[:-2], height[1:-1], height[2:]])
+    low, mid, high = windows
+    column, row = np.nonzero(((mid >= low) & (mid > high) & (mid > least)).T)
+    a, b, c = windows[:, row, column]
+    return column, row + 1 + 0.5 * (a - c) / (a - 2 * b + c), b
 
 
 def outward_line(a, b, outward):
@@ -270,8 +262,8 @@ def on_board(xy, pose, model):
 
     Far outside the image where they lie behind the camera.
     """
-    points = np.column_stack([xy.reshape(-1, 2), np.zeros(xy.size // 2)])
-    return np.nan_to_num(pinhole(pose.apply(points), model), nan=BEHIND).reshape(xy.shape)
+    points = pose.apply(np.pad(xy.reshape(-1, 2), ((0, 0), (0, 1))))
+    return np.nan_to_num(pinhole(points, model), nan=BEHIND).reshape(xy.shape)
 
 
 def _line_in_strip(strip, visible, across, half_width, prior_px):
@@ -291,7 +283,7 @@ def _line_in_strip(strip, visible, across, half_width, prior_px):
     slope = slopes[turned]
     fit = _fit_line(column, place, at - slope * (count - 1) / 2, slope)
     support = len(np.unique(fit.columns)) / visible
-    if support < LEAST_SUPPORT or len(fit.columns) < LEAST_PROFILES:
+    if support < LEAST_SUPPORT:
         raise EdgeNotSeen(
             f"no clear edge: {100 * support:.0f}% of the profiles agree on a line"
         )
@@ -309,8 +301,8 @@ def _fit_line(column, place, offset, slope):
     for _ in range(FIT_ROUNDS):
         residuals = place - design @ line
         near = np.abs(residuals) < TOLERANCE_PX / ACROSS_STEP_PX
-        if near.sum() < 3:
-            return _Fit(*line, np.full((2, 2), np.inf), column[near], np.inf)
+        if near.sum() < LEAST_PROFILES:
+            raise EdgeNotSeen(f"no clear edge: {near.sum()} profiles agree on a line")
         sigma = robust_sigma(residuals[near], least=LEAST_SIGMA)
         weight = np.where(near, biweight(residuals, sigma), 0)
         normal = design.T @ (design * weight[:, None])
@@ -327,25 +319,21 @@ def _fit_line(column, place, offset, slope):
 
 
 def _correlation_factor(column, residuals):
-    """Integrated autocorrelation of residuals along the edge, ``1 + 2 sum rho``, at least 1."""
+    """Integrated autocorrelation of residuals along the edge, ``1 + 2 sum rho``."""
     place = column - column.min()
-    length = place.max() + 1
-    series = np.zeros(length)
+    series = np.zeros(place.max() + 1)
+    present = np.zeros_like(series)
     series[place] = residuals
-    present = np.zeros(length)
     present[place] = 1.0
-    mean_product = _autocorrelation(series) / np.maximum(_autocorrelation(present), 1)
+    products, pairs = (
+        np.correlate(values, values, "full")[place.max() :] for values in (series, present)
+    )
+    mean_product = products / np.maximum(pairs, 1)
     rho = mean_product / max(mean_product[0], 1e-300)
     # a line was taken out: the residuals of white noise already sum to about -1, so no further
     # correction is needed
-    total = 1 + 2 * np.cumsum(np.r_[0.0, rho[1 : length // 3]])
+    rho[0] = 0.0
+    total = 1 + 2 * np.cumsum(rho[: max(len(rho) // 3, 1)])
     wide = np.arange(len(total)) >= SOKAL * total
     wide[-1] = True
-    return float(max(total[wide.argmax()], 1.0))
-
-
-def _autocorrelation(series):
-    """Sums of products of a series (n,) with itself, by the distance apart."""
-    size = 2 ** int(np.ceil(np.log2(2 * len(series))))
-    power = np.abs(np.fft.rfft(series, size)) ** 2
-    return np.fft.irfft(power, size)[: len(series)]
+    return total[wide.argmax()]

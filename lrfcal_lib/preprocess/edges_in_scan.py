@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, tilt
+from lrfcal_lib.model.geometry import lrf_to_platform, plane_axes, polar_to_points, tilt
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step, row_median
 from lrfcal_lib.preprocess.straight_runs import LEAST_TURN, line_of, straight_runs
-from lrfcal_lib.preprocess.surfaces import SAME_PITCH, depth_jump, plane_axes, row_ends
+from lrfcal_lib.preprocess.surfaces import SAME_PITCH, depth_jump, row_ends
 
 VARIANTS = ("last_beam", "half_step")
 # metres; an LMS2xx gives one reading for two surfaces nearer together along the beam (telegram
@@ -172,33 +172,32 @@ def crossings(
         All of them, with those left out.
     """
     ends = _ends(scan, across)
-    gap = ends.outer - ends.inner
     shift = 0.0
     warp_sigma = 0.0
     if not across:
         shift, warp_sigma = _warp(scan, ends)
-    elif len(scan.sweep.pitch) > 1:
-        # the pitch is read in steps, it may seem to stand still
-        gap = np.copysign(np.maximum(np.abs(gap), median_step(scan.sweep.pitch)), gap)
-    order = ends.beam if across else ends.line
 
     def at(angle):
         if across:
             return _down_columns(scan, ends, angle)
         return _along_lines(scan, ends.line, angle, shift)
 
+    last = at(ends.inner)
     middle = at((ends.inner + ends.outer) / 2)
     here = scan.fitted[ends.line, ends.beam]
     behind = beyond(scan, ends.line, ends.beam, ends.step)
+    order = ends.beam if across else ends.line
     side, every = _group(scan, middle, order, ends.end, behind - here < MIXING, known)
-    sigma = np.abs(gap) * UNIFORM
+    # the pitch is read in steps, it may seem to stand still
+    step = median_step(scan.sweep.pitch if across else scan.sweep.bearings)
+    sigma = np.maximum(np.abs(ends.outer - ends.inner), step) * UNIFORM
     by_angle = _to_platform(scan, middle.by_angle, middle.pitch)
     sigma = sigma * _inflation(by_angle, sigma, side, every)
     sides = tuple(s for s in every if _leans(s, across))
     if every:  # scans at one pitch have no sides, and keep all points
         side = np.where(np.isin(side, [s.side for s in sides]), side, -1)
     edges = {}
-    for variant, crossing in (("last_beam", at(ends.inner)), ("half_step", middle)):
+    for variant, crossing in (("last_beam", last), ("half_step", middle)):
         edges[variant] = ScanEdges(
             variant=variant,
             points=crossing.points,
@@ -218,8 +217,9 @@ def crossings(
 def _covariance(crossing, sigma, warp_sigma):
     """Of crossings, metres^2: along their rays, and by the angle at which they lie."""
     rays = crossing.points / np.linalg.norm(crossing.points, axis=1, keepdims=True)
-    noise = _outer(rays * np.hypot(crossing.range_sigma, warp_sigma)[:, None])
-    return noise + _outer(crossing.by_angle * sigma[:, None])
+    noise = rays * np.hypot(crossing.range_sigma, warp_sigma)[:, None]
+    place = crossing.by_angle * sigma[:, None]
+    return noise[:, :, None] * noise[:, None, :] + place[:, :, None] * place[:, None, :]
 
 
 def beyond(scan, line, beam, step):
@@ -242,8 +242,7 @@ def beyond(scan, line, beam, step):
     cells = ends[:, None] + step[:, None] * away
     cells = np.clip(cells, 0, np.array(scan.mask.shape) - 1)
     ranges = scan.sweep.ranges[cells[..., 0], cells[..., 1]]
-    ordered = np.sort(np.nan_to_num(ranges, nan=np.inf), axis=1)
-    return ordered[:, CELLS_BEHIND // 2]
+    return np.median(np.nan_to_num(ranges, nan=np.inf), axis=1)
 
 
 def background_odds(here, behind):
@@ -280,11 +279,6 @@ def plane_range(scan, rays, pitch) -> tuple[np.ndarray, np.ndarray]:
         return height / cosine, cosine
 
 
-def _outer(vectors):
-    """Products (n, 3, 3) of vectors (n, 3) with themselves."""
-    return vectors[:, :, None] * vectors[:, None, :]
-
-
 def _leans(side, across):
     """Whether the place along a scan line (a column) tells more of a side than the pitch does."""
     lean = np.pi / 2 - side.angle if across else side.angle
@@ -295,40 +289,31 @@ def _ends(scan, across):
     """Ends of lines (columns) that may be edges."""
     mask = scan.mask.T if across else scan.mask
     sweep = scan.sweep
+    angles = sweep.pitch if across else sweep.bearings
     rows, first, last = row_ends(mask)
-    row = np.r_[rows, rows]
-    cell = np.r_[first, last]
+    row = np.tile(rows, 2)
+    cell = np.concatenate([first, last])
     way = np.repeat([-1, 1], len(rows))
     line, beam = (cell, row) if across else (row, cell)
-    keep = (cell >= BORDER) & (cell < mask.shape[1] - BORDER)
-    keep &= np.isfinite(scan.lines[line, 0])
-    line = line[keep]
-    beam = beam[keep]
-    way = way[keep]
-    step = np.zeros((len(way), 2), int)
-    step[:, 0 if across else 1] = way
-    angles = sweep.pitch if across else sweep.bearings
-    inner = angles[cell[keep]]
-    outer = angles[cell[keep] + way]
-    end = way
-    if across:
-        turned = outer - inner
-        number = np.arange(len(angles))
-        if len(angles) > 1 and np.polyfit(number, angles, 1)[0] <= 0:
-            end = -way  # a sweep downwards
-    else:
-        turned = np.median(np.diff(angles))
+    inside = (cell >= BORDER) & (cell < mask.shape[1] - BORDER)
+    inside &= np.isfinite(scan.lines[line, 0])
+    row, cell, way, line, beam = np.stack([row, cell, way, line, beam])[:, inside]
+    step = np.outer(way, [across, not across])
+    inner = angles[cell]
+    outer = angles[cell + way]
+    falling = across and np.polyfit(np.arange(len(angles)), angles, 1)[0] <= 0
     here = scan.fitted[line, beam]
     after = sweep.ranges[line + step[:, 0], beam + step[:, 1]]
-    visible = ~(after < here - depth_jump(here, turned))  # nothing nearer hides the board
-    ends = line, beam, step, end, inner, outer
+    # nothing nearer hides the board
+    visible = ~(after < here - depth_jump(here, outer - inner))
+    ends = line, beam, step, -way if falling else way, inner, outer
     return _Ends(*(part[visible] for part in ends))
 
 
 def _along_lines(scan, line, bearing, shift=0.0):
     """Crossings on the fitted lines at bearings, moved by `shift` (metres) along the ray."""
-    rays = polar_to_points(np.ones(len(bearing)), bearing)
-    turned = np.stack([-rays[:, 1], rays[:, 0], 0 * bearing], axis=1)
+    rays = polar_to_points(1.0, bearing)
+    turned = np.cross([0.0, 0.0, 1.0], rays)
     u = scan.lines[line]
     r = 1 / np.sum(u * rays[:, :2], axis=1)
     slope = -(r**2) * np.sum(u * turned[:, :2], axis=1)
@@ -342,7 +327,7 @@ def _along_lines(scan, line, bearing, shift=0.0):
 
 def _down_columns(scan, ends, pitch):
     """Crossings at pitch angles: on the fitted lines, changed as the board's plane predicts."""
-    rays = polar_to_points(np.ones(len(pitch)), scan.sweep.bearings[ends.beam])
+    rays = polar_to_points(1.0, scan.sweep.bearings[ends.beam])
     there, _ = plane_range(scan, rays, pitch)
     here, _ = plane_range(scan, rays, scan.sweep.pitch[ends.line])
     fitted = scan.fitted[ends.line, ends.beam]
@@ -384,13 +369,13 @@ def _warp(scan, ends):
     inwards = np.arange(WARPED_BEAMS)
     count = np.clip(scan.mask[ends.line].sum(axis=1) // 8, 1, WARPED_BEAMS)
     beams = ends.beam[:, None] - ends.end[:, None] * inwards
-    inside = (beams >= 0) & (beams < scan.mask.shape[1])
-    cells = ends.line[:, None], np.where(inside, beams, 0)
-    use = inside & (inwards < count[:, None]) & scan.mask[cells]
+    # an eighth of a line never leaves the view
+    cells = ends.line[:, None], np.clip(beams, 0, scan.mask.shape[1] - 1)
+    use = (inwards < count[:, None]) & scan.mask[cells]
     misses = (scan.sweep.ranges - scan.fitted)[cells]
     middle = row_median(np.where(use, misses, np.nan))
     # of a median: pi / 2 times that of a mean
-    noise = np.pi / 2 * scan.sigma_range**2 / np.maximum(use.sum(axis=1), 1)
+    noise = np.pi / 2 * scan.sigma_range**2 / use.sum(axis=1)
     excess = np.zeros(len(noise))
     for way in np.unique(ends.end):
         rows = ends.end == way
@@ -425,9 +410,8 @@ def _group(scan, crossing, order, end, mixed, known):
     """
     if np.ptp(scan.sweep.pitch) < SAME_PITCH:
         return (end + 1) // 2, ()  # scans at one pitch show one point a side
-    pitch = crossing.pitch
     axes = plane_axes(scan.normal)
-    flat = lrf_to_platform(crossing.points, pitch, scan.T_head_lrf) @ axes.T
+    flat = lrf_to_platform(crossing.points, crossing.pitch, scan.T_head_lrf) @ axes.T
     side = np.full(len(flat), -1)
     if len(flat) == 0:
         return side, ()
@@ -441,7 +425,7 @@ def _group(scan, crossing, order, end, mixed, known):
         place = order[candidates] - np.searchsorted(left_out, order[candidates])
         for run in straight_runs(flat[candidates], place, tolerance, shortest):
             rows = candidates[run]
-            new = _side_through(scan, flat[rows], axes, np.mean(pitch[rows]), hand)
+            new = _side_through(scan, flat[rows], axes, np.mean(crossing.pitch[rows]), hand)
             same = [s.side for s in known if s.is_same(new)]
             number = same[0] if same else len(known) + len(sides)
             side[rows] = number
@@ -453,9 +437,9 @@ def _spacing(scan):
     """Median distance of neighbouring beams at the ends of the board's scan lines, metres."""
     row, first, last = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
     bearing = scan.sweep.bearings[np.r_[first, last]]
-    by_bearing = _along_lines(scan, np.r_[row, row], bearing).by_angle
-    step = np.median(np.diff(scan.sweep.bearings))
-    return float(np.median(np.linalg.norm(by_bearing, axis=1)) * step)
+    by_bearing = _along_lines(scan, np.tile(row, 2), bearing).by_angle
+    apart = np.median(np.linalg.norm(by_bearing, axis=1))
+    return float(apart) * median_step(scan.sweep.bearings)
 
 
 def _side_through(scan, flat, axes, pitch, end):

@@ -126,8 +126,8 @@ def first_pose(
         When there is none in front of the camera.
     """
     good = np.isfinite(pixels).all(axis=1)
-    board = points[good].astype(float)
-    image = np.ascontiguousarray(pixels[good], float)
+    board = points[good]
+    image = pixels[good]
     why = f"{good.sum()} corners do not determine a pose in front of the camera"
     try:
         solved, turn, shift = cv2.solvePnP(
@@ -181,13 +181,9 @@ def board_pose(
     """
     pixels = np.asarray(pixels, float)
     points = raised_points(pattern, relief)
-    if pixels.shape != points[:, :2].shape or (
-        np.isfinite(pixels).all(axis=1).sum() < FEWEST_CORNERS
-    ):
-        raise ValueError(
-            f"a pose needs four or more of the pattern's {len(points)} corners, got shape "
-            f"{pixels.shape}"
-        )
+    count = np.isfinite(pixels).all(axis=1).sum()
+    if count < FEWEST_CORNERS:
+        raise ValueError(f"a pose needs four corners of the pattern or more, got {count}")
     if start is None:
         start = first_pose(points, pixels, model)
     poses = RigidTransform.concatenate([start])

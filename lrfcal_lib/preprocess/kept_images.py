@@ -28,9 +28,7 @@ class Part:
     def image(self) -> np.ndarray:
         """The image, black where nothing of the board can be."""
         height, width = self.pixels.shape[:2]
-        image = np.zeros(
-            self.shape, np.uint8
-        )  # the system gives memory where it is written to
+        image = np.zeros(self.shape, np.uint8)
         image[self.top : self.top + height, self.left : self.left + width] = self.pixels
         return image
 
@@ -54,9 +52,9 @@ def part_around(image: np.ndarray, corners: np.ndarray, board) -> Part:
     beyond = FARTHEST + ALONG  # squares
     if board.corners is not None:
         grid = pattern.points()[:, :2]
-        low = grid.min(axis=0) - board.corners.min(axis=0)
-        high = board.corners.max(axis=0) - grid.max(axis=0)
-        beyond = max(*low, *high) / pattern.square
+        low = np.max(grid.min(axis=0) - board.corners)
+        high = np.max(board.corners - grid.max(axis=0))
+        beyond = max(low, high) / pattern.square
     sides = np.linalg.norm(square_axes(corners, (pattern.columns, pattern.rows)), axis=1)
     room = NEARER * beyond * sides.max() + ROOM_PX
     left, top = np.maximum(corners.min(axis=0) - room, 0).astype(int)

@@ -100,12 +100,11 @@ def edge_votes(
     distances = _distances(pattern)
     slopes = np.linspace(-STEEPEST_SLOPE, STEEPEST_SLOPE, SLOPES) * APART
     size = _size(pattern)
+    square = pattern.square
     shares = []
     for normal in SIDE_NORMALS:
         along = np.abs(normal[::-1])
-        s = np.arange(
-            -pattern.square, size @ along + pattern.square, APART * STEP * pattern.square
-        )
+        s = np.arange(-square, size @ along + square, APART * STEP * square)
         corner = np.asarray(pattern.origin) + np.maximum(normal, 0) * size
         xy = corner + s[None, :, None] * along + distances[:, None, None] * normal
         strip = sample(image, model, on_board(xy, pose, model))
@@ -115,7 +114,8 @@ def edge_votes(
         votes = loops().vote(column, place, weight, height.shape, slopes).max(axis=0)
         visible = np.isfinite(strip[..., 0]).sum(axis=1)
         share = votes / np.maximum(visible, 1)
-        shares.append(np.where(visible > LEAST_SHARE * len(s), share, np.nan))
+        share[visible <= LEAST_SHARE * len(s)] = np.nan
+        shares.append(share)
     return np.stack(shares)
 
 
@@ -137,13 +137,13 @@ def turned_views(votes: np.ndarray, up: np.ndarray, leader: np.ndarray) -> np.nd
     ndarray of bool, shape (v,)
     """
     wide = uniform_filter1d(np.nan_to_num(votes), MOVES_WITHIN, axis=-1)
-    both = np.stack([wide, wide[:, OPPOSITE]])
+    opposite = wide[:, OPPOSITE]
     turned = np.bincount(leader, up)[leader] < 0
     for _ in range(TURN_ROUNDS):
-        mean = both[turned.astype(int), np.arange(len(votes))].mean(axis=0)
-        score = np.sum(both * mean, axis=(2, 3))
+        mean = np.where(turned[:, None, None], opposite, wide).mean(axis=0)
+        gain = np.sum((opposite - wide) * mean, axis=(1, 2))
         before = turned
-        turned = np.bincount(leader, score[1] - score[0])[leader] > 0
+        turned = np.bincount(leader, gain)[leader] > 0
         if np.array_equal(turned, before):
             break
     upright = np.where(turned, -up, up) > 0
@@ -172,22 +172,19 @@ def common_lines(votes: np.ndarray, board) -> np.ndarray:
     """
     wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), MOVES_BETWEEN, axis=-1)
     wide[wide < 0] = np.nan
-    distances = _distances(board.pattern)
-    fewest = min(3, len(votes))
+    count = np.isfinite(wide).sum(axis=0)
+    mean = np.nansum(wide, axis=0) / np.maximum(count, 1)
+    mean[count < min(3, len(votes))] = 0
     places = []
-    for side, name in enumerate(SIDES):
-        of_side = wide[:, side]
-        enough = np.isfinite(of_side).sum(axis=0) >= fewest
-        mean = np.zeros(len(distances))
-        mean[enough] = np.nanmean(of_side[:, enough], axis=0)
-        place = _outer_peak(gaussian_filter1d(mean, 1.0))
+    for name, of_side in zip(SIDES, gaussian_filter1d(mean, 1.0), strict=True):
+        place = _outer_peak(of_side)
         if place is None:
             raise OutlineNotSeen(
                 f"the images do not agree on the {name} edge of board '{board.name}': give the "
                 "corners of the board or pick edges by hand"
             )
         places.append(place)
-    return side_lines(board.pattern, distances[places])
+    return side_lines(board.pattern, _distances(board.pattern)[places])
 
 
 def side_lines(pattern: Chessboard, distances) -> np.ndarray:
@@ -231,42 +228,36 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     DegenerateGeometry
         Names an edge that was found in no image.
     """
-    usable = [view for view in views if not view.reason]
-    lines_of_views = []
-    for view in usable:
-        model = models[view.camera]
-        lines_of_views.append(
-            {edge.name: board_line(view, edge, model) for edge in view.edges}
-        )
-    lines = [
-        np.array([of_view[name] for of_view in lines_of_views if name in of_view])
-        for name in board.edges
+    lines_of_views = [
+        {edge.name: board_line(view, edge, models[view.camera]) for edge in view.edges}
+        for view in views
+        if not view.reason
     ]
-    for name, of_edge in zip(board.edges, lines, strict=True):
-        if not len(of_edge):
+    lines = []
+    for name in board.edges:
+        of_edge = [of_view[name] for of_view in lines_of_views if name in of_view]
+        if not of_edge:
             raise DegenerateGeometry(
-                f"edge '{name}' of board '{board.name}' was found in none of {len(usable)} images: "
-                "pick it by hand in edges.csv or give the corners of the board"
+                f"edge '{name}' of board '{board.name}' was found in none of "
+                f"{len(lines_of_views)} images: pick it by hand in edges.csv or give the corners "
+                "of the board"
             )
+        lines.append(np.array(of_edge))
     rough = corners_of_lines([np.median(of_edge, axis=0) for of_edge in lines])
-    fitted = []
-    line_sd = []
-    for of_edge, start, end in zip(lines, rough, np.roll(rough, -1, axis=0), strict=True):
-        line, spread = _median_line(of_edge, np.stack([start, end]))
-        fitted.append(line)
-        line_sd.append(spread)
-    lengths = {}
+    ends = np.stack([rough, np.roll(rough, -1, axis=0)], axis=1)
+    medians = [_median_line(*each) for each in zip(lines, ends, strict=True)]
+    fitted = [line for line, _ in medians]
+    lengths: dict[str, list] = {name: [] for name in board.edges}
     for i, name in enumerate(board.edges):
         trio = board.edges[i - 1], name, board.edges[(i + 1) % len(board.edges)]
-        lengths[name] = [
-            _length([of_view[each] for each in trio])
-            for of_view in lines_of_views
-            if of_view.keys() >= {*trio}
-        ]
+        for of_view in lines_of_views:
+            if of_view.keys() >= {*trio}:
+                corners = corners_of_lines([of_view[each] for each in trio])
+                lengths[name].append(np.linalg.norm(corners[2] - corners[1]))
     return Outline(
         board=replace(board, corners=corners_of_lines(fitted)),
         lines=np.array(fitted),
-        line_sd=np.array(line_sd),
+        line_sd=np.array([spread for _, spread in medians]),
         length_sd={name: _spread(of_edge) for name, of_edge in lengths.items()},
         n_lengths={name: len(of_edge) for name, of_edge in lengths.items()},
     )
@@ -290,21 +281,14 @@ def _outer_peak(votes):
     """
     best = None
     start = 0
-    for i in np.flatnonzero(votes >= LEAST_VOTES):
-        if votes[i] < votes[max(i - LINE_WIDTH, 0) : i + LINE_WIDTH + 1].max():
-            continue
+    highest = votes >= maximum_filter1d(votes, 2 * LINE_WIDTH + 1)
+    for i in np.flatnonzero(highest & (votes >= LEAST_VOTES)):
         gap = votes[start : max(i - 2 * LINE_WIDTH, start)]
         if gap.size and gap.mean() > QUIET:
             break
         best = int(i)
         start = best + 2 * LINE_WIDTH
     return best
-
-
-def _length(trio):
-    """Length of the edge between its two neighbours, lines (3, 3) in order."""
-    corners = corners_of_lines(trio)
-    return np.linalg.norm(corners[2] - corners[1])
 
 
 def _median_line(lines, ends):

@@ -51,26 +51,21 @@ def find_polygon(image: np.ndarray, n_corners: int) -> np.ndarray:
     """
     picture = cv2.GaussianBlur(grey(image), (0, 0), BLUR_PX)
     level = cv2.threshold(picture, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0]
-    best = None
-    best_area = LEAST_AREA_SHARE * picture.size
-    cut = False
+    contours = []
     for threshold in DARKNESS * level:
         dark = (picture < threshold).astype(np.uint8)
-        for contour in cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
-            area = cv2.contourArea(contour)
-            if area <= best_area:
-                continue
-            corners = _polygon(contour, area, n_corners)
-            if corners is None:
-                continue
-            border = contour.reshape(-1, 2)
-            if np.any(border <= 1) or np.any(border >= np.array(picture.shape[::-1]) - 2):
-                cut = True
-            else:
-                best = corners
-                best_area = area
-    if best is not None:
-        return best
+        contours += cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    last = np.array(picture.shape[::-1]) - 2
+    cut = False
+    for contour in sorted(contours, key=cv2.contourArea, reverse=True):
+        if cv2.contourArea(contour) <= LEAST_AREA_SHARE * picture.size:
+            break
+        corners = _polygon(contour, n_corners)
+        if corners is None:
+            continue
+        if np.all((contour > 1) & (contour < last)):
+            return corners
+        cut = True
     if cut:
         raise EdgeNotSeen("the dark board is cut by the image border")
     raise EdgeNotSeen(
@@ -135,10 +130,11 @@ def frontal(pose: RigidTransform) -> float:
     return float(-normal @ pose.translation / np.linalg.norm(pose.translation))
 
 
-def _polygon(contour, area, n_corners):
+def _polygon(contour, n_corners):
     """The polygon around a contour; None where the region does not fill it or has other corners."""
+    least = cv2.contourArea(contour) / LEAST_FILL
     hull = cv2.convexHull(contour)
-    if area < LEAST_FILL * cv2.contourArea(hull) or len(hull) < n_corners:
+    if cv2.contourArea(hull) > least or len(hull) < n_corners:
         return None
     if n_corners == 3:
         corners = cv2.minEnclosingTriangle(hull)[1]
@@ -146,11 +142,11 @@ def _polygon(contour, area, n_corners):
         corners = cv2.approxPolyN(hull, n_corners, None, -1.0, True)
     if corners is None or corners.size != 2 * n_corners:
         return None
-    if area < LEAST_FILL * cv2.contourArea(corners):
-        return None
     corners = corners.reshape(-1, 2).astype(np.float32)
-    clockwise = cv2.contourArea(corners, True) > 0
-    return (corners if clockwise else corners[::-1]).astype(float)
+    area = cv2.contourArea(corners, True)  # above 0 clockwise
+    if abs(area) > least:
+        return None
+    return (corners if area > 0 else corners[::-1]).astype(float)
 
 
 def _starts(flat, corners, model):

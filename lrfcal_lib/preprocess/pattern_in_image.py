@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.polynomial.polynomial import polyvander2d
 from scipy.ndimage import map_coordinates, spline_filter
+from scipy.spatial.distance import cdist
 
 from lrfcal_lib.model.board import Chessboard
 
@@ -65,17 +66,7 @@ def grey(image) -> np.ndarray:
     Returns
     -------
     ndarray of uint8, shape (h, w)
-
-    Raises
-    ------
-    ValueError
-        For anything else.
     """
-    image = np.asarray(image)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.size == 0:
-        raise ValueError(
-            f"an image must be uint8 of shape (h, w) or (h, w, 3), got {image.dtype} {image.shape}"
-        )
     if image.ndim == 2:
         return image
     return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -121,8 +112,6 @@ class PatternFinder:
         ------
         PatternNotFound
             Where no detector finds all corners.
-        ValueError
-            For what is no 8-bit image.
         """
         picture = grey(image)
         corners = self._in_reduced(picture)
@@ -132,12 +121,10 @@ class PatternFinder:
                 f"no chessboard with {columns} x {rows} inner corners in the image: it must be "
                 "whole, and not glare"
             )
+        if np.linalg.det(square_axes(corners, self.size)).mean() > 0:
+            return corners
         grid = corners.reshape(self.size[1], self.size[0], 2)
-        x = grid[0, -1] - grid[0, 0]
-        y = grid[-1, 0] - grid[0, 0]
-        if x[0] * y[1] - x[1] * y[0] <= 0:  # a mirrored image
-            grid = grid[::-1]
-        return grid.reshape(-1, 2)
+        return grid[::-1].reshape(-1, 2)  # of a mirrored image
 
     def _in_reduced(self, picture):
         """Corners of a large picture by way of a reduced one, or without it where that shows
@@ -146,8 +133,7 @@ class PatternFinder:
         times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
         if times <= 1:
             return self._search(picture)
-        height = picture.shape[0] // times
-        width = picture.shape[1] // times
+        height, width = (side // times for side in picture.shape)
         whole = picture[: height * times, : width * times]
         reduced = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         corners = self._search(reduced)
@@ -213,20 +199,16 @@ def _smoothest(picture, size, rough):
     From sectors near by where rough corners were too far off for their windows.
     """
     refined = refine_corners(picture, rough, size)
-    noise = grid_noise(refined, size)
-    if noise < SMOOTH_ENOUGH_PX:
+    if grid_noise(refined, size) < SMOOTH_ENOUGH_PX:
         return refined
-    low = rough.min(axis=0)
-    high = rough.max(axis=0)
-    margin = AROUND * (high - low) + AROUND_PX
-    left, top = np.maximum(low - margin, 0).astype(int)
-    right, bottom = np.minimum(high + margin, picture.shape[::-1]).astype(int)
-    part = np.ascontiguousarray(picture[top:bottom, left:right])
-    start = sectors(part, size, 0)
+    margin = AROUND * np.ptp(rough, axis=0) + AROUND_PX
+    left, top = np.maximum(rough.min(axis=0) - margin, 0).astype(int)
+    right, bottom = (rough.max(axis=0) + margin).astype(int)
+    start = sectors(np.ascontiguousarray(picture[top:bottom, left:right]), size, 0)
     if start is None:
         return refined
     other = refine_corners(picture, start + [left, top], size)
-    return refined if noise <= grid_noise(other, size) else other
+    return min(refined, other, key=lambda corners: grid_noise(corners, size))
 
 
 def grid_noise(corners, size):
@@ -276,9 +258,7 @@ def refine_corners(picture, corners, size):
     reach = np.clip(WIDEST_WINDOW_PX / longest, LEAST_REACH, REACH)  # (n,), squares
     around = int(MARGIN * np.max(reach * longest)) + 3
     low = np.maximum(start.min(axis=0).astype(int) - around, 0)
-    high = np.minimum(start.max(axis=0).astype(int) + around, picture.shape[::-1])
-    if np.any(high - low < 3):
-        return start
+    high = start.max(axis=0).astype(int) + around
     part = picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
     half_window = np.median(reach[:, None] * side)
     kept = start - low
@@ -299,18 +279,14 @@ def symmetric_points(picture, points, size, reach, look):
     spline = spline_filter(picture, look.order, np.float32) if look.order > 1 else picture
     slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
     slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
-    last = np.array(picture.shape[::-1]) - 1
     for _ in range(REFINE_ROUNDS):
         axes = square_axes(points, size) * reach[:, None, None]
         arms = np.swapaxes(axes @ offsets, 1, 2)  # (n, m, 2)
         pairs = np.stack([points[:, None] + arms, points[:, None] - arms])
-        inside = np.all((pairs >= 0) & (pairs <= last), axis=(0, 3))
-        there, opposite = interpolated(spline, pairs, look.order)
-        differs = there - opposite
-        by_u = np.subtract(*interpolated(slope_u, pairs))
-        by_v = np.subtract(*interpolated(slope_v, pairs))
-        jacobian = np.stack([by_u, by_v], axis=2)
-        weighted = (inside * weight)[..., None] * jacobian
+        differs = np.subtract(*interpolated(spline, pairs, look.order))
+        slopes = [np.subtract(*interpolated(slope, pairs)) for slope in (slope_u, slope_v)]
+        jacobian = np.stack(slopes, axis=2)
+        weighted = weight[:, None] * jacobian
         normal = weighted.swapaxes(1, 2) @ jacobian
         right = weighted.swapaxes(1, 2) @ differs[..., None]
         step = -(np.linalg.pinv(normal, hermitian=True) @ right)[..., 0]
@@ -342,18 +318,17 @@ def square_axes(corners, size):
 def square_px(corners, size):
     """Mean side of a chessboard's squares in an image along the shorter of its two axes, pixels.
 
-    Corners (n, 2) that are NaN do not count; NaN where no two neighbours are left.
+    Corners (n, 2) that are NaN do not count.
     """
     grid = np.reshape(corners, (size[1], size[0], 2))
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2) for axis in (0, 1)]
-    means = [np.mean(side[np.isfinite(side)]) for side in sides if np.isfinite(side).any()]
-    return float(min(means, default=np.nan))
+    return float(min(np.nanmean(side) for side in sides))
 
 
 def scale_error(side_px):
     """Standard deviation, a share, of the scale of corners whose squares have a side in pixels."""
     error = SCALE_ERROR * (SCALE_ERROR_AT_PX / side_px) ** SCALE_ERROR_POWER
-    return float(np.fmin(error, LARGEST_SCALE_ERROR))  # the largest for a side that is NaN
+    return float(min(LARGEST_SCALE_ERROR, error))
 
 
 def _ends_in_squares(picture, corners, size):
@@ -369,12 +344,10 @@ def _ends_in_squares(picture, corners, size):
         away = BEYOND * (inner - edge)
         places = np.array([edge - away, edge + away])
         visible = np.all((places >= 0) & (places <= last), axis=(0, 2))
-        if not visible.any():
-            continue
         colours = cv2.remap(picture, places.astype(np.float32), None, cv2.INTER_LINEAR)
         outside, inside = colours[:, visible].astype(float)
         sign = np.resize([1.0, -1.0], len(visible))[visible]
-        sign -= sign.mean()
+        sign -= sign.sum() / max(len(sign), 1)
         contrast = sign @ inside
         if (sign @ outside) * contrast > -LEAST_BEYOND * contrast**2:
             return False
@@ -398,19 +371,18 @@ def pattern_orders(pattern: Chessboard, mirrored: bool = True) -> np.ndarray:
         pattern turned by 180 deg; square patterns may also stand on their side.
     """
     grid = np.arange(pattern.rows * pattern.columns).reshape(pattern.rows, pattern.columns)
-    orders = [grid, grid[::-1, ::-1]]
+    orders = [grid, np.rot90(grid, 2)]
     if pattern.rows == pattern.columns and mirrored:
-        quarter = grid[::-1].T
-        orders += [quarter, quarter[::-1, ::-1]]
+        orders += [np.rot90(grid, 3), np.rot90(grid)]
     if mirrored:
         orders += [order[::-1] for order in orders]
     return np.stack([order.ravel() for order in orders])
 
 
 def spread_views(pixels, count: int) -> list[int]:
-    """Which views of a pattern differ most, the largest view first.
+    """Which views of a pattern differ most: all, or the largest and then so many others.
 
-    Each of the others is the one whose corners lie farthest from those of all views before it.
+    Each of those is the one whose corners lie farthest from those of all views before it.
 
     Parameters
     ----------
@@ -423,15 +395,13 @@ def spread_views(pixels, count: int) -> list[int]:
     -------
     list of int
     """
-    if not len(pixels):
-        return []
+    if len(pixels) <= count or count == 0:
+        return list(range(min(len(pixels), count)))
     pixels = np.asarray(pixels, float)
     flat = pixels.reshape(len(pixels), -1)
+    apart = cdist(flat, flat)
     size = np.ptp(pixels, axis=1).prod(axis=1)
-    chosen: list[int] = []
-    nearest = np.full(len(flat), np.inf)
-    while len(chosen) < min(count, len(flat)):
-        chosen.append(int(np.argmax(nearest if chosen else size)))
-        nearest = np.minimum(nearest, np.linalg.norm(flat - flat[chosen[-1]], axis=1))
-        nearest[chosen[-1]] = -1.0
+    chosen = [int(np.argmax(size))]
+    while len(chosen) < count:
+        chosen.append(int(apart[:, chosen].min(axis=1).argmax()))
     return chosen

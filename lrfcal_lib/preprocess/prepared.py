@@ -160,9 +160,8 @@ class Prepared:
         """
         view = self.views[camera][placement]
         records = self.session.images(camera, placement=placement)
-        return view, self.session.read_image(
-            next(r for r in records if r.file.name == view.file)
-        )
+        (record,) = (r for r in records if r.file.name == view.file)
+        return view, self.session.read_image(record)
 
 
 @cached
@@ -182,17 +181,16 @@ def prepare_scans(session: Session) -> Prepared:
     problems = []
     edges: dict[str, dict] = {variant: {} for variant in VARIANTS}
     swept: dict[str, dict] = {variant: {} for variant in VARIANTS}
-
     for result in spread(partial(_crossed, session), session.board_placements):
         if isinstance(result, Problem):
             problems.append(result)
             continue
         scan, along, across = result
         scans[scan.placement] = scan
-        for variant in along:
+        for variant in VARIANTS:
             edges[variant][scan.placement] = along[variant]
-        for variant in across:
-            swept[variant][scan.placement] = across[variant]
+            if across:
+                swept[variant][scan.placement] = across[variant]
     return Prepared(session, session.board, scans, edges, swept, problems=tuple(problems))
 
 
@@ -228,16 +226,16 @@ def prepare_images(prepared: Prepared) -> Prepared:
         With the board in every image, the cameras' intrinsics, and the board's outline.
     """
     try:
-        surveyed = views_of(prepared.session, one_per_placement=True)
+        surveyed = views_of(prepared.session)
     except DegenerateGeometry as error:  # what remains is a session without cameras
         words = f"no image can be used: {error}"
         lost = Problem(Stage.IMAGES, ProblemKind.NO_IMAGES, words)
         return replace(prepared, problems=(*prepared.problems, lost))
     views = {}
     for camera, of_camera in surveyed.views.items():
-        ordered = sorted(of_camera, key=lambda view: view.placement)
+        by_placement = {view.placement: view for view in of_camera}
         # an image that belongs to no placement is left out
-        views[camera] = {view.placement: view for view in ordered if view.placement >= 0}
+        views[camera] = {p: by_placement[p] for p in sorted(by_placement) if p >= 0}
     problems = list(prepared.problems)
     if surveyed.unseen:
         words = f"faces of the board only: {surveyed.unseen}"

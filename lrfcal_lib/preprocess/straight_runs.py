@@ -47,8 +47,8 @@ def straight_runs(
             break
         left = np.setdiff1d(left, run)
         _, direction, along, _ = line_of(points[run])
-        turned = all(abs(direction @ other) < np.cos(LEAST_TURN) for other in directions)
-        if turned and np.ptp(along) >= shortest:
+        cosines = [abs(direction @ other) for other in directions]
+        if max(cosines, default=0.0) < np.cos(LEAST_TURN) and np.ptp(along) >= shortest:
             runs.append(run)
             directions.append(direction)
     return runs
@@ -72,33 +72,29 @@ def line_of(points: np.ndarray, among=slice(None)):
     """
     centre = points[among].mean(axis=0)
     offset = points - centre
-    spread = offset[among].T @ offset[among]
-    direction = np.linalg.eigh(spread)[1][:, 1]
-    across = offset[:, 1] * direction[0] - offset[:, 0] * direction[1]
-    return centre, direction, offset @ direction, across
+    across, direction = np.linalg.eigh(offset[among].T @ offset[among])[1].T
+    return centre, direction, offset @ direction, offset @ across
 
 
 def _without_gaps(run, order):
     """The largest part of a run without a gap of more than a tenth of it (five steps at least)."""
-    if len(run) == 0:
-        return run
     along = run[np.argsort(order[run], kind="stable")]
-    steps = np.diff(order[along], prepend=order[along[0]])
+    steps = np.diff(order[along], prepend=order[along[:1]])
     part = np.cumsum(steps > max(LONGEST_GAP, 0.1 * len(run)))
-    return np.sort(along[part == np.bincount(part).argmax()])
+    return np.sort(along[part == np.bincount(part, minlength=1).argmax()])
 
 
 def _consensus(points, tolerance, apart, rng):
     """Which points lie near the line that most agree with, after two least-squares refinements."""
     a = points[rng.integers(len(points), size=TRIALS)]
     b = points[rng.integers(len(points), size=TRIALS)]
-    length = np.linalg.norm(b - a, axis=1)
-    far = length > apart
+    far = np.linalg.norm(b - a, axis=1) > apart
     if not far.any():
         return np.zeros(len(points), bool)
-    along = (b - a)[far] / length[far, None]
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    distance = normal @ points.T - np.sum(normal * a[far], axis=1)[:, None]
+    a = a[far]
+    along = b[far] - a
+    normal = along[:, ::-1] * [-1, 1] / np.linalg.norm(along, axis=1, keepdims=True)
+    distance = normal @ points.T - np.sum(normal * a, axis=1)[:, None]
     # The sum of truncated squares ranks lines through the middle of a trace above those along its
     # rim.
     best = np.minimum((distance / tolerance) ** 2, 1).sum(axis=1).argmin()

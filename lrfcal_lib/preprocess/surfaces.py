@@ -2,17 +2,23 @@
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.robust import robust_sigma
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.geometry import fit_plane, lrf_to_platform, polar_to_points, tilt
+from lrfcal_lib.model.geometry import (
+    fit_plane,
+    lrf_to_platform,
+    plane_axes,
+    polar_to_points,
+    tilt,
+)
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import LrfInfo
 
@@ -33,10 +39,6 @@ NEIGHBOURS = 0.3  # metres; points that may span a plane together
 TRIALS = 200  # of random sample consensus
 SAMPLE = 1500  # points that it looks at
 REFINE_ROUNDS = 3
-# share of its convex hull that a board fills; what clutter leaves on a plane is patchy
-LEAST_FILL = 0.5
-# that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
-FEWEST_LINES = 4
 LEAST_LENGTH = 0.3  # of a scan line on a board, in units of the root of its least area
 
 
@@ -84,12 +86,12 @@ def segments(ranges, *, jump=DEPTH_NOISE, bridge=0) -> np.ndarray:
     line, beam = np.nonzero(valid)
     jump = np.broadcast_to(jump, ranges.shape)[valid]
     bridge = np.broadcast_to(bridge, ranges.shape)[valid]
-    gap = np.diff(beam)
-    change = np.abs(np.diff(ranges[valid]))
+    gap = np.diff(beam, prepend=0)
+    change = np.abs(np.diff(ranges[valid], prepend=0.0))
     broken = np.diff(line, prepend=-1) != 0
-    broken[1:] |= gap - 1 > bridge[1:]
-    broken[1:] |= change > gap * jump[1:]
+    broken |= (gap - 1 > bridge) | (change > gap * jump)
     labels = np.full(ranges.shape, -1)
+    broken[:1] = True
     labels[valid] = np.cumsum(broken) - 1
     return labels
 
@@ -99,9 +101,9 @@ def surfaces(ranges: np.ndarray, bearings: np.ndarray, pitch: np.ndarray) -> np.
 
     -1 without a return.
     """
-    step = np.median(np.diff(bearings)) if len(bearings) > 1 else 0.0
+    step = np.median(np.diff(bearings))
     near = np.where(np.isfinite(ranges), ranges, 1.0)
-    bridge = (LONGEST_HOLE / np.maximum(near * step, 1e-9)).astype(int)
+    bridge = (LONGEST_HOLE / (near * step)).astype(int)
     pieces = segments(ranges, jump=depth_jump(near, step), bridge=bridge)
     if not np.any(pieces >= 0):
         return pieces
@@ -120,7 +122,7 @@ def planar_surface(
     T_head_lrf: RigidTransform,
     board: Board | None,
     rng: np.random.Generator,
-    lrf: LrfInfo | None = None,
+    lrf: LrfInfo | None,
 ) -> Surface:
     """The nearest flat connected surface of a board's size.
 
@@ -136,7 +138,7 @@ def planar_surface(
         Tells the size.
     rng : numpy.random.Generator
         For the random sampling.
-    lrf : LrfInfo, optional
+    lrf : LrfInfo or None
         A spot that reads the board while it only touches it makes it larger by its radius.
 
     Returns
@@ -149,7 +151,10 @@ def planar_surface(
         Says what was seen instead.
     """
     ranges = sweep.ranges
-    points = _in_platform(sweep, T_head_lrf)
+    if not np.isfinite(ranges).any():
+        raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
+    p_lrf = polar_to_points(ranges, sweep.bearings)
+    points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)  # (L, B, 3), metres
     upright = None
     if np.ptp(sweep.pitch) <= SAME_PITCH:
         across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
@@ -161,24 +166,17 @@ def planar_surface(
         if nearest > best_reach:
             break
         for part in _planes(sweep, points, mask, upright, rng):
-            if ranges[part.mask].min() > best_reach:
-                continue
             reach = float(np.median(ranges[part.mask]))
             grown = 0.0 if lrf is None else float(lrf.spot_radius(reach))
             limits = _size_limits(board, grown)
-            area = 0.0
-            fault = ""
             if upright is None:
                 part = _trimmed(part, points, limits)
-                area, length = plane_size(points[part.mask], part.normal)
-                fits = limits.hold(area, length)
-                fault = _fault(part, sweep, T_head_lrf, points)
-            else:
-                length = float(np.ptp(points[part.mask] @ np.cross(part.normal, upright)))
+            area, length = plane_size(points[part.mask], part.normal)
+            fits = limits.hold(area, length)
+            if upright is not None:
                 fits = LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest
-            if not fits or fault:
-                size = f"{area:.2f} m2, {length:.2f} m long"
-                rejected.append(f"{size} at {reach:.2f} m{fault}")
+            if not fits:
+                rejected.append(f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m")
             elif reach < best_reach:
                 best = part
                 best_reach = reach
@@ -186,14 +184,6 @@ def planar_surface(
         words = "; ".join(rejected[:4]) or "no flat surface"
         raise BoardNotFound(f"no flat surface of the board's size; seen: {words}")
     return _grown(best, points)
-
-
-def _in_platform(sweep, T_head_lrf):
-    """All points of a sweep (L, B, 3), metres."""
-    if not np.isfinite(sweep.ranges).any():
-        raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
-    p_lrf = polar_to_points(sweep.ranges, sweep.bearings)
-    return lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)
 
 
 def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
@@ -220,12 +210,9 @@ def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
     others = sample[np.argpartition(-lots, 1, axis=1)[:, :2]]
     second = others[:, 1] - seeds if upright is None else upright
     normals = np.cross(others[:, 0] - seeds, second)
-    length = np.linalg.norm(normals, axis=1)
-    good = length > 1e-9
-    if not good.any():
-        return None
-    normals = normals[good] / length[good, None]
-    offsets = np.sum(normals * seeds[good], axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / np.where(length > 1e-9, length, np.nan)
+    offsets = np.sum(normals * seeds, axis=1)
     misses = np.abs(normals @ sample.T - offsets[:, None])
     best = np.sum(misses < PLANE_NOISE, axis=1).argmax()
     normal = normals[best]
@@ -241,27 +228,11 @@ def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
     return normal, distance
 
 
-def plane_axes(normal: np.ndarray) -> np.ndarray:
-    """Two unit vectors in a plane, shape (2, 3): the first as level as the second is steep.
-
-    Parameters
-    ----------
-    normal : ndarray, shape (3,)
-    """
-    other = [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0]
-    across = np.cross(normal, other)
-    across /= np.linalg.norm(across)
-    return np.stack([np.cross(across, normal), across])
-
-
 def plane_size(points: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
     """Area (m2; 0 for a single line) and greatest length (m) of points in a plane."""
     flat = points @ plane_axes(normal).T
-    try:
-        hull = ConvexHull(flat)
-    except QhullError:
-        return 0.0, float(np.linalg.norm(np.ptp(flat, axis=0)))
-    return float(hull.volume), float(pdist(flat[hull.vertices]).max())
+    hull = cv2.convexHull(flat.astype(np.float32))[:, 0]
+    return cv2.contourArea(hull), float(pdist(hull).max())
 
 
 def row_ends(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -285,8 +256,8 @@ def row_ends(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _by_distance(sweep):
     """Smallest range and cells (L, B) of the connected surfaces of a sweep, the nearest first."""
     labels = surfaces(sweep.ranges, sweep.bearings, sweep.pitch)
-    numbers, counts = np.unique(labels[labels >= 0], return_counts=True)
-    numbers = numbers[counts >= FEWEST_POINTS]
+    count = np.bincount(labels[labels >= 0])
+    numbers = np.flatnonzero(count >= FEWEST_POINTS)
     nearest = ndimage.minimum(sweep.ranges, labels, numbers)
     for k in np.argsort(nearest):
         yield nearest[k], labels == numbers[k]
@@ -316,8 +287,7 @@ def _trimmed(part, points, limits):
     if limits.hold(*plane_size(points[part.mask], part.normal)):
         return part
     whole = ndimage.binary_closing(part.mask, iterations=2)
-    core = ndimage.binary_opening(whole, np.ones((5, 5)))
-    labels, count = ndimage.label(core)
+    labels, count = ndimage.label(ndimage.binary_opening(whole, np.ones((5, 5))))
     if count == 0:
         return part
     core = labels == np.bincount(labels[labels > 0]).argmax()
@@ -336,10 +306,10 @@ def _grown(surface, points):
 def _size_limits(board, grown):
     """Limits of a board with its outline grown (m)."""
     if board is not None and board.corners is not None:
-        hull = ConvexHull(board.corners)
-        area = hull.volume
-        rim = hull.area  # of a plane figure: its circumference
-        length = pdist(board.corners).max()
+        corners = board.corners.astype(np.float32)
+        area = cv2.contourArea(corners)
+        rim = cv2.arcLength(corners, True)
+        length = pdist(corners).max()
         return Limits(0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown)
     if board is not None and board.pattern is not None:
         pattern = board.pattern
@@ -347,28 +317,3 @@ def _size_limits(board, grown):
         area = np.prod(sides)
         return Limits(0.3 * area, 4 * area, 2.5 * np.linalg.norm(sides))
     return ANY_BOARD
-
-
-def _fault(surface, sweep, T_head_lrf, points):
-    """Why a surface is no face of a board: few scan lines, seen along itself, patchy; or ''."""
-    mask = surface.mask
-    lines = int(mask.any(axis=1).sum())
-    if lines < min(FEWEST_LINES, len(sweep.pitch)):
-        return f" on {lines} of {len(sweep.pitch)} scan lines"
-    cells = np.argwhere(mask)
-    rays = points[mask] - tilt(T_head_lrf.translation, sweep.pitch[cells[:, 0]])
-    cosine = np.abs(rays @ surface.normal) / np.linalg.norm(rays, axis=1)
-    if np.median(cosine) * STEEPEST < 1:
-        return " seen along itself"
-    try:
-        hull = ConvexHull(cells)
-    except QhullError:
-        return ""
-    corners = cells[hull.vertices]
-    sides = np.abs(np.roll(corners, -1, axis=0) - corners)
-    rim = np.gcd(*sides.T).sum()
-    within = hull.volume + rim / 2 + 1  # cells of the hull, by Pick's theorem
-    fill = len(cells) / within
-    if fill < LEAST_FILL:
-        return f" filled to {100 * fill:.0f} %"
-    return ""

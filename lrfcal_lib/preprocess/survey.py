@@ -90,27 +90,12 @@ class Shot:
         return read(self.record) if self.part is None else self.part.image()
 
 
-@dataclass(frozen=True)
-class Ordered:
-    """Shots whose corners are in the order of the pattern, and the lines of the outline.
-
-    `lines` (E, 3) are rough where the outline is not known; None, and `unseen` says why, where the
-    images do not show it.
-    """
-
-    shots: list[Shot]
-    lines: np.ndarray | None
-    unseen: str = ""
-
-
-def views_of(session: Session, *, one_per_placement: bool = False) -> Survey:
+def views_of(session: Session) -> Survey:
     """:func:`survey` of a session's images.
 
     Parameters
     ----------
     session : Session
-    one_per_placement : bool
-        See :func:`survey`.
 
     Returns
     -------
@@ -126,14 +111,14 @@ def views_of(session: Session, *, one_per_placement: bool = False) -> Survey:
         session.board,
         {name: info.model for name, info in session.cameras.items()},
         session.picks,
-        one_per_placement=one_per_placement,
     )
 
 
-def survey(
-    records, read, board: Board, models, picks=(), *, one_per_placement=False
-) -> Survey:
-    """Find the board in all images of several cameras.
+def survey(records, read, board: Board, models, picks=()) -> Survey:
+    """Find the board in the images of several cameras, one of each camera and placement.
+
+    Of those that show the board it is the one whose pitch is nearest to the middle of the
+    placement's images. Images of no placement are all used.
 
     Parameters
     ----------
@@ -144,9 +129,6 @@ def survey(
     models : dict of str to (CameraModel or None)
         By camera; None asks for an estimate from these images.
     picks : sequence of EdgePick
-    one_per_placement : bool
-        Use one image of each camera and placement: of those that show the board the one whose pitch
-        is nearest to the middle of the placement's images. Images of no placement are all used.
 
     Returns
     -------
@@ -161,23 +143,25 @@ def survey(
     look = partial(_look, read=read, board=board, marks=_marks(picks, board))
     if board.pattern is None:
         records = [record for record in records if record.purpose != "intrinsics"]
-    groups = []
-    for camera in models:
-        groups += _choices(records, camera, one_per_placement)
+    groups = _choices(records, list(models))
     if board.pattern is None:
         return _survey_plain(groups, look, board, models)
 
     shots = _find_corners(groups, read, board)
     find = partial(_intrinsics, models=models, shots=shots, board=board, read=read)
     rough = dict(zip(models, spread(find, models), strict=True))
-    ordered = _ordered(shots, read, board, rough)
-    refined, relief = _with_relief(ordered.shots, board, models, rough)
-    shots = [shot for shot in ordered.shots if shot.record.purpose != "intrinsics"]
-    see = partial(_views, shots, look, models=refined, relief=relief)
-    views = see(lines=ordered.lines)
+    shots, lines, unseen = _ordered(shots, read, board, rough)
+    refined, relief = _with_relief(shots, board, models, rough)
+    shots = [shot for shot in shots if shot.record.purpose != "intrinsics"]
+
+    def see(lines):
+        again = partial(look, models=refined, lines=lines, relief=relief)
+        return spread(partial(_unless_unseen, look=again), shots)
+
+    views = see(lines)
     outline = None
-    if board.corners is None and not ordered.unseen:
-        views = see(lines=measure_outline(views, board, refined).lines)
+    if board.corners is None and not unseen:
+        views = see(measure_outline(views, board, refined).lines)
         outline = measure_outline(views, board, refined)
         board = outline.board
     return Survey(
@@ -186,7 +170,7 @@ def survey(
         outline=outline,
         board=board,
         relief=relief,
-        unseen=ordered.unseen,
+        unseen=unseen,
     )
 
 
@@ -206,44 +190,42 @@ def all_views(prepared) -> dict[str, list[BoardView]]:
     dict of str to list of BoardView
         By camera.
     """
-    session = prepared.session
-    board = prepared.board
     known = prepared.views
     records = [
         record
-        for record in session.images(purpose="board")
+        for record in prepared.session.images(purpose="board")
         if record.placement in known.get(record.camera, {})
     ]
-    if board.pattern is None or len(records) <= sum(map(len, known.values())):
+    if prepared.board.pattern is None or len(records) <= sum(map(len, known.values())):
         return {camera: list(views.values()) for camera, views in known.items()}
-    marks = _marks(session.picks, board)
-    finder = PatternFinder(board.pattern)
-    orders = pattern_orders(board.pattern)
-    lines = None if board.corners is None else board.lines()
-
-    def look(record):
-        """The board in one image: that of the placement where it is the same, or none shows it."""
-        prepared_view = known[record.camera][record.placement]
-        view = _view(record)
-        if prepared_view.file == view.file or prepared_view.pixels is None:
-            return replace(prepared_view, file=view.file, pitch=record.pitch)
-        image = session.read_image(record)
-        view = _corners(view, image, finder)
-        if view.reason:
-            return view
-        shifts = view.pixels[orders] - prepared_view.pixels
-        order = orders[np.nanstd(shifts, axis=1).sum(axis=1).argmin()]
-        return view_board(
-            image,
-            board,
-            prepared.models[record.camera],
-            replace(view, pixels=view.pixels[order]),
-            marks.get((record.camera, record.file)),
-            lines=lines,
-            relief=prepared.relief,
-        )
-
+    finder = PatternFinder(prepared.board.pattern)
+    look = partial(_like_prepared, prepared=prepared, finder=finder)
     return _by_camera(known, spread(look, records))
+
+
+def _like_prepared(record, prepared, finder):
+    """The board in one image: that of the placement where it is the same, or none shows it."""
+    board = prepared.board
+    known = prepared.views[record.camera][record.placement]
+    view = _view(record)
+    if known.file == view.file or known.pixels is None:
+        return replace(known, file=view.file, pitch=record.pitch)
+    image = prepared.session.read_image(record)
+    view = _corners(view, image, finder)
+    if view.reason:
+        return view
+    orders = pattern_orders(board.pattern)
+    shifts = view.pixels[orders] - known.pixels
+    order = orders[np.nanstd(shifts, axis=1).sum(axis=1).argmin()]
+    return _look(
+        Shot(record, replace(view, pixels=view.pixels[order])),
+        prepared.models,
+        read=lambda _: image,
+        board=board,
+        marks=_marks(prepared.session.picks, board),
+        lines=None if board.corners is None else board.lines(),
+        relief=prepared.relief,
+    )
 
 
 def small_squares(views, pattern) -> dict[str, str]:
@@ -265,21 +247,17 @@ def small_squares(views, pattern) -> dict[str, str]:
         return words
     size = (pattern.columns, pattern.rows)
     for camera, of_camera in views.items():
-        sides = {
-            p: square_px(v.pixels, size)
-            for p, v in of_camera.items()
-            if v.pixels is not None
-        }
-        small = {p: side for p, side in sides.items() if side < SMALL_SQUARE_PX}
-        if not small:
-            continue
-        least = min(small.values())
-        words[camera] = (
-            f"squares are less than {SMALL_SQUARE_PX:.0f} px wide in {len(small)} of {len(sides)} "
-            f"images (placements {short(list(small))}), {least:.1f} px at least: distances may be "
-            f"off by {100 * scale_error(least):.2g} %, more if the image is blurred; go nearer, or "
-            "print larger squares"
-        )
+        seen = {p: view.pixels for p, view in of_camera.items() if view.pixels is not None}
+        sides = {p: square_px(pixels, size) for p, pixels in seen.items()}
+        small = [p for p, side in sides.items() if side < SMALL_SQUARE_PX]
+        if small:
+            least = min(sides.values())
+            words[camera] = (
+                f"squares are less than {SMALL_SQUARE_PX:.0f} px wide in {len(small)} of "
+                f"{len(sides)} images (placements {short(small)}), {least:.1f} px at least: "
+                f"distances may be off by {100 * scale_error(least):.2g} %, more if the image is "
+                "blurred; go nearer, or print larger squares"
+            )
     return words
 
 
@@ -319,14 +297,9 @@ def _look(shot, models, *, read, board, marks, lines=None, relief=None):
     )
 
 
-def _views(shots, look, **options):
-    """The views of shots, those that show the corners of the pattern with pose and edges."""
-    return spread(partial(_view_again, look=look, options=options), shots)
-
-
-def _view_again(shot, look, options):
-    """The view of a shot with pose and edges, unless it does not show the pattern."""
-    return shot.view if shot.view.reason else look(shot, **options)
+def _unless_unseen(shot, look):
+    """The view of a shot, looked at again unless it does not show the pattern."""
+    return shot.view if shot.view.reason else look(shot)
 
 
 def _corners(view, image, finder):
@@ -341,23 +314,18 @@ def _by_camera(cameras, views):
     return {camera: [view for view in views if view.camera == camera] for camera in cameras}
 
 
-def _choices(records, camera, one_per_placement):
-    """Records of one camera, in lists of those of which one is to be used, the best first."""
+def _choices(records, cameras):
+    """Records in lists of those of which one is to be used, the best first."""
     groups = {}
-    for number, record in enumerate(
-        record for record in records if record.camera == camera
-    ):
-        alone = (
-            not one_per_placement or record.placement < 0 or record.purpose == "intrinsics"
-        )
-        key = (number, None) if alone else (None, record.placement)
+    for number, record in enumerate(r for r in records if r.camera in cameras):
+        shared = record.placement >= 0 and record.purpose != "intrinsics"
+        key = (record.camera, record.placement) if shared else number
         groups.setdefault(key, []).append(record)
     for group in groups.values():
-        pitch = np.array([record.pitch for record in group], float)
-        if np.isfinite(pitch).any():
-            middle = (np.nanmin(pitch) + np.nanmax(pitch)) / 2
-            group[:] = [group[i] for i in np.argsort(np.abs(pitch - middle), kind="stable")]
-    return list(groups.values())
+        pitch = [record.pitch for record in group]
+        middle = (min(pitch) + max(pitch)) / 2
+        group.sort(key=lambda record: abs(record.pitch - middle))
+    return sorted(groups.values(), key=lambda group: cameras.index(group[0].camera))
 
 
 def _first(group, begin):
@@ -372,23 +340,22 @@ def _first(group, begin):
 
 def _survey_plain(groups, look, board, models):
     """The survey of a board without pattern."""
-    for camera, model in models.items():
-        if model is None:
-            raise ValueError(
-                f"camera '{camera}' has no intrinsics and board '{board.name}' no pattern to find "
-                "them with: state them"
-            )
-
-    begin = partial(_plain_shot, look=look, models=models)
+    unknown = [camera for camera, model in models.items() if model is None]
+    if unknown:
+        raise ValueError(
+            f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find "
+            "them with: state them"
+        )
+    begin = partial(_plain_shot, look=partial(look, models=models))
     shots = spread(partial(_first, begin=begin), groups)
     views = _turned_alike([shot.view for shot in shots])
     return Survey(_by_camera(models, views), dict(models), None, board)
 
 
-def _plain_shot(record, look, models):
+def _plain_shot(record, look):
     """A shot of a board without pattern, with its view."""
     shot = Shot(record, _view(record))
-    return replace(shot, view=look(shot, models))
+    return replace(shot, view=look(shot))
 
 
 def _find_corners(groups, read, board):
@@ -397,9 +364,7 @@ def _find_corners(groups, read, board):
     room = KEPT_BYTES // max(len(groups), 1)
 
     begin = partial(_shot_with_corners, read=read, board=board, finder=finder, room=room)
-    # the first one tells the finder what to look for
-    shots = [_first(group, begin) for group in groups[:1]]
-    return shots + spread(partial(_first, begin=begin), groups[1:])
+    return spread(partial(_first, begin=begin), groups)
 
 
 def _shot_with_corners(record, read, board, finder, room):
@@ -418,31 +383,24 @@ def _for_intrinsics(shots, camera):
 
     Without images taken for the intrinsics all are used.
     """
-    meant = []
-    others = []
-    for shot in shots:
-        if shot.record.camera == camera and shot.view.pixels is not None:
-            taken = meant if shot.record.purpose == "intrinsics" else others
-            taken.append(shot.view.pixels)
+    visible = [s for s in shots if s.record.camera == camera and s.view.pixels is not None]
+    meant = [s.view.pixels for s in visible if s.record.purpose == "intrinsics"]
+    others = [s.view.pixels for s in visible if s.record.purpose != "intrinsics"]
     if not meant:
         return others
-    meant = [meant[i] for i in spread_views(meant, VIEWS_FOR_INTRINSICS)]
-    return meant + [
-        others[i] for i in spread_views(others, VIEWS_FOR_INTRINSICS - len(meant))
-    ]
+    chosen = [meant[i] for i in spread_views(meant, VIEWS_FOR_INTRINSICS)]
+    more = spread_views(others, VIEWS_FOR_INTRINSICS - len(chosen))
+    return chosen + [others[i] for i in more]
 
 
 def _intrinsics(camera, models, shots, board, read):
     """Intrinsics of a camera as stated, or from the corners in its images, in any order."""
     if models[camera] is not None:
         return models[camera]
-    size = (0, 0)
-    for shot in shots:
-        if shot.record.camera == camera:
-            size = read(shot.record).shape[1::-1]
-            break
+    pixels = _for_intrinsics(shots, camera)
+    record = next(shot.record for shot in shots if shot.record.camera == camera)
     try:
-        pixels = _for_intrinsics(shots, camera)
+        size = read(record).shape[1::-1]
         return estimate_intrinsics(pixels, board.pattern, size).models[0]
     except ValueError as error:
         raise DegenerateGeometry(f"camera '{camera}': {error}") from error
@@ -460,39 +418,26 @@ def _with_relief(shots, board, models, rough):
         if adjustment is not None:
             refined[camera] = adjustment.models[0]
             reliefs.append(adjustment.relief)
-    if not reliefs:
-        reliefs.append(np.zeros(len(board.pattern.points())))
-    return refined, np.mean(reliefs, axis=0)
+    return refined, np.mean(reliefs, axis=0) if reliefs else None
 
 
 def _adjustment(camera, shots, board, models, rough):
     """The Adjustment of a camera that sees the pattern often enough."""
     pixels = _for_intrinsics(shots, camera)
-    model = rough[camera]
     if len(pixels) < LEAST_VIEWS_FOR_RELIEF:
         return None
     if models[camera] is None:
-        size = (model.width, model.height)
+        size = (rough[camera].width, rough[camera].height)
         return estimate_intrinsics(pixels, board.pattern, size, relief=True)
-    return estimate_relief(pixels, board.pattern, model)
-
-
-@dataclass(frozen=True)
-class _Orders:
-    """Orders of the corners that images of a pattern allow.
-
-    `corners` (m, n, k, 2) are those of m images in n orders, those that belong together in one
-    column, `poses` (m stacks of n) the rough ``T_camera_board`` that go with them; `leader` is as
-    in :class:`lrfcal_lib.preprocess.turns.Alike`.
-    """
-
-    corners: np.ndarray
-    poses: list[RigidTransform]
-    leader: np.ndarray
+    return estimate_relief(pixels, board.pattern, models[camera])
 
 
 def _ordered(shots, read, board, models):
-    """The corners of all shots in the order that the outline asks for, alike in a placement."""
+    """Shots with their corners in the order that the outline asks for, alike in a placement.
+
+    And the lines of the outline (E, 3): rough where it is not known; None, and the reason why,
+    where the images do not show it.
+    """
     known = board.corners is not None
     visible = [shot for shot in shots if shot.view.pixels is not None]
     if not known and len(board.edges) != 4:
@@ -504,55 +449,63 @@ def _ordered(shots, read, board, models):
         raise DegenerateGeometry(
             f"none of {len(shots)} images shows the pattern of board '{board.name}'"
         )
+    lines = board.lines() if known else None
     if not visible:
-        return Ordered(shots, board.lines())
-    orders = _orders(visible, board.pattern, models, mirrored=known)
+        return shots, lines, ""
+    corners, poses, leader = _orders(visible, board.pattern, models, mirrored=known)
     unseen = ""
     if known:
-        lines = board.lines()
-        chosen = _by_outline(visible, orders, read, board, models)
+        score = partial(_order_scores, read=read, board=board, models=models)
+        scores = spread(score, zip(visible, poses, strict=True))
+        chosen = decide(np.array(scores), leader)
     else:
-        votes, turned = _by_votes(visible, orders, read, board, models)
+        votes = []
+        up = []
+        for shot, pixels in zip(visible, corners[:, 0], strict=True):
+            model = models[shot.record.camera]
+            pose = board_pose(pixels, board.pattern, model)[0]
+            votes.append(edge_votes(shot.image(read), board.pattern, model, pose))
+            up.append(pose.rotation.as_matrix()[1, 1])
+        turned = turned_views(np.stack(votes), np.array(up), leader)
         chosen = turned.astype(int)
+        for number in np.flatnonzero(turned):
+            votes[number] = votes[number][OPPOSITE]
         try:
-            lines = common_lines(votes, board)
+            lines = common_lines(np.stack(votes), board)
         except OutlineNotSeen as error:
-            lines = None
             unseen = str(error)
-    corners = iter(orders.corners[np.arange(len(visible)), chosen])
+    in_order = iter(corners[np.arange(len(visible)), chosen])
     ordered = []
     for shot in shots:
         if shot.view.pixels is not None:
-            shot = replace(shot, view=replace(shot.view, pixels=next(corners)))
+            shot = replace(shot, view=replace(shot.view, pixels=next(in_order)))
         ordered.append(shot)
-    return Ordered(ordered, lines, unseen)
+    return ordered, lines, unseen
 
 
 def _orders(shots, pattern, models, mirrored):
-    """The orders that the corners of shots may have, alike in a placement."""
+    """The orders that the corners of m shots may have, alike in a placement.
+
+    Corners (m, n, k, 2) in n orders, those that belong together in one column, m stacks of the
+    rough ``T_camera_board`` that go with them, and the leaders of
+    :class:`lrfcal_lib.preprocess.turns.Alike`.
+    """
     orders = pattern_orders(pattern, mirrored=mirrored)
     turns = turned_boards(pattern, orders)
     poses = []
     placements = []
+    cameras = []
     for shot in shots:
         model = models[shot.record.camera]
         poses.append(first_pose(pattern.points(), shot.view.pixels, model) * turns)
         alone = shot.record.purpose == "intrinsics"
         placements.append(-1 if alone else shot.record.placement)
-    cameras = [shot.record.camera for shot in shots]
+        cameras.append(shot.record.camera)
     together = alike([pose.rotation for pose in poses], placements, cameras)
-    corners = []
-    for number, order in enumerate(together.order):
-        corners.append(shots[number].view.pixels[orders[order]])
-        poses[number] = poses[number][order]
-    return _Orders(np.array(corners), poses, together.leader)
-
-
-def _by_outline(shots, orders, read, board, models):
-    """Columns (m,) of the orders that the known outline prefers."""
-    score = partial(_order_scores, read=read, board=board, models=models)
-    scores = spread(score, zip(shots, orders.poses, strict=True))
-    return decide(np.array(scores), orders.leader)
+    pairs = list(zip(shots, together.order, strict=True))
+    corners = np.array([shot.view.pixels[orders[order]] for shot, order in pairs])
+    posed = [pose[order] for pose, order in zip(poses, together.order, strict=True)]
+    return corners, posed, together.leader
 
 
 def _order_scores(shot_and_poses, read, board, models):
@@ -561,30 +514,16 @@ def _order_scores(shot_and_poses, read, board, models):
     return order_scores(shot.image(read), board, models[shot.record.camera], poses)
 
 
-def _by_votes(shots, orders, read, board, models):
-    """Votes (m, 4, n) for the sides of the board, all turned alike, and which were turned."""
-    votes = []
-    up = []
-    for shot, corners in zip(shots, orders.corners[:, 0], strict=True):
-        model = models[shot.record.camera]
-        pose = board_pose(corners, board.pattern, model)[0]
-        votes.append(edge_votes(shot.image(read), board.pattern, model, pose))
-        up.append(pose.rotation.as_matrix()[1, 1])
-    votes = np.stack(votes)
-    turned = turned_views(votes, np.array(up), orders.leader)
-    return np.where(turned[:, None, None], votes[:, OPPOSITE], votes), turned
-
-
 def _turned_alike(views):
     """Views of a plain board, turned alike in a placement where it looks the same when turned."""
     posed = [view for view in views if view.T_camera_board is not None]
     turned = []  # of every view those that differ by a turn in the board's plane
     for view in posed:
-        normal = view.T_camera_board.rotation.as_matrix()[:, 2]
-        same = [view]
-        for other in view.alternatives:
-            if other.T_camera_board.rotation.as_matrix()[:, 2] @ normal > SAME_PLANE:
-                same.append(other)
+        same = [
+            each
+            for each in (view, *view.alternatives)
+            if _normal(each) @ _normal(view) > SAME_PLANE
+        ]
         turned.append(same)
     most = max(map(len, turned), default=0)
     stacks = []
@@ -594,7 +533,16 @@ def _turned_alike(views):
         stacks.append(poses.rotation)
     placements = [view.placement for view in posed]
     together = alike(stacks, placements, [view.camera for view in posed])
-    chosen = iter(
-        [same[order[0]] for same, order in zip(turned, together.order, strict=True)]
-    )
-    return [view if view.T_camera_board is None else next(chosen) for view in views]
+    chosen = iter(zip(turned, together.order[:, :1].ravel(), strict=True))
+    alike_views = []
+    for view in views:
+        if view.T_camera_board is not None:
+            same, order = next(chosen)
+            view = same[order]
+        alike_views.append(view)
+    return alike_views
+
+
+def _normal(view):
+    """Normal (3,) of the board in a view, camera frame."""
+    return view.T_camera_board.rotation.as_matrix()[:, 2]

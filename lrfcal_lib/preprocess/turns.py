@@ -73,26 +73,22 @@ def alike(rotations, placements, cameras) -> Alike:
     -------
     Alike
     """
-    leaders: dict[int, int] = {}
-    leader = np.zeros(len(placements), int)
-    for i, placement in enumerate(placements):
-        alone = placement < 0
-        leader[i] = i if alone else leaders.setdefault(placement, i)
-    turn_of_camera = {}
-    for camera in dict.fromkeys(cameras):
-        turn_of_camera[camera] = _between(
-            rotations, placements, cameras, cameras[0], camera
-        )
+    placements = list(placements)
+    leader = [i if p < 0 else placements.index(p) for i, p in enumerate(placements)]
+    turn_of_camera = {
+        camera: _between(rotations, placements, cameras, camera) for camera in set(cameras)
+    }
     order = []
     for i, j in enumerate(leader):
         turn = turn_of_camera[cameras[i]] * turn_of_camera[cameras[j]].inv()
         off = [(rotations[i] * ahead.inv()).magnitude() for ahead in turn * rotations[j]]
         order.append(np.argmin(off, axis=1))
-    return Alike(leader, np.array(order, int))
+    return Alike(np.array(leader, int), np.array(order, int))
 
 
-def _between(rotations, placements, cameras, base, camera):
-    """Rotation from one camera to another on which most placements agree."""
+def _between(rotations, placements, cameras, camera):
+    """Rotation from the first camera to another on which most placements agree."""
+    base = cameras[0]
     if base == camera:
         return Rotation.identity()
     first = {base: {}, camera: {}}  # image of a placement

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import numpy as np
 from matplotlib.figure import Figure
 
 from lrfcal_lib.measure.compare import Comparison, history, rig_at
 from lrfcal_lib.plots import comparison as plots
+from lrfcal_lib.plots.colors import COLORS
 from lrfcal_lib.report.notebook import STYLE
 from lrfcal_lib.session.write import whole
 
@@ -67,39 +67,30 @@ def comparison_figure(comparisons: Sequence[Comparison]) -> Figure:
     comparisons : sequence of Comparison
     """
     last = comparisons[-1]
-    columns = max(3, len(last.images) + 1)
+    columns = len(last.images) + 2
     with plt.style.context(STYLE):
         figure, axes = plt.subplots(
-            2, columns, figsize=(4.2 * columns, 7), layout="constrained"
+            1, columns, figsize=(4.4 * columns, 3.8), layout="constrained"
         )
-        for ax, (name, shifts) in zip(axes[0], last.images.items(), strict=False):
+        for ax, (name, shifts) in zip(axes[:-2], last.images.items(), strict=True):
             model = last.first.cameras[name].model
             size = (model.width, model.height)
             longest = plots.pixel_shifts(ax, shifts.at, shifts.off, size)
             ax.set_title(f"'{name}' at 2 m, longest {longest:.2g} px")
-        drawn = plots.field_shifts(axes[0, -1], last.cloud.at, last.cloud.off)
-        figure.colorbar(drawn, ax=axes[0, -1], label="[mm]")
-        axes[0, -1].set_title("points at 2 m")
-        for ax, unit in zip(axes[1], ("deg", "mm", "px"), strict=False):
-            _claims(ax, comparisons, unit)
-        axes[1, 0].set_title("dots: differences; bars: one standard deviation, as claimed")
-        axes[1, 2].legend(title="from, to", loc="upper left", bbox_to_anchor=(1.0, 1.0))
-        for ax in [*axes[0, len(last.images) : -1], *axes[1, 3:]]:
-            ax.set_axis_off()
+        drawn = plots.field_shifts(axes[-2], last.cloud.at, last.cloud.off)
+        figure.colorbar(drawn, ax=axes[-2], label="[mm]")
+        axes[-2].set_title("points at 2 m")
+        for compared in comparisons:
+            ratios = {}
+            for part in compared.parts:
+                for amount in part.amounts:
+                    ratios[f"{part.name}, {amount.what}"] = amount.value / amount.claimed
+            names = f"{compared.first.session}, {compared.second.session}"
+            axes[-1].plot(list(ratios.values()), list(ratios), "o", label=names)
+        axes[-1].axvline(1.0, color=COLORS["raw"])
+        axes[-1].set(
+            xlabel="difference / standard deviation that both claim", xlim=(0, None)
+        )
+        axes[-1].legend(title="from, to")
+        axes[-1].set_title("differences beside claims")
     return figure
-
-
-def _claims(ax, comparisons, unit):
-    """The differences in one unit."""
-    rows = []
-    for compared in comparisons:
-        row = {}
-        for part in compared.parts:
-            for amount in part.amounts:
-                if amount.unit == unit:
-                    row[part.name] = (amount.value, amount.claimed)
-        rows.append(row)
-    labels = [name for name in rows[-1] if all(name in row for row in rows)]
-    table = np.array([[row[name] for name in labels] for row in rows])
-    names = [f"{pair.first.session}, {pair.second.session}" for pair in comparisons]
-    plots.beside_claims(ax, labels, table[..., 0], table[..., 1], unit=unit, names=names)

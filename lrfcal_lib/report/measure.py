@@ -2,14 +2,10 @@
 
 from pathlib import Path
 
-from lrfcal_lib.calibrate.calibration_file import (
-    load_calibration,
-    refuse_untrusted,
-    require_same_rig,
-)
+from lrfcal_lib.measure.features import with_sigma
 from lrfcal_lib.measure.lengths import features_of_station, measure, read_picks
-from lrfcal_lib.measure.scene import stations_of
-from lrfcal_lib.session.read import open_session
+from lrfcal_lib.report.merge import NOT_ALL, joined_stations
+from lrfcal_lib.report.reconstruct import open_scene
 from lrfcal_lib.session.write import whole
 
 
@@ -25,50 +21,54 @@ def measure_session(
 
     Parameters
     ----------
-    path : path-like
-        Of the session.
-    calibration : path-like
-        ``calibration.json`` of the same rig.
+    path, calibration, untrusted
+        See :func:`lrfcal_lib.report.reconstruct.open_scene`.
     picks : path-like
-        The list that ``scene.html`` of the station saves.
+        The list that ``scene.html`` saves.
     out : path-like, optional
         ``reports/<name>/lengths.csv`` under the current folder by default.
     station : int, optional
-        In whose frame the places are; needed where there are several.
-    untrusted : bool
-        Also with a calibration whose verdict is 'no'.
+        Whose ``scene.html`` it was; that of 'merge' unless given, and every length is then the
+        weighted mean of the stations that show both its ends.
 
     Returns
     -------
     int
-        0.
+        0, or 3 where a length could not be measured.
 
     Raises
     ------
     ValueError
-        For a file that cannot be used or written, or a place where there is nothing to measure.
+        For a file that cannot be used or written, or stations that cannot be joined.
     """
     table = read_picks(picks)
-    rig = load_calibration(calibration)
-    refuse_untrusted(rig, untrusted)
-    session = open_session(path)
-    require_same_rig(rig, session)
-    numbers = stations_of(session)
-    if station is None and len(numbers) == 1:
-        station = numbers[0]
-    if station not in numbers:
-        raise ValueError(
-            f"{path}: its stations are {', '.join(map(str, numbers))}: say with --station in "
-            "whose scene.html the places were picked"
-        )
-    lengths = measure(features_of_station(session, rig, station), table)
-    file = Path(out or Path("reports") / Path(path).resolve().name / "lengths.csv")
+    scene = open_scene(path, calibration, None, untrusted)
+    numbers = scene.stations
+    if station is not None:
+        if station not in numbers:
+            known = ", ".join(map(str, numbers))
+            raise ValueError(
+                f"{path}: there is no station {station}; its stations are {known}"
+            )
+        numbers = (station,)
+    scenes = {n: features_of_station(scene.session, scene.rig, n) for n in numbers}
+    poses = None
+    if len(scenes) > 1:
+        clouds = {n: with_sigma(each.cloud, scene.rig) for n, each in scenes.items()}
+        poses = joined_stations(clouds, scene.rig, path).T_world_station
+        scenes = {n: scenes[n] for n in poses}
+    lengths = measure(scenes, table, poses)
+    file = Path(out or scene.folder / "lengths.csv")
     with whole(file) as draft:
         lengths.to_csv(draft, index=False, float_format="%.6f")
-    for row in lengths.to_dict("records"):
-        low, high = 1000 * row["low_m"], 1000 * row["high_m"]
-        print(
-            f"{row['name']}: {1000 * row['length_m']:.1f} mm, 90 % in {low:.1f} to {high:.1f}"
-        )
-    print(f"{file}: {len(lengths)} lengths")
-    return 0
+    for row in lengths.itertuples():
+        words = f"not measured, {row.problem}"
+        if not row.problem:
+            words = (
+                f"{1000 * row.length_m:.1f} mm, 90 % in {1000 * row.low_m:.1f} to "
+                f"{1000 * row.high_m:.1f}, from station {row.stations}"
+            )
+        print(f"{row.name}: {words}")
+    measured = int((lengths.problem == "").sum())
+    print(f"{file}: {measured} of {len(lengths)} lengths")
+    return 0 if measured == len(lengths) else NOT_ALL

@@ -6,6 +6,7 @@ Nothing is written outside a report run (:mod:`lrfcal_lib.report.report`), which
 ``parts/``) and ``LRFCAL_NOTEBOOK`` (a name in these).
 """
 
+import ast
 import json
 import math
 import os
@@ -47,6 +48,10 @@ OTHER_LABELS = {  # of what is no row of METHODS
 # read by Open3D when it is imported, perhaps in the same cell as this module
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
 _found: dict[str, list] = {"figures": [], "tables": [], "findings": [], "verdicts": []}
+NEEDS = "notebook.needs("
+_lacking: set[str] = (
+    set()
+)  # 'section' or 'notebook': where nothing is done, for want of data
 
 
 def set_up() -> None:
@@ -61,8 +66,8 @@ def set_up() -> None:
         get_ipython().run_line_magic(
             "config", f"InlineBackend.print_figure_kwargs = {kwargs}"
         )
-        while _only_start in get_ipython().input_transformers_cleanup:
-            get_ipython().input_transformers_cleanup.remove(_only_start)
+        get_ipython().ast_transformers[:] = [Sections()]
+    _lacking.clear()
     for kind in _found.values():
         kind.clear()
 
@@ -272,17 +277,49 @@ def asked(possible: object, why: str, *, rest: bool = False) -> bool:
     why
         What the session does not have.
     rest
-        Nothing that follows can be asked either: until :func:`start` cells do nothing.
+        As of :func:`needs`.
     """
+    if rest:
+        return needs(possible, why, rest=True)
     if not possible:
         print(f"not asked: {why}")
-        if rest and get_ipython() is not None:
-            get_ipython().input_transformers_cleanup.append(_only_start)
     return bool(possible)
 
 
-def _only_start(lines):
-    return lines if any("notebook.start(" in line for line in lines) else []
+def needs(possible: object = True, why: str = "", *, rest: bool = False) -> bool:
+    """What follows needs something of the session; without it nothing is done, and that is printed.
+
+    So it is up to the next call, also for the rest of the same cell.
+
+    Parameters
+    ----------
+    possible
+        Nothing more is needed, unless given.
+    why
+        What the session does not have.
+    rest
+        Nothing at all can be done without it, until :func:`start`.
+    """
+    _lacking.discard("section")
+    if not asked(possible, why):
+        _lacking.add("notebook" if rest else "section")
+    return bool(possible)
+
+
+class Sections(ast.NodeTransformer):
+    """Takes out of cells what a call of :func:`needs` leaves undone."""
+
+    def visit_Module(self, node: ast.Module) -> ast.Module:
+        """The statements of a cell."""
+        words = [ast.unparse(statement) for statement in node.body]
+        needing = [row for row, text in enumerate(words) if text.startswith(NEEDS)]
+        undone = "notebook" in _lacking or ("section" in _lacking and not needing)
+        if undone and not any("notebook.start(" in text for text in words):
+            node.body = []
+        for row in reversed(needing if node.body else []):
+            call = ast.parse(words[row], mode="eval").body
+            node.body[row:] = [ast.If(call, node.body[row + 1 :] or [ast.Pass()], [])]
+        return ast.fix_missing_locations(node)
 
 
 def _record(kind, name, entry):

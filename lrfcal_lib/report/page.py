@@ -6,10 +6,13 @@ import base64
 import html
 import re
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import nbformat
+import pandas as pd
 from bs4 import BeautifulSoup
+from jinja2 import Environment, FileSystemLoader
 from latex2mathml.converter import convert
 from nbconvert.filters.highlight import Highlight2HTML
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
@@ -20,6 +23,11 @@ SHORT = 15  # rows of a table that is shown unfolded
 PIXELS_PER_INCH = 96 / 150  # of a page, by those of a figure's file
 # columns from which a table is turned on screens as narrow
 WIDTHS = ((9, "wide"), (3, "medium"), (0, "narrow"))
+FOLDER = Path(__file__).parent
+TEMPLATES = Environment(
+    autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=FileSystemLoader(FOLDER)
+)
+PIECES: Any = TEMPLATES.get_template("pieces.html.jinja").module
 FITTING = 42  # characters of a row that a screen of 400 pixels shows beside each other
 
 
@@ -144,41 +152,14 @@ def _figure(folder, entry, label):
     if not (file := folder / "figures" / f"{entry['name']}.png").is_file():
         return ""
     data = file.read_bytes()
-    caption = html.escape(entry["caption"])
     width = round(int.from_bytes(data[16:20]) * PIXELS_PER_INCH)
-    picture = (
-        f'<img alt="{caption}" width="{width}" '
-        f'src="data:image/png;base64,{base64.b64encode(data).decode()}">'
-    )
-    # a box that is ticked by a click on the picture: then the picture fills the window
-    return (
-        f'<figure id="{file.stem}"><label class="grows" title="click: larger, or back">'
-        f'<input type="checkbox" aria-label="show larger"><span>{picture}</span></label>'
-        f"<figcaption><b>{label}.</b> {caption} "
-        f'<a class="soft" href="figures/{file.name}">PNG</a></figcaption></figure>'
-    )
-
-
-def folded(figure: str) -> str:
-    """A figure folded under its caption, for a page that has more important ones."""
-    caption = re.search("<figcaption>(.*?) <a ", figure, re.DOTALL)
-    if caption is None:
-        return figure
-    return f'<details class="figure"><summary>{caption[1]}</summary>{figure}</details>'
+    return str(PIECES.figure(entry, label, base64.b64encode(data).decode(), width))
 
 
 def _table(entry, label):
     """A table, folded where it is long."""
     made = turned(entry["html"])
-    rows = made.count("<tr>") - 1
-    file = f"tables/{entry['name']}.csv"
-    caption = html.escape(entry["caption"])
-    return (
-        f'<details class="table" id="T-{entry["name"]}"{" open" if rows <= SHORT else ""}><summary>'
-        f'<b>{label}.</b> {caption} <span class="soft">({rows} rows, <a '
-        f'href="{file}">CSV</a>)</span></summary>'
-        f"{made}</details>"
-    )
+    return str(PIECES.table(entry, label, made, made.count("<tr>") - 1, SHORT))
 
 
 def turned(text):
@@ -206,11 +187,7 @@ def turned(text):
 
 def _fits(table):
     """Whether a narrow screen shows a whole row of a table, its headings broken into words."""
-    rows = [row(["th", "td"]) for row in table("tr")]
-    longest = [0] * max(map(len, rows), default=0)
-    for number, row in enumerate(rows):
-        for column, cell in enumerate(row):
-            text = cell.get_text().strip()
-            words = text.split() if number == 0 else [text]
-            longest[column] = max([longest[column], *map(len, words)])
-    return sum(longest) + 1.5 * len(longest) <= FITTING
+    rows = [[cell.get_text().strip() for cell in row(["th", "td"])] for row in table("tr")]
+    words = [max(head.split(), key=len, default="") for head in rows[0]]
+    longest = pd.DataFrame([words, *rows[1:]]).fillna("").map(len).max()
+    return longest.sum() + 1.5 * len(longest) <= FITTING

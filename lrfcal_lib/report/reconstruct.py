@@ -1,6 +1,7 @@
 """The command ``reconstruct``: coloured clouds of a scene, from its stations and a calibration."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,61 @@ from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.shown import printable
 
 
+@dataclass(frozen=True)
+class SceneAsked:
+    """A recorded scene, the rig that recorded it, its stations and the folder for its files."""
+
+    session: Session
+    rig: CalibratedRig
+    stations: tuple[int, ...]
+    folder: Path
+
+    @property
+    def about(self) -> str:
+        """Where a cloud is from, and whether to trust it, in a sentence for its files."""
+        rig = self.rig
+        about = (
+            f"session {self.session.name}, calibration of {rig.session} {rig.date} "
+            f"(method {rig.method}), lrfcal {__version__}"
+        )
+        if rig.answer == "no":
+            about = f"UNTRUSTED, the verdict on its calibration is no; {about}"
+        return printable(about)
+
+
+def open_scene(
+    path: str | Path, calibration: str | Path, out: str | Path | None, untrusted: bool
+) -> SceneAsked:
+    """Read a scene and the calibration that it is to be used with.
+
+    Parameters
+    ----------
+    path : path-like
+        Of the session.
+    calibration : path-like
+        ``calibration.json`` of the same rig.
+    out : path-like or None
+        Folder of the files; ``reports/<name>`` under the current folder by default.
+    untrusted : bool
+        Also with a calibration whose verdict is 'no', which every file then says.
+
+    Returns
+    -------
+    SceneAsked
+
+    Raises
+    ------
+    ValueError
+        For a calibration or a session that cannot be used.
+    """
+    rig = load_calibration(calibration)
+    refuse_untrusted(rig, untrusted)
+    session = open_session(path)
+    require_same_rig(rig, session)
+    folder = Path(out or Path("reports") / Path(path).resolve().name)
+    return SceneAsked(session, rig, stations_of(session), folder)
+
+
 def reconstruct_session(
     path: str | Path,
     calibration: str | Path,
@@ -29,15 +85,8 @@ def reconstruct_session(
 
     Parameters
     ----------
-    path : path-like
-        Of the session.
-    calibration : path-like
-        ``calibration.json`` of the same rig.
-    out : path-like, optional
-        Folder of ``scene.ply``, ``.pcd``, ``.e57`` and ``.html``; ``reports/<name>`` under the
-        current folder by default. Of several stations each has its own in there.
-    untrusted : bool
-        Also with a calibration whose verdict is 'no', which every file then says.
+    path, calibration, out, untrusted
+        See :func:`open_scene`. Of several stations each has its own folder in `out`.
 
     Returns
     -------
@@ -49,36 +98,20 @@ def reconstruct_session(
     ValueError
         For a calibration or a session that cannot be used, or a file that cannot be written.
     """
-    rig = load_calibration(calibration)
-    refuse_untrusted(rig, untrusted)
-    session = open_session(path)
-    require_same_rig(rig, session)
-    numbers = stations_of(session)
-    folder = Path(out or Path("reports") / Path(path).resolve().name)
-    counts = [np.isfinite(session.sweep(number).ranges).sum() for number in numbers]
+    scene = open_scene(path, calibration, out, untrusted)
+    session = scene.session
+    counts = [np.isfinite(session.sweep(n).ranges).sum() for n in scene.stations]
     told = _told(sum(counts))
-    about = about_scene(session, rig)
-    for number in numbers:
-        place = folder
-        if len(numbers) > 1:
-            place = folder / f"station_{number}"
+    for number in scene.stations:
+        place = scene.folder
+        if len(scene.stations) > 1:
+            place = scene.folder / f"station_{number}"
         still = {number: RigidTransform.identity()}
-        files = write_scene(place, session, rig, still, about, told)
+        files = write_scene(place, session, scene.rig, still, scene.about, told)
         print(f"station {number}: {', '.join(map(str, files))}", flush=True)
-    if len(numbers) > 1:
-        print(f"{len(numbers)} stations, each in its own frame; 'merge' joins them")
+    if len(scene.stations) > 1:
+        print(f"{len(scene.stations)} stations, each in its own frame; 'merge' joins them")
     return 0
-
-
-def about_scene(session: Session, rig: CalibratedRig) -> str:
-    """Where a cloud is from, and whether to trust it, in a sentence for its files."""
-    about = (
-        f"session {session.name}, calibration of {rig.session} {rig.date} "
-        f"(method {rig.method}), lrfcal {__version__}"
-    )
-    if rig.answer == "no":
-        about = f"UNTRUSTED, the verdict on its calibration is no; {about}"
-    return printable(about)
 
 
 def _told(total) -> Callable[[int], None]:

@@ -20,7 +20,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import nbformat
-from jinja2 import Environment, FileSystemLoader
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 from tqdm import tqdm
@@ -28,7 +27,7 @@ from tqdm import tqdm
 from lrfcal_lib.report import first_screen, page
 from lrfcal_lib.report.notebook import ROOT, SHIPPED, label_of
 from lrfcal_lib.session.cache import VARIABLE as CACHE
-from lrfcal_lib.session.progress import Progress, duration
+from lrfcal_lib.session.progress import duration
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import RECORDINGS
@@ -62,19 +61,7 @@ EXCHANGE = 2  # RENAME_EXCHANGE of Linux
 PART = ".report-"  # begins the names of folders in which a report is being written
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
-USUAL_SECONDS = {  # by number, two at a time on two busy cores; only their ratios count
-    "00": 22.0,
-    "01": 28.0,
-    "02": 22.0,
-    "03": 29.0,
-    "04": 79.0,
-    "05": 64.0,
-    "06": 124.0,
-    "07": 117.0,
-    "08": 129.0,
-    "09": 144.0,
-    "10": 60.0,
-}
+METHOD = re.compile(r"(?<=')\w+(?=')")  # named in a sentence
 _CLIENTS: set[NotebookClient] = set()  # of the notebooks that are being executed
 
 
@@ -345,7 +332,7 @@ def _execute_all(paths, environment, jobs):
         # later notebooks go through more stages and take longer, so they start first
         futures = {pool.submit(_run, path, environment): path for path in reversed(paths)}
         try:
-            _show_progress(futures, max(1, jobs))
+            _show_progress(futures)
         finally:  # end the notebooks that are being executed and leave out the others
             for future in futures:
                 future.cancel()
@@ -357,37 +344,19 @@ def _execute_all(paths, environment, jobs):
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
-def _show_progress(futures, jobs):
-    """Wait for notebooks with a bar, or where there is no terminal a line for each.
-
-    `futures` are paths by future, each of a Run; so many `jobs` go on at the same time.
-    """
-    progress = Progress()
+def _show_progress(futures):
+    """Wait for notebooks (paths by future) with a bar, or without a terminal a line for each."""
+    begin = time.monotonic()
     count = len(futures)
-    total = sum(_usual_seconds(path) for path in futures.values())
-    usual = 0.0  # seconds of those that are done, and what they took
-    taken = 0.0
-    shape = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}]{postfix}"
-    with tqdm(total=count, desc="notebooks", bar_format=shape, disable=None) as bar:
+    with tqdm(as_completed(futures), total=count, desc="notebooks", disable=None) as bar:
         if bar.disable:
             print(f"lrfcal: {count} notebooks begun", file=sys.stderr, flush=True)
-        for done, future in enumerate(as_completed(futures), start=1):
-            usual += _usual_seconds(futures[future])
-            taken += future.result().seconds
-            expected = total * taken / usual / jobs
+        for done, future in enumerate(bar, start=1):
             name = futures[future].stem
-            left = progress.left(progress.seconds / expected) if done < count else ""
-            words = ", ".join(filter(None, [name, left]))
-            bar.set_postfix_str(words)
-            bar.update()
+            bar.set_postfix_str(name)
             if bar.disable:
-                said = f"{done} of {count} done after {duration(progress.seconds)}"
-                print(f"lrfcal: {said} ({words})", file=sys.stderr, flush=True)
-
-
-def _usual_seconds(path):
-    """How long a notebook takes beside others, on the shipped session."""
-    return USUAL_SECONDS.get(path.stem[:2], 60.0)
+                said = f"{done} of {count} done after {duration(time.monotonic() - begin)}"
+                print(f"lrfcal: {said} ({name})", file=sys.stderr, flush=True)
 
 
 def _run(path, environment):
@@ -400,16 +369,13 @@ def _run(path, environment):
 
 
 def _beginning(notebook):
-    """First heading and first paragraph of a notebook, '' where there is none."""
-    text = "\n\n".join(
+    """Title and thesis of a notebook, the lines after '# ' and '> '; '' where there is none."""
+    text = "\n".join(
         cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown"
     )
-    blocks = [block.strip() for block in re.split(r"\n\s*\n", text) if block.strip()]
-    headings = [block for block in blocks if block.startswith("#")]
-    paragraphs = [block for block in blocks if not block.startswith("#")]
-    title = headings[0].lstrip("# ").splitlines()[0] if headings else ""
-    thesis = re.sub(r"[*`>]", "", paragraphs[0]) if paragraphs else ""
-    return title, " ".join(thesis.split())
+    found = [re.search(f"^{mark} (.*)$", text, re.MULTILINE) for mark in "#>"]
+    title, thesis = (match[1] if match else "" for match in found)
+    return title, re.sub(r"[*`]", "", thesis)
 
 
 def write_pages(out, session, runs, found, seconds):
@@ -426,7 +392,6 @@ def write_pages(out, session, runs, found, seconds):
     seconds : float
         That the notebooks took.
     """
-    jinja = _templates()
     numbers = {run.name: run.name[:2].removeprefix("0") for run in runs}
     drawn = {}  # figures and tables of each notebook, as HTML
     for before, run, after in zip([None, *runs], runs, [*runs[1:], None], strict=False):
@@ -436,7 +401,6 @@ def write_pages(out, session, runs, found, seconds):
         file = out / f"{run.name}.html"
         around = {"before": before, "after": after}
         _write_page(
-            jinja,
             file,
             "notebook.html.jinja",
             session=session,
@@ -448,7 +412,6 @@ def write_pages(out, session, runs, found, seconds):
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
     main = first_screen.main_verdict(verdicts)
     _write_page(
-        jinja,
         out / "index.html",
         "report.html.jinja",
         session=session,
@@ -465,27 +428,17 @@ def write_pages(out, session, runs, found, seconds):
         handed=first_screen.handed_over(out / "calibration.json"),
         rest=first_screen.sentences_below(main),
         picture=first_screen.first_picture(drawn),
-        folded=page.folded,
         files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
     )
 
 
-def _templates():
-    """The templates of pages, in which methods are called by their labels."""
-    loader = FileSystemLoader(Path(__file__).parent)
-    jinja = Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader
+def _write_page(file, template, **values):
+    """Write a page made by a template, in which methods are called by their labels."""
+    jinja = page.TEMPLATES
+    jinja.filters["words"] = lambda text: METHOD.sub(
+        lambda m: label_of(m[0]), label_of(text)
     )
-    quoted = r"(?<=')\w+(?=')"  # methods named in sentences
-    jinja.filters["words"] = lambda text: re.sub(
-        quoted, lambda m: label_of(m[0]), label_of(text)
-    )
-    return jinja
-
-
-def _write_page(jinja, file, template, **values):
-    """Write a page made by a template."""
     file.write_text(jinja.get_template(template).render(**values), encoding="utf-8")
 
 

@@ -25,7 +25,7 @@ from lrfcal_lib.session.cluster import source_digest
 from lrfcal_lib.session.files import opened
 
 VARIABLE = "LRFCAL_CACHE"
-REMEDY = "and what lies there is run; chmod go-w, or name a folder of your own"
+REMEDY = "and files in it are executed; use chmod go-w, or name a folder of your own"
 LARGEST_RESULT = 4_000_000_000  # bytes that are read; the largest are clouds of some 100 MB
 
 

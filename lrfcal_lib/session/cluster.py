@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from multiprocessing import get_context
 from os import sched_getaffinity
 from pathlib import Path
@@ -42,7 +42,19 @@ def workers_at(scheduler: str | None) -> Iterator[Executor]:
         ) from error
     with client:
         refuse_others(client)
-        yield client.get_executor(pure=False)
+        yield Checked(client.get_executor(pure=False))
+
+
+class Checked(Executor):
+    """Of a cluster: workers that join after :func:`refuse_others` has looked are caught, too."""
+
+    def __init__(self, executor):
+        self.executor = executor
+
+    def submit(self, work, /, *args, **kwargs):
+        """See :meth:`concurrent.futures.Executor.submit`."""
+        here = partial(checked, source_digest(), work)
+        return self.executor.submit(here, *args, **kwargs)
 
 
 def refuse_others(client):
@@ -68,21 +80,18 @@ def refuse_others(client):
             raise ValueError(_other_version(worker, theirs))
 
 
-def checked(digest: str, work: Callable, item):
-    """``work(item)``, unless this process has another version of the library: ValueError.
-
-    Workers that come after :func:`refuse_others` has looked are caught here.
+def checked(digest: str, work: Callable, *args, **kwargs):
+    """``work(...)``, unless this process has another version of the library: ValueError.
 
     Parameters
     ----------
     digest : str
         :func:`source_digest` of who asks.
     work : callable
-    item : object
     """
     if digest != source_digest():
         raise ValueError(_other_version("that joined later", source_digest()))
-    return work(item)
+    return work(*args, **kwargs)
 
 
 def _other_version(worker, digest):

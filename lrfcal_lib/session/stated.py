@@ -83,6 +83,18 @@ SYSTEMATIC_ERROR = {
 # centimetres: so many standard deviations or steps of a range; the sheets above admit 2 to 4.2, and
 # 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
+# degrees between beams, by part of the model's name: parts of a full turn that the sensor's own
+# disc divides, so that their scale has no error
+BEARING_STEPS = {
+    "LMS1": (0.25, 0.5),
+    "LMS2": (0.25, 0.5, 1.0),
+    "LMS4": (0.1, 0.2, 0.25, 0.5, 1.0),
+    "LMS5": (1 / 6, 0.25, 1 / 3, 0.5, 2 / 3, 1.0),
+    "TiM5": (1 / 3, 1.0),
+}
+SAME_STEP = 0.001  # of a step; one that is rounded to three digits
+# standard deviation of other steps, a fraction: anything within 1 %, which nobody notices
+ASSUMED_STEP_ERROR = 0.0058
 # metres; only the unit of the edge bias where nobody stated the spot
 ASSUMED_SPOT_RADIUS = 0.005
 
@@ -373,6 +385,8 @@ class LrfInfo:
         maker's data sheet.
     systematic_error : float or None
         Largest offset of all ranges that the maker admits, metres.
+    step_error : float or None
+        Standard deviation of the stated angular step, a fraction of it.
     """
 
     model: str
@@ -383,6 +397,9 @@ class LrfInfo:
     range_resolution: Annotated[FiniteFloat, Field(alias="range_resolution_m")] = 0.001
     max_range: Annotated[Endless, Field(alias="max_range_m")] = math.inf
     systematic_error: Annotated[Positive | None, Field(alias="systematic_error_m")] = None
+    step_error: Annotated[
+        FiniteFloat | None, Field(alias="angular_step_relative", ge=0, le=0.1)
+    ] = None
     spot_exit: Annotated[FiniteFloat | None, Field(alias="spot_exit_m", gt=0, le=0.2)] = (
         None
     )
@@ -399,6 +416,19 @@ class LrfInfo:
                 if name in self.model:
                     assumed = value
         return self.systematic_error or assumed
+
+    @property
+    def step_sigma(self) -> float:
+        """Standard deviation of the angular step, a fraction: stated, or none where the model has
+        such a step, or assumed.
+        """
+        if self.step_error is not None:
+            return self.step_error
+        for name, steps in BEARING_STEPS.items():
+            ratio = np.degrees(self.bearing_step) / np.array(steps)
+            if name in self.model and np.abs(ratio - 1).min() < SAME_STEP:
+                return 0.0
+        return ASSUMED_STEP_ERROR
 
     def spot_radius(self, distance: ArrayLike) -> np.ndarray:
         """Radius of the spot, metres; ASSUMED_SPOT_RADIUS everywhere where the spot is not stated.

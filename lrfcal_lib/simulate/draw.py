@@ -1,9 +1,8 @@
 """Observations drawn directly from the noise models of beam, platform and cameras, without images.
 
 A session of :mod:`lrfcal_lib.simulate.record` takes minutes; this takes milliseconds, for
-Monte-Carlo trials by the hundred: sweeps of a whole rig (:func:`observe`), or single shots, one
-scan line and one image a placement (:func:`draw_shots`). It returns plain arrays and knows no
-solver.
+Monte-Carlo trials by the hundred. It returns plain arrays and knows no solver. Single shots are in
+:mod:`lrfcal_lib.simulate.shots`.
 """
 
 from collections import defaultdict
@@ -13,20 +12,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.special import logit
 
-from lrfcal_lib.model.board import Board, Chessboard, triangle_board
+from lrfcal_lib.fit.edge_likelihood import disc_edge, disc_share
+from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
-from lrfcal_lib.model.geometry import AHEAD, polar_to_points, pose_array, tilt
+from lrfcal_lib.model.geometry import AHEAD, polar_to_points, tilt
 
 # corners of a pattern that fills the triangle, metres, where the board has none
 PLACES = [(i, j, 0) for i in range(5) for j in range(6) if i + j < 7]
 CORNERS = np.array([0.04, 0.04, 0.0]) + 0.03 * np.array(PLACES)
 MARGIN = 6  # beams beyond the board
 REACH = 2  # beams kept on either side of an edge, along and across the scan lines
-CLEAR = 1.3  # spot radii between a crossing and a second edge
-FEWEST_BEAMS = 8
-MOST_ROUNDS = 200
-LEAST_DEPTH = 0.1  # of a corner before the camera, metres: nearer, its pixel means nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,54 +66,6 @@ class Bench(Devices):
     sigma_stop: float = 0.0
     # standard deviation of the log odds of the edge from side to side: uneven backgrounds
     spread: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShotSetup(Devices):
-    """What single shots are drawn from: devices like the paper's, and distances in metres."""
-
-    board: Board = field(
-        default_factory=lambda: triangle_board(
-            pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))
-        )
-    )
-    softness: float = 0.03
-    # standard deviation of `bias` from edge to edge of every placement: uneven backgrounds
-    spread: float = 0.0
-    distances: tuple[float, float] = (1.0, 2.5)
-    lean: float = 0.6  # of the boards about x and y at most, radians
-    bearings_deg: tuple[float, float] = (40.0, 140.0)
-    fewest_beams: int = FEWEST_BEAMS  # on a board
-    whole_image: bool = True  # placements with corners outside the image are drawn anew
-    uniform: bool = False  # the errors of ranges; normal otherwise
-
-    def bearings(self):
-        """Of the beams, radians, shape (B,)."""
-        first, last = np.radians(self.bearings_deg)
-        return first + self.step * np.arange(int((last - first) / self.step + 1.5))
-
-    def range_errors(self, rng, shape):
-        """Errors of ranges, metres."""
-        if self.uniform:
-            return self.sigma_range * np.sqrt(3) * rng.uniform(-1, 1, shape)
-        return self.sigma_range * rng.standard_normal(shape)
-
-    def rigs(self, rng, trials):
-        """True poses ``T_camera_lrf``, one a trial."""
-        rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3))) * AHEAD
-        centre = np.array([0.12, 0.03, 0.12]) + rng.normal(0, 0.01, (trials, 3))
-        return RigidTransform.from_components(-rotation.apply(centre), rotation)
-
-    def boards(self, rng, T_camera_lrf):
-        """Poses ``T_lrf_board`` of boards that face the LRF, one for each rig."""
-        count = len(T_camera_lrf)
-        spin = rng.uniform(0, 2 * np.pi, count)
-        lean = rng.uniform(-self.lean, self.lean, (count, 2))
-        away = rng.uniform(*self.distances, count)
-        right = rng.uniform(-0.35, 0.35, count) * away
-        up = rng.uniform(-0.12, 0.12, count)
-        middle = np.append(self.board.corners.mean(axis=0), 0.0)
-        return _posed(spin, lean, np.column_stack([right, away, up]), middle)
 
 
 def bench(
@@ -167,7 +116,7 @@ def board_poses(
     drawn = rng.uniform(low, high, (count, len(limits)))
     right, up, away = drawn[:, 3:].T
     centre = np.column_stack([right * away, away, up * away])
-    return list(_posed(drawn[:, 0], drawn[:, 1:3], centre, [0.105, 0.127, 0.0]))
+    return list(posed(drawn[:, 0], drawn[:, 1:3], centre, [0.105, 0.127, 0.0]))
 
 
 def observe(
@@ -254,7 +203,7 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     p_head = head.rotation.apply(polar_to_points(np.ones(len(bearings)), bearings))
     rays = tilt(p_head, true) @ R
     origin = (tilt(head.translation, true) - pose.translation) @ R
-    distances, r = _beside(bench.board, origin, rays)
+    distances, r = beside(bench.board, origin, rays)
     radius = bench.radius(r)
     sensible = (r > 0.2) & (r < 30)
     u = distances.max(axis=-1)
@@ -297,12 +246,8 @@ def _bias_of_sides(bench, rng):
     """How far outside each edge (E,) of a placement a spot still reads the board, spot radii."""
     bias = np.full(len(bench.board.edges), float(bench.bias))
     if bench.spread:
-        x = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]
-        # of a disc within an edge x radii inside its centre
-        share = (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi
-        odds = np.log(share / (1 - share))
-        own = np.interp(bias, x, odds) + bench.spread * rng.standard_normal(len(bias))
-        bias = np.interp(-own, -odds, x)
+        own = logit(disc_share(bias)) + bench.spread * rng.standard_normal(len(bias))
+        bias, _ = disc_edge(own)
     return bias
 
 
@@ -320,144 +265,14 @@ def _views(bench, pose, at, rng, noise):
             T_source_platform = bench.T_head_lrf.inv() * T_head_platform
         true.append((camera * T_source_platform * pose).as_matrix())
     true = np.concatenate([*true, np.zeros((0, 4, 4))])
-    drawn, covariance = _seen_poses(bench, true[:, :3], rng, noise)
+    drawn, covariance, _ = seen_poses(bench, true[:, :3], rng, noise)
     camera = np.repeat(np.arange(len(bench.cameras)), len(at))
     pitch = np.tile(at, len(bench.cameras))
     pose = np.concatenate([drawn, true[:, 3:]], axis=1)
     return {"camera": camera, "pitch": pitch, "pose": pose, "covariance": covariance}
 
 
-def draw_shots(
-    setup: ShotSetup, rng: np.random.Generator, trials: int, placements: int = 20
-) -> dict[str, np.ndarray]:
-    """Draw calibration sessions of single shots: one scan line and one image a placement.
-
-    A beam reads the board while its ray passes an edge line at less than `bias` radii outside, give
-    or take the softness. Placements whose crossings come near a corner are drawn anew.
-
-    Parameters
-    ----------
-    setup : ShotSetup
-    rng : numpy.random.Generator
-    trials, placements : int
-        Sessions t, and shots p of each.
-
-    Returns
-    -------
-    dict of ndarray
-        ``T_camera_lrf`` (t, 3, 4), truth; ``ranges`` (t, p, B), metres, NaN off the board;
-        ``lines`` (t, p, 2, 3) and ``edges`` (t, p, 2), undistorted image lines and numbers of the
-        edges at the low and the high bearings; ``boards`` (t, p, 3, 4) and ``board_covariance`` (t,
-        p, 6, 6), ``T_camera_board`` as the pattern shows it; ``true_boards``, the truth of that.
-
-    Raises
-    ------
-    ValueError
-        If hardly any board is crossed on two edges and seen by the camera, with the shares that
-        fail each condition.
-    """
-    T_camera_lrf = setup.rigs(rng, trials)
-    parts = []
-    failing = []
-    missing = np.full(trials, placements)
-    for _ in range(MOST_ROUNDS):
-        if not missing.any():
-            break
-        trial = np.repeat(np.arange(trials), 2 * missing)
-        conditions, shots = _shots(setup, rng, T_camera_lrf[trial])
-        usable = np.logical_and.reduce(list(conditions.values()))
-        failing.append({words: np.mean(~good) for words, good in conditions.items()})
-        parts.append({name: value[usable] for name, value in shots.items()})
-        parts[-1]["trial"] = trial[usable]
-        missing = np.maximum(missing - np.bincount(trial[usable], minlength=trials), 0)
-    if missing.any():
-        shares = [
-            f"{100 * np.mean([part[words] for part in failing]):.0f} % {words}"
-            for words in failing[0]
-        ]
-        raise ValueError(
-            f"boards at {setup.distances} m are hardly ever crossed on two edges and seen by "
-            f"the camera: {', '.join(shares)}"
-        )
-
-    drawn = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    trial = drawn.pop("trial")
-    order = np.argsort(trial, kind="stable")
-    first = np.searchsorted(trial[order], np.arange(trials))
-    kept = order[first[:, None] + np.arange(placements)]
-    shots = {name: value[kept] for name, value in drawn.items()}
-    return {"T_camera_lrf": pose_array(T_camera_lrf)} | shots
-
-
-def _shots(setup, rng, T_camera_lrf):
-    """Of shots, one for each of some rigs, which meet the conditions (named by what fails), and the
-    shots.
-    """
-    board = setup.board
-    T_lrf_board = setup.boards(rng, T_camera_lrf)
-    ranges, hit, ends, enough = _ends_of_scan_lines(setup, rng, T_lrf_board)
-    edges = ends.argmax(axis=-1)
-    second = np.sort(ends, axis=-1)[..., -2]
-    clear = (edges[:, 0] != edges[:, 1]) & (second < -CLEAR).all(axis=1)
-
-    true = pose_array(T_camera_lrf * T_lrf_board)
-    corners = board.corners @ true[..., :2].mT + true[:, None, :, 3]
-    uv = pinhole(corners, setup.model)
-    inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
-    ahead = (corners[..., 2] > LEAST_DEPTH).all(axis=1)
-    if setup.whole_image:
-        ahead &= inside.all(axis=(1, 2))
-    conditions = {
-        f"have fewer than {setup.fewest_beams} beams on the board": enough,
-        "are crossed near a corner": clear,
-        "are not in the image": ahead,
-    }
-
-    shown = np.where(ahead[:, None, None], true, true[ahead.argmax()])
-    boards, covariance = _seen_poses(setup, shown, rng, 1.0)
-    noisy = ranges + setup.range_errors(rng, ranges.shape)
-    homography = (
-        setup.model.matrix @ true[..., [0, 1, 3]]
-    )  # from the board's plane to pixels
-    lines = board.lines()[edges] @ np.linalg.inv(homography)  # normals out of the board
-    lines /= np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
-    lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
-    return conditions, {
-        "ranges": np.where(hit, noisy, np.nan),
-        "lines": lines,
-        "edges": edges,
-        "boards": boards,
-        "board_covariance": covariance,
-        "true_boards": true,
-    }
-
-
-def _ends_of_scan_lines(setup, rng, T_lrf_board):
-    """Of one scan line over each board: exact ranges (n, B), which beams hit, distances (n, 2, E)
-    in spot radii of the first and the last of these from the edges, and whether there are enough.
-    """
-    bearings = setup.bearings()
-    R = T_lrf_board.rotation.as_matrix()
-    rays = polar_to_points(np.ones(len(bearings)), bearings) @ R
-    origin = -T_lrf_board.translation[:, None] @ R
-    distances, ranges = _beside(setup.board, origin, rays)
-    radii = distances / setup.radius(ranges)[..., None]
-    of_edges = 0.0
-    if setup.spread:
-        of_edges = setup.spread * rng.standard_normal((len(R), 1, radii.shape[-1]))
-    spot = setup.radius(np.abs(ranges))
-    soft = np.hypot(setup.softness, setup.floor * setup.step * ranges / spot)
-    flips = setup.bias + soft * rng.standard_normal(ranges.shape)
-    hit = ((radii - of_edges).max(axis=-1) < flips) & (ranges > 0)
-    last = len(bearings) - 1
-    first_hit = hit.argmax(axis=1)
-    last_hit = last - hit[:, ::-1].argmax(axis=1)
-    ends = np.stack([first_hit, last_hit], axis=1)
-    enough = (hit.sum(axis=1) >= setup.fewest_beams) & (first_hit > 0) & (last_hit < last)
-    return ranges, hit, np.take_along_axis(radii, ends[..., None], axis=1), enough
-
-
-def _posed(spin, lean, centre, middle):
+def posed(spin, lean, centre, middle):
     """Poses of boards with their middle (board frame) at a centre (n, 3), which face the LRF but
     for a lean (n, 2) about x and y, and are turned in their plane by a spin (n,).
     """
@@ -467,7 +282,7 @@ def _posed(spin, lean, centre, middle):
     return RigidTransform.from_components(centre - facing.apply(middle), facing)
 
 
-def _beside(board, origin, rays):
+def beside(board, origin, rays):
     """Distances between rays (board frame) and the lines of edges (..., E), positive outside.
 
     And the ranges to the plane of the board.
@@ -483,8 +298,10 @@ def _beside(board, origin, rays):
     return inside * np.abs(z) / np.hypot(across, z), ranges
 
 
-def _seen_poses(devices, true, rng, noise):
-    """Poses (n, 3, 4) of boards as their pattern tells them, and their covariances."""
+def seen_poses(devices, true, rng, noise):
+    """Poses (n, 3, 4) of boards as their pattern tells them, their covariances, and the pixels
+    (n, c, 2) of the pattern's corners behind them.
+    """
     pattern = devices.board.pattern
     corners = CORNERS if pattern is None else pattern.points()
     turned = corners @ true[..., :3].mT
@@ -494,9 +311,12 @@ def _seen_poses(devices, true, rng, noise):
     J = np.concatenate([np.cross(turned[:, :, None], by_point), by_point], axis=-1)
     J = J.reshape(len(true), 2 * len(corners), 6)
     information = J.mT @ J
-    covariance = np.linalg.inv(information) * devices.sigma_px**2
-    unit = rng.standard_normal((len(true), 6))
-    error = noise * np.matvec(np.linalg.cholesky(covariance), unit)
+    inverse = np.linalg.inv(information)
+    sigma_px = noise * devices.sigma_px
+    errors_px = sigma_px * rng.standard_normal((len(true), 2 * len(corners)))
+    error = np.matvec(inverse @ J.mT, errors_px)
+    pixels = pinhole(points, devices.model) + errors_px.reshape(len(true), -1, 2)
     rotation = Rotation.from_rotvec(error[:, :3]).as_matrix() @ true[..., :3]
     translation = true[..., 3:] + error[:, 3:, None]
-    return np.concatenate([rotation, translation], axis=-1), covariance
+    poses = np.concatenate([rotation, translation], axis=-1)
+    return poses, inverse * devices.sigma_px**2, pixels

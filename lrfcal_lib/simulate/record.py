@@ -1,13 +1,11 @@
 """Record a session with a simulated rig: telegrams, platform log, images and the truth."""
 
-import errno
 import json
 import math
 import os
 import shutil
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +21,7 @@ from lrfcal_lib.session.lms2xx_codec import (
 )
 from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import transform_to_json
+from lrfcal_lib.session.workers import spread
 from lrfcal_lib.session.write import SessionWriter, write_file
 from lrfcal_lib.simulate.beam import scan
 from lrfcal_lib.simulate.lengths import room_lengths
@@ -33,7 +32,6 @@ from lrfcal_lib.simulate.scene import (
     board_on_stand,
     furnished,
     furnished_room,
-    need,
 )
 
 LICENCE = "CC-BY-4.0"
@@ -57,20 +55,23 @@ class Stops(NamedTuple):
 
 
 class Shots(NamedTuple):
-    """Images of one camera, by its number in the rig, in one arrangement of the room.
+    """Images of one camera, by its number in the rig, at one placement.
 
-    The placement is -1 for the board held close; `T_platform_board` None where there is no board
-    but a table with things; `poses` are ``T_camera_platform``, `key` that of the random numbers;
-    `T_room_platform` is that of a station.
+    `poses` are ``T_camera_platform``, `key` that of the random numbers. The board held close to a
+    camera is placement -1.
     """
 
     camera: int
-    placement: int
-    purpose: str
-    T_platform_board: RigidTransform | None
+    placement: Placement
     poses: list
     key: tuple
-    T_room_platform: RigidTransform | None = None
+
+    @property
+    def purpose(self) -> str:
+        """What the images are for, as a session names it."""
+        if self.placement.number < 0:
+            return "intrinsics"
+        return "scene" if self.placement.T_platform_board is None else "board"
 
 
 def world_of(
@@ -93,22 +94,19 @@ def world_of(
     """
     if T_platform_board is None:
         room = furnished_room(*furnished("still life"))
-        if T_room_platform is None:
-            return room
-        return room.seen_from(T_room_platform)
+        return room if T_room_platform is None else room.seen_from(T_room_platform)
     things = board_on_stand(setup.rig.board, T_platform_board, setup.rig.ring)
     return furnished_room(*(things if stand else things[:1]))
 
 
 def step_angles(first, last, step):
     """Pitch commands of a stop-and-go sweep: multiples of `step` about from `first` to `last`."""
-    need(step > 0, f"a pitch step must be positive, got {step} rad")
     low, high = sorted((first, last))
     angles = np.arange(math.floor(low / step), math.ceil(high / step) + 1) * step
     return angles if last >= first else angles[::-1]
 
 
-def stops_of(setup: Setup, placement: Placement) -> tuple[Stops, Stops]:
+def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     """Where the head stands for the images and for the scan lines of a placement.
 
     Parameters
@@ -116,15 +114,14 @@ def stops_of(setup: Setup, placement: Placement) -> tuple[Stops, Stops]:
     setup
     placement
     """
-    step = setup.step if placement.T_platform_board is not None else setup.room_sweep[2]
+    step = setup.step
+    if placement.T_platform_board is None:
+        _, _, step = setup.room_sweep  # type: ignore[misc]
     rng = random(setup, STOPS, placement.number)
     images = np.asarray(placement.image_pitch)
     lines = step_angles(*placement.sweep, step)
     stop = setup.rig.platform.stop
-    return (
-        Stops(images, *stop(images, placement.direction, rng)),
-        Stops(lines, *stop(lines, placement.direction, rng)),
-    )
+    return [Stops(c, *stop(c, placement.direction, rng)) for c in (images, lines)]
 
 
 def sweep_of(setup, placement):
@@ -132,13 +129,8 @@ def sweep_of(setup, placement):
     pitch = stops_of(setup, placement)[1].true
     station = placement.T_room_platform
     world = world_of(setup, placement.T_platform_board, T_room_platform=station)
-    return scan(
-        setup.rig.beam,
-        world,
-        pitch[:, None],
-        setup.rig.T_head_lrf,
-        random(setup, SWEEP, placement.number),
-    )
+    rng = random(setup, SWEEP, placement.number)
+    return scan(setup.rig.beam, world, pitch[:, None], setup.rig.T_head_lrf, rng)
 
 
 def close_views(setup: Setup, number: int) -> list[RigidTransform]:
@@ -151,14 +143,10 @@ def close_views(setup: Setup, number: int) -> list[RigidTransform]:
         Of the camera in the rig.
     """
     rig = setup.rig
-    camera = setup.rig.cameras[number]
+    camera = rig.cameras[number]
     still = rig.camera_pose(camera, 0.0).inv()
-    return [
-        still * pose
-        for pose in held_close(
-            rig, camera, setup.intrinsics_views, random(setup, VIEWS, number)
-        )
-    ]
+    rng = random(setup, VIEWS, number)
+    return [still * pose for pose in held_close(rig, camera, setup.intrinsics_views, rng)]
 
 
 def shots_of(setup, placements):
@@ -168,26 +156,14 @@ def shots_of(setup, placements):
     for number, camera in enumerate(rig.cameras):
         still = [rig.camera_pose(camera, 0.0)]
         for i, pose in enumerate(close_views(setup, number)):
-            out.append(Shots(number, -1, "intrinsics", pose, still, (PHOTO, number, 0, i)))
+            close = Placement(-1, pose, sweep=(0.0, 0.0), image_pitch=(0.0,))
+            out.append(Shots(number, close, still, (PHOTO, number, 0, i)))
     for placement in placements:
-        pose = placement.T_platform_board
-        purpose = "scene" if placement.T_platform_board is None else "board"
+        stops, _ = stops_of(setup, placement)
         for number, camera in enumerate(rig.cameras):
-            poses = [
-                rig.camera_pose(camera, pitch)
-                for pitch in stops_of(setup, placement)[0].true
-            ]
-            out.append(
-                Shots(
-                    number,
-                    placement.number,
-                    purpose,
-                    pose,
-                    poses,
-                    (PHOTO, number, placement.number),
-                    placement.T_room_platform,
-                )
-            )
+            poses = [rig.camera_pose(camera, pitch) for pitch in stops.true]
+            key = (PHOTO, number, placement.number)
+            out.append(Shots(number, placement, poses, key))
     return out
 
 
@@ -195,8 +171,13 @@ def photograph(setup, shots):
     """Take pictures, a list of JPEG files as bytes."""
     camera = setup.rig.cameras[shots.camera]
     imager = Imager(camera.model, camera.exposure)
-    stand = shots.purpose == "board"
-    world = world_of(setup, shots.T_platform_board, stand, shots.T_room_platform)
+    placement = shots.placement
+    world = world_of(
+        setup,
+        placement.T_platform_board,
+        stand=shots.purpose == "board",
+        T_room_platform=placement.T_room_platform,
+    )
     rng = random(setup, *shots.key)
     quality = [cv2.IMWRITE_JPEG_QUALITY, setup.quality]
     return [
@@ -205,15 +186,15 @@ def photograph(setup, shots):
     ]
 
 
-def simulate(path: str | os.PathLike, setup: Setup, workers: int = 1) -> None:
+def simulate(path: str | os.PathLike, setup: Setup) -> None:
     """Simulate a recording and write its session into a new folder.
+
+    Images are rendered by the workers of :func:`lrfcal_lib.session.workers.side_by_side`.
 
     Parameters
     ----------
     path
     setup
-    workers
-        Processes that render images.
 
     Raises
     ------
@@ -227,16 +208,11 @@ def simulate(path: str | os.PathLike, setup: Setup, workers: int = 1) -> None:
         raise ValueError(f"{path}: exists already; choose another name or remove it first")
     draft = path.with_name(f".{path.name}.draft{os.getpid()}")
     try:
-        _record(draft, path.name, setup, workers)
+        _record(draft, path.name, setup)
         draft.rename(path)
     except OSError as error:
-        full = (
-            "; free some space"
-            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-            else ""
-        )
         raise ValueError(
-            f"{path}: cannot be written ({error.strerror}){full}; nothing was kept"
+            f"{path}: cannot be written ({error.strerror}): is there space? Nothing was kept"
         ) from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -244,11 +220,9 @@ def simulate(path: str | os.PathLike, setup: Setup, workers: int = 1) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _record(folder, name, setup, workers):
+def _record(folder, name, setup):
     rig = setup.rig
     placements = placements_of(setup)
-    for placement in placements:
-        rig.platform.check(np.array(placement.sweep))
     reference = {
         "recording": RECORDING,
         "scene_placements": [p.number for p in placements if p.T_platform_board is None],
@@ -267,7 +241,7 @@ def _record(folder, name, setup, workers):
         reference=reference,
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}",
     ) as writer:
-        log = _add_placements(writer, setup, placements, truth, workers)
+        log = _add_placements(writer, setup, placements, truth)
     lines = [",".join(PLATFORM_COLUMNS), *log]
     write_file(folder / "platform.csv", "\n".join(lines) + "\n", folder)
     write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
@@ -299,7 +273,7 @@ def _truth(setup, placements):
     return truth
 
 
-def _add_placements(writer, setup, placements, truth, workers):
+def _add_placements(writer, setup, placements, truth):
     """Write the images for the intrinsics, then images and sweep of each placement.
 
     Returns the rows of the platform's log.
@@ -313,12 +287,14 @@ def _add_placements(writer, setup, placements, truth, workers):
     configuration = Configuration().changed(measuring_mode=0, unit=unit)
     writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
     shots = shots_of(setup, placements)
-    files = _photographs(setup, shots, workers)
-    _add_images(writer, setup, [s for s in shots if s.placement < 0], files, truth)
+    files = iter(spread(partial(photograph, setup), shots))
+    close = [s for s in shots if s.purpose == "intrinsics"]
+    still = np.zeros(1)
+    _add_images(writer, setup, close, files, truth, Stops(still, still, still), [np.nan])
     for placement in placements:
         images, lines = stops_of(setup, placement)
         shot_at = clock + pause * np.arange(1, len(images.true) + 1)
-        own = [s for s in shots if s.placement == placement.number]
+        own = [s for s in shots if s.placement == placement]
         _add_images(writer, setup, own, files, truth, images, shot_at)
         first = shot_at[-1] + pause
         began = first + (pause + took) * np.arange(len(lines.true))
@@ -335,33 +311,23 @@ def _add_placements(writer, setup, placements, truth, workers):
     return log
 
 
-def _photographs(setup, shots, workers):
-    """The images of all shots in order, lists of files, rendered ahead by worker processes."""
-    if workers <= 1:
-        yield from (photograph(setup, item) for item in shots)
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(photograph, [setup] * len(shots), shots)
-
-
-def _add_images(writer, setup, shots, files, truth, stops=None, times=None):
-    """Write the next images, with where the head then stood: at pitch 0 without stops."""
+def _add_images(writer, setup, shots, files, truth, stops, times):
+    """Write the next images, with where the head then stood."""
     for shot, images in zip(shots, files, strict=False):
         name = setup.rig.cameras[shot.camera].name
+        placement = shot.placement
         for i, data in enumerate(images):
-            pitch = true = 0.0
-            time = math.nan
-            if stops is not None:
-                pitch = float(stops.measured[i])
-                true = float(stops.true[i])
-                time = float(np.round(times[i], 4))
             writer.add_image(
-                name, data, shot.placement, pitch=pitch, time_s=time, purpose=shot.purpose
+                name,
+                data,
+                placement.number,
+                pitch=float(stops.measured[i]),
+                time_s=float(np.round(times[i], 4)),
+                purpose=shot.purpose,
             )
-            known = {"pitch_rad": true}
-            if shot.T_platform_board is not None:
+            known = {"pitch_rad": float(stops.true[i])}
+            if placement.T_platform_board is not None:
                 known["T_camera_board"] = transform_to_json(
-                    shot.poses[i] * shot.T_platform_board
+                    shot.poses[i] * placement.T_platform_board
                 )
-            file = f"images/{name}/{writer.shots[name]:04d}.jpg"
-            truth["images"][file] = known
+            truth["images"][f"images/{name}/{writer.shots[name]:04d}.jpg"] = known

@@ -10,14 +10,12 @@ import numpy as np
 import pydantic
 from numpy.typing import ArrayLike
 from pydantic import (
-    AfterValidator,
     Field,
     InstanceOf,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
 )
-from scipy.spatial.distance import pdist
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
@@ -33,6 +31,7 @@ from lrfcal_lib.simulate.beam import LMS221, Beam
 from lrfcal_lib.simulate.scene import Exposure, need
 
 MOST_TRIES = 4000
+SCAN_ROUNDS = 20  # of the pitch at which the scan plane meets a point; each gains a digit
 PITCH_GRID = np.radians(
     np.arange(-30.0, 30.1, 0.5)
 )  # pitch angles at which an image may be taken
@@ -88,11 +87,8 @@ class Platform:
         step = self.encoder_step
         self.check(commanded)
         motor = commanded + self.noise * rng.standard_normal(commanded.shape)
-        behind = np.asarray(direction) * self.backlash / 2
-        head = (1 + self.stretch) * motor - behind
-        if step:
-            return head, np.rint(motor / step) * step
-        return head, motor
+        head = (1 + self.stretch) * motor - direction * self.backlash / 2
+        return head, np.rint(motor / step) * step if step else motor
 
     def check(self, pitch: np.ndarray) -> None:
         """Refuse angles beyond the limits.
@@ -106,13 +102,12 @@ class Platform:
         ------
         ValueError
         """
-        low = min(pitch, default=0.0)
-        high = max(pitch, default=0.0)
-        first, last = np.round(np.degrees([low, high]), 2)
-        lowest, highest = np.round(np.degrees(self.limits), 2)
-        asked = f"platform: pitch {first} to {last} deg is asked for"
-        good = self.limits[0] <= low and high <= self.limits[1]
-        need(good, f"{asked}, it turns {lowest} to {highest} deg")
+        low, high = self.limits
+        first = np.degrees(np.min(pitch, initial=0.0))
+        last = np.degrees(np.max(pitch, initial=0.0))
+        asked = f"platform: pitch {first:.2f} to {last:.2f} deg is asked for"
+        turns = f"it turns {np.degrees(low):.2f} to {np.degrees(high):.2f} deg"
+        need(np.all((low <= pitch) & (pitch <= high)), f"{asked}, {turns}")
 
 
 @dataclass(frozen=True)
@@ -180,23 +175,14 @@ class Rig:
     def sweep_pitch(self, p_platform):
         """Pitch (n,) at which the scan plane meets points (n, 3), and their bearing there, radians.
 
-        With n the third row of the rotation of ``T_head_lrf.inv()`` and h its shift, the point p
-        lies in the scan plane where ``n . Rx(-pitch) p + h = 0``; of the two solutions the one
-        ahead is taken.
+        The head turns by what the point lies off the scan plane until it lies in it.
         """
         back = self.T_head_lrf.inv()
-        n = back.rotation.as_matrix()[2]
-        h = back.translation[2]
-        x, y, z = np.asarray(p_platform, float).T
-        along = n[1] * y + n[2] * z
-        across = n[1] * z - n[2] * y
-        turn = np.arctan2(across, along)
-        cosine = -(n[0] * x + h) / np.hypot(along, across)
-        lift = np.arccos(np.clip(cosine, -1, 1))
-        first, second = np.angle(np.exp(1j * np.stack([turn + lift, turn - lift])))
-        pitch = np.where(np.abs(first) < np.abs(second), first, second)
-        p_lrf = back.apply(tilt(p_platform, -pitch))
-        return pitch, np.arctan2(p_lrf[:, 1], p_lrf[:, 0])
+        pitch = np.zeros(len(p_platform))
+        for _ in range(SCAN_ROUNDS):
+            x, y, z = back.apply(tilt(p_platform, -pitch)).T
+            pitch = pitch + np.arctan2(z, y)
+        return pitch, np.arctan2(y, x)
 
     def shows(self, camera, T_camera_board, points=None, margin=12.0):
         """Whether a camera sees points of the board (corners by default) well inside the image.
@@ -214,11 +200,6 @@ class Rig:
         return np.all(ahead & inside.all(axis=-1), axis=-1)
 
 
-def _three_or_none(values):
-    need(len(values) in (0, 3), "first, last and step are needed, or nothing")
-    return values
-
-
 @pydantic.dataclasses.dataclass(frozen=True)
 class Setup:
     """A recording to simulate; everything follows from it."""
@@ -231,7 +212,7 @@ class Setup:
     step: PositiveFloat = math.radians(0.25)  # between the stops of a sweep, radians
     intrinsics_views: NonNegativeInt = 20  # images of the board held close, a camera
     # first pitch, last pitch and step of the sweep of the room, radians; empty for none
-    room_sweep: Annotated[tuple[float, ...], AfterValidator(_three_or_none)] = ()
+    room_sweep: tuple[()] | tuple[float, float, float] = ()
     room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
     # T_room_platform of each sweep of the room; empty for one sweep from where the boards are seen
     stations: tuple[InstanceOf[RigidTransform], ...] = ()
@@ -262,43 +243,33 @@ def load_setup(name: str) -> Setup:
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
     row = _radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
-    names = (
-        "seed",
-        "pairs",
-        "distances",
-        "step",
-        "intrinsics_views",
-        "room_sweep",
-        "room_images",
-        "quality",
-    )
-    cameras = []
-    for camera, c in row["cameras"].items():
-        scale = row["image_width"] / c["size"][0]
-        turn = Rotation.from_rotvec(c["turn"], degrees=True) * AHEAD
-        mounting = RigidTransform.from_components(-turn.apply(c["centre"]), turn)
-        off = Rotation.from_rotvec(c["guess"]["turn"], degrees=True) * mounting.rotation
-        guess = RigidTransform.from_components(
-            mounting.translation + np.array(c["guess"]["shift"]), off
-        )
-        width, height = (round(v * scale) for v in c["size"])
-        fx, fy, cx, cy = (v * scale for v in c["pinhole"])
-        model = CameraModel(width, height, fx, fy, cx, cy, np.array(c["distortion"]))
-        cameras.append(RigCamera(camera, model, mounting, guess, Exposure(**c["exposure"])))
-    beam = replace(LMS221, **row["beam"])
-    platform = Platform(**_radians(row["platform"]))
+    width = row["image_width"]
+    cameras = [_camera(key, camera, width) for key, camera in row["cameras"].items()]
     rig = Rig(
-        beam,
-        platform,
-        _placed(row["head"]),
-        _placed(row["head_stated"]),
-        tuple(cameras),
-        printed_triangle(),
+        beam=replace(LMS221, **row["beam"]),
+        platform=Platform(**_radians(row["platform"])),
+        T_head_lrf=_placed(row["head"]),
+        T_head_lrf_stated=_placed(row["head_stated"]),
+        cameras=tuple(cameras),
+        board=printed_triangle(),
     )
-    settings = {k: row[k] for k in names}
-    if "stations" in row:
-        settings["stations"] = tuple(_placed(station) for station in row["stations"])
-    return Setup(name, rig=rig, **settings)
+    stations = tuple(_placed(station) for station in row.get("stations", ()))
+    settings = {key: row[key] for key in Setup.__dataclass_fields__.keys() & row.keys()}
+    return Setup(**settings | {"name": name, "rig": rig, "stations": stations})
+
+
+def _camera(name, row, width):
+    """A camera with images so many pixels wide."""
+    scale = width / row["size"][0]
+    turn = Rotation.from_rotvec(row["turn"], degrees=True) * AHEAD
+    mounting = RigidTransform.from_components(-turn.apply(row["centre"]), turn)
+    off = Rotation.from_rotvec(row["guess"]["turn"], degrees=True)
+    shift = mounting.translation + row["guess"]["shift"]
+    guess = RigidTransform.from_components(shift, off * mounting.rotation)
+    width, height = (round(v * scale) for v in row["size"])
+    pinhole = [v * scale for v in row["pinhole"]]
+    model = CameraModel(width, height, *pinhole, np.array(row["distortion"]))
+    return RigCamera(name, model, mounting, guess, Exposure(**row["exposure"]))
 
 
 def _placed(row):
@@ -368,22 +339,6 @@ def placements_of(setup: Setup) -> list[Placement]:
     return out
 
 
-def check_size(rig, nearest):
-    """Refuse a board that does not fit into a view of LRF or camera at a distance, metres."""
-    length = pdist(rig.board.known_corners()).max()
-    angle = np.degrees(2 * np.arctan(length / 2 / nearest))
-    views = {rig.beam.name: float(rig.beam.field_of_view)}
-    for camera in rig.cameras:
-        m = camera.model
-        narrow = min(m.width / m.fx, m.height / m.fy)
-        views[f"camera '{camera.name}'"] = np.degrees(2 * np.arctan(narrow / 2))
-    board = f"board '{rig.board.name}' is {length:.3g} m long"
-    large = f"{board}: {angle:.0f} deg at {nearest:g} m"
-    for name, view in views.items():
-        seen = f"{name} sees {view:.0f} deg; take a smaller board or a greater distance"
-        need(angle <= 0.9 * view, f"{large}, but {seen}")
-
-
 def pairs(
     rig: Rig,
     count: int,
@@ -417,7 +372,6 @@ def pairs(
         count >= 1 and 0.3 <= distances[0] <= distances[1],
         f"{asked}: at least one pair, at 0.3 m or more, is needed",
     )
-    check_size(rig, distances[0])
     out = []
     shuffled = rng.permutation(np.linspace(*distances, count))
     for i, distance in enumerate(shuffled):
@@ -505,21 +459,15 @@ def held_close(
     Raises
     ------
     ValueError
-        If it does not fit, or the board has no pattern.
+        If it does not fit.
     """
     m = camera.model
-    out: list[RigidTransform] = []
-    if count == 0:
-        return out
-    if rig.board.pattern is None:
-        raise ValueError(
-            f"board '{rig.board.name}' has no pattern: it cannot serve for the intrinsics"
-        )
     points = rig.board.pattern.points()
     size = np.array([m.width, m.height])
-    columns = int(np.ceil(np.sqrt(count * 4 / 3)))
-    to_camera = Rotation.from_euler("x", 180, degrees=True)
+    columns = max(int(np.ceil(np.sqrt(count * 4 / 3))), 1)
     rows = np.ceil(count / columns)
+    to_camera = Rotation.from_euler("x", 180, degrees=True)
+    out = []
     for i in range(count):
         row, column = divmod(i, columns)
         pixel = np.array([(column + 0.5) / columns, (row + 0.5) / rows]) * size
@@ -532,15 +480,10 @@ def held_close(
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])
             turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
             place = z * np.array([(u - m.cx) / m.fx, (v - m.cy) / m.fy, 1.0])
-            pose = RigidTransform.from_components(
-                place - turn.apply(points.mean(axis=0)), turn
-            )
+            shift = place - turn.apply(points.mean(axis=0))
+            pose = RigidTransform.from_components(shift, turn)
             if rig.shows(camera, pose, points, margin=18.0):
+                out.append(pose)
                 break
-        else:
-            where = f"the image of camera '{camera.name}'"
-            raise ValueError(
-                f"the pattern of board '{rig.board.name}' does not fit into {where}"
-            )
-        out.append(pose)
+    need(len(out) == count, f"the pattern does not fit into the image of '{camera.name}'")
     return out

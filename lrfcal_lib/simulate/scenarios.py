@@ -1,121 +1,17 @@
 """Set-ups by name to compare methods on, some of them published (``scenarios.json``)."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import AHEAD
-from lrfcal_lib.simulate.draw import ShotSetup
-
-FORWARD_X = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # camera from an LRF that looks along x
-FACING = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))  # camera from a board before it
-TARGET = Rotation.from_euler("ZY", [45, 45], degrees=True)  # world from the board, 'around'
-# as in `triangle_board` of shots: 23 corners or so, away from the edges
-PATTERN = Chessboard(4, 5, 0.029, (0.03885, 0.03885))
-PLAIN = (
-    "spot",
-    "sigma_range",
-    "sigma_px",
-    "bias",
-    "uniform",
-    "bearings_deg",
-    "fewest_beams",
-    "whole_image",
-    "distances",
-    "poses",
-    "start",
-    "sensor",
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scenario(ShotSetup):
-    """What the single shots of a study are drawn from; see also
-    :class:`lrfcal_lib.simulate.draw.ShotSetup`.
-    """
-
-    name: str = "own"
-    about: str = ""
-    softness: float = 0.1
-    floor: float = LEAST_STEP
-    # standard deviations of what iterative methods start with, radians and metres
-    start: tuple[float, float] = (0.05, 0.05)
-    # what the joint estimate does not know of the sensor; published simulations know it all
-    sensor: tuple[str, ...] = ("range_offset", "edge_log_odds", "edge_log_softness")
-    T_camera_lrf: RigidTransform | None = (
-        None  # drawn anew for every trial where it is None
-    )
-    roll: float = 0.0  # of the scan plane about the viewing direction, radians
-    poses: str = "ahead"  # of the boards: ahead, tilted or around
-    tilt: float = 0.0  # of boards from the image plane, radians ('tilted')
-    least_angle: float = 0.0  # between the LRF's place and the target's planes ('around')
-    extra: tuple[float, float, float] = (0.0, 0.0, 0.0)  # turns about z, x, y ('around')
-
-    def rigs(self, rng, trials):
-        """True poses ``T_camera_lrf``, one a trial."""
-        if self.T_camera_lrf is None:
-            roll = Rotation.from_rotvec([0.0, 0.0, self.roll])
-            return RigidTransform.from_rotation(roll) * super().rigs(rng, trials)
-        matrix = np.broadcast_to(self.T_camera_lrf.as_matrix(), (trials, 4, 4))
-        return RigidTransform.from_matrix(matrix)
-
-    def boards(self, rng, T_camera_lrf):
-        """Poses ``T_lrf_board``, one for each rig."""
-        if self.poses == "tilted":
-            return T_camera_lrf.inv() * self._tilted(rng, len(T_camera_lrf))
-        if self.poses == "around":
-            return self._around(rng, T_camera_lrf)
-        return super().boards(rng, T_camera_lrf)
-
-    def _middle(self):
-        return np.append(self.board.corners.mean(axis=0), 0.0)
-
-    def _tilted(self, rng, count):
-        """Poses ``T_camera_board`` of boards parallel to the image but for a turn about a random
-        axis in the board, anywhere in the image.
-        """
-        angle = rng.uniform(0, 2 * np.pi, count)
-        axis = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
-        rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
-        away = rng.uniform(*self.distances, count)
-        pixels = rng.uniform(0, [self.model.width, self.model.height], (count, 2))
-        ray = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(self.model.matrix).T
-        centre = away[:, None] * ray
-        return RigidTransform.from_components(
-            centre - rotation.apply(self._middle()), rotation
-        )
-
-    def _around(self, rng, T_camera_lrf):
-        """Poses of a target about which the LRF is put, looking at it but for turns."""
-        count = len(T_camera_lrf)
-        direction = np.zeros((count, 3))
-        open_ = np.ones(count, bool)
-        while open_.any():
-            v = rng.uniform(0, 1, (open_.sum(), 3))
-            direction[open_] = v / np.linalg.norm(v, axis=1, keepdims=True)
-            open_ = direction.min(axis=1) < np.sin(self.least_angle)
-        z = -direction
-        x = np.cross(z, [0.0, 0.0, 1.0])
-        x /= np.linalg.norm(x, axis=1, keepdims=True)
-        looking = np.stack([x, np.cross(z, x), z], axis=-1)
-        turns = rng.uniform(-1, 1, (count, 3)) * self.extra
-        turned = Rotation.from_matrix(looking) * Rotation.from_euler("ZXY", turns)
-        away = rng.uniform(*self.distances, (count, 1))
-        T_world_lrf = RigidTransform.from_components(
-            away * direction, turned * Rotation.from_matrix(FORWARD_X)
-        )
-        T_world_board = RigidTransform.from_components(
-            -TARGET.apply(self._middle()), TARGET
-        )
-        return T_world_lrf.inv() * T_world_board
-
+from lrfcal_lib.simulate.shots import FORWARD_X, PATTERN, Scenario
 
 FILE = json.loads(Path(__file__).with_name("scenarios.json").read_text())
 
@@ -125,68 +21,65 @@ def load_scenario(name: str) -> Scenario:
     if name not in FILE:
         raise ValueError(f"unknown scenario {name!r}: use one of {', '.join(FILE)}")
     facts = FILE[name]
-    settings: dict[str, Any] = {key: facts[key] for key in PLAIN if key in facts}
-    for key in ("spot", "bearings_deg", "distances", "start", "sensor"):
-        if key in settings:
-            settings[key] = tuple(settings[key])
-    return Scenario(
-        name=name,
-        about=facts["about"],
-        model=_camera(*facts["camera"]),
-        board=_board(facts),
-        step=np.radians(facts["step_deg"]),
-        T_camera_lrf=_mount(facts),
-        roll=np.radians(facts.get("roll_deg", 0.0)),
-        tilt=np.radians(facts.get("tilt_deg", 0.0)),
-        least_angle=np.radians(facts.get("least_angle_deg", 0.0)),
-        extra=tuple(np.radians(facts.get("extra_deg", (0.0, 0.0, 0.0))).tolist()),
-        **settings,
-    )
+    settings: dict[str, Any] = {
+        "name": name,
+        "model": _camera(*facts["camera"]),
+        "board": _board(facts),
+        "T_camera_lrf": _mount(facts),
+    }
+    others = {f.name for f in fields(Scenario)} - settings.keys()
+    for key, value in facts.items():
+        if key not in others and key.endswith("_deg"):
+            key = key.removesuffix("_deg")
+            value = np.radians(value).tolist()
+        if key in others:
+            settings[key] = tuple(value) if isinstance(value, list) else value
+    return Scenario(**settings)
 
 
 def varied(scenario: Scenario, key: str, value: float) -> Scenario:
-    """A scenario with one thing changed, which its name then tells.
+    """A scenario with one thing changed, which it then tells.
 
     Parameters
     ----------
     scenario : Scenario
     key : str
-        ``range_noise_mm``, ``pixel_noise_px``, ``step_deg``, ``spot_mm`` (diameter 2 m away; it
-        grows in proportion), ``board_scale``, ``lean_deg`` (of the boards at most) or ``start_deg``
-        (as standard deviation; a degree comes with 17 mm).
+        Of `VARIED`.
     value : float
-        Positive.
+        Positive but for the bias and its spread.
 
     Raises
     ------
     ValueError
         For an unknown key or a value that is not positive.
     """
-    if not value > 0:
+    if key not in VARIED:
+        known = ", ".join(VARIED)
+        raise ValueError(f"nothing called {key!r} can be varied: use one of {known}")
+    if not value > 0 and key not in ("bias", "spread"):
         raise ValueError(f"{key}={value:g}: a positive number is needed")
-    change: dict[str, Any]
-    match key:
-        case "range_noise_mm":
-            change = {"sigma_range": value / 1000}
-        case "pixel_noise_px":
-            change = {"sigma_px": value}
-        case "step_deg":
-            change = {"step": np.radians(value)}
-        case "spot_mm":
-            scale = value / 2000 / scenario.radius(2.0)
-            change = {"spot": (scale * scenario.spot[0], scale * scenario.spot[1])}
-        case "board_scale":
-            change = {"board": _scaled(scenario.board, value)}
-        case "lean_deg":
-            change = {"lean": np.radians(value)}
-        case "start_deg":
-            change = {"start": (np.radians(value), np.radians(value))}
-        case _:
-            raise ValueError(
-                f"nothing called {key!r} can be varied: use range_noise_mm, pixel_noise_px, "
-                "step_deg, spot_mm, board_scale, lean_deg or start_deg"
-            )
-    return replace(scenario, name=f"{scenario.name} {key}={value:g}", **change)
+    changed = VARIED[key](scenario, value)
+    return replace(scenario, varied=scenario.varied | {key: value}, **changed)
+
+
+def _spot(scenario, value):
+    """Diameter 2 m away; it grows in proportion."""
+    scale = value / 2000 / scenario.radius(2.0)
+    return {"spot": tuple(scale * part for part in scenario.spot)}
+
+
+VARIED = {
+    "range_noise_mm": lambda scenario, value: {"sigma_range": value / 1000},
+    "pixel_noise_px": lambda scenario, value: {"sigma_px": value},
+    "step_deg": lambda scenario, value: {"step": np.radians(value)},
+    "spot_mm": _spot,
+    "bias": lambda scenario, value: {"bias": value},  # spot radii
+    "spread": lambda scenario, value: {"spread": value},  # of the bias, spot radii
+    "board_scale": lambda scenario, value: {"board": _scaled(scenario.board, value)},
+    "lean_deg": lambda scenario, value: {"lean": np.radians(value)},  # at most
+    # standard deviation; a degree comes with 17 mm
+    "start_deg": lambda scenario, value: {"start": (np.radians(value), np.radians(value))},
+}
 
 
 def _scaled(board, scale):
@@ -209,7 +102,13 @@ def _board(facts):
     and sides of n squares.
     """
     if "triangle" in facts:
-        return triangle_board(*facts["triangle"], pattern=PATTERN)
+        pattern = PATTERN
+        if "pattern" in facts:
+            columns, rows, square, first = facts["pattern"]
+            pattern = Chessboard(columns, rows, square, (first, first))
+        return triangle_board(*facts["triangle"], pattern=pattern)
+    if "square" not in facts:
+        return triangle_board(pattern=PATTERN)  # a corner is looked at instead
     corners, square, squares = facts["square"]
     side = squares * square
     border = (side - (corners - 1) * square) / 2

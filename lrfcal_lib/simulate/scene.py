@@ -21,18 +21,10 @@ from pydantic import Field, NonNegativeFloat, PositiveInt
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.camera import CameraModel, distort, undistort
-from lrfcal_lib.simulate.textures import (
-    book_spines,
-    chessboard,
-    plain,
-    planks,
-    poster,
-    printed_page,
-    stripes,
-    tiles,
-    wood,
-)
+from lrfcal_lib.model.camera import CameraModel, project, undistort
+from lrfcal_lib.model.geometry import plane_axes
+from lrfcal_lib.simulate import textures
+from lrfcal_lib.simulate.textures import chessboard, plain
 
 FLOOR = -1.1  # metres, below the platform
 SKY = (0.95, 0.98, 1.0)  # light from where there is nothing
@@ -141,11 +133,9 @@ def rod(start, end, radius, sides=12):
     end = np.asarray(end, float)
     length = np.linalg.norm(end - start)
     z = (end - start) / length
-    other = [1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0]
-    x = np.cross(z, other)
-    x /= np.linalg.norm(x)
+    y, x = plane_axes(z)
     vertices, faces = cylinder(radius, length, sides)
-    return start + vertices @ np.stack([x, np.cross(z, x), z]), faces
+    return start + vertices @ np.stack([x, -y, z]), faces
 
 
 def curtain(width, height, depth, folds):
@@ -159,12 +149,6 @@ def curtain(width, height, depth, folds):
 
 SHAPES = {
     f.__name__: f for f in (polygon, rectangle, box, lathe, cylinder, sphere, rod, curtain)
-}
-
-
-TEXTURES = {
-    f.__name__: f
-    for f in (plain, wood, planks, stripes, tiles, printed_page, poster, book_spines)
 }
 
 
@@ -258,7 +242,7 @@ class World:
         directions = np.asarray(directions, float)
         origins, directions = np.broadcast_arrays(origins, directions)
         rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
-        ids = self._scene.cast_rays(_tensor(rays))["primitive_ids"].numpy()
+        ids = self._scene.cast_rays(o3d.core.Tensor(rays))["primitive_ids"].numpy()
         seen = ids != o3d.t.geometry.RaycastingScene.INVALID_ID
         face = np.where(seen, ids.astype(np.int64), -1)
         distance = np.full(len(face), np.inf)
@@ -270,9 +254,8 @@ class World:
     def albedo(self, points: np.ndarray, thing: np.ndarray) -> np.ndarray:
         """Albedo (n, 3) of points (n, 3) on things of these numbers (n,)."""
         out = np.zeros((len(points), 3))
-        order = np.argsort(thing, kind="stable")
-        numbers, starts = np.unique(thing[order], return_index=True)
-        for number, rows in zip(numbers, np.split(order, starts[1:]), strict=False):
+        for number in np.unique(thing):
+            rows = thing == number
             item = self.things[number]
             texture, *settings = item.texture
             out[rows] = texture(item.pose.inv().apply(points[rows]), *settings)
@@ -323,18 +306,16 @@ class World:
         normal = self.normals[hits.face[seen]]
         normal *= -np.sign(np.einsum("ni,ni->n", normal, directions[seen]))[:, None]
         light = np.full(len(points), self.lights.ambient)
-        for position, strength in zip(
-            self.lights.positions, self.lights.strengths, strict=True
-        ):
+        lamps = zip(self.lights.positions, self.lights.strengths, strict=True)
+        for position, strength in lamps:
             way = position - points
             squared = np.einsum("ni,ni->n", way, way)
             share = np.einsum("ni,ni->n", normal, way) / (squared * np.sqrt(squared))
             ask = share > 1e-3
-            off = (
-                points[ask] + 2e-3 * normal[ask]
-            )  # metres, so that no surface shades itself
+            # 2 mm off, so that no surface shades itself
+            off = points[ask] + 2e-3 * normal[ask]
             rays = np.concatenate([off, 0.999 * way[ask]], axis=1, dtype=np.float32)
-            dark = self._scene.test_occlusions(_tensor(rays), 0.0, 1.0).numpy()
+            dark = self._scene.test_occlusions(o3d.core.Tensor(rays), 0.0, 1.0).numpy()
             light[ask] += strength * (share[ask] * ~dark)
         out = np.tile(SKY, (len(seen), 1))
         glow = np.array([t.glow for t in self.things])[thing]
@@ -342,42 +323,24 @@ class World:
         return out
 
 
-def _tensor(rays):
-    return o3d.core.Tensor(rays)
-
-
 def furnished(*parts: str) -> list[Thing]:
     """Things of parts of ``room.json``."""
-    things = []
-    for row in (dict(row) for part in parts for row in ROOM[part]):
-        (shape, *sizes) = row.pop("shape")
-        (texture, *settings) = row.pop("texture")
-        angles = [row.pop("turn", 0.0), row.pop("tip", 0.0)]
-        turned = Rotation.from_euler("ZX", angles, degrees=True)
-        pose = RigidTransform.from_components(row.pop("at", [0.0, 0.0, 0.0]), turned)
-        things.append(
-            Thing(SHAPES[shape](*sizes), (TEXTURES[texture], *settings), pose, **row)
-        )
-    return things
+    return [_thing(**row) for part in parts for row in ROOM[part]]
+
+
+def _thing(shape, texture, at=(0.0, 0.0, 0.0), turn=0.0, tip=0.0, **settings):
+    """The thing of a row."""
+    mesh = SHAPES[shape[0]](*shape[1:])
+    pattern = (getattr(textures, texture[0]), *texture[1:])
+    turned = Rotation.from_euler("ZX", [turn, tip], degrees=True)
+    return Thing(mesh, pattern, RigidTransform.from_components(at, turned), **settings)
 
 
 def furnished_room(*more: Thing) -> World:
     """The room around the rig with further things in it, under two lamps."""
-    parts = (
-        "shell",
-        "fittings",
-        "bookshelf",
-        "desk",
-        "chair",
-        "plant",
-        "standing lamp",
-        "small things",
-    )
     lamps = ROOM["lights"]
-    lights = Lights(
-        np.array(lamps["positions"]), np.array(lamps["strengths"]), lamps["ambient"]
-    )
-    return World([*furnished(*parts), *more], lights)
+    lights = Lights(np.array(lamps["positions"]), lamps["strengths"], lamps["ambient"])
+    return World([*furnished(*ROOM["parts"]), *more], lights)
 
 
 def board_on_stand(board, T_platform_board, ring):
@@ -428,26 +391,18 @@ class Imager:
     """
 
     def __init__(self, model: CameraModel, exposure: Exposure | None = None):
-        size = f"the image is {model.width} x {model.height} pixels"
-        need(
-            not (model.width % BLOCK or model.height % BLOCK),
-            f"{size}, both must be multiples of {BLOCK}",
-        )
+        size = f"{model.width} x {model.height} pixels"
+        whole = not (model.width % BLOCK or model.height % BLOCK)
+        need(whole, f"the image is {size}, both must be multiples of {BLOCK}")
         self.model = model
         self.exposure = exposure or Exposure()
         v, u = np.mgrid[: model.height + 1, : model.width + 1] - 0.5
         corners = np.stack([u, v], axis=-1)
-        self.grid = (undistort(corners, model) - [model.cx, model.cy]) / [
-            model.fx,
-            model.fy,
-        ]
-        again = distort(self.grid, model.distortion) * [model.fx, model.fy] + [
-            model.cx,
-            model.cy,
-        ]
-        miss = np.abs(again - corners).max()
-        lens = f"lens {model.distortion} folds the image (off by {miss:.3g} px)"
-        need(miss < 1e-3, f"{lens}: weaken the distortion")
+        middle = [model.cx, model.cy]
+        self.grid = (undistort(corners, model) - middle) / [model.fx, model.fy]
+        rays = np.dstack([self.grid, np.ones(u.shape)])
+        miss = np.abs(project(rays, model) - corners).max()
+        need(miss < 1e-3, f"lens {model.distortion} folds the image: weaken the distortion")
 
     def render(
         self, world: World, T_camera_platform: RigidTransform, rng: np.random.Generator

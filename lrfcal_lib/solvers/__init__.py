@@ -1,4 +1,7 @@
-"""Calibration methods of one camera: the same observations in, a `Solution` out."""
+"""Calibration methods of one camera: the same observations in, a `Solution` out.
+
+A table of the methods and their choice; equations are in the modules of their residuals.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -29,17 +32,15 @@ class Method:
 
     Attributes
     ----------
-    variant : str
-        Of :func:`lrfcal_lib.calibrate.observe.observe`: 'half_step', 'last_beam' or 'one_scan'.
     uses : str
         What it needs of the observations: 'crossing', 'plane' or 'scene'.
-    fewest : int
-        Crossings, placements with planes, or scene points that it needs.
     label : str
         For tables and figures.
     residual : callable
         ``residual(pose, obs) -> Block``: its residuals, two or more, at ``T_camera_source`` (...,
         3, 4).
+    variant : str
+        Of :func:`lrfcal_lib.calibrate.observe.observe`: 'half_step', 'last_beam' or 'one_scan'.
     estimate : callable
         What is done with the residual; least squares in the pose by default.
     options : dict
@@ -48,11 +49,10 @@ class Method:
         Without the edges found across the scan lines.
     """
 
-    variant: str
     uses: str
-    fewest: int
     label: str
     residual: Callable
+    variant: str = "half_step"
     estimate: Callable = lines.estimate_pose
     options: dict = field(default_factory=dict)
     along: bool = False
@@ -63,7 +63,6 @@ METHODS = {
     "line_printed": Method(
         variant="one_scan",
         uses="crossing",
-        fewest=6,
         label="lines as the paper prints them",
         residual=line_block,
         options=PLAIN,
@@ -71,65 +70,50 @@ METHODS = {
     "line_last_beam": Method(
         variant="last_beam",
         uses="crossing",
-        fewest=6,
         label="lines, last beam, all edges",
         residual=line_block,
         options=PLAIN,
         along=True,
     ),
     "line": Method(
-        variant="half_step",
         uses="crossing",
-        fewest=6,
         label="lines, half step",
         residual=line_block,
     ),
     "zhang_pless_printed": Method(
-        variant="half_step",
         uses="plane",
-        fewest=3,
         label="Zhang-Pless, unweighted",
         residual=planes.plane_block,
         estimate=planes.estimate_from_planes,
         options=PLAIN,
     ),
     "zhang_pless": Method(
-        variant="half_step",
         uses="plane",
-        fewest=3,
         label="Zhang-Pless",
         residual=planes.plane_block,
         estimate=planes.estimate_from_planes,
     ),
     "zhang_pless_k": Method(
-        variant="half_step",
         uses="plane",
-        fewest=3,
         label="Zhang-Pless with K",
         residual=planes.planes_and_pattern,
         estimate=planes.estimate_with_lens,
         options={"lens": 4},
     ),
     "zhang_pless_joint": Method(
-        variant="half_step",
         uses="plane",
-        fewest=3,
         label="Zhang-Pless with K and lens",
         residual=planes.planes_and_pattern,
         estimate=planes.estimate_with_lens,
     ),
     "wasielewski_strauss": Method(
-        variant="half_step",
         uses="crossing",
-        fewest=6,
         label="Wasielewski-Strauss, in space",
         residual=lines.distance_block,
         options=PLAIN,
     ),
     "bauermann": Method(
-        variant="half_step",
         uses="scene",
-        fewest=3,
         label="after Bauermann, outline corners",
         residual=lines.point_block,
     ),
@@ -139,29 +123,16 @@ CANDIDATES = (
     "zhang_pless",
     "line",
 )  # the better one is handed over where no joint estimate is
-STARTS = {
-    "crossing": (
-        plane_start.start_from_planes,
-        lines.start_from_lines,
-        lines.start_from_scene,
-    ),
-    "plane": (plane_start.start_from_planes,),
-    "scene": (
-        plane_start.start_from_planes,
-        lines.start_from_scene,
-        lines.start_from_lines,
-    ),
-}
+# of each kind: crossings, placements with planes, scene points
+FEWEST = {"crossing": 6, "plane": 3, "scene": 3}
 
 
-def starting_transform(obs: CameraObservations, uses: str = "crossing") -> RigidTransform:
-    """Start values of ``T_camera_source`` from what the observations hold.
+def starting_transform(obs: CameraObservations) -> RigidTransform:
+    """Start values of ``T_camera_source`` from planes, or else from lines.
 
     Parameters
     ----------
     obs : CameraObservations
-    uses : {'crossing', 'plane', 'scene'}
-        What they are for: these observations are asked first.
 
     Returns
     -------
@@ -174,7 +145,7 @@ def starting_transform(obs: CameraObservations, uses: str = "crossing") -> Rigid
         When no way determines the pose, with the reason of each.
     """
     reasons = []
-    for way in STARTS[uses]:
+    for way in (plane_start.start_from_planes, lines.start_from_lines):
         try:
             return way(obs)
         except DegenerateGeometry as error:
@@ -191,7 +162,7 @@ def row_of(method: str) -> Method:
 
 def solve_camera(
     observations: CameraObservations,
-    method: str | None = None,
+    method: str,
     T0: RigidTransform | None = None,
     *,
     search: bool = True,
@@ -203,9 +174,8 @@ def solve_camera(
     ----------
     observations : CameraObservations
         Of one session, or of many trials at once: arrays with a leading axis.
-    method : str, optional
-        Of `METHODS`. By default what is handed over where there is no joint estimate: lines or
-        planes, whichever errs less on placements left out (:func:`best_method`).
+    method : str
+        Of `METHODS`.
     T0 : RigidTransform, optional
         Start value of ``T_camera_source``, one or one a trial; found by :func:`starting_transform`
         when left out.
@@ -213,9 +183,9 @@ def solve_camera(
         A single T0 competes with the start value found: the better minimum is handed back. False:
         T0 is near it.
     **options
-        ``loss`` (None or 'cauchy') of single crossings, points or whole placements, with its
-        ``scale`` (standard deviations, or 'auto'); ``weighted`` (False: every residual counts the
-        same, True: by the propagated noise); ``max_iterations``.
+        ``robust`` (a loss of single crossings, points or whole placements, see
+        :func:`lrfcal_lib.fit.least_squares.minimise`); ``weighted`` (False: every residual counts
+        the same, True: by the propagated noise); ``max_iterations``.
 
     Returns
     -------
@@ -229,19 +199,17 @@ def solve_camera(
     DegenerateGeometry
         With fewer observations than the method needs, or when they leave a motion open.
     ValueError
-        For an unknown method, or many trials without a method.
+        For an unknown method.
     """
-    if method is None:
-        return _solve_best(observations, T0, search=search, **options)
     row = row_of(method)
     obs = observations.along() if row.along else observations
-    obs.require(row.uses, row.fewest)
+    obs.require(row.uses, FEWEST[row.uses])
     options = {"method": method, "uses": row.uses} | row.options | options
     points = getattr(obs, f"{row.uses}_points")
     starts = [] if T0 is None else [pose_array(T0)]
     if T0 is None or (search and T0.single and points.ndim == 2):
         try:
-            starts += [*pose_array(starting_transform(obs, row.uses)).reshape(-1, 3, 4)]
+            starts += [*pose_array(starting_transform(obs)).reshape(-1, 3, 4)]
         except DegenerateGeometry:
             if T0 is None:
                 raise
@@ -256,28 +224,7 @@ def solve_camera(
             problems.append(error)
     if not minima:
         raise problems[0]
-    return minima[0] if len(minima) == 1 else best_minimum(obs, row.uses, minima)
-
-
-def _solve_best(obs, T0, **options):
-    """The better one of the candidates that determine the pose."""
-    if obs.crossing_points.ndim > 2:
-        raise ValueError(
-            f"many trials at once: name the method, one of {', '.join(METHODS)}"
-        )
-    solutions = {}
-    problems = []
-    for method in CANDIDATES:
-        try:
-            solutions["camera", method] = solve_camera(obs, method, T0, **options)
-        except DegenerateGeometry as error:
-            problems.append(error)
-    if not solutions:
-        raise problems[0]
-    best = best_method({"camera": obs}, solutions)
-    if best is None:  # too few placements to leave one out
-        return next(iter(solutions.values()))
-    return solutions["camera", best]
+    return minima[0] if len(minima) == 1 else best_minimum(obs, row, minima)
 
 
 def left_out(
@@ -368,13 +315,15 @@ def _mean(values):
     return values.mean() if len(values) else np.nan
 
 
-def best_minimum(obs, uses, minima):
+def best_minimum(obs, row, minima):
     """The best of several Solutions, with another one as `rival` that explains the data nearly as
     well.
     """
-    squares = [_misses(obs, uses, solution.transform) ** 2 for solution in minima]
+    squares = [_misses(obs, row, solution.transform) ** 2 for solution in minima]
     sizes = plane_start.sizes_of_minima(np.array(squares))
-    before = np.array([_lies_before(obs, uses, solution.transform) for solution in minima])
+    points = getattr(obs, f"{row.uses}_points")
+    depths = np.array([solution.transform.apply(points)[:, 2] for solution in minima])
+    before = np.mean(depths < 0, axis=1) <= 0.5  # most of the board is ahead of the camera
     order = np.lexsort([sizes, ~before])
     best = order[0]
     nearly = (before == before[best]) & (sizes <= plane_start.NEARLY * sizes[best])
@@ -385,21 +334,12 @@ def best_minimum(obs, uses, minima):
     return minima[best]
 
 
-def _misses(obs, uses, transform):
+def _misses(obs, row, transform):
     """Distances or pixels by which observations miss at a pose."""
-    if uses == "crossing":
-        misses = line_block(pose_array(transform), obs).residuals
-    elif uses == "scene":
-        misses = lines.point_block(pose_array(transform), obs).residuals
-    else:
-        misses = plane_residuals_m(obs, transform)
+    if row.uses != "plane":
+        return row.residual(pose_array(transform), obs).residuals
+    misses = plane_residuals_m(obs, transform)
     return misses[np.isfinite(misses)]
-
-
-def _lies_before(obs, uses, transform):
-    """Whether a pose puts (most of) the board before the camera."""
-    depth = transform.apply(getattr(obs, f"{uses}_points"))[:, 2]
-    return bool(np.mean(depth < 0) <= 0.5)
 
 
 def find_outlying_placements(obs: CameraObservations) -> tuple[list[int], dict[int, float]]:
@@ -427,8 +367,8 @@ def find_outlying_placements(obs: CameraObservations) -> tuple[list[int], dict[i
     Residuals are compared with their own level, not with the stated noise: the median over the
     accepted placements of the mean square, divided by its expectation, sets the scale.
     """
-    plain = partial(solve_camera, method="zhang_pless", scale="auto", weighted=False)
-    T = plain(obs, loss="cauchy").transform
+    plain = partial(solve_camera, method="zhang_pless", weighted=False)
+    T = plain(obs, robust=True).transform
     placements, mean = _mean_squares(obs, T)
     accepted = np.ones(len(placements), bool)
     for number in range(OUTLIER_ROUNDS):

@@ -7,9 +7,9 @@ Equations (4) to (6) and (16) to (19) at once, every board's pose unknown and el
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
+from lrfcal_lib.fit.covariance import RANK
 from lrfcal_lib.fit.least_squares import solve
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
@@ -26,7 +26,6 @@ from lrfcal_lib.solvers.joint_contradictions import (
     refuse_contradiction,
     without_blind_cameras,
     without_lost_placements,
-    without_misfits,
 )
 from lrfcal_lib.solvers.joint_lens import lens_share
 from lrfcal_lib.solvers.joint_model import (
@@ -40,7 +39,7 @@ from lrfcal_lib.solvers.joint_model import (
 from lrfcal_lib.solvers.joint_noise import estimate_noise, settled
 from lrfcal_lib.solvers.joint_residuals import MOST_STEPS, minimum, named_blocks
 from lrfcal_lib.solvers.joint_search import best_start, coarse
-from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words, warnings_of
+from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words
 
 # what counts as a change by one, beside rad and m
 SCALES = {
@@ -53,6 +52,7 @@ FIRST_STEPS = 60
 NOISE_ROUNDS = 10
 ROUND_STEPS = 10
 LAST_STEP = 1e-4  # standard deviations: a shorter step ends the whole
+STEP = 1e-4  # of the numeric derivative by the angular step, a fraction of it
 # a direction whose standard deviation exceeds this (rad, m) is called unobservable
 UNSEEN = 0.5
 
@@ -67,7 +67,7 @@ class JointSettings:
         A rough measurement of the axis with its standard deviations. It yields where the data
         contradict it.
     axis : bool
-        False: the axis is the one of T0 (or the stated one), and known.
+        False: the axis is the stated one, and known.
     sensor : sequence of str
         Unknowns of the sensor, of :data:`lrfcal_lib.solvers.joint_model.SENSOR`; others stay zero
         (softness: 0.2).
@@ -80,6 +80,9 @@ class JointSettings:
         Their expected standard deviations, radians and fraction.
     lapse : float
         Share of edge beams expected to say nothing.
+    step_sigma : float
+        Standard deviation of the angular step of the beams, a fraction of it. It is no unknown; the
+        covariance has what it does to the result.
     noise : {'stated', 'estimate'}
         Estimate the noise levels (ranges, images, pitch, sides, repetition of errors among
         neighbours) from the residuals, and leave out placements and images that contradict all
@@ -98,6 +101,7 @@ class JointSettings:
     sweep: str = "none"
     sweep_sigma: tuple[float, float] = Levels.sweep_sigma
     lapse: float = 0.0
+    step_sigma: float = 0.0
     noise: str = "stated"
 
     def __post_init__(self):
@@ -106,14 +110,6 @@ class JointSettings:
                 raise ValueError(f"sensor unknowns are {', '.join(SENSOR)}; got {name!r}")
         if self.noise not in ("stated", "estimate"):
             raise ValueError(f"noise is 'stated' or 'estimate', got {self.noise!r}")
-        if not 0 <= self.lapse < 0.5:
-            raise ValueError(
-                f"lapse is the share of beams that say nothing, 0 to 0.5, got {self.lapse}"
-            )
-        if min(self.sweep_sigma) <= 0:
-            raise ValueError(
-                f"sweep_sigma must be positive (radians, fraction), got {self.sweep_sigma}"
-            )
 
     def unknowns(self, obs: JointObservations) -> Unknowns:
         """The unknowns for some observations."""
@@ -129,7 +125,6 @@ class JointSettings:
 
 def solve_joint(
     obs: JointObservations,
-    T0: RigidTransform | None = None,
     *,
     start: JointState | None = None,
     required: bool = True,
@@ -140,8 +135,6 @@ def solve_joint(
     Parameters
     ----------
     obs : JointObservations
-    T0 : RigidTransform, optional
-        Rough ``T_head_lrf``; closed forms are tried in any case.
     start : JointState, optional
         Skips the search for a start value.
     required : bool
@@ -161,31 +154,24 @@ def solve_joint(
         raise DegenerateGeometry("no placement to calibrate with")
     obs, left_out = without_blind_cameras(obs, required)
     unknowns = chosen.unknowns(obs)
-    levels = Levels(sweep_sigma=chosen.sweep_sigma)
-    coarsely_settled = False
+    levels = Levels(sweep_sigma=chosen.sweep_sigma, step_sigma=chosen.step_sigma)
     if start is None:
         obs, lost = without_lost_placements(obs)
-        best = best_start(obs, unknowns, levels, T0)
+        best = best_start(obs, unknowns, levels)
         obs = best.kept
         start = best.state
-        coarsely_settled = best.settled
         left_out += lost + best.left_out
     data = gather(obs, replace(levels, prior=chosen.prior))
     # stated levels of the noise may be wrong by far: what takes many steps with them leads away
-    if chosen.prior is not None or not coarsely_settled:
-        start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
+    start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
     state = minimum(start, data, unknowns, LAST_STEP, FIRST_STEPS).state
     data = replace(data, levels=replace(data.levels, lapse=chosen.lapse))
     if chosen.noise == "estimate":
         state, data = settle(state, data, unknowns)
-        obs, state, contradicting = without_misfits(obs, state, data, unknowns)
-        if contradicting:
-            left_out += contradicting
-            state, data = settle(state, gather(obs, data.levels), unknowns)
     if chosen.noise == "estimate" or chosen.lapse:
         state = minimum(state, data, unknowns, LAST_STEP).state
     if required:  # a cause before what follows from it: edges that fit nowhere, say
-        refuse_contradiction(state, data, LAST_MISS, left_out)
+        refuse_contradiction(obs, state, LAST_MISS)
     found = finished(obs, state, data, unknowns, required)
     return replace(found, excluded=tuple(left_out))
 
@@ -273,8 +259,32 @@ def finished(obs, state, data, unknowns, required):
         misfit=dict(zip(obs.placements.tolist(), squares.tolist(), strict=True)),
         lens=lens.covariance,
         lens_scale=lens.scatter,
+        step=np.zeros(unknowns.shared),
     )
-    return replace(solution, warnings=warnings_of(solution))
+    return with_step_error(solution)
+
+
+def with_step_error(solution: JointSolution) -> JointSolution:
+    """The solution with what errors of the angular step do to it in its covariances."""
+    sigma = solution.data.levels.step_sigma
+    if sigma == 0:
+        return solution
+    changed = gather(solution.observations.stretched(STEP), solution.data.levels)
+    here = solution.score()
+    pull = replace(solution, data=changed).score().gradient - here.gradient
+    free = np.linalg.pinv(here.information.sum(axis=0), rcond=RANK, hermitian=True)
+    moved = -free @ pull.sum(axis=0) / STEP * sigma
+    spread = np.outer(moved, moved)
+    estimate = solution.solution
+    by_placements = estimate.covariance_placements
+    if by_placements is not None:
+        by_placements = by_placements + spread
+    estimate = replace(
+        estimate,
+        covariance=estimate.covariance + spread,
+        covariance_placements=by_placements,
+    )
+    return replace(solution, solution=estimate, step=moved)
 
 
 def parameters_of(state: JointState, unknowns: Unknowns) -> np.ndarray:

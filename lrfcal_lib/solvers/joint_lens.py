@@ -1,4 +1,7 @@
-"""What errors of the intrinsics, which all images share, do to the joint estimate."""
+"""What errors of the intrinsics, which all images share, do to the joint estimate.
+
+Equations (18) and (19), to first order.
+"""
 
 from typing import NamedTuple
 
@@ -7,9 +10,9 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import OWN_RANK
-from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import CameraModel, project_jacobians
+from lrfcal_lib.model.geometry import gradient_by_pose
 from lrfcal_lib.model.observations import LENS, JointObservations
 from lrfcal_lib.solvers.joint_model import JointData, Unknowns
 from lrfcal_lib.solvers.joint_residuals import among_cameras, view_block
@@ -39,7 +42,7 @@ def pose_by_intrinsics(
         return np.zeros((6, LENS))
     turned = T_camera_board.rotation.apply(corners)
     by_point, by_lens = project_jacobians(turned + T_camera_board.translation, model)
-    by_pose = np.concatenate([np.cross(turned[:, None, :], by_point), by_point], axis=-1)
+    by_pose = gradient_by_pose(turned[:, None], by_point)
     return -np.linalg.lstsq(by_pose.reshape(-1, 6), by_lens.reshape(-1, LENS), rcond=None)[
         0
     ]
@@ -71,15 +74,12 @@ def lens_share(
     """The LensShare of a solution."""
     c = unknowns.shared
     if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
-        return LensShare(np.zeros((c, c)), np.zeros((c, c)), 0.0)
+        exact = np.zeros((c, c))
+        return LensShare(exact, exact, 0.0)
     block = view_block(found.state, data, unknowns)
     J = block.white_jacobian
     J_own = J[..., c:]
-    camera = data.view["camera"]
-    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(camera))[
-        "lens"
-    ]
-    by_lens = among_cameras(lens, camera, len(obs.cameras))
+    by_lens = among_cameras(data.view["lens"], data.view["camera"], len(obs.cameras))
     shift = block.whitened(by_lens.reshape(*J.shape[:2], -1))
     spread = block_diag(*obs.lens_covariance)
     hessian = np.swapaxes(found.jacobian, -1, -2) @ found.jacobian
@@ -91,9 +91,8 @@ def lens_share(
     square = np.sum(left @ spread * left)
     level = data.levels.view_scale**2
     taken = np.sum((J_own @ own) * J_own) + np.sum((reduced @ finite) * reduced)
-    square *= level / max(
-        6 * len(obs.view_camera) - taken, 1.0
-    )  # rows that are left to show it
+    # rows that are left to show it
+    square *= level / max(6 * len(obs.view_camera) - taken, 1.0)
     share = np.clip(level - 1, 0, square) / level
     counted = share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite
     return LensShare(gain @ spread @ gain.T, counted, float(np.sqrt(square)))

@@ -141,6 +141,8 @@ class Levels:
         Scale of the sides' deviations of the log odds, Student's t.
     prior : PlatformPrior or None
         The stated platform, which yields where the data contradict it.
+    step_sigma : float
+        Standard deviation of the angular step of the beams, a fraction of it.
     """
 
     face_scale: float = 1.0
@@ -152,6 +154,7 @@ class Levels:
     sweep_sigma: tuple[float, float] = (np.radians(0.5), 0.05)
     side_sigma: float = 0.35
     prior: PlatformPrior | None = None
+    step_sigma: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -185,11 +188,34 @@ class JointData:
 def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
     """Observations as padded arrays, with noise levels other than those stated."""
     count = len(obs.placements)
-    face = pad(obs.group("face"), count)
-    beam = pad(obs.group("beam"), count)
+    face = {
+        "placement": obs.face_placement,
+        "range": obs.face_range,
+        "bearing": obs.face_bearing,
+        "pitch": obs.face_pitch,
+        "sigma": obs.face_sigma,
+    }
+    beam = {
+        "placement": obs.beam_placement,
+        "bearing": obs.beam_bearing,
+        "pitch": obs.beam_pitch,
+        "hit": obs.beam_hit,
+        "edge": obs.beam_edge,
+        "radius": obs.beam_radius,
+        "background": obs.beam_background,
+        "step": obs.beam_step,
+    }
+    view = {
+        "placement": obs.view_placement,
+        "camera": obs.view_camera,
+        "pitch": obs.view_pitch,
+        "pose": obs.view_pose,
+        "covariance": obs.view_covariance,
+        "lens": obs.view_lens,
+    }
+    face, beam, view = (pad(group, count) for group in (face, beam, view))
     for group in (face, beam):
         group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
-    view = pad(obs.group("view"), count)
     padding = ~view["used"][..., None, None]
     covariance = np.where(padding, np.eye(6), view["covariance"])
     view["whitener"] = np.where(padding, 0.0, np.linalg.inv(np.linalg.cholesky(covariance)))

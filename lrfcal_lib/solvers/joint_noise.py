@@ -1,4 +1,4 @@
-"""Noise levels of the joint estimate, taken from its residuals."""
+"""Noise levels of the joint estimate, taken from its residuals (no equations of the paper)."""
 
 from dataclasses import replace
 
@@ -38,27 +38,27 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
     own = hessian[:, c:, c:]
     spread = np.linalg.pinv(own, rcond=OWN_RANK, hermitian=True)  # shared ones held
     levels = data.levels
+    changed = {}
     if "face" in blocks:
-        scale, share = face_levels(state, data, blocks["face"])
-        levels = replace(levels, face_scale=scale, face_share=share)
+        changed["face_scale"], changed["face_share"] = face_levels(
+            state, data, blocks["face"]
+        )
     if "beam" in blocks:
-        share = beam_share(state, data, blocks["beam"], c, spread)
-        levels = replace(levels, beam_share=share)
+        changed["beam_share"] = beam_share(state, data, blocks["beam"], c, spread)
     if "view" in blocks:
         factor, sigma = view_levels(data, blocks["view"], hessian, gradient, c)
-        scale = float(np.clip(levels.view_scale * factor, *SCALE_LIMITS))
-        levels = replace(levels, view_scale=scale, sigma_pitch=sigma)
-    if unknowns.sides and "beam" in blocks:
-        levels = replace(
-            levels, side_sigma=side_level(state.sides, data, own, gradient[:, c:])
-        )
-    number = SWEEPS[unknowns.sweep]
-    if number:
+        scale = np.clip(levels.view_scale * factor, *SCALE_LIMITS)
+        changed["view_scale"] = float(scale)
+        changed["sigma_pitch"] = sigma
+    if "side" in blocks and "beam" in blocks:
+        changed["side_sigma"] = side_level(state.sides, data, own, gradient[:, c:])
+    if "sweep" in blocks:
+        number = SWEEPS[unknowns.sweep]
         variance = np.diagonal(spread, axis1=1, axis2=2)[:, 6 : 6 + number]
         scatter = np.sqrt(np.mean(state.sweeps[:, :number] ** 2 + variance, axis=0))
         scatter = np.maximum(scatter, LEAST_SWEEP_SIGMA).tolist()
-        levels = replace(levels, sweep_sigma=(*scatter, *levels.sweep_sigma[number:]))
-    return replace(data, levels=levels)
+        changed["sweep_sigma"] = (*scatter, *levels.sweep_sigma[number:])
+    return replace(data, levels=replace(levels, **changed))
 
 
 def settled(before: Levels, after: Levels) -> bool:
@@ -124,29 +124,31 @@ def beam_share(state, data, block, shared, spread):
     """
     before = data.levels.beam_share
     used = data.beam["used"]
-    along = _along_edges(state, data)
+    edge = data.beam["edge"]
     by_own = block.jacobian[..., shared:]
     root = np.linalg.norm(by_own[..., 3:6], axis=-1)  # root information
     lapsed = data.levels.lapse * np.exp(np.where(used, block.cost, 0.0) / before)
     curvature = root**2 * (1 - block.residuals**2 * lapsed / (1 - lapsed))
-    parts = []
-    for edge in range(len(data.lines)):
-        mine = used & (data.beam["edge"] == edge)
-        third = _part(along, mine)
-        for part in range(PARTS):
-            weight = np.where(mine & (third == part), root, 0.0)
-            counted = np.sum(weight**2, axis=-1)
-            true = np.sum(np.where(weight > 0, curvature, 0.0), axis=-1)
-            score = np.sum(weight * block.residuals, axis=-1)
-            pull = (weight[:, None] @ by_own)[:, 0]
-            taken = before * np.vecdot(pull, (spread @ pull[..., None])[..., 0])
-            parts.append(np.stack([counted, true, score, taken], axis=1)[counted > 0])
-    counted, true, score, taken = np.concatenate(parts).T
-    left = np.sum(1 - taken / counted)
+    along = _along_edges(state, data)
+    edges = len(data.lines)
+    part = np.zeros(used.shape, int)
+    for number in range(edges):
+        mine = used & (edge == number)
+        part[mine] = _part(along, mine)[mine]
+    row = np.arange(len(used))[:, None]
+    group = ((row * edges + edge) * PARTS + part)[used]
+    counted = np.bincount(group, root[used] ** 2)
+    score = np.bincount(group, (root * block.residuals)[used])
+    pull = np.zeros((len(counted), by_own.shape[-1]))
+    np.add.at(pull, group, (root[..., None] * by_own)[used])
+    of_group = spread[np.arange(len(counted)) // (PARTS * edges)]
+    taken = before * np.vecdot(pull, np.matvec(of_group, pull))
+    there = counted > 0
+    left = np.sum(1 - taken[there] / counted[there])
     if left < 1:
         return before
-    gain = max(np.sum(true) / np.sum(counted), LEAST_CURVATURE)
-    ratio = np.sum(score**2 / counted) / left / gain
+    gain = max(np.sum(curvature[used]) / np.sum(counted), LEAST_CURVATURE)
+    ratio = np.sum(score[there] ** 2 / counted[there]) / left / gain
     return float(gain / max(ratio, 1.0))
 
 
@@ -175,18 +177,16 @@ def view_levels(data, block, hessian, gradient, shared):
     views, view_gradient, *_ = linearise([block])
     others = hessian - views, gradient - view_gradient
     rows = 6 * int(data.view["used"].sum())
-    levels = PITCH_LEVELS
-    if not data.on_head.any():
-        levels = PITCH_LEVELS[:1]
+    levels = PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]
     costs = []
-    factors = [1.0]
+    factors = []
+    factor = 1.0
     for sigma in levels:
         trial = replace(block, sigma_pitch=sigma)
         for _ in range(SCALE_ROUNDS):
-            cost, factor = judged(trial, factors[-1], others, rows, shared)
-            factors.append(factor)
+            cost, factor = judged(trial, factor, others, rows, shared)
         costs.append(cost)
-    factors = factors[SCALE_ROUNDS::SCALE_ROUNDS]
+        factors.append(factor)
     best = int(np.argmin(costs))
     sigma = levels[best]
     if 1 < best < len(costs) - 1:  # between the levels: a parabola through three of them
@@ -209,7 +209,7 @@ def judged(block, factor, others, rows, shared):
     f2 = factor**2
     z = block.white
     J = block.white_jacobian
-    hessian, gradient, half_square, _ = linearise([block])
+    hessian, gradient, half_square = linearise([block])
     whole = others[0] + hessian / f2
     right = others[1] + gradient / f2
     size = np.trace(whole, axis1=1, axis2=2)[:, None, None]

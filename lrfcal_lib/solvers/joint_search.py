@@ -1,4 +1,7 @@
-"""The start value of the joint estimate that leads to the best minimum, among closed forms."""
+"""The start value of the joint estimate that leads to the best minimum, among closed forms.
+
+No equations of its own.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -13,10 +16,7 @@ from lrfcal_lib.model.geometry import (
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_contradictions import (
-    CONTRADICTION,
-    FEW_STEPS,
     LARGEST_SHARE,
-    face_misses,
     left_out_share,
     refuse_contradiction,
     without_contradictions,
@@ -28,6 +28,9 @@ from lrfcal_lib.solvers.joint_start import start_states, state_of
 # mean half squared residual; a start value this good is not searched further
 GOOD_START = 0.7
 ROUGH_MISS = 0.08  # metres, of a start value's boards from where images put them
+# of all that is left out: what it counts against a start value
+PENALTY = 16.0
+FEW_STEPS = 8  # of a minimisation that only has to show where it leads
 
 
 @dataclass(frozen=True)
@@ -40,8 +43,6 @@ class Start:
         Without what contradicts it.
     state : JointState
     left_out : list of Problem
-    settled : bool
-        Whether more steps with the coarse unknowns would change nothing.
     badness : float
         Mean half squared residual of what is kept; the share that is left out counts against it.
     """
@@ -49,50 +50,34 @@ class Start:
     kept: JointObservations
     state: JointState
     left_out: list[Problem]
-    settled: bool
     badness: float
 
 
-def best_start(
-    obs: JointObservations,
-    unknowns: Unknowns,
-    levels: Levels,
-    T0: RigidTransform | None = None,
-) -> Start:
+def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> Start:
     """The most promising start value.
 
     More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows
     which ones are wrong.
     """
     data = gather(obs, levels)
-    tried = []
-    misses = []
-    for number, states in enumerate(start_states(obs, T0)):
+    tried: list[Start] = []
+    for states in start_states(obs):
         for state in states:
             if not unknowns.axis:
-                heads = (T0, obs.T_head_lrf, RigidTransform.identity())
-                known = next(head for head in heads if head is not None)
+                known = obs.T_head_lrf
+                if known is None:
+                    known = RigidTransform.identity()
                 state = replace(state, head=pose_array(known))
-            rows = np.arange(len(state.boards))
-            misses.append(np.median(face_misses(state, data, state.boards, rows)))
             tried.append(agreeing_start(obs, state, data, unknowns))
-        if min(start.badness for start in tried) < GOOD_START and (T0 is None or number):
+        if min(start.badness for start in tried) < GOOD_START:
             break
-    chosen = int(np.argmin([start.badness for start in tried]))
-    best = tried[chosen]
-    if misses[chosen] > ROUGH_MISS:
-        refuse_contradiction(best.state, gather(best.kept), ROUGH_MISS)
+    best = min(tried, key=lambda start: start.badness)
+    refuse_contradiction(best.kept, best.state, ROUGH_MISS)
     if left_out_share(obs, best.left_out) > LARGEST_SHARE:
-        names = []
-        for problem in best.left_out[:8]:
-            name = str(problem.placement)
-            if problem.camera is not None:
-                name += f" in camera '{problem.camera}'"
-            names.append(name)
+        words = "; ".join(map(str, best.left_out[:8]))
         raise DegenerateGeometry(
             f"{len(best.left_out)} placements or images of {len(obs.placements)} placements "
-            f"contradict the others: images put boards elsewhere than scans ({', '.join(names)}); "
-            "check that images and scans carry the right numbers"
+            f"contradict the others ({words}); check that images and scans carry the right numbers"
         )
     return best
 
@@ -120,8 +105,8 @@ def agreeing_start(obs, state, data, unknowns):
         share = left_out_share(obs, left_out)
         count = len(kept.face_range) + len(kept.beam_hit) + len(kept.view_pitch)
         cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / count
-        badness = cost * (1 + CONTRADICTION * share)
-        attempts.append(Start(kept, found.state, left_out, found.converged, badness))
+        badness = cost * (1 + PENALTY * share)
+        attempts.append(Start(kept, found.state, left_out, badness))
         if not left_out or share > LARGEST_SHARE:
             break
         cameras = [pose_transform(pose) for pose in found.state.cameras]

@@ -1,15 +1,17 @@
-"""What the joint estimate hands over: the rig, how well it is known, and what may be doubted."""
+"""What the joint estimate hands over: the rig, and how well it is known.
+
+No equations of its own; residuals are in :mod:`lrfcal_lib.solvers.joint_residuals`.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.edge_likelihood import disc_edge
-from lrfcal_lib.fit.least_squares import Block, eliminate, linearise
+from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import pose_array, pose_parameters, pose_transform
@@ -36,35 +38,6 @@ WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
 }
 SWEEP_HELD = (0.0, 0.0)  # standard deviations of what is not unknown
 NAMED = 0.3  # share of a direction's largest component from which an unknown is named
-# scatter of residuals in stated standard deviations that still agrees with the statement
-NOISE_LIMITS = (0.5, 2.0)
-ASKED = 20.0  # squared score in standard deviations: chance alone exceeds it once in 100 000 times
-# standard deviations of an axis nobody should rely on
-WEAK_DIRECTION = np.radians(1.0)
-WEAK_OFFSET = 0.020  # metres
-RANK = 1e-14  # of information: below this share of the largest eigenvalue is nothing
-
-
-class Held(NamedTuple):
-    """An error of the recorded pitch that may have been held at zero: what is worth a word."""
-
-    name: str
-    least: float
-    words: str
-    unit: float
-    unit_words: str
-
-
-HELD = (
-    Held("pitch_scale", 0.001, "the scale of the pitch", 100.0, "%"),
-    Held(
-        "pitch_by_direction",
-        np.radians(0.01),
-        "a pitch offset by sweep direction",
-        np.degrees(1.0),
-        "deg",
-    ),
-)
 
 
 @dataclass(frozen=True)
@@ -103,8 +76,9 @@ class JointSolution:
     lens_scale : float
         By how much errors of the intrinsics let board poses in images scatter, in stated standard
         deviations.
-    warnings : tuple of str
-        See :func:`warnings_of`.
+    step : ndarray, shape (c,)
+        What one standard deviation of the angular step does to the shared unknowns; in the
+        covariances.
     """
 
     solution: Solution
@@ -115,7 +89,7 @@ class JointSolution:
     misfit: dict[int, float]
     lens: np.ndarray
     lens_scale: float
-    warnings: tuple[str, ...] = ()
+    step: np.ndarray
 
     @property
     def excluded_placements(self) -> dict[int, str]:
@@ -372,76 +346,36 @@ def joint_words(
     return " with ".join(words)
 
 
-def warnings_of(solution: JointSolution) -> tuple[str, ...]:
-    """What is suspicious beyond convergence and unobservable motions, in words: noise that
-    contradicts what is stated, a weak axis, errors of the pitch that the data ask for.
+def expected_information(
+    obs: JointObservations, state: JointState, unknowns: Unknowns
+) -> np.ndarray:
+    """What placements are expected to say about the shared unknowns.
+
+    Parameters
+    ----------
+    obs : JointObservations
+        Of the drawn values nothing enters but which beams and views there are.
+    state : JointState
+        The truth.
+    unknowns : Unknowns
+
+    Returns
+    -------
+    ndarray, shape (p, c, c)
     """
-    words = []
-    for what, stated, level in _scatter(solution):
-        if not NOISE_LIMITS[0] < level < NOISE_LIMITS[1]:
-            words.append(
-                f"the {what} scatter {level:.2g} times what is stated ({stated}): standard "
-                "deviations of the result are off alike; noise='estimate' takes the level from "
-                "the residuals"
-            )
-    if solution.unknowns.axis:
-        turn, shift = np.linalg.norm(solution.solution.sigma[:4].reshape(2, 2), axis=1)
-        if turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET:
-            words.append(
-                f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, "
-                f"{1000 * shift:.0f} mm): sweep over a larger pitch range, take images at more "
-                "pitch angles, or state the platform with its accuracy"
-            )
-    for term, square, value in _held_at_zero(solution):
-        if square > ASKED and abs(value) > term.least:
-            words.append(
-                f"the data ask for {term.words}, about {term.unit * value:+.2f} "
-                f"{term.unit_words}, which was held at zero"
-            )
-    return tuple(words)
-
-
-def _scatter(solution):
-    """Groups of observations in words, the field that states their noise, and the size of their
-    whitened residuals: 1 agrees with it.
-    """
-    if "face" in solution.blocks:
-        z = solution.blocks["face"].white[solution.data.face["used"]]
-        yield (
-            "ranges",
-            "face_sigma",
-            np.sqrt(np.mean(z**2) / solution.data.levels.face_share),
-        )
-    if "view" in solution.blocks:
-        camera = solution.data.view["camera"]
-        z = solution.blocks["view"].white.reshape(camera.shape + (6,))
-        for number, name in enumerate(solution.observations.cameras):
-            mine = solution.data.view["used"] & (camera == number)
-            # more views than placements: what a board's own pose takes up is minor
-            if mine.sum() > len(camera):
-                what = f"poses of the board in camera '{name}'"
-                yield what, "view_covariance", np.sqrt(np.mean(z[mine] ** 2))
-
-
-def _held_at_zero(solution):
-    """Errors of the pitch that were held at zero, their squared scores (standard deviations)
-    and the values they would take.
-
-    Each one is tested by itself, with all that was estimated free.
-    """
-    names = [term.name for term in HELD]
-    sensor = tuple(dict.fromkeys((*solution.unknowns.sensor, *names)))
-    wider = replace(solution.unknowns, sensor=sensor)
-    blocks = named_blocks(solution.state, solution.data, wider)
-    hessian, gradient, *_ = linearise(blocks.values())
-    reduced, score, _ = eliminate(hessian, gradient, wider.shared)
-    names = wider.names(solution.observations.cameras)
-    estimated = [names.index(name) for name in solution.solution.names]
-    for term in HELD:
-        if term.name in solution.solution.names:
-            continue
-        free = [*estimated, names.index(term.name)]
-        information = reduced.sum(axis=0)[np.ix_(free, free)]
-        covariance = np.linalg.pinv(information, rcond=RANK, hermitian=True)
-        step = -(covariance @ score.sum(axis=0)[free])[-1]
-        yield term, float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)
+    data = gather(obs)
+    hit = np.ones_like(data.beam["hit"])
+    all_read = replace(data, beam=data.beam | {"hit": hit})
+    none_read = replace(data, beam=data.beam | {"hit": ~hit})
+    read = named_blocks(state, all_read, unknowns)
+    hessian = np.zeros(())
+    if "beam" in read:  # over both readings, weighted by how likely each is
+        hits = read["beam"]
+        misses = named_blocks(state, none_read, unknowns)["beam"]
+        chance = np.exp(-np.asarray(hits.cost))
+        weights = ((hits, chance), (misses, 1 - chance))
+        for block, share in weights:
+            J = np.sqrt(share)[..., None] * block.white_jacobian
+            hessian = hessian + J.mT @ J
+    others = [block for name, block in read.items() if name != "beam"]
+    return reduced_hessian(hessian + linearise(others).hessian, unknowns.shared)

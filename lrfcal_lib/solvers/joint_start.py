@@ -1,18 +1,15 @@
-"""Start values of the joint estimate from closed forms: cameras from planes, the axis from how
-the cameras turn.
+"""Start values of the joint estimate: cameras from planes, about the stated axis.
+
+Equations (4) to (6) and (16).
 """
 
 from collections.abc import Iterator
-from contextlib import suppress
-from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
-    lrf_to_platform,
     polar_to_points,
     pose_array,
     pose_transform,
@@ -23,41 +20,28 @@ from lrfcal_lib.solvers.joint_model import JointState
 from lrfcal_lib.solvers.plane_start import start_from_planes
 
 START_SOFTNESS = 0.2  # spot radii
-LEAST_TURN = np.radians(1.0)  # between two images of a camera for the axis
-SAME_PITCH = np.radians(0.6)  # scan lines so near the pitch of an image are used with it
 POINTS = 30  # a plane
 VIEWS = 24  # a camera; closed forms do not get much better with more
-FEWEST_VIEWS = 5
-FEWEST_ANGLE_POINTS = 6  # on an edge, for its direction
 
 
-def start_states(
-    obs: JointObservations, T0: RigidTransform | None = None
-) -> Iterator[list[JointState]]:
+def start_states(obs: JointObservations) -> Iterator[list[JointState]]:
     """Start values to choose from, made one by one: each with those of the cameras' other minima.
 
-    From the closed form of the axis, from T0, from the stated platform, from an axis along x
-    through the mirror; with cameras from scan lines at the pitch of their images, then from whole
-    sweeps. Raises DegenerateGeometry when no placement gives the pose of a board.
+    From the stated platform, then from an axis along x through the mirror; with cameras from the
+    planes of whole sweeps. Raises DegenerateGeometry when no placement gives the pose of a board.
     """
     if len(obs.face_range) == 0:
         raise DegenerateGeometry(
             "no ranges on the boards' faces: a start value needs them; give one as start="
         )
-    direct = {}
-    for camera, mount in enumerate(obs.mounts):
-        if mount == "head":
-            with suppress(DegenerateGeometry):
-                direct[camera] = _camera(obs, camera)
-    heads = [_axis_from_cameras(obs, direct), T0, obs.T_head_lrf, RigidTransform.identity()]
-    ways = [direct, {}] if direct else [{}]
+    heads = [RigidTransform.identity()]
+    if obs.T_head_lrf is not None:
+        heads.insert(0, obs.T_head_lrf)
     possible = False
     reasons = []
-    for head, known in product(heads, ways):
-        if head is None:
-            continue
+    for head in heads:
         try:
-            states = _states(obs, head, known)
+            states = _states(obs, head)
         except (DegenerateGeometry, np.linalg.LinAlgError) as error:
             reasons.append(str(error))
             continue
@@ -68,13 +52,11 @@ def start_states(
         raise DegenerateGeometry(f"no start value for the joint estimate: {every}")
 
 
-def _states(obs, head, known):
+def _states(obs, head):
     """States with an axis: with the best pose of every camera, then with each other one of one
-    camera. Poses of some are `known`.
+    camera.
     """
-    minima = []
-    for camera in range(len(obs.cameras)):
-        minima.append(known[camera] if camera in known else _camera(obs, camera, head))
+    minima = [_camera(obs, camera, head) for camera in range(len(obs.cameras))]
     best = [poses[0] for poses in minima]
     states = [state_of(obs, head, best)]
     for camera, poses in enumerate(minima):
@@ -83,34 +65,24 @@ def _states(obs, head, known):
     return states
 
 
-def _camera(obs, camera, head=None):
-    """Poses of a camera, the best one first, from its views of boards and points on these.
-
-    From whole sweeps, joined by a roughly known axis; of a camera on the head also from scan lines
-    at the pitch of its images, which needs no axis.
+def _camera(obs, camera, head):
+    """Poses of a camera, the best one first, from its first views of boards and the sweeps over
+    these, joined by a roughly known axis.
     """
     name = obs.cameras[camera]
     mine = np.flatnonzero(obs.view_camera == camera)
-    if head is not None:
-        mine = mine[np.unique(obs.view_placement[mine], return_index=True)[1]]
+    first = mine[np.unique(obs.view_placement[mine], return_index=True)[1]]
     views = []
     points = []
-    for view in thin(mine, VIEWS):
-        pitch = obs.view_pitch[view]
-        rows = np.flatnonzero(obs.face_placement == obs.view_placement[view])
-        if head is None:
-            away = np.abs(obs.face_pitch[rows] - pitch)
-            rows = rows[away <= min(away.min(initial=SAME_PITCH) + 1e-9, SAME_PITCH)]
+    for view in thin(first, VIEWS):
+        rows = thin(np.flatnonzero(obs.face_placement == obs.view_placement[view]), POINTS)
         if len(rows) == 0:
             continue
-        rows = thin(rows, POINTS)
         p = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
-        if head is not None:
-            frame = SourceFrame(head, obs.mounts[camera], pitch)
-            p = frame.apply(p, obs.face_pitch[rows])
-        points.append(p)
+        frame = SourceFrame(head, obs.mounts[camera], obs.view_pitch[view])
+        points.append(frame.apply(p, obs.face_pitch[rows]))
         views.append(view)
-    if len(views) < (1 if head is not None else FEWEST_VIEWS):
+    if not views:
         raise DegenerateGeometry(f"camera '{name}' never sees a board that the scans hit")
     seen = CameraObservations(
         None,
@@ -123,45 +95,14 @@ def _camera(obs, camera, head=None):
     return start_from_planes(seen)
 
 
-def _axis_from_cameras(obs, poses):
-    """The tilt axis from how a fixed board turns in the images of a camera that pitches, by
-    least squares.
-    """
-    for camera, (T_camera_lrf, *_) in poses.items():
-        views = np.flatnonzero(obs.view_camera == camera)
-        views = views[np.lexsort((obs.view_pitch[views], obs.view_placement[views]))]
-        placements = obs.view_placement[views]
-        first = views[np.searchsorted(placements, np.unique(placements))]
-        last = views[np.searchsorted(placements, np.unique(placements), side="right") - 1]
-        turns = obs.view_pitch[last] - obs.view_pitch[first]
-        if turns.max() <= LEAST_TURN:
-            continue
-        # the motions T_2 T_1^-1 are turns by -angle about one line in the camera
-        T_camera_board = RigidTransform.from_matrix(obs.view_pose)
-        motions = T_camera_board[last] * T_camera_board[first].inv()
-        lrf = T_camera_lrf.inv()
-        direction = lrf.rotation.apply(-turns @ motions.rotation.as_rotvec())
-        A = (np.eye(3) - motions.rotation.as_matrix()).reshape(-1, 3)
-        point = np.linalg.lstsq(A, motions.translation.ravel(), rcond=1e-3)[0]
-        direction /= np.linalg.norm(direction)
-        return geometry.head_from_axis(geometry.TiltAxis(direction, lrf.apply(point)))
-    return None
-
-
 def state_of(
     obs: JointObservations, head: RigidTransform, cameras: list[RigidTransform]
 ) -> JointState:
-    """All unknowns from an axis and the cameras: boards from their first images, or from the
-    scans alone.
-    """
-    poses = np.array([pose_array(T) for T in cameras]).reshape(-1, 3, 4)
+    """All unknowns from an axis and the cameras: boards from their first images."""
+    poses = np.array([pose_array(T) for T in cameras])
     count = len(obs.placements)
-    boards = np.zeros((count, 3, 4))
-    shown, first = np.unique(obs.view_placement, return_index=True)
-    if len(shown):
-        boards[shown] = boards_in_images(obs, pose_array(head), poses, first)
-    for placement in np.setdiff1d(np.arange(count), shown):
-        boards[placement] = pose_array(board_from_scan(obs, placement, head))
+    _, first = np.unique(obs.view_placement, return_index=True)
+    boards = boards_in_images(obs, pose_array(head), poses, first)
     return JointState(
         head=pose_array(head),
         cameras=poses,
@@ -187,54 +128,3 @@ def boards_in_images(
     T_camera_board = RigidTransform.from_matrix(obs.view_pose[views])
     boards = turn * T_head_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
     return pose_array(boards)
-
-
-def board_from_scan(obs, placement, head):
-    """``T_platform_board`` of a placement (by index) from its plane and where scans cross its
-    edges.
-
-    Raises DegenerateGeometry when fewer than two edges are crossed, or the scans span no plane.
-    """
-    face = obs.face_placement == placement
-    p = polar_to_points(obs.face_range[face], obs.face_bearing[face])
-    p = lrf_to_platform(p, obs.face_pitch[face], head)
-    origin = lrf_to_platform(np.zeros((1, 3)), obs.face_pitch[face][:1], head)[0]
-    centre = p.mean(axis=0)
-    normal = np.linalg.svd(p - centre, full_matrices=False)[2][2]
-    normal = normal * (
-        -np.sign(normal @ (centre - origin))
-    )  # the printed side faces the rig
-    level = np.cross([0.0, 0.0, 1.0], normal)
-    axes = np.stack([level, np.cross(normal, level), normal])
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    R, shift = _turn_in_plane(obs, placement, head, axes, centre)
-    rotation = Rotation.from_matrix(np.column_stack([axes[:2].T @ R, normal]))
-    return RigidTransform.from_components(centre + axes[:2].T @ shift, rotation)
-
-
-def _turn_in_plane(obs, placement, head, axes, centre):
-    """Turn (2, 2) and shift (2,) of the outline in the plane, from points on its edges (last
-    beams on the board).
-    """
-    beams = (obs.beam_placement == placement) & obs.beam_hit
-    ray = polar_to_points(np.ones(beams.sum()), obs.beam_bearing[beams])
-    o = lrf_to_platform(np.zeros_like(ray), obs.beam_pitch[beams], head)
-    d = lrf_to_platform(ray, obs.beam_pitch[beams], head) - o
-    x = (o + (((centre - o) @ axes[2]) / (d @ axes[2]))[:, None] * d - centre) @ axes[:2].T
-    edge = obs.beam_edge[beams]
-    line = obs.lines()[obs.beam_edge[beams]]
-    crossed = np.sum(np.bincount(edge) >= FEWEST_ANGLE_POINTS)
-    if crossed < 2:
-        raise DegenerateGeometry(
-            f"placement {obs.placements[placement]}: scans cross {crossed} edges, two needed"
-        )
-    # n . (R^T x + t) + c = 0, linear in cosine and sine of the turn and in t; then the shift for
-    # that turn alone
-    sine = line[:, 0] * x[:, 1] - line[:, 1] * x[:, 0]
-    A = np.column_stack([np.sum(line[:, :2] * x, axis=1), sine, line[:, :2]])
-    c, s = np.linalg.lstsq(A, -line[:, 2], rcond=None)[0][:2]
-    R = np.array([[c, -s], [s, c]]) / np.hypot(c, s)
-    normals = line[:, :2] @ R.T
-    return R, np.linalg.lstsq(
-        normals, np.sum(normals * x, axis=1) + line[:, 2], rcond=None
-    )[0]

@@ -1,6 +1,7 @@
 """Cameras from lines (equations 16 to 21), after Wasielewski and Strauss, and after Bauermann."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -37,28 +38,16 @@ def distance_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     """Distances of crossings from the planes of sight (Wasielewski and Strauss), metres, with the
     noise of both.
 
-    Weighted by it, the method is the same as with :func:`lrfcal_lib.fit.residuals.line_block` to
-    first order: the two residuals differ by a factor (depth / focal length) that the weights take
-    out.
+    Two residuals of one thing: that of :func:`lrfcal_lib.fit.residuals.line_block` is larger by
+    focal length / depth.
     """
     normals, length = sight_normals(obs.crossing_lines, obs.model)
     plain = sight_block(pose, obs.crossing_points, normals, 1.0)
-    rotated = rotate_points(pose, obs.crossing_points)
-    moved = rotated + pose[..., None, :, 3]
-    depth = moved[..., 2]
+    depth = apply_pose(pose, obs.crossing_points)[..., 2]
     noise = moved_noise(pose, normals, obs.crossing_covariance)
-    line_variance = (
-        obs.crossing_line_sigma / length
-    ) ** 2  # of the sight's direction, radians
-    variance = np.vecdot(noise, normals) + line_variance * depth**2
-    factor = plain.residuals / variance
-    depth_by_pose = gradient_by_pose(rotated, np.broadcast_to([0.0, 0.0, 1.0], moved.shape))
-    correction = noise_correction(rotated, moved, normals, noise, factor, pinhole=False)
-    correction = correction + (factor * line_variance * depth)[..., None] * depth_by_pose
-    corrected = plain.jacobian - correction
-    return Block(
-        plain.residuals, plain.jacobian, 1.0 / np.sqrt(variance), corrected=corrected
-    )
+    of_sight = obs.crossing_line_sigma * depth / length  # metres at the crossing
+    variance = np.vecdot(noise, normals) + of_sight**2
+    return replace(plain, whitener=variance**-0.5)
 
 
 def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
@@ -79,14 +68,11 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     force = np.linalg.solve(noise, errors[..., None])[..., 0]
     shift = np.matvec(pulled, force) @ pose[..., :3].mT
 
-    one = np.ones(errors.shape[:-1])
-    gradients = [by_point[..., 0, :], by_point[..., 1, :]]  # of u and of v
-    rows = [gradient_by_pose(rotated, gradient) for gradient in gradients]
-    corrections = [
-        noise_correction(rotated, moved, gradient, shift, one) for gradient in gradients
-    ]
-    jacobian = np.stack(rows, axis=-2)
-    corrected = jacobian - np.stack(corrections, axis=-2)
+    rotated = rotated[..., None, :]  # u and v, two scalars of one point
+    jacobian = gradient_by_pose(rotated, by_point)
+    corrected = jacobian - noise_correction(
+        rotated, moved[..., None, :], by_point, shift[..., None, :], np.ones(())
+    )
     shape = errors.shape[:-2] + (-1,)
     return Block(
         errors.reshape(shape),
@@ -139,16 +125,11 @@ def estimate_pose(
         return plain
 
     problem: Callable[[np.ndarray], Block] = partial(residual, obs=obs)
-    earlier: list[np.ndarray] = []
     if not weighted:
-        problem, pose, earlier = minimise_in_rounds(
-            equal_weights, pose, move_pose, 2, **options
-        )
-    placements = obs.group(uses)["placement"]
+        problem, pose = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
+    placements = getattr(obs, f"{uses}_placement")
     unknowns = pose_unknowns(method, obs.camera)
-    return solve(
-        problem, pose, move_pose, groups=placements, earlier=earlier, **unknowns, **options
-    )
+    return solve(problem, pose, move_pose, groups=placements, **unknowns, **options)
 
 
 def _variances(block):
@@ -161,26 +142,13 @@ def _variances(block):
 
 
 def start_from_lines(obs: CameraObservations) -> RigidTransform:
-    """From crossings and the image lines of their edges."""
-    obs.require("crossing", 6)
-    return _start_from_sights(obs.crossing_points, obs.crossing_lines, obs)
+    """From crossings and the image lines of their edges.
 
-
-def start_from_scene(obs: CameraObservations) -> RigidTransform:
-    """From named points: each is seen where a column and a row of the image cross."""
-    obs.require("scene", 4)
-    u, v = obs.scene_pixels.T
-    columns = np.column_stack([1 + 0 * u, 0 * u, -u])
-    rows = np.column_stack([0 * v, 1 + 0 * v, -v])
-    lines = np.concatenate([columns, rows])
-    return _start_from_sights(np.tile(obs.scene_points, (2, 1)), lines, obs)
-
-
-def _start_from_sights(points, lines, obs):
-    """Many rotations at once, each with its best translation, refined on planes of sight; robust
-    vote.
+    Many rotations at once, each with its best translation, refined on planes of sight; robust vote.
     """
-    normals, _ = sight_normals(lines, obs.model)
+    obs.require("crossing", 6)
+    points = obs.crossing_points
+    normals, _ = sight_normals(obs.crossing_lines, obs.model)
     rotations = start_rotations()
     offsets = -np.vecdot(normals, points @ rotations.mT)
     poses = shifted(rotations, normals, offsets)
@@ -188,9 +156,8 @@ def _start_from_sights(points, lines, obs):
     def evaluate(pose):
         return sight_block(pose, points, normals, START_SIGMA)
 
-    for loss in (None, "cauchy"):
-        options = {"loss": loss, "scale": "auto", "max_iterations": 40}
-        poses = minimise(evaluate, poses, move_pose, **options).state
+    for robust in (False, True):
+        poses = minimise(evaluate, poses, move_pose, robust=robust, max_iterations=40).state
     depth = apply_pose(poses, points)[..., 2]
     ahead = (depth > 0).mean(axis=1) > AHEAD
     if not ahead.any():

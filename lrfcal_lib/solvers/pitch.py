@@ -1,4 +1,7 @@
-"""Errors of the recorded pitch, found from the boards that cameras on the base see."""
+"""Errors of the recorded pitch, found from the boards that cameras on the base see.
+
+Equations (5) and (16), with points in the planes of boards and of sight.
+"""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple

@@ -1,4 +1,7 @@
-"""Start values of a camera from planes: minimal and closed forms, and the choice among minima."""
+"""Start values of a camera from planes: minimal and closed forms, and the choice among minima.
+
+After Zhang and Pless 2004, and Vasconcelos, Barreto and Nunes 2012.
+"""
 
 from functools import partial
 from itertools import combinations
@@ -13,7 +16,6 @@ from lrfcal_lib.model.geometry import (
     apply_pose,
     move_pose,
     pose_transform,
-    transform_difference,
 )
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.planes import (
@@ -74,12 +76,9 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
 
     # more placements than a closed form uses; half of them may be wrong, or all but one right
     squares = np.sort(_squares(candidates, triangles, sets), axis=1)
-    first = []
-    half = p // 2 + 2
-    for count in {half, max(half, FEWEST_LINES if flat else FEWEST_PLANES)}:
-        order = np.argsort(squares[:, :count].mean(axis=1))
-        first += [*order[:4], *_apart(candidates, order)]
-    best = candidates[np.unique(first)]
+    judging = max(p // 2 + 2, FEWEST_LINES if flat else FEWEST_PLANES)
+    order = np.argsort(squares[:, :judging].mean(axis=1))
+    best = candidates[np.union1d(order[:4], _apart(candidates, order))]
 
     def evaluate(pose):
         return plane_block(pose, triangles / ROUGH_SIGMA, sets.boards, None, sets.number)
@@ -87,7 +86,7 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     rough = partial(
         minimise, evaluate, retract=move_pose, max_iterations=12, tolerance=0.01
     )
-    robust = rough(state=best, loss="cauchy", scale="auto").state
+    robust = rough(state=best, robust=True).state
     plain = rough(state=robust).state
     minima = np.concatenate([robust, plain, best])
     sizes = sizes_of_minima(_squares(minima, triangles, sets), sets.number)
@@ -106,24 +105,6 @@ def sizes_of_minima(squares: np.ndarray, weights: np.ndarray | None = None) -> n
     level = np.median(squares, axis=1).min()
     capped = np.minimum(squares, CAPPED * level + SIGMA_FLOOR**2)
     return np.sqrt(np.average(capped, axis=1, weights=weights))
-
-
-def rival_words(camera: str, best: RigidTransform, other: RigidTransform) -> str:
-    """That another pose of a camera explains the data nearly as well.
-
-    Parameters
-    ----------
-    camera : str
-        Its name.
-    best, other : RigidTransform
-        What is handed over, and its rival.
-    """
-    turn, shift = transform_difference(best, other)
-    return (
-        f"a second minimum explains the data nearly as well: camera '{camera}' "
-        f"{np.degrees(turn):.0f} deg and {1000 * shift:.0f} mm from where it is handed over; "
-        "record more placements that lean other ways"
-    )
 
 
 def common_plane(triangles):

@@ -104,7 +104,7 @@ def estimate_from_planes(
         return lambda p: residual(p, triangles, sets.boards, whitener, offset=offset)
 
     rounds = ROUNDS if weighted else 0
-    problem, pose, earlier = minimise_in_rounds(freeze, pose, move_pose, rounds, **options)
+    problem, pose = minimise_in_rounds(freeze, pose, move_pose, rounds, **options)
     chi2_rest = correct_and_compress(sets, pose)[2] if weighted else 0.0
     count = int(sets.number.sum())
     return solve(
@@ -115,7 +115,6 @@ def estimate_from_planes(
         freedom=count - len(POSE_NAMES),
         n_observations=count,
         chi2_rest=chi2_rest,
-        earlier=earlier,
         **pose_unknowns(method, obs.camera),
         **options,
     )
@@ -312,10 +311,7 @@ def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> lis
     by_point, by_lens = project_jacobians(corners, camera)
     visible = np.isfinite(obs.pattern_pixels)
     errors = np.where(visible, project(corners, camera) - obs.pattern_pixels, 0.0)
-    rows = [
-        gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)
-    ]  # of u and of v
-    by_board = np.stack(rows, axis=-2)
+    by_board = gradient_by_pose(rotated[..., None, :], by_point)
     jacobian = np.concatenate(
         [np.zeros_like(by_board), by_lens[..., :lens], by_board], axis=-1
     )
@@ -374,7 +370,6 @@ def estimate_with_lens(
     error = plane_error(obs, solution)
     numbers = int(np.sum(plane_sets(obs).number) + visible.sum())
     state = (pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3])
-    earlier: list[np.ndarray] = []
     for _ in range(2):
         planes, rest = _planes_at(obs, state, error)
         solution = solve(
@@ -389,11 +384,9 @@ def estimate_with_lens(
             freedom=numbers - 6 - lens - 6 * len(obs.placements),
             chi2_rest=rest,
             n_observations=numbers,
-            earlier=earlier,
             **options,
         )
         state = solution.state
-        earlier = [solution.cost_history]
     return _with_refined_model(solution, obs, lens)
 
 

@@ -9,7 +9,13 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS, chart_parameters, move_head
+from lrfcal_lib.fit.axis_chart import (
+    AXIS_COLUMNS,
+    SMALL,
+    by_chart,
+    chart_parameters,
+    move_head,
+)
 from lrfcal_lib.fit.covariance import name_words
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.padding import pad
@@ -19,8 +25,9 @@ from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     axis_of,
+    cross,
     fit_line,
-    hat,
+    gradient_by_pose,
     head_from_axis,
     lrf_to_platform,
     tilt,
@@ -34,7 +41,6 @@ LEAST_SLOPE = 0.1  # nearer to a coordinate plane (6 degrees) a projected fit is
 # a combination of the four motions of the axis
 WORDS = partial(name_words, names=AXIS_WORDS, share=0.3)
 LEAST_SCATTER = 1e-6  # metres
-TINY = 1e-30  # of a complex step: derivatives without rounding
 
 
 @dataclass(frozen=True)
@@ -47,16 +53,12 @@ class PlatformSolution:
         Of the four unknowns ``(w_y, w_z, v_y, v_z)`` of ``T_head_lrf``.
     placements : ndarray of int, shape (p,)
         Those that were used.
-    skew, gap : ndarray, shape (p,)
-        Deviation of the two edges from a right angle (radians), and their distance (metres).
     skipped : dict of int to str
         The other placements, with the reason.
     """
 
     solution: Solution
     placements: np.ndarray
-    skew: np.ndarray
-    gap: np.ndarray
     skipped: dict[int, str]
 
     # what no pitching data can show
@@ -113,7 +115,6 @@ def solve_platform(
     placement with one edge serves too when it has face points.
     """
     gauge = start_head(T0)
-    earlier: list[np.ndarray] = []
     for final in (False, True):  # the second time in the gauge of the axis of the first
         boards = prepare_boards(obs, gauge)
         on_edges = int(boards.edge["used"].sum())
@@ -136,18 +137,9 @@ def solve_platform(
             max_iterations=100,
             n_observations=points,
             required=final,
-            earlier=earlier,
         )
         gauge = head_from_axis(axis_of(solution.transform))
-        earlier = [solution.cost_history]
-    _, _, bends = solution.state
-    return PlatformSolution(
-        solution,
-        boards.placements,
-        skew=bends[:, 0],
-        gap=bends[:, 1],
-        skipped=boards.skipped,
-    )
+    return PlatformSolution(solution, boards.placements, boards.skipped)
 
 
 @dataclass(frozen=True)
@@ -175,10 +167,8 @@ class Boards:
 
 def prepare_boards(obs: PlatformObservations, T_head_lrf: RigidTransform) -> Boards:
     """Boards and the points on them; DegenerateGeometry where no placement can be used."""
-    edge = obs.group("edge")
-    face = obs.group("face")
-    p_edge = lrf_to_platform(edge["points"], edge["pitch"], T_head_lrf)
-    p_face = lrf_to_platform(face["points"], face["pitch"], T_head_lrf)
+    p_edge = lrf_to_platform(obs.edge_points, obs.edge_pitch, T_head_lrf)
+    p_face = lrf_to_platform(obs.face_points, obs.face_pitch, T_head_lrf)
     boards = {}
     skipped = {}
     second = np.full(len(p_edge), -1.0)
@@ -196,9 +186,21 @@ def prepare_boards(obs: PlatformObservations, T_head_lrf: RigidTransform) -> Boa
             second[rows] = number
     if not boards:
         raise DegenerateGeometry(f"no placement can be used for the tilt axis: {skipped}")
-    edge["second"] = second
-    face["second"] = np.zeros(len(p_face))
     placements = np.array(list(boards))
+    edge = {
+        "points": obs.edge_points,
+        "covariance": obs.edge_covariance,
+        "pitch": obs.edge_pitch,
+        "placement": obs.edge_placement,
+        "second": second,
+    }
+    face = {
+        "points": obs.face_points,
+        "covariance": obs.face_covariance,
+        "pitch": obs.face_pitch,
+        "placement": obs.face_placement,
+        "second": np.zeros(len(p_face)),
+    }
     poses = np.array(list(boards.values()))
     return Boards(
         placements, poses, _padded(edge, placements), _padded(face, placements), skipped
@@ -221,17 +223,13 @@ def _start_board(edges, face):
         raise DegenerateGeometry("fewer than two points on either edge")
     point, x, _ = fit_line(edges[0])
     if len(edges) == 2:
-        point2, second, _ = fit_line(edges[1])
+        middle, second, _ = fit_line(edges[1])
         z = np.cross(x, second)
-        cosine = x @ second
-        between = point2 - point
         if np.linalg.norm(z) < np.sin(np.radians(30)):
             raise DegenerateGeometry(
                 "the two edges are nearly parallel: edges 1 and 2 must be perpendicular"
             )
-        # the origin is where edge 1 comes nearest to edge 2
-        along = between @ x - cosine * (between @ second)
-        point = point + x * along / (1 - cosine**2)
+        point = point + x * ((middle - point) @ x)  # about where edge 2 meets edge 1
     elif len(face) >= 3:
         normal = geometry.fit_plane(face)[0]
         z = normal - x * (x @ normal)
@@ -241,51 +239,40 @@ def _start_board(edges, face):
     return np.column_stack([x, np.cross(z, x), z, point])
 
 
-def board_coordinates(head, boards, points, pitch):
-    """Board coordinates (p, n, 3) of LRF points.
-
-    Jacobians by axis 4 and board's pose 6, by LRF point 3, by pitch.
-    """
-    rotated = points @ head[:, :3].T
-    q = tilt(rotated + head[:, 3], pitch)
-    lever = q - boards[:, None, :, 3]
-    to_board = boards[:, None, :, :3].mT
-    Rx = tilt(np.eye(3), pitch[..., None]).mT
-    turned = to_board @ Rx
-    eye = np.broadcast_to(np.eye(3), turned.shape)
-    by_head = turned @ np.concatenate([-hat(rotated), eye], axis=-1)
-    by_board = to_board @ np.concatenate([hat(lever), -eye], axis=-1)
-    J = np.concatenate([by_head[..., AXIS_COLUMNS], by_board], axis=-1)
-    turn = geometry.cross(np.array([1.0, 0.0, 0.0]), q)
-    by_pitch = np.matvec(to_board, turn)
-    return lever @ boards[:, :, :3], J, turned @ head[:, :3], by_pitch
-
-
 def distances(state, group):
-    """Distances (p, n, 2) of points from their edge, in the board's plane and across it.
+    """Distances (p, n, 3) of points from their edge in the board's plane and across it, and their
+    places along edge 1.
 
     And their Jacobians by the unknowns, by the point and by the pitch. Edge 1 lies along x of the
     board, edge 2 along y but for the skew and the gap. The second distance serves for points on the
     face, too.
     """
     head, boards, bends = state
-    b, J, by_point, by_pitch = board_coordinates(
-        head, boards, group["points"], group["pitch"]
-    )
     second = group["second"]
+    rotated = group["points"] @ head[:, :3].T
+    q = tilt(rotated + head[:, 3], group["pitch"])
+    lever = q - boards[:, None, :, 3]
+    b = lever @ boards[:, :, :3]
     cosine = second * np.cos(bends[:, :1])
     sine = second * np.sin(bends[:, :1])
-    normals = np.zeros(b.shape[:2] + (2, 3))
+    normals = np.zeros(b.shape[:2] + (3, 3))  # board frame
     normals[..., 0, 0] = cosine
     normals[..., 0, 1] = 1 - second + sine
     normals[..., 1, 2] = 1.0
+    normals[..., 2, 0] = 1.0
     r = np.matvec(normals, b)
     r[..., 1] -= second * bends[:, 1:]
+    gradient = normals @ boards[:, None, :, :3].mT  # by q, platform frame
+    in_head = tilt(gradient, -group["pitch"][..., None])
+    by_head = gradient_by_pose(rotated[..., None, :], in_head)
     by_unknowns = np.zeros(r.shape + (12,))
-    by_unknowns[..., :10] = normals @ J
+    by_unknowns[..., :4] = by_head[..., AXIS_COLUMNS]
+    by_unknowns[..., 4:7] = cross(gradient, lever[..., None, :])  # turn of the board
+    by_unknowns[..., 7:10] = -gradient
     by_unknowns[..., 0, 10] = cosine * b[..., 1] - sine * b[..., 0]
     by_unknowns[..., 1, 11] = -second
-    return r, by_unknowns, normals @ by_point, np.matvec(normals, by_pitch)
+    by_pitch = cross(q[..., None, :], gradient)[..., 0]
+    return r, by_unknowns, in_head @ head[:, :3], by_pitch
 
 
 def distance_block(state, group, sigma_pitch, which):
@@ -309,16 +296,15 @@ def platform_blocks(state, edge, face, sigma_pitch):
     """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
     head, boards, bends = state
     p = len(boards)
-    used = edge["used"][..., None]
+    used = edge["used"]
     lone = ~np.any(edge["second"], axis=1)
     tolerance = np.broadcast_to(np.eye(12)[10:], (p, 2, 12))
     # a board seen with one edge may slide along it: its origin is held at the middle of that edge's
     # points
-    b, J, _, _ = board_coordinates(head, boards, edge["points"], edge["pitch"])
-    count = np.maximum(used.sum(axis=1), 1)
-    middle = np.sum(b[..., :1] * used, axis=1) / count
-    by_middle = np.zeros((p, 1, 12))
-    by_middle[..., :10] = (np.sum(J[..., 0, :] * used, axis=1) / count)[:, None]
+    r, J, *_ = distances(state, edge)
+    count = np.maximum(used.sum(axis=1, keepdims=True), 1)
+    middle = np.sum(r[..., 2] * used, axis=1, keepdims=True) / count
+    by_middle = np.sum(J[..., 2, :] * used[..., None], axis=1)[:, None] / count[..., None]
     stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))
     return [
         distance_block(state, edge, sigma_pitch, slice(0, 2)),
@@ -374,18 +360,13 @@ def solve_projected(
     that. :func:`lrfcal_lib.solvers.platform.solve_platform` weighs every term by its noise.
     """
     gauge = start_head(T0)
-    turn = 0.0
-    if printed:
-        turn = _to_printed_chart(geometry.pose_array(gauge)[:, 3]).real
-    p_platform = lrf_to_platform(obs.edge_points, obs.edge_pitch, gauge)
-    groups, skipped = _slanted(obs, tilt(p_platform, turn))
+    groups, skipped = _slanted(obs, points_of(geometry.pose_array(gauge), obs, printed))
     if not groups:
         raise DegenerateGeometry(
             f"projected fits: no placement can be used: {skipped}; use the 3D fits instead"
         )
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
     scatter = 1.0
-    earlier: list[np.ndarray] = []
     for final in (False, True):  # the second time with the scatter of the first
         solution = solve(
             partial(
@@ -404,17 +385,12 @@ def solve_projected(
             limit=np.inf,
             read=_read_head,
             max_iterations=100,
-            earlier=earlier,
         )
         if not final:
             freedom = max(len(solution.residuals) - 4, 1)
             scatter = max(np.sqrt(np.sum(solution.residuals**2) / freedom), LEAST_SCATTER)
         gauge = head_from_axis(axis_of(solution.transform))
-        earlier = [solution.cost_history]
-    # the last two of every placement
-    cosine, gap = scatter * solution.residuals[np.cumsum(rows) - [[2], [1]]]
-    skew = np.arcsin(np.clip(cosine, -1, 1))
-    return PlatformSolution(solution, np.array(list(groups)), skew, gap, skipped)
+    return PlatformSolution(solution, np.array(list(groups)), skipped)
 
 
 def _read_head(head):
@@ -449,7 +425,7 @@ def _slanted(obs, p_platform):
 def projected_block(head, obs, groups, scatter=1.0, printed=False):
     """The six terms of equation (15) of every placement over their common scatter.
 
-    The Jacobian by the axis chart comes from complex steps, exact but for rounding.
+    The Jacobian by the axis chart comes from differences.
 
     Parameters
     ----------
@@ -463,43 +439,41 @@ def projected_block(head, obs, groups, scatter=1.0, printed=False):
     printed : bool
         As of :func:`solve_projected`.
     """
-    rotated = obs.edge_points @ head[:, :3].T
-    eye = np.broadcast_to(np.eye(3), rotated.shape + (3,))
-    by_head = np.concatenate([-hat(rotated), eye], axis=-1)
-    by_axis = np.moveaxis(by_head[..., AXIS_COLUMNS], -1, 0)
-    tiny = TINY * 1j
-    q = tilt(rotated + head[:, 3], obs.edge_pitch)
-    q = q + tiny * tilt(by_axis, obs.edge_pitch)
-    if printed:
-        t = head[:, 3] + tiny * np.eye(6)[AXIS_COLUMNS, 3:]
-        q = tilt(q, _to_printed_chart(t)[:, None])
-    terms = np.concatenate([_six_terms(q[:, a], q[:, b]) for a, b in groups], axis=1)
-    terms = terms / scatter
-    return Block(terms[0].real, terms.imag.T / TINY, np.ones(terms.shape[1]))
+
+    def terms(heads):
+        """Those of heads (k, 3, 4), shape (k, m)."""
+        q = points_of(heads, obs, printed)
+        every = [_six_terms(q[:, a], q[:, b]) for a, b in groups]
+        return np.concatenate(every, axis=1) / scatter
+
+    residuals, jacobian = by_chart(terms, head)
+    return Block(residuals, jacobian, np.ones_like(residuals))
 
 
-def _to_printed_chart(t):
-    """Angle about the tilt axis that turns shifts (..., 3) into the paper's (0, t_y, 0)."""
-    y, z = np.moveaxis(t[..., 1:], -1, 0)
-    squared = np.maximum(np.abs(y) ** 2 + np.abs(z) ** 2, TINY)
-    # of an axis through the LRF's origin: none
-    change = (z.real * y.imag - y.real * z.imag) / squared
-    return -np.arctan2(z.real, y.real) + 1j * change
+def points_of(heads, obs, printed):
+    """Edge points in the platform frames (..., n, 3) of heads (..., 3, 4)."""
+    pitch = obs.edge_pitch
+    if printed:  # turned about the tilt axis to where a shift is (0, t_y, 0)
+        y = heads[..., 1:2, 3]
+        z = heads[..., 2:, 3]
+        away = np.hypot(y, z) > 10 * SMALL  # an axis through the LRF's origin needs no turn
+        pitch = pitch - np.where(away, np.arctan2(z, y), 0.0)
+    return tilt(geometry.apply_pose(heads, obs.edge_points), pitch)
 
 
 def _six_terms(first, second):
-    """Errors of the four projected fits, u1 . u2, and the gap D of equation (14), shape (4, m)."""
+    """Errors of the four projected fits, u1 . u2, and the gap D of equation (14), shape (k, m)."""
     errors1, u1, p1 = _projected_line(first)
     errors2, u2, p2 = _projected_line(second)
-    normal = geometry.cross(u1, u2)
-    gap = _dot(normal, p1 - p2) / np.sqrt(_dot(normal, normal))
-    return np.concatenate([errors1, errors2, _dot(u1, u2), gap], axis=-1)
+    normal = cross(u1, u2)
+    gap = np.vecdot(normal, p1 - p2) / np.linalg.norm(normal, axis=-1)
+    return np.column_stack([errors1, errors2, np.vecdot(u1, u2), gap])
 
 
 def _projected_line(q):
-    """Fit ``x = a z + b`` and ``z = c y + d``, equations (7), (8), to points (4, n, 3) of an edge.
+    """Fit ``x = a z + b`` and ``z = c y + d``, equations (7), (8), to points (k, n, 3) of an edge.
 
-    Returns the errors (4, 2 n) over the root of n, and of equations (9) to (12) the direction ``u ~
+    Returns the errors (k, 2 n) over the root of n, and of equations (9) to (12) the direction ``u ~
     (a, 1 / c, 1)`` as a unit vector and the point ``p = (b, -d / c, 0)``.
     """
     x, y, z = np.moveaxis(q, -1, 0)
@@ -508,19 +482,13 @@ def _projected_line(q):
     u = np.concatenate([a, 1 / c, 1 + 0 * a], axis=-1)
     point = np.concatenate([b, -d / c, 0 * b], axis=-1)
     errors = np.concatenate([e1, e2], axis=-1) / np.sqrt(x.shape[-1])
-    return errors, u / np.sqrt(_dot(u, u)), point
+    return errors, u / np.linalg.norm(u, axis=-1, keepdims=True), point
 
 
 def _regression(s, v):
     """Errors, slope and offset of the straight-line fit ``v = slope s + offset``."""
     s_mean = s.mean(axis=-1, keepdims=True)
     v_mean = v.mean(axis=-1, keepdims=True)
-    s_off = s - s_mean
-    v_off = v - v_mean
-    slope = _dot(s_off, v_off) / _dot(s_off, s_off)
-    return v_off - slope * s_off, slope, v_mean - slope * s_mean
-
-
-def _dot(a, b):
-    """Scalar product along the last axis, without conjugation."""
-    return np.sum(a * b, axis=-1, keepdims=True)
+    away = s - s_mean
+    slope = (np.vecdot(away, v) / np.vecdot(away, away))[..., None]
+    return v - v_mean - slope * away, slope, v_mean - slope * s_mean

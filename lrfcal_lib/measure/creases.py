@@ -1,0 +1,231 @@
+"""Where flat surfaces of a scan meet, and by how much that misses the edges of images.
+
+A crease is known to millimetres from planes through hundreds of readings, and no spot widens it.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from lrfcal_lib.calibrate.cloud import Cloud
+from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.measure.features import Feature
+from lrfcal_lib.measure.pulls import Pull, View, poses_of, pull_of_groups
+from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
+from lrfcal_lib.preprocess.edges_in_image import (
+    ACROSS_STEP_PX,
+    FULL_CONTRAST,
+    SMOOTH_PX,
+    peaks,
+    sample,
+    step_contrast,
+)
+
+LEAST_SINE = 0.5  # of the angle between two surfaces that make an edge
+BESIDE = 0.1  # metres from a crease, within which both surfaces have readings
+STEP = 0.05  # metres between places of a crease
+MOST = 100_000  # creases of a station
+FEWEST = 4  # places of a crease
+REACH = 0.016  # of the image's width: 0.9 deg of a camera that sees 56 deg
+ALONG = 5  # pixels of a profile that are averaged
+CANDIDATES = 6  # edges of one profile, the clearest
+# before anything is seen: radians and metres of a camera's pose
+SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
+# of REACH: how far off an edge may lie, while it is sought
+WIDTHS = np.geomspace(0.3, 0.09, 12)
+OUTLIERS = 0.15  # of the clearest edge's weight
+MISS = 1.0  # pixels, of one crease: rounded edges and shadows
+
+
+@dataclass(frozen=True)
+class Creases:
+    """Places where two flat surfaces meet, a row each.
+
+    Attributes
+    ----------
+    points, along : ndarray, shape (n, 3)
+        Metres, and unit vectors along the crease; platform frame.
+    number : ndarray of int, shape (n,)
+        Of the crease. Its places err together.
+    """
+
+    points: np.ndarray
+    along: np.ndarray
+    number: np.ndarray
+
+
+def creases_of(
+    cloud: Cloud, planes: list[Feature], of_point: np.ndarray, station: int = 0
+) -> Creases:
+    """Where flat surfaces of a cloud meet.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    planes, of_point
+        What :func:`lrfcal_lib.measure.surfaces.planes_of` found.
+    station : int
+        Its placement, for the numbers of creases.
+
+    Returns
+    -------
+    Creases
+    """
+    points = [np.zeros((0, 3))]
+    along = [np.zeros((0, 3))]
+    for (i, first), (j, second) in combinations(enumerate(planes), 2):
+        way = np.cross(first.axis, second.axis)
+        sine = np.linalg.norm(way)
+        if sine < LEAST_SINE:
+            continue
+        way /= sine
+        rows = np.array([first.axis, second.axis, way])
+        middle = (first.centre + second.centre) / 2
+        origin = np.linalg.solve(
+            rows, np.vecdot(rows, [first.centre, second.centre, middle])
+        )
+        places = []
+        for plane in (i, j):
+            off = cloud.points[of_point == plane] - origin
+            place = off @ way
+            near = np.linalg.norm(off - place[:, None] * way, axis=1) < BESIDE
+            places.append(np.rint(place[near] / STEP))
+        common = np.intersect1d(*places)
+        if len(common) < FEWEST:
+            continue
+        points.append(origin + STEP * common[:, None] * way)
+        along.append(np.tile(way, (len(common), 1)))
+    number = np.repeat(np.arange(len(points)), [len(part) for part in points])
+    number = number + MOST * station
+    return Creases(np.concatenate(points), np.concatenate(along), number)
+
+
+@dataclass(frozen=True)
+class Sights:
+    """Places of creases as an image sees them, a row each.
+
+    Attributes
+    ----------
+    by_unknown : ndarray, shape (n, c)
+        How far the place moves along the normal of the crease, pixels, by the unknowns of a Pull.
+    offset, weight : ndarray, shape (n, k)
+        Of edges in the image: distance along the normal, pixels, and how clear they are, 0 to 1.
+    number : ndarray of int, shape (n,)
+        Of the crease.
+    """
+
+    by_unknown: np.ndarray
+    offset: np.ndarray
+    weight: np.ndarray
+    number: np.ndarray
+
+
+def sights(creases: Creases, view: View) -> Sights:
+    """Look in an image for edges near creases.
+
+    Parameters
+    ----------
+    creases : Creases
+    view : View
+
+    Returns
+    -------
+    Sights
+        Of places inside the image.
+    """
+    model = view.model
+    points, J = view.carried(creases.points)
+    reach = REACH * model.width
+    size = np.array([model.width, model.height])
+    recorded = project(points, model)
+    inside = ((recorded > reach) & (recorded < size - 1 - reach)).all(axis=1)
+    by_point = pinhole_jacobian(points[inside], model)
+    way = view.rotation.apply(creases.along[inside])
+    tangent = np.einsum("nij,nj->ni", by_point, way)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    offset, weight = _candidates(view, pinhole(points[inside], model), tangent, normal)
+    return Sights(
+        by_unknown=np.einsum("ni,nij,njk->nk", normal, by_point, J[inside]),
+        offset=offset,
+        weight=weight,
+        number=creases.number[inside],
+    )
+
+
+def _candidates(view, edge, tangent, normal):
+    """Places and clearness (n, k) of edges about pixels (n, 2), along their normals (n, 2)."""
+    offset = np.zeros((len(edge), CANDIDATES))
+    weight = np.zeros((len(edge), CANDIDATES))
+    if not len(edge):
+        return offset, weight
+    reach = REACH * view.model.width
+    across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
+    side = np.arange(ALONG) - ALONG // 2
+    profile = edge[:, None] + side[:, None] * tangent[:, None]
+    away = across[:, None, None, None] * normal[:, None]
+    strips = sample(view.image, view.model, profile + away)
+    mean = strips.mean(axis=2)  # NaN outside the image
+    row, place, contrast = peaks(step_contrast(mean, SMOOTH_PX / ACROSS_STEP_PX, along=1))
+    order = np.lexsort([-contrast, row])
+    row = row[order]
+    number = np.arange(len(row)) - np.searchsorted(row, row)
+    kept = number < CANDIDATES
+    at = (row[kept], number[kept])
+    offset[at] = across[0] + ACROSS_STEP_PX * place[order][kept]
+    weight[at] = (contrast / (contrast + FULL_CONTRAST))[order][kept]
+    return offset, weight
+
+
+def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull | None:
+    """What creases and edges say about a camera: each place may go with one of several edges, or
+    with none.
+
+    Its pose is found with a width that narrows (expectation and maximisation). Places of one
+    crease err together.
+
+    Parameters
+    ----------
+    parts : list of Sights
+        Of the images of one camera.
+    rig : CalibratedRig
+    camera : str
+
+    Returns
+    -------
+    Pull or None
+        None where no crease is seen.
+    """
+    parts = [part for part in parts if len(part.number)]
+    if not parts:
+        return None
+    names = Sights.__dataclass_fields__
+    seen = Sights(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+    poses = poses_of(rig, camera)
+    by_pose = seen.by_unknown[:, poses]
+    reach = REACH * rig.cameras[camera].model.width
+    _, crease, count = np.unique(seen.number, return_inverse=True, return_counts=True)
+    trust = 1 / count[crease]
+    x = np.zeros(len(poses))
+    for width in np.append(WIDTHS, np.full(8, WIDTHS[-1])) * reach:
+        share, miss = _shares(seen, by_pose @ x, width)
+        pull = trust * np.sum(share * miss, axis=1)
+        weight = trust * share.sum(axis=1)
+        H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(SPREAD**-2.0)
+        x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / SPREAD**2)
+
+    share, miss = _shares(seen, by_pose @ x, WIDTHS[-1] * reach)
+    weight = trust * share.sum(axis=1) / MISS**2
+    information = (seen.by_unknown.T * weight) @ seen.by_unknown
+    pull = trust * np.sum(share * miss, axis=1) / MISS**2
+    fitted = np.zeros(seen.by_unknown.shape[1])
+    fitted[poses] = x
+    return pull_of_groups(information, pull[:, None] * seen.by_unknown, crease, fitted)
+
+
+def _shares(seen, moved, width):
+    """What each edge has of its place (n, k) that has moved (n,), and how far off it is, pixels."""
+    miss = seen.offset - moved[:, None]
+    likely = seen.weight * np.exp(-0.5 * (miss / width) ** 2)
+    return likely / (OUTLIERS + likely.sum(axis=1, keepdims=True)), miss

@@ -1,0 +1,69 @@
+"""What a command does with sessions, here or on a cluster."""
+
+import io
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from functools import partial
+from pathlib import Path
+
+from lrfcal_lib.session.cluster import workers_at
+from lrfcal_lib.session.workers import side_by_side
+
+
+def each_session(
+    work: Callable[..., int],
+    sessions: Sequence[str],
+    out: str | None = None,
+    scheduler: str | None = None,
+) -> int:
+    """Do something with sessions: one after the other on all cores of this machine, or each on a
+    worker of a cluster, which gives the same files.
+
+    Parameters
+    ----------
+    work : callable
+        ``work(session, out=folder)``, an exit code; None for the usual folder, ``reports/<name>``
+        under the current one.
+    sessions : sequence of path-like
+        Workers of a cluster see them, and write, under the same path as this machine.
+    out : path-like, optional
+        Folder of the files of a single session.
+    scheduler : str, optional
+        See :func:`lrfcal_lib.session.cluster.workers_at`.
+
+    Returns
+    -------
+    int
+        The worst exit code; 1 for a session that a worker could not use, which it says.
+
+    Raises
+    ------
+    ValueError
+        For one folder of several sessions, a cluster that cannot be had, or here a session that
+        cannot be used.
+    """
+    if out is not None and len(sessions) > 1:
+        raise ValueError("--out names the folder of one session: leave it out for several")
+    if scheduler is None:
+        with side_by_side():
+            return max(work(session, out=out) for session in sessions)
+    paths = [Path(session).resolve() for session in sessions]
+    folders = [Path(out or Path("reports") / path.name).resolve() for path in paths]
+    worst = 0
+    with workers_at(scheduler) as executor:
+        for code, words in executor.map(partial(_said, work), paths, folders):
+            print(words, end="", flush=True)
+            worst = max(worst, code)
+    return worst
+
+
+def _said(work, path, folder):
+    """The exit code of a session and what was printed."""
+    with redirect_stdout(io.StringIO()) as words:
+        print(f"{path}:")
+        try:
+            code = work(path, out=folder)
+        except ValueError as error:
+            print(f"error: {error}")
+            code = 1
+    return code, words.getvalue()

@@ -1,0 +1,101 @@
+"""The corner of two plates that Wasielewski and Strauss look at, as drawn shots.
+
+As in the simulation of Gomez-Ojeda and others (ICRA 2015), who use the edge where the plates meet,
+and the outer edges only to tell which shots show the whole corner.
+"""
+
+import numpy as np
+
+from lrfcal_lib.model.camera import pinhole
+from lrfcal_lib.model.geometry import polar_to_points, pose_array
+
+EDGE = np.array(
+    [-0.5, -0.5, 0.70711]
+)  # where the plates meet, through the origin of the target
+PLATES = np.array(
+    [[-0.36237, 0.86237, 0.35355], [0.86237, -0.36237, 0.35355]]
+)  # from the edge
+SIZE = 1.5  # metres, of a plate away from the edge and along it to either side
+FEWEST_POINTS = 2  # on a plate
+LEAST_LENGTH = 15.0  # of an image line, pixels
+
+
+def corner_shots(setup, rng, T_camera_lrf):
+    """Of shots, one for each of some rigs, which meet the conditions (named by what fails), and the
+    shots: points (n, 3) in the LRF frame where the scan line meets the middle edge, and image lines
+    (n, 3) of that.
+
+    Parameters
+    ----------
+    setup : lrfcal_lib.simulate.shots.Scenario
+    rng : numpy.random.Generator
+    T_camera_lrf : RigidTransform
+    """
+    T_lrf_target = setup.boards(rng, T_camera_lrf)
+    points, enough = _scanned(setup, rng, T_lrf_target)
+    lines, whole = _image_lines(setup, rng, T_camera_lrf * T_lrf_target)
+    conditions = {
+        f"have fewer than {FEWEST_POINTS} beams on a plate": enough,
+        "are not in the image": whole,
+    }
+    return conditions, {"points": points, "lines": lines}
+
+
+def _scanned(setup, rng, T_lrf_target):
+    """Where lines through the points on both plates meet, and whether there are enough points."""
+    R = T_lrf_target.rotation.as_matrix()
+    origin = T_lrf_target.translation[:, None] @ R  # in the frame of the target but for its place
+    rays = polar_to_points(1.0, setup.bearings())
+    turned = rays @ R
+    fits = []
+    enough = True
+    for plate in PLATES:
+        normal = np.cross(plate, EDGE)
+        ranges = (origin @ normal) / (turned @ normal)
+        on_plate = ranges[..., None] * turned - origin
+        away = on_plate @ plate
+        hit = (ranges > 0) & (away > 0) & (away < SIZE) & (np.abs(on_plate @ EDGE) < SIZE)
+        enough = enough & (hit.sum(axis=1) >= FEWEST_POINTS)
+        noisy = ranges + setup.range_errors(rng, ranges.shape)
+        fits.append(_fitted(noisy[..., None] * rays[:, :2], hit))
+    meeting = np.cross(*fits)
+    return meeting / meeting[:, 2:] * [1.0, 1.0, 0.0], enough
+
+
+def _fitted(points, used):
+    """Total least-squares lines (n, 3) through the used ones of some points (n, B, 2)."""
+    weight = used / np.maximum(used.sum(axis=1, keepdims=True), 1)
+    middle = np.sum(weight[..., None] * points, axis=1)
+    away = points - middle[:, None]
+    scatter = (weight[..., None] * away).mT @ away
+    normal = np.linalg.eigh(scatter)[1][..., 0]
+    return np.column_stack([normal, -np.vecdot(normal, middle)])
+
+
+def _image_lines(setup, rng, T_camera_target):
+    """Lines (n, 3) through the noisy ends of the middle edge in the image, and whether all three
+    edges are there.
+    """
+    middles = SIZE * np.array([0 * EDGE, *PLATES])
+    poses = pose_array(T_camera_target)[:, None]
+    uv = []
+    for along in (-SIZE, SIZE):
+        seen = np.matvec(poses[..., :3], middles + along * EDGE) + poses[..., 3]
+        uv.append(pinhole(seen, setup.model))  # NaN behind the camera
+    start, end = uv
+
+    # shares of the way at which the lines enter and leave the image
+    size = np.array([setup.model.width, setup.model.height])
+    borders = np.array(
+        [(0.5 - start) / (end - start), (size + 0.5 - start) / (end - start)]
+    )
+    enter = borders.min(axis=0).max(axis=-1)
+    leave = borders.max(axis=0).min(axis=-1)
+    shares = np.clip([0 * enter, 1 + 0 * leave], enter, leave)
+    length = (shares[1] - shares[0]) * np.linalg.norm(end - start, axis=-1)
+    whole = ((enter < leave) & (length > LEAST_LENGTH)).all(axis=1)
+
+    ends = start[:, 0] + shares[:, :, :1] * (end - start)[:, 0]
+    noisy = ends + setup.sigma_px * rng.standard_normal(ends.shape)
+    lines = np.cross(*np.concatenate([noisy, np.ones_like(noisy[..., :1])], axis=-1))
+    return lines / np.linalg.norm(lines[:, :2], axis=-1, keepdims=True), whole

@@ -1,0 +1,298 @@
+"""Drawn calibration sessions of single shots: one scan line and one image of every placement."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
+from lrfcal_lib.model.board import Board, Chessboard, triangle_board
+from lrfcal_lib.model.camera import pinhole
+from lrfcal_lib.model.geometry import AHEAD, polar_to_points, pose_array
+from lrfcal_lib.simulate.corner import corner_shots
+from lrfcal_lib.simulate.draw import Devices, beside, posed, seen_poses
+
+FORWARD_X = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # camera from an LRF that looks along x
+FACING = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))  # camera from a board before it
+TARGET = Rotation.from_euler("ZY", [45, 45], degrees=True)  # world from the board, 'around'
+# of the triangle: 20 corners, away from the edges
+PATTERN = Chessboard(4, 5, 0.029, (0.03885, 0.03885))
+# between a crossing and a second edge: spot radii, and standard deviations of the least softness
+CLEAR = 1.3
+CLEAR_FLOORS = 2.0
+FARTHER = 1.5  # than the farthest corner no beam reads a board
+MOST_ROUNDS = 200
+LEAST_DEPTH = 0.1  # of a corner before the camera, metres: nearer, its pixel means nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario(Devices):
+    """What the single shots of a study are drawn from; see also
+    :class:`lrfcal_lib.simulate.draw.Devices`.
+    """
+
+    name: str = "own"
+    varied: dict[str, float] = field(
+        default_factory=dict
+    )  # settings that differ from its file
+    about: str = ""
+    board: Board = field(default_factory=lambda: triangle_board(pattern=PATTERN))
+    bearings_deg: tuple[float, float] = (40.0, 140.0)
+    uniform: bool = False  # the errors of ranges; normal otherwise
+    floor: float = LEAST_STEP
+    # standard deviation of `bias` from edge to edge of every placement: uneven backgrounds
+    spread: float = 0.0
+    scans: int = 1  # lines of a placement, of the LRF at rest
+    fewest_beams: int = 8  # of a scan line on a board
+    whole_image: bool = True  # placements with corners outside the image are drawn anew
+    # standard deviations of what iterative methods start with, radians and metres
+    start: tuple[float, float] = (0.05, 0.05)
+    # what the joint estimate does not know of the sensor; published simulations know it all
+    sensor: tuple[str, ...] = ("range_offset", "edge_log_odds", "edge_log_softness")
+    T_camera_lrf: RigidTransform | None = (
+        None  # drawn anew for every trial where it is None
+    )
+    roll: float = 0.0  # of the scan plane about the viewing direction, radians
+    poses: str = "ahead"  # of the boards: ahead, tilted or around
+    distances: tuple[float, float] = (1.0, 2.5)  # metres
+    lean: float = 0.6  # of the boards about x and y at most, radians ('ahead')
+    tilt: float = 0.0  # of boards from the image plane, radians ('tilted')
+    least_angle: float = 0.0  # between the LRF's place and the target's planes ('around')
+    extra: tuple[float, float, float] = (0.0, 0.0, 0.0)  # turns about z, x, y ('around')
+    corner: bool = False  # of two plates, which takes the place of boards
+
+    def bearings(self):
+        """Of the beams, radians, shape (B,)."""
+        first, last = np.radians(self.bearings_deg)
+        return first + self.step * np.arange(int((last - first) / self.step + 1.5))
+
+    def range_errors(self, rng, shape):
+        """Errors of ranges, metres."""
+        if self.uniform:
+            return self.sigma_range * np.sqrt(3) * rng.uniform(-1, 1, shape)
+        return self.sigma_range * rng.standard_normal(shape)
+
+    def rigs(self, rng, trials):
+        """True poses ``T_camera_lrf``, one a trial."""
+        if self.T_camera_lrf is not None:
+            matrix = np.broadcast_to(self.T_camera_lrf.as_matrix(), (trials, 4, 4))
+            return RigidTransform.from_matrix(matrix)
+        rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3))) * AHEAD
+        centre = np.array([0.12, 0.03, 0.12]) + rng.normal(0, 0.01, (trials, 3))
+        upright = RigidTransform.from_components(-rotation.apply(centre), rotation)
+        roll = Rotation.from_rotvec([0.0, 0.0, self.roll])
+        return RigidTransform.from_rotation(roll) * upright
+
+    def boards(self, rng, T_camera_lrf):
+        """Poses ``T_lrf_board`` of boards (or corners), one for each rig."""
+        count = len(T_camera_lrf)
+        middle = np.append(self.board.corners.mean(axis=0), 0.0)
+        if self.poses == "tilted":
+            return T_camera_lrf.inv() * self._tilted(rng, count, middle)
+        if self.poses == "ahead":
+            return self._ahead(rng, count, middle)
+        T_lrf_world = self._around(rng, count).inv()
+        if self.corner:
+            return T_lrf_world
+        centred = RigidTransform.from_translation(-middle)
+        return T_lrf_world * RigidTransform.from_rotation(TARGET) * centred
+
+    def shots(self, rng, T_camera_lrf):
+        """One of each rig: the conditions that they meet by what else fails, and what is seen."""
+        draw = corner_shots if self.corner else board_shots
+        return draw(self, rng, T_camera_lrf)
+
+    def _ahead(self, rng, count, middle):
+        """Poses ``T_lrf_board`` of boards that face the LRF but for a lean."""
+        spin = rng.uniform(0, 2 * np.pi, count)
+        lean = rng.uniform(-self.lean, self.lean, (count, 2))
+        away = rng.uniform(*self.distances, count)
+        right = rng.uniform(-0.35, 0.35, count) * away
+        up = rng.uniform(-0.12, 0.12, count)
+        return posed(spin, lean, np.column_stack([right, away, up]), middle)
+
+    def _tilted(self, rng, count, middle):
+        """Poses ``T_camera_board`` of boards parallel to the image but for a turn about a random
+        axis in the board, anywhere in the image.
+        """
+        angle = rng.uniform(0, 2 * np.pi, count)
+        axis = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
+        rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
+        away = rng.uniform(*self.distances, count)
+        pixels = rng.uniform(0, [self.model.width, self.model.height], (count, 2))
+        ray = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(self.model.matrix).T
+        centre = away[:, None] * ray
+        return RigidTransform.from_components(centre - rotation.apply(middle), rotation)
+
+    def _around(self, rng, count):
+        """Poses ``T_world_lrf`` of an LRF that looks at the origin but for turns."""
+        direction = np.zeros((count, 3))
+        open_ = np.ones(count, bool)
+        while open_.any():
+            v = rng.uniform(0, 1, (open_.sum(), 3))
+            direction[open_] = v / np.linalg.norm(v, axis=1, keepdims=True)
+            open_ = direction.min(axis=1) < np.sin(self.least_angle)
+        z = -direction
+        x = np.cross(z, [0.0, 0.0, 1.0])
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        looking = np.stack([x, np.cross(z, x), z], axis=-1)
+        turns = rng.uniform(-1, 1, (count, 3)) * self.extra
+        turned = Rotation.from_matrix(looking) * Rotation.from_euler("ZXY", turns)
+        away = rng.uniform(*self.distances, (count, 1))
+        return RigidTransform.from_components(
+            away * direction, turned * Rotation.from_matrix(FORWARD_X)
+        )
+
+
+def draw_shots(
+    setup: Scenario, rng: np.random.Generator, trials: int, placements: int = 20
+) -> dict[str, np.ndarray]:
+    """Draw calibration sessions of single shots: one scan line and one image a placement.
+
+    A beam reads the board while its ray passes an edge line at less than `bias` radii outside, give
+    or take the softness. Placements whose crossings come near a corner are drawn anew.
+
+    Parameters
+    ----------
+    setup : Scenario
+    rng : numpy.random.Generator
+    trials, placements : int
+        Sessions t, and shots p of each.
+
+    Returns
+    -------
+    dict of ndarray
+        ``T_camera_lrf`` (t, 3, 4), truth; ``ranges`` (t, p, scans, B), metres, NaN off the board;
+        ``lines`` (t, p, 2, 3) and ``edges`` (t, p, 2), undistorted image lines and numbers of the
+        edges at the low and the high bearings; ``boards`` (t, p, 3, 4) and ``board_covariance`` (t,
+        p, 6, 6), ``T_camera_board`` as the pattern shows it; ``true_boards``, the truth of that.
+
+    Raises
+    ------
+    ValueError
+        If hardly any board is crossed on two edges and seen by the camera, with the shares that
+        fail each condition.
+    """
+    T_camera_lrf = setup.rigs(rng, trials)
+    parts = []
+    failing = []
+    missing = np.full(trials, placements)
+    for _ in range(MOST_ROUNDS):
+        if not missing.any():
+            break
+        trial = np.repeat(np.arange(trials), 2 * missing)
+        conditions, shots = setup.shots(rng, T_camera_lrf[trial])
+        usable = np.logical_and.reduce(list(conditions.values()))
+        failing.append({words: np.mean(~good) for words, good in conditions.items()})
+        parts.append({name: value[usable] for name, value in shots.items()})
+        parts[-1]["trial"] = trial[usable]
+        missing = np.maximum(missing - np.bincount(trial[usable], minlength=trials), 0)
+    if missing.any():
+        shares = [
+            f"{100 * np.mean([part[words] for part in failing]):.0f} % {words}"
+            for words in failing[0]
+        ]
+        raise ValueError(
+            f"boards at {setup.distances} m are hardly ever crossed on two edges and seen by "
+            f"the camera: {', '.join(shares)}"
+        )
+
+    drawn = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    trial = drawn.pop("trial")
+    order = np.argsort(trial, kind="stable")
+    first = np.searchsorted(trial[order], np.arange(trials))
+    kept = order[first[:, None] + np.arange(placements)]
+    shots = {name: value[kept] for name, value in drawn.items()}
+    return {"T_camera_lrf": pose_array(T_camera_lrf)} | shots
+
+
+def board_shots(setup, rng, T_camera_lrf):
+    """Of shots, one for each of some rigs, which meet the conditions (named by what fails), and the
+    shots.
+    """
+    board = setup.board
+    T_lrf_board = setup.boards(rng, T_camera_lrf)
+    edges, clear = _crossed_edges(setup, T_lrf_board)
+    ranges, hit, enough = _scans(setup, rng, T_lrf_board)
+
+    true = pose_array(T_camera_lrf * T_lrf_board)
+    corners = board.corners @ true[..., :2].mT + true[:, None, :, 3]
+    uv = pinhole(corners, setup.model)
+    inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
+    ahead = (corners[..., 2] > LEAST_DEPTH).all(axis=1)
+    if setup.whole_image:
+        ahead &= inside.all(axis=(1, 2))
+    conditions = {
+        f"have fewer than {setup.fewest_beams} beams on the board": enough,
+        "are crossed near a corner": clear,
+        "are not in the image": ahead,
+    }
+
+    shown = np.where(ahead[:, None, None], true, true[ahead.argmax()])
+    boards, covariance, pixels = seen_poses(setup, shown, rng, 1.0)
+    noisy = ranges[:, None] + setup.range_errors(rng, hit.shape)
+    homography = (
+        setup.model.matrix @ true[..., [0, 1, 3]]
+    )  # from the board's plane to pixels
+    lines = board.lines()[edges] @ np.linalg.inv(homography)  # normals out of the board
+    lines /= np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
+    lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
+    return conditions, {
+        "ranges": np.where(hit, noisy, np.nan),
+        "lines": lines,
+        "edges": edges,
+        "boards": boards,
+        "board_covariance": covariance,
+        "pattern_pixels": pixels,
+        "true_boards": true,
+    }
+
+
+def _crossed_edges(setup, T_lrf_board):
+    """Edges (n, 2) of convex boards that the scan plane crosses, at the low and the high bearing,
+    and whether both crossings are clear of the other edges.
+    """
+    R = T_lrf_board.rotation.as_matrix()
+    ends = setup.board.points() @ R.mT + T_lrf_board.translation[:, None]
+    following = np.roll(ends, -1, axis=1)
+    height = ends[..., 2]
+    crossed = height * following[..., 2] < 0
+    share = height / np.where(crossed, height - following[..., 2], 1.0)
+    at = ends + share[..., None] * (following - ends)
+    bearing = np.where(crossed, np.arctan2(at[..., 1], at[..., 0]), np.nan)
+    edges = np.argsort(bearing, axis=1)[:, :2]  # NaN comes last
+    at = np.take_along_axis(at, edges[..., None], axis=1)
+    origin = -T_lrf_board.translation[:, None] @ R
+    distances, _ = beside(setup.board, origin, at @ R)
+    second = np.sort(distances, axis=-1)[..., -2]
+    away = np.linalg.norm(at, axis=-1)
+    least = CLEAR * setup.radius(away) + CLEAR_FLOORS * setup.floor * setup.step * away
+    return edges, (crossed.sum(axis=1) == 2) & (second < -least).all(axis=1)
+
+
+def _scans(setup, rng, T_lrf_board):
+    """Of the scan lines over each board: exact ranges (n, B), which beams hit (n, S, B), and
+    whether there are enough in every one.
+    """
+    bearings = setup.bearings()
+    R = T_lrf_board.rotation.as_matrix()
+    rays = polar_to_points(np.ones(len(bearings)), bearings) @ R
+    origin = -T_lrf_board.translation[:, None] @ R
+    distances, ranges = beside(setup.board, origin, rays)
+    spot = setup.radius(np.abs(ranges))
+    radii = distances / spot[..., None]
+    of_edges = 0.0
+    if setup.spread:
+        of_edges = setup.spread * rng.standard_normal((len(R), 1, radii.shape[-1]))
+    outside = (radii - of_edges).max(axis=-1)[:, None]
+    soft = np.hypot(setup.softness, setup.floor * setup.step * ranges / spot)[:, None]
+    shape = (len(R), setup.scans, len(bearings))
+    flips = setup.bias + soft * rng.standard_normal(shape)
+    # rays along the board meet its plane far away, where the least softness means nothing
+    corners = T_lrf_board.translation[:, None] + setup.board.points() @ R.mT
+    farthest = np.linalg.norm(corners, axis=-1).max(axis=-1, keepdims=True)
+    sensible = (ranges > 0) & (ranges < FARTHER * farthest)
+    hit = (outside < flips) & sensible[:, None]
+    enough = hit.sum(axis=-1) >= setup.fewest_beams
+    whole = ~hit[..., [0, -1]].any(axis=-1)
+    return ranges, hit, (enough & whole).all(axis=1)
