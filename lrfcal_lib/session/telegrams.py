@@ -136,8 +136,10 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     values = np.zeros((len(outcome), len(codec.REASONS)), int)
     for group in groups:
         outcome[group.rows] = SCANNED
-        for reason in range(len(codec.REASONS)):
-            values[group.rows, reason] = (group.reasons == reason).sum(axis=1)
+        reasons = group.reasons
+        row, column = np.nonzero(reasons)  # nearly all values are valid
+        np.add.at(values, (group.rows[row], reasons[row, column]), 1)
+        values[group.rows, 0] = reasons.shape[1] - values[group.rows].sum(axis=1)
     problems = [f"{file}: {note}" for note in (*notes, *_damage(index, outcome, len(data)))]
     if torn:
         problems.append(f"{path}: the last row is cut off, its telegram is left out")
