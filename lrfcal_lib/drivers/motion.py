@@ -33,7 +33,7 @@ LEAST_S = 1e-4  # of a wait worth its while
 # queries without a reply, after which a head that is swept is not asked any more
 MISSES = 3
 WRONG_WAY = math.radians(2)  # that a sweep may seem to go
-OTHER_WAY = "the head moves the other way: set invert to the contrary"
+OTHER_WAY = "the head moves in the opposite direction: change invert"
 DISOBEYS = "the head does not obey set-tilt (4D)"
 STOPPED = "the head was stopped before it arrived"
 UNKNOWN = (
