@@ -238,15 +238,15 @@ def _add_sessions(verbs):
     _add_scene(verbs.add_parser("merge", help="join the stations of a scene in one cloud"))
 
 
-def _add_scene(verb):
+def _add_scene(
+    verb, out="folder of its files (default reports/<session> under this folder)"
+):
     """What the use of a calibration on a scene takes."""
     verb.add_argument(
         "sessions", nargs="+", metavar="session", help="as 'record --scene' recorded it"
     )
     verb.add_argument("--calibration", required=True, help="calibration.json")
-    verb.add_argument(
-        "--out", help="folder of its files (default reports/<session> under this folder)"
-    )
+    verb.add_argument("--out", help=out)
     verb.add_argument(
         "--untrusted",
         action="store_true",
@@ -257,22 +257,12 @@ def _add_scene(verb):
 
 def _add_measure(verbs):
     """The verb that measures in a scene."""
-    measure = verbs.add_parser(
-        "measure", help="measure lengths between places picked in scene.html"
-    )
-    measure.add_argument("session", help="as 'record --scene' recorded it")
-    measure.add_argument("--calibration", required=True, help="calibration.json")
+    words = "measure lengths between places picked in scene.html"
+    measure = verbs.add_parser("measure", help=words)
+    _add_scene(measure, "CSV with the lengths (default reports/<session>/lengths.csv)")
     measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
     measure.add_argument(
         "--station", type=int, help="whose scene.html it was (default: that of 'merge')"
-    )
-    measure.add_argument(
-        "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"
-    )
-    measure.add_argument(
-        "--untrusted",
-        action="store_true",
-        help="even if the verdict on the calibration is 'no'",
     )
 
 

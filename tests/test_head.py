@@ -33,8 +33,9 @@ def replace(settings, **changes):
     return HeadSettings(**{**vars(settings), **changes})
 
 
-FAST = HeadSettings(baudrate=38400, settle_s=0.08, poll_s=0.01, reply_s=0.1, gap_s=0.005, retries=2,
-                    reconnect_s=2.0)  # fmt: skip
+FAST = HeadSettings(
+    baudrate=38400, settle_s=0.08, poll_s=0.01, reply_s=0.1, gap_s=0.005, retries=2
+)
 SPEEDS = 4.0, 67.0  # deg/s of the devices at speed bytes 0 and 0x3F: byte + 4
 TIMED = replace(FAST, tilt_speed=0x10, degrees_per_second=20.0)
 DEGREE = math.radians(1)
@@ -344,10 +345,10 @@ def test_the_end_of_the_process_stops_the_head(tmp_path, way):
 
 
 def test_line_that_stays_away(opened):
-    device, head = opened(replace(FAST, reconnect_s=0.2))
+    device, head = opened()
     device.port.unplug()
-    for call in (to(10), PanTilt.pitch):
-        with pytest.raises(LineLost, match="there is no port"):
+    for call, message in ((to(10), "was unplugged"), (PanTilt.pitch, "there is no port")):
+        with pytest.raises(LineLost, match=message):
             call(head)
     device.port.plug()
     assert head.move_to(10 * DEGREE) == near(10)
@@ -410,7 +411,7 @@ def test_what_to_state_for_a_head_that_answers_late(changes):
 
 @pytest.mark.parametrize("kind", HEAD)
 def test_no_fault_ends_in_a_wrong_pitch(opened, kind):
-    device, head = opened(replace(FAST, retries=3, reconnect_s=3.0), settle=0.05)
+    device, head = opened(replace(FAST, retries=3), settle=0.05)
     for goal in (4, -4):
         device.faults.inject(kind, 1 if kind == "unplug" else 2)
         begun = device.host.now()

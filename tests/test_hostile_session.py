@@ -191,7 +191,7 @@ DAMAGE = {
     "0001.jpg: the image is truncated after": jpeg(
         lambda data: data[:2] + 10_000 * b"\xff\xe5\0\2" + data[2:]
     ),
-    "images.csv line 7: images/left/0001.png stands in line 4 already; remove one": lambda p: (
+    "images.csv line 7: .*images/left/0001.png stands in line 4 already; remove one": lambda p: (
         named_again(p)
     ),
     "left.height is 30000: at most 30000000 pixels": bomb,
@@ -361,8 +361,8 @@ def test_check_finds_what_two_writers_or_hands_do_to_tables(folder):
         table.write("left,images/left/0001.png,ab,1,2,20,9\n")
     told = "\n".join(validate(folder / "scans"))
     assert (
-        "edges.csv line 4: left, images/left/0001.png, ab stands in line 2 already; remove one"
-        in told
+        "images/left/0001.png, ab stands in line 2 already; remove one" in told
+        and "edges.csv line 4: left, " in told
     )
     replaced("images.csv", "\n2", "\nnoon")(
         folder / "telegrams"

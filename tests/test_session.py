@@ -407,9 +407,9 @@ DAMAGE = [
     (cell("file", "..\\x.png"), OUT + r"'\.\.\\"),
     (cell("file", "images/left/0009.png"), "0009.png: No such file"),
     (cell("file", "session.json"), "neither PNG nor JPEG"),
-    (cell("camera", "up"), "camera is one of left, right, got 'up'"),
-    (cell("purpose", "fun"), "purpose is one of intrinsics, board, scene, got 'fun'"),
-    (cell("placement", "12"), "placement is one of 1, 2, -1, got '12'"),
+    (cell("camera", "up"), "camera must be one of left, right, got 'up'"),
+    (cell("purpose", "fun"), "purpose must be one of intrinsics, board, scene, got 'fun'"),
+    (cell("placement", "12"), "placement must be one of 1, 2, -1, got '12'"),
     (
         cell("placement", "1.5"),
         "images.csv line 2: placement is '1.5': a whole number is needed",
@@ -484,7 +484,7 @@ REFUSED = [
     (
         "add_image",
         ("up", pixels()),
-        "camera 'up', purpose 'board': cameras are left, right",
+        "camera must be one of left, right, got 'up'",
     ),
     (
         "add_image",
@@ -500,5 +500,7 @@ def test_the_writer_refuses_what_the_reader_would(tmp_path):
     for method, wrong, message in REFUSED:
         with pytest.raises(SessionError, match=message):
             getattr(writer, method)(*wrong)
-    with pytest.raises(SessionError, match="purpose is one of intrinsics, board, scene"):
+    with pytest.raises(
+        SessionError, match="purpose must be one of intrinsics, board, scene"
+    ):
         writer.add_image("left", pixels(), purpose="fun")

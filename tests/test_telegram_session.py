@@ -159,7 +159,7 @@ def test_other_telegrams_and_scans_of_no_placement_are_ignored(recorded):
     assert session.sweep(1).ranges.shape == (4, 401)
     (problem,) = session.problems
     assert (
-        "line 4, offset 51, length 9: reply F4 has 1 bytes of data, needs 7; ignored"
+        "line 4, offset 51, length 9, placement -1: reply F4 has 1 bytes of data, needs 7; ignored"
         in problem
     )
 
@@ -256,11 +256,11 @@ HALF = np.ones((4, 361))
 DAMAGE = [
     (
         cell(3, 1, "853"),
-        r"index\.csv: line 4, offset 853, length 812: .*one after the other; restore",
+        r"index\.csv: line 4, offset 853, length 812, .*one after the other; restore",
     ),
     (
         cell(2, 2, "6"),
-        r"index\.csv: line 3, offset 42, length 6: telegrams of 7 to 65541 bytes",
+        r"index\.csv: line 3, offset 42, length 6, placement 1: telegrams of 7 to 65541 bytes",
     ),
     (
         cell(2, 4, ""),

@@ -12,7 +12,6 @@ from lrfcal_lib.drivers.port import (
     REAL,
     DeviceError,
     Host,
-    LineLost,
     NoReply,
     OutOfRange,
     WrongDevice,
@@ -209,7 +208,7 @@ class PanTilt(port.Closed):
     def move_to(self, pitch: float) -> float:
         """Move and wait until the head rests.
 
-        It may take twice the time that the way takes, and 10 s; a lost line adds `reconnect_s`.
+        It may take twice the time that the way takes, and 10 s.
 
         Parameters
         ----------
@@ -230,7 +229,7 @@ class PanTilt(port.Closed):
         NoReply
             If a head with feedback stays silent.
         LineLost
-            If the port vanished and did not come back, or the head has no feedback.
+            If the port vanished.
         DeviceError
             If it was stopped meanwhile.
         """
@@ -245,13 +244,7 @@ class PanTilt(port.Closed):
             if not self.has_feedback:
                 return motion.timed(pitch, seconds)
             deadline = self._host.now() + 2 * seconds + EXTRA_S
-            while True:
-                try:
-                    return motion.move(pitch, deadline)
-                except LineLost:
-                    if self._host.now() >= deadline:
-                        raise
-                    line.opened()
+            return motion.move(pitch, deadline)
         except BaseException:
             self.emergency_stop()
             raise

@@ -33,15 +33,11 @@ LEAST_S = 1e-4  # of a wait worth its while
 # queries without a reply, after which a head that is swept is not asked any more
 MISSES = 3
 WRONG_WAY = math.radians(2)  # that a sweep may seem to go
-OTHER_WAY = "the head moves the other way: set invert to the contrary"
+OTHER_WAY = "the head moves in the opposite direction: change invert"
 DISOBEYS = "the head does not obey set-tilt (4D)"
 STOPPED = "the head was stopped before it arrived"
 UNKNOWN = (
     "where the head stands is unknown since its line was lost: look, and call set_pitch"
-)
-INTERRUPTED = (
-    "the head's line was lost, and the head stopped when it came back: move or sweep again; where "
-    "it tells nothing look where it stands, and call set_pitch"
 )
 
 
@@ -248,11 +244,10 @@ class Motion:
         Raises
         ------
         LineLost
-            If the port vanished; the head was stopped if it came back.
+            If the port vanished; the head is stopped if it comes back.
         """
         line = self.line
         settings = self.settings
-        reconnects = line.reconnects
         way = math.copysign(1, goal - self.estimate())
         bit = UP if (way > 0) != settings.invert else DOWN
         asking_s = self._shortest_s + settings.reply_s + pelco_d.READ_S
@@ -269,7 +264,7 @@ class Motion:
             begun = self._repeated = self._send(self._frame)
             self._going = way, step, begun
             try:
-                while left() > LEAST_S and line.reconnects == reconnects:
+                while left() > LEAST_S:
                     if look is not None:
                         look()
                     elif self.feedback and left() > asking_s:
@@ -277,8 +272,6 @@ class Motion:
                     self.pause(min(left(), settings.poll_s))
             finally:
                 ended = self.stop()
-            if line.reconnects != reconnects:
-                raise LineLost(INTERRUPTED)
         except LineLost:
             if not self.feedback:
                 self._pitch = None

@@ -25,7 +25,8 @@ TURN = 36000  # hundredths of a degree
 READ_S = 0.02
 # bytes looked at after a frame: a head sends up to 18, the rest is another device
 MOST = 512
-AGAIN_S = 0.05  # between looks for a port that vanished
+RECONNECT_S = 3.0  # that a call waits for a port that vanished
+AGAIN_S = 0.05  # between looks for it
 
 
 @dataclass(frozen=True)
@@ -231,9 +232,8 @@ class HeadLine:
 
     Attributes
     ----------
-    frames, echoed, skipped, reconnects : int
-        Frames sent, bytes that came back as an echo or belong to nothing, and how often the port
-        came back.
+    frames, echoed, skipped : int
+        Frames sent, and bytes that came back as an echo or belong to nothing.
     """
 
     def __init__(self, path: str | os.PathLike, settings, host: Host = REAL):
@@ -243,7 +243,6 @@ class HeadLine:
         self.frames = 0
         self.echoed = 0
         self.skipped = 0
-        self.reconnects = 0
         self.lock = host.lock()
         self._stop = encode_frame(settings.address)
         self._free = 0.0  # when the next frame may be sent
@@ -270,7 +269,7 @@ class HeadLine:
             with self.lock:
                 suspect = self._late
                 begun = self.host.now()
-                tilts = self._exchange(query, self.settings.reply_s, again=True).tilts
+                tilts = self._exchange(query, self.settings.reply_s).tilts
                 self._late = not tilts
             if tilts and not suspect:
                 halfway = (begun + self.host.now()) / 2
@@ -278,10 +277,7 @@ class HeadLine:
         return None
 
     def command(self, frame):
-        """Send a frame that a head may acknowledge; the host's instant at which it was sent.
-
-        If the port vanished it is not sent again, because its time has passed.
-        """
+        """Send a frame that a head may acknowledge; the host's instant at which it was sent."""
         with self.lock:
             self._exchange(frame)
             return self._sent
@@ -294,7 +290,7 @@ class HeadLine:
         first = None
         for _ in range(2 + self.settings.retries * self._acknowledges):
             with self.lock:
-                acknowledged = self._exchange(self._stop, again=True).acknowledged
+                acknowledged = self._exchange(self._stop).acknowledged
                 if first is None:
                     first = self._sent
             if acknowledged:
@@ -318,11 +314,11 @@ class HeadLine:
             if held:
                 self.lock.release()
 
-    def _exchange(self, frame, wait_s=None, *, again=False):
+    def _exchange(self, frame, wait_s=None):
         """Send a frame, and collect what is Received until a reply.
 
-        With `again` it is sent again where the port was lost and came back. The wait (by default
-        that of an acknowledgement) counts from the end of the transmission of frame and reply.
+        The wait (by default that of an acknowledgement) counts from the end of the transmission of
+        frame and reply.
         """
         wait_s = wait_s or self.settings.gap_s
         with self.lock:
@@ -337,12 +333,8 @@ class HeadLine:
                         port, frame, self._sent + self.wire_s(2 * FRAME) + wait_s
                     )
             except LineLost:
-                LOG.warning("the line %s to the head is lost", self.path)
-                vanished = self._port is not None  # else it did not come back
                 self.close()
-                if not (again and vanished):
-                    raise
-                return self._exchange(frame, wait_s)
+                raise
             self._free = (
                 max(self.host.now(), self._sent + self.wire_s()) + self.settings.gap_s
             )
@@ -365,12 +357,12 @@ class HeadLine:
     # --------------------------------------------------------------------------------------- port
 
     def opened(self):
-        """The port; after it was lost it is waited for.
+        """The port; after it was lost, which ends what was under way, it is waited for.
 
         The head, which went on with what it was told, is stopped then.
         """
         with self.lock, line_lost(self.path):
-            deadline = self.host.now() + self.settings.reconnect_s
+            deadline = self.host.now() + RECONNECT_S
             while self._port is None:
                 try:
                     self._port = self.host.port(
@@ -381,7 +373,6 @@ class HeadLine:
                         raise LineLost(f"the head's line is lost: {error}") from error
                     self.host.sleep(AGAIN_S)
                     continue
-                self.reconnects += 1
                 LOG.warning("the line %s to the head is back", self.path)
                 self._port.write(self._stop * 2)
                 self.host.sleep(self.wire_s(2 * FRAME) + self.settings.gap_s)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import compress
 
 import numpy as np
 import urllib3
@@ -431,11 +430,10 @@ class Rig(Closed):
     def _continuous(self, placement):
         first, last = placement.pitch[[0, -1]].tolist()
         images = sorted(placement.image_pitch, reverse=placement.direction < 0)
-        stops = [*images, first]
-        for number, pitch in enumerate(stops, 1):
-            moved = self._move(placement.number, float(pitch), number, len(stops))
+        for number, pitch in enumerate([*images, first], 1):
+            moved = self._move(placement.number, float(pitch), number, len(images) + 1)
             yield moved
-            if number < len(stops):
+            if number <= len(images):
                 yield from self._photograph(self.cameras, moved, placement.purpose)
         self.lrf.start()
         held = self.lrf.take(1, timeout=SCAN_S)  # readings whose pitch is not known yet
@@ -503,9 +501,10 @@ def placed(
         return (), np.empty(0), list(readings)
     times, pitch = np.array([point[:2] for point in track]).T
     middle = np.array([np.mean(reading.beam_times_s[[0, -1]]) for reading in readings])
-    inside = (middle >= times[0]) & (middle <= times[-1])
-    later = list(compress(readings, middle > times[-1]))
-    return tuple(compress(readings, inside)), np.interp(middle[inside], times, pitch), later
+    begin = np.searchsorted(middle, times[0])
+    end = np.searchsorted(middle, times[-1], side="right")
+    known = np.interp(middle[begin:end], times, pitch)
+    return tuple(readings[begin:end]), known, list(readings[end:])
 
 
 def unchanged(scans: Iterable[np.ndarray]) -> bool:
@@ -544,9 +543,8 @@ def _camera(stated, name):
     camera = Camera(device.source, name=name, size=size, **options)
     if camera.size not in (None, size):
         camera.close()
-        given = "{} x {} pixels".format(*camera.size)
-        expected = "{} x {}".format(*size)
         raise ValueError(
-            f"it gives {given}, rig.cameras.{name} states {expected}: state a size that it can do"
+            "it gives {} x {} pixels, rig.cameras.{} states {} x {}: state a size that it can "
+            "do".format(*camera.size, name, *size)
         )
     return camera

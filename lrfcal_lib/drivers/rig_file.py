@@ -185,7 +185,6 @@ class HeadSettings(Stated):
     retries: whole(0, 20) = 3  # queries repeated when no reply came
     # below 1 for heads that stop by themselves without
     repeat_s: number(1e-3, 60) = None
-    reconnect_s: number(0, 3600) = 3.0  # that a call waits for a vanished port
 
     def elevation(self, pitch: float) -> float:
         """What the head calls a pitch.

@@ -91,7 +91,7 @@ def _repeated(session, first_camera, camera, pairs):
         cause = f"was the folder of camera '{first_camera}' copied?"
     words = (
         f"{len(pairs)} of {count} images of camera '{camera}' (in placements: "
-        f"{short(placements)}) are the very pictures of others: {examples}: {cause}; put the right "
+        f"{short(placements)}) are identical to others: {examples}: {cause}; put the right "
         "images there or remove their rows from images.csv"
     )
     severe = len(pairs) > MANY * count

@@ -91,7 +91,7 @@ class Scans:
     @property
     def reasons(self):
         """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
-        return meanings(self.mode, self.unit)[1][self.words]
+        return np.take(meanings(self.mode, self.unit)[1], self.words, mode="clip")
 
 
 def encode_values(
@@ -249,7 +249,7 @@ def decode_scans(
         indices = np.full((len(chosen), 2), -1)
         if extra[group[0]]:
             indices[:] = cut(data, begin + size, 2)
-        ranges = meanings(mode, unit)[0][words]
+        ranges = np.take(meanings(mode, unit)[0], words, mode="clip")
         scans.append(Scans(chosen, words, ranges, unit, mode, partial, *indices.T))
     return scans
 

@@ -56,8 +56,9 @@ def _locked(file, path):
     except BlockingIOError:
         with stream:
             holder = stream.read(200).decode(errors="replace") or "another process"
-        remedy = "end that first, or choose another one"
-        raise SessionError(f"{path}: {holder} writes this session: {remedy}") from None
+        raise SessionError(
+            f"{path}: {holder} writes this session: end that first, or choose another one"
+        ) from None
     return stream
 
 

@@ -106,7 +106,7 @@ def inside(path, name, where):
 def known(value, values, what):
     """A value that must be one of some; ValueError in words otherwise."""
     if value not in values:
-        raise ValueError(f"{what} is one of {short(values)}, got '{value}'")
+        raise ValueError(f"{what} must be one of {short(values)}, got '{value}'")
     return value
 
 
@@ -147,7 +147,7 @@ def read_images(path, facts, unfinished):
                 time_s=float(row["t_s"] or "nan"),
                 purpose=known(row["purpose"], PURPOSES, "purpose"),
             )
-            once(lines, number, record.file.relative_to(path))
+            once(lines, number, record.file)
             content = read_bytes(record.file, path)
             check_image_size(record.file, content, cameras[record.camera])
         out.append(record)
@@ -170,7 +170,7 @@ def read_edges(path, facts, records):
                     f"images.csv has no '{row['file']}' of camera '{row['camera']}'"
                 )
             edge = known(row["edge"], facts["board"].edges, "edge")
-            once(lines, number, row["camera"], target.relative_to(path), edge)
+            once(lines, number, row["camera"], target, edge)
             ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
             if not np.linalg.norm(ends[1] - ends[0]) >= CLOSEST or np.isinf(ends).any():
                 raise ValueError(

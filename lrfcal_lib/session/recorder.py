@@ -56,9 +56,10 @@ class SessionRecorder(SessionWriter):
             known = stated.parse_session(data)
             for key in ("board", "rig"):
                 if data[key] != mine[key]:
-                    where = _first_difference(data[key], mine[key], key)
-                    remedy = "go on with the same rig file, or begin another one"
-                    raise ValueError(f"{where}, unlike the rig now: {remedy}")
+                    raise ValueError(
+                        f"{_first_difference(data[key], mine[key], key)}, unlike the rig now: go "
+                        "on with the same rig file, or begin another one"
+                    )
         self.data = dict(data)
         self.data["placements"] = list(known["placements"])
         self.data["unfinished"] = list(known["unfinished"] or ())
@@ -134,9 +135,8 @@ class SessionRecorder(SessionWriter):
             Time of this computer (s), commanded and measured pitch (rad), NaN where unknown.
         """
         cells = []
-        for time_s, commanded, measured in rows:
-            angles = [cell(math.degrees(angle)) for angle in (commanded, measured)]
-            cells.append([cell(time_s), *angles])
+        for time_s, *angles in rows:
+            cells.append(map(cell, (time_s, *map(math.degrees, angles))))
         self._append_rows("platform.csv", cells)
 
     def finish(self) -> None:

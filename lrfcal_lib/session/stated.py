@@ -222,16 +222,10 @@ class LensStated(BaseModel):
 
     def made(self, width, height):
         """As a CameraModel."""
+        pinhole = self.fx, self.fy, self.cx, self.cy
+        covariance = self.covariance and np.array(self.covariance)
         return CameraModel(
-            width,
-            height,
-            self.fx,
-            self.fy,
-            self.cx,
-            self.cy,
-            np.array(self.distortion),
-            self.covariance and np.array(self.covariance),
-            self.rms_px,
+            width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px
         )
 
 

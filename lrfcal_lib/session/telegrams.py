@@ -69,7 +69,10 @@ class Index:
 
     def place(self, row: int | np.intp) -> str:
         """Where a telegram is, as text."""
-        return f"line {row + 2}, offset {self.offset[row]}, length {self.length[row]}"
+        return (
+            f"line {row + 2}, offset {self.offset[row]}, length {self.length[row]}, placement "
+            f"{self.placement[row]}"
+        )
 
 
 def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], TelegramLog]:
@@ -133,8 +136,10 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     values = np.zeros((len(outcome), len(codec.REASONS)), int)
     for group in groups:
         outcome[group.rows] = SCANNED
-        for reason in range(len(codec.REASONS)):
-            values[group.rows, reason] = (group.reasons == reason).sum(axis=1)
+        reasons = group.reasons
+        row, column = np.nonzero(reasons)  # nearly all values are valid
+        np.add.at(values, (group.rows[row], reasons[row, column]), 1)
+        values[group.rows, 0] = reasons.shape[1] - values[group.rows].sum(axis=1)
     problems = [f"{file}: {note}" for note in (*notes, *_damage(index, outcome, len(data)))]
     if torn:
         problems.append(f"{path}: the last row is cut off, its telegram is left out")
@@ -166,23 +171,25 @@ def _check_index(index, size, file):
         )
     absurd = (index.length < 7) | (index.length > LONGEST) | (index.offset > LARGEST_FILE)
     absurd |= index.offset < np.r_[0, index.end[:-1]]
-    if absurd.any():
-        raise ValueError(
-            f"{index.place(absurd.argmax())}: telegrams of 7 to {LONGEST} bytes lie one after the "
-            "other; restore the file"
-        )
     missing = index.end > size
-    if missing[:-1].any():
-        raise ValueError(
-            f"{index.place(missing.argmax())}, but {file.name} has {size} bytes: restore it, or "
-            "remove the rows from this one on"
-        )
+    missing[-1] = False
     blind = (index.placement >= 0) & ~np.isfinite(index.pitch)
-    if blind.any():
-        raise ValueError(
-            f"{index.place(blind.argmax())}, placement {index.placement[blind][0]}: pitch_deg is "
-            "missing; fill it in, or empty the placement to ignore the telegram"
-        )
+    for wrong, words in (
+        (
+            absurd,
+            f"telegrams of 7 to {LONGEST} bytes lie one after the other; restore the file",
+        ),
+        (
+            missing,
+            f"{file.name} has {size} bytes: restore it, or remove the rows from this one on",
+        ),
+        (
+            blind,
+            "pitch_deg is missing; fill it in, or empty the placement to ignore the telegram",
+        ),
+    ):
+        if wrong.any():
+            raise ValueError(f"{index.place(wrong.argmax())}: {words}")
 
 
 def _modes(data, index, rows):

@@ -22,6 +22,7 @@ from lrfcal_lib.session.scans import check_scans, parts_of, read_npz
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, naming, short
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
+ABOUT = {"name": "", "licence": "", "source": "", "simulated": False, "reference": {}}
 RECORDINGS = "LRFCAL_RECORDINGS"  # environment variable: where new recordings go
 
 
@@ -78,18 +79,12 @@ class SessionWriter:
         self.parts = 0  # files of sweeps so far
         self.shots = dict.fromkeys(self.cameras, 0)  # images so far, by camera
         self.telegrams = self.path / "lrf" / "telegrams.bin"
-        words = {
-            "name": self.path.resolve().name,
-            "licence": "",
-            "source": "",
-            "simulated": False,
-            "reference": {},
-        }
-        if not about.keys() <= words.keys():
-            raise TypeError(f"a session has {short(words)}, got {short(about)}")
+        if not about.keys() <= ABOUT.keys():
+            raise TypeError(f"a session has {short(ABOUT)}, got {short(about)}")
         self.data = {
             "schema": stated.SCHEMA,
-            **words,
+            **ABOUT,
+            "name": self.path.resolve().name,
             **about,
             "board": stated.board_to_json(board),
             "rig": {
