@@ -17,6 +17,7 @@ from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_contradictions import (
     LARGEST_SHARE,
+    face_misses,
     left_out_share,
     refuse_contradiction,
     without_contradictions,
@@ -45,12 +46,15 @@ class Start:
     left_out : list of Problem
     badness : float
         Mean half squared residual of what is kept; the share that is left out counts against it.
+    miss : float
+        By how much the closed form, before any step, puts points off their boards, metres (median).
     """
 
     kept: JointObservations
     state: JointState
     left_out: list[Problem]
     badness: float
+    miss: float
 
 
 def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> Start:
@@ -72,7 +76,8 @@ def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> St
         if min(start.badness for start in tried) < GOOD_START:
             break
     best = min(tried, key=lambda start: start.badness)
-    refuse_contradiction(best.kept, best.state, ROUGH_MISS)
+    if best.miss > ROUGH_MISS:  # a camera that was knocked is to be named, not refused
+        refuse_contradiction(best.kept, best.state, ROUGH_MISS)
     if left_out_share(obs, best.left_out) > LARGEST_SHARE:
         words = "; ".join(map(str, best.left_out[:8]))
         raise DegenerateGeometry(
@@ -97,6 +102,8 @@ def agreeing_start(obs, state, data, unknowns):
 
     The better one of both attempts, a Start: what still contradicts may have led the rest astray.
     """
+    rows = np.arange(len(state.boards))
+    miss = float(np.median(face_misses(state, data, state.boards, rows)))
     attempts = []
     for _ in range(2):
         kept, fitting, left_out = without_contradictions(obs, state, data)
@@ -106,7 +113,7 @@ def agreeing_start(obs, state, data, unknowns):
         count = len(kept.face_range) + len(kept.beam_hit) + len(kept.view_pitch)
         cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / count
         badness = cost * (1 + PENALTY * share)
-        attempts.append(Start(kept, found.state, left_out, badness))
+        attempts.append(Start(kept, found.state, left_out, badness, miss))
         if not left_out or share > LARGEST_SHARE:
             break
         cameras = [pose_transform(pose) for pose in found.state.cameras]
