@@ -25,29 +25,31 @@ def medians(values: np.ndarray, used: np.ndarray) -> np.ndarray:
     return np.where(count > 0, 0.5 * low + 0.5 * high, 0.0)[..., 0]
 
 
-def pad(group: dict[str, np.ndarray], count: int, width: int = 1) -> dict[str, np.ndarray]:
+def pad(
+    placement: np.ndarray, count: int, width: int = 1, **columns: np.ndarray
+) -> dict[str, np.ndarray]:
     """Arrays sorted by placement into rectangles, zeros behind the rows of each.
 
     Parameters
     ----------
-    group : dict of str to ndarray, shapes (m, ...)
-        With `placement`, indices below `count`.
+    placement : ndarray of int, shape (m,)
+        Indices below `count` of the rows; -1 leaves a row out.
     count : int
         Number of placements.
     width : int
         Of the rectangles, at least.
+    **columns : ndarray, shapes (m, ...)
 
     Returns
     -------
     dict of str to ndarray, shapes (count, n, ...)
-        Without `placement`; `used` marks what is no padding. Rows of a placement keep their order.
+        The columns; `used` marks what is no padding. Rows of a placement keep their order.
     """
-    order = np.argsort(group["placement"], kind="stable")
-    number = np.bincount(group["placement"], minlength=count)
+    order = np.argsort(placement, kind="stable")[np.sum(placement < 0) :]
+    number = np.bincount(placement[order], minlength=count)
     used = np.arange(number.max(initial=width)) < number[:, None]
     out = {"used": used}
-    for key, value in group.items():
-        if key != "placement":
-            out[key] = np.zeros(used.shape + value.shape[1:], value.dtype)
-            out[key][used] = value[order]
+    for key, value in columns.items():
+        out[key] = np.zeros(used.shape + value.shape[1:], value.dtype)
+        out[key][used] = value[order]
     return out

@@ -96,25 +96,15 @@ def refuse_contradiction(obs: JointObservations, state: JointState, most: float)
         )
 
 
-def face_misses(state, data, boards, placement):
-    """Median distance of face points from boards (n, 3, 4) of some placements (n,), metres,
-    (n,).
-    """
-    x = face_points(state, data)[placement] - boards[:, None, :, 3]
-    return medians(
-        np.abs(np.vecdot(x, boards[:, None, :, 2])), data.face["used"][placement]
-    )
-
-
 def without_contradictions(obs, state, data):
     """Leave out images that put the board far off where it was scanned, and placements of which
     none is left.
     """
     place = obs.view_placement
-    if len(place) == 0:
-        return obs, state, []
     boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
-    misses = face_misses(state, data, boards, place)
+    away = face_points(state, data)[place] - boards[:, None, :, 3]
+    heights = np.abs(np.vecdot(away, boards[:, None, :, 2]))
+    misses = medians(heights, data.face["used"][place])  # of the faces' points
     wrong = misses > max(LAST_MISS, FAR_MISS * np.median(misses))
     if not wrong.any():
         return obs, state, []

@@ -188,32 +188,34 @@ class JointData:
 def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
     """Observations as padded arrays, with noise levels other than those stated."""
     count = len(obs.placements)
-    face = {
-        "placement": obs.face_placement,
-        "range": obs.face_range,
-        "bearing": obs.face_bearing,
-        "pitch": obs.face_pitch,
-        "sigma": obs.face_sigma,
-    }
-    beam = {
-        "placement": obs.beam_placement,
-        "bearing": obs.beam_bearing,
-        "pitch": obs.beam_pitch,
-        "hit": obs.beam_hit,
-        "edge": obs.beam_edge,
-        "radius": obs.beam_radius,
-        "background": obs.beam_background,
-        "step": obs.beam_step,
-    }
-    view = {
-        "placement": obs.view_placement,
-        "camera": obs.view_camera,
-        "pitch": obs.view_pitch,
-        "pose": obs.view_pose,
-        "covariance": obs.view_covariance,
-        "lens": obs.view_lens,
-    }
-    face, beam, view = (pad(group, count) for group in (face, beam, view))
+    face = pad(
+        obs.face_placement,
+        count,
+        range=obs.face_range,
+        bearing=obs.face_bearing,
+        pitch=obs.face_pitch,
+        sigma=obs.face_sigma,
+    )
+    beam = pad(
+        obs.beam_placement,
+        count,
+        bearing=obs.beam_bearing,
+        pitch=obs.beam_pitch,
+        hit=obs.beam_hit,
+        edge=obs.beam_edge,
+        radius=obs.beam_radius,
+        background=obs.beam_background,
+        step=obs.beam_step,
+    )
+    view = pad(
+        obs.view_placement,
+        count,
+        camera=obs.view_camera,
+        pitch=obs.view_pitch,
+        pose=obs.view_pose,
+        covariance=obs.view_covariance,
+        lens=obs.view_lens,
+    )
     for group in (face, beam):
         group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
     padding = ~view["used"][..., None, None]

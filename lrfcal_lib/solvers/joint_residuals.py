@@ -357,8 +357,7 @@ def prior_block(state, data, unknowns):
     square = np.sum((r / sigma) ** 2)
     p = len(state.boards)
     root = np.sqrt((PRIOR_FREEDOM + 4) / (PRIOR_FREEDOM + square) / p) / sigma
-    jacobian = np.zeros((p, 4, unknowns.shared + unknowns.own))
-    jacobian[..., :4] = root[:, None] * J
+    jacobian = root[:, None] * J @ own_jacobian(unknowns, p, "axis")
     cost = 0.125 * (PRIOR_FREEDOM + 4) * np.log1p(square / PRIOR_FREEDOM) / p
     return Block(
         np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=np.full((p, 4), cost)

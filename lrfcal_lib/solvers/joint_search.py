@@ -11,7 +11,6 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     pose_array,
-    pose_transform,
 )
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
@@ -116,6 +115,5 @@ def agreeing_start(obs, state, data, unknowns):
         attempts.append(Start(kept, found.state, left_out, badness, miss))
         if not left_out or share > LARGEST_SHARE:
             break
-        cameras = [pose_transform(pose) for pose in found.state.cameras]
-        state = state_of(obs, pose_transform(found.state.head), cameras)
+        state = state_of(obs, found.state.head, found.state.cameras)
     return min(attempts, key=lambda start: start.badness)

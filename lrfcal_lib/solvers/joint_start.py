@@ -57,11 +57,13 @@ def _states(obs, head):
     camera.
     """
     minima = [_camera(obs, camera, head) for camera in range(len(obs.cameras))]
-    best = [poses[0] for poses in minima]
-    states = [state_of(obs, head, best)]
+    best = np.array([poses[0] for poses in minima])
+    states = [state_of(obs, pose_array(head), best)]
     for camera, poses in enumerate(minima):
         for pose in poses[1:]:
-            states.append(state_of(obs, head, [*best[:camera], pose, *best[camera + 1 :]]))
+            other = best.copy()
+            other[camera] = pose
+            states.append(state_of(obs, pose_array(head), other))
     return states
 
 
@@ -92,22 +94,18 @@ def _camera(obs, camera, head):
         board_poses=obs.view_pose[views],
         board_covariance=obs.view_covariance[views],
     )
-    return start_from_planes(seen)
+    return pose_array(start_from_planes(seen))
 
 
-def state_of(
-    obs: JointObservations, head: RigidTransform, cameras: list[RigidTransform]
-) -> JointState:
-    """All unknowns from an axis and the cameras: boards from their first images."""
-    poses = np.array([pose_array(T) for T in cameras])
+def state_of(obs: JointObservations, head: np.ndarray, cameras: np.ndarray) -> JointState:
+    """All unknowns from an axis and the cameras (as in JointState): boards from first images."""
     count = len(obs.placements)
     _, first = np.unique(obs.view_placement, return_index=True)
-    boards = boards_in_images(obs, pose_array(head), poses, first)
     return JointState(
-        head=pose_array(head),
-        cameras=poses,
+        head=head,
+        cameras=cameras,
         sensor=np.array([0.0, 0.0, np.log(START_SOFTNESS), 0.0, 0.0]),
-        boards=boards,
+        boards=boards_in_images(obs, head, cameras, first),
         sweeps=np.zeros((count, 2)),
         sides=np.zeros((count, len(obs.edges))),
     )

@@ -140,7 +140,7 @@ def plane_sets(obs: CameraObservations) -> PlaneSets:
     )
     mine = np.flatnonzero(np.isin(obs.plane_placement, placements))
     where = np.searchsorted(placements, obs.plane_placement[mine])
-    padded = pad({"row": mine, "placement": where}, len(placements), width=4)
+    padded = pad(where, len(placements), width=4, row=mine)
     index = padded["row"]
     used = padded["used"]
     return PlaneSets(

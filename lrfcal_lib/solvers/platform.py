@@ -171,50 +171,46 @@ def prepare_boards(obs: PlatformObservations, T_head_lrf: RigidTransform) -> Boa
     p_face = lrf_to_platform(obs.face_points, obs.face_pitch, T_head_lrf)
     boards = {}
     skipped = {}
-    second = np.full(len(p_edge), -1.0)
+    second = np.zeros(len(p_edge))
+    edge_row = np.full(len(p_edge), -1)
+    face_row = np.full(len(p_face), -1)
     for placement in np.unique(obs.edge_placement).tolist():
         here = obs.edge_placement == placement
         edges = [here & (obs.edge_number == number) for number in (1, 2)]
         edges = [rows for rows in edges if rows.sum() >= 2]
-        on_face = p_face[obs.face_placement == placement]
+        on_face = obs.face_placement == placement
         try:
-            boards[placement] = _start_board([p_edge[rows] for rows in edges], on_face)
+            pose = _start_board([p_edge[rows] for rows in edges], p_face[on_face])
         except DegenerateGeometry as error:
             skipped[placement] = str(error)
             continue
+        face_row[on_face] = len(boards)
         for number, rows in enumerate(edges):
+            edge_row[rows] = len(boards)
             second[rows] = number
+        boards[placement] = pose
     if not boards:
         raise DegenerateGeometry(f"no placement can be used for the tilt axis: {skipped}")
-    placements = np.array(list(boards))
-    edge = {
-        "points": obs.edge_points,
-        "covariance": obs.edge_covariance,
-        "pitch": obs.edge_pitch,
-        "placement": obs.edge_placement,
-        "second": second,
-    }
-    face = {
-        "points": obs.face_points,
-        "covariance": obs.face_covariance,
-        "pitch": obs.face_pitch,
-        "placement": obs.face_placement,
-        "second": np.zeros(len(p_face)),
-    }
-    poses = np.array(list(boards.values()))
-    return Boards(
-        placements, poses, _padded(edge, placements), _padded(face, placements), skipped
+    edge = pad(
+        edge_row,
+        len(boards),
+        points=obs.edge_points,
+        covariance=obs.edge_covariance,
+        pitch=obs.edge_pitch,
+        second=second,
     )
-
-
-def _padded(group, placements):
-    """Columns of points by placement, padded, without those of other placements and lone points."""
-    kept = np.isin(group["placement"], placements) & (group["second"] >= 0)
-    group = {key: value[kept] for key, value in group.items()}
-    group["placement"] = np.searchsorted(placements, group["placement"])
-    out = pad(group, len(placements))
-    out["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
-    return out
+    face = pad(
+        face_row,
+        len(boards),
+        points=obs.face_points,
+        covariance=obs.face_covariance,
+        pitch=obs.face_pitch,
+        second=np.zeros(len(p_face)),
+    )
+    for group in (edge, face):
+        group["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
+    poses = np.array(list(boards.values()))
+    return Boards(np.array(list(boards)), poses, edge, face, skipped)
 
 
 def _start_board(edges, face):
