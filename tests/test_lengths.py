@@ -11,12 +11,12 @@ from shared import DATA
 
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.calibrate.calibration_file import load_calibration
-from lrfcal_lib.evaluate.true_lengths import true_picks
 from lrfcal_lib.measure import features, lengths
 from lrfcal_lib.measure.edges import edges_of
 from lrfcal_lib.measure.lengths import nearest_edge
 from lrfcal_lib.measure.scene import stations_of
 from lrfcal_lib.measure.stations import join_stations
+from lrfcal_lib.report.true_lengths import true_picks
 from lrfcal_lib.session.read import open_session
 
 

@@ -59,13 +59,15 @@ def edges_of(
         uv = pinhole(p_camera, view.model)
         segments = _segments(view)
         shown = []
+        lines = []
         for ends in segments:
             number = _surface_at(ends, uv, p_camera[:, 2], of_point[rows])
             if number >= 0:
                 with suppress(EdgeNotSeen):
-                    shown.append((planes[number], _refined(view, ends, segments)))
+                    lines.append(_refined(view, ends, segments))
+                    shown.append(planes[number])
         if shown:
-            edges += _on_planes(*zip(*shown, strict=True), view, pitch)
+            edges += _on_planes(shown, lines, view, pitch)
     return edges
 
 
@@ -132,19 +134,12 @@ def _on_planes(
 ) -> list[Feature]:
     """The edges of a scene that k lines of an image show, each on its plane."""
     rig = planes[0].rig
-    T_platform_camera = view.T_camera_platform.inv()
-    K = view.model.matrix
     normal = np.array([plane.axis for plane in planes])
     centre = np.array([plane.centre for plane in planes])
     line = np.array([each.line for each in lines])
     pixels = np.array([each.ends for each in lines])
 
-    # where the sight through the ends (k, 2, 3) meets the plane
-    rays = np.insert(pixels, 2, 1.0, axis=-1) @ np.linalg.inv(K).T
-    rays = rays @ T_platform_camera.rotation.as_matrix().T
-    eye = T_platform_camera.translation
-    far = np.vecdot(normal, centre - eye)[:, None] / np.vecdot(rays, normal[:, None])
-    ends = eye + far[..., None] * rays
+    ends = _where_seen(view, normal, centre, pixels)
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)[:, None]
     direction = (ends[:, 1] - ends[:, 0]) / length
 
@@ -152,7 +147,7 @@ def _on_planes(
     # metre
     R = view.T_camera_platform.rotation.as_matrix()
     depth = ends @ R[2] + view.T_camera_platform.translation[2]
-    sight = (line @ K)[:, None] / depth[..., None]
+    sight = (line @ view.model.matrix)[:, None] / depth[..., None]
     gradient = sight @ R
     across = np.cross(normal, direction)[:, None]
     way = across / np.vecdot(gradient, across)[..., None]  # metres a pixel
@@ -172,24 +167,39 @@ def _on_planes(
     by_shared -= way[..., None] * (sight[..., None, :] @ by_camera)
     by_shared[..., -1] = lifted
     jacobian = _of_line(by_shared, length)
-    edges = []
-    for i, (plane, each) in enumerate(zip(planes, lines, strict=True)):
-        noise = np.zeros((6, 6))
-        noise[0, 0] = plane.axis @ plane.noise[:3, :3] @ plane.axis
-        noise[1:4, 1:4] = plane.noise[3:, 3:]
-        noise[4:, 4:] = each.covariance
-        edge = replace(
-            plane,
-            kind=Kind.EDGE,
-            centre=ends[i].mean(axis=0),
-            axis=direction[i],
-            noise=by_noise[i] @ noise @ by_noise[i].T,
-            jacobian=jacobian[i],
-            ends=ends[i],
-            image=view.number,
-        )
-        edges.append(edge)
-    return edges
+    parts = zip(planes, lines, ends, by_noise, jacobian, strict=True)
+    return [_edge(*one, view.number) for one in parts]
+
+
+def _where_seen(view, normal, centre, pixels):
+    """Where the sights through pixels (k, 2, 2) meet planes (k, 3), platform frame, (k, 2, 3)."""
+    T_platform_camera = view.T_camera_platform.inv()
+    rays = np.insert(pixels, 2, 1.0, axis=-1) @ np.linalg.inv(view.model.matrix).T
+    rays = rays @ T_platform_camera.rotation.as_matrix().T
+    eye = T_platform_camera.translation
+    far = np.vecdot(normal, centre - eye)[:, None] / np.vecdot(rays, normal[:, None])
+    return eye + far[..., None] * rays
+
+
+def _edge(plane, line, ends, by_noise, jacobian, number):
+    """An edge of a plane between two ends (2, 3), from an image by its number."""
+    noise = np.zeros(
+        (6, 6)
+    )  # of the plane's height and turn, of the line's offset and turn
+    noise[0, 0] = plane.axis @ plane.noise[:3, :3] @ plane.axis
+    noise[1:4, 1:4] = plane.noise[3:, 3:]
+    noise[4:, 4:] = line.covariance
+    way = ends[1] - ends[0]
+    return replace(
+        plane,
+        kind=Kind.EDGE,
+        centre=ends.mean(axis=0),
+        axis=way / np.linalg.norm(way),
+        noise=by_noise @ noise @ by_noise.T,
+        jacobian=jacobian,
+        ends=ends,
+        image=number,
+    )
 
 
 def _of_line(by, length):

@@ -256,8 +256,8 @@ def beams_moved(
     """
     names = uncertainty_of(rig).names
     chain = chain_of(rig, camera)
-    _, by_link, by_pitch = carried(chain, *beams, image_pitch)
-    turn = beams[1]
+    bearing, turn, distance = beams
+    _, by_link, by_pitch = carried(chain, bearing, turn, distance, image_pitch)
     by_offset = by_pitch
     if camera is None:
         R = chain.head[:, :3]

@@ -95,7 +95,8 @@ def nearest_edge(
     along = np.vecdot(place - first, way) / np.vecdot(way, way)
     foot = first + np.clip(along, 0, 1)[:, None] * way
     away = np.linalg.norm(foot - place, axis=1)
-    return edges[np.argmin(away)], float(away.min())
+    nearest = int(np.argmin(away))
+    return edges[nearest], float(away[nearest])
 
 
 def features_of(

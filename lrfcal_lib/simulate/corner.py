@@ -44,7 +44,9 @@ def corner_shots(setup, rng, T_camera_lrf):
 def _scanned(setup, rng, T_lrf_target):
     """Where lines through the points on both plates meet, and whether there are enough points."""
     R = T_lrf_target.rotation.as_matrix()
-    origin = T_lrf_target.translation[:, None] @ R  # in the frame of the target but for its place
+    origin = (
+        T_lrf_target.translation[:, None] @ R
+    )  # in the frame of the target but for its place
     rays = polar_to_points(1.0, setup.bearings())
     turned = rays @ R
     fits = []

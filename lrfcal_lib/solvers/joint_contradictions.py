@@ -96,6 +96,13 @@ def refuse_contradiction(obs: JointObservations, state: JointState, most: float)
         )
 
 
+def face_miss(state: JointState, data: JointData) -> float:
+    """By how much a state puts the scanned points off their boards, metres (median)."""
+    boards = state.boards[:, None]
+    heights = np.abs(np.vecdot(face_points(state, data) - boards[..., 3], boards[..., 2]))
+    return float(np.median(medians(heights, data.face["used"])))
+
+
 def without_contradictions(obs, state, data):
     """Leave out images that put the board far off where it was scanned, and placements of which
     none is left.

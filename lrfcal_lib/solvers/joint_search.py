@@ -16,7 +16,7 @@ from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_contradictions import (
     LARGEST_SHARE,
-    face_misses,
+    face_miss,
     left_out_share,
     refuse_contradiction,
     without_contradictions,
@@ -101,8 +101,7 @@ def agreeing_start(obs, state, data, unknowns):
 
     The better one of both attempts, a Start: what still contradicts may have led the rest astray.
     """
-    rows = np.arange(len(state.boards))
-    miss = float(np.median(face_misses(state, data, state.boards, rows)))
+    miss = face_miss(state, data)
     attempts = []
     for _ in range(2):
         kept, fitting, left_out = without_contradictions(obs, state, data)

@@ -27,14 +27,16 @@ VIEWS = 24  # a camera; closed forms do not get much better with more
 def start_states(obs: JointObservations) -> Iterator[list[JointState]]:
     """Start values to choose from, made one by one: each with those of the cameras' other minima.
 
-    From the stated platform, then from an axis along x through the mirror; with cameras from the
-    planes of whole sweeps. Raises DegenerateGeometry when no placement gives the pose of a board.
+    From the stated platform, then from an axis along x through the mirror, which may turn
+    backwards; with cameras from the planes of whole sweeps. Raises DegenerateGeometry when no
+    placement gives the pose of a board.
     """
     if len(obs.face_range) == 0:
         raise DegenerateGeometry(
             "no ranges on the boards' faces: a start value needs them; give one as start="
         )
-    heads = [RigidTransform.identity()]
+    backwards = Rotation.from_rotvec([0.0, 0.0, np.pi])
+    heads = [RigidTransform.identity(), RigidTransform.from_rotation(backwards)]
     if obs.T_head_lrf is not None:
         heads.insert(0, obs.T_head_lrf)
     possible = False

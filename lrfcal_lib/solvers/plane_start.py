@@ -76,9 +76,12 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
 
     # more placements than a closed form uses; half of them may be wrong, or all but one right
     squares = np.sort(_squares(candidates, triangles, sets), axis=1)
-    judging = max(p // 2 + 2, FEWEST_LINES if flat else FEWEST_PLANES)
-    order = np.argsort(squares[:, :judging].mean(axis=1))
-    best = candidates[np.union1d(order[:4], _apart(candidates, order))]
+    first = []
+    half = p // 2 + 2
+    for count in {half, max(half, FEWEST_LINES if flat else FEWEST_PLANES)}:
+        order = np.argsort(squares[:, :count].mean(axis=1))
+        first += [*order[:4], *_apart(candidates, order)]
+    best = candidates[np.unique(first)]
 
     def evaluate(pose):
         return plane_block(pose, triangles / ROUGH_SIGMA, sets.boards, None, sets.number)

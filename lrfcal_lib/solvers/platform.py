@@ -219,13 +219,17 @@ def _start_board(edges, face):
         raise DegenerateGeometry("fewer than two points on either edge")
     point, x, _ = fit_line(edges[0])
     if len(edges) == 2:
-        middle, second, _ = fit_line(edges[1])
+        point2, second, _ = fit_line(edges[1])
         z = np.cross(x, second)
+        cosine = x @ second
+        between = point2 - point
         if np.linalg.norm(z) < np.sin(np.radians(30)):
             raise DegenerateGeometry(
                 "the two edges are nearly parallel: edges 1 and 2 must be perpendicular"
             )
-        point = point + x * ((middle - point) @ x)  # about where edge 2 meets edge 1
+        # the origin is where edge 1 comes nearest to edge 2
+        along = between @ x - cosine * (between @ second)
+        point = point + x * along / (1 - cosine**2)
     elif len(face) >= 3:
         normal = geometry.fit_plane(face)[0]
         z = normal - x * (x @ normal)
