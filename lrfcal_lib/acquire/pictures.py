@@ -3,7 +3,6 @@
 import io
 
 import cv2
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
@@ -14,7 +13,8 @@ from lrfcal_lib.session.read import Sweep
 
 WIDTH = 400  # of a picture, pixels
 REACHES = np.array([2.0, 4.0, 8.0, 12.0, 20.0, 40.0, 80.0])  # of the top view, metres
-SIZE = {"figsize": (4, 3), "dpi": 100}
+# whatever layout a notebook has set for its own figures
+PLAIN = {"figsize": (4, 3), "dpi": 100, "layout": "none"}
 NEAR_IS_BRIGHT = "viridis_r"
 
 
@@ -32,7 +32,7 @@ def scan_picture(
     field_of_view
         First and last bearing, radians.
     """
-    figure = Figure(**SIZE)
+    figure = Figure(**PLAIN)
     ax = figure.add_axes((0.1, 0.1, 0.8, 0.85), projection="polar")
     ax.plot(bearings, ranges, ".", color=COLORS["lrf"], markersize=3)
     known = np.ravel(ranges)[np.isfinite(ranges)]
@@ -58,15 +58,15 @@ def sweep_picture(
     pitch
         Its ends, radians.
     """
-    figure = Figure(**SIZE)
+    figure = Figure(**PLAIN)
     ax = figure.add_axes((0.17, 0.17, 0.81, 0.79))
     if len(rows) > 1:
         known = np.array(list(rows))
         sweep = Sweep(
             0, np.array(list(rows.values())), bearings, known, np.zeros(len(known))
         )
-        with matplotlib.rc_context({"image.cmap": NEAR_IS_BRIGHT}):
-            range_image(ax, sweep, limits=(None, None))
+        range_image(ax, sweep, limits=(None, None))
+        ax.collections[0].set_cmap(NEAR_IS_BRIGHT)
     ax.set(ylim=np.degrees(np.sort(pitch)), aspect="auto")
     return _png(figure)
 
