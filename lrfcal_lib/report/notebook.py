@@ -268,7 +268,7 @@ def verdict(title: str, sentences: Sequence[str], record: dict | None = None) ->
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 
-def asked(possible: object, why: str, *, rest: bool = False) -> bool:
+def asked(possible: object, why: str) -> bool:
     """Whether a question can be put to a session; prints why not.
 
     Parameters
@@ -276,11 +276,7 @@ def asked(possible: object, why: str, *, rest: bool = False) -> bool:
     possible
     why
         What the session does not have.
-    rest
-        As of :func:`needs`.
     """
-    if rest:
-        return needs(possible, why, rest=True)
     if not possible:
         print(f"not asked: {why}")
     return bool(possible)
