@@ -64,6 +64,21 @@ def shelf(s):
     return ranges
 
 
+def edge_on(s):
+    """Returns from a surface that is seen along itself."""
+    flat = np.abs(np.degrees(s.sweep.bearings)[None] - 70) < 0.6
+    ranges = np.full(s.on.shape, np.nan)
+    depth = 1.0 + 0.25 * np.random.default_rng(0).random(s.on.shape) ** 0.5
+    ranges[40:80] = np.where(flat, depth, np.nan)[40:80]
+    return np.sort(ranges, axis=0)
+
+
+def patchy(s):
+    return np.where(
+        np.random.default_rng(1).random(s.on.shape) < 0.75, np.nan, s.sweep.ranges
+    )
+
+
 MISSING = {
     "no return in 161 scan lines": (scene, lambda s: np.full_like(s.sweep.ranges, np.nan)),
     r"no flat surface of the board's size; seen: .* m2": (
@@ -72,6 +87,8 @@ MISSING = {
     ),
     "seen: no flat": (scene, lambda s: np.random.default_rng(0).uniform(1, 90, s.on.shape)),
     "on 1 of 161 scan lines": (noisy_triangle, lambda s: np.where(s.on, np.nan, shelf(s))),
+    "seen along itself": (lambda: noisy_triangle(wall=None), edge_on),
+    "filled to 2[0-9] %": (lambda: noisy_triangle(wall=None), patchy),
     r"seen: 0\.5\d m2": (
         lambda: replace(scene(wall=None), board=TRIANGLE),
         lambda s: s.sweep.ranges,

@@ -52,7 +52,10 @@ def test_cameras_open_as_any_stream_and_show_the_place(rig):
 
 
 def test_a_setup_that_is_not_there():
-    with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, room_lms221, sim_quick, practice"):
+    with pytest.raises(
+        ValueError,
+        match="no set-up 'x'; there are sim_lms221, room_lms221, sim_quick, practice",
+    ):
         main("x")
 
 

@@ -73,7 +73,9 @@ def test_a_repeated_placement_is_seen_while_recording(folder):
     session = open_session(folder)
     bad = [light for light in check_placement(session, 4) if light.name == "recording"]
     assert {light.state for light in bad} == {"bad"}
-    assert "the same to the last digit" in bad[-1].text and "are identical to" in bad[0].text
+    assert (
+        "the same to the last digit" in bad[-1].text and "are identical to" in bad[0].text
+    )
     assert "recording" not in [light.name for light in check_placement(session, 1)]
 
 

@@ -77,7 +77,8 @@ def test_a_known_error_moves_the_estimate_as_the_covariance_says(mount):
     ]
     columns = known.columns(f"{name}_")
     predicted = np.sqrt(np.diag(told.lens))[columns]
-    large = predicted > 0.03 * known.solution.sigma[columns]
+    # less moves by as little as two minima differ
+    large = predicted > 0.035 * known.solution.sigma[columns]
     assert large.any()
     np.testing.assert_allclose(np.abs(change[large]), predicted[large], rtol=0.15)
     change = (moved.residuals("view") - known.residuals("view"))[

@@ -41,6 +41,7 @@ SAMPLE = 1500  # points that it looks at
 REFINE_ROUNDS = 3
 # that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
 FEWEST_LINES = 4
+LEAST_FILL = 0.5  # of a board's cells in their hull
 LEAST_LENGTH = 0.3  # of a scan line on a board, in units of the root of its least area
 
 
@@ -178,9 +179,13 @@ def planar_surface(
             fits = limits.hold(area, length) and lines >= min(FEWEST_LINES, len(ranges))
             if upright is not None:
                 fits = LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest
+            fault = f" on {lines} of {len(ranges)} scan lines"
+            if fits:
+                fault = _fault(part, points, sweep.pitch, T_head_lrf)
+                fits = upright is not None or not fault
             if not fits:
                 size = f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m"
-                rejected.append(f"{size} on {lines} of {len(ranges)} scan lines")
+                rejected.append(size + fault)
             elif reach < best_reach:
                 best = part
                 best_reach = reach
@@ -321,3 +326,21 @@ def _size_limits(board, grown):
         area = np.prod(sides)
         return Limits(0.3 * area, 4 * area, 2.5 * np.linalg.norm(sides))
     return ANY_BOARD
+
+
+def _fault(surface, points, pitch, T_head_lrf):
+    """Why a surface of the board's size is no board: seen along itself, patchy; or ''.
+
+    A pitch in radians where degrees are expected flattens boards into such surfaces.
+    """
+    cells = np.argwhere(surface.mask)
+    rays = points[surface.mask] - tilt(T_head_lrf.translation, pitch[cells[:, 0]])
+    cosine = np.abs(rays @ surface.normal) / np.linalg.norm(rays, axis=1)
+    if np.median(cosine) * STEEPEST < 1:
+        return " seen along itself"
+    hull = cv2.convexHull(cells[:, ::-1].astype(np.int32))
+    whole = cv2.fillConvexPoly(np.zeros(surface.mask.shape, np.uint8), hull, 1)
+    fill = len(cells) / whole.sum()
+    if fill < LEAST_FILL:
+        return f" filled to {100 * fill:.0f} %"
+    return ""
