@@ -17,7 +17,7 @@ from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import LrfInfo, from_json, plain
 
-SCHEMA = 2
+SCHEMA = 3
 KIND = "lrfcal calibration"
 AGAIN = "calibrate its session again"
 FORMULAS = {
