@@ -66,9 +66,9 @@ def shelf(s):
 
 def edge_on(s):
     """Returns from a surface that is seen along itself."""
-    flat = np.abs(np.degrees(s.sweep.bearings)[None] - 70) < 0.6
+    flat = np.abs(np.degrees(s.sweep.bearings)[None] - 70) < 1.0
     ranges = np.full(s.on.shape, np.nan)
-    depth = 1.0 + 0.25 * np.random.default_rng(0).random(s.on.shape) ** 0.5
+    depth = 1.0 + 0.5 * np.random.default_rng(0).random(s.on.shape) ** 0.5
     ranges[40:80] = np.where(flat, depth, np.nan)[40:80]
     return np.sort(ranges, axis=0)
 
