@@ -13,7 +13,8 @@ from lrfcal_lib.calibrate.cloud import write_ply
 from lrfcal_lib.evaluate.export import write_calibration
 from lrfcal_lib.measure.cloud_files import write_clouds, write_pcd
 from lrfcal_lib.model.board import triangle_board
-from lrfcal_lib.session import cache, workers
+from lrfcal_lib.report import many
+from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.write import SessionWriter
 
@@ -110,7 +111,7 @@ def test_calibrate_on_a_full_disk_says_so(
     calibrate, quick, tmp_path, little_space, monkeypatch
 ):
     # processes that another test has left running would know nothing of the little space
-    monkeypatch.setattr(workers, "side_by_side", nullcontext)
+    monkeypatch.setattr(many, "side_by_side", nullcontext)
     with little_space(LITTLE):
         code, _, complaint = calibrate(QUICK)
     assert (

@@ -1,6 +1,7 @@
 """Loops are shared in order, whoever works, and no worker outlives the process that it works for."""
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -10,7 +11,9 @@ from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 from shared import ROOT, until
 
 from lrfcal_lib.session import workers
@@ -37,6 +40,12 @@ def test_a_loop_is_shared_in_order(two, tmp_path):
             [1, 2, 3],
         ]
         assert spread(abs, []) == [] and spread(abs, [-1]) == [1]
+
+
+def test_poses_travel_to_the_last_digit():
+    poses = RigidTransform.from_exp_coords(np.random.default_rng(0).normal(size=(500, 6)))
+    there = pickle.loads(pickle.dumps(poses * poses[::-1]))
+    np.testing.assert_array_equal(there.as_matrix(), (poses * poses[::-1]).as_matrix())
 
 
 def process_of(item, here):

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
@@ -74,8 +75,9 @@ class Suggestion:
         """What to record next and what it brings."""
         distance, bearing, elevation, turn, lean = self.place
         words = (
-            f"Record next: board {distance:.1f} m ahead, {bearing:+.0f} deg to the left, "
-            f"{elevation:+.0f} deg up, turned by {turn:.0f} deg in its plane, "
+            f"Record next: board {distance:.1f} m ahead, {abs(bearing):.0f} deg to the "
+            f"{by_sign(bearing, 'left', 'right')}, {abs(elevation):.0f} deg "
+            f"{by_sign(elevation, 'up', 'down')}, turned by {turn:.0f} deg in its plane, "
             f"{list(LEANS)[int(lean)]}"
         )
         if len(self.pitches):

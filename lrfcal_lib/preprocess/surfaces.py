@@ -158,10 +158,7 @@ def planar_surface(
         raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
     p_lrf = polar_to_points(ranges, sweep.bearings)
     points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)  # (L, B, 3), metres
-    upright = None
-    if np.ptp(sweep.pitch) <= SAME_PITCH:
-        across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
-        upright = tilt(across_scan, float(sweep.pitch[0]))
+    upright = _upright(sweep, T_head_lrf)
     rejected = []
     best = None
     best_reach = np.inf
@@ -193,6 +190,14 @@ def planar_surface(
         words = "; ".join(rejected[:4]) or "no flat surface"
         raise BoardNotFound(f"no flat surface of the board's size; seen: {words}")
     return _grown(best, points)
+
+
+def _upright(sweep, T_head_lrf):
+    """The normal at right angles to the scan plane, where all scan lines have one pitch."""
+    if np.ptp(sweep.pitch) > SAME_PITCH:
+        return None
+    across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
+    return tilt(across_scan, float(sweep.pitch[0]))
 
 
 def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:

@@ -1,5 +1,6 @@
 """Loops that several workers share: an executor that the caller names, or forked processes."""
 
+import copyreg
 import multiprocessing
 import os
 import pickle
@@ -11,9 +12,19 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial
 
+from scipy.spatial.transform import RigidTransform
+
 _executor: ContextVar[Executor | None] = ContextVar("executor", default=None)
 _cores: ContextVar[int] = ContextVar("cores", default=1)  # for processes of our own
 _loop: tuple = ()  # of a forked process, which finds it in its memory
+
+
+def _exactly(transform):
+    """How a pose travels: scipy makes it rigid anew on arrival, which moves its last digit."""
+    return partial(RigidTransform, normalize=False), (transform.as_matrix(),)
+
+
+copyreg.pickle(RigidTransform, _exactly)
 
 
 @contextmanager
