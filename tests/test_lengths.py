@@ -90,10 +90,6 @@ def test_derivatives_of_an_edge_are_those_of_the_edge_of_a_moved_camera(quick, s
     rig = scene.rig
     number = session.scene_placements[0]
     views = lengths.views_of(session, rig, number)
-    pitches = [
-        float(rig.corrections.pitch(number, session.image_records[v.number].pitch))
-        for v in views
-    ]
     step = 1e-4
     name = views[0].camera
     surfaces = (scene.planes, scene.of_point)
@@ -102,7 +98,7 @@ def test_derivatives_of_an_edge_are_those_of_the_edge_of_a_moved_camera(quick, s
         replace(v, T_camera_platform=shift * v.T_camera_platform) if v.camera == name else v
         for v in views
     ]
-    after = edges_of(scene.cloud, surfaces, moved, pitches)
+    after = edges_of(scene.cloud, surfaces, moved)
     column = list(rig.uncertainty.names).index(f"{name}_tx")
     changes = []
     of_camera = {view.number for view in views if view.camera == name}

@@ -32,7 +32,6 @@ def edges_of(
     cloud: Cloud,
     surfaces: tuple[list[Feature], np.ndarray],
     views: Sequence[View],
-    pitches: Sequence[float],
 ) -> list[Feature]:
     """All straight edges that images show at the flat surfaces of a cloud.
 
@@ -44,8 +43,6 @@ def edges_of(
     surfaces : tuple
         What :func:`lrfcal_lib.measure.surfaces.planes_of` found.
     views : sequence of View
-    pitches : sequence of float
-        Of the head at each view, radians.
 
     Returns
     -------
@@ -53,7 +50,7 @@ def edges_of(
     """
     planes, of_point = surfaces
     edges = []
-    for view, pitch in zip(views, pitches, strict=True):
+    for view in views:
         rows = np.flatnonzero(cloud.image == view.number)
         p_camera = view.T_camera_platform.apply(cloud.points[rows])
         uv = pinhole(p_camera, view.model)
@@ -67,7 +64,7 @@ def edges_of(
                     lines.append(_refined(view, ends, segments))
                     shown.append(planes[number])
         if shown:
-            edges += _on_planes(shown, lines, view, pitch)
+            edges += _on_planes(shown, lines, view)
     return edges
 
 
@@ -130,7 +127,7 @@ def _surface_at(ends, uv, depth, plane):
 
 
 def _on_planes(
-    planes: Sequence[Feature], lines: Sequence[ImageEdge], view: View, pitch: float
+    planes: Sequence[Feature], lines: Sequence[ImageEdge], view: View
 ) -> list[Feature]:
     """The edges of a scene that k lines of an image show, each on its plane."""
     rig = planes[0].rig
@@ -162,7 +159,7 @@ def _on_planes(
     by_noise = _of_line(np.concatenate(by, axis=-1), length)
 
     beams = beams_to(ends, rig.T_head_lrf)
-    by_camera = beams_moved(rig, beams, view.camera, pitch)
+    by_camera = beams_moved(rig, beams, view.camera, view.pitch)
     by_shared = beams_moved(rig, beams)
     by_shared -= way[..., None] * (sight[..., None, :] @ by_camera)
     by_shared[..., -1] = lifted

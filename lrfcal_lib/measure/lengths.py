@@ -9,9 +9,8 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud, join
-from lrfcal_lib.calibrate.clouds import views_of
+from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
 from lrfcal_lib.calibrate.painting import View
-from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.judge.uncertainty import chain_of, uncertainty_of
@@ -100,7 +99,7 @@ def nearest_edge(
 
 
 def features_of(
-    cloud: Cloud, rig: CalibratedRig, views: Sequence[View], pitches: Sequence[float]
+    cloud: Cloud, rig: CalibratedRig, views: Sequence[View]
 ) -> SceneFeatures:
     """All planes and edges of the cloud of a station.
 
@@ -110,21 +109,19 @@ def features_of(
         Coloured from these views.
     rig : CalibratedRig
     views : sequence of View
-    pitches : sequence of float
-        Of the head at each view, radians.
 
     Returns
     -------
     SceneFeatures
     """
     planes, of_point = planes_of(cloud, rig)
-    edges = edges_of(cloud, (planes, of_point), views, pitches)
+    edges = edges_of(cloud, (planes, of_point), views)
     return SceneFeatures(cloud, rig, planes, of_point, edges)
 
 
 @cached
 def features_of_station(
-    session: Session, rig: CalibratedRig, number: int, cloud: Cloud | None = None
+    session: Session, rig: CalibratedRig, number: int
 ) -> SceneFeatures:
     """All planes and edges that a station of a session shows.
 
@@ -134,29 +131,15 @@ def features_of_station(
     rig : CalibratedRig
     number : int
         Placement.
-    cloud : Cloud, optional
-        Of it, platform frame, if it is there already.
 
     Returns
     -------
     SceneFeatures
     """
     views = views_of(session, rig, number)
-    recorded = [session.image_records[view.number].pitch for view in views]
-    pitches = [float(rig.corrections.pitch(number, pitch)) for pitch in recorded]
-    if cloud is None:
-        sweep, _ = without_closing(session.sweep(number))
-        cloud = join(
-            reconstruct(
-                sweep,
-                views,
-                rig.T_head_lrf,
-                rig.corrections,
-                lrf=session.lrf,
-                continuous=session.continuous,
-            )
-        )
-    return features_of(cloud, rig, views, pitches)
+    sweep, _ = without_closing(session.sweep(number))
+    cloud = join(sweep_blocks(session, rig, sweep, views))
+    return features_of(cloud, rig, views)
 
 
 def measure(

@@ -8,14 +8,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from lrfcal_lib.calibrate.cloud import Cloud, join
+from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.measure.features import with_sigma
-from lrfcal_lib.measure.scene import Station, colored_blocks, write_scene
+from lrfcal_lib.measure.scene import station_cloud, write_scene
 from lrfcal_lib.measure.stations import Joined, advice, join_stations, joined_cloud
-from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.report.reconstruct import open_scene
-from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.write import whole
 
 NOT_ALL = 3  # exit code where something is left out
@@ -64,19 +61,19 @@ def merge_session(
         a file that cannot be written.
     """
     scene = open_scene(path, calibration, out, untrusted)
-    clouds = {n: plain_cloud(scene.session, scene.rig, n) for n in scene.stations}
+    clouds = {n: station_cloud(scene.session, scene.rig, n) for n in scene.stations}
     joined = joined_stations(clouds, scene.rig, path)
     print(FRAME.format(min(joined.T_world_station)))
     for table in (stations_table(joined), pairs_table(joined)):
         print(table.to_string(index=False))
     print(*sentences(joined), sep="\n", flush=True)
-    poses = joined.T_world_station
-    files = write_scene(scene.folder, scene.session, scene.rig, poses, scene.about)
+    asked = (scene.folder, scene.session, scene.rig)
+    files = write_scene(*asked, joined, scene.about, clouds=clouds)
     page = scene.folder / "stations.html"
     with whole(page) as draft:
         draft.write_text(stations_page(joined, joined_cloud(clouds, joined), scene.about))
     print("written:", ", ".join(map(str, [*files, page])))
-    return 0 if len(poses) == len(clouds) else NOT_ALL
+    return 0 if len(joined.T_world_station) == len(clouds) else NOT_ALL
 
 
 def joined_stations(
@@ -88,13 +85,6 @@ def joined_stations(
         reasons = "; ".join(map(str, joined.problems))
         raise ValueError(f"{path}: no two stations can be joined: {reasons}")
     return joined
-
-
-def plain_cloud(session: Session, rig: CalibratedRig, number: int) -> Cloud:
-    """A station without colours, with sigma."""
-    sweep, _ = without_closing(session.sweep(number))
-    blocks = colored_blocks(session, rig, Station(number, sweep, []))
-    return join(with_sigma(block, rig) for block in blocks)
 
 
 def stations_table(joined: Joined) -> pd.DataFrame:
