@@ -283,7 +283,7 @@ def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
 
 
 def _steps(first, second, shared):
-    """Increments from the first rig to the second by name, a Series: radians, metres, a fraction."""
+    """Increments from the first rig to the second by name: radians, metres, a fraction."""
     by_axis = _increments(first.T_head_lrf, second.T_head_lrf)[AXIS_COLUMNS]
     steps = dict(zip(AXIS_NAMES, by_axis, strict=True))
     for name in shared:
