@@ -5,11 +5,13 @@ line and the eye of the camera span a plane of sight, which meets the plane of t
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
@@ -50,15 +52,19 @@ def edges_of(
     """
     planes, of_point = surfaces
     edges = []
-    for view in views:
+    with ThreadPoolExecutor() as pool:
+        segments_of = list(pool.map(_segments, views))
+    for view, segments in zip(views, segments_of, strict=True):
         rows = np.flatnonzero(cloud.image == view.number)
         p_camera = view.T_camera_platform.apply(cloud.points[rows])
         uv = pinhole(p_camera, view.model)
-        segments = _segments(view)
+        tree = KDTree(uv)
         shown = []
         lines = []
         for ends in segments:
-            number = _surface_at(ends, uv, p_camera[:, 2], of_point[rows])
+            reach = np.linalg.norm(ends[1] - ends[0]) / 2 + BESIDE_PX[1]
+            near = tree.query_ball_point(ends.mean(axis=0), reach, return_sorted=True)
+            number = _surface_at(ends, uv[near], p_camera[near, 2], of_point[rows[near]])
             if number >= 0:
                 with suppress(EdgeNotSeen):
                     lines.append(_refined(view, ends, segments))

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud, join
@@ -32,6 +32,9 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 REACH = (
     0.1  # metres from a picked place to points of its plane, and from a click to its edge
@@ -144,9 +147,9 @@ def features_of_station(
 
 def measure(
     scenes: Mapping[int, SceneFeatures],
-    picks: pd.DataFrame,
+    picks: "pd.DataFrame",
     poses: Mapping[int, RigidTransform] | None = None,
-) -> pd.DataFrame:
+) -> "pd.DataFrame":
     """Lengths between pairs of picked places.
 
     A length that several stations show is one: the mean of theirs, each weighted by how well it
@@ -168,6 +171,8 @@ def measure(
         The same, with length_m, sigma_m, the ends of the 90 % interval, low_m and high_m, the
         stations, and problem: why there is no length, NaN then, or ''.
     """
+    import pandas as pd  # a third of a second
+
     poses = poses or dict.fromkeys(scenes, IN_PLACE)
     rows = []
     for row in picks.to_dict("records"):
@@ -237,7 +242,7 @@ def _shown(scenes, poses, kind, place) -> dict[int, Feature]:
     return shown
 
 
-def read_picks(path: str | PathLike) -> pd.DataFrame:
+def read_picks(path: str | PathLike) -> "pd.DataFrame":
     """Read the list that ``scene.html`` saves.
 
     Parameters
@@ -254,6 +259,8 @@ def read_picks(path: str | PathLike) -> pd.DataFrame:
     ValueError
         If the file is no such list; it names file, row and remedy.
     """
+    import pandas as pd
+
     remedy = "save it from scene.html again"
     try:
         table = pd.read_csv(path)

@@ -91,19 +91,12 @@ def stations_table(joined: Joined) -> pd.DataFrame:
     """Where the stations stood in the joined frame, and how well that is known."""
     rows = []
     for number, T in joined.T_world_station.items():
-        x, y, z = T.translation.round(3)
         variance = np.diag(joined.covariance_of(number))
-        row = {
-            "station": number,
-            "x_m": x,
-            "y_m": y,
-            "z_m": z,
-            "yaw_deg": T.rotation.as_euler("ZYX", degrees=True)[0].round(2),
-            "sigma_mm": 1000 * np.sqrt(variance[3:].sum()).round(4),
-            "sigma_deg": np.degrees(np.sqrt(variance[:3].sum())).round(3),
-        }
-        rows.append(row)
-    return pd.DataFrame(rows)
+        yaw = T.rotation.as_euler("ZYX", degrees=True)[0]
+        sigma = np.sqrt([variance[3:].sum(), variance[:3].sum()]) * [1000, np.degrees(1)]
+        rows.append([number, *T.translation, yaw, *sigma])
+    names = ["station", "x_m", "y_m", "z_m", "yaw_deg", "sigma_mm", "sigma_deg"]
+    return pd.DataFrame(rows, columns=names).round(3)
 
 
 def pairs_table(joined: Joined) -> pd.DataFrame:
@@ -111,15 +104,12 @@ def pairs_table(joined: Joined) -> pd.DataFrame:
     rows = []
     for pair in joined.pairs:
         turn, shift = joined.miss(pair)
-        row = {
-            "stations": f"{pair.first} and {pair.second}",
-            "overlap_percent": round(100 * pair.overlap),
-            "surfaces_apart_mm": round(1000 * pair.rms, 1),
-            "miss_mm": round(1000 * shift, 1),
-            "miss_deg": round(np.degrees(turn), 3),
-        }
-        rows.append(row)
-    return pd.DataFrame(rows)
+        names = f"{pair.first} and {pair.second}"
+        millimetres = 1000 * np.array([pair.rms, shift])
+        overlap = round(100 * pair.overlap)
+        rows.append([names, overlap, *millimetres, np.degrees(turn)])
+    names = ["stations", "overlap_percent", "surfaces_apart_mm", "miss_mm", "miss_deg"]
+    return pd.DataFrame(rows, columns=names).round(3)
 
 
 def sentences(joined: Joined) -> list[str]:
@@ -176,25 +166,18 @@ def stations_figure(joined: Joined, cloud: Cloud) -> Figure:
     low, high = SLICE
     height = cloud.points[:, 2]
     x, y, _ = cloud.points[(height > low) & (height < high)][::3].T
-    label = f"points {-low:.1f} m below to {high:.1f} m above the platform"
-    plan.plot(x, y, ".", color="0.6", ms=1, label=label)
+    plan.plot(x, y, ".", color="0.6", ms=1)
+    poses = joined.T_world_station
     for pair in joined.pairs:
-        ends = [joined.T_world_station[n].translation for n in (pair.first, pair.second)]
-        plan.plot(*np.transpose(ends)[:2], "-", color="C0", lw=1.2)
-    places = np.array([T.translation for T in joined.T_world_station.values()])
-    ahead = np.array(
-        [T.rotation.apply([0, ARROW, 0]) for T in joined.T_world_station.values()]
+        ends = [poses[pair.first].translation, poses[pair.second].translation]
+        plan.plot(*np.transpose(ends)[:2], "C0-", lw=1.2)
+    for number, T in poses.items():
+        place, ahead = T.apply([[0, 0, 0], [0, ARROW, 0]])[:, :2]
+        arrow = {"arrowstyle": "->", "color": "C3"}
+        plan.annotate(f"{number}", ahead, place, color="C3", size=13, arrowprops=arrow)
+    plan.set(aspect="equal", xlabel="x, m", ylabel="y, m")
+    plan.set_title(
+        f"Stations, where they look, and the pairs used; points {-low:.1f} m below to {high:.1f} m "
+        "above the platform"
     )
-    plan.quiver(
-        *places.T[:2], *ahead.T[:2], color="C3", angles="xy", scale_units="xy", scale=1
-    )
-    words = "stations, and where they look at pitch 0"
-    plan.plot(*places.T[:2], "o", color="C3", ms=4, label=words)
-    for number, beside in zip(joined.T_world_station, places - 0.4 * ahead, strict=True):
-        plan.annotate(
-            f"{number}", beside[:2], color="C3", fontsize=13, ha="center", va="center"
-        )
-    plan.plot([], [], "-", color="C0", label="pairs used")
-    plan.set(aspect="equal", xlabel="x, m", ylabel="y, m", title="Stations from above")
-    figure.legend(loc="outside upper center", ncols=3, markerscale=2, fontsize=9)
     return figure
