@@ -195,6 +195,22 @@ def test_a_length_of_two_stations_is_one_and_their_shared_errors_stay(scene):
     assert len(apart.stations[0].split()) == 1
 
 
+def test_another_edge_that_crosses_there_is_not_taken_for_the_same(scene):
+    i, j = parallel(scene.edges)
+    ends = [("edge", scene.edges[k].centre) for k in (i, j)]
+    row = {"name": "it"} | pick(*ends[0], 1) | pick(*ends[1], 2)
+    other = seen_from(scene, RigidTransform.identity(), 0.0)
+    edge = other.edges[i]
+    off, across = np.linalg.svd(edge.axis[None])[2][1:]
+    same = replace(edge, centre=edge.centre + 0.003 * off, ends=edge.ends + 0.003 * off)
+    ends = edge.centre + 0.001 * off + np.outer([-0.1, 0.1], across)
+    nearer = replace(edge, axis=across, ends=ends)
+    other = replace(other, edges=[nearer, same, other.edges[j]])
+    poses = dict.fromkeys((1, 9), RigidTransform.identity())
+    both = lengths.measure({1: scene, 9: other}, pd.DataFrame([row]), poses)
+    assert both.problem[0] == "" and both.stations[0] == "1 9"
+
+
 def test_places_that_no_station_shows_together_are_named(scene):
     i, j = parallel(scene.planes)
     ends = [("plane", scene.cloud.points[scene.of_point == k][0]) for k in (i, j)]

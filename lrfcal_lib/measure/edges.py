@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,8 +28,10 @@ CLOSE_PX = 5.0  # between two lines that pull each other
 PULLED_PX = 0.4  # by how much: edges of a printed rim of 2 px
 BESIDE_PX = (2.0, 40.0)  # from the edge: where the points of its surface lie
 FEWEST = 30  # points that make a plane beside an edge
+LEAST_OWN = 10  # of them for which the image counts most
 LEAST_SHARE = 0.6  # of the points beside an edge that lie on one plane
 STEP = 0.03  # metres between two surfaces at an edge: there the nearer one ends
+PLANES_APART = 0.005  # the same of two planes, which are better known
 
 
 def edges_of(
@@ -55,16 +59,25 @@ def edges_of(
     with ThreadPoolExecutor() as pool:
         segments_of = list(pool.map(_segments, views))
     for view, segments in zip(views, segments_of, strict=True):
-        rows = np.flatnonzero(cloud.image == view.number)
+        # what one image of a camera sees, all of them see that have it in view
+        of_camera = [other.number for other in views if other.camera == view.camera]
+        rows = np.flatnonzero(np.isin(cloud.image, of_camera))
         p_camera = view.T_camera_platform.apply(cloud.points[rows])
         uv = pinhole(p_camera, view.model)
+        size = np.array([view.model.width, view.model.height])
+        inside = np.flatnonzero((np.abs(uv - size / 2) < size).all(axis=1))
+        rows = rows[inside]
+        uv = uv[inside]
+        beside = _Beside(uv, p_camera[inside, 2], of_point[rows], cloud.image[rows])
         tree = KDTree(uv)
+        depths = partial(_depth, view, planes)
         shown = []
         lines = []
         for ends in segments:
             reach = np.linalg.norm(ends[1] - ends[0]) / 2 + BESIDE_PX[1]
-            near = tree.query_ball_point(ends.mean(axis=0), reach, return_sorted=True)
-            number = _surface_at(ends, uv[near], p_camera[near, 2], of_point[rows[near]])
+            near = tree.query_ball_point(ends.mean(axis=0), reach, return_sorted=False)
+            near = _Beside(*(column[near] for column in beside))
+            number = _surface_at(ends, near, depths, view.number)
             if number >= 0:
                 with suppress(EdgeNotSeen):
                     lines.append(_refined(view, ends, segments))
@@ -72,6 +85,17 @@ def edges_of(
         if shown:
             edges += _on_planes(shown, lines, view)
     return edges
+
+
+class _Beside(NamedTuple):
+    """Points that a camera sees, a row each: undistorted pixels of an image, depth, numbers of the
+    surface and of the image that counts most.
+    """
+
+    uv: np.ndarray
+    depth: np.ndarray
+    plane: np.ndarray
+    image: np.ndarray
 
 
 def _segments(view):
@@ -102,34 +126,53 @@ def _refined(view, ends, segments):
     return replace(line, covariance=covariance)
 
 
-def _surface_at(ends, uv, depth, plane):
+def _depth(view, planes, number, pixel):
+    """How deep in an image a plane is at an undistorted pixel (2,); inf behind it."""
+    plane = planes[number]
+    T = view.T_camera_platform
+    normal = T.rotation.apply(plane.axis)
+    ray = np.append(
+        (pixel - [view.model.cx, view.model.cy]) / [view.model.fx, view.model.fy], 1
+    )
+    depth = normal @ T.apply(plane.centre) / (normal @ ray)
+    return depth if depth > 0 else np.inf
+
+
+def _surface_at(ends, points, depths, image):
     """The number of the surface that ends at a segment (2, 2) of an image, or that it is on; -1
     for none.
 
-    Of the points that the image sees: undistorted pixels (n, 2), depth, number of the plane.
+    Of `points` about it; ``depths(number, pixel)`` are those of surfaces.
     """
     first, last = ends
     length = np.linalg.norm(last - first)
     along = (last - first) / length
-    s = (uv - first) @ along
-    t = (uv - first) @ [along[1], -along[0]]
+    s = (points.uv - first) @ along
+    t = (points.uv - first) @ [along[1], -along[0]]
     near, far = BESIDE_PX
     beside = (s > 0) & (s < length) & (np.abs(t) > near) & (np.abs(t) < far)
-    sides = []  # depth, points of the surface, its number
+    # depth, whether it is no flat surface, less the points of it, its number, points of the image
+    sides = []
     for side in (1.0, -1.0):
         rows = np.flatnonzero(beside & (side * t > 0))
         if len(rows) < FEWEST:
             continue
-        numbers, counts = np.unique(plane[rows], return_counts=True)
+        numbers, counts = np.unique(points.plane[rows], return_counts=True)
         most = np.argmax(counts)
         number = -1
-        if counts[most] > LEAST_SHARE * len(rows):
+        depth = np.median(points.depth[rows])
+        if counts[most] > LEAST_SHARE * len(rows) and numbers[most] >= 0:
             number = numbers[most]
-        sides.append((np.median(depth[rows]), counts[most], number))
+            depth = depths(number, (first + last) / 2)
+        own = np.sum(points.image[rows] == image)
+        sides.append((depth, number < 0, -counts[most], number, own))
     sides.sort()
-    if len(sides) == 2 and sides[1][0] - sides[0][0] < STEP:
-        sides.sort(key=lambda side: -side[1])
-    return sides[0][2] if sides else -1
+    step = STEP if any(side[1] for side in sides) else PLANES_APART
+    if len(sides) == 2 and sides[1][0] - sides[0][0] < step:
+        sides.sort(key=lambda side: side[1:])
+    if not sides or sides[0][-1] < LEAST_OWN:
+        return -1
+    return sides[0][3]
 
 
 def _on_planes(

@@ -69,19 +69,22 @@ class SceneFeatures:
     of_point: np.ndarray
     edges: list[Feature]
 
-    def at(self, kind: str, place: np.ndarray) -> tuple[Feature | None, float]:
-        """The feature of a kind that is nearest to a place (3,), platform frame, and how near its
-        points or the edge are, metres; None where there is no such feature.
+    def at(
+        self, kind: str, place: np.ndarray, axis: np.ndarray | None = None
+    ) -> tuple[Feature | None, float]:
+        """The feature of a kind that is nearest to a place (3,), platform frame, of those along an
+        axis (3,), and how near its points or the edge are, metres; None where there is none.
         """
         if kind == Kind.EDGE:
-            return nearest_edge(self.edges, place)
+            return nearest_edge([e for e in self.edges if e.lies_along(axis)], place)
         away = np.linalg.norm(self.cloud.points - place, axis=1)
         if kind == Kind.POINT:
             about = np.argsort(away)[:ABOUT]
             return fit_feature(self.cloud, about, self.rig, plane=False), away.min()
-        away[self.of_point < 0] = np.inf
+        fits = np.array([*(plane.lies_along(axis) for plane in self.planes), False])
+        away[~fits[self.of_point]] = np.inf
         nearest = int(np.argmin(away))
-        if not self.planes:
+        if not np.isfinite(away[nearest]):
             return None, np.inf
         return self.planes[self.of_point[nearest]], away[nearest]
 
@@ -101,9 +104,7 @@ def nearest_edge(
     return edges[nearest], float(away[nearest])
 
 
-def features_of(
-    cloud: Cloud, rig: CalibratedRig, views: Sequence[View]
-) -> SceneFeatures:
+def features_of(cloud: Cloud, rig: CalibratedRig, views: Sequence[View]) -> SceneFeatures:
     """All planes and edges of the cloud of a station.
 
     Parameters
@@ -123,9 +124,7 @@ def features_of(
 
 
 @cached
-def features_of_station(
-    session: Session, rig: CalibratedRig, number: int
-) -> SceneFeatures:
+def features_of_station(session: Session, rig: CalibratedRig, number: int) -> SceneFeatures:
     """All planes and edges that a station of a session shows.
 
     Parameters
@@ -234,8 +233,10 @@ def _shown(scenes, poses, kind, place) -> dict[int, Feature]:
     foot = poses[clicked].apply(feature.foot(poses[clicked].inv().apply(place)))
     shown = {clicked: feature}
     for number, scene in scenes.items():
-        there = poses[number].inv().apply(foot)
-        other, away = scene.at(kind, there)
+        T = poses[number].inv()
+        there = T.apply(foot)
+        axis = (T * poses[clicked]).rotation.apply(feature.axis)
+        other, away = scene.at(kind, there, axis)
         if number != clicked and away < REACH:
             if np.linalg.norm(other.foot(there) - there) < ON_IT:
                 shown[number] = other
