@@ -104,10 +104,10 @@ def pairs_table(joined: Joined) -> pd.DataFrame:
     rows = []
     for pair in joined.pairs:
         turn, shift = joined.miss(pair)
-        names = f"{pair.first} and {pair.second}"
+        both = f"{pair.first} and {pair.second}"
         millimetres = 1000 * np.array([pair.rms, shift])
         overlap = round(100 * pair.overlap)
-        rows.append([names, overlap, *millimetres, np.degrees(turn)])
+        rows.append([both, overlap, *millimetres, np.degrees(turn)])
     names = ["stations", "overlap_percent", "surfaces_apart_mm", "miss_mm", "miss_deg"]
     return pd.DataFrame(rows, columns=names).round(3)
 
