@@ -76,8 +76,9 @@ def edges_of(
         for ends in segments:
             reach = np.linalg.norm(ends[1] - ends[0]) / 2 + BESIDE_PX[1]
             near = tree.query_ball_point(ends.mean(axis=0), reach, return_sorted=False)
-            near = _Beside(*(column[near] for column in beside))
-            number = _surface_at(ends, near, depths, view.number)
+            near = np.array(near, int)
+            points = _Beside(*(column[near] for column in beside))
+            number = _surface_at(ends, points, depths, view.number)
             if number >= 0:
                 with suppress(EdgeNotSeen):
                     lines.append(_refined(view, ends, segments))
@@ -157,15 +158,15 @@ def _surface_at(ends, points, depths, image):
         rows = np.flatnonzero(beside & (side * t > 0))
         if len(rows) < FEWEST:
             continue
-        numbers, counts = np.unique(points.plane[rows], return_counts=True)
-        most = np.argmax(counts)
-        number = -1
-        depth = np.median(points.depth[rows])
-        if counts[most] > LEAST_SHARE * len(rows) and numbers[most] >= 0:
-            number = numbers[most]
+        counts = np.bincount(points.plane[rows] + 1)  # of none first
+        number = int(np.argmax(counts)) - 1
+        if number >= 0 and counts.max() > LEAST_SHARE * len(rows):
             depth = depths(number, (first + last) / 2)
+        else:
+            number = -1
+            depth = np.median(points.depth[rows])
         own = np.sum(points.image[rows] == image)
-        sides.append((depth, number < 0, -counts[most], number, own))
+        sides.append((depth, number < 0, -counts.max(), number, own))
     sides.sort()
     step = STEP if any(side[1] for side in sides) else PLANES_APART
     if len(sides) == 2 and sides[1][0] - sides[0][0] < step:
