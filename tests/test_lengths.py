@@ -224,7 +224,7 @@ def test_places_that_no_station_shows_together_are_named(scene):
 
 
 @pytest.mark.campaign
-def test_lengths_in_three_rooms_nobody_tuned_on(tmp_path):
+def test_lengths_in_rooms_nobody_tuned_on(tmp_path):
     """60 lengths are stated, each is measured once, from four joined stations of its room."""
     rig = load_calibration(calibrated(tmp_path))
     tables = []
@@ -241,7 +241,10 @@ def test_lengths_in_three_rooms_nobody_tuned_on(tmp_path):
     table = pd.concat(tables)
     found = table[table.problem == ""]
     error = (found.length_m - found.true_m).abs()
-    assert len(found) >= 45
+    assert len(found) >= 48
+    left_out = table[table.problem != ""]
+    reasons = "place [12]: no edge within 10 mm|no station shows both places"
+    assert left_out.problem.str.contains(reasons).all()
     assert error[found.kind_1 == "plane"].mean() < 0.0015
     assert error[found.kind_1 == "edge"].mean() < 0.004
     assert 0.83 < np.mean(error < lengths.NINETY * found.sigma_m) <= 0.96
