@@ -61,9 +61,8 @@ def planes_of(cloud: Cloud, rig: CalibratedRig) -> tuple[list[Feature], np.ndarr
 
 def _grown(points, normals, seed, facing):
     """Rows of the flat surface about a point (3,) with this normal (3,)."""
-    alike = normals @ facing > np.cos(ALIKE)
-    near = np.linalg.norm(points - seed, axis=1) < SEED
-    surface = np.flatnonzero(alike & near)
+    near = np.flatnonzero(np.linalg.norm(points - seed, axis=1) < SEED)
+    surface = near[normals[near] @ facing > np.cos(ALIKE)]
     with suppress(DegenerateGeometry):
         for _ in range(ROUNDS):
             if len(surface) < FEWEST / 2:
@@ -72,8 +71,8 @@ def _grown(points, normals, seed, facing):
             normal, offset, _ = fit_plane(inner)
             sigma = robust_sigma(inner @ normal - offset)
             miss = points @ normal - offset
-            alike = np.abs(normals @ normal) > np.cos(ALIKE)
-            near = np.flatnonzero(alike & (np.abs(miss) < TUKEY * sigma))
+            near = np.flatnonzero(np.abs(miss) < TUKEY * sigma)
+            near = near[np.abs(normals[near] @ normal) > np.cos(ALIKE)]
             with_seed = np.vstack([points[near], seed])
             before = len(surface)
             surface = near[_connected(with_seed, normal, miss[near], sigma)]
