@@ -299,7 +299,10 @@ def _add_rigs(verbs):
 
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument(
-        "setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221"
+        "setup",
+        nargs="?",
+        default="sim_quick",
+        help="practice (recorded in minutes), sim_quick (default) or sim_lms221",
     )
     emulate.add_argument(
         "--rig-file",

@@ -510,9 +510,8 @@ def _stated(rig, stack):
     if str(rig) in PRACTICE_RIGS:
         from lrfcal_lib.emulators.rig import emulated
 
-        devices, data = emulated(str(rig))
-        stack.enter_context(devices)
-        return rig_of(data(), Path(f"emulated {devices.setup.name}"))
+        devices = stack.enter_context(emulated(str(rig)))
+        return rig_of(devices.rig_file(), Path(f"emulated {rig}"))
     if not Path(rig).suffix and not Path(rig).exists():
         known = ", ".join(PRACTICE_RIGS)
         raise RigFileError(
