@@ -5,6 +5,7 @@ import sys
 
 FEW = 6  # placements, with fewer of which no error of the model shows
 INTERRUPTED = 130  # exit code after Ctrl-C
+SCENE = "as 'record --scene' recorded it"
 
 
 def run(args):
@@ -233,33 +234,39 @@ def _add_sessions(verbs):
     )
     compare.add_argument("--figure", metavar="PNG", help="also draw them")
 
-    words = "make coloured clouds of a scene with a calibration of its rig"
-    _add_scene(verbs.add_parser("reconstruct", help=words))
-    _add_scene(verbs.add_parser("merge", help="join the stations of a scene in one cloud"))
+    for name, words in (
+        ("reconstruct", "make coloured clouds of a scene with a calibration of its rig"),
+        ("merge", "join the stations of a scene in one cloud"),
+    ):
+        scenes = verbs.add_parser(name, help=words)
+        scenes.add_argument("sessions", nargs="+", metavar="session", help=SCENE)
+        scenes.add_argument(
+            "--out",
+            help="folder of its files (default reports/<session> under this folder)",
+        )
+        _add_calibration(scenes)
+        _add_scheduler(scenes)
 
 
-def _add_scene(
-    verb, out="folder of its files (default reports/<session> under this folder)"
-):
+def _add_calibration(verb):
     """What the use of a calibration on a scene takes."""
-    verb.add_argument(
-        "sessions", nargs="+", metavar="session", help="as 'record --scene' recorded it"
-    )
     verb.add_argument("--calibration", required=True, help="calibration.json")
-    verb.add_argument("--out", help=out)
     verb.add_argument(
         "--untrusted",
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",
     )
-    _add_scheduler(verb)
 
 
 def _add_measure(verbs):
     """The verb that measures in a scene."""
     words = "measure lengths between places picked in scene.html"
     measure = verbs.add_parser("measure", help=words)
-    _add_scene(measure, "CSV with the lengths (default reports/<session>/lengths.csv)")
+    measure.add_argument("session", help=SCENE)
+    measure.add_argument(
+        "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"
+    )
+    _add_calibration(measure)
     measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
     measure.add_argument(
         "--station", type=int, help="whose scene.html it was (default: that of 'merge')"

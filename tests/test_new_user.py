@@ -83,4 +83,4 @@ def test_a_room_is_measured_by_the_readme_alone(folder, emulated, browser):
     typed("measure")
     (told,) = pd.read_csv(folder / "reports" / "my_room" / "lengths.csv").itertuples()
     for mm, metres in ((length, told.length_m), (low, told.low_m), (high, told.high_m)):
-        assert mm == pytest.approx(1000 * metres, abs=0.2)
+        assert mm == pytest.approx(1000 * metres, abs=0.5)

@@ -171,7 +171,7 @@ def test_a_scene_is_measured_by_the_readme_alone(
     typed("measure")
     (told,) = pd.read_csv(folder / "reports" / "my_room" / "lengths.csv").itertuples()
     for mm, metres in ((length, told.length_m), (low, told.low_m), (high, told.high_m)):
-        assert mm == pytest.approx(1000 * metres, abs=0.2)
+        assert mm == pytest.approx(1000 * metres, abs=0.5)
     assert low < length < high
 
 
