@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
+from falsified_sessions import copied, image_twice, judged
 from scipy.stats import binom
 from shared import QUICK, ROOT
 from test_reconstruct_scene import Case, two_stations
@@ -421,6 +422,17 @@ def test_scenes_are_used_on_a_cluster_as_here(verb, address, quick, tmp_path, mo
     assert sorted(p.name for p in (tmp_path / "here").rglob("scene.*")) == sorted(
         p.name for p in (tmp_path / "reports").rglob("scene.*")
     )
+
+
+def test_falsified_recordings_are_judged_on_a_cluster_as_here(
+    address, tmp_path, monkeypatch
+):
+    """`make campaign` has many of them."""
+    folder = copied(QUICK, tmp_path / "quick")
+    image_twice(folder)
+    here = judged(folder)
+    monkeypatch.setenv("LRFCAL_SCHEDULER", address)
+    assert judged(folder).record() == here.record()
 
 
 def test_a_worker_with_another_version_is_refused(address, monkeypatch):
