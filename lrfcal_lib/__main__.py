@@ -42,7 +42,7 @@ def run(args):
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
-            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
+            return main(args.setup, args.rig_file, args.feedback)
         case "board":
             print_board(args)
 
@@ -145,7 +145,7 @@ def record(args):
     """Record placements of the board, or stations of a scene."""
     from lrfcal_lib.acquire.record import main
 
-    options = {"resume": args.resume, "count": args.placements, "mode": args.mode}
+    options = {"resume": args.resume, "count": args.placements}
     if args.scene:
         from lrfcal_lib.acquire.stations import Stations
         from lrfcal_lib.calibrate.calibration_file import load_calibration
@@ -292,9 +292,6 @@ def _add_rigs(verbs):
         "--placements", type=how_many, metavar="N", help="record N placements of the plan"
     )
     record.add_argument(
-        "--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's"
-    )
-    record.add_argument(
         "--scene", action="store_true", help="record a scene instead of the plan's boards"
     )
     record.add_argument(
@@ -315,7 +312,6 @@ def _add_rigs(verbs):
         "--rig-file",
         help="write a new file for 'record', removed at the end unless changed",
     )
-    emulate.add_argument("--seed", type=int, default=0, help="of noise")
     emulate.add_argument(
         "--feedback",
         choices=("full", "partial", "none"),

@@ -542,7 +542,6 @@ def main(
     *,
     resume: bool = False,
     count: int | None = None,
-    mode: str | None = None,
     guide: Boards | None = None,
 ) -> int:
     """Record from the command line.
@@ -553,8 +552,6 @@ def main(
         Its path.
     path, resume, count
         As of :func:`record_session`.
-    mode
-        Instead of the plan's.
     guide
         As of :func:`record_session`.
 
@@ -567,7 +564,7 @@ def main(
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     guide = guide or Boards()
     try:
-        stated = guide.planned(read_rig_file(rig_file).with_mode(mode))
+        stated = guide.planned(read_rig_file(rig_file))
         print(f"{rig_file}: opening the devices", flush=True)
         with Rig.open(stated) as rig:
             recording = record_session(rig, path, resume=resume, count=count, guide=guide)

@@ -205,15 +205,13 @@ def practice_setup() -> tuple[Setup, list[Placement]]:
     return setup, placements
 
 
-def emulated(name: str, seed: int = 0, feedback: str = "full") -> EmulatedRig:
+def emulated(name: str, feedback: str = "full") -> EmulatedRig:
     """An emulated rig, not started yet.
 
     Parameters
     ----------
     name
         'practice', or a set-up.
-    seed
-        Of noise.
     feedback
         Of the head, see :class:`Habits`.
 
@@ -228,7 +226,6 @@ def emulated(name: str, seed: int = 0, feedback: str = "full") -> EmulatedRig:
         setup, placements = practice_setup()
     return EmulatedRig(
         setup,
-        seed=seed,
         placements=placements,
         head_options={"feedback": feedback},
         quick=name == PRACTICE,
@@ -236,11 +233,7 @@ def emulated(name: str, seed: int = 0, feedback: str = "full") -> EmulatedRig:
 
 
 def main(
-    name: str,
-    rig_file: str | os.PathLike | None = None,
-    *,
-    seed: int = 0,
-    feedback: str = "full",
+    name: str, rig_file: str | os.PathLike | None = None, feedback: str = "full"
 ) -> int:
     """Emulate a set-up until Ctrl-C, SIGTERM or SIGHUP.
 
@@ -250,8 +243,8 @@ def main(
         Of :func:`emulated`.
     rig_file
         Where its rig file is written, see :func:`written_rig_file`.
-    seed, feedback
-        Of :func:`emulated`.
+    feedback
+        Of the head.
 
     Returns
     -------
@@ -270,7 +263,7 @@ def main(
                 continue  # as nohup leaves it
             before = signal.signal(number, lambda *_: quit_.set())
             stack.callback(signal.signal, number, before)
-        rig = stack.enter_context(emulated(name, seed, feedback))
+        rig = stack.enter_context(emulated(name, feedback))
         if rig_file is not None:
             stack.enter_context(written_rig_file(rig, Path(rig_file)))
         print(summary(rig, rig_file), flush=True)
