@@ -8,8 +8,8 @@ from lrfcal_lib.calibrate.pipeline import calibrate
 from lrfcal_lib.judge.alternatives import ALTERNATIVES
 from lrfcal_lib.judge.recording_faults import recording_faults
 from lrfcal_lib.session.faults import faults_of_files
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import SessionError
 
 CASES = [(name, session) for name, way in WAYS.items() for session in way.sessions]
 

@@ -19,9 +19,9 @@ from shared import DATA, campaign
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.lock import alone
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import SessionError
 
 SCANS = [
     "session.json",

@@ -10,6 +10,7 @@ from tiny_import import BOUGUET, authors_points, write_source
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session import importers
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.importers import (
     import_lasersetero,
     read_bouguet,
@@ -17,7 +18,6 @@ from lrfcal_lib.session.importers import (
     recover_polar,
 )
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import SessionError
 
 
 @pytest.fixture

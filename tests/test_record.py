@@ -17,9 +17,9 @@ from lrfcal_lib.acquire.record import Recording, RecordingError, main, record_se
 from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.port import DeviceError
 from lrfcal_lib.session import progress
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.recorder import SessionRecorder
-from lrfcal_lib.session.stated import SessionError
 
 
 def write(rig, path, count=None, **options):

@@ -16,10 +16,10 @@ from lrfcal_lib.acquire.checks import Light, check_image, check_placement
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, read_rig_file
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.progress import Progress, duration
 from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.recorder import SessionRecorder
-from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import not_written
 
 FAILED = 2

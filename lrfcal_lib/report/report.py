@@ -27,9 +27,9 @@ from tqdm import tqdm
 from lrfcal_lib.report import first_screen, page
 from lrfcal_lib.report.notebook import ROOT, SHIPPED, label_of
 from lrfcal_lib.session.cache import VARIABLE as CACHE
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.progress import duration
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import RECORDINGS
 
 NOTEBOOKS = ROOT / "notebooks"

@@ -3,7 +3,8 @@
 import struct
 from os import PathLike
 
-from lrfcal_lib.session.stated import CameraInfo, SessionError
+from lrfcal_lib.session.files import SessionError
+from lrfcal_lib.session.stated import CameraInfo
 
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
