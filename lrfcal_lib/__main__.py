@@ -17,8 +17,12 @@ def run(args):
             return check(args)
         case "calibrate" | "reconstruct" | "merge":
             return use_sessions(args)
-        case "compare" | "measure":
-            return use_calibrations(args)
+        case "compare":
+            from lrfcal_lib.report.compare import compare_files
+
+            return compare_files(args.calibrations, args.figure)
+        case "measure":
+            return measure(args)
         case "simulate":
             from lrfcal_lib.session.workers import side_by_side
             from lrfcal_lib.simulate.record import simulate
@@ -47,24 +51,12 @@ def run(args):
             print_board(args)
 
 
-def use_calibrations(args):
-    """Do what a verb asks for that takes calibration.json."""
-    match args.verb:
-        case "compare":
-            from lrfcal_lib.report.compare import compare_files
+def measure(args):
+    """Measure lengths between picked places."""
+    from lrfcal_lib.report.measure import measure_session
 
-            return compare_files(args.calibrations, args.figure)
-        case "measure":
-            from lrfcal_lib.report.measure import measure_session
-
-            return measure_session(
-                args.session,
-                args.calibration,
-                args.picks,
-                args.out,
-                args.station,
-                args.untrusted,
-            )
+    options = (args.out, args.station, args.untrusted)
+    return measure_session(args.session, args.calibration, args.picks, *options)
 
 
 def print_board(args):

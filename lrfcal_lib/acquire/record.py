@@ -17,6 +17,7 @@ from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, read_rig_file
 from lrfcal_lib.session.files import SessionError
+from lrfcal_lib.session.lms2xx_codec import encode_configuration
 from lrfcal_lib.session.progress import Progress, duration
 from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.recorder import SessionRecorder
@@ -86,7 +87,9 @@ class Recording(Closed):
         with self._safely(), contextlib.ExitStack() as stack:
             writer = self._open(resume)
             stack.callback(writer.close)
-            writer.add_telegrams(-1, rig.begin_telegrams(), time_s=rig.clock())
+            # a scan does not tell its measuring mode, this does
+            begin = encode_configuration(rig.lrf.configuration)
+            writer.add_telegrams(-1, [begin], time_s=rig.clock())
             self.writer = writer
             stack.pop_all()
 
@@ -275,7 +278,9 @@ class Recording(Closed):
                     measured = event.pitch
                 writer.add_platform([(event.time_s, event.commanded, measured)])
             elif isinstance(event, Scanned):
-                self._write_scans(event)
+                scans = zip(event.readings, event.pitch, strict=True)
+                rows = [(raw, p, one.time_s) for one, p in scans for raw in one.telegrams]
+                writer.add_telegrams(event.placement, *zip(*rows, strict=True))
             elif isinstance(event, Photographed):
                 writer.add_image(
                     event.camera,
@@ -292,18 +297,6 @@ class Recording(Closed):
                     if measured
                 ]
                 writer.add_platform(track)
-
-    def _write_scans(self, event):
-        """Put the telegrams of readings on the disk."""
-        telegrams = []
-        pitches = []
-        times = []
-        for reading, pitch in zip(event.readings, event.pitch, strict=True):
-            for raw in reading.telegrams:
-                telegrams.append(raw)
-                pitches.append(pitch)
-                times.append(reading.time_s)
-        self.writer.add_telegrams(event.placement, telegrams, pitches, times)
 
     @contextlib.contextmanager
     def _safely(self):

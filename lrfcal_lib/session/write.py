@@ -254,12 +254,8 @@ class SessionWriter:
         offset = append_file(self.telegrams, b"".join(telegrams), self.path)
         offsets = offset + np.cumsum([0, *lengths[:-1]])
         number = number_cell(placement)
-        rows = []
-        pitch_deg = np.degrees(pitch)
-        for begin, length, at, angle in zip(
-            offsets, lengths, time_s, pitch_deg, strict=True
-        ):
-            rows.append([cell(at), begin, length, number, cell(angle)])
+        columns = zip(time_s, offsets, lengths, np.degrees(pitch), strict=True)
+        rows = [[cell(t), at, size, number, cell(angle)] for t, at, size, angle in columns]
         self._append_rows("lrf/index.csv", rows)
 
     def add_image(
