@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -68,6 +69,8 @@ def test_a_room_is_measured_by_the_readme_alone(folder, emulated, browser):
     assert typed("record", "--scene").count("ok    stood still") == 3
     typed("reconstruct")
     typed("merge")
+    shutil.copytree("my_rig", "later")
+    typed("compare")
 
     view = browser.new_page(viewport={"width": 900, "height": 700})
     view.set_default_timeout(280_000)
