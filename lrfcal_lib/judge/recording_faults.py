@@ -9,12 +9,11 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtri
 
-from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
+from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
-from lrfcal_lib.judge.alternatives import guesses_of
-from lrfcal_lib.judge.camera_changes import LEVER, camera_changes, explains, large_changes
+from lrfcal_lib.judge.alternatives import LEVER, guesses_of
+from lrfcal_lib.judge.camera_changes import camera_changes, explains
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
@@ -169,24 +168,11 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
         misread = misread_recording(prepared)
         if misread:
             return found + misread
-    if prepared.views and prepared.scans:
-        found += faults_of_changes(changes_of_cameras(calibration), tuple(prepared.views))
-        if joint is not None:
-            found += exchanged_placements(calibration)
-    return found
-
-
-def changes_of_cameras(calibration):
-    """The CameraChanges of a Calibration, also where its joint estimate explains nothing."""
-    prepared = calibration.prepared
-    joint = calibration.joint
     if joint is not None:
         changes = camera_changes(joint.solution, prepared, joint.settings)
-        if changes or explains(joint.solution):
-            return changes
-    views = {camera: list(own.values()) for camera, own in prepared.views.items()}
-    obs = observe_joint(prepared, views)
-    return large_changes(obs, prepared, joint_settings(prepared, obs))
+        found += faults_of_changes(changes, tuple(prepared.views))
+        found += exchanged_placements(calibration)
+    return found
 
 
 def explained(faults: list[Fault]) -> bool:
