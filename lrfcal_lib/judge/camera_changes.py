@@ -37,12 +37,10 @@ class CameraChange:
     Attributes
     ----------
     camera : str
-    before, after : int
-        The placements next to the change.
-    turn, turn_sigma : float
-        Radians.
-    shift, shift_sigma : float
-        Metres.
+    after : int
+        The first placement after the change.
+    turn, shift : float
+        Radians, metres.
     p_value : float
         Probability of such a turn and shift by chance.
     motion_px : float
@@ -54,12 +52,9 @@ class CameraChange:
     """
 
     camera: str
-    before: int
     after: int
     turn: float
-    turn_sigma: float
     shift: float
-    shift_sigma: float
     p_value: float
     motion_px: float
     zoom: float
@@ -259,7 +254,6 @@ def change_between(solution, first, later, camera, prepared):
     both = solution.covariance(f"{first}_", f"{later}_")
     later_less_first = np.hstack([-np.eye(POSE), np.eye(POSE)])
     spread = later_less_first @ both @ later_less_first.T
-    sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
     both_parts = np.concatenate([change.rotation.as_rotvec(), shift])
     square = both_parts @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ both_parts
 
@@ -267,9 +261,7 @@ def change_between(solution, first, later, camera, prepared):
     middle = [*obs.corners.mean(axis=0), 0.0]
     middles = RigidTransform.from_matrix(obs.view_pose[views]).apply(middle)
     motion = project(middles, model) - project(change.inv().apply(middles), model)
-    rows = np.unique(obs.view_placement[views])
-    earlier = np.unique(obs.view_placement[obs.view_camera == obs.cameras.index(first)])
-    after = int(obs.placements[rows[0]])
+    after = int(obs.placements[obs.view_placement[views].min()])
     growths = [
         growth_by_depth(solution, index),
         growth_of_focal_length(prepared, camera, after),
@@ -277,12 +269,9 @@ def change_between(solution, first, later, camera, prepared):
     zoom, zoom_sigma = max(growths, key=lambda growth: abs(growth[0]) / growth[1])
     return CameraChange(
         camera=camera,
-        before=int(obs.placements[earlier[earlier < rows[0]].max(initial=0)]),
         after=after,
         turn=float(change.rotation.magnitude()),
-        turn_sigma=float(np.linalg.norm(sigma[:3])),
         shift=float(np.linalg.norm(shift)),
-        shift_sigma=float(np.linalg.norm(sigma[3:])),
         p_value=float(chdtrc(POSE, square)),
         motion_px=float(np.median(np.linalg.norm(motion, axis=1))),
         zoom=zoom,

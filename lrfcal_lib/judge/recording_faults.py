@@ -371,8 +371,8 @@ def faults_of_changes(changes, cameras):
         elif len(at_once) == len(cameras):
             words += " (or the range finder was: all cameras changed at once)"
         remedy = (
-            "fix what is loose and record anew, or make two sessions: one of the placements up to "
-            f"{change.before}, one from {change.after} on"
+            "fix what is loose and record anew, or make two sessions: one of the placements before "
+            f"{change.after}, one of the others"
         )
         severe = change.size_px > SEVERE_PX
         concerned = (change.after,)
@@ -392,12 +392,10 @@ def _zoomed(change):
 
 def _moved(change):
     """A CameraChange of the pose, in words."""
-    turn = f"{np.degrees(change.turn):.2f} +- {np.degrees(change.turn_sigma):.2f} deg"
-    shift = f"{1000 * change.shift:.1f} +- {1000 * change.shift_sigma:.1f} mm"
     return (
-        f"camera '{change.camera}' was moved between placement {change.before} and placement "
-        f"{change.after}: turned by {turn} and shifted by {shift}, which moves the board by "
-        f"{change.motion_px:.1f} px in its images"
+        f"camera '{change.camera}' was moved before placement {change.after}: turned by "
+        f"{np.degrees(change.turn):.2f} deg and shifted by {1000 * change.shift:.1f} mm, which "
+        f"moves the board by {change.motion_px:.1f} px in its images"
     )
 
 
