@@ -198,7 +198,7 @@ def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:
         map_coordinates(channel, places, np.float32, order=1, cval=np.nan)
         for channel in channels
     ]
-    return np.stack(colours, axis=-1).reshape(uv.shape[:-1] + image.shape[2:])
+    return np.stack(colours, axis=-1)
 
 
 def vote(column, place, weight, shape, slopes):
