@@ -148,28 +148,31 @@ def sights(creases: Creases, view: View) -> Sights:
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
     return Sights(
         by_unknown=np.einsum("ni,nij,njk->nk", normal, by_point, J[inside]),
-        across=np.tile(across, (len(clear), 1)),
+        across=across,
         clear=clear,
         number=creases.number[inside],
     )
 
 
 def _edges(view, places, tangent, normal):
-    """How clear an edge there is (n, k), 0 to 1, at k offsets (k,) in pixels from pixels (n, 2),
-    along their normals (n, 2).
+    """Offsets (n, k) of edges in pixels from pixels (n, 2) along their normals (n, 2), and how
+    clear each is, 0 to 1.
     """
     reach = REACH * view.model.width
-    across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    clear = np.zeros((len(places), len(across)))
+    grid = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
+    across = np.tile(grid, (len(places), 1))
+    clear = np.zeros_like(across)
     if len(places):
         side = np.arange(ALONG) - ALONG // 2
         profile = places[:, None] + side[:, None] * tangent[:, None]
-        away = across[:, None, None, None] * normal[:, None]
+        away = grid[:, None, None, None] * normal[:, None]
         strips = sample(view.image, view.model, profile + away)
         mean = strips.mean(axis=2)  # NaN outside the image
         height = step_contrast(mean, SMOOTH_PX / ACROSS_STEP_PX, along=1)
         row, place, contrast = peaks(height)
-        clear[row, place.round().astype(int)] = contrast / (contrast + FULL_CONTRAST)
+        cell = place.round().astype(int)
+        across[row, cell] = grid[0] + ACROSS_STEP_PX * place
+        clear[row, cell] = contrast / (contrast + FULL_CONTRAST)
     return across, clear
 
 

@@ -277,7 +277,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         creases = creases_of(cloud, planes, of_point, placement)
         for view in views:
             of_creases[view.camera].append(sights(creases, view))
-        stations.append((cloud.rows(of_point >= 0), views))
+        stations.append((flat_cloud(cloud, planes, of_point), views))
     by_camera = [creases_pull(parts, rig, camera) for camera, parts in of_creases.items()]
     by_camera = [pull for pull in by_camera if pull is not None]
     of_pairs = [pairs_pull(*station, by_camera) for station in stations]
@@ -323,6 +323,16 @@ def _cloud(session, rig, placement) -> Cloud:
     return join_clouds(
         reconstruct(sweep, [], head, clean, lrf=session.lrf, continuous=continuous)
     )
+
+
+def flat_cloud(cloud, planes, of_point):
+    """The points of flat surfaces, moved onto them: single readings are noisy."""
+    cloud = cloud.rows(of_point >= 0)
+    plane = of_point[of_point >= 0]
+    normal = np.reshape([plane.axis for plane in planes], (-1, 3))[plane]
+    centre = np.reshape([plane.centre for plane in planes], (-1, 3))[plane]
+    off = np.vecdot(cloud.points - centre, normal)
+    return replace(cloud, points=cloud.points - off[:, None] * normal)
 
 
 def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
