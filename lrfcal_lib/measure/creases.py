@@ -3,7 +3,7 @@
 A crease is known to millimetres from planes through hundreds of readings, and no spot widens it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -34,6 +34,8 @@ SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
 HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
 WIDTHS = np.geomspace(0.3, 0.09, 12)
+SEARCHED = -1  # of them, for a slip
+SLIPS = np.radians(np.linspace(-1.0, 1.0, 81))  # that are tried
 OUTLIERS = 0.15  # of the clearest edge's weight
 MISS = 1.0  # pixels, of one crease: rounded edges and shadows
 
@@ -120,6 +122,16 @@ class Sights:
     clear: np.ndarray
     number: np.ndarray
 
+    @property
+    def trust(self) -> np.ndarray:
+        """Places of one crease count as one together, (n,)."""
+        _, crease, count = np.unique(self.number, return_inverse=True, return_counts=True)
+        return 1 / count[crease]
+
+    def after(self, slip: float) -> "Sights":
+        """The same where the head slipped, radians."""
+        return replace(self, across=self.across - slip * self.by_unknown[:, -1:])
+
 
 def sights(creases: Creases, view: View) -> Sights:
     """Look in an image for edges near creases.
@@ -176,7 +188,38 @@ def _edges(view, places, tangent, normal):
     return across, clear
 
 
-def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull | None:
+def joined(parts: list[Sights]) -> Sights:
+    """Those of all images of one camera, at least one."""
+    names = Sights.__dataclass_fields__
+    return Sights(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+
+
+def slip_of(by_camera: dict[str, Sights], rig: CalibratedRig) -> float:
+    """By how much the head slipped under cameras on the base that creases meet edges, radians; 0
+    where that explains no more than chance finds (Schwarz's criterion).
+
+    Parameters
+    ----------
+    by_camera : dict of str to Sights
+        Of cameras on the base.
+    rig : CalibratedRig
+    """
+    explained = np.zeros(len(SLIPS))
+    for camera, seen in by_camera.items():
+        width = WIDTHS[SEARCHED] * REACH * rig.cameras[camera].model.width
+        for i, slip in enumerate(SLIPS):
+            explained[i] += _explained(seen, seen.by_unknown[:, -1] * slip, width)
+    slip = float(SLIPS[np.argmax(explained)])
+    gain = 0.0
+    creases = 1
+    for camera, seen in by_camera.items():
+        creases += len(np.unique(seen.number))
+        for sign, start in ((1, slip), (-1, 0.0)):
+            gain += sign * _fitted(seen.after(start), rig, camera, HONEST)[1]
+    return slip if gain > np.log(creases) / 2 else 0.0
+
+
+def creases_pull(seen: Sights, rig: CalibratedRig, camera: str, slip: float = 0.0) -> Pull:
     """What creases and edges say about a camera: each place may go with one of several edges, or
     with none.
 
@@ -185,46 +228,41 @@ def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull |
 
     Parameters
     ----------
-    parts : list of Sights
+    seen : Sights
         Of the images of one camera.
     rig : CalibratedRig
     camera : str
+    slip : float
+        Of the head, where it is sought, radians.
 
     Returns
     -------
-    Pull or None
-        None where no crease is seen.
+    Pull
     """
-    parts = [part for part in parts if len(part.number)]
-    if not parts:
-        return None
-    names = Sights.__dataclass_fields__
-    seen = Sights(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
-    poses = poses_of(rig, camera)
-    by_pose = seen.by_unknown[:, poses]
-    reach = REACH * rig.cameras[camera].model.width
-    _, crease, count = np.unique(seen.number, return_inverse=True, return_counts=True)
-    trust = 1 / count[crease]
-    x, fit = _fitted(seen, by_pose, trust, reach, HONEST)
-    moved, fit_moved = _fitted(seen, by_pose, trust, reach, SPREAD)
+    after = seen.after(slip)
+    x, fit = _fitted(after, rig, camera, HONEST)
+    moved, fit_moved = _fitted(after, rig, camera, SPREAD)
     # edges run beside each other: what has moved must explain more than chance finds
-    # (Schwarz's criterion)
-    if fit_moved - fit > len(poses) / 2 * np.log(len(count)):
+    if fit_moved - fit > len(x) / 2 * np.log(len(np.unique(seen.number))):
         x = moved
 
-    share, miss = _shares(seen, by_pose @ x, WIDTHS[-1] * reach)
-    weight = trust * share.sum(axis=1) / MISS**2
+    poses = poses_of(rig, camera)
+    width = WIDTHS[-1] * REACH * rig.cameras[camera].model.width
+    share, miss = _shares(after, seen.by_unknown[:, poses] @ x, width)
+    weight = seen.trust * share.sum(axis=1) / MISS**2
     information = (seen.by_unknown.T * weight) @ seen.by_unknown
-    pull = trust * np.sum(share * miss, axis=1) / MISS**2
+    pull = seen.trust * np.sum(share * miss, axis=1) / MISS**2
     fitted = np.zeros(seen.by_unknown.shape[1])
     fitted[poses] = x
-    return pull_of_groups(information, pull[:, None] * seen.by_unknown, crease, fitted)
+    fitted[-1] = slip
+    return pull_of_groups(information, pull[:, None] * seen.by_unknown, seen.number, fitted)
 
 
-def _fitted(seen, by_pose, trust, reach, spread):
-    """A camera's pose (6,) that is likely to `spread` (6,), and its log likelihood but for a
-    constant.
-    """
+def _fitted(seen, rig, camera, spread):
+    """A camera's pose (6,) that is likely to `spread` (6,), and how much it explains."""
+    by_pose = seen.by_unknown[:, poses_of(rig, camera)]
+    reach = REACH * rig.cameras[camera].model.width
+    trust = seen.trust
     x = np.zeros(len(spread))
     for width in np.append(WIDTHS, np.full(8, WIDTHS[-1])) * reach:
         share, miss = _shares(seen, by_pose @ x, width)
@@ -232,8 +270,13 @@ def _fitted(seen, by_pose, trust, reach, spread):
         weight = trust * share.sum(axis=1)
         H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(spread**-2.0)
         x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / spread**2)
-    share, _ = _shares(seen, by_pose @ x, width)
-    return x, -float(trust @ np.log(1 - share.sum(axis=1)))
+    return x, _explained(seen, by_pose @ x, width)
+
+
+def _explained(seen, moved, width):
+    """Log likelihood of places that have moved (n,), but for a constant."""
+    share, _ = _shares(seen, moved, width)
+    return -float(seen.trust @ np.log(1 - share.sum(axis=1)))
 
 
 def _shares(seen, moved, width):

@@ -14,7 +14,14 @@ from lrfcal_lib.calibrate.cloud import join as join_clouds
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
-from lrfcal_lib.measure.creases import Sights, creases_of, creases_pull, sights
+from lrfcal_lib.measure.creases import (
+    Sights,
+    creases_of,
+    creases_pull,
+    joined,
+    sights,
+    slip_of,
+)
 from lrfcal_lib.measure.features import flatness, largest_plane
 from lrfcal_lib.measure.image_pairs import STIFF, pairs_pull
 from lrfcal_lib.measure.pulls import Pull, poses_of, views_of_station
@@ -26,8 +33,8 @@ from lrfcal_lib.session.read import Session
 # what no covariance of a calibration knows, radians and metres of a camera's pose: lens and light,
 # of one camera; and what all on the head have in common, whose pitch is never quite what is
 # recorded (both found from honest simulated rooms)
-OWN = np.array([*np.radians([0.03, 0.03, 0.03]), 0.001, 0.001, 0.001])
-COMMON = np.array([*np.radians([0.12, 0.04, 0.04]), 0.002, 0.002, 0.002])
+OWN = np.array([*np.radians([0.02, 0.02, 0.02]), 0.0007, 0.0007, 0.0007])
+COMMON = np.array([*np.radians([0.04, 0.04, 0.04]), 0.001, 0.001, 0.001])
 PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
 LEVEL = 0.01  # probability of an alarm for nothing, of a recording; 0.05 is asked for
 UNEVEN = 0.003  # metres, of real walls
@@ -278,8 +285,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         for view in views:
             of_creases[view.camera].append(sights(creases, view))
         stations.append((flat_cloud(cloud, planes, of_point), views))
-    by_camera = [creases_pull(parts, rig, camera) for camera, parts in of_creases.items()]
-    by_camera = [pull for pull in by_camera if pull is not None]
+    by_camera = creases_pulls(of_creases, rig)
     of_pairs = [pairs_pull(*station, by_camera) for station in stations]
     of_pairs = [pull for pull in of_pairs if pull is not None]
     pulls = [*by_camera, *of_pairs]
@@ -296,6 +302,26 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         regions=sum(pull.groups for pull in of_pairs),
         all_on_head=all(c.mount == "head" for c in rig.cameras.values()),
     )
+
+
+def creases_pulls(of_creases: dict[str, list[Sights]], rig: CalibratedRig) -> list[Pull]:
+    """Of each camera that sees creases, after what the head slipped under those on the base.
+
+    Parameters
+    ----------
+    of_creases : dict of str to list of Sights
+        By camera and image.
+    rig : CalibratedRig
+    """
+    seen = {camera: joined(parts) for camera, parts in of_creases.items() if parts}
+    seen = {camera: places for camera, places in seen.items() if len(places.number)}
+    fixed = {
+        camera: s for camera, s in seen.items() if rig.cameras[camera].mount == "platform"
+    }
+    slip = slip_of(fixed, rig)
+    return [
+        creases_pull(s, rig, camera, slip * (camera in fixed)) for camera, s in seen.items()
+    ]
 
 
 def _stations(session, rig):
