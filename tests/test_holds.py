@@ -46,6 +46,29 @@ def test_an_honest_calibration_holds_and_says_what_it_rests_on(held):
     assert any("only turns the whole cloud" in line for line in words)
 
 
+def test_what_would_not_show_is_not_called_holding(held):
+    """The least turn and move that show are said, and more than 0.3 deg or 8 mm is not enough."""
+    left, right = held.shifts
+    assert left.shows[0] < TURN and left.shows[1] < MOVE
+    assert "moves from" in left.sentence()
+    for shows, words in (
+        ((left.shows[0], 0.011), "a move of 8 mm of camera 'left' (11 mm would)"),
+        ((2 * TURN, 0.001), "a turn of 0.3 deg of camera 'left' (0.6 deg would)"),
+    ):
+        blind = replace(held, shifts=(replace(left, shows=shows), right))
+        assert blind.answer is Answer.UNKNOWN
+        assert words in blind.sentences()[0]
+
+
+@pytest.mark.parametrize("way", ["down", "ahead"])
+def test_a_camera_that_moved_is_told(seen, way):
+    """8 mm up or down say whose; along the line of sight only that one of the two moved."""
+    move = {"down": [0.0, MOVE, 0.0], "ahead": [0.0, 0.0, MOVE]}[way]
+    held = holds(seen, changed(true_rig(seen), "right", [0.0, 0.0, 0.0, *move]))
+    assert held.answer is Answer.MOVED
+    assert held.culprit.camera == "right" or way == "ahead"
+
+
 def test_a_turned_camera_is_named(seen):
     held = holds(seen, changed(true_rig(seen), "left", [0.0, TURN, 0.0, 0.0, 0.0, 0.0]))
     assert held.answer is Answer.MOVED and held.culprit.camera == "left"

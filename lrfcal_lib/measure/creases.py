@@ -33,7 +33,7 @@ ALONG = 5  # pixels of a profile that are averaged
 SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
 HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
-WIDTHS = np.geomspace(0.3, 0.09, 12)
+WIDTHS = np.geomspace(0.3, 0.04, 12)
 SEARCHED = -1  # of them, for a slip
 SLIPS = np.radians(np.linspace(-1.0, 1.0, 81))  # that are tried
 OUTLIERS = 0.15  # of the clearest edge's weight
