@@ -43,3 +43,9 @@ def test_tails_are_finite(margin):
 def test_a_lapse_bounds_what_one_beam_costs():
     far = beam_terms(np.array([-0.5]), 0.002, True, 0.01)
     assert far[0] == pytest.approx(-np.log(0.01), rel=1e-3) and abs(far[1]) < 1e-6
+
+
+def test_information_far_outside_is_not_negative():
+    margins = -np.logspace(-3, 2, 10_001)
+    information = beam_terms(margins, 1e-4, np.ones(len(margins), bool))[2]
+    assert (information >= 0).all()

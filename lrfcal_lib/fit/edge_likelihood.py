@@ -159,4 +159,5 @@ def beam_terms(
     if lapse:
         cost = -np.logaddexp(np.log(lapse), np.log1p(-2 * lapse) + log_p)
         weight = np.exp(np.log1p(-2 * lapse) + log_p + cost)
-    return cost, -weight * sign * mills / sigma, weight * mills * (z + mills) / sigma**2
+    decline = np.maximum(z + mills, 0.0)  # far outside what is left of it is rounding
+    return cost, -weight * sign * mills / sigma, weight * mills * decline / sigma**2

@@ -11,14 +11,31 @@ from scipy.spatial.transform import RigidTransform, Rotation
 # axes of a camera that looks ahead of the LRF, and of an upright board with its print towards it
 AHEAD = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
-
-cross = np.linalg.cross  # of stacks of vectors, along the last axis
+NEXT = np.array([1, 2, 0])  # the axis after one, and the one before it
+PREVIOUS = np.array([2, 0, 1])
 
 
 class DegenerateGeometry(ValueError):
     """The data do not determine what was asked for; the message names the motion that stays
     unobservable.
     """
+
+
+def cross(a: ArrayLike, b: ArrayLike) -> np.ndarray:
+    """Cross products; those of ``numpy.linalg`` to the bit, in an eighth of its time for few.
+
+    Parameters
+    ----------
+    a, b : array_like, shape (..., 3)
+        Broadcast against each other.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
+    a = np.asarray(a)
+    b = np.asarray(b)
+    return a.take(NEXT, -1) * b.take(PREVIOUS, -1) - a.take(PREVIOUS, -1) * b.take(NEXT, -1)
 
 
 def hat(v: ArrayLike) -> np.ndarray:
@@ -98,10 +115,16 @@ def tilt(points: ArrayLike, pitch: ArrayLike) -> np.ndarray:
     ndarray, shape (..., 3)
         ``p_platform = Rx(pitch) p_head``.
     """
-    x, y, z = np.moveaxis(np.asarray(points), -1, 0)
+    points = np.asarray(points)
+    y = points[..., 1]
+    z = points[..., 2]
     cosine = np.cos(pitch)
     sine = np.sin(pitch)
-    return np.stack([x + 0 * cosine, cosine * y - sine * z, sine * y + cosine * z], axis=-1)
+    turned = np.empty((*np.broadcast_shapes(y.shape, cosine.shape), 3))
+    turned[..., 0] = points[..., 0]
+    turned[..., 1] = cosine * y - sine * z
+    turned[..., 2] = sine * y + cosine * z
+    return turned
 
 
 def lrf_to_platform(
