@@ -34,7 +34,7 @@ SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
 HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
 WIDTHS = np.geomspace(0.3, 0.04, 12)
-SEARCHED = -1  # of them, for a slip
+SCANNED = 0.09  # of REACH, for a slip: what a calibration that holds is off
 SLIPS = np.radians(np.linspace(-1.0, 1.0, 81))  # that are tried
 OUTLIERS = 0.15  # of the clearest edge's weight
 MISS = 1.0  # pixels, of one crease: rounded edges and shadows
@@ -206,7 +206,7 @@ def slip_of(by_camera: dict[str, Sights], rig: CalibratedRig) -> float:
     """
     explained = np.zeros(len(SLIPS))
     for camera, seen in by_camera.items():
-        width = WIDTHS[SEARCHED] * REACH * rig.cameras[camera].model.width
+        width = SCANNED * REACH * rig.cameras[camera].model.width
         for i, slip in enumerate(SLIPS):
             explained[i] += _explained(seen, seen.by_unknown[:, -1] * slip, width)
     slip = float(SLIPS[np.argmax(explained)])
