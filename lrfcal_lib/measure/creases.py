@@ -11,7 +11,7 @@ import numpy as np
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.features import Feature
-from lrfcal_lib.measure.pulls import Pull, View, poses_of, pull_of_groups
+from lrfcal_lib.measure.pulls import SPREAD, Pull, View, poses_of, pull_of_groups
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
 from lrfcal_lib.preprocess.edges_in_image import (
     ACROSS_STEP_PX,
@@ -29,8 +29,6 @@ MOST = 100_000  # creases of a station
 FEWEST = 4  # places of a crease
 REACH = 0.016  # of the image's width: 0.9 deg of a camera that sees 56 deg
 ALONG = 5  # pixels of a profile that are averaged
-# before anything is seen: radians and metres of a camera's pose
-SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
 HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
 WIDTHS = np.geomspace(0.3, 0.04, 12)

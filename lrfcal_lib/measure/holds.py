@@ -23,8 +23,8 @@ from lrfcal_lib.measure.creases import (
     slip_of,
 )
 from lrfcal_lib.measure.features import flatness, largest_plane
-from lrfcal_lib.measure.image_pairs import STIFF, pairs_pull
-from lrfcal_lib.measure.pulls import Pull, poses_of, views_of_station
+from lrfcal_lib.measure.image_pairs import pairs_pull
+from lrfcal_lib.measure.pulls import SPREAD, Pull, poses_of, views_of_station
 from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.model.camera import pinhole_jacobian
 from lrfcal_lib.model.geometry import fit_plane, hat
@@ -480,7 +480,7 @@ def _allowed(rig):
 def _shift(camera, columns, score, sharp, rig):
     """The Shift of one suspect, of unknowns in these columns."""
     known = sharp[np.ix_(columns, columns)]
-    likely = STIFF if camera else np.array([np.radians(1.0)])
+    likely = SPREAD if camera else np.array([np.radians(1.0)])
     covariance = np.linalg.inv(known + np.diag(likely**-2.0))
     change = covariance @ score[columns]
     # turns and moves apart: the first three unknowns, and the others
