@@ -13,9 +13,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.images import image_size
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo
 from lrfcal_lib.session.write import SessionWriter, finish
 
 BEARINGS = np.radians(np.arange(60.0, 121.0))

@@ -22,35 +22,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.session.files import (
-    LARGEST_FILE,
-    LARGEST_TEXT,
-    SPLIT,
-    SessionError,
-    check_amount,
-    checked,
-    naming,
-    opened,
-    read_bytes,
-    read_json,
-    reading,
-    short,
-)
-
-__all__ = [  # how files are opened, beside all that is below
-    "LARGEST_FILE",
-    "LARGEST_TEXT",
-    "SPLIT",
-    "SessionError",
-    "check_amount",
-    "checked",
-    "naming",
-    "opened",
-    "read_bytes",
-    "read_json",
-    "reading",
-    "short",
-]
+from lrfcal_lib.session.files import short
 
 FILES = (  # of any session, besides its images
     "session.json",
