@@ -274,7 +274,9 @@ def test_merge_writes_one_cloud_and_a_page(tmp_path, rig, monkeypatch, capsys):
     asked = SceneAsked(open_session(room), rig, (1, 3), tmp_path)
     monkeypatch.setattr(merge, "station_cloud", grey_cloud)
     monkeypatch.setattr(merge, "open_scene", lambda *scene: asked)
-    monkeypatch.setattr(merge, "write_scene", lambda folder, *rest, **clouds: [folder / "scene.ply"])
+    monkeypatch.setattr(
+        merge, "write_scene", lambda folder, *rest, **clouds: [folder / "scene.ply"]
+    )
     assert merge.merge_session(room, "calibration.json", tmp_path) == 0
     said = capsys.readouterr().out
     assert "platform frame of station 1" in said
