@@ -22,6 +22,7 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.model.kinematics import SourceFrame
 from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault, dark_images, faults_of_files
@@ -195,7 +196,8 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     prepared
     """
     session = prepared.session
-    if len(prepared.scans) <= len(session.board_placements) / 2:
+    # also placements that images contradict are left out, of which scans show the board
+    if 2 * len(prepared.problems_of(ProblemKind.NO_BOARD)) >= len(session.board_placements):
         for reading in UNITS:
             if shows_boards(session, reading):
                 return [Fault(reading.kind, reading.words, severe=True)]
