@@ -135,11 +135,6 @@ UNITS = (
         "the recorded pitch is in radians where degrees are asked for: multiply it by 57.29578",
         pitch=180 / np.pi,
     ),
-    Reading(
-        "unit",
-        "the recorded pitch is in degrees where radians are asked for: divide it by 57.29578",
-        pitch=np.pi / 180,
-    ),
     Reading("unit", "the ranges are in inches: multiply them by 0.0254", ranges=0.0254),
     Reading("unit", "the ranges are in feet: multiply them by 0.3048", ranges=0.3048),
     Reading("unit", "the ranges are in centimetres: divide them by 100", ranges=0.01),
