@@ -60,7 +60,6 @@ ACCUSATIONS = {
         "beyond range",
         "field of view",
         "dark",
-        "exchanged",
     ),
     *(
         "camera moved",
