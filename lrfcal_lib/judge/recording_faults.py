@@ -24,7 +24,7 @@ from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault, dark_images, faults_of_files
-from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.solvers import solve_camera
 
 EXPLAINING = (

@@ -322,7 +322,7 @@ def _fit_line(column, place, offset, slope):
         normal = design.T @ (design * weight[:, None])
         before = line
         line = np.linalg.solve(normal, design.T @ (weight * place))
-        if np.allclose(line, before, rtol=0, atol=SETTLED_PX):
+        if np.abs(line - before).max() <= SETTLED_PX:
             break
     kept = weight > 0
     column = column[kept]
