@@ -59,7 +59,6 @@ ACCUSATIONS = {
         "beyond range",
         "field of view",
         "dark",
-        "exchanged",
     ),
     *(
         "camera moved",

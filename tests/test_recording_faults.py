@@ -1,5 +1,6 @@
 """Units and senses that a recording states wrongly are named; a sound one is not accused."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -19,6 +20,13 @@ from lrfcal_lib.session.read import open_session
 def test_a_sound_recording_is_not_accused(quick):
     assert recording_faults(quick) == []
     assert misread_recording(quick.prepared) == []
+
+
+def test_scans_that_images_contradict_show_the_board_in_the_right_unit(quick):
+    """Images of half their stated size had 15 of 24 placements left out: "the ranges are in feet"."""
+    first = min(quick.prepared.scans)
+    scans = {first: quick.prepared.scans[first]}
+    assert misread_recording(replace(quick.prepared, scans=scans)) == []
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 import pandas as pd
@@ -17,11 +16,11 @@ from lrfcal_lib.judge.camera_changes import camera_changes, explains
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
-    lrf_to_platform,
     transform_difference,
 )
 from lrfcal_lib.model.kinematics import SourceFrame
 from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault, dark_images, faults_of_files
@@ -46,9 +45,6 @@ PLANE = 3  # numbers of a plane
 POSE = 6  # numbers of a camera's pose
 HALF = 0.6745  # standard deviations of normal noise that half of all values stay below
 LEAST_MISS = 0.001  # metres; paper is no flatter
-MOST_LOST = 8  # placements; where more are left out, something else is wrong
-# metres between the middles of a board in a scan, which may be cut, and in images
-BESIDE = 0.15
 
 
 @dataclass(frozen=True)
@@ -134,11 +130,6 @@ UNITS = (
         "the recorded pitch is in radians where degrees are asked for: multiply it by 57.29578",
         pitch=180 / np.pi,
     ),
-    Reading(
-        "unit",
-        "the recorded pitch is in degrees where radians are asked for: divide it by 57.29578",
-        pitch=np.pi / 180,
-    ),
     Reading("unit", "the ranges are in inches: multiply them by 0.0254", ranges=0.0254),
     Reading("unit", "the ranges are in feet: multiply them by 0.3048", ranges=0.3048),
     Reading("unit", "the ranges are in centimetres: divide them by 100", ranges=0.01),
@@ -171,7 +162,6 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     if joint is not None:
         changes = camera_changes(joint.solution, prepared, joint.settings)
         found += faults_of_changes(changes, tuple(prepared.views))
-        found += exchanged_placements(calibration)
     return found
 
 
@@ -195,7 +185,8 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     prepared
     """
     session = prepared.session
-    if len(prepared.scans) <= len(session.board_placements) / 2:
+    # also placements that images contradict are left out, of which scans show the board
+    if 2 * len(prepared.problems_of(ProblemKind.NO_BOARD)) >= len(session.board_placements):
         for reading in UNITS:
             if shows_boards(session, reading):
                 return [Fault(reading.kind, reading.words, severe=True)]
@@ -397,57 +388,3 @@ def _moved(change):
         f"{np.degrees(change.turn):.2f} deg and shifted by {1000 * change.shift:.1f} mm, which "
         f"moves the board by {change.motion_px:.1f} px in its images"
     )
-
-
-def exchanged_placements(calibration):
-    """Pairs of placements that are left out, and whose images fit the scans of each other."""
-    prepared = calibration.prepared
-    joint = calibration.joint
-    session = prepared.session
-    lost = [
-        p
-        for p in session.board_placements
-        if p in prepared.left_out or p in joint.solution.excluded_placements
-    ]
-    scans = {}
-    for placement in lost[:MOST_LOST]:
-        with suppress(BoardNotFound, SessionError):
-            sweep = session.sweep(placement)
-            scans[placement] = find_board(
-                sweep, session.board, session.T_head_lrf, session.lrf
-            )
-
-    found = []
-    strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
-    for first, second in combinations(strange, 2):
-        there = _same_board(calibration, scans[first], second)
-        back = _same_board(calibration, scans[second], first)
-        if there and back:
-            words = (
-                f"the images of placement {first} fit the scans of placement {second}, and those "
-                f"of {second} the scans of {first}: their numbers are exchanged; exchange them "
-                "back in images.csv"
-            )
-            found.append(Fault("exchanged", words, placements=(first, second)))
-    return found
-
-
-def _same_board(calibration, scan, placement):
-    """Whether a BoardScan shows the board where all images of a placement put it."""
-    prepared = calibration.prepared
-    solution = calibration.joint.solution
-    corners = prepared.board.corners
-    if corners is None:
-        corners = prepared.board.pattern.points()
-    middle = corners.mean(axis=0)[:2]
-    p_lrf, pitch, _ = face_points(scan, POINTS)
-    p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
-    agree = []
-    for camera in solution.transforms:
-        view = prepared.views[camera].get(placement)
-        if view is not None and view.T_camera_board is not None:
-            T_camera_platform = solution.camera_at(camera, view.pitch)
-            on_board = (view.T_camera_board.inv() * T_camera_platform).apply(p_platform)
-            beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
-            agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
-    return bool(agree) and all(agree)

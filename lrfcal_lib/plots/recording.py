@@ -22,6 +22,7 @@ ABOUT = 3.0  # degrees shown around a board
 BEYOND = "#d9d9d9"  # ranges outside the limits of several sweeps
 BRIGHT = 150  # grey level: a picture whose brightest hundredth is darker is brightened
 GAIN = 5.0  # by this factor at most
+EXAGGERATED = 20  # times, the spread of an edge
 STRETCH = 61  # points of an edge as the lens bends it
 CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}  # text about its place
 PRINT = ListedColormap(["#333333", "white"])  # of a board
@@ -378,15 +379,13 @@ def board_plan(ax: Axes, board: Board) -> None:
     to_scale(ax, "x [m]", "y [m]")
 
 
-def outline(ax: Axes, measured, exaggerate: float = 20) -> None:
+def outline(ax: Axes, measured) -> None:
     """The measured outline of the board.
 
     Parameters
     ----------
     ax
     measured : Outline
-    exaggerate
-        By which the spread of each edge is drawn larger.
     """
     board = measured.board
     around = closed(board.known_corners())
@@ -394,7 +393,7 @@ def outline(ax: Axes, measured, exaggerate: float = 20) -> None:
     outwards = measured.lines[:, :2]
     for index, spread in enumerate(measured.line_sd):
         ends = around[index : index + 2]
-        away = exaggerate * np.nan_to_num(spread) * outwards[index]
+        away = EXAGGERATED * np.nan_to_num(spread) * outwards[index]
         band = np.vstack([ends - away, ends[::-1] + away])
         ax.fill(*band.T, color=COLORS["fit"], alpha=0.25, linewidth=0)
     _lengths(ax, board, outwards, -0.09)
@@ -403,4 +402,4 @@ def outline(ax: Axes, measured, exaggerate: float = 20) -> None:
         ax.plot(*points.T, "+", color=COLORS["raw"], markersize=4)
     ax.invert_yaxis()
     to_scale(ax, "x [m]", "y [m]")
-    ax.set_title(f"bands: spread over the images, {exaggerate:g} times")
+    ax.set_title(f"bands: spread over the images, {EXAGGERATED} times")

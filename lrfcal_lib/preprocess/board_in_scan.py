@@ -82,7 +82,7 @@ class BoardScan:
 
 def find_board(
     sweep: Sweep,
-    board: Board | None = None,
+    board: Board,
     T_head_lrf: RigidTransform | None = None,
     lrf: LrfInfo | None = None,
     *,
@@ -93,8 +93,8 @@ def find_board(
     Parameters
     ----------
     sweep : Sweep
-    board : Board, optional
-        Tells the size by its outline, else by its pattern; anything from 0.02 to 4 m2 without it.
+    board : Board
+        Tells the size by its outline, else by its pattern.
     T_head_lrf : RigidTransform, optional
         Roughly known platform; without it the tilt axis is taken to be the x axis of the LRF.
     lrf : LrfInfo, optional
@@ -181,9 +181,7 @@ def median_filter(
     return filtered
 
 
-def fit_lines(
-    ranges: np.ndarray, bearings: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A straight line to every scan line at once, robust against outliers (Tukey's weights).
 
     In polar form ``1 / r = u . (cos b, sin b)`` is linear in u, with weights r^4 because of 1 / r.

@@ -292,7 +292,7 @@ def _adjusted(bundle, block, pixels, points, basis, free, models):
     count = len(block.residuals)
     error = block.residuals @ block.residuals
     variance = max(error / max(count - free.sum(), 1), 1e-18)
-    lens, mount, pose, _ = _covariances(bundle, variance, block.jacobian, free)
+    lens, mount, pose = _covariances(bundle, variance, block.jacobian, free)
     rms = np.sqrt(2 * np.nanmean(residuals**2, axis=(1, 2, 3)))  # as OpenCV counts it
     adjusted = zip(models, bundle.lenses, lens, rms.tolist(), strict=True)
     penalty = free.sum() * np.log(count)
@@ -311,7 +311,7 @@ def _adjusted(bundle, block, pixels, points, basis, free, models):
 
 
 def _covariances(bundle, variance, jacobian, free):
-    """Of every lens, mounting and pose (n, k, k), and of the shape; those that are `free`."""
+    """Of every lens, mounting and pose (n, k, k); those that are `free`."""
     normal = jacobian.T @ jacobian
     # pixels, radians and metres mix safely
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -320,7 +320,6 @@ def _covariances(bundle, variance, jacobian, free):
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(free, free)] = variance * inverse * scale
     kinds = np.split(np.arange(len(free)), bundle.ends[:-1])
-    sizes = (LENS, POSE, POSE, max(len(bundle.shape), 1))
-    for unknowns, size in zip(kinds, sizes, strict=True):
+    for unknowns, size in zip(kinds, (LENS, POSE, POSE), strict=False):
         rows = unknowns.reshape(-1, size)
         yield covariance[rows[:, :, None], rows[:, None]]

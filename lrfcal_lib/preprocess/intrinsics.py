@@ -145,7 +145,6 @@ def board_pose(
     pattern: Chessboard,
     model: CameraModel,
     relief: np.ndarray | None = None,
-    start: RigidTransform | None = None,
 ) -> tuple[RigidTransform, np.ndarray, np.ndarray]:
     """Pose of a chessboard in one image.
 
@@ -162,8 +161,6 @@ def board_pose(
     model : CameraModel
     relief : ndarray, shape (k,), optional
         Heights of the corners, metres.
-    start : RigidTransform, optional
-        Replaces OpenCV's start pose.
 
     Returns
     -------
@@ -184,9 +181,7 @@ def board_pose(
     count = np.isfinite(pixels).all(axis=1).sum()
     if count < FEWEST_CORNERS:
         raise ValueError(f"a pose needs four corners of the pattern or more, got {count}")
-    if start is None:
-        start = first_pose(points, pixels, model)
-    poses = RigidTransform.concatenate([start])
+    poses = RigidTransform.concatenate([first_pose(points, pixels, model)])
     result = adjust_robust(pixels[None, None], points, [model], poses, intrinsics=False)
     residuals = result.residuals[0, 0]
     pose = result.poses[0]

@@ -71,9 +71,6 @@ class Limits:
         return self.least < area < self.most and length < self.longest
 
 
-ANY_BOARD = Limits(0.02, 4.0, 4.0)  # when nothing is known about it
-
-
 def depth_jump(ranges, step):
     """Change of range (metres) between beams a `step` apart that no face of a board makes."""
     return DEPTH_NOISE + STEEPEST * np.asarray(ranges) * np.abs(step)
@@ -123,7 +120,7 @@ def surfaces(ranges: np.ndarray, bearings: np.ndarray, pitch: np.ndarray) -> np.
 def planar_surface(
     sweep: Sweep,
     T_head_lrf: RigidTransform,
-    board: Board | None,
+    board: Board,
     rng: np.random.Generator,
     lrf: LrfInfo | None,
 ) -> Surface:
@@ -137,7 +134,7 @@ def planar_surface(
     sweep : Sweep
     T_head_lrf : RigidTransform
         Only nominal.
-    board : Board or None
+    board : Board
         Tells the size.
     rng : numpy.random.Generator
         For the random sampling.
@@ -319,18 +316,15 @@ def _grown(surface, points):
 
 def _size_limits(board, grown):
     """Limits of a board with its outline grown (m)."""
-    if board is not None and board.corners is not None:
-        corners = board.corners.astype(np.float32)
-        area = cv2.contourArea(corners)
-        rim = cv2.arcLength(corners, True)
-        length = pdist(corners).max()
-        return Limits(0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown)
-    if board is not None and board.pattern is not None:
-        pattern = board.pattern
-        sides = pattern.square * np.array([pattern.columns + 1, pattern.rows + 1])
+    if board.corners is None and board.pattern is not None:
+        sides = np.ptp(board.pattern.outline(), axis=0)
         area = np.prod(sides)
         return Limits(0.3 * area, 4 * area, 2.5 * np.linalg.norm(sides))
-    return ANY_BOARD
+    corners = board.known_corners().astype(np.float32)
+    area = cv2.contourArea(corners)
+    rim = cv2.arcLength(corners, True)
+    length = pdist(corners).max()
+    return Limits(0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown)
 
 
 def _fault(surface, points, pitch, T_head_lrf):
