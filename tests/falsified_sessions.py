@@ -346,7 +346,7 @@ WAYS = {
     "pitch reversed": Way(pitch_times(-1.0), ("sense", "far from stated"), "sense"),
     "images of half the size": Way(half_size, ("lens",), "image size", ("sim_lms221",)),
     "pattern stated 6 x 8": Way(pattern_turned, (), sessions=("lms400_zed",)),
-    "rows exchanged": Way(exchange_rows, ()),  # both placements are left out
+    "rows exchanged": Way(exchange_rows, ("exchanged",), "exchange them back"),
     "numbers of images ahead": Way(numbers_ahead, ("numbers",), "too large by one"),
     "pitch of images in radians": Way(
         image_pitch_in_radians, ("unit",), "images.csv is in radians", ("sim_lms221",)

@@ -59,6 +59,7 @@ ACCUSATIONS = {
         "beyond range",
         "field of view",
         "dark",
+        "exchanged",
     ),
     *(
         "camera moved",

@@ -111,7 +111,7 @@ def _disagreement(prepared, placement, misses):
     off = f"its plane is {1000 * max(misses.values()):.0f} mm rms off the"
     if not len(wrong) == len(misses) > 1:
         return f"camera {wrong[0]}: {off} scan"
-    causes = "another surface, mixed readings, the images of another placement"
+    causes = "another surface, mixed readings"
     views = {
         c: {placement: seen[placement]}
         for c, seen in prepared.views.items()

@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,7 @@ from lrfcal_lib.judge.camera_changes import camera_changes, explains
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
+    lrf_to_platform,
     transform_difference,
 )
 from lrfcal_lib.model.kinematics import SourceFrame
@@ -45,6 +47,9 @@ PLANE = 3  # numbers of a plane
 POSE = 6  # numbers of a camera's pose
 HALF = 0.6745  # standard deviations of normal noise that half of all values stay below
 LEAST_MISS = 0.001  # metres; paper is no flatter
+MOST_LOST = 8  # placements; where more are left out, something else is wrong
+# metres between the middles of a board in a scan, which may be cut, and in images
+BESIDE = 0.15
 
 
 @dataclass(frozen=True)
@@ -162,6 +167,7 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     if joint is not None:
         changes = camera_changes(joint.solution, prepared, joint.settings)
         found += faults_of_changes(changes, tuple(prepared.views))
+        found += exchanged_placements(calibration)
     return found
 
 
@@ -388,3 +394,57 @@ def _moved(change):
         f"{np.degrees(change.turn):.2f} deg and shifted by {1000 * change.shift:.1f} mm, which "
         f"moves the board by {change.motion_px:.1f} px in its images"
     )
+
+
+def exchanged_placements(calibration):
+    """Pairs of placements that are left out, and whose images fit the scans of each other."""
+    prepared = calibration.prepared
+    joint = calibration.joint
+    session = prepared.session
+    lost = [
+        p
+        for p in session.board_placements
+        if p in prepared.left_out or p in joint.solution.excluded_placements
+    ]
+    scans = {}
+    for placement in lost[:MOST_LOST]:
+        with suppress(BoardNotFound, SessionError):
+            sweep = session.sweep(placement)
+            scans[placement] = find_board(
+                sweep, session.board, session.T_head_lrf, session.lrf
+            )
+
+    found = []
+    strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
+    for first, second in combinations(strange, 2):
+        there = _same_board(calibration, scans[first], second)
+        back = _same_board(calibration, scans[second], first)
+        if there and back:
+            words = (
+                f"the images of placement {first} fit the scans of placement {second}, and those "
+                f"of {second} the scans of {first}: their numbers are exchanged; exchange them "
+                "back in images.csv"
+            )
+            found.append(Fault("exchanged", words, placements=(first, second)))
+    return found
+
+
+def _same_board(calibration, scan, placement):
+    """Whether a BoardScan shows the board where all images of a placement put it."""
+    prepared = calibration.prepared
+    solution = calibration.joint.solution
+    corners = prepared.board.corners
+    if corners is None:
+        corners = prepared.board.pattern.points()
+    middle = corners.mean(axis=0)[:2]
+    p_lrf, pitch, _ = face_points(scan, POINTS)
+    p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
+    agree = []
+    for camera in solution.transforms:
+        view = prepared.views[camera].get(placement)
+        if view is not None and view.T_camera_board is not None:
+            T_camera_platform = solution.camera_at(camera, view.pitch)
+            on_board = (view.T_camera_board.inv() * T_camera_platform).apply(p_platform)
+            beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
+            agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
+    return bool(agree) and all(agree)

@@ -26,7 +26,7 @@ class Fault:
     kind : str
         'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark'; of
         :mod:`lrfcal_lib.judge.recording_faults` also 'camera moved', 'camera zoomed',
-        'numbers', 'sense', 'unit'.
+        'exchanged', 'numbers', 'sense', 'unit'.
     words : str
         What was found, where, and what to do about it.
     severe : bool
