@@ -45,13 +45,8 @@ def room_of(rng):
         "strengths": rng.uniform(2.5, 5.0, 2).tolist(),
         "ambient": rng.uniform(0.3, 0.5),
     }
-    empty = dict.fromkeys(scene.ROOM, [])
-    return empty | {
-        "lights": lamps,
-        "shell": shell,
-        "fittings": fittings,
-        "desk": furniture,
-    }
+    parts = {"shell": shell, "fittings": fittings, "desk": furniture, "still life": []}
+    return {"parts": ["shell", "fittings", "desk"], "lights": lamps} | parts
 
 
 def colour(rng, low, high):

@@ -3,7 +3,7 @@
 A crease is known to millimetres from planes through hundreds of readings, and no spot widens it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.features import Feature
-from lrfcal_lib.measure.pulls import Pull, View, poses_of, pull_of_groups
+from lrfcal_lib.measure.pulls import SPREAD, Pull, View, poses_of, pull_of_groups
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
 from lrfcal_lib.preprocess.edges_in_image import (
     ACROSS_STEP_PX,
@@ -29,11 +29,11 @@ MOST = 100_000  # creases of a station
 FEWEST = 4  # places of a crease
 REACH = 0.016  # of the image's width: 0.9 deg of a camera that sees 56 deg
 ALONG = 5  # pixels of a profile that are averaged
-# before anything is seen: radians and metres of a camera's pose
-SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
 HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
-WIDTHS = np.geomspace(0.3, 0.09, 12)
+WIDTHS = np.geomspace(0.3, 0.04, 12)
+SCANNED = 0.09  # of REACH, for a slip: what a calibration that holds is off
+SLIPS = np.radians(np.linspace(-1.0, 1.0, 81))  # that are tried
 OUTLIERS = 0.15  # of the clearest edge's weight
 MISS = 1.0  # pixels, of one crease: rounded edges and shadows
 
@@ -120,6 +120,16 @@ class Sights:
     clear: np.ndarray
     number: np.ndarray
 
+    @property
+    def trust(self) -> np.ndarray:
+        """Places of one crease count as one together, (n,)."""
+        _, crease, count = np.unique(self.number, return_inverse=True, return_counts=True)
+        return 1 / count[crease]
+
+    def after(self, slip: float) -> "Sights":
+        """The same where the head slipped, radians."""
+        return replace(self, across=self.across - slip * self.by_unknown[:, -1:])
+
 
 def sights(creases: Creases, view: View) -> Sights:
     """Look in an image for edges near creases.
@@ -148,32 +158,66 @@ def sights(creases: Creases, view: View) -> Sights:
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
     return Sights(
         by_unknown=np.einsum("ni,nij,njk->nk", normal, by_point, J[inside]),
-        across=np.tile(across, (len(clear), 1)),
+        across=across,
         clear=clear,
         number=creases.number[inside],
     )
 
 
 def _edges(view, places, tangent, normal):
-    """How clear an edge there is (n, k), 0 to 1, at k offsets (k,) in pixels from pixels (n, 2),
-    along their normals (n, 2).
+    """Offsets (n, k) of edges in pixels from pixels (n, 2) along their normals (n, 2), and how
+    clear each is, 0 to 1.
     """
     reach = REACH * view.model.width
-    across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    clear = np.zeros((len(places), len(across)))
+    grid = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
+    across = np.tile(grid, (len(places), 1))
+    clear = np.zeros_like(across)
     if len(places):
         side = np.arange(ALONG) - ALONG // 2
         profile = places[:, None] + side[:, None] * tangent[:, None]
-        away = across[:, None, None, None] * normal[:, None]
+        away = grid[:, None, None, None] * normal[:, None]
         strips = sample(view.image, view.model, profile + away)
         mean = strips.mean(axis=2)  # NaN outside the image
         height = step_contrast(mean, SMOOTH_PX / ACROSS_STEP_PX, along=1)
         row, place, contrast = peaks(height)
-        clear[row, place.round().astype(int)] = contrast / (contrast + FULL_CONTRAST)
+        cell = place.round().astype(int)
+        across[row, cell] = grid[0] + ACROSS_STEP_PX * place
+        clear[row, cell] = contrast / (contrast + FULL_CONTRAST)
     return across, clear
 
 
-def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull | None:
+def joined(parts: list[Sights]) -> Sights:
+    """Those of all images of one camera, at least one."""
+    names = Sights.__dataclass_fields__
+    return Sights(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+
+
+def slip_of(by_camera: dict[str, Sights], rig: CalibratedRig) -> float:
+    """By how much the head slipped under cameras on the base that creases meet edges, radians; 0
+    where that explains no more than chance finds (Schwarz's criterion).
+
+    Parameters
+    ----------
+    by_camera : dict of str to Sights
+        Of cameras on the base.
+    rig : CalibratedRig
+    """
+    explained = np.zeros(len(SLIPS))
+    for camera, seen in by_camera.items():
+        width = SCANNED * REACH * rig.cameras[camera].model.width
+        for i, slip in enumerate(SLIPS):
+            explained[i] += _explained(seen, seen.by_unknown[:, -1] * slip, width)
+    slip = float(SLIPS[np.argmax(explained)])
+    gain = 0.0
+    creases = 1
+    for camera, seen in by_camera.items():
+        creases += len(np.unique(seen.number))
+        for sign, start in ((1, slip), (-1, 0.0)):
+            gain += sign * _fitted(seen.after(start), rig, camera, HONEST)[1]
+    return slip if gain > np.log(creases) / 2 else 0.0
+
+
+def creases_pull(seen: Sights, rig: CalibratedRig, camera: str, slip: float = 0.0) -> Pull:
     """What creases and edges say about a camera: each place may go with one of several edges, or
     with none.
 
@@ -182,46 +226,41 @@ def creases_pull(parts: list[Sights], rig: CalibratedRig, camera: str) -> Pull |
 
     Parameters
     ----------
-    parts : list of Sights
+    seen : Sights
         Of the images of one camera.
     rig : CalibratedRig
     camera : str
+    slip : float
+        Of the head, where it is sought, radians.
 
     Returns
     -------
-    Pull or None
-        None where no crease is seen.
+    Pull
     """
-    parts = [part for part in parts if len(part.number)]
-    if not parts:
-        return None
-    names = Sights.__dataclass_fields__
-    seen = Sights(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
-    poses = poses_of(rig, camera)
-    by_pose = seen.by_unknown[:, poses]
-    reach = REACH * rig.cameras[camera].model.width
-    _, crease, count = np.unique(seen.number, return_inverse=True, return_counts=True)
-    trust = 1 / count[crease]
-    x, fit = _fitted(seen, by_pose, trust, reach, HONEST)
-    moved, fit_moved = _fitted(seen, by_pose, trust, reach, SPREAD)
+    after = seen.after(slip)
+    x, fit = _fitted(after, rig, camera, HONEST)
+    moved, fit_moved = _fitted(after, rig, camera, SPREAD)
     # edges run beside each other: what has moved must explain more than chance finds
-    # (Schwarz's criterion)
-    if fit_moved - fit > len(poses) / 2 * np.log(len(count)):
+    if fit_moved - fit > len(x) / 2 * np.log(len(np.unique(seen.number))):
         x = moved
 
-    share, miss = _shares(seen, by_pose @ x, WIDTHS[-1] * reach)
-    weight = trust * share.sum(axis=1) / MISS**2
+    poses = poses_of(rig, camera)
+    width = WIDTHS[-1] * REACH * rig.cameras[camera].model.width
+    share, miss = _shares(after, seen.by_unknown[:, poses] @ x, width)
+    weight = seen.trust * share.sum(axis=1) / MISS**2
     information = (seen.by_unknown.T * weight) @ seen.by_unknown
-    pull = trust * np.sum(share * miss, axis=1) / MISS**2
+    pull = seen.trust * np.sum(share * miss, axis=1) / MISS**2
     fitted = np.zeros(seen.by_unknown.shape[1])
     fitted[poses] = x
-    return pull_of_groups(information, pull[:, None] * seen.by_unknown, crease, fitted)
+    fitted[-1] = slip
+    return pull_of_groups(information, pull[:, None] * seen.by_unknown, seen.number, fitted)
 
 
-def _fitted(seen, by_pose, trust, reach, spread):
-    """A camera's pose (6,) that is likely to `spread` (6,), and its log likelihood but for a
-    constant.
-    """
+def _fitted(seen, rig, camera, spread):
+    """A camera's pose (6,) that is likely to `spread` (6,), and how much it explains."""
+    by_pose = seen.by_unknown[:, poses_of(rig, camera)]
+    reach = REACH * rig.cameras[camera].model.width
+    trust = seen.trust
     x = np.zeros(len(spread))
     for width in np.append(WIDTHS, np.full(8, WIDTHS[-1])) * reach:
         share, miss = _shares(seen, by_pose @ x, width)
@@ -229,8 +268,13 @@ def _fitted(seen, by_pose, trust, reach, spread):
         weight = trust * share.sum(axis=1)
         H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(spread**-2.0)
         x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / spread**2)
-    share, _ = _shares(seen, by_pose @ x, width)
-    return x, -float(trust @ np.log(1 - share.sum(axis=1)))
+    return x, _explained(seen, by_pose @ x, width)
+
+
+def _explained(seen, moved, width):
+    """Log likelihood of places that have moved (n,), but for a constant."""
+    share, _ = _shares(seen, moved, width)
+    return -float(seen.trust @ np.log(1 - share.sum(axis=1)))
 
 
 def _shares(seen, moved, width):

@@ -14,10 +14,17 @@ from lrfcal_lib.calibrate.cloud import join as join_clouds
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
-from lrfcal_lib.measure.creases import Sights, creases_of, creases_pull, sights
+from lrfcal_lib.measure.creases import (
+    Sights,
+    creases_of,
+    creases_pull,
+    joined,
+    sights,
+    slip_of,
+)
 from lrfcal_lib.measure.features import flatness, largest_plane
-from lrfcal_lib.measure.image_pairs import STIFF, pairs_pull
-from lrfcal_lib.measure.pulls import Pull, poses_of, views_of_station
+from lrfcal_lib.measure.image_pairs import pairs_pull
+from lrfcal_lib.measure.pulls import SPREAD, Pull, poses_of, views_of_station
 from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.model.camera import pinhole_jacobian
 from lrfcal_lib.model.geometry import fit_plane, hat
@@ -25,9 +32,9 @@ from lrfcal_lib.session.read import Session
 
 # what no covariance of a calibration knows, radians and metres of a camera's pose: lens and light,
 # of one camera; and what all on the head have in common, whose pitch is never quite what is
-# recorded (both found from honest simulated rooms)
-OWN = np.array([*np.radians([0.03, 0.03, 0.03]), 0.001, 0.001, 0.001])
-COMMON = np.array([*np.radians([0.12, 0.04, 0.04]), 0.002, 0.002, 0.002])
+# recorded (true rigs in three simulated rooms: 0.016 deg, 1 mm; 0.03 deg)
+OWN = np.array([*np.radians([0.02, 0.02, 0.02]), 0.0005, 0.0005, 0.0005])
+COMMON = np.array([*np.radians([0.04, 0.04, 0.04]), 0.001, 0.001, 0.001])
 PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
 LEVEL = 0.01  # probability of an alarm for nothing, of a recording; 0.05 is asked for
 UNEVEN = 0.003  # metres, of real walls
@@ -36,10 +43,13 @@ FEWEST_POINTS = 200  # of a wall, or of two passes
 STEEP = 3.0  # metres a radian, by which ranges grow with the pitch on a smooth surface
 SAME_PLACE = 0.5  # of the readings agree where two sweeps are of one place
 FEWEST_GROUPS = 8  # creases, or regions of patches, that must speak
-WANTED = np.radians(0.3)  # a turn that must not pass unseen
+# a turn and a move that must not pass unseen, radians and metres
+WANTED = np.radians(0.3)
+WANTED_MOVE = 0.008
 SURE = 3.0  # sigma, of two passes
-# of sigma: a turn that is so large raises an alarm in 9 of 10 cases (2.9 of LEVEL, 1.3 more)
-SHOWS = 4.2
+# sigma of a change of one unknown and of six that raises an alarm in 9 of 10 cases (noncentral chi
+# squared at a third of LEVEL)
+SHOWS = {1: 4.2, 6: 5.2}
 AWAY = 3.0  # metres, where shifts are stated
 FURNITURE = "record a room with furniture and pictures, 1 to 4 m away"
 
@@ -67,6 +77,9 @@ class Shift:
         To the right and down in the middle of the image, 3 m away; NaN for the head.
     p_value : float
         Probability of as much where nothing has moved.
+    shows : tuple of float
+        The least turn (radians), and the least move of a camera (metres), that raise an alarm in 9
+        of 10 cases, whichever way they go.
     """
 
     camera: str | None
@@ -75,16 +88,21 @@ class Shift:
     pixels: np.ndarray
     pixels_sigma: np.ndarray
     p_value: float
+    shows: tuple[float, ...]
 
     @property
     def name(self) -> str:
         """Of the suspect."""
         return "the head" if self.camera is None else f"camera '{self.camera}'"
 
-    @property
-    def told(self) -> bool:
-        """Whether a turn of 0.3 deg would show."""
-        return bool(SHOWS * self.sigma[:3].max() < WANTED)
+    def unseen(self) -> str:
+        """What would not show though it must; '' for nothing."""
+        turn, *move = self.shows
+        if turn > WANTED:
+            return f"a turn of 0.3 deg of {self.name} ({np.degrees(turn):.1f} deg would)"
+        if move and move[0] > WANTED_MOVE:
+            return f"a move of 8 mm of {self.name} ({1000 * move[0]:.0f} mm would)"
+        return ""
 
     @property
     def matters(self) -> bool:
@@ -97,12 +115,14 @@ class Shift:
         turn, sigma = np.degrees([self.change, self.sigma])
         if self.camera is None:
             amount = f"by {turn[0]:+.2f} +- {sigma[0]:.2f} deg"
-            return f"{self.name}, if only it slipped: {amount}; {chance}"
+            least = f"slips from {np.degrees(self.shows[0]):.2f} deg on show"
+            return f"{self.name}, if only it slipped: {amount}; {chance}; {least}"
         (right, down), (of_right, of_down) = self.pixels, self.pixels_sigma
         return (
             f"{self.name}, if only it moved: image {right:+.2f} +- {of_right:.2f} px to the right, "
             f"{down:+.2f} +- {of_down:.2f} px down (3 m away), turned by {turn[2]:+.2f} +- "
-            f"{sigma[2]:.2f} deg; {chance}"
+            f"{sigma[2]:.2f} deg; {chance}; turns from {np.degrees(self.shows[0]):.2f} deg and "
+            f"moves from {1000 * self.shows[1]:.0f} mm on show"
         )
 
 
@@ -204,11 +224,10 @@ class Held:
             return (
                 "no image shows where surfaces meet, or a surface that another image shows"
             )
-        unsure = [shift.name for shift in self.shifts if not shift.told]
-        if unsure:
-            who = " or ".join(unsure)
+        unseen = [shift.unseen() for shift in self.shifts if shift.unseen()]
+        if unseen:
             more = f"{FURNITURE}, from two places or more"
-            return f"a turn of 0.3 deg of {who} would not show; {more}"
+            return f"{' or '.join(unseen)} would not show in every direction; {more}"
         if max(self.creases, self.regions) < FEWEST_GROUPS:
             number = f"{self.creases:.0f} creases and {self.regions:.0f} regions"
             return f"{number} are too few; {FURNITURE}"
@@ -277,9 +296,8 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         creases = creases_of(cloud, planes, of_point, placement)
         for view in views:
             of_creases[view.camera].append(sights(creases, view))
-        stations.append((cloud.rows(of_point >= 0), views))
-    by_camera = [creases_pull(parts, rig, camera) for camera, parts in of_creases.items()]
-    by_camera = [pull for pull in by_camera if pull is not None]
+        stations.append((flat_cloud(cloud, planes, of_point), views))
+    by_camera = creases_pulls(of_creases, rig)
     of_pairs = [pairs_pull(*station, by_camera) for station in stations]
     of_pairs = [pull for pull in of_pairs if pull is not None]
     pulls = [*by_camera, *of_pairs]
@@ -296,6 +314,26 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         regions=sum(pull.groups for pull in of_pairs),
         all_on_head=all(c.mount == "head" for c in rig.cameras.values()),
     )
+
+
+def creases_pulls(of_creases: dict[str, list[Sights]], rig: CalibratedRig) -> list[Pull]:
+    """Of each camera that sees creases, after what the head slipped under those on the base.
+
+    Parameters
+    ----------
+    of_creases : dict of str to list of Sights
+        By camera and image.
+    rig : CalibratedRig
+    """
+    seen = {camera: joined(parts) for camera, parts in of_creases.items() if parts}
+    seen = {camera: places for camera, places in seen.items() if len(places.number)}
+    fixed = {
+        camera: s for camera, s in seen.items() if rig.cameras[camera].mount == "platform"
+    }
+    slip = slip_of(fixed, rig)
+    return [
+        creases_pull(s, rig, camera, slip * (camera in fixed)) for camera, s in seen.items()
+    ]
 
 
 def _stations(session, rig):
@@ -323,6 +361,16 @@ def _cloud(session, rig, placement) -> Cloud:
     return join_clouds(
         reconstruct(sweep, [], head, clean, lrf=session.lrf, continuous=continuous)
     )
+
+
+def flat_cloud(cloud, planes, of_point):
+    """The points of flat surfaces, moved onto them: single readings are noisy."""
+    cloud = cloud.rows(of_point >= 0)
+    plane = of_point[of_point >= 0]
+    normal = np.reshape([plane.axis for plane in planes], (-1, 3))[plane]
+    centre = np.reshape([plane.centre for plane in planes], (-1, 3))[plane]
+    off = np.vecdot(cloud.points - centre, normal)
+    return replace(cloud, points=cloud.points - off[:, None] * normal)
 
 
 def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
@@ -432,9 +480,12 @@ def _allowed(rig):
 def _shift(camera, columns, score, sharp, rig):
     """The Shift of one suspect, of unknowns in these columns."""
     known = sharp[np.ix_(columns, columns)]
-    likely = STIFF if camera else np.array([np.radians(1.0)])
+    likely = SPREAD if camera else np.array([np.radians(1.0)])
     covariance = np.linalg.inv(known + np.diag(likely**-2.0))
     change = covariance @ score[columns]
+    # turns and moves apart: the first three unknowns, and the others
+    of_change = [part for part in (known[:3, :3], known[3:, 3:]) if part.size]
+    least = [max(np.linalg.eigvalsh(part)[0], 1e-12) for part in of_change]
     # the score test, of what is known at all
     inverse = np.linalg.pinv(known, rcond=1e-6, hermitian=True)
     square = score[columns] @ inverse @ score[columns]
@@ -449,4 +500,5 @@ def _shift(camera, columns, score, sharp, rig):
         pixels=motion @ change,
         pixels_sigma=np.sqrt(np.diag(motion @ covariance @ motion.T)),
         p_value=float(chdtrc(len(columns), square)),
+        shows=tuple(SHOWS[len(columns)] / np.sqrt(least)),
     )

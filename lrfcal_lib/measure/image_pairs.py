@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.calibrate.cloud import Cloud
-from lrfcal_lib.measure.pulls import Pull, View, poses_of, pull_of_groups
+from lrfcal_lib.measure.pulls import SPREAD, Pull, View, poses_of, pull_of_groups
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
 from lrfcal_lib.preprocess.edges_in_image import sample
 
@@ -22,7 +22,6 @@ NEAR_PITCH = np.radians(15.0)  # between images of a camera that are compared
 BLURS = (6.0, 4.0, 2.5, 1.5, 1.0, 1.0)  # pixels, round by round
 ALIKE = 0.7  # correlation below which patches do not show the same
 CELL = np.radians(6.0)  # patches nearer together err together
-STIFF = np.array([*np.radians([1.0] * 3), 0.02, 0.02, 0.02])  # a camera's likely changes
 BORDER = 20  # pixels
 
 
@@ -64,7 +63,7 @@ def pairs_pull(cloud: Cloud, views: list[View], known: list[Pull]) -> Pull | Non
     cameras = dict.fromkeys(view.camera for view in views)
     poses = np.concatenate([poses_of(views[0].rig, camera) for camera in cameras])
     x = np.zeros(pairs[0].by_unknown[0].shape[-1])
-    prior = np.diag(np.tile(STIFF**-2.0, len(cameras)))
+    prior = np.diag(np.tile(SPREAD**-2.0, len(cameras)))
     slope = np.zeros(len(poses))
     for pull in known:
         prior = prior + pull.information[np.ix_(poses, poses)]

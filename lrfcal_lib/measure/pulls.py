@@ -11,6 +11,9 @@ from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
 from lrfcal_lib.session.read import Session
 
+# a camera's likely changes, radians and metres of its pose
+SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
+
 
 @dataclass(frozen=True)
 class View:

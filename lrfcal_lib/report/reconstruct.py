@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 from tqdm import tqdm
 
 from lrfcal_lib import __version__
@@ -15,6 +14,7 @@ from lrfcal_lib.calibrate.calibration_file import (
 )
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.scene import stations_of, write_scene
+from lrfcal_lib.measure.stations import alone
 from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.shown import printable
 
@@ -105,7 +105,7 @@ def reconstruct_session(
         place = scene.folder
         if len(scene.stations) > 1:
             place = scene.folder / f"station_{number}"
-        still = {number: RigidTransform.identity()}
+        still = alone(number)
         files = write_scene(place, session, scene.rig, still, scene.about, bar.update)
         bar.clear()
         print(f"station {number}: {', '.join(map(str, files))}", flush=True)
