@@ -240,6 +240,11 @@ CHANGES = [  # place in session.json, what stands there instead ("gone": nothing
         [[0, 0], [1, 0]],
         "corners_m must be one corner for each of 3 edges, got 2",
     ),
+    (
+        "board.pattern",
+        CHESSBOARD | {"origin_m": [0.3, 0.05]},
+        "inner corner at .* m lies [0-9]+ mm outside the outline: check columns, rows",
+    ),
     ("board.edges", ["ab", "ab", "ca"], "the edges need different names"),
     ("board.edges", ["ab", "ca"], "board.edges is .*at least 3 items"),
     (
