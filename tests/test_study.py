@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from falsified_sessions import copied, image_twice, judged
 from scipy.stats import binom
-from shared import QUICK, ROOT
+from shared import QUICK, ROOT, campaign
 from test_reconstruct_scene import Case, two_stations
 
 from lrfcal_lib.__main__ import main
@@ -406,7 +406,7 @@ def test_sessions_are_calibrated_on_a_cluster_as_here(
     assert "one session" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("verb", ["reconstruct", "merge"])
+@pytest.mark.parametrize("verb", ["reconstruct", pytest.param("merge", marks=campaign)])
 def test_scenes_are_used_on_a_cluster_as_here(verb, address, quick, tmp_path, monkeypatch):
     """The same bytes, but for the names (GUIDs) that every E57 file has of its own."""
     monkeypatch.chdir(tmp_path)
@@ -424,6 +424,7 @@ def test_scenes_are_used_on_a_cluster_as_here(verb, address, quick, tmp_path, mo
     )
 
 
+@campaign
 def test_falsified_recordings_are_judged_on_a_cluster_as_here(
     address, tmp_path, monkeypatch
 ):

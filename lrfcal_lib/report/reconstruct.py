@@ -100,16 +100,16 @@ def reconstruct_session(
     scene = open_scene(path, calibration, out, untrusted)
     session = scene.session
     counts = [np.isfinite(session.sweep(n).ranges).sum() for n in scene.stations]
-    bar = tqdm(total=int(sum(counts)), unit=" points", unit_scale=True, disable=None)
-    for number in scene.stations:
-        place = scene.folder
-        if len(scene.stations) > 1:
-            place = scene.folder / f"station_{number}"
-        still = alone(number)
-        files = write_scene(place, session, scene.rig, still, scene.about, bar.update)
-        bar.clear()
-        print(f"station {number}: {', '.join(map(str, files))}", flush=True)
-    bar.close()
+    total = int(sum(counts))
+    with tqdm(total=total, unit=" points", unit_scale=True, disable=None) as bar:
+        for number in scene.stations:
+            place = scene.folder
+            if len(scene.stations) > 1:
+                place = scene.folder / f"station_{number}"
+            still = alone(number)
+            files = write_scene(place, session, scene.rig, still, scene.about, bar.update)
+            bar.clear()
+            print(f"station {number}: {', '.join(map(str, files))}", flush=True)
     if len(scene.stations) > 1:
         print(f"{len(scene.stations)} stations, each in its own frame; 'merge' joins them")
     return 0
