@@ -5,6 +5,7 @@ import sys
 
 FEW = 6  # placements, with fewer of which no error of the model shows
 INTERRUPTED = 130  # exit code after Ctrl-C
+SCENE = "as 'record --scene' recorded it"
 
 
 def run(args):
@@ -16,8 +17,12 @@ def run(args):
             return check(args)
         case "calibrate" | "reconstruct" | "merge":
             return use_sessions(args)
-        case "compare" | "measure":
-            return use_calibrations(args)
+        case "compare":
+            from lrfcal_lib.report.compare import compare_files
+
+            return compare_files(args.calibrations, args.figure)
+        case "measure":
+            return measure(args)
         case "simulate":
             from lrfcal_lib.session.workers import side_by_side
             from lrfcal_lib.simulate.record import simulate
@@ -41,29 +46,17 @@ def run(args):
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
-            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
+            return main(args.setup, args.rig_file, args.feedback)
         case "board":
             print_board(args)
 
 
-def use_calibrations(args):
-    """Do what a verb asks for that takes calibration.json."""
-    match args.verb:
-        case "compare":
-            from lrfcal_lib.report.compare import compare_files
+def measure(args):
+    """Measure lengths between picked places."""
+    from lrfcal_lib.report.measure import measure_session
 
-            return compare_files(args.calibrations, args.figure)
-        case "measure":
-            from lrfcal_lib.report.measure import measure_session
-
-            return measure_session(
-                args.session,
-                args.calibration,
-                args.picks,
-                args.out,
-                args.station,
-                args.untrusted,
-            )
+    options = (args.out, args.station, args.untrusted)
+    return measure_session(args.session, args.calibration, args.picks, *options)
 
 
 def print_board(args):
@@ -144,7 +137,7 @@ def record(args):
     """Record placements of the board, or stations of a scene."""
     from lrfcal_lib.acquire.record import main
 
-    options = {"resume": args.resume, "count": args.placements, "mode": args.mode}
+    options = {"resume": args.resume, "count": args.placements}
     if args.scene:
         from lrfcal_lib.acquire.stations import Stations
         from lrfcal_lib.calibrate.calibration_file import load_calibration
@@ -233,33 +226,39 @@ def _add_sessions(verbs):
     )
     compare.add_argument("--figure", metavar="PNG", help="also draw them")
 
-    words = "make coloured clouds of a scene with a calibration of its rig"
-    _add_scene(verbs.add_parser("reconstruct", help=words))
-    _add_scene(verbs.add_parser("merge", help="join the stations of a scene in one cloud"))
+    for name, words in (
+        ("reconstruct", "make coloured clouds of a scene with a calibration of its rig"),
+        ("merge", "join the stations of a scene in one cloud"),
+    ):
+        scenes = verbs.add_parser(name, help=words)
+        scenes.add_argument("sessions", nargs="+", metavar="session", help=SCENE)
+        scenes.add_argument(
+            "--out",
+            help="folder of its files (default reports/<session> under this folder)",
+        )
+        _add_calibration(scenes)
+        _add_scheduler(scenes)
 
 
-def _add_scene(
-    verb, out="folder of its files (default reports/<session> under this folder)"
-):
+def _add_calibration(verb):
     """What the use of a calibration on a scene takes."""
-    verb.add_argument(
-        "sessions", nargs="+", metavar="session", help="as 'record --scene' recorded it"
-    )
     verb.add_argument("--calibration", required=True, help="calibration.json")
-    verb.add_argument("--out", help=out)
     verb.add_argument(
         "--untrusted",
         action="store_true",
         help="even if the verdict on the calibration is 'no'; every file says so",
     )
-    _add_scheduler(verb)
 
 
 def _add_measure(verbs):
     """The verb that measures in a scene."""
     words = "measure lengths between places picked in scene.html"
     measure = verbs.add_parser("measure", help=words)
-    _add_scene(measure, "CSV with the lengths (default reports/<session>/lengths.csv)")
+    measure.add_argument("session", help=SCENE)
+    measure.add_argument(
+        "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"
+    )
+    _add_calibration(measure)
     measure.add_argument("--picks", required=True, help="the CSV that scene.html saves")
     measure.add_argument(
         "--station", type=int, help="whose scene.html it was (default: that of 'merge')"
@@ -285,9 +284,6 @@ def _add_rigs(verbs):
         "--placements", type=how_many, metavar="N", help="record N placements of the plan"
     )
     record.add_argument(
-        "--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's"
-    )
-    record.add_argument(
         "--scene", action="store_true", help="record a scene instead of the plan's boards"
     )
     record.add_argument(
@@ -299,13 +295,15 @@ def _add_rigs(verbs):
 
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument(
-        "setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221"
+        "setup",
+        nargs="?",
+        default="sim_quick",
+        help="practice (recorded in minutes), sim_quick (default) or sim_lms221",
     )
     emulate.add_argument(
         "--rig-file",
         help="write a new file for 'record', removed at the end unless changed",
     )
-    emulate.add_argument("--seed", type=int, default=0, help="of noise")
     emulate.add_argument(
         "--feedback",
         choices=("full", "partial", "none"),

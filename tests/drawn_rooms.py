@@ -65,7 +65,7 @@ def turned(rows, middle, angle, shift):
 def draw_room(rng):
     """What room.json may say: another scale, the table, the chair, the door and the pictures elsewhere."""
     scale = rng.uniform(0.88, 1.12)
-    room = {"lights": copy.deepcopy(ROOM["lights"])}
+    room = {"parts": ROOM["parts"], "lights": copy.deepcopy(ROOM["lights"])}
     for part in ROOM.keys() - room.keys():
         room[part] = [sized(copy.deepcopy(row), scale) for row in ROOM[part]]
     room["lights"]["positions"] = [

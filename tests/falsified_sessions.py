@@ -10,6 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from lrfcal_lib.calibrate.pipeline import calibrate
+from lrfcal_lib.judge.verdict import judge
+from lrfcal_lib.session.cluster import workers_at
 from lrfcal_lib.session.read import IMAGE_COLUMNS, open_session
 from lrfcal_lib.session.tables import read_table
 from lrfcal_lib.session.write import as_lines
@@ -52,6 +55,23 @@ def copied(source, target):
         except OSError:  # another disk
             shutil.copyfile(file, other)
     return Path(target)
+
+
+def judged(folder):
+    """The verdict on a recording, of a worker where LRFCAL_SCHEDULER names a cluster.
+
+    Its workers see the folder under the same path, and have `tests` in their PYTHONPATH. As many recordings are judged
+    at a time as pytest has processes: ``pytest -m campaign -n 32 tests/test_falsified_sessions.py``.
+    """
+    scheduler = os.environ.get("LRFCAL_SCHEDULER")
+    if scheduler is None:
+        return _judged(folder)
+    with workers_at(scheduler) as executor:
+        return executor.submit(_judged, folder).result()
+
+
+def _judged(folder):
+    return judge(calibrate(open_session(folder)), suggest=False)
 
 
 def replaced(file, content):

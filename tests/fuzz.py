@@ -37,10 +37,11 @@ from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess.survey import views_of
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.importers import import_lasersetero
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.recorder import SessionRecorder
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, transform_to_json
 from lrfcal_lib.session.write import SessionWriter, finish
 
 SEED = 11

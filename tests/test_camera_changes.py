@@ -14,7 +14,6 @@ from lrfcal_lib.judge.camera_changes import (
     LEAST_SIZE,
     Step,
     camera_changes,
-    large_changes,
     largest_motion,
     likeliest_step,
 )
@@ -67,13 +66,10 @@ def found_in(obs, settings, prepared):
 def test_a_camera_that_is_knocked_is_named_with_its_size(seed, mount, turn_deg, shift):
     obs, settings, prepared = drawn(seed, mount=mount)
     (change,) = found_in(changed(obs, turn_deg=turn_deg, shift=shift), settings, prepared)
-    assert (change.camera, change.before, change.after) == (
-        "left",
-        *obs.placements[[FIRST - 1, FIRST]],
-    )
+    assert (change.camera, change.after) == ("left", obs.placements[FIRST])
     assert change.moved and not change.zoomed
     turn = np.radians(np.linalg.norm(turn_deg))
-    assert change.turn == pytest.approx(turn, abs=4 * change.turn_sigma)
+    assert change.turn == pytest.approx(turn, abs=np.radians(0.1))
     (fault,) = faults_of_changes([change], obs.cameras)
     for words in (
         "camera 'left' was moved",
@@ -107,27 +103,6 @@ def test_a_camera_that_zooms_is_named_with_its_size(seed, mount, growth):
         fault.kind == "camera zoomed"
         and ("larger" if growth > 0 else "smaller") in fault.words
     )
-
-
-@campaign
-@pytest.mark.parametrize(
-    ("seed", "mount", "turn_deg", "shift"),
-    [
-        (7, "head", [0.0, 30.0, 0.0], [0.0, 0.0, 0.0]),
-        (8, "platform", [0.0, 9.0, 0.0], [0.2, 0.0, 0.1]),
-    ],
-)
-def test_a_change_beyond_every_estimate_is_seen_by_the_other_cameras(
-    seed, mount, turn_deg, shift
-):
-    obs, settings, prepared = drawn(seed, mount=mount)
-    assert large_changes(obs, prepared, settings) == []
-    (change,) = large_changes(
-        changed(obs, turn_deg=turn_deg, shift=shift), prepared, settings
-    )
-    assert (change.camera, change.after) == ("left", obs.placements[FIRST])
-    turn = np.radians(np.linalg.norm(turn_deg))
-    assert change.turn == pytest.approx(turn, abs=5 * change.turn_sigma)
 
 
 @campaign

@@ -1,16 +1,15 @@
 """Whole recordings that users spoil: `check` or the verdict names what was done."""
 
 import pytest
-from falsified_sessions import WAYS, copied
+from falsified_sessions import WAYS, copied, judged
 from shared import DATA, campaign
 
 from lrfcal_lib.calibrate.pipeline import calibrate
 from lrfcal_lib.judge.alternatives import ALTERNATIVES
 from lrfcal_lib.judge.recording_faults import recording_faults
-from lrfcal_lib.judge.verdict import judge
 from lrfcal_lib.session.faults import faults_of_files
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import SessionError
 
 CASES = [(name, session) for name, way in WAYS.items() for session in way.sessions]
 
@@ -43,9 +42,9 @@ def test_what_was_done_is_named(name, folder):
         assert way.kinds == ("refused",) or "unit" in way.kinds
         assert way.words in words
         return
-    judged = judge(calibrate(open_session(folder)), suggest=False)
-    causes = kinds | {reason.kind for reason in judged.reasons}
-    said = f"{words}; {' '.join(judged.sentences())}"
+    verdict = judged(folder)
+    causes = kinds | {reason.kind for reason in verdict.reasons}
+    said = f"{words}; {' '.join(verdict.sentences())}"
     if way.kinds:
         assert causes & set(way.kinds) and way.words in said, said
     else:

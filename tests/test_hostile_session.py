@@ -19,9 +19,9 @@ from shared import DATA, campaign
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.lock import alone
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import SessionError
 
 SCANS = [
     "session.json",
@@ -189,7 +189,7 @@ DAMAGE = {
         lambda data: data[:2] + 11_000 * b"\xff\xe1\0\2" + data[2:]
     ),
     "0001.jpg: the image is truncated after": jpeg(
-        lambda data: data[:2] + 10_000 * b"\xff\xe5\0\2" + data[2:]
+        lambda data: data[:2] + 150_000 * b"\xff\xe5\0\2" + data[2:]
     ),
     "images.csv line 7: .*images/left/0001.png stands in line 4 already; remove one": lambda p: (
         named_again(p)

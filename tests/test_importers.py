@@ -5,12 +5,12 @@ import re
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from tiny_import import BOUGUET, authors_points, write_source
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session import importers
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.importers import (
     import_lasersetero,
     read_bouguet,
@@ -18,7 +18,6 @@ from lrfcal_lib.session.importers import (
     recover_polar,
 )
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import SessionError, TransformStated, from_json
 
 
 @pytest.fixture
@@ -100,7 +99,6 @@ REFUSED = [
     (results("-0.17 ;", ""), r"c\.m: no value of kc"),
     (results("700.5", "1e999"), r"c\.m: values of fc are not finite"),
     (results("700.5", "3-2"), r"c\.m: could not convert"),
-    (results("1.3e+03", "1.3e+03 ; 1"), r"c\.m: .*shape"),
     (
         lambda _: recover_polar(scattered(20_000), "c 9"),
         "c 9: 14020000 values of scan lines, more than 12000000",
@@ -166,15 +164,6 @@ def test_import_makes_a_sound_session(source, tmp_path, capsys):
         15.25,
         11.75,
     ]
-    sigma = [*published["intrinsics_sigma"].values()]
-    np.testing.assert_allclose(sigma[:5], [1, 2, 0.1, 0.2, 0.001])
-    pose = from_json(
-        TransformStated, session.reference["cameras"]["left"]["T_camera_board"]["1"]
-    ).made()
-    np.testing.assert_allclose(pose.translation, [-0.1428, 0.098, 1.3])
-    np.testing.assert_allclose(
-        pose.rotation.as_matrix(), Rotation.from_rotvec([-0.74, -0.3, 1.4]).as_matrix()
-    )
 
 
 def test_commands_say_what_is_wrong(source, tmp_path, capsys):

@@ -90,10 +90,6 @@ def test_derivatives_of_an_edge_are_those_of_the_edge_of_a_moved_camera(quick, s
     rig = scene.rig
     number = session.scene_placements[0]
     views = lengths.views_of(session, rig, number)
-    pitches = [
-        float(rig.corrections.pitch(number, session.image_records[v.number].pitch))
-        for v in views
-    ]
     step = 1e-4
     name = views[0].camera
     surfaces = (scene.planes, scene.of_point)
@@ -102,7 +98,7 @@ def test_derivatives_of_an_edge_are_those_of_the_edge_of_a_moved_camera(quick, s
         replace(v, T_camera_platform=shift * v.T_camera_platform) if v.camera == name else v
         for v in views
     ]
-    after = edges_of(scene.cloud, surfaces, moved, pitches)
+    after = edges_of(scene.cloud, surfaces, moved)
     column = list(rig.uncertainty.names).index(f"{name}_tx")
     changes = []
     of_camera = {view.number for view in views if view.camera == name}
@@ -197,6 +193,22 @@ def test_a_length_of_two_stations_is_one_and_their_shared_errors_stay(scene):
     far = seen_from(scene, T_scene_station.inv(), 0.02)
     apart = lengths.measure({1: scene, 9: far}, pd.DataFrame([row]), poses)
     assert len(apart.stations[0].split()) == 1
+
+
+def test_another_edge_that_crosses_there_is_not_taken_for_the_same(scene):
+    i, j = parallel(scene.edges)
+    ends = [("edge", scene.edges[k].centre) for k in (i, j)]
+    row = {"name": "it"} | pick(*ends[0], 1) | pick(*ends[1], 2)
+    other = seen_from(scene, RigidTransform.identity(), 0.0)
+    edge = other.edges[i]
+    off, across = np.linalg.svd(edge.axis[None])[2][1:]
+    same = replace(edge, centre=edge.centre + 0.003 * off, ends=edge.ends + 0.003 * off)
+    ends = edge.centre + 0.001 * off + np.outer([-0.1, 0.1], across)
+    nearer = replace(edge, axis=across, ends=ends)
+    other = replace(other, edges=[nearer, same, other.edges[j]])
+    poses = dict.fromkeys((1, 9), RigidTransform.identity())
+    both = lengths.measure({1: scene, 9: other}, pd.DataFrame([row]), poses)
+    assert both.problem[0] == "" and both.stations[0] == "1 9"
 
 
 def test_places_that_no_station_shows_together_are_named(scene):

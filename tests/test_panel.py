@@ -125,7 +125,7 @@ def test_advice_where_nothing_is_determined_yet(monkeypatch):
 
 
 @pytest.mark.parametrize(("rig", "error", "said"), [
-    ("practise", RigFileError, "emulated are practice, sim_quick, sim_lms221"),
+    ("practise", RigFileError, "practise: No such file"),
     ("missing.json", RigFileError, "No such file.*emulate"),
     ("rig.json", PortError, "head: .*fake_head"),
 ])  # fmt: skip

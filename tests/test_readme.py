@@ -116,12 +116,7 @@ def test_every_command_is_understood():
             assert done.returncode == 0, (words, done.stderr)
         else:
             assert words[1:3] == ["-m", "lrfcal_lib"]
-            known, rest = command_line.parser().parse_known_args(words[3:])
-            assert (
-                not rest
-                or known.verb == "emulate"
-                and rest == ["sim_quick", "--rig-file", "emulated.json"]
-            )
+            command_line.parser().parse_args(words[3:])  # exits where it is not
 
 
 def test_the_clone_line_gives_a_checkout_that_checks_its_session(tmp_path):

@@ -165,7 +165,9 @@ def test_an_untrusted_calibration_is_named_in_every_file(case, tmp_path, capsys)
         assert str(file) in said and b"UNTRUSTED" in file.read_bytes()
 
 
-def test_stations_stay_apart_until_they_are_joined(case, tmp_path, capsys):
+def two_stations(case):
+    """The scene once more, 10 mm farther away, as a second station."""
+
     def shifted(values, key):
         copy = values[case.rows]
         if key == "ranges":
@@ -187,6 +189,10 @@ def test_stations_stay_apart_until_they_are_joined(case, tmp_path, capsys):
     shutil.copy(case.session / source, copies)
     row = last.replace(source, "images/left/copy.jpg").replace(f",{SCENE},", ",9,")
     table.write_text("\n".join([*rows, row]) + "\n")
+
+
+def test_stations_stay_apart_until_they_are_joined(case, tmp_path, capsys):
+    two_stations(case)
     assert reconstruct(case, "--out", tmp_path / "out") == 0
     assert (
         "2 stations, each in its own frame; 'merge' joins them" in capsys.readouterr().out

@@ -15,7 +15,7 @@ import pytest
 from shared import until
 from small_rigs import scaled
 
-from lrfcal_lib.emulators.rig import EmulatedRig, practice_setup, quick_file
+from lrfcal_lib.emulators.rig import EmulatedRig, practice_setup
 from lrfcal_lib.session.read import open_session, validate
 
 DEADLINE = 120.0  # s, against hanging
@@ -30,15 +30,14 @@ def rig():
     setup = replace(
         setup, rig=scaled(replace(setup.rig, cameras=setup.rig.cameras[:1]), 64)
     )
-    head = {"baudrate": 38400, "go_speed": 60.0}
-    with EmulatedRig(setup, placements=short, head_options=head, rest_s=0.1) as rig:
+    with EmulatedRig(setup, placements=short, quick=True, rest_s=0.1) as rig:
         yield rig
 
 
 @pytest.fixture
 def stated(rig):
     """Its rig file, to be spoilt."""
-    return quick_file(rig)
+    return rig.rig_file()
 
 
 class Program:

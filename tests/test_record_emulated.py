@@ -8,9 +8,12 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.stats import chi2
 from small_rigs import scaled
+from test_new_user import words_of
+from test_scene_page import said_on_page
 from virtual import VirtualHost
 
 from lrfcal_lib import __main__ as command_line
@@ -27,7 +30,6 @@ from lrfcal_lib.measure.features import flatness, largest_plane
 from lrfcal_lib.measure.scene import station_cloud
 from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import model_to_json
 from lrfcal_lib.simulate.rig import PLACES, load_setup, pairs, random
 
 DEADLINE = 180.0  # s, against hanging
@@ -47,12 +49,6 @@ def small_setup():
     return setup, [
         replace(p, image_pitch=p.image_pitch[len(p.image_pitch) // 2 :][:1]) for p in found
     ]
-
-
-def state_intrinsics(data, setup):
-    for camera in setup.rig.cameras:
-        data["rig"]["cameras"][camera.name]["intrinsics"] = model_to_json(camera.model)
-    return data
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +81,7 @@ def emulated_rig(setup, file):
         setup[0], placements=setup[1], host=host, rest_s=0.0,
         head_options={"baudrate": 9600, "go_speed": 20.0},
     ) as emulated:  # fmt: skip
-        data = state_intrinsics(emulated.rig_file(), setup[0])
+        data = emulated.rig_file()
         data["devices"]["head"] |= {
             "settle_s": 0.25,
             "poll_s": 0.05,
@@ -113,8 +109,10 @@ def recorded_session(devices):
     """What `record` makes of the emulated devices."""
     folder, rig = devices
     with rig.open(read_rig_file(folder / "rig.json")) as opened:
-        record_session(opened, folder / "s")  # nobody is asked: the board moves by itself
-    return open_session(folder / "s")
+        record_session(
+            opened, folder / "my_session"
+        )  # nobody is asked: the board moves by itself
+    return open_session(folder / "my_session")
 
 
 def test_the_recording_calibrates_to_the_truth_within_what_it_says(recorded_session, setup):
@@ -133,42 +131,48 @@ def test_the_recording_calibrates_to_the_truth_within_what_it_says(recorded_sess
     assert nees(axis - true, solution.covariance("axis_", "offset_")) < chi2.ppf(0.999, 4)
 
 
-def test_a_scene_is_recorded_and_rebuilt_with_that_calibration(
-    recorded_session, devices, monkeypatch, capsys
+def typed(verb, *more):
+    """A command of README's own blocks, in this process."""
+    assert command_line.main(words_of(verb, *more)[3:]) == 0
+
+
+def test_a_scene_is_measured_by_the_readme_alone(
+    recorded_session, devices, monkeypatch, capsys, browser
 ):
-    """As a new user does it, by the commands alone."""
+    """As a new user does it; test_new_user.py waits for devices in real time, and clicks with the mouse."""
     folder, rig = devices
     monkeypatch.setattr(record, "Rig", rig)
-    file = folder / "out" / "calibration.json"
-    verb(0, "calibrate", folder / "s", "--out", folder / "out")
-    plan = ["--scene", "--stations", "1", "--calibration", file]
-    verb(0, "record", folder / "rig.json", folder / "room", *plan)
+    monkeypatch.chdir(folder)
+    typed("calibrate")
+    typed("record", "--scene")
     said = capsys.readouterr().out
     planned = float(re.search(r"deg: (\d+) % of the cloud can get a colour", said)[1])
     colored = float(re.search(r"colour: (\d+) % of the points", said)[1])
     # things hide more from a camera than planned, the more the farther apart the beams are
-    assert planned - 20 < colored < planned + 5 and "ok    stood still" in said
+    assert planned - 20 < colored < planned + 5 and said.count("ok    stood still") == 3
 
-    verb(
-        0,
-        "reconstruct",
-        folder / "room",
-        "--calibration",
-        file,
-        "--out",
-        folder / "room_out",
-    )
-    names = sorted(path.name for path in (folder / "room_out").iterdir())
+    typed("reconstruct")
+    out = folder / "reports" / "my_room" / "station_1"
+    names = sorted(path.name for path in out.iterdir())
     assert names == ["scene.e57", "scene.html", "scene.pcd", "scene.ply"]
-    session = open_session(folder / "room")
-    cloud = station_cloud(session, load_calibration(file), 1)
+    session = open_session(folder / "my_room")
+    cloud = station_cloud(session, load_calibration(folder / "my_rig/calibration.json"), 1)
     wall = cloud.points[largest_plane(cloud)]
     assert len(wall) > 500 and flatness(wall)[1] < 0.02
 
-
-def verb(code, *words):
-    """Run a command."""
-    assert command_line.main([str(word) for word in words]) == code
+    view = browser.new_page()
+    view.goto((out / "scene.html").as_uri())
+    view.wait_for_selector("#measure", state="attached")
+    for number, place in enumerate(cloud.points[cloud.seen][[100, -100]].tolist()):
+        view.evaluate("([p, n]) => measuring.pick('point', p, 0, n)", [place, number])
+    length, low, high = said_on_page(view)
+    (folder / "picks.csv").write_text(view.evaluate("measuring.csv()"))
+    view.close()
+    typed("measure")
+    (told,) = pd.read_csv(folder / "reports" / "my_room" / "lengths.csv").itertuples()
+    for mm, metres in ((length, told.length_m), (low, told.low_m), (high, told.high_m)):
+        assert mm == pytest.approx(1000 * metres, abs=0.5)
+    assert low < length < high
 
 
 def nees(miss, covariance):

@@ -63,7 +63,7 @@ def test_every_station_is_swept_photographed_and_closed(run, tmp_path):
 
 
 def test_a_continuous_sweep_is_closed_as_well(run, tmp_path):
-    assert run([""], "--mode", "continuous")[0] == 0
+    assert run([""], mode="continuous")[0] == 0
     session = open_session(tmp_path / "s")
     assert session.continuous and not closing_of(session.sweep(1)).moved
 

@@ -75,9 +75,10 @@ def test_no_rig_file(tmp_path, made, message):
 
 
 def test_interlaced_scans_need_a_head_at_rest(tmp_path):
-    stated = read(tmp_path, changed("devices.lrf.interlaced", True))
+    data = changed("devices.lrf.interlaced", True)
+    data["plan"]["mode"] = "continuous"
     with pytest.raises(RigFileError, match=r"devices\.lrf\.interlaced is true"):
-        stated.with_mode("continuous")
+        read(tmp_path, data)
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.calibrate.cloud import COLUMNS, point_type
 from lrfcal_lib.calibrate.clouds import color_cloud
 from lrfcal_lib.measure.scene import station_cloud, stations_of, write_scene
+from lrfcal_lib.measure.stations import Joined, alone
 
 ABOUT = "session sim_quick, UNTRUSTED for a test"
 POSE = RigidTransform.from_components(
     [3.0, -1.0, 0.5], Rotation.from_rotvec([0.1, -0.2, 0.8])
 )
+SHIFT = 0.05  # metres, sigma of the place of its station
+SHIFTS = np.diag([0.0, 0, 0, 1, 1, 1])
 NOT_SEEN = 0.02  # share of the points whose pixel lies on the very rim of its image
 
 
@@ -40,8 +43,8 @@ def folder(session, rig, tmp_path_factory):
     """The files of the scene, whose station has a pose."""
     folder = tmp_path_factory.mktemp("scene")
     counts = []
-    poses = {stations_of(session)[0]: POSE}
-    files = write_scene(folder, session, rig, poses, ABOUT, counts.append)
+    posed = Joined({stations_of(session)[0]: POSE}, SHIFT**2 * SHIFTS, (), ())
+    files = write_scene(folder, session, rig, posed, ABOUT, counts.append)
     assert sorted(files) == sorted(folder.iterdir())
     assert sum(counts) == len(ply_points(folder))
     return folder
@@ -70,7 +73,6 @@ def test_all_files_hold_the_same_points(folder, e57, cloud):
     rows = ply_points(folder)
     np.testing.assert_allclose(rows["points"], POSE.apply(cloud.points), atol=1e-6)
     np.testing.assert_array_equal(rows["colors"], cloud.colors)
-    np.testing.assert_allclose(rows["sigma"][:, 0], cloud.sigma, rtol=1e-6)
     assert np.all(rows["sigma"] > 0)
 
     read = e57.read_scan(0, colors=True, ignore_missing_fields=True)
@@ -81,6 +83,13 @@ def test_all_files_hold_the_same_points(folder, e57, cloud):
 
     pcd = o3d.io.read_point_cloud(str(folder / "scene.pcd"))
     np.testing.assert_allclose(np.asarray(pcd.points), rows["points"], atol=1e-6)
+
+
+def test_points_are_as_uncertain_as_their_station(folder, cloud):
+    sigma = ply_points(folder)["sigma"][:, 0]
+    smooth = np.isfinite(cloud.normals).all(axis=1)
+    expected = np.hypot(cloud.sigma, SHIFT * smooth)
+    np.testing.assert_allclose(sigma, expected, rtol=1e-6)
 
 
 def test_every_file_says_where_it_is_from(folder, e57):
@@ -160,9 +169,8 @@ def test_points_without_a_color_are_as_grey_as_their_echoes(session, rig, cloud)
 
 def test_a_file_that_breaks_off_is_not_there(session, rig, tmp_path, little_space):
     number = session.scene_placements[0]
-    still = {number: RigidTransform.identity()}
     with little_space(100_000), pytest.raises(ValueError, match="cannot be written"):
-        write_scene(tmp_path, session, rig, still, ABOUT)
+        write_scene(tmp_path, session, rig, alone(number), ABOUT)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -13,9 +13,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.images import image_size
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo
 from lrfcal_lib.session.write import SessionWriter, finish
 
 BEARINGS = np.radians(np.arange(60.0, 121.0))
@@ -238,6 +239,11 @@ CHANGES = [  # place in session.json, what stands there instead ("gone": nothing
         "board.corners_m",
         [[0, 0], [1, 0]],
         "corners_m must be one corner for each of 3 edges, got 2",
+    ),
+    (
+        "board.pattern",
+        CHESSBOARD | {"origin_m": [0.3, 0.05]},
+        "inner corner at .* m lies [0-9]+ mm outside the outline: check columns, rows",
     ),
     ("board.edges", ["ab", "ab", "ca"], "the edges need different names"),
     ("board.edges", ["ab", "ca"], "board.edges is .*at least 3 items"),

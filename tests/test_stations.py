@@ -9,8 +9,10 @@ import rooms
 from scipy.spatial.transform import RigidTransform, Rotation
 from shared import DATA
 
+from lrfcal_lib.calibrate.cloud import join
 from lrfcal_lib.measure.features import flatness, with_sigma
 from lrfcal_lib.measure.pose_graph import connected, solved
+from lrfcal_lib.measure.scene import Station, colored_blocks
 from lrfcal_lib.measure.stations import (
     Joined,
     Pair,
@@ -270,8 +272,9 @@ def corridor_cloud():
 def test_merge_writes_one_cloud_and_a_page(tmp_path, rig, monkeypatch, capsys):
     room = DATA / "room_lms221"
     asked = SceneAsked(open_session(room), rig, (1, 3), tmp_path)
+    monkeypatch.setattr(merge, "station_cloud", grey_cloud)
     monkeypatch.setattr(merge, "open_scene", lambda *scene: asked)
-    monkeypatch.setattr(merge, "write_scene", lambda folder, *rest: [folder / "scene.ply"])
+    monkeypatch.setattr(merge, "write_scene", lambda folder, *rest, **clouds: [folder / "scene.ply"])
     assert merge.merge_session(room, "calibration.json", tmp_path) == 0
     said = capsys.readouterr().out
     assert "platform frame of station 1" in said
@@ -287,6 +290,12 @@ def test_merge_writes_one_cloud_and_a_page(tmp_path, rig, monkeypatch, capsys):
     monkeypatch.setattr(merge, "join_stations", lambda clouds, rig: lonely())
     with pytest.raises(ValueError, match="room_lms221: no two stations can be joined"):
         merge.merge_session(room, "calibration.json")
+
+
+def grey_cloud(session, rig, number):
+    """A station without its images, which another rig took."""
+    station = Station(number, session.sweep(number), [])
+    return with_sigma(join(colored_blocks(session, rig, station)), rig)
 
 
 def lonely():

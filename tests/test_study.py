@@ -11,11 +11,14 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
+from falsified_sessions import copied, image_twice, judged
 from scipy.stats import binom
 from shared import QUICK, ROOT
+from test_reconstruct_scene import Case, two_stations
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.evaluate import study
+from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.evaluate.study import (
     COUNTS,
     finished,
@@ -401,6 +404,35 @@ def test_sessions_are_calibrated_on_a_cluster_as_here(
         assert elsewhere.read_bytes() == (tmp_path / "here" / name).read_bytes()
     assert main(["calibrate", "a", "b", "--out", "here"]) == 1
     assert "one session" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["reconstruct", "merge"])
+def test_scenes_are_used_on_a_cluster_as_here(verb, address, quick, tmp_path, monkeypatch):
+    """The same bytes, but for the names (GUIDs) that every E57 file has of its own."""
+    monkeypatch.chdir(tmp_path)
+    write_calibration(tmp_path / "quick.json", calibration_record(quick, "joint"))
+    case = Case(tmp_path, tmp_path / "quick.json", quick.prepared.session.scans)
+    two_stations(case)
+    command = [verb, "room", "--calibration", "calibration.json"]
+    assert main([*command, "--out", "here"]) == 0
+    assert main([*command, "--scheduler", address]) == 0
+    for file in (tmp_path / "here").rglob("*.*"):
+        there = tmp_path / "reports" / "room" / file.relative_to(tmp_path / "here")
+        assert file.suffix == ".e57" or there.read_bytes() == file.read_bytes()
+    assert sorted(p.name for p in (tmp_path / "here").rglob("scene.*")) == sorted(
+        p.name for p in (tmp_path / "reports").rglob("scene.*")
+    )
+
+
+def test_falsified_recordings_are_judged_on_a_cluster_as_here(
+    address, tmp_path, monkeypatch
+):
+    """`make campaign` has many of them."""
+    folder = copied(QUICK, tmp_path / "quick")
+    image_twice(folder)
+    here = judged(folder)
+    monkeypatch.setenv("LRFCAL_SCHEDULER", address)
+    assert judged(folder).record() == here.record()
 
 
 def test_a_worker_with_another_version_is_refused(address, monkeypatch):

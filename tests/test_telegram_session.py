@@ -8,6 +8,7 @@ import pytest
 from telegrams import encode_scan
 
 from lrfcal_lib.model.board import triangle_board
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.lms2xx_codec import (
     Configuration,
     encode_configuration,
@@ -18,7 +19,7 @@ from lrfcal_lib.session.lms2xx_frame import (
     encode_telegram,
 )
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import LrfInfo, SessionError
+from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.session.telegrams import TRUNCATED, WRONG
 from lrfcal_lib.session.write import SessionWriter, finish
 

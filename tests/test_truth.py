@@ -12,8 +12,8 @@ from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.observe import platform_observations
 from lrfcal_lib.evaluate.truth import axis_errors, camera_errors, on_true_edges, read_truth
 from lrfcal_lib.model import geometry
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import SessionError
 
 
 def test_a_recording_has_no_truth(tmp_path):

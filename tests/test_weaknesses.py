@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
 from lrfcal_lib.judge.verdict import verdict
@@ -66,25 +65,12 @@ def test_a_good_recording_is_trusted(good):
     assert 0.1 < errors.pixels["left"] < 3 and 0.1 < errors.cloud_mm < 10
 
 
-def parallel(poses):
-    """The boards where they are, all turned like the first but for a spin in their planes."""
-    turns = poses[0].rotation * Rotation.from_rotvec(
-        np.outer(np.arange(len(poses)), [0, 0, 0.7])
-    )
-    return [
-        RigidTransform.from_components(p.translation, turn)
-        for p, turn in zip(poses, turns, strict=True)
-    ]
-
-
 WEAK = {
     "pitch": (lambda poses: poses, {"span": np.radians(1.0), "images": 1}, "no", "tilt axis is hardly determined"),
     "image pitch": (lambda poses: poses, {"images": 1}, "with care", "every placement has its images at one pitch"),
-    "parallel": (parallel, {}, "with care", "all boards are parallel"),
     "distance": (lambda poses: board_poses(np.random.default_rng(8), 8, (1.5, 1.52)), {}, "with care",
                  "all boards stand at one distance"),
     "placements": (lambda poses: poses[:4], {}, "with care", "only 4 placements, 6 or more are needed"),
-    "cameras": (lambda poses: poses[:2], {}, "with care", "camera 'right' sees the board in only 2 placements"),
 }  # fmt: skip
 
 

@@ -167,6 +167,7 @@ def rig_of(v):
 def _board(v, square):
     """The paper's triangle or a plate, with as many squares as fit."""
     if v.triangle:
+        square = min(square, 0.034)  # of larger ones a pattern does not fit
         count = int((0.19 - 0.02) / square)
         columns = max(count - 1, 4)
         rows = max(count, 5)

@@ -15,8 +15,9 @@ from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
 from lrfcal_lib.session.faults import DARK, dark_image, repeated_images, repeated_scans
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session, Sweep
-from lrfcal_lib.session.stated import LrfInfo, SessionError
+from lrfcal_lib.session.stated import LrfInfo
 
 STATES = ("ok", "warn", "bad")
 FEWEST_CROSSINGS = 6  # of a side, below which a straight line says little about it

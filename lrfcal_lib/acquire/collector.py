@@ -22,7 +22,7 @@ from lrfcal_lib.calibrate.pipeline import (
 )
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
-from lrfcal_lib.drivers.rig_file import Placement, RigFileError, read_rig_file, rig_of
+from lrfcal_lib.drivers.rig_file import Placement, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.judge.verdict import YES, judge, verdict
@@ -510,14 +510,8 @@ def _stated(rig, stack):
     if str(rig) in PRACTICE_RIGS:
         from lrfcal_lib.emulators.rig import emulated
 
-        devices, data = emulated(str(rig))
-        stack.enter_context(devices)
-        return rig_of(data(), Path(f"emulated {devices.setup.name}"))
-    if not Path(rig).suffix and not Path(rig).exists():
-        known = ", ".join(PRACTICE_RIGS)
-        raise RigFileError(
-            f"there is no rig file or emulated rig '{rig}'; emulated are {known}"
-        )
+        devices = stack.enter_context(emulated(str(rig)))
+        return rig_of(devices.rig_file(), Path(f"emulated {rig}"))
     return read_rig_file(rig)
 
 

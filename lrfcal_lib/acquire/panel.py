@@ -255,12 +255,9 @@ def absolute(text):
 
 def rig_named(text):
     """What the field of the rig names: an emulated rig, or the absolute path of a rig file."""
-    text = text.strip()
-    path = Path(text).expanduser()
-    looks_like_a_file = bool(path.suffix) or path.exists() or len(path.parts) > 1
-    if text in PRACTICE_RIGS or not looks_like_a_file:
-        return text
-    return path.absolute()
+    if text.strip() in PRACTICE_RIGS:
+        return text.strip()
+    return absolute(text)
 
 
 class Panel(Closed):

@@ -16,14 +16,16 @@ from lrfcal_lib.acquire.checks import Light, check_image, check_placement
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, read_rig_file
-from lrfcal_lib.session.progress import Progress, duration
+from lrfcal_lib.session.files import SessionError
+from lrfcal_lib.session.lms2xx_codec import encode_configuration
 from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.recorder import SessionRecorder
-from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import not_written
 
 FAILED = 2
 INTERRUPTED = 130  # exit codes
+LINE = "  {desc}, {remaining} left"  # of tqdm
+LINE_S = {True: 0.1, False: 10.0}  # between two of them, on a terminal and elsewhere
 MARKS = {"ok": "  ok  ", "warn": "  WARN", "bad": "  BAD "}
 HOW = {  # a session was recorded, by the mode of the plan
     "stop-and-go": (
@@ -86,7 +88,9 @@ class Recording(Closed):
         with self._safely(), contextlib.ExitStack() as stack:
             writer = self._open(resume)
             stack.callback(writer.close)
-            writer.add_telegrams(-1, rig.begin_telegrams(), time_s=rig.clock())
+            # a scan does not tell its measuring mode, this does
+            begin = encode_configuration(rig.lrf.configuration)
+            writer.add_telegrams(-1, [begin], time_s=rig.clock())
             self.writer = writer
             stack.pop_all()
 
@@ -275,7 +279,9 @@ class Recording(Closed):
                     measured = event.pitch
                 writer.add_platform([(event.time_s, event.commanded, measured)])
             elif isinstance(event, Scanned):
-                self._write_scans(event)
+                scans = zip(event.readings, event.pitch, strict=True)
+                rows = [(raw, p, one.time_s) for one, p in scans for raw in one.telegrams]
+                writer.add_telegrams(event.placement, *zip(*rows, strict=True))
             elif isinstance(event, Photographed):
                 writer.add_image(
                     event.camera,
@@ -292,18 +298,6 @@ class Recording(Closed):
                     if measured
                 ]
                 writer.add_platform(track)
-
-    def _write_scans(self, event):
-        """Put the telegrams of readings on the disk."""
-        telegrams = []
-        pitches = []
-        times = []
-        for reading, pitch in zip(event.readings, event.pitch, strict=True):
-            for raw in reading.telegrams:
-                telegrams.append(raw)
-                pitches.append(pitch)
-                times.append(reading.time_s)
-        self.writer.add_telegrams(event.placement, telegrams, pitches, times)
 
     @contextlib.contextmanager
     def _safely(self):
@@ -375,7 +369,7 @@ class Sweeping:
 def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) -> None:
     """Show the recording of a placement while it runs, and how long it will still take.
 
-    On a terminal one line is written over and over; a file gets a line now and then.
+    One line is written over and over, in a file now and then.
 
     Parameters
     ----------
@@ -389,18 +383,17 @@ def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) 
     first, last = (math.degrees(pitch) for pitch in placement.pitch[[0, -1]])
     title = f"placement {placement.number} ({number} of {of}): {placement.purpose}"
     print(f"{title}, pitch {first:.2f} to {last:.2f} deg", flush=True)
-    progress = Progress()
     sweeping = Sweeping()
-    with tqdm(bar_format="  {desc}", file=sys.stdout, leave=False, disable=None) as line:
+    pause = LINE_S[sys.stdout.isatty()]
+    with tqdm(
+        total=1, bar_format=LINE, file=sys.stdout, leave=False, mininterval=pause
+    ) as line:
         for event in events:
             sweeping.note(event)
             words = f"{sweeping.stop}{math.degrees(sweeping.pitch):+.2f} deg, {sweeping.counts()}"
-            if left := progress.left(sweeping.share):
-                words = f"{words}, {left}"
-            line.set_description_str(words)
-            if line.disable and progress.due():
-                print(f"  {words}", flush=True)
-    print(f"  {sweeping.counts()} in {progress.seconds:.0f} s", flush=True)
+            line.set_description_str(words, refresh=False)
+            line.update(sweeping.share - line.n)
+    print(f"  {sweeping.counts()}", flush=True)
 
 
 def show(light: Light, name: str) -> None:
@@ -499,7 +492,6 @@ def _placements(recording, guide):
     """Each placement that is missing; the user may have the one before again (r), or end (q)."""
     before = None
     of = len(recording.plan)
-    recorded = []  # seconds of each placement of this run
     while todo := recording.to_do():
         placement = todo[0]
         answer = guide.ready(recording.rig, placement, before)
@@ -509,18 +501,12 @@ def _placements(recording, guide):
             recording.drop(before)
             before = None
             continue
-        progress = Progress()
         follow(placement, of - len(todo) + 1, of, recording.run(placement))
-        recorded.append(progress.seconds)
         before = placement.number
         for light in guide.check(open_session(recording.path), before):
             show(light, light.name)
         if left := len(todo) - 1:
-            expected = duration(left * sum(recorded) / len(recorded))
-            print(
-                f"  {left} of {of} placements left: about {expected} of recording",
-                flush=True,
-            )
+            print(f"  {left} of {of} placements left", flush=True)
 
 
 def ask_before(kind: str, number: int, what: str, before: int | None) -> str:
@@ -542,7 +528,6 @@ def main(
     *,
     resume: bool = False,
     count: int | None = None,
-    mode: str | None = None,
     guide: Boards | None = None,
 ) -> int:
     """Record from the command line.
@@ -553,8 +538,6 @@ def main(
         Its path.
     path, resume, count
         As of :func:`record_session`.
-    mode
-        Instead of the plan's.
     guide
         As of :func:`record_session`.
 
@@ -567,7 +550,7 @@ def main(
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     guide = guide or Boards()
     try:
-        stated = guide.planned(read_rig_file(rig_file).with_mode(mode))
+        stated = guide.planned(read_rig_file(rig_file))
         print(f"{rig_file}: opening the devices", flush=True)
         with Rig.open(stated) as rig:
             recording = record_session(rig, path, resume=resume, count=count, guide=guide)

@@ -1,6 +1,6 @@
 """Coloured clouds of a session: its sweeps and images, seen by a calibrated rig."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.preprocess.closing_scan import without_closing
-from lrfcal_lib.session.read import Session
+from lrfcal_lib.session.read import Session, Sweep
 
 MARGIN = 20  # scan lines and beams about a board that are worked on with it
 
@@ -79,15 +79,26 @@ def cloud_blocks(
             sweep, _ = without_closing(sweep)
         else:
             sweep, mask = _about(sweep, mask)
-        yield from reconstruct(
-            sweep,
-            views,
-            rig.T_head_lrf,
-            rig.corrections,
-            lrf=session.lrf,
-            continuous=session.continuous,
-            mask=mask,
-        )
+        yield from sweep_blocks(session, rig, sweep, views, mask)
+
+
+def sweep_blocks(
+    session: Session,
+    rig: CalibratedRig,
+    sweep: Sweep,
+    views: Sequence[View],
+    mask: np.ndarray | None = None,
+) -> Iterator[Cloud]:
+    """A sweep of a session as a rig sees it: :func:`reconstruct` with all that both know."""
+    return reconstruct(
+        sweep,
+        views,
+        rig.T_head_lrf,
+        rig.corrections,
+        lrf=session.lrf,
+        continuous=session.continuous,
+        mask=mask,
+    )
 
 
 def _about(sweep, mask):
@@ -136,7 +147,8 @@ def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]
         number = session.image_records.index(record)
         T_camera_platform = rig.camera_at(record.camera, pitch)
         image = session.read_image(record)
-        views.append(View(number, record.camera, T_camera_platform, camera.model, image))
+        view = View(number, record.camera, T_camera_platform, camera.model, image, pitch)
+        views.append(view)
     if records and not views:
         raise ValueError(
             f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; "

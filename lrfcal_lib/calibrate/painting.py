@@ -33,6 +33,8 @@ class View:
     model : CameraModel
     image : ndarray of uint8, shape (height, width, 3)
         Blue, green, red as OpenCV reads it. ValueError if it has another size than the model.
+    pitch : float
+        Of the head, radians.
     """
 
     number: int
@@ -40,6 +42,7 @@ class View:
     T_camera_platform: RigidTransform
     model: CameraModel
     image: np.ndarray
+    pitch: float = 0.0
 
     def __post_init__(self):
         height, width = self.image.shape[:2]

@@ -398,20 +398,22 @@ class LMS2xx(Closed):
             If the port vanished.
         """
         self._need_quiet()
+        link = self._opened()
         end = self._host.now() + timeout
-        for _ in range(wire.TRIES):
-            link = self._opened()
+        usual_s = REPLY_S + self._assembler.duration_s
+        while True:
             left = max(0.0, end - self._host.now())
             arrival = link.ask(wire.VALUES, ALL_VALUES, limit_s=left)
-            if arrival.time_s - link.asked_s > REPLY_S + self._assembler.duration_s:
-                continue  # nobody knows the instant of a scan that came late
-            reading = self._assembler.feed(*arrival)
-            if reading is not None:
-                return reading
-        raise NoReply(
-            f"{self.port}: scans arrive, but too late, not new, or not of the variant "
-            f"{self.variant}"
-        )
+            # nobody knows the instant of a scan that came late
+            if arrival.time_s - link.asked_s <= usual_s:
+                reading = self._assembler.feed(*arrival)
+                if reading is not None:
+                    return reading
+            if self._host.now() > end - usual_s:
+                raise NoReply(
+                    f"{self.port}: scans arrive, but too late, not new, or not of the variant "
+                    f"{self.variant}"
+                )
 
     def start(self, interlaced: bool = False) -> None:
         """Stream: a thread reads every scan from now on.

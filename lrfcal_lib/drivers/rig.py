@@ -16,7 +16,7 @@ from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, Host, LineLost, NoReply
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, RigFileError
 from lrfcal_lib.drivers.video import Camera, Frame
-from lrfcal_lib.session.lms2xx_codec import METRES, encode_configuration, largest
+from lrfcal_lib.session.lms2xx_codec import METRES, largest
 from lrfcal_lib.session.stated import LrfInfo
 
 LOG = logging.getLogger(__name__)
@@ -198,12 +198,6 @@ class Rig(Closed):
             range_resolution=unit,
             max_range=largest(configuration.measuring_mode) * unit,
         )
-
-    def begin_telegrams(self) -> list[bytes]:
-        """Telegrams with which a recording begins: the configuration, which states the measuring
-        mode.
-        """
-        return [encode_configuration(self.lrf.configuration)]
 
     # --------------------------------------------------------------------------------------------
     # the board

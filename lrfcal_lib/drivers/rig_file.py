@@ -2,7 +2,7 @@
 
 import math
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -380,23 +380,6 @@ class RigFile:
                 f"{self.path}: devices.lrf.interlaced is true: the four scans of a set need the "
                 "head at rest, use the mode stop-and-go, or a variant of 0.5 or 1 deg"
             )
-
-    def with_mode(self, mode: str | None) -> "RigFile":
-        """The same with another mode of the plan.
-
-        Parameters
-        ----------
-        mode
-            'stop-and-go' or 'continuous'; None: its own.
-
-        Raises
-        ------
-        RigFileError
-            If its laser range finder cannot do that.
-        """
-        if mode is None:
-            return self
-        return replace(self, plan=self.plan.model_copy(update={"mode": mode}))
 
 
 class RigFileStated(SessionStated):

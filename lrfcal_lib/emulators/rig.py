@@ -6,7 +6,7 @@ import os
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +25,8 @@ SILENCE_S = 600.0
 LOOK_S = 0.5
 PRACTICE = "practice"
 MARGIN = np.radians(1.0)  # of a sweep beyond the board
+QUICK_HEAD = {"baudrate": 38400, "go_speed": 60.0}  # habits
+QUICK_SETTINGS = {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}  # of its driver
 
 
 class EmulatedRig:
@@ -42,6 +44,8 @@ class EmulatedRig:
         Where the board can be put, see :class:`EmulatedWorld`.
     head_options
         Of :class:`EmulatedHead`.
+    quick
+        Its head is quick, and the rig file says so.
     rest_s
         Of :class:`CameraServer`.
     host
@@ -60,18 +64,22 @@ class EmulatedRig:
         seed: int = 0,
         placements: Sequence[Placement] | None = None,
         head_options: dict | None = None,
+        quick: bool = False,
         rest_s: float = 0.5,
         host: Host = REAL,
     ):
         self.setup = setup
         self.host = host
+        self.quick = quick
         self._closing = contextlib.ExitStack()
         folder = tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
         self.folder = Path(self._closing.enter_context(folder))
         self.world = EmulatedWorld(setup, host, seed, placements)
         self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host, seed=seed)
         head = self.world.head
-        options = head_options or {}
+        options = dict(head_options or {})
+        if quick:
+            options |= QUICK_HEAD
         path = self.folder / "head"
         self.pan_tilt = EmulatedHead(head, path=path, host=host, seed=seed, **options)
         self.camera_server = CameraServer(self.world, seed=seed, rest_s=rest_s)
@@ -122,11 +130,15 @@ class EmulatedRig:
 
     def rig_file(self) -> dict:
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices,
-        plan.
+        plan. Without close views of the board nobody can find the intrinsics, so they are stated.
         """
         setup = self.setup
         rig = setup.rig
-        cameras = {camera.name: camera for camera in rig.camera_infos()}
+        cameras = {}
+        for info, camera in zip(rig.camera_infos(), rig.cameras, strict=True):
+            if setup.intrinsics_views == 0:
+                info = replace(info, model=camera.model)
+            cameras[info.name] = info
         return {
             "schema": stated.SCHEMA,
             "name": f"{setup.name}_emulated",
@@ -147,6 +159,15 @@ class EmulatedRig:
         """Where the devices are, and how they are to be set."""
         rig = self.setup.rig
         head = self.pan_tilt
+        stated_head = {
+            "port": head.path,
+            "address": head.habits.address,
+            "baudrate": head.baudrate,
+            "feedback": head.habits.feedback != "none",
+            "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist(),
+        }
+        if self.quick:
+            stated_head |= QUICK_SETTINGS
         return {
             "lrf": {
                 "port": self.lrf.path,
@@ -155,13 +176,7 @@ class EmulatedRig:
                 "unit": rig.beam.unit_name,
                 "variant": [rig.beam.field_of_view, rig.beam.resolution / 100],
             },
-            "head": {
-                "port": head.path,
-                "address": head.habits.address,
-                "baudrate": head.baudrate,
-                "feedback": head.habits.feedback != "none",
-                "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist(),
-            },
+            "head": stated_head,
             "cameras": {
                 name: {
                     "source": self.camera_urls[name],
@@ -190,70 +205,46 @@ def practice_setup() -> tuple[Setup, list[Placement]]:
     return setup, placements
 
 
-def emulated(name: str) -> tuple[EmulatedRig, Callable[[], dict]]:
+def emulated(name: str, feedback: str = "full") -> EmulatedRig:
     """An emulated rig, not started yet.
 
     Parameters
     ----------
     name
         'practice', or a set-up.
-
-    Returns
-    -------
-    rig : EmulatedRig
-    rig_file : callable
-        Makes its rig file (parsed) once it is started.
+    feedback
+        Of the head, see :class:`Habits`.
 
     Raises
     ------
     ValueError
         For another name.
     """
-    if name != PRACTICE:
-        rig = EmulatedRig(load_setup(name))
-        return rig, rig.rig_file
-    setup, placements = practice_setup()
-    quick = {"baudrate": 38400, "go_speed": 60.0}
-    rig = EmulatedRig(setup, placements=placements, head_options=quick)
-    return rig, lambda: quick_file(rig)
-
-
-def quick_file(rig: EmulatedRig) -> dict:
-    """The rig file of a rig whose head is quick and told to be, and whose cameras are known.
-
-    Parameters
-    ----------
-    rig
-        Emulated.
-    """
-    data = rig.rig_file()
-    data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}
-    for camera in rig.setup.rig.cameras:
-        data["rig"]["cameras"][camera.name]["intrinsics"] = stated.model_to_json(
-            camera.model
-        )
-    return data
+    setup = load_setup(name)
+    placements = None
+    if name == PRACTICE:
+        setup, placements = practice_setup()
+    return EmulatedRig(
+        setup,
+        placements=placements,
+        head_options={"feedback": feedback},
+        quick=name == PRACTICE,
+    )
 
 
 def main(
-    name: str,
-    rig_file: str | os.PathLike | None = None,
-    *,
-    seed: int = 0,
-    feedback: str = "full",
+    name: str, rig_file: str | os.PathLike | None = None, feedback: str = "full"
 ) -> int:
     """Emulate a set-up until Ctrl-C, SIGTERM or SIGHUP.
 
     Parameters
     ----------
     name
-        Of the set-up.
+        Of :func:`emulated`.
     rig_file
         Where its rig file is written, see :func:`written_rig_file`.
-    seed
-        Of noise.
     feedback
-        Of the head, see :class:`Habits`.
+        Of the head.
 
     Returns
     -------
@@ -272,8 +263,7 @@ def main(
                 continue  # as nohup leaves it
             before = signal.signal(number, lambda *_: quit_.set())
             stack.callback(signal.signal, number, before)
-        rig = EmulatedRig(load_setup(name), seed=seed, head_options={"feedback": feedback})
-        stack.enter_context(rig)
+        rig = stack.enter_context(emulated(name, feedback))
         if rig_file is not None:
             stack.enter_context(written_rig_file(rig, Path(rig_file)))
         print(summary(rig, rig_file), flush=True)

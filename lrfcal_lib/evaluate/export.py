@@ -14,8 +14,9 @@ from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.judge.verdict import Verdict, judge
+from lrfcal_lib.session.files import opened
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import FILES, opened
+from lrfcal_lib.session.stated import FILES
 from lrfcal_lib.session.write import whole
 
 # numbers one below the other; no text of JSON has a line end

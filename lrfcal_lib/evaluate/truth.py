@@ -11,14 +11,9 @@ from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.observations import PlatformObservations
+from lrfcal_lib.session.files import naming, read_json
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import (
-    TransformStated,
-    board_from_json,
-    from_json,
-    naming,
-    read_json,
-)
+from lrfcal_lib.session.stated import TransformStated, board_from_json, from_json
 
 
 @dataclass(frozen=True)

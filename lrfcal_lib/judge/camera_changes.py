@@ -4,13 +4,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc, fdtrc
 
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -27,8 +25,6 @@ ASKED = 4.0  # standard deviations: a change of the image scale that is none of 
 STEP = 1e-4  # of the numeric derivative by the image scale
 NOISY = 10.0  # residuals in units of the stated noise: an estimate that explains nothing
 MOST_CHANGES = 3  # in one recording
-FEWEST_PLACEMENTS = 6  # for a pose before and one after a change
-LEVER = 0.2  # metres, weighs turns against shifts
 FEWEST_VIEWS = 3  # of a chessboard, for a focal length
 ALL_BUT_FOCAL_LENGTH = tuple(range(2, 9))  # of fx, fy, cx, cy, k1..k5
 RCOND = 1e-13
@@ -41,12 +37,10 @@ class CameraChange:
     Attributes
     ----------
     camera : str
-    before, after : int
-        The placements next to the change.
-    turn, turn_sigma : float
-        Radians.
-    shift, shift_sigma : float
-        Metres.
+    after : int
+        The first placement after the change.
+    turn, shift : float
+        Radians, metres.
     p_value : float
         Probability of such a turn and shift by chance.
     motion_px : float
@@ -58,12 +52,9 @@ class CameraChange:
     """
 
     camera: str
-    before: int
     after: int
     turn: float
-    turn_sigma: float
     shift: float
-    shift_sigma: float
     p_value: float
     motion_px: float
     zoom: float
@@ -141,43 +132,6 @@ def camera_changes(
     return changes if explains(solution) else []
 
 
-def large_changes(
-    obs: JointObservations, prepared: Prepared, settings: dict
-) -> list[CameraChange]:
-    """Cameras that changed by so much that no estimate with one pose of each is possible.
-
-    What one camera contradicts, the others and the scans agree about: its poses are seen from
-    an estimate without it.
-
-    Parameters
-    ----------
-    obs : JointObservations
-        Of all placements.
-    prepared, settings
-        As of :func:`camera_changes`.
-
-    Returns
-    -------
-    list of CameraChange
-        One at most.
-    """
-    if len(obs.cameras) < 2 or len(obs.placements) < FEWEST_PLACEMENTS:
-        return []
-    for index, camera in enumerate(obs.cameras):
-        others = [name for name in obs.cameras if name != camera]
-        try:
-            without = solve_joint(obs.with_cameras(others), required=False, **settings)
-        except DegenerateGeometry:
-            continue
-        if without.converged and len(without.boards) >= FEWEST_PLACEMENTS:
-            known = obs.select(without.boards)
-            step = Step(index, row_of_largest_step(known, index, without))
-            parted = with_change(known, step, camera, prepared, settings)
-            if parted is not None and explains(parted[0]):
-                return [parted[1]]
-    return []
-
-
 def explains(solution: JointSolution) -> bool:
     """Whether an estimate leaves residuals that are anything like the noise.
 
@@ -204,25 +158,6 @@ def with_change(obs, step, camera, prepared, settings):
             if change.moved or change.zoomed:
                 return solution, change
     return None
-
-
-def row_of_largest_step(obs, camera, solution):
-    """The row of placements at which the pose of a camera (index) changes most.
-
-    `solution` knows the boards from other cameras and scans.
-    """
-    mine = np.flatnonzero(obs.view_camera == camera)
-    rows = obs.view_placement[mine]
-    boards = [solution.boards[int(number)] for number in obs.placements[rows]]
-    poses = RigidTransform.from_matrix(obs.view_pose[mine])
-    poses = poses * RigidTransform.concatenate(boards).inv()
-    if obs.mounts[camera] == "head":
-        turns = np.outer(obs.view_pitch[mine], [1.0, 0.0, 0.0])
-        poses = poses * RigidTransform.from_rotation(Rotation.from_rotvec(turns))
-    turns = (poses.rotation * poses[0].rotation.inv()).as_rotvec()
-    by_view = pd.DataFrame(np.column_stack([LEVER * turns, poses.translation]))
-    steps = by_view.groupby(rows).median().diff().abs().sum(axis=1)
-    return int(steps.iloc[BESIDE : len(steps) - BESIDE + 1].idxmax())
 
 
 def likeliest_step(solution):
@@ -319,7 +254,6 @@ def change_between(solution, first, later, camera, prepared):
     both = solution.covariance(f"{first}_", f"{later}_")
     later_less_first = np.hstack([-np.eye(POSE), np.eye(POSE)])
     spread = later_less_first @ both @ later_less_first.T
-    sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
     both_parts = np.concatenate([change.rotation.as_rotvec(), shift])
     square = both_parts @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ both_parts
 
@@ -327,9 +261,7 @@ def change_between(solution, first, later, camera, prepared):
     middle = [*obs.corners.mean(axis=0), 0.0]
     middles = RigidTransform.from_matrix(obs.view_pose[views]).apply(middle)
     motion = project(middles, model) - project(change.inv().apply(middles), model)
-    rows = np.unique(obs.view_placement[views])
-    earlier = np.unique(obs.view_placement[obs.view_camera == obs.cameras.index(first)])
-    after = int(obs.placements[rows[0]])
+    after = int(obs.placements[obs.view_placement[views].min()])
     growths = [
         growth_by_depth(solution, index),
         growth_of_focal_length(prepared, camera, after),
@@ -337,12 +269,9 @@ def change_between(solution, first, later, camera, prepared):
     zoom, zoom_sigma = max(growths, key=lambda growth: abs(growth[0]) / growth[1])
     return CameraChange(
         camera=camera,
-        before=int(obs.placements[earlier[earlier < rows[0]].max(initial=0)]),
         after=after,
         turn=float(change.rotation.magnitude()),
-        turn_sigma=float(np.linalg.norm(sigma[:3])),
         shift=float(np.linalg.norm(shift)),
-        shift_sigma=float(np.linalg.norm(sigma[3:])),
         p_value=float(chdtrc(POSE, square)),
         motion_px=float(np.median(np.linalg.norm(motion, axis=1))),
         zoom=zoom,

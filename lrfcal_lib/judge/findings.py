@@ -29,7 +29,6 @@ class Kind(StrEnum):
     CAMERAS = "cameras"
     LEFT_OUT = "left out"
     EXCLUDED = "excluded"
-    PARALLEL = "parallel"
     DISTANCE = "distance"
     PITCH = "pitch"
     IMAGE_PITCH = "image pitch"

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from lrfcal_lib.judge.findings import Finding, Kind, no_if
-from lrfcal_lib.model.camera import CameraModel, fold, lens_terms, project
+from lrfcal_lib.model.camera import project
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
 
@@ -12,13 +12,9 @@ LENS_PARTS = np.array([6, 4])  # columns and rows that an image is cut into
 LENS_CORNERS = 20  # corners of the chessboard in a part, at least
 LENS_MISS = 0.15  # pixels that corners of a part may miss by alike
 OFF_MIDDLE = 0.2  # of the image's size
-WIDE = np.radians(80.0)  # across an image, by the focal length: five numbers hardly hold it
 REMEDY = (
-    "state intrinsics of this image size, or take sharp images with the chessboard all over"
-)
-REMEDY_WIDE = (
-    "use a lens below 110 deg, crop or undistort the images first, "
-    "state intrinsics of this size"
+    "state intrinsics of this image size, or take sharp images with the chessboard all over; "
+    "undistort the images of a wide lens first"
 )
 
 
@@ -51,11 +47,6 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
                 f"in parts of the images the corners of the chessboard lie {miss:.2f} px beside "
                 "their prediction, all in one direction"
             )
-        reach = reach_of_fold(model)
-        if reach < 1:
-            faults.append(
-                f"the model folds back at {100 * reach:.0f} % of the way to the image's corners"
-            )
         middle = np.array([model.cx / model.width, model.cy / model.height])
         other_size = np.abs(middle - 0.5).max() > OFF_MIDDLE
         if other_size:
@@ -64,12 +55,9 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
                 "image's centre, as with intrinsics of another image size"
             )
         if faults:
-            remedy = REMEDY
-            if 2 * np.arctan2(model.width / 2, model.fx) > WIDE:
-                remedy = REMEDY_WIDE
             words = (
                 f"the lens of camera '{camera}' is not that of its model ({'; '.join(faults)}): "
-                f"{remedy}"
+                f"{REMEDY}"
             )
             findings.append(Finding(no_if(other_size), Kind.LENS, words))
     return findings
@@ -89,21 +77,3 @@ def common_miss(views, points, model):
     noise = parts.var(ddof=0).div(parts.size(), axis=0)
     squares = (parts.mean() ** 2 - noise).sum(axis=1)[parts.size() >= LENS_CORNERS]
     return np.sqrt(max(squares.mean(), 0.0)) if len(squares) else 0.0
-
-
-def reach_of_fold(model: CameraModel) -> float:
-    """Recorded radius at which a lens model folds back, relative to the image's corners.
-
-    Parameters
-    ----------
-    model
-    """
-    r = np.sqrt(fold(model))
-    if not np.isfinite(r):
-        return np.inf
-    far = np.maximum(
-        [model.cx, model.cy], [model.width - model.cx, model.height - model.cy]
-    )
-    corner = np.linalg.norm(far / [model.fx, model.fy])
-    k1, k2, _, _, k5 = model.distortion
-    return float(r * (1 + lens_terms(r, 0.0, k1, k2, 0.0, 0.0, k5)[0]) / corner)

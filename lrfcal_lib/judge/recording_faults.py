@@ -9,12 +9,11 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtri
 
-from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
+from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
-from lrfcal_lib.judge.alternatives import guesses_of
-from lrfcal_lib.judge.camera_changes import LEVER, camera_changes, explains, large_changes
+from lrfcal_lib.judge.alternatives import LEVER, guesses_of
+from lrfcal_lib.judge.camera_changes import camera_changes, explains
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
@@ -26,7 +25,7 @@ from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault, dark_images, faults_of_files
-from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.solvers import solve_camera
 
 EXPLAINING = (
@@ -169,24 +168,11 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
         misread = misread_recording(prepared)
         if misread:
             return found + misread
-    if prepared.views and prepared.scans:
-        found += faults_of_changes(changes_of_cameras(calibration), tuple(prepared.views))
-        if joint is not None:
-            found += exchanged_placements(calibration)
-    return found
-
-
-def changes_of_cameras(calibration):
-    """The CameraChanges of a Calibration, also where its joint estimate explains nothing."""
-    prepared = calibration.prepared
-    joint = calibration.joint
     if joint is not None:
         changes = camera_changes(joint.solution, prepared, joint.settings)
-        if changes or explains(joint.solution):
-            return changes
-    views = {camera: list(own.values()) for camera, own in prepared.views.items()}
-    obs = observe_joint(prepared, views)
-    return large_changes(obs, prepared, joint_settings(prepared, obs))
+        found += faults_of_changes(changes, tuple(prepared.views))
+        found += exchanged_placements(calibration)
+    return found
 
 
 def explained(faults: list[Fault]) -> bool:
@@ -385,8 +371,8 @@ def faults_of_changes(changes, cameras):
         elif len(at_once) == len(cameras):
             words += " (or the range finder was: all cameras changed at once)"
         remedy = (
-            "fix what is loose and record anew, or make two sessions: one of the placements up to "
-            f"{change.before}, one from {change.after} on"
+            "fix what is loose and record anew, or make two sessions: one of the placements before "
+            f"{change.after}, one of the others"
         )
         severe = change.size_px > SEVERE_PX
         concerned = (change.after,)
@@ -406,12 +392,10 @@ def _zoomed(change):
 
 def _moved(change):
     """A CameraChange of the pose, in words."""
-    turn = f"{np.degrees(change.turn):.2f} +- {np.degrees(change.turn_sigma):.2f} deg"
-    shift = f"{1000 * change.shift:.1f} +- {1000 * change.shift_sigma:.1f} mm"
     return (
-        f"camera '{change.camera}' was moved between placement {change.before} and placement "
-        f"{change.after}: turned by {turn} and shifted by {shift}, which moves the board by "
-        f"{change.motion_px:.1f} px in its images"
+        f"camera '{change.camera}' was moved before placement {change.after}: turned by "
+        f"{np.degrees(change.turn):.2f} deg and shifted by {1000 * change.shift:.1f} mm, which "
+        f"moves the board by {change.motion_px:.1f} px in its images"
     )
 
 

@@ -17,7 +17,6 @@ from lrfcal_lib.solvers.joint_solution import JointSolution
 # placements: too few, and few
 FEWEST = 3
 FEW = 6
-PARALLEL = np.radians(6.0)  # normals of the boards about their mean
 SAME_DISTANCE = 0.12  # range of the distances, relative to their median
 SMALL_PITCH = np.radians(3.0)  # range of the recorded pitch
 SMALL_IMAGE_PITCH = np.radians(
@@ -60,12 +59,6 @@ def weak_estimate(solution) -> Iterator[Finding]:
         iterations = solution.solution.iterations
         words = f"the estimate has not converged after {iterations} iterations"
         yield Finding(NO, Kind.CONVERGENCE, words)
-    obs = solution.observations
-    for number, camera in enumerate(obs.cameras):
-        count = len(np.unique(obs.view_placement[obs.view_camera == number]))
-        if count < FEWEST:
-            words = f"camera '{camera}' sees the board in only {count} placements"
-            yield Finding(CARE, Kind.CAMERAS, words)
     if solution.unobservable:
         words = f"the data do not determine {'; '.join(solution.unobservable)}"
         yield Finding(NO, Kind.UNOBSERVABLE, words)
@@ -117,15 +110,6 @@ def weak_poses(solution) -> Iterator[Finding]:
     boards = solution.board_poses
     if len(boards) < 2:
         return
-    normals = boards[:, :, 2]
-    mean = normals.mean(axis=0)
-    apart = np.arccos(np.clip(normals @ mean / np.linalg.norm(mean), -1, 1)).max()
-    if apart < PARALLEL:
-        words = (
-            f"all boards are parallel (within {np.degrees(apart):.1f} deg): lean them every way "
-            "by 20 deg and more"
-        )
-        yield Finding(CARE, Kind.PARALLEL, words)
     distance = np.linalg.norm(sights(boards, solution), axis=1)
     if np.ptp(distance) < SAME_DISTANCE * np.median(distance):
         words = (

@@ -1,11 +1,13 @@
 """Two calibrations of one rig: how far they differ, beside what both claim to know."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
+from scipy.linalg import pinvh
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc
 
@@ -35,7 +37,6 @@ UNITS = {  # of amounts: factor and name
     "turn": (np.degrees(1.0), "deg"),
     "shift": (1000.0, "mm"),
     "scale": (100.0, "%"),
-    "all": (1.0, ""),
 }
 TOLD = 1e-9  # share of the largest eigenvalue: less is no freedom of its own
 
@@ -147,7 +148,7 @@ class Comparison:
 
     def sentence(self) -> str:
         """The answer."""
-        odds = f"honest calibrations differ more in {_percent(self.whole.p)} of cases"
+        odds = f"honest calibrations differ more in {100 * self.whole.p:.2g} % of cases"
         if self.one_lens:
             odds = f"{odds}; both use the same intrinsics, whose errors do not count"
         names = f"'{self.first.session}' and '{self.second.session}'"
@@ -161,13 +162,6 @@ class Comparison:
             f"{names} differ by more than both claim ({odds}): {where}. The rig has changed in "
             "between, or one of them errs."
         )
-
-
-def _percent(share):
-    """A share in words."""
-    if share < 1e-4:
-        return "less than 0.01 %"
-    return f"{100 * share:.2g} %"
 
 
 def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
@@ -198,39 +192,42 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
         first = _without_lens(first)
         second = _without_lens(second)
     second_there = in_gauge_of(first, second)
-    steps = dict(_steps(first, second_there, shared))
-    names = list(steps)
-    covariance = _covariance(first, names) + _covariance(second, names)
-    images = {name: image_shifts(first, second_there, name) for name in shared}
-    cloud = cloud_shifts(first, second_there)
-    parts = [
-        _part("axis", steps, covariance, turn=AXIS_NAMES[:2], shift=AXIS_NAMES[2:]),
-        _part("sensor", steps, covariance, scale=["pitch_scale"], shift=["range_offset"]),
-    ]
+    step = _steps(first, second_there, shared)
+    covariance = _covariance(first, step.index) + _covariance(second, step.index)
+    images = {name: shifts(first, second_there, name) for name in shared}
+    groups = {
+        "axis": {"turn": [*AXIS_NAMES[:2]], "shift": [*AXIS_NAMES[2:]]},
+        "sensor": {"scale": ["pitch_scale"], "shift": ["range_offset"]},
+    }
     for name in shared:
         pose = [f"{name}_{part}" for part in POSE_NAMES]
-        part = _part(name, steps, covariance, turn=pose[:3], shift=pose[3:])
-        amounts = (*part.amounts, images[name].amount("px"))
-        parts.append(replace(part, amounts=amounts))
-    whole = _part("everything", steps, covariance, all=names)
-    whole = replace(whole, amounts=(cloud.amount("mm in the cloud", 1000),))
+        groups[name] = {"turn": pose[:3], "shift": pose[3:]}
+    parts = []
+    for name, of_part in groups.items():
+        part = _part(name, of_part, step, covariance)
+        if name in images:
+            part = replace(part, amounts=(*part.amounts, images[name].amount("px")))
+        parts.append(part)
+    cloud = shifts(first, second_there)
+    moved = (cloud.amount("mm in the cloud", 1000),)
+    chi2, freedom, p = _chi2(step, covariance)
+    whole = Part("everything", moved, chi2, freedom, p, p_of_others=1.0)
     return Comparison(first, second, tuple(parts), whole, images, cloud, one_lens)
 
 
-def _part(name, steps, covariance, **groups):
-    """The Part of differences by name: turns, shifts, a scale, or all of them."""
-    names = np.array(list(steps))
-    step = np.array(list(steps.values()))
+def _part(name, groups, step, covariance):
+    """The Part of some differences: turns, shifts, a scale."""
     amounts = []
     for what, members in groups.items():
         scale, unit = UNITS[what]
-        rows = np.isin(names, members)
-        value = np.linalg.norm(step[rows])
-        claimed = np.sqrt(covariance.diagonal()[rows].sum())
-        amounts.append(Amount(what, scale * float(value), scale * float(claimed), unit))
-    mine = np.isin(names, np.concatenate(list(groups.values())))
-    *_, p_of_others = _chi2(step, covariance, ~mine)
-    return Part(name, tuple(amounts), *_chi2(step, covariance, mine), p_of_others)
+        value = scale * float(np.linalg.norm(step[members]))
+        claimed = scale * np.sqrt(np.diag(covariance.loc[members, members]).sum())
+        amounts.append(Amount(what, value, float(np.nan_to_num(claimed, nan=np.inf)), unit))
+    mine = [member for members in groups.values() for member in members]
+    others = step.index.difference(mine)
+    *_, p_of_others = _chi2(step[others], covariance.loc[others, others])
+    chi2 = _chi2(step[mine], covariance.loc[mine, mine])
+    return Part(name, tuple(amounts), *chi2, p_of_others)
 
 
 def _same_lens(first, second, camera):
@@ -247,22 +244,21 @@ def _without_lens(rig):
     return replace(rig, uncertainty=known)
 
 
-def _chi2(step, covariance, rows):
-    """Chi-square of some differences, its degrees of freedom, and how often chance exceeds it.
+def _chi2(step, covariance):
+    """Chi-square of differences, its degrees of freedom, and how often chance exceeds it.
 
     Without what nothing bounds, or one of the two took as it is.
     """
     variance = np.diag(covariance)
-    index = np.flatnonzero(rows & np.isfinite(variance) & (variance > 0))
-    if not len(index):
+    known = np.isfinite(variance) & (variance > 0)
+    if not known.any():
         return 0.0, 0, 1.0
-    sigma = np.sqrt(variance[index])
-    z = step[index] / sigma
-    correlation = covariance[np.ix_(index, index)] / np.outer(sigma, sigma)
-    inverse = np.linalg.pinv(correlation, rcond=TOLD, hermitian=True)
+    sigma = np.sqrt(variance[known])
+    z = step.to_numpy()[known] / sigma
+    correlation = covariance.to_numpy()[np.ix_(known, known)] / np.outer(sigma, sigma)
+    inverse, freedom = pinvh(correlation, rtol=TOLD, return_rank=True)
     chi2 = float(z @ inverse @ z)
-    freedom = int(np.linalg.matrix_rank(inverse, hermitian=True))
-    return chi2, freedom, float(chdtrc(freedom, chi2))
+    return chi2, int(freedom), float(chdtrc(freedom, chi2))
 
 
 def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
@@ -287,17 +283,18 @@ def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
     return replace(second, axis=axis, cameras=cameras)
 
 
-def _steps(first, second, shared) -> Iterator[tuple[str, float]]:
-    """Increments from the first rig to the second by name, radians, metres and a fraction."""
+def _steps(first, second, shared):
+    """Increments from the first rig to the second by name: radians, metres, a fraction."""
     by_axis = _increments(first.T_head_lrf, second.T_head_lrf)[AXIS_COLUMNS]
-    yield from zip(AXIS_NAMES, by_axis, strict=True)
+    steps = dict(zip(AXIS_NAMES, by_axis, strict=True))
     for name in shared:
         step = _increments(first.cameras[name].T_camera, second.cameras[name].T_camera)
-        yield from zip([f"{name}_{pose}" for pose in POSE_NAMES], step, strict=True)
+        steps |= zip([f"{name}_{pose}" for pose in POSE_NAMES], step, strict=True)
     one = first.corrections
     other = second.corrections
-    yield "range_offset", other.range_offset - one.range_offset
-    yield "pitch_scale", other.pitch_scale - one.pitch_scale
+    steps["range_offset"] = other.range_offset - one.range_offset
+    steps["pitch_scale"] = other.pitch_scale - one.pitch_scale
+    return pd.Series(steps)
 
 
 def _increments(first, second):
@@ -307,56 +304,37 @@ def _increments(first, second):
 
 
 def _covariance(rig, names):
-    """Covariance to rely on of shared unknowns; what was taken as it is has no bound."""
+    """Covariance to rely on of shared unknowns, a DataFrame; NaN for what was taken as it is."""
     known = uncertainty_of(rig)
-    covariance = np.zeros((len(names), len(names)))
-    np.fill_diagonal(covariance, np.inf)
-    rows = [row for row, name in enumerate(names) if name in known.names]
-    index = [known.names.index(names[row]) for row in rows]
-    covariance[np.ix_(rows, rows)] = known.trusted[np.ix_(index, index)]
-    return covariance
+    covariance = pd.DataFrame(known.trusted, known.names, known.names)
+    return covariance.reindex(index=names, columns=names)
 
 
-def image_shifts(first: CalibratedRig, second: CalibratedRig, name: str) -> Shifts:
-    """How the second rig shifts points of scans in the image of a camera, taken at pitch 0.
+def shifts(
+    first: CalibratedRig, second: CalibratedRig, camera: str | None = None
+) -> Shifts:
+    """How the second rig shifts the ends of beams that are `DISTANCE` long by the first.
 
     Parameters
     ----------
     first, second : CalibratedRig
         In one gauge.
-    name : str
-        The camera.
+    camera : str, optional
+        In its image, taken at pitch 0; unless given, relative to the head at pitch 0.
+
+    Returns
+    -------
+    Shifts
     """
-    model = first.cameras[name].model
-    pixels = pixel_grid(model, PIXELS)
-    beams = beams_of_pixels(chain_of(first, name), model, pixels, DISTANCE, 0.0)
-
-    def shown(rig, points, by_link):
-        there = rig.cameras[name].model
-        return project(points, there), project_jacobians(points, there)[0] @ by_link
-
-    return _shifts(first, second, beams, pixels, name, shown)
-
-
-def cloud_shifts(first: CalibratedRig, second: CalibratedRig) -> Shifts:
-    """How the second rig shifts points of scans, relative to the head at pitch 0.
-
-    Parameters
-    ----------
-    first, second : CalibratedRig
-        In one gauge.
-    """
-    bearings = np.linspace(*first.lrf.field_of_view, BEARINGS)
-    at = np.stack(np.meshgrid(bearings, PITCHES), axis=-1)
-    return _shifts(first, second, np.moveaxis(at, -1, 0), at)
-
-
-def _shifts(first, second, beams, at, camera=None, shown=lambda rig, *point: point):
-    """The Shifts of the ends of beams (bearing, pitch) that are `DISTANCE` long by the first rig.
-
-    `shown(rig, points, by_link)` is what counts of a point, and its derivative.
-    """
-    bearing, pitch = beams
+    if camera is None:
+        bearings = np.linspace(*first.lrf.field_of_view, BEARINGS)
+        at = np.stack(np.meshgrid(bearings, PITCHES), axis=-1)
+        bearing, pitch = np.moveaxis(at, -1, 0)
+    else:
+        model = first.cameras[camera].model
+        at = pixel_grid(model, PIXELS)
+        chain = chain_of(first, camera)
+        bearing, pitch = beams_of_pixels(chain, model, at, DISTANCE, 0.0)
     recorded = pitch / (1 + first.corrections.pitch_scale)
     ends = []
     variance = np.zeros(bearing.shape)
@@ -364,8 +342,11 @@ def _shifts(first, second, beams, at, camera=None, shown=lambda rig, *point: poi
         chain = chain_of(rig, camera)
         true = recorded * (1 + rig.corrections.pitch_scale)
         length = DISTANCE + first.corrections.range_offset - rig.corrections.range_offset
-        points, by_link, _ = carried(chain, bearing, true, length)
-        end, derivative = shown(rig, points, by_link)
+        end, derivative, _ = carried(chain, bearing, true, length)
+        if camera is not None:
+            model = rig.cameras[camera].model
+            derivative = project_jacobians(end, model)[0] @ derivative
+            end = project(end, model)
         ends.append(end)
         variance = variance + spread(chain, derivative) ** 2
     return Shifts(at, ends[1] - ends[0], np.sqrt(variance))

@@ -100,13 +100,14 @@ class E57Writer:
         writer = points.writer(buffers)
 
         def write(cloud):
-            """Hand over blocks that fit into the buffers."""
+            """Hand over what fits into the buffers."""
+            columns = _values(cloud)
             for start in range(0, len(cloud.points), AT_ONCE):
-                columns = _values(cloud.rows(slice(start, start + AT_ONCE)))
-                count = len(columns["intensity"])
+                part = slice(start, start + AT_ONCE)
                 for field, array in arrays.items():
-                    array[:count] = columns[field]
-                writer.write(count)
+                    values = columns[field][part]
+                    array[: len(values)] = values
+                writer.write(len(values))
 
         try:
             yield write
@@ -116,20 +117,14 @@ class E57Writer:
     def _columns(self, intensity):
         """Arrays by field, with the library's statement of their types and its view of them."""
         libe57, image_file = self._library()
-        fields = dict.fromkeys(POINT, np.float32) | dict.fromkeys(COLORS, np.uint8)
-        if intensity:
-            fields["intensity"] = np.float32
-        arrays = {}
+        fields = [*POINT, *COLORS, "intensity"] if intensity else [*POINT, *COLORS]
         prototype = libe57.StructureNode(image_file)
-        buffers = libe57.VectorSourceDestBuffer()
-        for field, kind in fields.items():
+        for field in fields:
             node = libe57.FloatNode(image_file, 0.0, libe57.E57_SINGLE)
             if field in COLORS:
                 node = libe57.IntegerNode(image_file, 0, 0, 255)
             prototype.set(field, node)
-            arrays[field] = np.empty(AT_ONCE, kind)
-            view = (image_file, field, arrays[field], AT_ONCE, True, False)
-            buffers.append(libe57.SourceDestBuffer(*view))
+        arrays, buffers = self._file.make_buffers(fields, AT_ONCE)
         return arrays, prototype, buffers
 
     def image(

@@ -5,11 +5,15 @@ line and the eye of the camera span a plane of sight, which meets the plane of t
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
@@ -24,15 +28,16 @@ CLOSE_PX = 5.0  # between two lines that pull each other
 PULLED_PX = 0.4  # by how much: edges of a printed rim of 2 px
 BESIDE_PX = (2.0, 40.0)  # from the edge: where the points of its surface lie
 FEWEST = 30  # points that make a plane beside an edge
+LEAST_OWN = 10  # of them for which the image counts most
 LEAST_SHARE = 0.6  # of the points beside an edge that lie on one plane
 STEP = 0.03  # metres between two surfaces at an edge: there the nearer one ends
+PLANES_APART = 0.005  # the same of two planes, which are better known
 
 
 def edges_of(
     cloud: Cloud,
     surfaces: tuple[list[Feature], np.ndarray],
     views: Sequence[View],
-    pitches: Sequence[float],
 ) -> list[Feature]:
     """All straight edges that images show at the flat surfaces of a cloud.
 
@@ -44,8 +49,6 @@ def edges_of(
     surfaces : tuple
         What :func:`lrfcal_lib.measure.surfaces.planes_of` found.
     views : sequence of View
-    pitches : sequence of float
-        Of the head at each view, radians.
 
     Returns
     -------
@@ -53,22 +56,47 @@ def edges_of(
     """
     planes, of_point = surfaces
     edges = []
-    for view, pitch in zip(views, pitches, strict=True):
-        rows = np.flatnonzero(cloud.image == view.number)
+    with ThreadPoolExecutor() as pool:
+        segments_of = list(pool.map(_segments, views))
+    for view, segments in zip(views, segments_of, strict=True):
+        # what one image of a camera sees, all of them see that have it in view
+        of_camera = [other.number for other in views if other.camera == view.camera]
+        rows = np.flatnonzero(np.isin(cloud.image, of_camera))
         p_camera = view.T_camera_platform.apply(cloud.points[rows])
         uv = pinhole(p_camera, view.model)
-        segments = _segments(view)
+        size = np.array([view.model.width, view.model.height])
+        inside = np.flatnonzero((np.abs(uv - size / 2) < size).all(axis=1))
+        rows = rows[inside]
+        uv = uv[inside]
+        beside = _Beside(uv, p_camera[inside, 2], of_point[rows], cloud.image[rows])
+        tree = KDTree(uv)
+        depths = partial(_depth, view, planes)
         shown = []
         lines = []
         for ends in segments:
-            number = _surface_at(ends, uv, p_camera[:, 2], of_point[rows])
+            reach = np.linalg.norm(ends[1] - ends[0]) / 2 + BESIDE_PX[1]
+            near = tree.query_ball_point(ends.mean(axis=0), reach, return_sorted=False)
+            near = np.array(near, int)
+            points = _Beside(*(column[near] for column in beside))
+            number = _surface_at(ends, points, depths, view.number)
             if number >= 0:
                 with suppress(EdgeNotSeen):
                     lines.append(_refined(view, ends, segments))
                     shown.append(planes[number])
         if shown:
-            edges += _on_planes(shown, lines, view, pitch)
+            edges += _on_planes(shown, lines, view)
     return edges
+
+
+class _Beside(NamedTuple):
+    """Points that a camera sees, a row each: undistorted pixels of an image, depth, numbers of the
+    surface and of the image that counts most.
+    """
+
+    uv: np.ndarray
+    depth: np.ndarray
+    plane: np.ndarray
+    image: np.ndarray
 
 
 def _segments(view):
@@ -99,38 +127,57 @@ def _refined(view, ends, segments):
     return replace(line, covariance=covariance)
 
 
-def _surface_at(ends, uv, depth, plane):
+def _depth(view, planes, number, pixel):
+    """How deep in an image a plane is at an undistorted pixel (2,); inf behind it."""
+    plane = planes[number]
+    T = view.T_camera_platform
+    normal = T.rotation.apply(plane.axis)
+    ray = np.append(
+        (pixel - [view.model.cx, view.model.cy]) / [view.model.fx, view.model.fy], 1
+    )
+    depth = normal @ T.apply(plane.centre) / (normal @ ray)
+    return depth if depth > 0 else np.inf
+
+
+def _surface_at(ends, points, depths, image):
     """The number of the surface that ends at a segment (2, 2) of an image, or that it is on; -1
     for none.
 
-    Of the points that the image sees: undistorted pixels (n, 2), depth, number of the plane.
+    Of `points` about it; ``depths(number, pixel)`` are those of surfaces.
     """
     first, last = ends
     length = np.linalg.norm(last - first)
     along = (last - first) / length
-    s = (uv - first) @ along
-    t = (uv - first) @ [along[1], -along[0]]
+    s = (points.uv - first) @ along
+    t = (points.uv - first) @ [along[1], -along[0]]
     near, far = BESIDE_PX
     beside = (s > 0) & (s < length) & (np.abs(t) > near) & (np.abs(t) < far)
-    sides = []  # depth, points of the surface, its number
+    # depth, whether it is no flat surface, less the points of it, its number, points of the image
+    sides = []
     for side in (1.0, -1.0):
         rows = np.flatnonzero(beside & (side * t > 0))
         if len(rows) < FEWEST:
             continue
-        numbers, counts = np.unique(plane[rows], return_counts=True)
-        most = np.argmax(counts)
-        number = -1
-        if counts[most] > LEAST_SHARE * len(rows):
-            number = numbers[most]
-        sides.append((np.median(depth[rows]), counts[most], number))
+        counts = np.bincount(points.plane[rows] + 1)  # of none first
+        number = int(np.argmax(counts)) - 1
+        if number >= 0 and counts.max() > LEAST_SHARE * len(rows):
+            depth = depths(number, (first + last) / 2)
+        else:
+            number = -1
+            depth = np.median(points.depth[rows])
+        own = np.sum(points.image[rows] == image)
+        sides.append((depth, number < 0, -counts.max(), number, own))
     sides.sort()
-    if len(sides) == 2 and sides[1][0] - sides[0][0] < STEP:
-        sides.sort(key=lambda side: -side[1])
-    return sides[0][2] if sides else -1
+    step = STEP if any(side[1] for side in sides) else PLANES_APART
+    if len(sides) == 2 and sides[1][0] - sides[0][0] < step:
+        sides.sort(key=lambda side: side[1:])
+    if not sides or sides[0][-1] < LEAST_OWN:
+        return -1
+    return sides[0][3]
 
 
 def _on_planes(
-    planes: Sequence[Feature], lines: Sequence[ImageEdge], view: View, pitch: float
+    planes: Sequence[Feature], lines: Sequence[ImageEdge], view: View
 ) -> list[Feature]:
     """The edges of a scene that k lines of an image show, each on its plane."""
     rig = planes[0].rig
@@ -162,7 +209,7 @@ def _on_planes(
     by_noise = _of_line(np.concatenate(by, axis=-1), length)
 
     beams = beams_to(ends, rig.T_head_lrf)
-    by_camera = beams_moved(rig, beams, view.camera, pitch)
+    by_camera = beams_moved(rig, beams, view.camera, view.pitch)
     by_shared = beams_moved(rig, beams)
     by_shared -= way[..., None] * (sight[..., None, :] @ by_camera)
     by_shared[..., -1] = lifted

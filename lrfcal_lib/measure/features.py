@@ -161,6 +161,10 @@ class Feature:
     ends: np.ndarray
     image: int = -1
 
+    def lies_along(self, axis: np.ndarray | None) -> bool:
+        """Whether its axis is parallel to another one (3,) to 15 deg; None is to all."""
+        return axis is None or abs(self.axis @ axis) > np.cos(ALIKE)
+
     def foot(self, place: np.ndarray) -> np.ndarray:
         """The place (3,) on the plane or the line of an edge that is nearest to another."""
         away = place - self.centre

@@ -3,15 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud, join
-from lrfcal_lib.calibrate.clouds import views_of
+from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
 from lrfcal_lib.calibrate.painting import View
-from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.judge.uncertainty import chain_of, uncertainty_of
@@ -33,6 +32,9 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 REACH = (
     0.1  # metres from a picked place to points of its plane, and from a click to its edge
@@ -67,19 +69,22 @@ class SceneFeatures:
     of_point: np.ndarray
     edges: list[Feature]
 
-    def at(self, kind: str, place: np.ndarray) -> tuple[Feature | None, float]:
-        """The feature of a kind that is nearest to a place (3,), platform frame, and how near its
-        points or the edge are, metres; None where there is no such feature.
+    def at(
+        self, kind: str, place: np.ndarray, axis: np.ndarray | None = None
+    ) -> tuple[Feature | None, float]:
+        """The feature of a kind that is nearest to a place (3,), platform frame, of those along an
+        axis (3,), and how near its points or the edge are, metres; None where there is none.
         """
         if kind == Kind.EDGE:
-            return nearest_edge(self.edges, place)
+            return nearest_edge([e for e in self.edges if e.lies_along(axis)], place)
         away = np.linalg.norm(self.cloud.points - place, axis=1)
         if kind == Kind.POINT:
             about = np.argsort(away)[:ABOUT]
             return fit_feature(self.cloud, about, self.rig, plane=False), away.min()
-        away[self.of_point < 0] = np.inf
+        fits = np.array([*(plane.lies_along(axis) for plane in self.planes), False])
+        away[~fits[self.of_point]] = np.inf
         nearest = int(np.argmin(away))
-        if not self.planes:
+        if not np.isfinite(away[nearest]):
             return None, np.inf
         return self.planes[self.of_point[nearest]], away[nearest]
 
@@ -99,9 +104,7 @@ def nearest_edge(
     return edges[nearest], float(away[nearest])
 
 
-def features_of(
-    cloud: Cloud, rig: CalibratedRig, views: Sequence[View], pitches: Sequence[float]
-) -> SceneFeatures:
+def features_of(cloud: Cloud, rig: CalibratedRig, views: Sequence[View]) -> SceneFeatures:
     """All planes and edges of the cloud of a station.
 
     Parameters
@@ -110,22 +113,18 @@ def features_of(
         Coloured from these views.
     rig : CalibratedRig
     views : sequence of View
-    pitches : sequence of float
-        Of the head at each view, radians.
 
     Returns
     -------
     SceneFeatures
     """
     planes, of_point = planes_of(cloud, rig)
-    edges = edges_of(cloud, (planes, of_point), views, pitches)
+    edges = edges_of(cloud, (planes, of_point), views)
     return SceneFeatures(cloud, rig, planes, of_point, edges)
 
 
 @cached
-def features_of_station(
-    session: Session, rig: CalibratedRig, number: int, cloud: Cloud | None = None
-) -> SceneFeatures:
+def features_of_station(session: Session, rig: CalibratedRig, number: int) -> SceneFeatures:
     """All planes and edges that a station of a session shows.
 
     Parameters
@@ -134,36 +133,22 @@ def features_of_station(
     rig : CalibratedRig
     number : int
         Placement.
-    cloud : Cloud, optional
-        Of it, platform frame, if it is there already.
 
     Returns
     -------
     SceneFeatures
     """
     views = views_of(session, rig, number)
-    recorded = [session.image_records[view.number].pitch for view in views]
-    pitches = [float(rig.corrections.pitch(number, pitch)) for pitch in recorded]
-    if cloud is None:
-        sweep, _ = without_closing(session.sweep(number))
-        cloud = join(
-            reconstruct(
-                sweep,
-                views,
-                rig.T_head_lrf,
-                rig.corrections,
-                lrf=session.lrf,
-                continuous=session.continuous,
-            )
-        )
-    return features_of(cloud, rig, views, pitches)
+    sweep, _ = without_closing(session.sweep(number))
+    cloud = join(sweep_blocks(session, rig, sweep, views))
+    return features_of(cloud, rig, views)
 
 
 def measure(
     scenes: Mapping[int, SceneFeatures],
-    picks: pd.DataFrame,
+    picks: "pd.DataFrame",
     poses: Mapping[int, RigidTransform] | None = None,
-) -> pd.DataFrame:
+) -> "pd.DataFrame":
     """Lengths between pairs of picked places.
 
     A length that several stations show is one: the mean of theirs, each weighted by how well it
@@ -185,6 +170,8 @@ def measure(
         The same, with length_m, sigma_m, the ends of the 90 % interval, low_m and high_m, the
         stations, and problem: why there is no length, NaN then, or ''.
     """
+    import pandas as pd  # a third of a second
+
     poses = poses or dict.fromkeys(scenes, IN_PLACE)
     rows = []
     for row in picks.to_dict("records"):
@@ -246,15 +233,17 @@ def _shown(scenes, poses, kind, place) -> dict[int, Feature]:
     foot = poses[clicked].apply(feature.foot(poses[clicked].inv().apply(place)))
     shown = {clicked: feature}
     for number, scene in scenes.items():
-        there = poses[number].inv().apply(foot)
-        other, away = scene.at(kind, there)
+        T = poses[number].inv()
+        there = T.apply(foot)
+        axis = (T * poses[clicked]).rotation.apply(feature.axis)
+        other, away = scene.at(kind, there, axis)
         if number != clicked and away < REACH:
             if np.linalg.norm(other.foot(there) - there) < ON_IT:
                 shown[number] = other
     return shown
 
 
-def read_picks(path: str | PathLike) -> pd.DataFrame:
+def read_picks(path: str | PathLike) -> "pd.DataFrame":
     """Read the list that ``scene.html`` saves.
 
     Parameters
@@ -271,6 +260,8 @@ def read_picks(path: str | PathLike) -> pd.DataFrame:
     ValueError
         If the file is no such list; it names file, row and remedy.
     """
+    import pandas as pd
+
     remedy = "save it from scene.html again"
     try:
         table = pd.read_csv(path)

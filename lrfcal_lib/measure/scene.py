@@ -9,17 +9,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud, join, write_ply
-from lrfcal_lib.calibrate.clouds import views_of
+from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
 from lrfcal_lib.calibrate.painting import View
-from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.cloud_files import write_pcd
 from lrfcal_lib.measure.e57 import E57Writer, new_guid
 from lrfcal_lib.measure.features import with_sigma
-from lrfcal_lib.measure.lengths import SceneFeatures, features_of_station, for_page
+from lrfcal_lib.measure.lengths import SceneFeatures, features_of, for_page
+from lrfcal_lib.measure.stations import Joined, placed
 from lrfcal_lib.plots.interactive import MOST_POINTS, rig_lines, scene_page
 from lrfcal_lib.preprocess.closing_scan import closing_of, without_closing
 from lrfcal_lib.session.faults import repeated_scans
@@ -147,15 +146,7 @@ def colored_blocks(
     if intensities is not None:
         some = intensities.ravel()[:: 1 + intensities.size // COMPARED]
         levels = np.nanpercentile(some, [2, 98])
-    blocks = reconstruct(
-        station.sweep,
-        station.views,
-        rig.T_head_lrf,
-        rig.corrections,
-        lrf=session.lrf,
-        continuous=session.continuous,
-    )
-    for cloud in blocks:
+    for cloud in sweep_blocks(session, rig, station.sweep, station.views):
         if levels is not None:
             cloud = _shaded(cloud, *levels)
         yield cloud
@@ -191,9 +182,10 @@ def write_scene(
     folder: Path,
     session: Session,
     rig: CalibratedRig,
-    poses: dict[int, RigidTransform],
+    joined: Joined,
     about: str,
     told: Told = lambda count: None,
+    clouds: Mapping[int, Cloud] | None = None,
 ) -> list[Path]:
     """Write stations as ``scene.ply``, ``scene.pcd``, ``scene.e57`` and ``scene.html``.
 
@@ -202,12 +194,14 @@ def write_scene(
     folder : Path
     session : Session
     rig : CalibratedRig
-    poses : dict of int to RigidTransform
-        ``T_scene_platform`` of the stations by their number; the identity for a single one.
+    joined : Joined
+        The stations, and how they stand in the scene.
     about : str
         Where it is from and whether to trust it, for every file.
     told : callable
         ``told(count)`` is called after every block with the number of its points.
+    clouds : dict of int to Cloud, optional
+        What :func:`station_cloud` gives for each, where it is there already.
 
     Returns
     -------
@@ -222,50 +216,32 @@ def write_scene(
     ply, pcd, e57, page = (
         folder / f"scene.{kind}" for kind in ("ply", "pcd", "e57", "html")
     )
-    thinned: dict[int, list[Cloud]] = {number: [] for number in poses}
+    scenes: dict[int, SceneFeatures] = {}
+    poses = joined.T_world_station
     with ExitStack() as stack:
         page_draft, e57_draft = (stack.enter_context(whole(file)) for file in (page, e57))
         writer = E57Writer(e57_draft, about)
         with writer:
-            blocks = _written(writer, session, rig, poses, thinned, told)
+            blocks = _written(writer, session, rig, joined, told, clouds or {}, scenes)
             write_ply(ply, blocks, [about])
         write_pcd(pcd, ply, [about])
         title = f"{session.name}, station {', '.join(map(str, poses))}"
-        scenes = {
-            number: features_of_station(session, rig, number, join(blocks))
-            for number, blocks in thinned.items()
-        }
-        measuring_page(page_draft, scenes, poses, title=title, note=about)
+        _measuring_page(page_draft, scenes, poses, title, about)
     return [ply, pcd, e57, page]
 
 
-def measuring_page(
-    path: Path,
-    scenes: Mapping[int, SceneFeatures],
-    poses: Mapping[int, RigidTransform],
-    title: str,
-    note: str = "",
-) -> None:
-    """Write the page on which two clicks give a length, see :func:`scene_page`.
-
-    Parameters
-    ----------
-    path : Path
-    scenes : dict of int to SceneFeatures
-        By station.
-    poses : dict of int to RigidTransform
-        ``T_scene_platform`` of each.
-    title, note : str
-    """
+def _measuring_page(path, scenes, poses, title, note):
+    """Write the page on which two clicks give a length: SceneFeatures and poses by station."""
     rig = next(iter(scenes.values())).rig
     cameras = {
         name: (rig.camera_at(name, 0.0), camera.model)
         for name, camera in rig.cameras.items()
     }
-    shown = join(_placed(scene.cloud, poses[number]) for number, scene in scenes.items())
+    points = [poses[number].apply(scene.cloud.points) for number, scene in scenes.items()]
+    shown = join(scene.cloud for scene in scenes.values())
     scene_page(
         path,
-        shown.points,
+        np.concatenate(points),
         shown.colors,
         shown.seen,
         rig_lines(rig.T_head_lrf, cameras),
@@ -275,27 +251,29 @@ def measuring_page(
     )
 
 
-def _placed(cloud, pose):
-    """A Cloud in the frame of the scene."""
-    normals = pose.rotation.apply(cloud.normals)
-    return replace(cloud, points=pose.apply(cloud.points), normals=normals)
+def _written(writer, session, rig, joined, told, clouds, scenes):
+    """Blocks of all stations in the frame of the scene; they are in the E57 file already.
 
-
-def _written(writer, session, rig, poses, thinned, told):
-    """Blocks of all stations in the frame of the scene; they are in the E57 file already."""
+    `scenes` take what can be measured in so many points as a page shows.
+    """
+    poses = joined.T_world_station
     count = sum(np.isfinite(session.sweep(number).ranges).sum() for number in poses)
     every = int(-(-count // MOST_POINTS))
     for number, pose in poses.items():
         station = station_of(session, rig, number)
+        blocks = (with_sigma(b, rig) for b in colored_blocks(session, rig, station))
+        if number in clouds:
+            blocks = [clouds[number]]
         guid = new_guid()
         intensity = station.sweep.intensities is not None
+        thinned = []
         with writer.scan(f"station {number}", guid, pose, intensity) as write:
-            for colored in colored_blocks(session, rig, station):
-                cloud = with_sigma(colored, rig)
+            for cloud in blocks:
                 write(cloud)
-                thinned[number].append(cloud.rows(slice(None, None, every)))
+                thinned.append(cloud.rows(slice(None, None, every)))
                 told(len(cloud.points))
-                yield _placed(cloud, pose)
+                yield placed(cloud, pose, joined.covariance_of(number))
+        scenes[number] = features_of(join(thinned), rig, station.views)
         for view in station.views:
             name = f"station {number}, {view.camera}, image {view.number}"
             writer.image(name, guid, pose * view.T_camera_platform.inv(), view)

@@ -78,6 +78,11 @@ class Joined:
         return self.covariance[place : place + 6, place : place + 6]
 
 
+def alone(station: int) -> Joined:
+    """One station in its own frame."""
+    return Joined({station: RigidTransform.identity()}, np.zeros((6, 6)), (), ())
+
+
 def join_stations(clouds: Mapping[int, Cloud], rig: CalibratedRig | None = None) -> Joined:
     """Bring stations into one frame, without a guess where they stood.
 

@@ -63,12 +63,18 @@ class Measurer {
     return feature.kind === "plane" ? minus(place, along) : plus(feature.centre, along);
   }
 
-  // The edge of a station that passes closest to a place in its frame, and how close, metres.
-  nearestEdge(station, place) {
+  // Whether a feature lies along an axis in the frame of its station, as Feature.lies_along.
+  liesAlong(feature, axis) {
+    return !axis || Math.abs(dot(feature.axis, axis)) > Math.cos(this.data.alike);
+  }
+
+  // The edge of a station along an axis that passes closest to a place in its frame, and how close, metres.
+  nearestEdge(station, place, axis) {
     let best = { away: Infinity };
     this.data.kinds.forEach((kind, number) => {
       if (kind !== "edge" || this.data.placements[number] !== station) return;
       const feature = this.feature(number);
+      if (!this.liesAlong(feature, axis)) return;
       const way = minus(feature.ends[1], feature.ends[0]);
       const along = Math.min(Math.max(dot(minus(place, feature.ends[0]), way) / dot(way, way), 0), 1);
       const away = norm(minus(plus(feature.ends[0], way, along), place));
@@ -85,7 +91,9 @@ class Measurer {
     for (const station of this.stations) {
       if (station === clicked.placement) continue;
       const own = this.inStation(station, there);
-      const { away, feature } = nearest(station, own);
+      const inPage = applied(this.data.poses[clicked.placement].R, clicked.axis);
+      const axis = applied(transposed(this.data.poses[station].R), inPage);
+      const { away, feature } = nearest(station, own, axis);
       if (away < this.data.reach && norm(minus(this.foot(feature, own), own)) < this.data.on_it) features[station] = feature;
     }
     return { place: there, features };
@@ -275,13 +283,14 @@ function panel(page, data) {
     if (kind === "plane") {
       const plane = planes[curve][number];
       if (plane < 0) return "no flat surface here: pick an edge or a point";
-      return measurer.shown(measurer.feature(plane), place, (station, there) => {
-        const [first] = near(measurer.inPage(station, there), (s, number) => s === station && number >= 0);
+      return measurer.shown(measurer.feature(plane), place, (station, there, axis) => {
+        const fits = (s, number) => s === station && number >= 0 && measurer.liesAlong(measurer.feature(number), axis);
+        const [first] = near(measurer.inPage(station, there), fits);
         return first ? { away: first.away, feature: measurer.feature(first.plane) } : { away: Infinity };
       });
     }
     if (kind === "edge") {
-      const nearest = (station, there) => measurer.nearestEdge(station, there);
+      const nearest = (station, there, axis) => measurer.nearestEdge(station, there, axis);
       const edges = measurer.stations.map((station) => nearest(station, measurer.inStation(station, place)));
       const edge = edges.reduce((a, b) => (b.away < a.away ? b : a));
       if (edge.away > data.reach) return "no edge within 10 cm: pick another place, or a point";

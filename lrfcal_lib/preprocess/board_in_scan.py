@@ -177,12 +177,12 @@ def median_filter(
     windows = np.lib.stride_tricks.sliding_window_view(padded, width, axis=1)
     valid = np.isfinite(taken)
     filtered = np.full(taken.shape, np.nan)
-    filtered[valid] = row_median(windows[valid])
+    filtered[valid] = np.nanmedian(windows[valid], axis=1)
     return filtered
 
 
 def fit_lines(
-    ranges: np.ndarray, bearings: np.ndarray, rounds: int = LINE_ROUNDS
+    ranges: np.ndarray, bearings: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """A straight line to every scan line at once, robust against outliers (Tukey's weights).
 
@@ -194,8 +194,6 @@ def fit_lines(
         Metres; NaN does not take part.
     bearings : ndarray, shape (B,)
         Radians.
-    rounds : int
-        Of weighing.
 
     Returns
     -------
@@ -212,30 +210,18 @@ def fit_lines(
     enough = valid.sum(axis=1) >= FEWEST_BEAMS
     base = np.where(valid & enough[:, None], r**4, 0.0)
     weights = base
-    for _ in range(rounds):
+    for _ in range(LINE_ROUNDS):
         information = np.einsum("lb,bij->lij", weights, products)
         right = (weights / r) @ rays
         information[~enough] = np.eye(2)
         right[~enough] = np.nan
         lines = np.linalg.solve(information, right[..., None])[..., 0]
         misses = np.where(valid, np.abs(r - _line_ranges(lines, bearings)), np.nan)
-        with np.errstate(invalid="ignore"):
-            sigma = np.maximum(NORMAL * row_median(misses), LEAST_SIGMA)[:, None]
-            weights = np.nan_to_num(base * biweight(misses, sigma))
+        misses[~enough] = 0.0
+        sigma = np.maximum(NORMAL * np.nanmedian(misses, axis=1), LEAST_SIGMA)[:, None]
+        weights = np.nan_to_num(base * biweight(misses, sigma))
     information[~enough] = np.nan
     return lines, information
-
-
-def row_median(values: np.ndarray) -> np.ndarray:
-    """Median of each row of an array (n, m) without its NaN; NaN for an empty row.
-
-    `numpy.nanmedian` says the same, thirty times as slowly.
-    """
-    ordered = np.sort(values, axis=1)
-    count = np.isfinite(ordered).sum(axis=1, keepdims=True)
-    middle = np.hstack([np.maximum(count - 1, 0) // 2, count // 2])
-    last = values.shape[1] - 1
-    return np.take_along_axis(ordered, np.minimum(middle, last), axis=1).mean(axis=1)
 
 
 def jump_points(ranges: np.ndarray, fitted: np.ndarray, sigma_range: float) -> np.ndarray:

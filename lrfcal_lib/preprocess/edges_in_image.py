@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from lrfcal_lib.fit.robust import biweight, robust_sigma
-from lrfcal_lib.model.camera import CameraModel, fold, line_through, pinhole
+from lrfcal_lib.model.camera import CameraModel, distort, fold, line_through, pinhole
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -180,23 +181,45 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     return ImageEdge(name, line, covariance, centre, ends, n_points=2, rms_px=0.0)
 
 
-def loops():
-    """The compiled loops; numba takes half a second to load."""
-    from lrfcal_lib.preprocess import profiles
-
-    return profiles
-
-
 def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:
     """Colours (..., channels) at undistorted pixels (..., 2), bilinear; NaN outside the image.
 
     `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid.
     """
-    image = np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
-    pixels = np.ascontiguousarray(uv, float).reshape(-1, 2)
-    out = np.empty((len(pixels), image.shape[2]), np.float32)
-    loops().bilinear(image, pixels, model.parameters, fold(model), out)
-    return out.reshape(uv.shape[:-1] + image.shape[2:])
+    focal = np.array([model.fx, model.fy])
+    centre = np.array([model.cx, model.cy])
+    normalized = (uv - centre) / focal
+    recorded = distort(normalized, model.distortion) * focal + centre
+    # the lens would fold what is farther out back into the image
+    recorded[np.sum(normalized**2, axis=-1) >= fold(model)] = BEHIND
+    places = np.moveaxis(recorded, -1, 0)[::-1]
+    channels = np.moveaxis(np.atleast_3d(image), -1, 0)
+    colours = [
+        map_coordinates(channel, places, np.float32, order=1, cval=np.nan)
+        for channel in channels
+    ]
+    return np.stack(colours, axis=-1)
+
+
+def vote(column, place, weight, shape, slopes):
+    """Weight of the profiles with a peak near each line ``place = offset + slope (column -
+    middle)``, (m, across).
+
+    `shape` is (across, along) of the strip; a sample to either side still agrees, and of the peaks
+    of one profile that agree with a line the highest counts.
+    """
+    across, along = shape
+    order = np.argsort(weight)
+    leaning = slopes[:, None] * (column[order] - (along - 1) / 2)
+    first = np.rint(place[order] - leaning).astype(int)
+    rows = np.clip(
+        first[..., None] + np.arange(3), 0, across + 1
+    )  # a row beyond either border
+    lines = np.arange(len(slopes))[:, None, None]
+    # of peaks in one place the last one, the highest, stays
+    highest = np.zeros((len(slopes), across + 2, along))
+    highest[lines, rows, column[order, None]] = weight[order, None]
+    return highest[:, 1:-1].sum(axis=2)
 
 
 def step_contrast(strip, sigma, along=AVERAGED_PROFILES):
@@ -264,7 +287,7 @@ def _line_in_strip(strip, visible, across, half_width, prior_px):
     widest = min(half_width / ACROSS_STEP_PX, STEEPEST)
     slopes = np.linspace(-1, 1, SLOPES) * widest / count * 2
     weight = contrast / (contrast + FULL_CONTRAST)
-    votes = loops().vote(column, place, weight, height.shape, slopes)
+    votes = vote(column, place, weight, height.shape, slopes)
     # the prediction is as uncertain at either end as it is in the middle
     tilted = slopes[:, None] * ACROSS_STEP_PX * count / 2
     likely = np.exp(-0.5 * (across**2 + tilted**2) / prior_px**2)
@@ -299,7 +322,7 @@ def _fit_line(column, place, offset, slope):
         normal = design.T @ (design * weight[:, None])
         before = line
         line = np.linalg.solve(normal, design.T @ (weight * place))
-        if np.allclose(line, before, rtol=0, atol=SETTLED_PX):
+        if np.abs(line - before).max() <= SETTLED_PX:
             break
     kept = weight > 0
     column = column[kept]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.model.geometry import lrf_to_platform, plane_axes, polar_to_points, tilt
-from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step, row_median
+from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.straight_runs import LEAST_TURN, line_of, straight_runs
 from lrfcal_lib.preprocess.surfaces import SAME_PITCH, depth_jump, row_ends
 
@@ -360,7 +360,7 @@ def _warp(scan, ends):
     cells = ends.line[:, None], np.clip(beams, 0, scan.mask.shape[1] - 1)
     use = (inwards < count[:, None]) & scan.mask[cells]
     misses = (scan.sweep.ranges - scan.fitted)[cells]
-    middle = row_median(np.where(use, misses, np.nan))
+    middle = np.nanmedian(np.where(use, misses, np.nan), axis=1)
     # of a median: pi / 2 times that of a mean
     noise = np.pi / 2 * scan.sigma_range**2 / use.sum(axis=1)
     excess = np.zeros(len(noise))

@@ -16,12 +16,12 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.edges_in_image import (
     board_line,
-    loops,
     on_board,
     outward_line,
     peaks,
     sample,
     step_contrast,
+    vote,
 )
 
 STEP = 0.02  # of the wide search, in squares
@@ -111,7 +111,7 @@ def edge_votes(
         height = step_contrast(strip, SMOOTH_STEPS, along=AVERAGED_PROFILES)
         column, place, _ = peaks(height, LEAST_CONTRAST)
         weight = np.ones(len(column))
-        votes = loops().vote(column, place, weight, height.shape, slopes).max(axis=0)
+        votes = vote(column, place, weight, height.shape, slopes).max(axis=0)
         visible = np.isfinite(strip[..., 0]).sum(axis=1)
         share = votes / np.maximum(visible, 1)
         share[visible <= LEAST_SHARE * len(s)] = np.nan

@@ -13,8 +13,8 @@ from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
 from lrfcal_lib.preprocess.outline_in_images import Outline
 from lrfcal_lib.preprocess.survey import small_squares, views_of
 from lrfcal_lib.session.cache import cached
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.workers import spread
 
 LEAST_SWEEP = np.deg2rad(1.0)  # a placement whose pitch spans less is a single shot

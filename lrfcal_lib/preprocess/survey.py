@@ -37,8 +37,8 @@ from lrfcal_lib.preprocess.pattern_in_image import (
     square_px,
 )
 from lrfcal_lib.preprocess.turns import alike, decide, turned_boards
+from lrfcal_lib.session.files import short
 from lrfcal_lib.session.read import ImageRecord, Session
-from lrfcal_lib.session.stated import short
 from lrfcal_lib.session.workers import spread
 
 LEAST_VIEWS_FOR_RELIEF = 8

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.figure import Figure
 
 from lrfcal_lib.measure.compare import Comparison, history, rig_at
-from lrfcal_lib.plots import comparison as plots
-from lrfcal_lib.plots.colors import COLORS
+from lrfcal_lib.plots.comparison import shift_map
 from lrfcal_lib.report.notebook import STYLE
 from lrfcal_lib.session.write import whole
 
@@ -60,37 +60,33 @@ def _dated(rig):
 
 
 def comparison_figure(comparisons: Sequence[Comparison]) -> Figure:
-    """Where the last two calibrations differ, and every difference beside what is claimed.
+    """Where each calibration differs from the one before it, a row each.
 
     Parameters
     ----------
     comparisons : sequence of Comparison
     """
-    last = comparisons[-1]
-    columns = len(last.images) + 2
+    columns = 1 + max(len(compared.images) for compared in comparisons)
+    size = (4.4 * columns, 3.4 * len(comparisons))
     with plt.style.context(STYLE):
-        figure, axes = plt.subplots(
-            1, columns, figsize=(4.4 * columns, 3.8), layout="constrained"
+        figure, grid = plt.subplots(
+            len(comparisons), columns, figsize=size, layout="constrained", squeeze=False
         )
-        for ax, (name, shifts) in zip(axes[:-2], last.images.items(), strict=True):
-            model = last.first.cameras[name].model
-            size = (model.width, model.height)
-            longest = plots.pixel_shifts(ax, shifts.at, shifts.off, size)
-            ax.set_title(f"'{name}' at 2 m, longest {longest:.2g} px")
-        drawn = plots.field_shifts(axes[-2], last.cloud.at, last.cloud.off)
-        figure.colorbar(drawn, ax=axes[-2], label="[mm]")
-        axes[-2].set_title("points at 2 m")
-        for compared in comparisons:
-            ratios = {}
-            for part in compared.parts:
-                for amount in part.amounts:
-                    ratios[f"{part.name}, {amount.what}"] = amount.value / amount.claimed
+        for axes, compared in zip(grid, comparisons, strict=True):
             names = f"{compared.first.session}, {compared.second.session}"
-            axes[-1].plot(list(ratios.values()), list(ratios), "o", label=names)
-        axes[-1].axvline(1.0, color=COLORS["raw"])
-        axes[-1].set(
-            xlabel="difference / standard deviation that both claim", xlim=(0, None)
-        )
-        axes[-1].legend(title="from, to")
-        axes[-1].set_title("differences beside claims")
+            for ax, (name, shifts) in zip(axes[1:], compared.images.items(), strict=False):
+                drawn = shift_map(ax, shifts.at, shifts.off)
+                figure.colorbar(drawn, ax=ax, label="[px]")
+                ax.set(
+                    xlabel="u [px]",
+                    ylabel="v [px]",
+                    title=f"'{name}' {shifts.amount('px')}",
+                )
+                ax.invert_yaxis()
+            field = compared.cloud
+            drawn = shift_map(axes[0], np.degrees(field.at), 1000 * field.off)
+            figure.colorbar(drawn, ax=axes[0], label="[mm]")
+            title = f"{names}: {field.amount('mm', 1000)}"
+            axes[0].set(xlabel="bearing [deg]", ylabel="pitch [deg]", title=title)
+            axes[0].invert_xaxis()  # as the rig sees it
     return figure

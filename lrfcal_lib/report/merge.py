@@ -8,14 +8,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from lrfcal_lib.calibrate.cloud import Cloud, join
+from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.measure.features import with_sigma
-from lrfcal_lib.measure.scene import Station, colored_blocks, write_scene
+from lrfcal_lib.measure.scene import station_cloud, write_scene
 from lrfcal_lib.measure.stations import Joined, advice, join_stations, joined_cloud
-from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.report.reconstruct import open_scene
-from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.write import whole
 
 NOT_ALL = 3  # exit code where something is left out
@@ -64,19 +61,19 @@ def merge_session(
         a file that cannot be written.
     """
     scene = open_scene(path, calibration, out, untrusted)
-    clouds = {n: plain_cloud(scene.session, scene.rig, n) for n in scene.stations}
+    clouds = {n: station_cloud(scene.session, scene.rig, n) for n in scene.stations}
     joined = joined_stations(clouds, scene.rig, path)
     print(FRAME.format(min(joined.T_world_station)))
     for table in (stations_table(joined), pairs_table(joined)):
         print(table.to_string(index=False))
     print(*sentences(joined), sep="\n", flush=True)
-    poses = joined.T_world_station
-    files = write_scene(scene.folder, scene.session, scene.rig, poses, scene.about)
+    asked = (scene.folder, scene.session, scene.rig)
+    files = write_scene(*asked, joined, scene.about, clouds=clouds)
     page = scene.folder / "stations.html"
     with whole(page) as draft:
         draft.write_text(stations_page(joined, joined_cloud(clouds, joined), scene.about))
     print("written:", ", ".join(map(str, [*files, page])))
-    return 0 if len(poses) == len(clouds) else NOT_ALL
+    return 0 if len(joined.T_world_station) == len(clouds) else NOT_ALL
 
 
 def joined_stations(
@@ -90,30 +87,16 @@ def joined_stations(
     return joined
 
 
-def plain_cloud(session: Session, rig: CalibratedRig, number: int) -> Cloud:
-    """A station without colours, with sigma."""
-    sweep, _ = without_closing(session.sweep(number))
-    blocks = colored_blocks(session, rig, Station(number, sweep, []))
-    return join(with_sigma(block, rig) for block in blocks)
-
-
 def stations_table(joined: Joined) -> pd.DataFrame:
     """Where the stations stood in the joined frame, and how well that is known."""
     rows = []
     for number, T in joined.T_world_station.items():
-        x, y, z = T.translation.round(3)
         variance = np.diag(joined.covariance_of(number))
-        row = {
-            "station": number,
-            "x_m": x,
-            "y_m": y,
-            "z_m": z,
-            "yaw_deg": T.rotation.as_euler("ZYX", degrees=True)[0].round(2),
-            "sigma_mm": 1000 * np.sqrt(variance[3:].sum()).round(4),
-            "sigma_deg": np.degrees(np.sqrt(variance[:3].sum())).round(3),
-        }
-        rows.append(row)
-    return pd.DataFrame(rows)
+        yaw = T.rotation.as_euler("ZYX", degrees=True)[0]
+        sigma = np.sqrt([variance[3:].sum(), variance[:3].sum()]) * [1000, np.degrees(1)]
+        rows.append([number, *T.translation, yaw, *sigma])
+    names = ["station", "x_m", "y_m", "z_m", "yaw_deg", "sigma_mm", "sigma_deg"]
+    return pd.DataFrame(rows, columns=names).round(3)
 
 
 def pairs_table(joined: Joined) -> pd.DataFrame:
@@ -121,15 +104,12 @@ def pairs_table(joined: Joined) -> pd.DataFrame:
     rows = []
     for pair in joined.pairs:
         turn, shift = joined.miss(pair)
-        row = {
-            "stations": f"{pair.first} and {pair.second}",
-            "overlap_percent": round(100 * pair.overlap),
-            "surfaces_apart_mm": round(1000 * pair.rms, 1),
-            "miss_mm": round(1000 * shift, 1),
-            "miss_deg": round(np.degrees(turn), 3),
-        }
-        rows.append(row)
-    return pd.DataFrame(rows)
+        both = f"{pair.first} and {pair.second}"
+        millimetres = 1000 * np.array([pair.rms, shift])
+        overlap = round(100 * pair.overlap)
+        rows.append([both, overlap, *millimetres, np.degrees(turn)])
+    names = ["stations", "overlap_percent", "surfaces_apart_mm", "miss_mm", "miss_deg"]
+    return pd.DataFrame(rows, columns=names).round(3)
 
 
 def sentences(joined: Joined) -> list[str]:
@@ -186,25 +166,18 @@ def stations_figure(joined: Joined, cloud: Cloud) -> Figure:
     low, high = SLICE
     height = cloud.points[:, 2]
     x, y, _ = cloud.points[(height > low) & (height < high)][::3].T
-    label = f"points {-low:.1f} m below to {high:.1f} m above the platform"
-    plan.plot(x, y, ".", color="0.6", ms=1, label=label)
+    plan.plot(x, y, ".", color="0.6", ms=1)
+    poses = joined.T_world_station
     for pair in joined.pairs:
-        ends = [joined.T_world_station[n].translation for n in (pair.first, pair.second)]
-        plan.plot(*np.transpose(ends)[:2], "-", color="C0", lw=1.2)
-    places = np.array([T.translation for T in joined.T_world_station.values()])
-    ahead = np.array(
-        [T.rotation.apply([0, ARROW, 0]) for T in joined.T_world_station.values()]
+        ends = [poses[pair.first].translation, poses[pair.second].translation]
+        plan.plot(*np.transpose(ends)[:2], "C0-", lw=1.2)
+    for number, T in poses.items():
+        place, ahead = T.apply([[0, 0, 0], [0, ARROW, 0]])[:, :2]
+        arrow = {"arrowstyle": "->", "color": "C3"}
+        plan.annotate(f"{number}", ahead, place, color="C3", size=13, arrowprops=arrow)
+    plan.set(aspect="equal", xlabel="x, m", ylabel="y, m")
+    plan.set_title(
+        f"Stations, where they look, and the pairs used; points {-low:.1f} m below to {high:.1f} m "
+        "above the platform"
     )
-    plan.quiver(
-        *places.T[:2], *ahead.T[:2], color="C3", angles="xy", scale_units="xy", scale=1
-    )
-    words = "stations, and where they look at pitch 0"
-    plan.plot(*places.T[:2], "o", color="C3", ms=4, label=words)
-    for number, beside in zip(joined.T_world_station, places - 0.4 * ahead, strict=True):
-        plan.annotate(
-            f"{number}", beside[:2], color="C3", fontsize=13, ha="center", va="center"
-        )
-    plan.plot([], [], "-", color="C0", label="pairs used")
-    plan.set(aspect="equal", xlabel="x, m", ylabel="y, m", title="Stations from above")
-    figure.legend(loc="outside upper center", ncols=3, markerscale=2, fontsize=9)
     return figure

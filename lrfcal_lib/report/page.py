@@ -7,7 +7,6 @@ import html
 import re
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import nbformat
 import pandas as pd
@@ -36,48 +35,18 @@ class Renderer(IPythonRenderer):
 
     def inline_math(self, body: str) -> str:
         """A formula within a line."""
-        return formula(body)
+        return convert(body)
 
     def block_math(self, body: str) -> str:
         """A displayed formula, the number of its tag beside it."""
         number = re.search(r"\\tag\{(.*?)\}", body)
-        drawn = formula(re.sub(r"\\tag\{.*?\}", "", body), display=True)
+        drawn = convert(re.sub(r"\\tag\{.*?\}", "", body), display="block")
         beside = f"<span>({number[1]})</span>" if number else ""
         return f'<div class="formula"><div>{drawn}</div>{beside}</div>'
 
     def multiline_math(self, text: str) -> str:
         """A displayed formula over several lines."""
         return self.block_math(text.strip("$"))
-
-
-def formula(latex: str, display: bool = False) -> str:
-    """A formula as MathML.
-
-    Parameters
-    ----------
-    latex
-    display
-        In parts, so that lines can break where it says = or +, or leaves a gap.
-    """
-    row = ElementTree.fromstring(re.sub(' xmlns="[^"]*"', "", convert(latex)))[0]
-    if not display:
-        inner = "".join(ElementTree.tostring(node, "unicode") for node in row)
-        return f"<math><mrow>{inner}</mrow></math>"
-    nodes: list[ElementTree.Element] = []
-    for node in row:
-        # what stands between \left and \right may be broken too
-        nodes += node if node.tag == "mrow" else [node]
-    parts = [""]
-    for node in nodes:
-        if parts[-1] and node.tag == "mo" and node.text in ("=", "+"):
-            node.set("form", "infix")
-            parts.append("")
-        parts[-1] += ElementTree.tostring(node, "unicode")
-        if node.tag == "mspace" and float(node.get("width").removesuffix("em")) >= 1:
-            parts.append("")
-    return " ".join(
-        f'<math displaystyle="true"><mrow>{part}</mrow></math>' for part in parts
-    )
 
 
 def render(

@@ -1,11 +1,10 @@
 """The command ``reconstruct``: coloured clouds of a scene, from its stations and a calibration."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from tqdm import tqdm
 
 from lrfcal_lib import __version__
 from lrfcal_lib.calibrate.calibration_file import (
@@ -15,7 +14,7 @@ from lrfcal_lib.calibrate.calibration_file import (
 )
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.scene import stations_of, write_scene
-from lrfcal_lib.session.progress import Progress
+from lrfcal_lib.measure.stations import alone
 from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.session.shown import printable
 
@@ -101,30 +100,16 @@ def reconstruct_session(
     scene = open_scene(path, calibration, out, untrusted)
     session = scene.session
     counts = [np.isfinite(session.sweep(n).ranges).sum() for n in scene.stations]
-    told = _told(sum(counts))
+    bar = tqdm(total=int(sum(counts)), unit=" points", unit_scale=True, disable=None)
     for number in scene.stations:
         place = scene.folder
         if len(scene.stations) > 1:
             place = scene.folder / f"station_{number}"
-        still = {number: RigidTransform.identity()}
-        files = write_scene(place, session, scene.rig, still, scene.about, told)
+        still = alone(number)
+        files = write_scene(place, session, scene.rig, still, scene.about, bar.update)
+        bar.clear()
         print(f"station {number}: {', '.join(map(str, files))}", flush=True)
+    bar.close()
     if len(scene.stations) > 1:
         print(f"{len(scene.stations)} stations, each in its own frame; 'merge' joins them")
     return 0
-
-
-def _told(total) -> Callable[[int], None]:
-    """What says now and then how many of so many points are done."""
-    progress = Progress()
-    done = 0
-
-    def told(count):
-        """So many more are."""
-        nonlocal done
-        done += count
-        if progress.due():
-            left = progress.left(done / total)
-            print(f"  {done} of {total} points, {left}", flush=True)
-
-    return told

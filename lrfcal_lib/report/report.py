@@ -27,9 +27,8 @@ from tqdm import tqdm
 from lrfcal_lib.report import first_screen, page
 from lrfcal_lib.report.notebook import ROOT, SHIPPED, label_of
 from lrfcal_lib.session.cache import VARIABLE as CACHE
-from lrfcal_lib.session.progress import duration
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import RECORDINGS
 
 NOTEBOOKS = ROOT / "notebooks"
@@ -359,7 +358,7 @@ def _show_progress(futures):
             name = futures[future].stem
             bar.set_postfix_str(name)
             if bar.disable:
-                said = f"{done} of {count} done after {duration(time.monotonic() - begin)}"
+                said = f"{done} of {count} done after {time.monotonic() - begin:.0f} s"
                 print(f"lrfcal: {said} ({name})", file=sys.stderr, flush=True)
 
 

@@ -44,8 +44,9 @@ def true_picks(
     -------
     DataFrame
         A row a length: name, kind, x_m, y_m and z_m of both ends with _1 and _2 (the middle of what
-        the clouds show of it, or of the face or edge itself where they show nothing; metres, frame
-        of `poses`), and true_m. Empty where no lengths are stated, as in a recording.
+        stations show of it, of those that show both ends where there are such, or of the face or
+        edge itself where none shows it; metres, frame of `poses`), and true_m. Empty where no
+        lengths are stated, as in a recording.
     """
     truth = read_truth(session)
     if truth is None:
@@ -55,19 +56,21 @@ def true_picks(
     for length in truth.lengths:
         row = {"name": length["name"], "true_m": length["metres"]}
         kinds = length["kind"].split("-")
-        for number, (kind, end) in enumerate(zip(kinds, length["ends"], strict=True), 1):
-            places = []
+        shown = []
+        for kind, end in zip(kinds, length["ends"], strict=True):
+            look = _on_face if kind == "plane" else _on_edge
+            by_station = {}
             for station, scene in scenes.items():
                 corners = _in_station(truth, rig, session, station, np.array(end))
-                shown = _on_edge(scene, corners)
-                if kind == "plane":
-                    shown = _on_face(scene, corners)
-                places.append(poses[station].apply(shown))
-            shown = np.concatenate(places)
-            place = poses[station].apply(corners.mean(axis=0))
-            if len(shown):
-                away = np.linalg.norm(shown - shown.mean(axis=0), axis=1)
-                place = shown[np.argmin(away)]
+                by_station[station] = poses[station].apply(look(scene, corners))
+            nothing = poses[station].apply(corners.mean(axis=0))
+            shown.append((by_station, nothing))
+        both = [s for s in scenes if all(len(places[s]) for places, _ in shown)]
+        for number, (kind, (places, place)) in enumerate(zip(kinds, shown, strict=True), 1):
+            picked = np.concatenate([places[station] for station in both or scenes])
+            if len(picked):
+                away = np.linalg.norm(picked - picked.mean(axis=0), axis=1)
+                place = picked[np.argmin(away)]
             row[f"kind_{number}"] = kind
             row |= {
                 f"{axis}_m_{number}": value

@@ -49,7 +49,7 @@ def faults_of_files(session) -> list[Fault]:
     Parameters
     ----------
     session : Session
-        Opened; its images are read again where two files are of the same size.
+        Opened; its images are read again.
 
     Returns
     -------
@@ -61,15 +61,10 @@ def faults_of_files(session) -> list[Fault]:
 
 def repeated_images(session) -> list[Fault]:
     """Images whose files are the same to the byte; one Fault a pair of cameras."""
-    by_size = defaultdict(list)
-    for record in session.image_records:
-        by_size[record.file.stat().st_size].append(record)
-
     groups = defaultdict(list)
-    for records in by_size.values():
-        for record in records if len(records) > 1 else ():
-            content = read_bytes(record.file, session.path)
-            groups[hashlib.blake2b(content).digest()].append(record)
+    for record in session.image_records:
+        content = read_bytes(record.file, session.path)
+        groups[hashlib.blake2b(content).digest()].append(record)
 
     pairs = defaultdict(list)
     for first, *others in groups.values():

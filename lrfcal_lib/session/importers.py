@@ -74,7 +74,7 @@ LINE_JUMP = 1e-4
 # metres between published points and those rebuilt from what was recovered
 LARGEST_MISS = 1e-5
 # of a Calib_Results.m, and how many numbers each has: focal lengths, principal point, lens
-KEYS = {"fc": 2, "cc": 2, "kc": 5, "fc_error": 2, "cc_error": 2, "kc_error": 5}
+KEYS = {"fc": 2, "cc": 2, "kc": 5}
 
 
 @dataclass(frozen=True)
@@ -273,39 +273,21 @@ def read_pcd(file: str | PathLike) -> np.ndarray:
 
 
 def read_bouguet(file: str | PathLike) -> dict:
-    """Intrinsics and board poses of a ``Calib_Results.m`` of Bouguet's toolbox, as JSON has them;
-    SessionError if something is missing.
-
-    The toolbox prints three standard deviations. ``T_camera_board`` by image number is in metres,
-    not millimetres.
+    """Intrinsics of a ``Calib_Results.m`` of Bouguet's toolbox, as JSON has them; SessionError if
+    something is missing.
     """
-    assigned = re.findall(
-        r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.M
-    )
+    lists = re.findall(r"^(\w+)\s*=\s*\[([-+.\deE;\s]+)\]", source_text(file), re.M)
+    listed = dict(lists)
     with naming(file):
         values = {
-            key: np.array((many or one).replace(";", " ").split(), float)
-            for key, many, one in assigned
+            key: np.array(listed.get(key, "").replace(";", " ").split(), float)
+            for key in KEYS
         }
-        lacking = [key for key, n in KEYS.items() if len(values.get(key, ())) != n]
+        lacking = [key for key, n in KEYS.items() if len(values[key]) != n]
         if lacking:
             raise ValueError(f"no value of {short(lacking)}; is this a Calib_Results.m?")
         endless = [key for key, array in values.items() if not np.isfinite(array).all()]
         if endless:
             raise ValueError(f"values of {short(endless)} are not finite; damaged?")
-        intrinsics = np.concatenate([values["fc"], values["cc"], values["kc"]])
-        errors = [values["fc_error"], values["cc_error"], values["kc_error"]]
-        sigma = np.concatenate(errors) / 3
-        poses = {}
-        for key in values:
-            number = key.removeprefix("omc_")
-            if number.isdecimal() and f"Tc_{number}" in values:
-                turn = Rotation.from_rotvec(values[key])
-                shift = values[f"Tc_{number}"] / 1000
-                pose = RigidTransform.from_components(shift, turn)
-                poses[number] = transform_to_json(pose)
-        return {
-            "intrinsics": dict(zip(INTRINSIC_NAMES, intrinsics.tolist(), strict=True)),
-            "intrinsics_sigma": dict(zip(INTRINSIC_NAMES, sigma.tolist(), strict=True)),
-            "T_camera_board": poses,
-        }
+    intrinsics = np.concatenate(list(values.values()))
+    return {"intrinsics": dict(zip(INTRINSIC_NAMES, intrinsics.tolist(), strict=True))}

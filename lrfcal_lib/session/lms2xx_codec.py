@@ -327,12 +327,10 @@ def unit_of(raw):
 class DeviceStatus:
     """The parts of the status reply 0xB1 that a recording needs."""
 
-    firmware: str
     measuring_mode: int
     scan_angle_deg: float
     resolution_deg: float
     address: int
-    unit: str
 
 
 @dataclass(frozen=True)
@@ -422,12 +420,10 @@ def parse_status(raw: bytes) -> DeviceStatus:
     # counted as in the manual, which calls the code 0
     data = bytes([STATUS]) + reply_data(raw, STATUS, 123)
     return DeviceStatus(
-        firmware=text(data[1:8]),
         measuring_mode=data[102],
         scan_angle_deg=float(whole(data[107:109])),
         resolution_deg=whole(data[109:111]) / 100,
         address=data[120],
-        unit=unit_of(data[122:]),
     )
 
 

@@ -1,7 +1,6 @@
 """Telegrams of the SICK LMS2xx as bytes: their frame, checksum, and where they are in a stream."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -11,7 +10,7 @@ HOST = 0x00
 DEVICE = 0x80
 LONGEST = 812 + 2  # bytes of the longest reply, 401 values, with real-time indices
 OVERHEAD = 6  # start, address, length, CRC
-CHUNK = 512  # telegrams worked on at once: what fits into the cache of a processor
+MANY = 20  # telegrams whose checksums are sooner computed side by side than one by one
 
 
 class TelegramError(ValueError):
@@ -51,7 +50,7 @@ class Stream:
 
 
 def crc16(data):
-    """The device's checksum of a byte string; :func:`check_crc` has it for many at once.
+    """The device's checksum of a byte string, or of many in the columns of an array of uint16.
 
     Notes
     -----
@@ -189,33 +188,16 @@ def word(data, at):
     return data[at] | (data[at + 1].astype(int) << 8)
 
 
-@lru_cache
-def times_x(power):
-    """Every 16-bit polynomial times ``x^power``, shape (65536,); for powers of two, see crc16."""
-    if power > 1:
-        root = times_x(power // 2)
-        return root[root]
-    table = np.arange(1 << 16, dtype=np.uint16)
-    return (table << 1) ^ (table >> 15) * np.uint16(0x8005)
-
-
 def check_crc(data, offset, length):
     """Which of the whole telegrams in an array of uint8 have the right CRC, shape (m,)."""
     good = np.zeros(len(offset), bool)
     for rows in alike(length):
-        for first in range(0, len(rows), CHUNK):
-            chunk = rows[first : first + CHUNK]
-            raw = cut(data, offset[chunk], length[rows[0]])
-            # each byte with the one before it; neighbours are joined until one word is left
-            words = raw[:, :-2].astype(np.uint16)
-            words[:, 1:] |= raw[:, :-3].astype(np.uint16) << 8
-            power = 1
-            while words.shape[1] > 1:
-                if words.shape[1] % 2:  # zeros in front change nothing
-                    words = np.pad(words, ((0, 0), (1, 0)))
-                words = times_x(power)[words[:, ::2]] ^ words[:, 1::2]
-                power *= 2
-            good[chunk] = words[:, 0] == word(raw.T, -2)
+        raw = cut(data, offset[rows], length[rows[0]])
+        if len(rows) < MANY:
+            sums = [crc16(bytes(one)) for one in raw[:, :-2]]
+        else:
+            sums = crc16(raw[:, :-2].T.astype(np.uint16, order="C"))
+        good[rows] = sums == word(raw.T, -2)
     return good
 
 

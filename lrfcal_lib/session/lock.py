@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
-from lrfcal_lib.session.stated import SessionError, opened
+from lrfcal_lib.session.files import SessionError, opened
 
 LOCK = "writer.lock"
 

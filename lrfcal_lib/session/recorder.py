@@ -5,9 +5,9 @@ import math
 import os
 from collections.abc import Iterable
 
-from lrfcal_lib.session import read, stated
+from lrfcal_lib.session import files, read, stated
+from lrfcal_lib.session.files import SessionError, naming, short
 from lrfcal_lib.session.lock import LOCK
-from lrfcal_lib.session.stated import SessionError, naming, short
 from lrfcal_lib.session.tables import read_table
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 from lrfcal_lib.session.write import SessionWriter, as_lines, cell, mend_tables
@@ -51,7 +51,7 @@ class SessionRecorder(SessionWriter):
         not finish.
         """
         mine = json.loads(json.dumps(self.data))
-        data = stated.read_json(self.path / "session.json", self.path)
+        data = files.read_json(self.path / "session.json", self.path)
         with naming(self.path / "session.json"):
             known = stated.parse_session(data)
             for key in ("board", "rig"):

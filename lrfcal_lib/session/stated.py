@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
+import cv2
 import numpy as np
 import pydantic
 from numpy.typing import ArrayLike
@@ -22,35 +23,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.session.files import (
-    LARGEST_FILE,
-    LARGEST_TEXT,
-    SPLIT,
-    SessionError,
-    check_amount,
-    checked,
-    naming,
-    opened,
-    read_bytes,
-    read_json,
-    reading,
-    short,
-)
-
-__all__ = [  # how files are opened, beside all that is below
-    "LARGEST_FILE",
-    "LARGEST_TEXT",
-    "SPLIT",
-    "SessionError",
-    "check_amount",
-    "checked",
-    "naming",
-    "opened",
-    "read_bytes",
-    "read_json",
-    "reading",
-    "short",
-]
+from lrfcal_lib.session.files import short
 
 FILES = (  # of any session, besides its images
     "session.json",
@@ -288,7 +261,22 @@ class BoardStated(BaseModel):
                 )
             if size > LONGEST_BOARD:
                 raise ValueError(f"the board is {size:g} m large: {MILLIMETRES}")
+            self._hold_pattern(corners)
         return Board(self.name, self.edges, corners, self.pattern, self.features)
+
+    def _hold_pattern(self, corners):
+        """Refuse a pattern that does not fit on the board, farther than outlines are wrong."""
+        if self.pattern is None:
+            return
+        outline = corners.astype(np.float32)
+        for x, y, _ in self.pattern.points():
+            beyond = -cv2.pointPolygonTest(outline, (x, y), True)
+            if beyond > self.pattern.square / 4:
+                raise ValueError(
+                    f"the pattern's inner corner at ({x:.3f}, {y:.3f}) m lies {1e3 * beyond:.0f} "
+                    "mm outside the outline: check columns, rows, square_m and origin_m of the "
+                    "pattern, and corners_m"
+                )
 
 
 def board_to_json(board: Board) -> dict:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 
 _executor: ContextVar[Executor | None] = ContextVar("executor", default=None)
 _cores: ContextVar[int] = ContextVar("cores", default=1)  # for processes of our own
+FORK = multiprocessing.get_context("fork")
 _loop: tuple = ()  # of a forked process, which finds it in its memory
 
 
@@ -35,19 +36,16 @@ def side_by_side(executor: Executor | None = None) -> Iterator[None]:
     ----------
     executor
         Whose workers take part; it is not shut down. By default processes of this machine's
-        cores: forked for every loop, so that they have what was read before it, or kept for all
-        loops where this process has threads, which must not be forked.
+        cores, forked for every loop, so that they have what was read before it; none where this
+        process has threads, which must not be forked.
     """
     if executor is not None:
         with _setting(_executor, executor):
             yield
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    if cores > 1 and threading.active_count() > 1:
-        context = multiprocessing.get_context("forkserver")
-        with _pool(cores, context) as pool, _setting(_executor, pool):
-            yield
-        return
+    cores = 1
+    if hasattr(os, "sched_getaffinity") and threading.active_count() == 1:
+        cores = len(os.sched_getaffinity(0))
     with _setting(_cores, cores):
         yield
 
@@ -100,9 +98,8 @@ def _packed(work, item):
 
 def _forked(work, items, cores):
     """Results by number, of forked processes and of this one, which keeps what it has read."""
-    fork = multiprocessing.get_context("fork")
-    loop = (work, items, fork.Value("i"))
-    with _pool(cores - 1, fork, loop) as pool, _setting(_cores, 1):
+    loop = (work, items, FORK.Value("i"))
+    with _pool(cores - 1, loop) as pool, _setting(_cores, 1):
         others = [pool.submit(_take_part) for _ in range(cores - 1)]
         results = _rounds(*loop)
         for other in others:
@@ -133,13 +130,13 @@ def _setting(variable, value):
 
 
 @contextmanager
-def _pool(count, context, loop=()):
+def _pool(count, loop):
     """Processes that end with this one, however it ends, and at once after Ctrl-C."""
-    ours, theirs = context.Pipe()
+    ours, theirs = FORK.Pipe()
     with (
         ours,
         theirs,
-        ProcessPoolExecutor(count, context, _begin, (ours, theirs, loop)) as pool,
+        ProcessPoolExecutor(count, FORK, _begin, (ours, theirs, loop)) as pool,
     ):
         try:
             yield pool
@@ -155,7 +152,6 @@ def _begin(ours, theirs, loop):
     """In a worker: it shares no loop itself, and its end is not the user's."""
     global _loop
     ours.close()  # here; that of the other process tells that it is there
-    _executor.set(None)
     _cores.set(1)
     _loop = loop
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -15,11 +15,12 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session import read, stated
+from lrfcal_lib.session import files, read, stated
+from lrfcal_lib.session.files import SessionError, naming, short
 from lrfcal_lib.session.images import JPEG, check_image_size
 from lrfcal_lib.session.lock import LOCK, alone
 from lrfcal_lib.session.scans import check_scans, parts_of, read_npz
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, naming, short
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
 ABOUT = {"name": "", "licence": "", "source": "", "simulated": False, "reference": {}}
@@ -117,7 +118,7 @@ class SessionWriter:
 
     def _make_folders(self):
         for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
-            stated.checked(self.path / name / "any", self.path, make=True)
+            files.checked(self.path / name / "any", self.path, make=True)
         if self.cameras:
             self._begin_table("images.csv", read.IMAGE_COLUMNS)
 
@@ -253,12 +254,8 @@ class SessionWriter:
         offset = append_file(self.telegrams, b"".join(telegrams), self.path)
         offsets = offset + np.cumsum([0, *lengths[:-1]])
         number = number_cell(placement)
-        rows = []
-        pitch_deg = np.degrees(pitch)
-        for begin, length, at, angle in zip(
-            offsets, lengths, time_s, pitch_deg, strict=True
-        ):
-            rows.append([cell(at), begin, length, number, cell(angle)])
+        columns = zip(time_s, offsets, lengths, np.degrees(pitch), strict=True)
+        rows = [[cell(t), at, size, number, cell(angle)] for t, at, size, angle in columns]
         self._append_rows("lrf/index.csv", rows)
 
     def add_image(
@@ -302,7 +299,7 @@ class SessionWriter:
             content = image
         else:
             what = image
-            content = stated.read_bytes(image)
+            content = files.read_bytes(image)
         check_image_size(what, content, self.cameras[camera])
         self.shots[camera] += 1
         kind = "jpg" if content.startswith(JPEG) else "png"
@@ -364,7 +361,7 @@ def mend_tables(path):
         table = path / name
         if not os.path.lexists(table):
             continue
-        data = stated.read_bytes(table, path)
+        data = files.read_bytes(table, path)
         if not data.endswith(b"\n"):
             write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
 
@@ -395,9 +392,9 @@ def write_file(file: Path, content: str | bytes | dict, within: str | os.PathLik
     within
         The session's folder.
     """
-    draft = stated.checked(file, within).with_name(file.name + ".draft")
+    draft = files.checked(file, within).with_name(file.name + ".draft")
     draft.unlink(missing_ok=True)
-    with stated.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
+    with files.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
         if isinstance(content, dict):
             np.savez_compressed(stream, **content)
         else:
@@ -458,7 +455,7 @@ def append_file(file, content, within):
     all or nothing.
     """
     left = memoryview(content.encode() if isinstance(content, str) else content)
-    with stated.opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
+    with files.opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
         handle = stream.fileno()
         begin = os.fstat(stream.fileno()).st_size
         try:
