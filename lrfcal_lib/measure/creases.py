@@ -206,12 +206,12 @@ def creases_pulls(of_creases: dict[str, list[Sights]], rig: CalibratedRig) -> li
     mounted: dict[str, list] = {"head": [], "platform": []}
     for camera, parts in of_creases.items():
         if sum(len(part.number) for part in parts):
-            seen = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
+            rows = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
             looks = mounted[rig.cameras[camera].mount]
-            looks.append((Sights(**seen), poses_of(rig, camera)))
+            looks.append((Sights(**rows), poses_of(rig, camera)))
     slip = _slip(mounted["platform"])
-    pulls = [_pull(*look, 0.0) for look in mounted["head"]]
-    return pulls + [_pull(*look, slip) for look in mounted["platform"]]
+    pulls = [_pull(seen, poses, 0.0) for seen, poses in mounted["head"]]
+    return pulls + [_pull(seen, poses, slip) for seen, poses in mounted["platform"]]
 
 
 def _slip(fixed):
