@@ -31,11 +31,10 @@ REACH = 0.016  # of the image's width: 0.9 deg of a camera that sees 56 deg
 ALONG = 5  # pixels of a profile that are averaged
 HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
-WIDTHS = np.geomspace(0.3, 0.04, 12)
+WIDTHS = np.append(np.geomspace(0.3, 0.04, 12), np.full(8, 0.04))
 SCANNED = 0.09  # of REACH, for a slip: what a calibration that holds is off
 SLIPS = np.radians(np.linspace(-1.0, 1.0, 81))  # that are tried
 OUTLIERS = 0.15  # of the clearest edge's weight
-MISS = 1.0  # pixels, of one crease: rounded edges and shadows
 
 
 @dataclass(frozen=True)
@@ -103,14 +102,14 @@ def creases_of(
 
 @dataclass(frozen=True)
 class Sights:
-    """Places of creases as an image sees them, a row each.
+    """Places of creases as an image sees them, a row each; lengths are shares of `REACH` of it.
 
     Attributes
     ----------
     by_unknown : ndarray, shape (n, c)
-        How far the place moves along the normal of the crease, pixels, by the unknowns of a Pull.
+        How far the place moves along the normal of the crease, by the unknowns of a Pull.
     across, clear : ndarray, shape (n, k)
-        Distances along the normal, pixels, and how clear an edge of the image is there, 0 to 1.
+        Distances along the normal, and how clear an edge of the image is there, 0 to 1.
     number : ndarray of int, shape (n,)
         Of the crease.
     """
@@ -157,8 +156,8 @@ def sights(creases: Creases, view: View) -> Sights:
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
     return Sights(
-        by_unknown=np.einsum("ni,nij,njk->nk", normal, by_point, J[inside]),
-        across=across,
+        by_unknown=np.einsum("ni,nij,njk->nk", normal, by_point, J[inside]) / reach,
+        across=across / reach,
         clear=clear,
         number=creases.number[inside],
     )
@@ -186,89 +185,79 @@ def _edges(view, places, tangent, normal):
     return across, clear
 
 
-def joined(parts: list[Sights]) -> Sights:
-    """Those of all images of one camera, at least one."""
-    names = Sights.__dataclass_fields__
-    return Sights(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+def creases_pulls(of_creases: dict[str, list[Sights]], rig: CalibratedRig) -> list[Pull]:
+    """What creases and edges say about each camera that sees some: each place may go with one of
+    several edges, or with none.
 
-
-def slip_of(by_camera: dict[str, Sights], rig: CalibratedRig) -> float:
-    """By how much the head slipped under cameras on the base that creases meet edges, radians; 0
-    where that explains no more than chance finds (Schwarz's criterion).
+    A slip of the head is sought under all cameras on the base, then the pose of each camera with a
+    width that narrows (expectation and maximisation). Places of one crease err together.
 
     Parameters
     ----------
-    by_camera : dict of str to Sights
-        Of cameras on the base.
+    of_creases : dict of str to list of Sights
+        By camera and image.
     rig : CalibratedRig
-    """
-    explained = np.zeros(len(SLIPS))
-    for camera, seen in by_camera.items():
-        width = SCANNED * REACH * rig.cameras[camera].model.width
-        for i, slip in enumerate(SLIPS):
-            explained[i] += _explained(seen, seen.by_unknown[:, -1] * slip, width)
-    slip = float(SLIPS[np.argmax(explained)])
-    gain = 0.0
-    creases = 1
-    for camera, seen in by_camera.items():
-        creases += len(np.unique(seen.number))
-        for sign, start in ((1, slip), (-1, 0.0)):
-            gain += sign * _fitted(seen.after(start), rig, camera, HONEST)[1]
-    return slip if gain > np.log(creases) / 2 else 0.0
-
-
-def creases_pull(seen: Sights, rig: CalibratedRig, camera: str, slip: float = 0.0) -> Pull:
-    """What creases and edges say about a camera: each place may go with one of several edges, or
-    with none.
-
-    Its pose is found with a width that narrows (expectation and maximisation). Places of one
-    crease err together.
-
-    Parameters
-    ----------
-    seen : Sights
-        Of the images of one camera.
-    rig : CalibratedRig
-    camera : str
-    slip : float
-        Of the head, where it is sought, radians.
 
     Returns
     -------
-    Pull
+    list of Pull
     """
+    names = Sights.__dataclass_fields__
+    mounted: dict[str, list] = {"head": [], "platform": []}
+    for camera, parts in of_creases.items():
+        if sum(len(part.number) for part in parts):
+            rows = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
+            looks = mounted[rig.cameras[camera].mount]
+            looks.append((Sights(**rows), poses_of(rig, camera)))
+    slip = _slip(mounted["platform"])
+    pulls = [_pull(seen, poses, 0.0) for seen, poses in mounted["head"]]
+    return pulls + [_pull(seen, poses, slip) for seen, poses in mounted["platform"]]
+
+
+def _slip(fixed):
+    """By how much the head slipped under cameras on the base that creases meet edges, radians; 0
+    where that explains no more than chance finds (Schwarz's criterion).
+    """
+    explained = np.zeros(len(SLIPS))
+    for seen, _ in fixed:
+        by_slip = seen.by_unknown[:, -1]
+        explained += [_explained(seen, by_slip * slip, SCANNED) for slip in SLIPS]
+    slip = float(SLIPS[np.argmax(explained)])
+    gain = 0.0
+    creases = 1
+    for seen, poses in fixed:
+        creases += len(np.unique(seen.number))
+        gain += _fitted(seen.after(slip), poses, HONEST)[1]
+        gain -= _fitted(seen, poses, HONEST)[1]
+    return slip if gain > np.log(creases) / 2 else 0.0
+
+
+def _pull(seen, poses, slip):
+    """The Pull of a camera whose pose stands in these columns (6,), after a slip of the head."""
     after = seen.after(slip)
-    x, fit = _fitted(after, rig, camera, HONEST)
-    moved, fit_moved = _fitted(after, rig, camera, SPREAD)
+    x, fit = _fitted(after, poses, HONEST)
+    moved, fit_moved = _fitted(after, poses, SPREAD)
     # edges run beside each other: what has moved must explain more than chance finds
     if fit_moved - fit > len(x) / 2 * np.log(len(np.unique(seen.number))):
         x = moved
 
-    poses = poses_of(rig, camera)
-    width = WIDTHS[-1] * REACH * rig.cameras[camera].model.width
-    share, miss = _shares(after, seen.by_unknown[:, poses] @ x, width)
-    weight = seen.trust * share.sum(axis=1) / MISS**2
+    weight, pull = _weighed(after, seen.by_unknown[:, poses] @ x, WIDTHS[-1])
     information = (seen.by_unknown.T * weight) @ seen.by_unknown
-    pull = seen.trust * np.sum(share * miss, axis=1) / MISS**2
     fitted = np.zeros(seen.by_unknown.shape[1])
     fitted[poses] = x
     fitted[-1] = slip
     return pull_of_groups(information, pull[:, None] * seen.by_unknown, seen.number, fitted)
 
 
-def _fitted(seen, rig, camera, spread):
+def _fitted(seen, poses, spread):
     """A camera's pose (6,) that is likely to `spread` (6,), and how much it explains."""
-    by_pose = seen.by_unknown[:, poses_of(rig, camera)]
-    reach = REACH * rig.cameras[camera].model.width
-    trust = seen.trust
+    by_pose = seen.by_unknown[:, poses]
     x = np.zeros(len(spread))
-    for width in np.append(WIDTHS, np.full(8, WIDTHS[-1])) * reach:
-        share, miss = _shares(seen, by_pose @ x, width)
-        pull = trust * np.sum(share * miss, axis=1)
-        weight = trust * share.sum(axis=1)
+    for width in WIDTHS:
+        weight, pull = _weighed(seen, by_pose @ x, width)
         H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(spread**-2.0)
         x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / spread**2)
-    return x, _explained(seen, by_pose @ x, width)
+    return x, _explained(seen, by_pose @ x, WIDTHS[-1])
 
 
 def _explained(seen, moved, width):
@@ -277,8 +266,14 @@ def _explained(seen, moved, width):
     return -float(seen.trust @ np.log(1 - share.sum(axis=1)))
 
 
+def _weighed(seen, moved, width):
+    """What places that have moved (n,) count, (n,), and that times how far off their edges are."""
+    share, miss = _shares(seen, moved, width)
+    return seen.trust * share.sum(axis=1), seen.trust * np.sum(share * miss, axis=1)
+
+
 def _shares(seen, moved, width):
-    """What each edge has of its place (n, k) that has moved (n,), and how far off it is, pixels."""
+    """What each edge has of its place (n, k) that has moved (n,), and how far off it is."""
     miss = seen.across - moved[:, None]
     likely = seen.clear * np.exp(-0.5 * (miss / width) ** 2)
     return likely / (OUTLIERS + likely.sum(axis=1, keepdims=True)), miss

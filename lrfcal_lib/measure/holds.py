@@ -14,14 +14,7 @@ from lrfcal_lib.calibrate.cloud import join as join_clouds
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
-from lrfcal_lib.measure.creases import (
-    Sights,
-    creases_of,
-    creases_pull,
-    joined,
-    sights,
-    slip_of,
-)
+from lrfcal_lib.measure.creases import Sights, creases_of, creases_pulls, sights
 from lrfcal_lib.measure.features import flatness, largest_plane
 from lrfcal_lib.measure.image_pairs import pairs_pull
 from lrfcal_lib.measure.pulls import SPREAD, Pull, poses_of, views_of_station
@@ -314,26 +307,6 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         regions=sum(pull.groups for pull in of_pairs),
         all_on_head=all(c.mount == "head" for c in rig.cameras.values()),
     )
-
-
-def creases_pulls(of_creases: dict[str, list[Sights]], rig: CalibratedRig) -> list[Pull]:
-    """Of each camera that sees creases, after what the head slipped under those on the base.
-
-    Parameters
-    ----------
-    of_creases : dict of str to list of Sights
-        By camera and image.
-    rig : CalibratedRig
-    """
-    seen = {camera: joined(parts) for camera, parts in of_creases.items() if parts}
-    seen = {camera: places for camera, places in seen.items() if len(places.number)}
-    fixed = {
-        camera: s for camera, s in seen.items() if rig.cameras[camera].mount == "platform"
-    }
-    slip = slip_of(fixed, rig)
-    return [
-        creases_pull(s, rig, camera, slip * (camera in fixed)) for camera, s in seen.items()
-    ]
 
 
 def _stations(session, rig):
