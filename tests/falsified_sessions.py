@@ -340,10 +340,10 @@ WAYS = {
     "cameras exchanged": Way(exchange_folders, ("far from stated",), "folders"),
     "bearings reversed": Way(
         lambda folder: change_scans(folder, turned_round),
-        ("sense", "far from stated"),
-        "sense",
+        ("sense",),
+        "bearings are counted in the opposite direction",
     ),
-    "pitch reversed": Way(pitch_times(-1.0), ("sense", "far from stated"), "sense"),
+    "pitch reversed": Way(pitch_times(-1.0), ("sense",), "the pitch has the opposite sign"),
     "images of half the size": Way(half_size, ("lens",), "image size", ("sim_lms221",)),
     "pattern stated 6 x 8": Way(pattern_turned, (), sessions=("lms400_zed",)),
     "rows exchanged": Way(exchange_rows, ("exchanged",), "exchange them back"),

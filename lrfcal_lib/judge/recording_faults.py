@@ -12,7 +12,7 @@ from scipy.special import fdtri
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
-from lrfcal_lib.judge.alternatives import LEVER, guesses_of
+from lrfcal_lib.judge.alternatives import LEVER, far_axis, guesses_of
 from lrfcal_lib.judge.camera_changes import camera_changes, explains
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
@@ -177,10 +177,13 @@ def explained(faults: list[Fault]) -> bool:
 
 
 def hopeless(joint):
-    """Whether a JointCalibration (or None) explains so little that something may be misread."""
-    return (
-        joint is None or not explains(joint.solution) or bool(joint.solution.unobservable)
-    )
+    """Whether a JointCalibration (or None) explains so little, or only by an axis that points
+    backwards, that something may be misread.
+    """
+    if joint is None:
+        return True
+    backwards = any(far.angle > np.pi / 2 for far in far_axis(joint))
+    return backwards or not explains(joint.solution) or bool(joint.solution.unobservable)
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:
