@@ -3,8 +3,10 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from falsified_sessions import WAYS, copied
+from scipy.spatial.transform import RigidTransform, Rotation
 from shared import QUICK, campaign
 
 from lrfcal_lib.calibrate.pipeline import prepare
@@ -54,3 +56,11 @@ def test_nothing_is_hopeless_but_what_explains_nothing(quick):
     noisy = {"face_scale": 1.0, "view_scale": 30.0}
     estimate = SimpleNamespace(converged=True, unobservable=(), noise=noisy)
     assert hopeless(SimpleNamespace(solution=estimate))
+
+
+def test_an_axis_that_points_backwards_is_hopeless(quick):
+    turned = RigidTransform.from_rotation(Rotation.from_rotvec([0, 0, np.pi]))
+    session = quick.prepared.session
+    session = replace(session, T_head_lrf=session.T_head_lrf * turned)
+    prepared = replace(quick.joint.prepared, session=session)
+    assert hopeless(replace(quick.joint, prepared=prepared))

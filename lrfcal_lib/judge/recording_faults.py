@@ -180,10 +180,9 @@ def hopeless(joint):
     """Whether a JointCalibration (or None) explains so little, or only by an axis that points
     backwards, that something may be misread.
     """
-    if joint is None:
+    if joint is None or not explains(joint.solution) or joint.solution.unobservable:
         return True
-    backwards = any(far.angle > np.pi / 2 for far in far_axis(joint))
-    return backwards or not explains(joint.solution) or bool(joint.solution.unobservable)
+    return any(far.angle > np.pi / 2 for far in far_axis(joint))
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:
