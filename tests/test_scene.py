@@ -13,6 +13,7 @@ from lrfcal_lib.calibrate.cloud import COLUMNS, point_type
 from lrfcal_lib.calibrate.clouds import color_cloud
 from lrfcal_lib.measure.scene import station_cloud, stations_of, write_scene
 from lrfcal_lib.measure.stations import Joined, alone
+from lrfcal_lib.model.kinematics import SweepPitch
 
 ABOUT = "session sim_quick, UNTRUSTED for a test"
 POSE = RigidTransform.from_components(
@@ -154,6 +155,15 @@ def test_the_pose_of_an_image_is_that_of_its_camera(e57, session, rig):
         np.testing.assert_allclose(
             transform(node).as_matrix(), expected.as_matrix(), atol=1e-9
         )
+
+
+def test_what_a_board_s_sweep_was_off_by_is_not_taken_from_a_scene(session, rig, cloud):
+    number = session.scene_placements[0]
+    of_a_board = {number: SweepPitch(offset=np.radians(1.0), stretch=0.0, middle=0.0)}
+    corrections = replace(rig.corrections, sweeps=of_a_board)
+    live = station_cloud(session, replace(rig, corrections=corrections), number)
+    np.testing.assert_array_equal(live.points, cloud.points)
+    np.testing.assert_array_equal(live.colors, cloud.colors)
 
 
 def test_points_without_a_color_are_as_grey_as_their_echoes(session, rig, cloud):

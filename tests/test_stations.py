@@ -25,6 +25,7 @@ from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.report import merge
 from lrfcal_lib.report.reconstruct import SceneAsked
 from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.shown import escape
 from lrfcal_lib.simulate.scene import World
 
 IN_PLACE = RigidTransform.identity()
@@ -271,7 +272,8 @@ def corridor_cloud():
 
 def test_merge_writes_one_cloud_and_a_page(tmp_path, rig, monkeypatch, capsys):
     room = DATA / "room_lms221"
-    asked = SceneAsked(open_session(room), rig, (1, 3), tmp_path)
+    foreign = replace(rig, session="<b>bold</b> & $x$")
+    asked = SceneAsked(open_session(room), foreign, (1, 3), tmp_path)
     monkeypatch.setattr(merge, "station_cloud", grey_cloud)
     monkeypatch.setattr(merge, "open_scene", lambda *scene: asked)
     monkeypatch.setattr(
@@ -282,7 +284,8 @@ def test_merge_writes_one_cloud_and_a_page(tmp_path, rig, monkeypatch, capsys):
     assert "platform frame of station 1" in said
     assert "Nothing checks how stations 1 and 3 lie" in said
     page = (tmp_path / "stations.html").read_text()
-    assert "UNTRUSTED" not in page and asked.about in page
+    assert "UNTRUSTED" not in page and escape(asked.about) in page
+    assert "<b>" not in page and "<b>bold</b>" in asked.about
     for words in (
         "Nothing checks how stations 1 and 3 lie",
         "<td>1 and 3</td>",

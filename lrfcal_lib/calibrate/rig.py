@@ -1,6 +1,6 @@
 """A calibrated rig: all that turns its sweeps and images into a coloured cloud."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -78,6 +78,11 @@ class CalibratedRig:
     def T_head_lrf(self) -> RigidTransform:
         """Of its axis."""
         return self.axis.T_head_lrf
+
+    @property
+    def for_scenes(self) -> "CalibratedRig":
+        """Without what single sweeps of a board were off by, which is of no other sweep."""
+        return replace(self, corrections=replace(self.corrections, sweeps={}))
 
     def camera_at(self, name: str, pitch: float) -> RigidTransform:
         """``T_camera_platform`` of a camera at a true pitch (radians)."""

@@ -122,7 +122,7 @@ def station_of(session: Session, rig: CalibratedRig, number: int) -> Station:
         For a sweep without a range, or images that the rig cannot pose or that have another size.
     """
     sweep, _ = without_closing(session.sweep(number))
-    return Station(number, sweep, views_of(session, rig, number))
+    return Station(number, sweep, views_of(session, rig.for_scenes, number))
 
 
 def colored_blocks(
@@ -146,7 +146,7 @@ def colored_blocks(
     if intensities is not None:
         some = intensities.ravel()[:: 1 + intensities.size // COMPARED]
         levels = np.nanpercentile(some, [2, 98])
-    for cloud in sweep_blocks(session, rig, station.sweep, station.views):
+    for cloud in sweep_blocks(session, rig.for_scenes, station.sweep, station.views):
         if levels is not None:
             cloud = _shaded(cloud, *levels)
         yield cloud

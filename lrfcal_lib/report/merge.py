@@ -13,6 +13,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.scene import station_cloud, write_scene
 from lrfcal_lib.measure.stations import Joined, advice, join_stations, joined_cloud
 from lrfcal_lib.report.reconstruct import open_scene
+from lrfcal_lib.session.shown import escape
 from lrfcal_lib.session.write import whole
 
 NOT_ALL = 3  # exit code where something is left out
@@ -139,12 +140,12 @@ def stations_page(joined: Joined, cloud: Cloud, about: str) -> str:
     picture = BytesIO()
     stations_figure(joined, cloud).savefig(picture, dpi=110)
     return PAGE.format(
-        about=about,
+        about=escape(about),
         frame=FRAME.format(min(joined.T_world_station)),
         picture=base64.b64encode(picture.getvalue()).decode(),
         stations=stations_table(joined).to_html(index=False, border=0),
         pairs=pairs_table(joined).to_html(index=False, border=0),
-        sentences="".join(f"<li>{words}</li>" for words in sentences(joined)),
+        sentences="".join(f"<li>{escape(words)}</li>" for words in sentences(joined)),
     )
 
 
