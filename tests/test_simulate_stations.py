@@ -87,7 +87,11 @@ def test_a_world_seen_from_elsewhere_is_the_same_world():
 
 def test_ends_of_lengths_lie_on_things_of_the_room():
     truth = json.loads((ROOM / "truth.json").read_text())["lengths"]
-    assert truth == lengths.room_lengths()
+    for stored, computed in zip(truth, lengths.room_lengths(), strict=True):
+        assert stored["name"] == computed["name"] and stored["kind"] == computed["kind"]
+        # to the last digit only on one machine: another LAPACK rounds the SVD in another way
+        assert stored["metres"] == pytest.approx(computed["metres"], abs=1e-12)
+        np.testing.assert_allclose(stored["ends"], computed["ends"], rtol=0, atol=1e-12)
     assert [row["kind"] for row in truth].count("edge-edge") == 10 and len(truth) == 20
     assert len({row["name"] for row in truth}) == 20
     room = record.world_of(SETUP, None)
