@@ -14,8 +14,10 @@ from rendered_boards import (
     score,
     view_poses,
 )
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.model.board import Chessboard
+from lrfcal_lib.model.camera import project
 from lrfcal_lib.preprocess import intrinsics, survey
 from lrfcal_lib.preprocess.board_in_image import (
     BoardView,
@@ -139,6 +141,31 @@ def test_pose_without_noise_is_exact_and_its_covariance_tells_the_error():
         for s in range(60)
     ]
     assert 0.6 < np.mean(chi2) < 1.4
+
+
+def test_a_corner_far_off_does_not_turn_a_small_board_over():
+    """Seen from afar a board leaning the other way looks nearly the same."""
+    small = Chessboard(5, 6, 0.025)
+    rng = np.random.default_rng(0)
+    wrong = 0
+    for _ in range(100):
+        lean = rng.uniform(0.1, 1.0) * np.append(uniform_direction(rng), 0.0)
+        turn = Rotation.from_rotvec(lean) * Rotation.from_euler(
+            "xz", [np.pi, rng.uniform(0, 6)]
+        )
+        place = rng.uniform([-0.2, -0.2, 1.2], [0.2, 0.2, 2.6])
+        pose = RigidTransform.from_components(place, turn)
+        pixels = project(pose.apply(small.points()), MODEL) + rng.normal(0, 0.02, (30, 2))
+        pixels[rng.integers(30)] += 3 * uniform_direction(rng)
+        found = board_pose(pixels, small, MODEL)[0]
+        wrong += (found.inv() * pose).rotation.magnitude() > np.radians(5)
+    assert wrong <= 1  # 10 without a second start
+
+
+def uniform_direction(rng):
+    """A unit vector (2,) of any direction."""
+    angle = rng.uniform(0, 2 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
 
 
 def test_errors_that_agree_between_neighbours_widen_the_covariance():

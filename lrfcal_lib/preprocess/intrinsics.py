@@ -181,8 +181,17 @@ def board_pose(
     count = np.isfinite(pixels).all(axis=1).sum()
     if count < FEWEST_CORNERS:
         raise ValueError(f"a pose needs four corners of the pattern or more, got {count}")
-    poses = RigidTransform.concatenate([first_pose(points, pixels, model)])
-    result = adjust_robust(pixels[None, None], points, [model], poses, intrinsics=False)
+
+    def settled(start):
+        poses = RigidTransform.concatenate([start])
+        return adjust_robust(pixels[None, None], points, [model], poses, intrinsics=False)
+
+    result = settled(first_pose(points, pixels, model))
+    used = np.isfinite(result.residuals[0, 0])
+    if used.sum() < np.isfinite(pixels).sum():
+        # a corner far off may have led to the mirrored lean of a small board
+        again = settled(first_pose(points, np.where(used, pixels, np.nan), model))
+        result = min(result, again, key=lambda each: each.sigma_px)
     residuals = result.residuals[0, 0]
     pose = result.poses[0]
     factor = max(1.0, SIGMA_FLOOR_PX / result.sigma_px) ** 2
