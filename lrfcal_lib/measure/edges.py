@@ -5,7 +5,6 @@ line and the eye of the camera span a plane of sight, which meets the plane of t
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -21,6 +20,7 @@ from lrfcal_lib.judge.uncertainty import beams_to
 from lrfcal_lib.measure.features import Feature, Kind, beams_moved
 from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge, refine_edge
+from lrfcal_lib.session.workers import spread
 
 SHORTEST_PX = 40.0  # of an edge in an image
 HALF_WIDTH_PX = 1.5  # about a detected segment, in which its line is looked for
@@ -54,38 +54,44 @@ def edges_of(
     -------
     list of Feature
     """
-    planes, of_point = surfaces
+    planes, _ = surfaces
     edges = []
-    with ThreadPoolExecutor() as pool:
-        segments_of = list(pool.map(_segments, views))
-    for view, segments in zip(views, segments_of, strict=True):
-        # what one image of a camera sees, all of them see that have it in view
-        of_camera = [other.number for other in views if other.camera == view.camera]
-        rows = np.flatnonzero(np.isin(cloud.image, of_camera))
-        p_camera = view.T_camera_platform.apply(cloud.points[rows])
-        uv = pinhole(p_camera, view.model)
-        size = np.array([view.model.width, view.model.height])
-        inside = np.flatnonzero((np.abs(uv - size / 2) < size).all(axis=1))
-        rows = rows[inside]
-        uv = uv[inside]
-        beside = _Beside(uv, p_camera[inside, 2], of_point[rows], cloud.image[rows])
-        tree = KDTree(uv)
-        depths = partial(_depth, view, planes)
-        shown = []
-        lines = []
-        for ends in segments:
-            reach = np.linalg.norm(ends[1] - ends[0]) / 2 + BESIDE_PX[1]
-            near = tree.query_ball_point(ends.mean(axis=0), reach, return_sorted=False)
-            near = np.array(near, int)
-            points = _Beside(*(column[near] for column in beside))
-            number = _surface_at(ends, points, depths, view.number)
-            if number >= 0:
-                with suppress(EdgeNotSeen):
-                    lines.append(_refined(view, ends, segments))
-                    shown.append(planes[number])
-        if shown:
-            edges += _on_planes(shown, lines, view)
+    seen = spread(partial(_lines_on_planes, cloud, surfaces, views), views)
+    for view, (numbers, lines) in zip(views, seen, strict=True):
+        if lines:
+            edges += _on_planes([planes[number] for number in numbers], lines, view)
     return edges
+
+
+def _lines_on_planes(cloud, surfaces, views, view):
+    """The lines of one image at planes of a cloud, and the numbers of these planes."""
+    planes, of_point = surfaces
+    segments = _segments(view)
+    # what one image of a camera sees, all of them see that have it in view
+    of_camera = [other.number for other in views if other.camera == view.camera]
+    rows = np.flatnonzero(np.isin(cloud.image, of_camera))
+    p_camera = view.T_camera_platform.apply(cloud.points[rows])
+    uv = pinhole(p_camera, view.model)
+    size = np.array([view.model.width, view.model.height])
+    inside = np.flatnonzero((np.abs(uv - size / 2) < size).all(axis=1))
+    rows = rows[inside]
+    uv = uv[inside]
+    beside = _Beside(uv, p_camera[inside, 2], of_point[rows], cloud.image[rows])
+    tree = KDTree(uv)
+    depths = partial(_depth, view, planes)
+    numbers = []
+    lines = []
+    for ends in segments:
+        reach = np.linalg.norm(ends[1] - ends[0]) / 2 + BESIDE_PX[1]
+        near = tree.query_ball_point(ends.mean(axis=0), reach, return_sorted=False)
+        near = np.array(near, int)
+        points = _Beside(*(column[near] for column in beside))
+        number = _surface_at(ends, points, depths, view.number)
+        if number >= 0:
+            with suppress(EdgeNotSeen):
+                lines.append(_refined(view, ends, segments))
+                numbers.append(number)
+    return numbers, lines
 
 
 class _Beside(NamedTuple):

@@ -3,6 +3,7 @@
 import base64
 import json
 from collections.abc import Mapping
+from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -54,8 +55,6 @@ def scene_page(
         What :func:`lrfcal_lib.measure.lengths.for_page` gives for these points: two clicks give a
         length.
     """
-    from plotly.io import write_html  # a second
-
     every = -(-len(points) // MOST_POINTS) or 1
     shown = {
         "points": np.flatnonzero(seen)[::every],
@@ -69,20 +68,30 @@ def scene_page(
         traces[-1]["visible"] = "legendonly" if name == "boards" else True
     data = "null"
     if measuring is not None:
-        data = json.dumps(_packed(measuring, list(shown.values()), len(traces)))
+        data = _in_script(_packed(measuring, list(shown.values()), len(traces)))
         traces += _measured_traces(measuring["lines"])
-    layout = _layout(title, note)
-    # unchecked: a check looks at every colour, 5 s
+    options = {"scrollZoom": False, "responsive": True}
+    plot = _in_script([traces, _layout(title, note), options])
     script = f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});"
-    write_html(
-        {"data": traces, "layout": layout},
-        path,
-        config={"scrollZoom": False},
-        validate=False,
-        div_id="scene",
-        default_height="100vh",
-        post_script=script,
+    page = (
+        '<html><head><meta charset="utf-8"></head><body>',
+        f"<script>{_plotly_js()}</script>",
+        '<div id="scene" style="height:100vh"></div>',
+        f"<script>Plotly.newPlot({PLOT}, ...{plot}).then(() => {{\n{script}\n}});</script>",
+        "</body></html>\n",
     )
+    Path(path).write_text("\n".join(page), encoding="utf-8")
+
+
+def _in_script(data):
+    """As JSON; no text in it ends the script that it stands in."""
+    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _plotly_js():
+    """The script that draws; to import its package takes a fifth of a second."""
+    package = Path(find_spec("plotly").origin).parent
+    return (package / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
 
 
 def _cloud_trace(name, points, colors):
