@@ -268,6 +268,22 @@ def test_large_residual_problem_converges_where_gauss_newton_diverges():
     assert state[0] == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("change", [0.0, 0.01])
+def test_weights_that_depend_on_the_state_do_not_keep_a_minimum_from_being_reached(change):
+    """Gradients leave their change out: the cost rises on the last thousandths of the way."""
+
+    def evaluate(state):
+        x = state[..., :1]
+        r = np.concatenate([x, x - 1], axis=-1)
+        whitener = np.concatenate([np.ones_like(x), 1 + change * x], axis=-1)
+        return Block(r, np.ones(r.shape + (1,)), whitener)
+
+    for start in (np.array([0.5013]), np.array([[3.0], [0.5013]])):
+        state, converged, *_ = minimise(evaluate, start, np.add, tolerance=1e-4)
+        assert np.all(converged)
+        assert state == pytest.approx(0.5, abs=0.005)
+
+
 @pytest.mark.parametrize("delta, words", [
     ([0, 0, 0, 0, 0, -1], "translation along z of the right frame"),
     ([0, 1, 0, 0, 0, 0], "rotation about y of the right frame"),

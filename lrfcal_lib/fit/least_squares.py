@@ -38,6 +38,9 @@ LEAST_DAMPING = 1e-12
 MOST_DAMPING = 1e14
 # a step with more is short because it is held, not because it has arrived
 SMALL_DAMPING = 10.0
+# tolerances: a step that began shorter and had to be held leads nowhere, because gradients leave out
+# what the state does to some weights (of the views at a stop)
+LEADS_NOWHERE = 100.0
 # chance alone exceeds chi-square so seldom where the stated noise is right
 LARGE_CHI2 = 0.001
 
@@ -317,7 +320,10 @@ def minimise(
         after = sum(_cost(block, axes) for block in tried)
         accepted = after <= at.cost * (1 + 1e-12) + 1e-26
         small = (length < tolerance**2) | (length < 1e-14 * at.cost)
-        converged = converged | (small & np.isfinite(after) & (damping < SMALL_DAMPING))
+        held = damping >= SMALL_DAMPING
+        began = (1 + damping) ** 2 * length  # so long the step was before it was held
+        arrived = np.where(held, began < (LEADS_NOWHERE * tolerance) ** 2, small)
+        converged = converged | (arrived & np.isfinite(after))
         gain = np.ones_like(at.cost)
         np.divide(at.cost - after, promised, out=gain, where=promised > 3e-15 * at.cost)
         damping = _next_damping(damping, gain, accepted)
