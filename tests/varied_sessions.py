@@ -376,7 +376,7 @@ def record(path, seed, **given):
     lrf = LrfInfo(
         f"{rig.beam.name} (varied)", tuple(rig.beam.bearings()[[0, -1]]), np.radians(v.resolution / 100), v.sigma_range,
         range_resolution=rig.beam.unit, spot_exit=rig.beam.spot_exit, spot_divergence=rig.beam.divergence,
-        systematic_error=0.035,
+        systematic_error=0.035, step_error=0.0,  # beams are drawn at the stated step
     )  # fmt: skip
     infos = [
         CameraInfo(
