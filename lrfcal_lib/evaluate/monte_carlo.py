@@ -9,7 +9,9 @@ import pandas as pd
 from scipy.special import logit
 from scipy.stats import binom, chi2
 
+from lrfcal_lib.evaluate.tables import unit_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
+from lrfcal_lib.fit.covariance import name_words, null_space, pseudo_inverse
 from lrfcal_lib.fit.edge_likelihood import disc_share
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_transform
 from lrfcal_lib.model.observations import JointObservations
@@ -21,17 +23,18 @@ INTERVAL = 0.9
 HALF_WIDTH = 1.6448536269514722  # standard normal: 90 % of it lies within
 LIMITS = (0.005, 0.995)  # of what chance alone does
 FEWEST_TRIALS = 10
-GROUPS = {  # unknowns by name: what they are together, the unit of that and the factor to it
-    r"axis_.*": ("axis direction", "deg", np.degrees(1.0)),
-    r"offset_.*": ("axis offset", "mm", 1000.0),
-    r"range_offset": ("range offset", "mm", 1000.0),
-    r"edge_log_odds": ("edge bias", "log odds", 1.0),
-    r"edge_log_softness": ("edge softness", "log", 1.0),
-    r"pitch_scale": ("pitch scale", "%", 100.0),
-    r"pitch_by_direction": ("pitch by direction", "deg", np.degrees(1.0)),
-    r"(.+)_r[xyz]": (r"\1 rotation", "deg", np.degrees(1.0)),
-    r"(.+)_t[xyz]": (r"\1 translation", "mm", 1000.0),
+MOST_SIGMA = 3e5  # standard deviations of one alone, in a direction that is left open
+LARGE = 0.3  # share of its largest component, of those that are named
+GROUPS = {  # unknowns by name: what they are together
+    r"axis_.*": "axis direction",
+    r"offset_.*": "axis offset",
+    r"edge_log_odds": "edge bias",
+    r"edge_log_softness": "edge softness",
+    r"(.+)_r[xyz]": r"\1 rotation",
+    r"(.+)_t[xyz]": r"\1 translation",
+    r"(.+)": r"\1",
 }
+LOGARITHMS = {"edge bias": "log odds", "edge softness": "log"}  # their units
 
 
 @dataclass(frozen=True)
@@ -190,27 +193,22 @@ def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.n
     """
     total = np.sum(expected_information(obs, truth, unknowns), axis=0)
     scale = 1 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))
-    values, vectors = np.linalg.eigh(total * scale[:, None] * scale)
-    if values[0] < 1e-11:
-        names = unknowns.names(obs.cameras)
-        large = np.flatnonzero(np.abs(vectors[:, 0]) > 0.3)
-        raise DegenerateGeometry(
-            f"no bound: the data leave {', '.join(names[i] for i in large)} open"
-        )
-    return (vectors / values) @ vectors.T * scale[:, None] * scale
+    left = null_space(total, scale, MOST_SIGMA)
+    if len(left):
+        open_ = name_words(left[0] / scale, unknowns.names(obs.cameras), LARGE)
+        raise DegenerateGeometry(f"no bound: the data leave {open_} open")
+    return pseudo_inverse(total * scale[:, None] * scale) * scale[:, None] * scale
 
 
 def groups_of(names: Sequence[str]) -> dict[str, tuple[list[int], str, float]]:
     """Unknowns in groups of one unit: dict of words to (indices, unit, factor to that unit)."""
     groups: dict[str, tuple[list[int], str, float]] = {}
     for i, name in enumerate(names):
-        for pattern, (words, unit, factor) in GROUPS.items():
-            if re.fullmatch(pattern, name):
-                group = re.sub(pattern, words, name)
-                groups.setdefault(group, ([], unit, factor))[0].append(i)
-                break
-        else:
-            raise ValueError(f"'{name}' belongs to no group of unknowns")
+        pattern = next(pattern for pattern in GROUPS if re.fullmatch(pattern, name))
+        words = re.sub(pattern, GROUPS[pattern], name, count=1).replace("_", " ")
+        unit, factor = unit_of(name)
+        group = groups.setdefault(words, ([], LOGARITHMS.get(words, unit), factor))
+        group[0].append(i)
     return groups
 
 
@@ -275,16 +273,12 @@ def _judge(trials, index, factor):
     sigma = np.sqrt(np.diagonal(mean))
     independent = len(e) * _freedom(mean / np.outer(sigma, sigma))
     seen = max(round(independent), 1)
+    unit = np.full(e.shape, factor)
     if factor is None:
         unit = 1 / np.sqrt(np.diagonal(B, axis1=1, axis2=2))
-    else:
-        unit = np.full(e.shape, factor)
-    scale = unit[:, :, None] * unit[:, None, :]
-    e = unit * e
-    C = scale * C
-    B = scale * B
+    B = unit[:, :, None] * B * unit[:, None]
     crb = np.sqrt(np.mean(np.trace(B, axis1=1, axis2=2)))
-    rmse = np.sqrt(np.mean(np.sum(e**2, axis=1)))
+    rmse = np.sqrt(np.mean(np.sum((unit * e) ** 2, axis=1)))
     free = len(e) * _freedom(np.mean(B, axis=0))
     half_width = HALF_WIDTH * np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     normalised = np.linalg.solve(C, e[..., None])[..., 0]

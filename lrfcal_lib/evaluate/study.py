@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, as_completed
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -98,13 +99,12 @@ def tasks_of(scenarios, methods, n_poses, trials, seed=0) -> list[Task]:
     for scenario in known:
         if scenario.corner and not BATCHED.keys() >= set(methods):
             raise ValueError(f"{scenario.name} shows no board: use {', '.join(BATCHED)}")
-    tasks = []
-    for first in range(0, trials, CHUNK):
-        number = min(CHUNK, trials - first)
-        for scenario in known:
-            for count in sorted(n_poses, reverse=True):  # the longest first
-                tasks.append(Task(scenario, tuple(methods), count, seed, first, number))
-    return tasks
+    counts = sorted(n_poses, reverse=True)  # the longest first
+    return [
+        Task(scenario, tuple(methods), count, seed, first, min(CHUNK, trials - first))
+        for first in range(0, trials, CHUNK)
+        for scenario, count in product(known, counts)
+    ]
 
 
 def finished(
@@ -151,24 +151,23 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     keys = [*settings, "method"]
     rows = rows.reindex(columns=list(dict.fromkeys([*rows.columns, *NUMBERS])))
     rows = rows.assign(method=pd.Categorical(rows.method, STUDIED))
-    rows = rows.sort_values([*keys, "trial"])
+    rows = rows.assign(failed=rows.outcome != "ok").sort_values([*keys, "trial"])
     every = rows.groupby(keys, observed=True)
-    good = rows[rows.outcome == "ok"].groupby(keys, observed=True)
-    table = pd.DataFrame({"trials": every.size()})
-    table["failed"] = every.outcome.agg(lambda words: int((words != "ok").sum()))
+    good = rows[~rows.failed].groupby(keys, observed=True)
+    table = pd.DataFrame({"trials": every.size(), "failed": every.failed.sum()})
     table["failures"] = every.outcome.agg(_reasons)
     for name, (unit, factor) in UNITS.items():
-        column = f"{name}_{unit}"
-        table[column] = factor * every[name].median()
-        table[f"{column}_mean"] = factor * every[name].mean()
+        columns = {"": every[name].median(), "mean": every[name].mean()}
         for end, share in INTERVAL.items():
-            table[f"{column}_{end}"] = factor * every[name].agg(resampled, share=share)
+            columns[end] = every[name].agg(resampled, share=share)
         for end, of in {
             "rmse": name,
             "bound": f"bound_{name}",
             "known": f"known_{name}",
         }.items():
-            table[f"{column}_{end}"] = factor * good[of].agg(_root_mean_square)
+            columns[end] = good[of].agg(lambda values: np.sqrt(np.mean(values**2)))
+        for end, values in columns.items():
+            table["_".join(filter(None, (name, unit, end)))] = factor * values
     table["rmse_over_bound"] = np.sqrt(good.over_bound.mean())
     for end, share in INTERVAL.items():
         squares = good.over_bound.agg(resampled, share=share, statistic=np.mean)
@@ -182,10 +181,6 @@ def _reasons(outcomes):
     """Why trials failed, and how often."""
     counts = outcomes[outcomes != "ok"].value_counts().sort_index()
     return "; ".join(f"{count} {words}" for words, count in counts.items())
-
-
-def _root_mean_square(values):
-    return np.sqrt(np.mean(np.square(values)))
 
 
 def resampled(values: np.ndarray, share: float, statistic=np.median) -> float:

@@ -1,6 +1,7 @@
 """Trials of a study: the same drawn single shots to every method, errors against the truth."""
 
 import hashlib
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
 from lrfcal_lib.preprocess.board_in_scan import fit_lines
-from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
+from lrfcal_lib.preprocess.edges_in_scan import UNIFORM, crossings_of
 from lrfcal_lib.preprocess.surfaces import row_ends
 from lrfcal_lib.session.cluster import source_digest
 from lrfcal_lib.simulate.draw import REACH
@@ -49,6 +50,7 @@ PLANES: dict[str, dict] = {
     },
 }
 STUDIED = (*BATCHED, *PLANES, "joint")
+PARTS = {"rotation": slice(3), "translation": slice(3, 6)}  # of a pose
 LEAST_RANGE = 0.05  # metres: noise may make a near one negative
 
 
@@ -155,23 +157,20 @@ def _judged(estimate, true, bounds):
     error = pose_errors(pose[None], true[None])[0]
     if not (np.isfinite(error).all() and np.isfinite(covariance).all()):
         return {"outcome": "not finite"}
-    turn = np.linalg.norm(error[:3])
+    numbers = {part: np.linalg.norm(error[of]) for part, of in PARTS.items()}
     outcome = "ok"
-    if turn > FAR:
+    if numbers["rotation"] > FAR:
         outcome = "more than 10 deg from the truth"
     elif not converged:
         outcome = "not converged"
-    numbers = {"rotation": turn, "translation": np.linalg.norm(error[3:])}
     if bounds is None:
         return {"outcome": outcome} | numbers
-    unknown, known = bounds
     interval = HALF_WIDTH * np.sqrt(np.maximum(np.diagonal(covariance), 0))
+    for name, limit in bounds.items():
+        for part, of in PARTS.items():
+            numbers[f"{name}_{part}"] = np.sqrt(np.trace(limit[of, of]))
     numbers |= {
-        "bound_rotation": np.sqrt(np.trace(unknown[:3, :3])),
-        "bound_translation": np.sqrt(np.trace(unknown[3:, 3:])),
-        "known_rotation": np.sqrt(np.trace(known[:3, :3])),
-        "known_translation": np.sqrt(np.trace(known[3:, 3:])),
-        "over_bound": np.mean(error**2 / np.diagonal(unknown)),
+        "over_bound": np.mean(error**2 / np.diagonal(bounds["bound"])),
         "nees": error @ np.linalg.pinv(covariance) @ error / 6,
         "covered": np.mean(np.abs(error) < interval),
     }
@@ -199,15 +198,15 @@ def crossing_observations(
     else:
         lines = np.tile(shots["lines"], (1, 1, scenario.scans, 1))
         points, covariance = _ends_of_lines(shots["ranges"], scenario, last_beam)
-    t, p, each = points.shape[:3]
-    shape = (t, p * each)
+    sessions, placements, each = points.shape[:3]
+    shape = (sessions, placements * each)
     return CameraObservations(
         scenario.model,
         crossing_points=points.reshape(*shape, 3),
         crossing_covariance=covariance.reshape(*shape, 3, 3),
         crossing_lines=lines.reshape(*shape, 3),
         crossing_line_sigma=np.full(shape, scenario.sigma_px),
-        crossing_placement=np.repeat(np.arange(p), each),
+        crossing_placement=np.repeat(np.arange(placements), each),
     )
 
 
@@ -216,31 +215,18 @@ def _ends_of_lines(ranges, setup, last_beam):
     covariances.
     """
     bearings = setup.bearings()
-    t, p, scans, beams = ranges.shape
+    *sessions, scans, beams = ranges.shape
     ranges = ranges.reshape(-1, beams)
     lines, information = fit_lines(ranges, bearings)
     _, first, last = row_ends(np.isfinite(ranges))
     ends = bearings[np.stack([first, last], axis=1)]
     if not last_beam:
         ends = ends + np.array([-0.5, 0.5]) * setup.step
-    ray = polar_to_points(1.0, ends)
-    across = np.cross([0.0, 0.0, 1.0], ray)
-    u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
-    r = 1 / np.vecdot(u, ray)  # to the fitted line u . p = 1
-    by_bearing = -(r**2) * np.vecdot(u, across)  # the range's change
-    turned = r[..., None] * across + by_bearing[..., None] * ray
     of_line = np.linalg.inv(information) * setup.sigma_range**2
-    flat_ray = ray[..., :2]
-    variance = r**4 * np.vecdot(flat_ray @ of_line, flat_ray)
-    spacing = _outer(turned * setup.step * UNIFORM)
-    points = r[..., None] * ray
-    covariance = variance[..., None, None] * _outer(ray) + spacing
-    shape = (t, p, 2 * scans)
-    return points.reshape(*shape, 3), covariance.reshape(*shape, 3, 3)
-
-
-def _outer(v):
-    return v[..., :, None] * v[..., None, :]
+    found = crossings_of(lines.repeat(2, axis=0), of_line.repeat(2, axis=0), ends.ravel())
+    covariance = found.covariance(setup.step * UNIFORM)
+    shape = (*sessions, 2 * scans, 3)
+    return found.points.reshape(shape), covariance.reshape(*shape, 3)
 
 
 def plane_observations(
@@ -257,13 +243,14 @@ def plane_observations(
     scenario : Scenario
     """
     rays = polar_to_points(1.0, obs.face_bearing)
+    thick = 1e-10 * np.eye(3)
     return CameraObservations(
         scenario.model,
         pattern_points=scenario.board.pattern.points(),
         pattern_pixels=pixels,
         pattern_sigma_px=scenario.sigma_px,
         plane_points=obs.face_range[:, None] * rays,
-        plane_covariance=scenario.sigma_range**2 * _outer(rays) + 1e-10 * np.eye(3),
+        plane_covariance=scenario.sigma_range**2 * rays[:, :, None] * rays[:, None] + thick,
         plane_placement=obs.face_placement,
         placements=np.arange(len(obs.placements)),
         board_poses=obs.view_pose,
@@ -284,8 +271,6 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     trial : int
     """
     count = len(shots["ranges"][trial])
-    views = np.tile(np.eye(4), (count, 1, 1))
-    views[:, :3] = shots["boards"][trial]
     obs = JointObservations(
         placements=np.arange(1, count + 1),
         middle=np.zeros(count),
@@ -293,7 +278,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
         **_readings(shots, scenario, trial),
         view_camera=np.zeros(count, int),
         view_pitch=np.zeros(count),
-        view_pose=views,
+        view_pose=pose_transform(shots["boards"][trial]).as_matrix(),
         view_covariance=shots["board_covariance"][trial],
         view_placement=np.arange(count),
         edges=scenario.board.edges,
@@ -308,7 +293,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
         obs,
         RigidTransform.identity(),
         {"camera": T_camera_lrf},
-        [boards[i] for i in range(count)],
+        list(boards),
         bias=scenario.bias,
         softness=scenario.softness,
     )
@@ -326,39 +311,38 @@ def _readings(shots, scenario, trial):
     hit = np.isfinite(ranges)
     line, beam = np.nonzero(hit)
     _, first, last = row_ends(hit)
+    ends = np.stack([first, last], axis=1)
+    at_ends = np.maximum(np.take_along_axis(ranges, ends, axis=1), LEAST_RANGE)
     near = np.arange(2 * REACH) - REACH  # beams about the end of a scan line
-    window = np.stack([first[:, None] + near, last[:, None] + 1 + near], axis=1)
-    window = np.clip(window, 0, beams - 1)
-    shape = window.shape
-    which = np.broadcast_to(np.arange(len(ranges))[:, None, None], shape).ravel()
-    ends = np.take_along_axis(ranges, np.stack([first, last], axis=1), axis=1)
-    at_end = np.broadcast_to(np.maximum(ends, LEAST_RANGE)[..., None], shape).ravel()
+    window = np.clip(ends[..., None] + [[0], [1]] + near, 0, beams - 1)
+    row, end, _ = np.indices(window.shape).reshape(3, -1)
+    window = window.ravel()
+    at_end = at_ends[row, end]
     return {
         "face_range": ranges[line, beam],
         "face_bearing": bearings[beam],
         "face_pitch": np.zeros(len(beam)),
         "face_sigma": np.full(len(beam), scenario.sigma_range),
         "face_placement": of_line[line],
-        "beam_bearing": bearings[window].ravel(),
-        "beam_pitch": np.zeros(len(which)),
-        "beam_hit": hit[which, window.ravel()],
-        "beam_edge": np.broadcast_to(edges[..., None], shape).ravel(),
+        "beam_bearing": bearings[window],
+        "beam_pitch": np.zeros(len(row)),
+        "beam_hit": hit[row, window],
+        "beam_edge": edges[row, end],
         "beam_radius": scenario.radius(at_end),
-        "beam_background": np.zeros(len(which)),
+        "beam_background": np.zeros(len(row)),
         "beam_step": scenario.step * at_end,
-        "beam_placement": of_line[which],
+        "beam_placement": of_line[row],
     }
 
 
 def bounds_of_camera(obs, truth, sensor):
-    """Cramer-Rao bounds (6, 6) of the camera, the boards' poses unknown in either: with these
-    properties of the sensor unknown, and with all known. NaN where the data leave it open.
+    """Cramer-Rao bounds (6, 6) of the camera, the boards' poses unknown in either: 'bound' with
+    these properties of the sensor unknown, 'known' with none. NaN where the data leave it open.
     """
-    bounds = []
-    for open_ in (sensor, ()):
+    bounds = {}
+    for name, open_ in (("bound", sensor), ("known", ())):
         unknowns = Unknowns(1, len(obs.edges), axis=False, sensor=open_)
-        try:
-            bounds.append(bound(obs, truth, unknowns)[:6, :6])
-        except DegenerateGeometry:
-            bounds.append(np.full((6, 6), np.nan))
+        bounds[name] = np.full((6, 6), np.nan)
+        with suppress(DegenerateGeometry):
+            bounds[name] = bound(obs, truth, unknowns)[:6, :6]
     return bounds

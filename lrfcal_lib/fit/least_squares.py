@@ -38,8 +38,8 @@ LEAST_DAMPING = 1e-12
 MOST_DAMPING = 1e14
 # a step with more is short because it is held, not because it has arrived
 SMALL_DAMPING = 10.0
-# tolerances: a step that began shorter and had to be held leads nowhere, because gradients leave out
-# what the state does to some weights (of the views at a stop)
+# tolerances: a step that began shorter and had to be held leads nowhere, because gradients leave
+# out what the state does to some weights (of the views at a stop)
 LEADS_NOWHERE = 100.0
 # chance alone exceeds chi-square so seldom where the stated noise is right
 LARGE_CHI2 = 0.001

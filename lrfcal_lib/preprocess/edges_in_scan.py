@@ -127,17 +127,69 @@ class _Ends:
 
 
 @dataclass(frozen=True)
-class _Crossings:
-    """Points (n, 3) of the board where lines (or columns) end, LRF frame at a `pitch` (n,).
+class Crossings:
+    """Where lines (or columns) of the board end, LRF frame.
 
-    `by_angle` (n, 3) is their derivative by bearing (or pitch), `range_sigma` (n,) the standard
-    deviation of the fitted range, metres.
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3)
+        Metres.
+    by_angle : ndarray, shape (n, 3)
+        Their derivative by bearing (or pitch).
+    range_sigma : ndarray, shape (n,)
+        Standard deviation of the fitted range, metres.
+    pitch : ndarray, shape (n,), or None
+        Where the head moves, radians.
     """
 
     points: np.ndarray
-    pitch: np.ndarray
     by_angle: np.ndarray
     range_sigma: np.ndarray
+    pitch: np.ndarray | None = None
+
+    def covariance(self, sigma, warp_sigma: float = 0.0) -> np.ndarray:
+        """Of the points, (n, 3, 3), metres^2: along their rays, and by the angle at which they lie.
+
+        Parameters
+        ----------
+        sigma : float or ndarray, shape (n,)
+            Standard deviation of that angle, radians.
+        warp_sigma : float
+            Of the range, beside that of the fit, metres.
+        """
+        rays = self.points / np.linalg.norm(self.points, axis=1, keepdims=True)
+        noise = rays * np.hypot(self.range_sigma, warp_sigma)[:, None]
+        place = self.by_angle * np.reshape(sigma, (-1, 1))
+        return noise[:, :, None] * noise[:, None, :] + place[:, :, None] * place[:, None, :]
+
+
+def crossings_of(
+    lines: np.ndarray, covariance: np.ndarray, bearings: np.ndarray
+) -> Crossings:
+    """Where rays meet the straight lines fitted to scan lines.
+
+    Parameters
+    ----------
+    lines, covariance : ndarray, shapes (n, 2), (n, 2, 2)
+        As :func:`lrfcal_lib.preprocess.board_in_scan.fit_lines` has them.
+    bearings : ndarray, shape (n,)
+        Of the rays, radians.
+
+    Returns
+    -------
+    Crossings
+    """
+    rays = polar_to_points(1.0, bearings)
+    flat = rays[:, :2]
+    fitted = 1 / np.sum(lines * flat, axis=1)
+    variance = np.einsum("ni,nij,nj->n", flat, covariance, flat)
+    points = fitted[:, None] * rays
+    normal = np.pad(lines, ((0, 0), (0, 1)))
+    return Crossings(
+        points=points,
+        by_angle=_slid(np.cross([0.0, 0.0, 1.0], points), normal, rays),
+        range_sigma=np.sqrt(variance) * fitted**2,
+    )
 
 
 def crossings(
@@ -201,7 +253,7 @@ def crossings(
         edges[variant] = ScanEdges(
             variant=variant,
             points=crossing.points,
-            covariance=_covariance(crossing, sigma, warp_sigma),
+            covariance=crossing.covariance(sigma, warp_sigma),
             pitch=crossing.pitch,
             line=ends.line,
             beam=ends.beam,
@@ -212,14 +264,6 @@ def crossings(
             background=background_odds(here, behind),
         )
     return edges, every
-
-
-def _covariance(crossing, sigma, warp_sigma):
-    """Of crossings, metres^2: along their rays, and by the angle at which they lie."""
-    rays = crossing.points / np.linalg.norm(crossing.points, axis=1, keepdims=True)
-    noise = rays * np.hypot(crossing.range_sigma, warp_sigma)[:, None]
-    place = crossing.by_angle * sigma[:, None]
-    return noise[:, :, None] * noise[:, None, :] + place[:, :, None] * place[:, None, :]
 
 
 def beyond(scan, line, beam, step):
@@ -315,29 +359,24 @@ def _at(scan, line, bearing, pitch, across=False, shift=0.0):
 
     At another pitch than that of the line changed as the board's plane predicts.
     """
+    found = crossings_of(scan.lines[line], scan.lines_covariance[line], bearing)
     rays = polar_to_points(1.0, bearing)
-    flat = rays[:, :2]
-    u = scan.lines[line]
-    fitted = 1 / np.sum(u * flat, axis=1)
-    variance = np.einsum("ni,nij,nj->n", flat, scan.lines_covariance[line], flat)
-    if across:
-        there, _ = plane_range(scan, rays, pitch)
-        here, _ = plane_range(scan, rays, scan.sweep.pitch[line])
-        points = (fitted + (there - here))[:, None] * rays
-        rotation = scan.T_head_lrf.rotation.as_matrix()
-        turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation
-        normal = tilt(scan.normal, -pitch) @ rotation
-    else:
-        points = fitted[:, None] * rays
-        turned = np.cross([0.0, 0.0, 1.0], points)
-        normal = np.pad(u, ((0, 0), (0, 1)))
+    if not across:
+        points = found.points + np.reshape(shift, (-1, 1)) * rays
+        return replace(found, points=points, pitch=pitch)
+    there, _ = plane_range(scan, rays, pitch)
+    here, _ = plane_range(scan, rays, scan.sweep.pitch[line])
+    points = found.points + (there - here)[:, None] * rays
+    rotation = scan.T_head_lrf.rotation.as_matrix()
+    turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation
+    normal = tilt(scan.normal, -pitch) @ rotation
+    return replace(found, points=points, pitch=pitch, by_angle=_slid(turned, normal, rays))
+
+
+def _slid(turned, normal, rays):
+    """How points on a surface with these normals move when their rays turn, all (n, 3)."""
     slide = np.sum(normal * turned, axis=1) / np.sum(normal * rays, axis=1)
-    return _Crossings(
-        points=points + np.reshape(shift, (-1, 1)) * rays,
-        pitch=pitch,
-        by_angle=turned - slide[:, None] * rays,
-        range_sigma=np.sqrt(variance) * fitted**2,
-    )
+    return turned - slide[:, None] * rays
 
 
 def _to_platform(scan, vectors, pitch):

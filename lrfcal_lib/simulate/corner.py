@@ -18,6 +18,7 @@ PLATES = np.array(
 SIZE = 1.5  # metres, of a plate away from the edge and along it to either side
 FEWEST_POINTS = 2  # on a plate
 LEAST_LENGTH = 15.0  # of an image line, pixels
+SAMPLES = 601  # of an edge, where it is in the image
 
 
 def corner_shots(setup, rng, T_camera_lrf):
@@ -78,26 +79,20 @@ def _image_lines(setup, rng, T_camera_target):
     """Lines (n, 3) through the noisy ends of the middle edge in the image, and whether all three
     edges are there.
     """
-    middles = SIZE * np.array([0 * EDGE, *PLATES])
-    poses = pose_array(T_camera_target)[:, None]
-    uv = []
-    for along in (-SIZE, SIZE):
-        seen = np.matvec(poses[..., :3], middles + along * EDGE) + poses[..., 3]
-        uv.append(pinhole(seen, setup.model))  # NaN behind the camera
-    start, end = uv
+    along = np.linspace(-SIZE, SIZE, SAMPLES)[:, None] * EDGE
+    edges = SIZE * np.array([0 * EDGE, *PLATES])[:, None] + along
+    poses = pose_array(T_camera_target)[:, None, None]
+    seen = np.matvec(poses[..., :3], edges) + poses[..., 3]
+    uv = pinhole(seen, setup.model)  # (n, 3, s, 2), NaN behind the camera
+    size = [setup.model.width, setup.model.height]
+    inside = ((uv > -0.5) & (uv < np.subtract(size, 0.5))).all(axis=-1)
+    first = inside.argmax(axis=-1)
+    last = SAMPLES - 1 - inside[..., ::-1].argmax(axis=-1)
+    ends = np.take_along_axis(uv, np.stack([first, last], axis=-1)[..., None], axis=2)
+    length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
+    whole = (inside.any(axis=-1) & (length > LEAST_LENGTH)).all(axis=1)
 
-    # shares of the way at which the lines enter and leave the image
-    size = np.array([setup.model.width, setup.model.height])
-    borders = np.array(
-        [(0.5 - start) / (end - start), (size + 0.5 - start) / (end - start)]
-    )
-    enter = borders.min(axis=0).max(axis=-1)
-    leave = borders.max(axis=0).min(axis=-1)
-    shares = np.clip([0 * enter, 1 + 0 * leave], enter, leave)
-    length = (shares[1] - shares[0]) * np.linalg.norm(end - start, axis=-1)
-    whole = ((enter < leave) & (length > LEAST_LENGTH)).all(axis=1)
-
-    ends = start[:, 0] + shares[:, :, :1] * (end - start)[:, 0]
-    noisy = ends + setup.sigma_px * rng.standard_normal(ends.shape)
-    lines = np.cross(*np.concatenate([noisy, np.ones_like(noisy[..., :1])], axis=-1))
+    noisy = ends[:, 0] + setup.sigma_px * rng.standard_normal(ends[:, 0].shape)
+    start, end = np.moveaxis(np.insert(noisy, 2, 1.0, axis=-1), 1, 0)
+    lines = np.cross(start, end)
     return lines / np.linalg.norm(lines[:, :2], axis=-1, keepdims=True), whole

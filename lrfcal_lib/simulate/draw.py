@@ -85,11 +85,15 @@ def bench(
     head = RigidTransform.from_components([0.0, *rng.normal(0, 0.05, 2)], turn)
     poses = {}
     for i, name in enumerate(cameras):
-        rotation = Rotation.from_rotvec(rng.normal(0, 0.03, 3)) * AHEAD
-        side = 2 * i - 1  # the first camera on the left
-        centre = np.array([0.12 * side, 0.03, 0.12]) + rng.normal(0, 0.01, 3)
-        poses[name] = RigidTransform.from_components(-rotation.apply(centre), rotation)
+        poses[name] = upright_camera(rng, 2 * i - 1)  # the first camera on the left
     return Bench(head, poses, **settings)
+
+
+def upright_camera(rng, side, *shape):
+    """Poses ``T_camera_lrf`` of cameras beside the LRF, left (-1) or right, mounted wrongly."""
+    rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (*shape, 3))) * AHEAD
+    centre = np.array([0.12 * side, 0.03, 0.12]) + rng.normal(0, 0.01, (*shape, 3))
+    return RigidTransform.from_components(-rotation.apply(centre), rotation)
 
 
 def board_poses(

@@ -8,9 +8,15 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import AHEAD, polar_to_points, pose_array
+from lrfcal_lib.model.geometry import polar_to_points, pose_array
 from lrfcal_lib.simulate.corner import corner_shots
-from lrfcal_lib.simulate.draw import Devices, beside, posed, seen_poses
+from lrfcal_lib.simulate.draw import (
+    Devices,
+    beside,
+    posed,
+    seen_poses,
+    upright_camera,
+)
 
 FORWARD_X = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # camera from an LRF that looks along x
 FACING = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))  # camera from a board before it
@@ -37,7 +43,7 @@ class Scenario(Devices):
     )  # settings that differ from its file
     about: str = ""
     board: Board = field(default_factory=lambda: triangle_board(pattern=PATTERN))
-    bearings_deg: tuple[float, float] = (40.0, 140.0)
+    field_of_view: tuple[float, float] = (np.radians(40.0), np.radians(140.0))
     uniform: bool = False  # the errors of ranges; normal otherwise
     floor: float = LEAST_STEP
     # standard deviation of `bias` from edge to edge of every placement: uneven backgrounds
@@ -63,7 +69,7 @@ class Scenario(Devices):
 
     def bearings(self):
         """Of the beams, radians, shape (B,)."""
-        first, last = np.radians(self.bearings_deg)
+        first, last = self.field_of_view
         return first + self.step * np.arange(int((last - first) / self.step + 1.5))
 
     def range_errors(self, rng, shape):
@@ -75,13 +81,9 @@ class Scenario(Devices):
     def rigs(self, rng, trials):
         """True poses ``T_camera_lrf``, one a trial."""
         if self.T_camera_lrf is not None:
-            matrix = np.broadcast_to(self.T_camera_lrf.as_matrix(), (trials, 4, 4))
-            return RigidTransform.from_matrix(matrix)
-        rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3))) * AHEAD
-        centre = np.array([0.12, 0.03, 0.12]) + rng.normal(0, 0.01, (trials, 3))
-        upright = RigidTransform.from_components(-rotation.apply(centre), rotation)
+            return RigidTransform.concatenate([self.T_camera_lrf] * trials)
         roll = Rotation.from_rotvec([0.0, 0.0, self.roll])
-        return RigidTransform.from_rotation(roll) * upright
+        return RigidTransform.from_rotation(roll) * upright_camera(rng, 1, trials)
 
     def boards(self, rng, T_camera_lrf):
         """Poses ``T_lrf_board`` of boards (or corners), one for each rig."""
@@ -183,15 +185,13 @@ def draw_shots(
         trial = np.repeat(np.arange(trials), 2 * missing)
         conditions, shots = setup.shots(rng, T_camera_lrf[trial])
         usable = np.logical_and.reduce(list(conditions.values()))
-        failing.append({words: np.mean(~good) for words, good in conditions.items()})
+        failing.append([100 * np.mean(~good) for good in conditions.values()])
         parts.append({name: value[usable] for name, value in shots.items()})
         parts[-1]["trial"] = trial[usable]
         missing = np.maximum(missing - np.bincount(trial[usable], minlength=trials), 0)
     if missing.any():
-        shares = [
-            f"{100 * np.mean([part[words] for part in failing]):.0f} % {words}"
-            for words in failing[0]
-        ]
+        means = zip(np.mean(failing, axis=0), conditions, strict=True)
+        shares = [f"{share:.0f} % {words}" for share, words in means]
         raise ValueError(
             f"boards at {setup.distances} m are hardly ever crossed on two edges and seen by "
             f"the camera: {', '.join(shares)}"
