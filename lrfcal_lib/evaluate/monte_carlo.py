@@ -137,7 +137,7 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
         limit = bound(obs, truth, joint.unknowns)
         rows.append((int(seed), errors, joint.solution.covariance, limit))
     if not rows:
-        last = list(failed.values())[-1] if failed else "no seed given"
+        last = next(reversed(failed.values()), "no seed given")
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
     seeds, errors, covariances, bounds = (
         np.array(column) for column in zip(*rows, strict=True)
@@ -271,8 +271,7 @@ def _judge(trials, index, factor):
     B = trials.bounds[block]
     mean = np.mean(C, axis=0)
     sigma = np.sqrt(np.diagonal(mean))
-    independent = len(e) * _freedom(mean / np.outer(sigma, sigma))
-    seen = max(round(independent), 1)
+    seen = max(round(len(e) * _freedom(mean / np.outer(sigma, sigma))), 1)
     unit = np.full(e.shape, factor)
     if factor is None:
         unit = 1 / np.sqrt(np.diagonal(B, axis1=1, axis2=2))

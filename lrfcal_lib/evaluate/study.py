@@ -157,17 +157,17 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     table = pd.DataFrame({"trials": every.size(), "failed": every.failed.sum()})
     table["failures"] = every.outcome.agg(_reasons)
     for name, (unit, factor) in UNITS.items():
-        columns = {"": every[name].median(), "mean": every[name].mean()}
+        columns = {"": every[name].median(), "_mean": every[name].mean()}
         for end, share in INTERVAL.items():
-            columns[end] = every[name].agg(resampled, share=share)
-        for end, of in {
-            "rmse": name,
-            "bound": f"bound_{name}",
-            "known": f"known_{name}",
-        }.items():
+            columns[f"_{end}"] = every[name].agg(resampled, share=share)
+        for end, of in (
+            ("_rmse", name),
+            ("_bound", f"bound_{name}"),
+            ("_known", f"known_{name}"),
+        ):
             columns[end] = good[of].agg(lambda values: np.sqrt(np.mean(values**2)))
         for end, values in columns.items():
-            table["_".join(filter(None, (name, unit, end)))] = factor * values
+            table[f"{name}_{unit}{end}"] = factor * values
     table["rmse_over_bound"] = np.sqrt(good.over_bound.mean())
     for end, share in INTERVAL.items():
         squares = good.over_bound.agg(resampled, share=share, statistic=np.mean)

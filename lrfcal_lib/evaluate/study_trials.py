@@ -5,7 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.evaluate.monte_carlo import (
     HALF_WIDTH,
@@ -15,6 +15,7 @@ from lrfcal_lib.evaluate.monte_carlo import (
 )
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
+    move_pose,
     polar_to_points,
     pose_array,
     pose_transform,
@@ -89,14 +90,13 @@ def run_task(task: Task) -> list[dict]:
     """
     rng = np.random.default_rng([task.seed, task.n_poses, task.first])
     shots = draw_shots(task.scenario, rng, task.trials, task.n_poses)
-    true = pose_transform(shots["T_camera_lrf"])
-    turn_sigma, shift_sigma = task.scenario.start
-    turn = Rotation.from_rotvec(turn_sigma * rng.standard_normal((task.trials, 3)))
-    shift = shift_sigma * rng.standard_normal((task.trials, 3))
-    T0 = RigidTransform.from_components(true.translation + shift, turn * true.rotation)
+    start = np.reshape(task.scenario.start, (2, 1, 1)) * rng.standard_normal(
+        (2, task.trials, 3)
+    )
+    T0 = pose_transform(move_pose(shots["T_camera_lrf"], np.concatenate(start, axis=1)))
 
     sessions = []
-    bounds = [None] * task.trials
+    bounds = [{}] * task.trials
     if not task.scenario.corner:
         sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
         sensor = task.scenario.sensor
@@ -163,7 +163,7 @@ def _judged(estimate, true, bounds):
         outcome = "more than 10 deg from the truth"
     elif not converged:
         outcome = "not converged"
-    if bounds is None:
+    if not bounds:
         return {"outcome": outcome} | numbers
     interval = HALF_WIDTH * np.sqrt(np.maximum(np.diagonal(covariance), 0))
     for name, limit in bounds.items():

@@ -7,7 +7,7 @@ and the outer edges only to tell which shots show the whole corner.
 import numpy as np
 
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import polar_to_points, pose_array
+from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
 
 EDGE = np.array(
     [-0.5, -0.5, 0.70711]
@@ -81,8 +81,7 @@ def _image_lines(setup, rng, T_camera_target):
     """
     along = np.linspace(-SIZE, SIZE, SAMPLES)[:, None] * EDGE
     edges = SIZE * np.array([0 * EDGE, *PLATES])[:, None] + along
-    poses = pose_array(T_camera_target)[:, None, None]
-    seen = np.matvec(poses[..., :3], edges) + poses[..., 3]
+    seen = apply_pose(pose_array(T_camera_target)[:, None], edges)
     uv = pinhole(seen, setup.model)  # (n, 3, s, 2), NaN behind the camera
     size = [setup.model.width, setup.model.height]
     inside = ((uv > -0.5) & (uv < np.subtract(size, 0.5))).all(axis=-1)

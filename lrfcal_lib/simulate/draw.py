@@ -17,7 +17,14 @@ from scipy.special import logit
 from lrfcal_lib.fit.edge_likelihood import disc_edge, disc_share
 from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
-from lrfcal_lib.model.geometry import AHEAD, polar_to_points, tilt
+from lrfcal_lib.model.geometry import (
+    AHEAD,
+    gradient_by_pose,
+    move_pose,
+    polar_to_points,
+    rotate_points,
+    tilt,
+)
 
 # corners of a pattern that fills the triangle, metres, where the board has none
 PLACES = [(i, j, 0) for i in range(5) for j in range(6) if i + j < 7]
@@ -158,13 +165,13 @@ def observe(
     count = len(poses)
     for number, pose in enumerate(poses):
         pitch, bearings = _grid(bench, pose, span)
-        face, beam = _scan_lines(bench, pose, pitch, bearings, rng, noise)
+        drawn = _scan_lines(bench, pose, pitch, bearings, rng, noise)
         between = np.linspace(pitch[0], pitch[-1], images + 2)[1:-1]
-        view = _views(bench, pose, between, rng, noise)
-        for name, group in (("face", face), ("beam", beam), ("view", view)):
-            group["placement"] = np.full(len(group["pitch"]), number)
-            for key, values in group.items():
-                parts[f"{name}_{key}"].append(values)
+        drawn |= _views(bench, pose, between, rng, noise)
+        for kind in ("face", "beam", "view"):
+            drawn[f"{kind}_placement"] = np.full(len(drawn[f"{kind}_pitch"]), number)
+        for key, values in drawn.items():
+            parts[key].append(values)
         middle.append(float(pitch.mean()))
     direction = np.zeros(count, int)
     if span != 0:
@@ -195,8 +202,9 @@ def _grid(bench, pose, span):
     p_head = tilt(p[:, None], -pitch * (1 + bench.stretch)).reshape(-1, 3)
     p_lrf = bench.T_head_lrf.inv().apply(p_head)
     bearing = np.arctan2(p_lrf[:, 1], p_lrf[:, 0])
-    first, last = (round(b / bench.step) for b in (bearing.min(), bearing.max()))
-    return pitch, bench.step * np.arange(first - MARGIN, last + MARGIN + 1)
+    first = round(bearing.min() / bench.step) - MARGIN
+    last = round(bearing.max() / bench.step) + MARGIN
+    return pitch, bench.step * np.arange(first, last + 1)
 
 
 def _scan_lines(bench, pose, pitch, bearings, rng, noise):
@@ -228,22 +236,19 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     step = np.where(along[row, b], bench.step, bench.pitch_step)
     line, beam = np.nonzero(hit)
     errors = noise * bench.sigma_range * rng.standard_normal(len(line))
-    face = {
-        "range": r[line, beam] + bench.range_offset + errors,
-        "bearing": bearings[beam],
-        "pitch": pitch[line],
-        "sigma": np.full(len(line), bench.sigma_range),
+    return {
+        "face_range": r[line, beam] + bench.range_offset + errors,
+        "face_bearing": bearings[beam],
+        "face_pitch": pitch[line],
+        "face_sigma": np.full(len(line), bench.sigma_range),
+        "beam_bearing": bearings[b],
+        "beam_pitch": pitch[row],
+        "beam_hit": hit[row, b],
+        "beam_edge": edge[row, b],
+        "beam_radius": radius[row, b],
+        "beam_background": np.zeros(len(row)),
+        "beam_step": step * r[row, b],
     }
-    beams = {
-        "bearing": bearings[b],
-        "pitch": pitch[row],
-        "hit": hit[row, b],
-        "edge": edge[row, b],
-        "radius": radius[row, b],
-        "background": np.zeros(len(row)),
-        "step": step * r[row, b],
-    }
-    return face, beams
 
 
 def _bias_of_sides(bench, rng):
@@ -270,10 +275,12 @@ def _views(bench, pose, at, rng, noise):
         true.append((camera * T_source_platform * pose).as_matrix())
     true = np.concatenate([*true, np.zeros((0, 4, 4))])
     drawn, covariance, _ = seen_poses(bench, true[:, :3], rng, noise)
-    camera = np.repeat(np.arange(len(bench.cameras)), len(at))
-    pitch = np.tile(at, len(bench.cameras))
-    pose = np.concatenate([drawn, true[:, 3:]], axis=1)
-    return {"camera": camera, "pitch": pitch, "pose": pose, "covariance": covariance}
+    return {
+        "view_camera": np.repeat(np.arange(len(bench.cameras)), len(at)),
+        "view_pitch": np.tile(at, len(bench.cameras)),
+        "view_pose": np.concatenate([drawn, true[:, 3:]], axis=1),
+        "view_covariance": covariance,
+    }
 
 
 def posed(spin, lean, centre, middle):
@@ -308,19 +315,13 @@ def seen_poses(devices, true, rng, noise):
     """
     pattern = devices.board.pattern
     corners = CORNERS if pattern is None else pattern.points()
-    turned = corners @ true[..., :3].mT
+    turned = rotate_points(true, corners)
     points = turned + true[:, None, :, 3]
-    by_point = project_jacobians(points.reshape(-1, 3), devices.model)[0]
-    by_point = by_point.reshape(points.shape[:2] + (2, 3))
-    J = np.concatenate([np.cross(turned[:, :, None], by_point), by_point], axis=-1)
-    J = J.reshape(len(true), 2 * len(corners), 6)
-    information = J.mT @ J
-    inverse = np.linalg.inv(information)
-    sigma_px = noise * devices.sigma_px
-    errors_px = sigma_px * rng.standard_normal((len(true), 2 * len(corners)))
-    error = np.matvec(inverse @ J.mT, errors_px)
+    by_point = project_jacobians(points, devices.model)[0]
+    rows = (len(true), 2 * len(corners), 3)
+    J = gradient_by_pose(turned.repeat(2, axis=1), by_point.reshape(rows))
+    inverse = np.linalg.inv(J.mT @ J)
+    errors_px = noise * devices.sigma_px * rng.standard_normal(rows[:2])
     pixels = pinhole(points, devices.model) + errors_px.reshape(len(true), -1, 2)
-    rotation = Rotation.from_rotvec(error[:, :3]).as_matrix() @ true[..., :3]
-    translation = true[..., 3:] + error[:, 3:, None]
-    poses = np.concatenate([rotation, translation], axis=-1)
+    poses = move_pose(true, np.matvec(inverse @ J.mT, errors_px))
     return poses, inverse * devices.sigma_px**2, pixels

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import polar_to_points, pose_array
+from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
 from lrfcal_lib.simulate.corner import corner_shots
 from lrfcal_lib.simulate.draw import (
     Devices,
@@ -99,11 +99,6 @@ class Scenario(Devices):
         centred = RigidTransform.from_translation(-middle)
         return T_lrf_world * RigidTransform.from_rotation(TARGET) * centred
 
-    def shots(self, rng, T_camera_lrf):
-        """One of each rig: the conditions that they meet by what else fails, and what is seen."""
-        draw = corner_shots if self.corner else board_shots
-        return draw(self, rng, T_camera_lrf)
-
     def _ahead(self, rng, count, middle):
         """Poses ``T_lrf_board`` of boards that face the LRF but for a lean."""
         spin = rng.uniform(0, 2 * np.pi, count)
@@ -176,14 +171,13 @@ def draw_shots(
         fail each condition.
     """
     T_camera_lrf = setup.rigs(rng, trials)
+    draw = corner_shots if setup.corner else board_shots
     parts = []
     failing = []
     missing = np.full(trials, placements)
-    for _ in range(MOST_ROUNDS):
-        if not missing.any():
-            break
+    while missing.any() and len(parts) < MOST_ROUNDS:
         trial = np.repeat(np.arange(trials), 2 * missing)
-        conditions, shots = setup.shots(rng, T_camera_lrf[trial])
+        conditions, shots = draw(setup, rng, T_camera_lrf[trial])
         usable = np.logical_and.reduce(list(conditions.values()))
         failing.append([100 * np.mean(~good) for good in conditions.values()])
         parts.append({name: value[usable] for name, value in shots.items()})
@@ -212,11 +206,12 @@ def board_shots(setup, rng, T_camera_lrf):
     """
     board = setup.board
     T_lrf_board = setup.boards(rng, T_camera_lrf)
-    edges, clear = _crossed_edges(setup, T_lrf_board)
-    ranges, hit, enough = _scans(setup, rng, T_lrf_board)
+    at_lrf = pose_array(T_lrf_board)
+    edges, clear = _crossed_edges(setup, at_lrf)
+    ranges, hit, enough = _scans(setup, rng, at_lrf)
 
     true = pose_array(T_camera_lrf * T_lrf_board)
-    corners = board.corners @ true[..., :2].mT + true[:, None, :, 3]
+    corners = apply_pose(true, board.points())
     uv = pinhole(corners, setup.model)
     inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
     ahead = (corners[..., 2] > LEAST_DEPTH).all(axis=1)
@@ -248,12 +243,11 @@ def board_shots(setup, rng, T_camera_lrf):
     }
 
 
-def _crossed_edges(setup, T_lrf_board):
-    """Edges (n, 2) of convex boards that the scan plane crosses, at the low and the high bearing,
-    and whether both crossings are clear of the other edges.
+def _crossed_edges(setup, pose):
+    """Edges (n, 2) of convex boards at poses (n, 3, 4) that the scan plane crosses, at the low and
+    the high bearing, and whether both crossings are clear of the other edges.
     """
-    R = T_lrf_board.rotation.as_matrix()
-    ends = setup.board.points() @ R.mT + T_lrf_board.translation[:, None]
+    ends = apply_pose(pose, setup.board.points())
     following = np.roll(ends, -1, axis=1)
     height = ends[..., 2]
     crossed = height * following[..., 2] < 0
@@ -262,37 +256,36 @@ def _crossed_edges(setup, T_lrf_board):
     bearing = np.where(crossed, np.arctan2(at[..., 1], at[..., 0]), np.nan)
     edges = np.argsort(bearing, axis=1)[:, :2]  # NaN comes last
     at = np.take_along_axis(at, edges[..., None], axis=1)
-    origin = -T_lrf_board.translation[:, None] @ R
-    distances, _ = beside(setup.board, origin, at @ R)
+    distances, _ = _beside(setup, pose, at)
     second = np.sort(distances, axis=-1)[..., -2]
     away = np.linalg.norm(at, axis=-1)
     least = CLEAR * setup.radius(away) + CLEAR_FLOORS * setup.floor * setup.step * away
     return edges, (crossed.sum(axis=1) == 2) & (second < -least).all(axis=1)
 
 
-def _scans(setup, rng, T_lrf_board):
-    """Of the scan lines over each board: exact ranges (n, B), which beams hit (n, S, B), and
-    whether there are enough in every one.
+def _scans(setup, rng, pose):
+    """Of the scan lines over boards at poses (n, 3, 4): exact ranges (n, B), which beams hit (n, S,
+    B), and whether there are enough in every one.
     """
-    bearings = setup.bearings()
-    R = T_lrf_board.rotation.as_matrix()
-    rays = polar_to_points(np.ones(len(bearings)), bearings) @ R
-    origin = -T_lrf_board.translation[:, None] @ R
-    distances, ranges = beside(setup.board, origin, rays)
+    distances, ranges = _beside(setup, pose, polar_to_points(1.0, setup.bearings()))
     spot = setup.radius(np.abs(ranges))
     radii = distances / spot[..., None]
-    of_edges = 0.0
     if setup.spread:
-        of_edges = setup.spread * rng.standard_normal((len(R), 1, radii.shape[-1]))
-    outside = (radii - of_edges).max(axis=-1)[:, None]
+        radii -= setup.spread * rng.standard_normal((len(pose), 1, radii.shape[-1]))
+    outside = radii.max(axis=-1)[:, None]
     soft = np.hypot(setup.softness, setup.floor * setup.step * ranges / spot)[:, None]
-    shape = (len(R), setup.scans, len(bearings))
-    flips = setup.bias + soft * rng.standard_normal(shape)
+    flips = rng.standard_normal((len(pose), setup.scans, ranges.shape[1]))
     # rays along the board meet its plane far away, where the least softness means nothing
-    corners = T_lrf_board.translation[:, None] + setup.board.points() @ R.mT
+    corners = apply_pose(pose, setup.board.points())
     farthest = np.linalg.norm(corners, axis=-1).max(axis=-1, keepdims=True)
     sensible = (ranges > 0) & (ranges < FARTHER * farthest)
-    hit = (outside < flips) & sensible[:, None]
+    hit = (outside < setup.bias + soft * flips) & sensible[:, None]
     enough = hit.sum(axis=-1) >= setup.fewest_beams
     whole = ~hit[..., [0, -1]].any(axis=-1)
     return ranges, hit, (enough & whole).all(axis=1)
+
+
+def _beside(setup, pose, rays):
+    """:func:`lrfcal_lib.simulate.draw.beside` of boards at poses (n, 3, 4), and rays of the LRF."""
+    R = pose[..., :3]
+    return beside(setup.board, -pose[:, None, :, 3] @ R, rays @ R)
