@@ -52,6 +52,13 @@ def test_honest_calibrations_differ_within_what_they_claim(days):
                 assert np.isfinite(amount.claimed) == (amount.what != "scale")
 
 
+def test_a_calibration_agrees_with_itself(days):
+    assert (
+        "honest calibrations differ more in 100 % of cases"
+        in compare(*days[:1] * 2).sentence()
+    )
+
+
 def test_a_camera_that_was_turned_is_named(days):
     first, second = days[:2]
     found = compare(first, turned(second, 0.5))

@@ -134,6 +134,13 @@ def test_a_list_that_is_none_is_refused_with_the_reason(tmp_path, what):
     assert words in str(refused.value) and str(file) in str(refused.value)
 
 
+def test_a_list_that_is_not_there_is_named_once(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"^\S+none.csv: No such file or directory: save it"
+    ):
+        lengths.read_picks(tmp_path / "none.csv")
+
+
 def test_places_where_nothing_is_are_named(scene):
     inside = ("point", scene.cloud.points[0])
     for kind, reach in (("plane", 100), ("edge", 10), ("point", 100)):

@@ -148,7 +148,8 @@ class Comparison:
 
     def sentence(self) -> str:
         """The answer."""
-        odds = f"honest calibrations differ more in {100 * self.whole.p:.2g} % of cases"
+        share = float(f"{100 * self.whole.p:.2g}")  # 100, not 1e+02
+        odds = f"honest calibrations differ more in {share:g} % of cases"
         if self.one_lens:
             odds = f"{odds}; both use the same intrinsics, whose errors do not count"
         names = f"'{self.first.session}' and '{self.second.session}'"

@@ -266,7 +266,8 @@ def read_picks(path: str | PathLike) -> "pd.DataFrame":
     try:
         table = pd.read_csv(path)
     except (OSError, ValueError) as problem:
-        raise ValueError(f"{path}: {problem}: {remedy}") from None
+        why = getattr(problem, "strerror", None) or problem
+        raise ValueError(f"{path}: {why}: {remedy}") from None
     missing = [name for name in ("name", *PICKED) if name not in table]
     if missing or table.empty:
         lack = f"no column {', '.join(missing)}" if missing else "no length in it"
