@@ -38,9 +38,10 @@ LEAST_DAMPING = 1e-12
 MOST_DAMPING = 1e14
 # a step with more is short because it is held, not because it has arrived
 SMALL_DAMPING = 10.0
-# tolerances: a step that began shorter and had to be held leads nowhere, because gradients leave
-# out what the state does to some weights (of the views at a stop)
-LEADS_NOWHERE = 100.0
+# a step that had to be held leads nowhere if it began shorter than this, in standard deviations and
+# in tolerances: gradients leave out what the state does to some weights (of the views at a stop)
+LEADS_NOWHERE = 0.01
+NOWHERE_TOLERANCES = 100.0
 # chance alone exceeds chi-square so seldom where the stated noise is right
 LARGE_CHI2 = 0.001
 
@@ -313,6 +314,7 @@ def minimise(
     history = [at.cost]
     converged = np.zeros(np.shape(at.cost), bool)
     damping = np.full(np.shape(at.cost), FIRST_DAMPING)
+    nowhere = min(LEADS_NOWHERE, NOWHERE_TOLERANCES * tolerance)
     while len(history) <= max_iterations and not converged.all():
         step, length, promised = _step(at.hessian, at.gradient, damping, shared)
         trial = retract(state, step)
@@ -322,7 +324,7 @@ def minimise(
         small = (length < tolerance**2) | (length < 1e-14 * at.cost)
         held = damping >= SMALL_DAMPING
         began = (1 + damping) ** 2 * length  # so long the step was before it was held
-        arrived = np.where(held, began < (LEADS_NOWHERE * tolerance) ** 2, small)
+        arrived = np.where(held, began < nowhere**2, small)
         converged = converged | (arrived & np.isfinite(after))
         gain = np.ones_like(at.cost)
         np.divide(at.cost - after, promised, out=gain, where=promised > 3e-15 * at.cost)
