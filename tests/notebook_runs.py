@@ -25,6 +25,7 @@ from lrfcal_lib.session.write import RECORDINGS
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 CELL_SECONDS = 600
+LOST_AXIS = 60.0  # degrees from the truth
 GOLDEN = Path(__file__).parent / "golden"
 # without a grammar of internet addresses, which takes 3 s to load
 NBVAL = "import sys; sys.modules['rfc3987_syntax'] = None; import pytest; sys.exit(pytest.main(sys.argv[1:]))"
@@ -148,6 +149,13 @@ def tables_of(path):
     )
 
 
+def comparable(table):
+    """Without the axes of fits that are lost: where these end, rounding decides, which differs from machine to machine."""
+    if "axis_direction_error_deg" in table:
+        return table[~(table.axis_direction_error_deg > LOST_AXIS)].reset_index(drop=True)
+    return table
+
+
 def check_tables(report, name, path):
     """The tables that a notebook wrote for a session are those of ``tests/golden``, numbers to the sixth digit.
 
@@ -166,7 +174,7 @@ def check_tables(report, name, path):
         "make golden stores the tables of all sessions anew"
     )
     for file in sorted(stored):
-        tables = (pd.read_csv(folder[file]) for folder in (found, stored))
+        tables = (comparable(pd.read_csv(folder[file])) for folder in (found, stored))
         pd.testing.assert_frame_equal(
             *tables, check_exact=False, rtol=3e-6, atol=2e-5, obj=f"{name}/{file}"
         )
