@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import binary_erosion, label
+from scipy.spatial import KDTree
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -46,10 +47,15 @@ def planes_of(cloud: Cloud, rig: CalibratedRig) -> tuple[list[Feature], np.ndarr
     free = np.flatnonzero(smooth)
     points = cloud.points[free]
     normals = cloud.normals[free]
+    tree = KDTree(cloud.points)
     for seed in range(0, len(of_point), max(1, len(of_point) // SEEDS)):
         if of_point[seed] >= 0 or not smooth[seed]:
             continue
-        surface = free[_grown(points, normals, cloud.points[seed], cloud.normals[seed])]
+        near = tree.query_ball_point(cloud.points[seed], SEED, return_sorted=True)
+        near = np.array(near)[(smooth & (of_point < 0))[near]]
+        rows = np.searchsorted(free, near)
+        rows = rows[normals[rows] @ cloud.normals[seed] > np.cos(ALIKE)]
+        surface = free[_grown(points, normals, rows, cloud.points[seed])]
         if len(surface) >= FEWEST:
             of_point[surface] = len(planes)
             planes.append(_fitted(cloud, surface, rig))
@@ -59,10 +65,8 @@ def planes_of(cloud: Cloud, rig: CalibratedRig) -> tuple[list[Feature], np.ndarr
     return planes, of_point
 
 
-def _grown(points, normals, seed, facing):
-    """Rows of the flat surface about a point (3,) with this normal (3,)."""
-    near = np.flatnonzero(np.linalg.norm(points - seed, axis=1) < SEED)
-    surface = near[normals[near] @ facing > np.cos(ALIKE)]
+def _grown(points, normals, surface, seed):
+    """Rows of the flat surface about a point (3,), grown from these rows."""
     with suppress(DegenerateGeometry):
         for _ in range(ROUNDS):
             if len(surface) < FEWEST / 2:
