@@ -13,7 +13,7 @@ from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.joint_solution import JointSolution
+from lrfcal_lib.solvers.joint_solution import RCOND, JointSolution, Score
 
 POSE = 6  # numbers of a camera's pose
 BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong
@@ -27,7 +27,6 @@ NOISY = 10.0  # residuals in units of the stated noise: an estimate that explain
 MOST_CHANGES = 3  # in one recording
 FEWEST_VIEWS = 3  # of a chessboard, for a focal length
 ALL_BUT_FOCAL_LENGTH = tuple(range(2, 9))  # of fx, fy, cx, cy, k1..k5
-RCOND = 1e-13
 
 
 @dataclass(frozen=True)
@@ -204,17 +203,16 @@ def _chance_of_step(score, columns, row):
     kept[~later, shared:] = 0.0
     both = kept[:, :, None] * kept[:, None, :]
     whole = both * score.information[:, repeated[:, None], repeated]
-    gradient = score.gradient[:, repeated] * kept
+    parted = Score(whole, score.gradient[:, repeated] * kept)
 
-    covariance = np.linalg.pinv(whole.sum(axis=0), rcond=RCOND, hermitian=True)
-    step = -covariance @ gradient.sum(axis=0)
+    covariance, step, pulls = parted.solved()
     information = np.linalg.pinv(covariance[-POSE:, -POSE:], rcond=RCOND, hermitian=True)
-    square = step[-POSE:] @ information @ step[-POSE:]
-    # what each placement still pulls at the value found: its scatter is that of the placements
-    pull = (gradient + whole @ step) @ covariance[:, -POSE:]
+    change = step[-POSE:]
+    square = change @ information @ change
+    pull = pulls[:, -POSE:]  # its scatter is that of the placements
     scatter = np.einsum("pi,ij,pj->", pull, information, pull) / POSE * count / (count - 1)
     p_value = fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0))
-    return float(p_value), step[-POSE:]
+    return float(p_value), change
 
 
 def largest_motion(solution, step, model):
@@ -322,7 +320,5 @@ def growth_by_depth(solution, camera):
     nearer = obs.view_pose.copy()
     nearer[obs.view_camera == camera, 2, 3] *= 1 + STEP
     score = solution.score(replace(obs, view_pose=nearer), STEP)
-    information = score.information.sum(axis=0)
-    covariance = np.linalg.pinv(information, rcond=RCOND, hermitian=True)
-    growth = -(covariance @ score.gradient.sum(axis=0))[-1]
-    return float(growth), float(np.sqrt(max(covariance[-1, -1], 0.0)))
+    covariance, step, _ = score.solved()
+    return float(step[-1]), float(np.sqrt(max(covariance[-1, -1], 0.0)))

@@ -347,10 +347,7 @@ def _scatter_note(placements):
 def _without_joint(calibration, method, doubt):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
     prepared = calibration.prepared
-    solved = {}
-    for (camera, name), solution in calibration.solutions.items():
-        if name == method:
-            solved[camera] = solution
+    solved = calibration.cameras(method)
     pitch = np.concatenate([scan.sweep.pitch for scan in prepared.scans.values()])
     judged = _expected(calibration.rig(method), pitch, doubt)
     findings = [_not_joint(calibration)]
