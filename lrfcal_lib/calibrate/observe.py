@@ -11,6 +11,7 @@ from lrfcal_lib.calibrate.outline import MeasuredBoard, outline_of
 from lrfcal_lib.calibrate.recorded import (
     NamedSide,
     named_sides,
+    face_columns,
     platform_of,
     source_of,
 )
@@ -93,16 +94,23 @@ def observe(
         else:
             sides = named_sides(prepared, placement, variant)
         crossed += _crossings(prepared, views[placement], source, sides, crossings)
-    corners: list = []
+    corners: Iterable[dict] = ()
     if faces:
         rule = "last_beam" if variant == ONE_SCAN else variant
         boards = {} if outlines is None else outlines
-        corners += _corners(prepared, camera, rule, T_head_lrf, boards)
+        corners = _corners(prepared, camera, rule, T_head_lrf, boards)
+    pattern = np.zeros((0, 3))
+    if prepared.board.pattern is not None:
+        pattern = raised_points(prepared.board.pattern, prepared.relief)
+    model = prepared.models[camera]
     on_base = prepared.session.cameras[camera].mount == "platform"
     return CameraObservations(
+        model=model,
         camera=camera,
         source="platform" if on_base else "lrf",
-        **_boards_in_images(prepared, camera, posed),
+        pattern_points=pattern,
+        pattern_sigma_px=max(model.rms_px or 0.0, LEAST_CORNER_SIGMA),
+        **stack("", _boards_in_images(posed, len(pattern))),
         **stack("plane_", on_faces),
         **stack("crossing_", crossed),
         **stack("scene_", corners),
@@ -146,21 +154,13 @@ def platform_observations(
         for number, (edges, side) in enumerate(feature, 1):
             rows = thin(np.flatnonzero(edges.side == side.side), PLATFORM_POINTS)
             columns = {
-                "points": edges.points[rows],
-                "covariance": edges.covariance[rows],
-                "pitch": edges.pitch[rows],
-                "placement": np.full(len(rows), placement),
-                "number": np.full(len(rows), number),
+                name: getattr(edges, name)[rows]
+                for name in ("points", "covariance", "pitch")
             }
+            columns["placement"] = np.full(len(rows), placement)
+            columns["number"] = np.full(len(rows), number)
             sides.append(columns)
-        points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
-        columns = {
-            "points": points,
-            "covariance": covariance,
-            "pitch": pitch,
-            "placement": np.full(len(pitch), placement),
-        }
-        faces.append(columns)
+        faces.append(face_columns(prepared.scans[placement], placement, FACE_POINTS))
     return PlatformObservations(**stack("edge_", sides), **stack("face_", faces))
 
 
@@ -217,29 +217,18 @@ def stack(prefix: str, parts: Iterable[dict]) -> dict[str, Any]:
     return {prefix + key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _boards_in_images(prepared, camera, posed):
-    """What one camera sees of the board: fields of CameraObservations by name."""
-    model = prepared.models[camera]
-    pattern = np.zeros((0, 3))
-    if prepared.board.pattern is not None:
-        pattern = raised_points(prepared.board.pattern, prepared.relief)
-    pixels = np.full((len(posed), len(pattern), 2), np.nan)
-    poses = np.zeros((len(posed), 4, 4))
-    covariances = np.zeros((len(posed), 6, 6))
-    for row, view in enumerate(posed.values()):
-        poses[row] = view.T_camera_board.as_matrix()
-        covariances[row] = view.covariance
-        if view.pixels is not None:
-            pixels[row] = view.pixels
-    return {
-        "model": model,
-        "placements": np.array(list(posed), int),
-        "board_poses": poses,
-        "board_covariance": covariances,
-        "pattern_points": pattern,
-        "pattern_pixels": pixels,
-        "pattern_sigma_px": max(model.rms_px or 0.0, LEAST_CORNER_SIGMA),
-    }
+def _boards_in_images(posed, corners):
+    """What the images of one camera show of the board and its so many corners of the pattern:
+    columns by name.
+    """
+    unseen = np.full((corners, 2), np.nan)
+    for placement, view in posed.items():
+        yield {
+            "placements": [placement],
+            "board_poses": [view.T_camera_board.as_matrix()],
+            "board_covariance": [view.covariance],
+            "pattern_pixels": [unseen if view.pixels is None else view.pixels],
+        }
 
 
 def _one_scan_line(prepared, placement, view):

@@ -132,11 +132,9 @@ def plane_frame(points: np.ndarray) -> np.ndarray:
     """A frame (4, 4) in the plane of points: origin in their middle, z towards their origin."""
     away, distance, _ = geometry.fit_plane(points)
     normal = -away
-    across = np.linalg.svd(geometry.hat(normal))[2][0]
     centre = np.nanmean(points, axis=0)
     pose = np.eye(4)
-    pose[:3, 0] = across
-    pose[:3, 1] = np.cross(normal, across)
+    pose[:3, :2] = geometry.plane_axes(normal).T
     pose[:3, 2] = normal
     pose[:3, 3] = centre - normal * (normal @ centre + distance)
     return pose

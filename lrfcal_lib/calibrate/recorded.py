@@ -47,13 +47,23 @@ class RecordedSource:
         """At most `count` points of a board's face, with covariance, pitch and placement: columns
         by name.
         """
-        p_lrf, pitch, covariance = face_points(scan, count)
-        return {
-            "points": self.points(p_lrf, pitch),
-            "covariance": self.covariance(covariance, pitch),
-            "pitch": pitch,
-            "placement": np.full(len(pitch), self.placement),
+        columns = face_columns(scan, self.placement, count)
+        pitch = columns["pitch"]
+        return columns | {
+            "points": self.points(columns["points"], pitch),
+            "covariance": self.covariance(columns["covariance"], pitch),
         }
+
+
+def face_columns(scan: BoardScan, placement: int, count: int) -> dict[str, np.ndarray]:
+    """At most `count` points of a board's face as recorded, columns by name."""
+    points, pitch, covariance = face_points(scan, count)
+    return {
+        "points": points,
+        "covariance": covariance,
+        "pitch": pitch,
+        "placement": np.full(len(pitch), placement),
+    }
 
 
 def source_of(
