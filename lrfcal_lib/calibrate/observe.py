@@ -10,8 +10,8 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.calibrate.outline import MeasuredBoard, outline_of
 from lrfcal_lib.calibrate.recorded import (
     NamedSide,
-    named_sides,
     face_columns,
+    named_sides,
     platform_of,
     source_of,
 )

@@ -165,12 +165,9 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     prepared = calibration.prepared
     joint = calibration.joint
     session = prepared.session
-    found = faults_of_files(session)
-    found += dark_images(session)
-    if hopeless(joint):
-        misread = misread_recording(prepared)
-        if misread:
-            return found + misread
+    found = faults_of_files(session) + dark_images(session)
+    if hopeless(joint) and (misread := misread_recording(prepared)):
+        return found + misread
     if joint is not None:
         changes = camera_changes(joint.solution, prepared, joint.settings)
         found += faults_of_changes(changes, tuple(prepared.views))
@@ -379,13 +376,9 @@ def exchanged_placements(calibration):
     prepared = calibration.prepared
     joint = calibration.joint
     session = prepared.session
-    lost = [
-        p
-        for p in session.board_placements
-        if p in prepared.left_out or p in joint.solution.excluded_placements
-    ]
+    lost = prepared.left_out | joint.solution.excluded_placements
     scans = {}
-    for placement in lost[:MOST_LOST]:
+    for placement in [p for p in session.board_placements if p in lost][:MOST_LOST]:
         with suppress(BoardNotFound, SessionError):
             sweep = session.sweep(placement)
             scans[placement] = find_board(

@@ -144,17 +144,16 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
     bearing = np.degrees(scan.sweep.bearings[near])
     raw = scan.sweep.ranges[line, near]
     board = scan.mask[line, near]
-    top = scan.fitted[line, near][board].max() + HEADROOM
-    shown = raw < top
-    ax.plot(bearing[shown], raw[shown], "o", color=COLORS["raw"], markersize=6, label="raw")
-    farther = raw >= top
-    if farther.any():
-        words = f"raw, farther: {raw[farther].min():.2f} to {raw[farther].max():.2f} m"
-        edge = 0 * raw[farther] + top
-        looks = {"color": COLORS["raw"], "clip_on": False, "label": words}
-        ax.plot(bearing[farther], edge, "^", **looks)
     filtered = scan.filtered[line, near][board]
     fitted = scan.fitted[line, near][board]
+    top = fitted.max() + HEADROOM
+    shown = raw < top
+    ax.plot(bearing[shown], raw[shown], "o", color=COLORS["raw"], markersize=6, label="raw")
+    farther = raw[raw >= top]
+    if farther.size:
+        words = f"raw, farther: {farther.min():.2f} to {farther.max():.2f} m"
+        looks = {"color": COLORS["raw"], "clip_on": False, "label": words}
+        ax.plot(bearing[raw >= top], np.full(farther.shape, top), "^", **looks)
     ax.plot(bearing[board], filtered, "x", color=COLORS["truth"], label="filtered")
     ax.plot(bearing[board], fitted, color=COLORS["fit"], label="line fitted to the board")
     for crossed, style in zip(edges, ("--", "-"), strict=False):
