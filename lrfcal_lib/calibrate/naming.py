@@ -47,9 +47,8 @@ def name_sides(
     if prepared.board.corners is None:
         return names, dropped, problems
     for camera, T_camera_source in rough.items():
-        for placement, view in prepared.views[camera].items():
-            posed = view.T_camera_board is not None and placement in prepared.scans
-            if not posed or placement in names:
+        for placement, view in prepared.posed(camera).items():
+            if placement not in prepared.scans or placement in names:
                 continue
             T_board_source = view.T_camera_board.inv() * T_camera_source
             sides = _sides_on_board(prepared, camera, placement, T_board_source)

@@ -28,7 +28,6 @@ from lrfcal_lib.model.observations import (
 from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edge_cells import edge_cells
-from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
 from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 
@@ -80,7 +79,7 @@ def observe(
     """
     T_head_lrf = platform_of(prepared, T_head_lrf)
     views = prepared.views[camera]
-    posed = {p: view for p, view in views.items() if view.T_camera_board is not None}
+    posed = prepared.posed(camera)
     on_faces = []
     crossed = []
     for placement, scan in prepared.scans.items():
@@ -99,9 +98,7 @@ def observe(
         rule = "last_beam" if variant == ONE_SCAN else variant
         boards = {} if outlines is None else outlines
         corners = _corners(prepared, camera, rule, T_head_lrf, boards)
-    pattern = np.zeros((0, 3))
-    if prepared.board.pattern is not None:
-        pattern = raised_points(prepared.board.pattern, prepared.relief)
+    pattern = prepared.pattern_points
     model = prepared.models[camera]
     on_base = prepared.session.cameras[camera].mount == "platform"
     return CameraObservations(
@@ -379,14 +376,15 @@ def _views(prepared, views, placements):
     """Poses of the board in all images, of cameras by number and placements by row: columns by
     name.
     """
-    pattern = prepared.board.pattern
     for number, (camera, of_camera) in enumerate(views.items()):
         for view in of_camera:
             if view.T_camera_board is None or view.placement not in placements:
                 continue
             visible = np.zeros((0, 3))
-            if pattern is not None and view.pixels is not None:
-                visible = pattern.points()[np.isfinite(view.pixels).all(axis=1)]
+            if view.pixels is not None:
+                visible = prepared.board.pattern.points()[
+                    np.isfinite(view.pixels).all(axis=1)
+                ]
             yield {
                 "camera": [number],
                 "pitch": [np.nan_to_num(view.pitch)],

@@ -10,7 +10,6 @@ from scipy.special import chdtrc, fdtrc
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.bundle import adjust_robust
-from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_solution import RCOND, JointSolution, Score
@@ -285,26 +284,21 @@ def growth_of_focal_length(prepared, camera, placement):
     images show them.
     """
     unknown = (0.0, np.inf)
-    if prepared.board.pattern is None:
-        return unknown
-    points = raised_points(prepared.board.pattern, prepared.relief)
     model = prepared.models[camera]
     lengths = []
     spreads = []
     for later in (False, True):
         views = [
             view
-            for number, view in prepared.views[camera].items()
+            for number, view in prepared.patterned(camera).items()
             if (number >= placement) is later
-            and view.pixels is not None
-            and not view.reason
         ]
         if len(views) < FEWEST_VIEWS:
             return unknown
         pixels = np.array([[view.pixels for view in views]])
         poses = RigidTransform.concatenate([view.T_camera_board for view in views])
         lens = adjust_robust(
-            pixels, points, [model], poses, fixed=ALL_BUT_FOCAL_LENGTH
+            pixels, prepared.pattern_points, [model], poses, fixed=ALL_BUT_FOCAL_LENGTH
         ).models[0]
         lengths.append(np.mean([lens.fx / model.fx, lens.fy / model.fy]))
         spreads.append(lens.covariance[:2, :2].mean() / model.fx**2)

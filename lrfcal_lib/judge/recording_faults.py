@@ -258,11 +258,10 @@ def board_misses(prepared, reading):
     """The BoardMiss of every camera that has one, with the recording read in some way."""
     misses = {}
     noise = np.median([scan.sigma_range for scan in prepared.scans.values()])
-    for camera, recorded in prepared.views.items():
+    for camera in prepared.views:
         views = {
             placement - reading.ahead: reading.view(view)
-            for placement, view in recorded.items()
-            if view.T_camera_board is not None
+            for placement, view in prepared.posed(camera).items()
         }
         read = replace(prepared, views={camera: views}, names={})
         obs = observe(read, camera, corrections=reading, faces=POINTS)
@@ -412,8 +411,8 @@ def _same_board(calibration, scan, placement):
     p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
     agree = []
     for camera in solution.transforms:
-        view = prepared.views[camera].get(placement)
-        if view is not None and view.T_camera_board is not None:
+        view = prepared.posed(camera).get(placement)
+        if view is not None:
             T_camera_platform = solution.camera_at(camera, view.pitch)
             on_board = (view.T_camera_board.inv() * T_camera_platform).apply(p_platform)
             beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
