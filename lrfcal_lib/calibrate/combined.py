@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.calibrate.observe import observe_joint
+from lrfcal_lib.calibrate.joint_observations import observe_joint
+from lrfcal_lib.calibrate.observe import LEAST_STRETCH, in_platform, named_sides
 from lrfcal_lib.calibrate.outline import (
-    LEAST_STRETCH,
     MeasuredBoard,
     measure_board,
     moved_lines,
@@ -20,7 +20,6 @@ from lrfcal_lib.calibrate.outline import (
     sized,
 )
 from lrfcal_lib.calibrate.pipeline import JointCalibration
-from lrfcal_lib.calibrate.recorded import in_platform, named_sides
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel

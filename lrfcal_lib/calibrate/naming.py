@@ -4,8 +4,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.calibrate.observe import observe
-from lrfcal_lib.calibrate.recorded import platform_of, source_of
+from lrfcal_lib.calibrate.observe import observe, platform_of, source_of
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage

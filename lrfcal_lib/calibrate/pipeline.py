@@ -17,11 +17,11 @@ from lrfcal_lib.calibrate.cameras import (
     result_problem,
     stated_covariance,
 )
+from lrfcal_lib.calibrate.joint_observations import observe_joint
 from lrfcal_lib.calibrate.naming import name_sides
 from lrfcal_lib.calibrate.observe import (
     observe,
     observe_all,
-    observe_joint,
     platform_observations,
 )
 from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig, joint_rig
