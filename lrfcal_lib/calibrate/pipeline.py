@@ -501,8 +501,7 @@ def handed_over(calibration: Calibration) -> str | None:
     if joint is not None and joint.solution.converged and not joint.solution.unobservable:
         return "joint"
     half_step = {
-        camera: observations
-        for (camera, variant), observations in calibration.observations.items()
-        if variant == "half_step"
+        camera: calibration.observations[camera, "half_step"]
+        for camera in calibration.prepared.views
     }
     return best_method(half_step, calibration.solutions)

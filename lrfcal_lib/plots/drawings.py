@@ -65,8 +65,10 @@ class View:
         color: str = COLORS["truth"],
     ) -> None:
         """A text beside a point (3,), so many printer's points to the right and up."""
-        looks = {"xytext": away, "textcoords": "offset points", "color": color}
-        self.ax.annotate(text, self.flat(point), **looks, **CENTRED)
+        place = self.flat(point)
+        self.ax.annotate(
+            text, place, away, textcoords="offset points", color=color, **CENTRED
+        )
 
     def arrow(self, ends: ArrayLike, color: str) -> None:
         """From one to the other of two points (2, 3)."""

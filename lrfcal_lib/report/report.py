@@ -142,13 +142,14 @@ def execute(path, environment):
     """
     notebook = nbformat.read(path, as_version=4)
     error = ""
-    place = {"metadata": {"path": str(Path(path).parent)}}
-    options = {
-        "kernel_name": "python3",
-        "record_timing": False,
-        "extra_arguments": ["--log-level=ERROR"],
-    }
-    client = NotebookClient(notebook, timeout=CELL_SECONDS, resources=place, **options)
+    client = NotebookClient(
+        notebook,
+        timeout=CELL_SECONDS,
+        resources={"metadata": {"path": str(Path(path).parent)}},
+        kernel_name="python3",
+        record_timing=False,
+        extra_arguments=["--log-level=ERROR"],
+    )
     _CLIENTS.add(client)
     try:
         client.execute(
@@ -399,15 +400,14 @@ def write_pages(out, session, runs, found, seconds):
         body, *drawn[run.name] = page.render(
             run.notebook, found[run.name], numbers[run.name], out
         )
-        file = out / f"{run.name}.html"
-        around = {"before": before, "after": after}
         _write_page(
-            file,
+            out / f"{run.name}.html",
             "notebook.html.jinja",
             session=session,
             run=run,
             body=body,
-            **around,
+            before=before,
+            after=after,
         )
 
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
