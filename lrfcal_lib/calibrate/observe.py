@@ -38,7 +38,6 @@ def observe(
     corrections: Corrections = AS_RECORDED,
     crossings: int = CROSSINGS_PER_EDGE,
     faces: int = FACE_POINTS,
-    outlines: dict | None = None,
 ) -> CameraObservations:
     """Pair what the LRF and one camera saw of the board.
 
@@ -57,9 +56,6 @@ def observe(
     crossings, faces : int
         Kept of each edge and of the face of a placement, evenly spread; without `faces` only
         crossings are paired.
-    outlines : dict, optional
-        Filled with the outlines of the board by placement and variant, which other calls with the
-        same `T_head_lrf` need not measure again.
 
     Returns
     -------
@@ -84,8 +80,7 @@ def observe(
     corners: Iterable[dict] = ()
     if faces:
         rule = "last_beam" if variant == ONE_SCAN else variant
-        boards = {} if outlines is None else outlines
-        corners = _corners(prepared, camera, rule, T_head_lrf, boards)
+        corners = _corners(prepared, camera, rule, T_head_lrf)
     pattern = prepared.pattern_points
     model = prepared.models[camera]
     on_base = prepared.session.cameras[camera].mount == "platform"
@@ -106,13 +101,10 @@ def observe_all(
     prepared: Prepared, T_head_lrf: RigidTransform | None = None
 ) -> dict[tuple[str, str], CameraObservations]:
     """Observations of all cameras in every edge-point variant, by camera and variant."""
-    outlines: dict = {}
-    observations = {}
-    for camera, variant in product(prepared.views, (*VARIANTS, ONE_SCAN)):
-        observations[camera, variant] = observe(
-            prepared, camera, variant, T_head_lrf, outlines=outlines
-        )
-    return observations
+    return {
+        (camera, variant): observe(prepared, camera, variant, T_head_lrf)
+        for camera, variant in product(prepared.views, (*VARIANTS, ONE_SCAN))
+    }
 
 
 def platform_observations(
@@ -433,7 +425,7 @@ def _crossings(prepared, view, source, sides, count):
         }
 
 
-def _corners(prepared, camera, variant, T_head_lrf, outlines) -> Iterator[dict]:
+def _corners(prepared, camera, variant, T_head_lrf) -> Iterator[dict]:
     """Corners of the outline that the cloud and the image can both name: where two fitted edges
     meet.
     """
@@ -444,11 +436,7 @@ def _corners(prepared, camera, variant, T_head_lrf, outlines) -> Iterator[dict]:
         swept = placement in prepared.scans and placement in prepared.swept[variant]
         if view is None or not swept:
             continue
-        if (placement, variant) not in outlines:  # the same for all cameras
-            outlines[placement, variant] = outline_of(
-                prepared, placement, variant, T_head_lrf
-            )[0]
-        board: MeasuredBoard = outlines[placement, variant]
+        board, _ = outline_of(prepared, placement, variant, T_head_lrf)
         for before, name in pairwise(around):
             edge = view.edge(name)
             previous = view.edge(before)

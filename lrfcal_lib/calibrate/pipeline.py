@@ -440,9 +440,8 @@ def with_joint(calibration: Calibration, joint: JointCalibration | Problem) -> C
     platform = calibration.platform
     observations = dict(calibration.observations)
     solutions = dict(calibration.solutions)
-    outlines: dict = {}
     for camera in joint.observations.cameras:
-        observations[camera, "joint"] = joint.seen_by(camera, outlines=outlines)
+        observations[camera, "joint"] = joint.seen_by(camera)
         solutions[camera, "joint"] = joint.solution.camera(camera)
     covariance = stated_covariance(platform.stated_sigma)
     if joint.settings["axis"]:  # scan lines of one pitch say nothing about it
