@@ -267,13 +267,9 @@ def source_of(
     RecordedSource
     """
     mount = prepared.session.cameras[camera].mount
-    image_pitch = 0.0
-    if mount == "head":
-        recorded = prepared.views[camera][placement].pitch
-        image_pitch = float(corrections.pitch(placement, recorded))
-    return RecordedSource(
-        placement, SourceFrame(T_head_lrf, mount, image_pitch), corrections
-    )
+    image_pitch = corrections.pitch(placement, prepared.views[camera][placement].pitch)
+    frame = SourceFrame(T_head_lrf, mount, float(image_pitch))
+    return RecordedSource(placement, frame, corrections)
 
 
 def in_platform(

@@ -164,28 +164,21 @@ def likeliest_step(solution):
     A score test with all that was estimated free. Where placements scatter more than their noise
     explains, the statistic is measured by their scatter.
     """
-    placements = len(solution.observations.placements)
-    last = placements - BESIDE
-    if last < BESIDE:
-        return None
+    obs = solution.observations
     score = solution.score()
 
     tested = []
-    for camera, name in enumerate(solution.observations.cameras):
+    for camera, name in enumerate(obs.cameras):
         columns = solution.columns(f"{name}_")
-        for row in range(BESIDE, last + 1):
-            if _seen_beside(solution.observations, camera, row):
+        shown = np.unique(obs.view_placement[obs.view_camera == camera])
+        for row in range(len(obs.placements)):
+            before = np.searchsorted(shown, row)
+            if BESIDE <= before <= len(shown) - BESIDE:
                 tested.append(Step(camera, row, *_chance_of_step(score, columns, row)))
     best = min(tested, key=lambda step: step.p_value, default=None)
     if best is None or best.p_value * len(tested) > LEVEL:
         return None
     return best
-
-
-def _seen_beside(obs, camera, row):
-    """Whether a camera sees boards in enough placements before and after a row."""
-    shown = np.unique(obs.view_placement[obs.view_camera == camera])
-    return min(np.sum(shown < row), np.sum(shown >= row)) >= BESIDE
 
 
 def _chance_of_step(score, columns, row):
@@ -283,7 +276,6 @@ def growth_of_focal_length(prepared, camera, placement):
     From the corners of the chessboard, the rest of the lens held; 0 and infinity where too few
     images show them.
     """
-    unknown = (0.0, np.inf)
     model = prepared.models[camera]
     lengths = []
     spreads = []
@@ -294,7 +286,7 @@ def growth_of_focal_length(prepared, camera, placement):
             if (number >= placement) is later
         ]
         if len(views) < FEWEST_VIEWS:
-            return unknown
+            return 0.0, np.inf
         pixels = np.array([[view.pixels for view in views]])
         poses = RigidTransform.concatenate([view.T_camera_board for view in views])
         lens = adjust_robust(

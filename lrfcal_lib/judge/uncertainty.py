@@ -143,7 +143,7 @@ def projection_sigma(
     )
     points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
     P, *_ = project_jacobians(points, model)
-    sigma_pitch = PitchNoise(*chain.sweep_sigma).sigma(pitch, np.mean(pitches))
+    sigma_pitch = PitchNoise(*chain.sweep_sigma).sigma(pitch, sum(pitches) / 2)
     if chain.on_head:  # the offset is that of the image, too
         sigma_pitch = chain.sweep_sigma[1] * (pitch - image_pitch)
     by_sweep = sigma_pitch * np.linalg.norm(np.matvec(P, by_pitch), axis=-1)

@@ -56,13 +56,13 @@ class Score:
     gradient: np.ndarray
 
     def solved(
-        self, expected: ArrayLike = 0.0, off: float = 0.0
+        self, expected: float | np.ndarray = 0.0, off: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What follows where everything is free.
 
         Parameters
         ----------
-        expected : array_like, shape (c,)
+        expected : float or ndarray, shape (c,)
             Information about unknowns that are expected to be smaller by `off`.
         off : float
 
