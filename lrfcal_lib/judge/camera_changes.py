@@ -7,8 +7,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc, fdtrc
 
+from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose
 from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
@@ -211,12 +212,11 @@ def largest_motion(solution, step, model):
     """By how many pixels the change of a Step moves a corner of a board in an image, at most."""
     obs = solution.observations
     poses = obs.view_pose[obs.view_camera == step.camera]
-    corners = obs.corners @ np.swapaxes(poses[:, :3, :2], 1, 2) + poses[:, None, :3, 3]
-    corners = corners.reshape(-1, 3)
+    corners = apply_pose(poses[:, :3], outline(solution))
     origin = solution.transforms[obs.cameras[step.camera]].translation
     turned = Rotation.from_rotvec(step.change[:3]).apply(corners - origin)
     motion = project(turned + origin + step.change[3:], model) - project(corners, model)
-    return float(np.max(np.linalg.norm(motion, axis=1)))
+    return float(np.max(np.linalg.norm(motion, axis=-1)))
 
 
 def with_two_poses(obs, step, name):
@@ -248,7 +248,7 @@ def change_between(solution, first, later, camera, prepared):
     square = both_parts @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ both_parts
 
     views = obs.view_camera == index
-    middle = [*obs.corners.mean(axis=0), 0.0]
+    middle = outline(solution).mean(axis=0)
     middles = RigidTransform.from_matrix(obs.view_pose[views]).apply(middle)
     motion = project(middles, model) - project(change.inv().apply(middles), model)
     after = int(obs.placements[obs.view_placement[views].min()])

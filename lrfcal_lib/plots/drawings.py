@@ -49,8 +49,8 @@ class View:
 
     def flat(self, points: ArrayLike) -> np.ndarray:
         """Where points (..., 3), metres, stand on the axes, (..., 2)."""
-        seen = self.T_view.apply(np.reshape(points, (-1, 3)))
-        return (seen[:, :2] / seen[:, 2:]).reshape(np.shape(points)[:-1] + (2,))
+        seen = self.T_view.apply(np.asarray(points, float))
+        return seen[..., :2] / seen[..., 2:]
 
     def line(self, points: ArrayLike, style: str = "-", **looks: Any) -> None:
         """A line through points (n, 3), metres."""
