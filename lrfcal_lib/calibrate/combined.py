@@ -343,10 +343,7 @@ def image_block(state, case, scale):
     off = joint_residuals.view_block(state.joint, case.data, case.unknowns).residuals
     poses = geometry.move_pose(view["pose"][..., :3, :], off.reshape(1, -1, 6))
     # with the poses as they are predicted: derivatives of [w, v] of every T_camera_board
-    as_predicted = view | {
-        "pose": np.concatenate([poses, view["pose"][..., 3:, :]], axis=-2)
-    }
-    data = replace(case.data, view=as_predicted)
+    data = replace(case.data, view=view | {"pose": poses})
     J = joint_residuals.view_block(state.joint, data, case.unknowns).jacobian
     by_all = J.reshape(-1, 6, J.shape[-1])
     residuals = []
