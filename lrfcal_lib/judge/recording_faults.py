@@ -214,8 +214,7 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     if 0 < len(mirrored) < len(stated):
         return mirrored
 
-    groups: tuple[tuple[Reading, ...], ...] = (SENSES, IMAGES, UNITS)
-    for group in groups:
+    for group in (SENSES, IMAGES, UNITS):
         misses = {reading: board_misses(prepared, reading) for reading in group}
         fitting = {reading: miss for reading, miss in misses.items() if _fits(miss, stated)}
         if fitting:
