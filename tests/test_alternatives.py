@@ -21,6 +21,7 @@ from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.geometry import hat
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
+from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
 
 ADMITTED = 0.025
@@ -177,11 +178,14 @@ def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named):
     model = model.with_parameters(model.parameters * np.r_[[scale] * 4, [1.0] * 5])
     views = {i: SimpleNamespace(pixels=uv, T_camera_board=first_pose(PATTERN.points(), uv, model), reason="")
              for i, uv in enumerate(pixels)}  # fmt: skip
-    prepared = SimpleNamespace(
+    prepared = Prepared(
+        session=None,
         board=SimpleNamespace(pattern=PATTERN),
+        scans={},
+        edges={},
+        swept={},
         models={"left": model},
         views={"left": views},
-        relief=None,
     )
     words = "".join(finding.words for finding in lens_findings(prepared))
     assert words == "" if named is None else "camera 'left'" in words and named in words

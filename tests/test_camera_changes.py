@@ -18,6 +18,7 @@ from lrfcal_lib.judge.camera_changes import (
     likeliest_step,
 )
 from lrfcal_lib.judge.recording_faults import faults_of_changes
+from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
 
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
@@ -36,7 +37,15 @@ def drawn(seed, count=14, **settings):
         "axis": True,
     }
     models = dict.fromkeys(rig.cameras, rig.model)
-    prepared = SimpleNamespace(models=models, board=SimpleNamespace(pattern=None))
+    prepared = Prepared(
+        session=None,
+        board=SimpleNamespace(pattern=None),
+        scans={},
+        edges={},
+        swept={},
+        models=models,
+        views={camera: {} for camera in models},
+    )
     return obs, settings | {"prior": prior}, prepared
 
 

@@ -7,7 +7,7 @@ import pytest
 from shared import QUICK, campaign
 
 from lrfcal_lib.calibrate import clouds, combined, pipeline
-from lrfcal_lib.calibrate.observe import observe_joint
+from lrfcal_lib.calibrate.joint_observations import observe_joint
 from lrfcal_lib.evaluate import edge_tables, joint_tables
 from lrfcal_lib.evaluate.export import calibration_record
 from lrfcal_lib.evaluate.truth import read_truth

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.calibrate.recorded import RecordedSource
+from lrfcal_lib.calibrate.observe import RecordedSource
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_covariance, polar_to_points
 from lrfcal_lib.model.kinematics import (
     AS_RECORDED,

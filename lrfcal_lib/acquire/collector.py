@@ -136,13 +136,12 @@ def calibrate_recording(path: Path) -> Result:
         return Result(judged.answer, sentences, "", {}, None, calibration)
     method = handed_over(calibration) or ""
     poses = {}
-    for (camera, name), solution in calibration.solutions.items():
-        if name == method:
-            values = POSE_UNITS * solution.parameters[:6]
-            sigma = POSE_UNITS * solution.trusted_sigma[:6]
-            poses[camera] = tuple(
-                f"{v:.2f} ± {s:.2f}" for v, s in zip(values, sigma, strict=True)
-            )
+    for camera, solution in calibration.cameras(method).items():
+        values = POSE_UNITS * solution.parameters[:6]
+        sigma = POSE_UNITS * solution.trusted_sigma[:6]
+        poses[camera] = tuple(
+            f"{v:.2f} ± {s:.2f}" for v, s in zip(values, sigma, strict=True)
+        )
     file = path.with_name(f"{path.name}_calibration") / "calibration.json"
     write_calibration(file, calibration_record(calibration, method, judged))
     return Result(judged.answer, sentences, method, poses, file, calibration)

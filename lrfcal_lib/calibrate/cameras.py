@@ -82,10 +82,7 @@ class PlatformCalibration:
 
     def problem(self, method: str) -> Problem | None:
         """Why a method (or 'combined') has no result; None if it has one."""
-        for problem in self.problems:
-            if problem.method == method:
-                return problem
-        return None
+        return result_problem(self.problems, method)
 
     def transform(self, method: str) -> RigidTransform:
         """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint')."""
@@ -180,6 +177,16 @@ def calibrate_cameras(
             except DegenerateGeometry as error:
                 problems.append(_no_result(Stage.CAMERAS, method, str(error), camera))
     return solutions, problems
+
+
+def result_problem(
+    problems: Iterable[Problem], method: str, camera: str | None = None
+) -> Problem | None:
+    """Why a method has no result, of a camera or without one; None if it has one."""
+    for problem in problems:
+        if (problem.method, problem.camera) == (method, camera):
+            return problem
+    return None
 
 
 def _no_result(stage, method, words, camera=None):

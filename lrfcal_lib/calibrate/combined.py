@@ -2,15 +2,17 @@
 what it is worth.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from lrfcal_lib.calibrate.observe import observe_joint
+from lrfcal_lib.calibrate.joint_observations import observe_joint
+from lrfcal_lib.calibrate.observe import LEAST_STRETCH, in_platform, named_sides
 from lrfcal_lib.calibrate.outline import (
-    LEAST_STRETCH,
     MeasuredBoard,
     measure_board,
     moved_lines,
@@ -18,7 +20,6 @@ from lrfcal_lib.calibrate.outline import (
     sized,
 )
 from lrfcal_lib.calibrate.pipeline import JointCalibration
-from lrfcal_lib.calibrate.recorded import in_platform, named_sides
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel
@@ -121,36 +122,30 @@ def combined_outlines(
         camera: list(of_camera.values()) for camera, of_camera in prepared.views.items()
     }
     observations = observe_joint(prepared, views)
-    states = {}
     cases = {}
     for placement in observations.placements.tolist():
-        try:
-            case = case_of(joint, observations, placement)
-        except DegenerateGeometry:
-            continue
-        cases[placement] = case
-        states[placement] = case.start
+        with suppress(DegenerateGeometry):
+            cases[placement] = case_of(joint, observations, placement)
     measured: dict = {}
     scale = 1.0
     for _ in range(SCALE_ROUNDS + 1):
-        measured = {}
         square = 0.0
         freedom = 0.0
-        for placement, case in cases.items():
-            # what is left open, as by single scans, has no answer
+        for placement, case in list(cases.items()):
             try:
-                state, covariance = fitted(case, states[placement], scale)
+                state, covariance = fitted(case, scale)
                 measured[placement] = _measured(case, state, covariance)
             except (DegenerateGeometry, np.linalg.LinAlgError):
+                # what is left open, as by single scans, has no answer
+                del cases[placement]
+                measured.pop(placement, None)
                 continue
-            states[placement] = state
+            cases[placement] = replace(case, start=state)
             if case.images:
                 block = image_block(state, case, scale)
-                r = block.white
-                J = block.white_jacobian
-                square += np.sum(r**2)
+                J = block.jacobian
+                square += np.sum(block.residuals**2)
                 freedom += np.sum(1 - np.vecdot(J @ covariance, J))
-        cases = {placement: cases[placement] for placement in measured}
         if freedom > 0:
             scale = max(scale * np.sqrt(square / freedom), LEAST_SCALE)
     return as_scattered(measured)
@@ -164,17 +159,11 @@ def as_scattered(
     Errors that all images of a side share (paint, a rim, a pattern close by), or all beams about
     it, show in no residual of its placement. But it is one board everywhere, whatever its size.
     """
-    lengths: dict = {}  # pairs of length and sigma, by edge
-    for board, _ in measured.values():
-        for name, length in board.lengths.items():
-            lengths.setdefault(name, []).append((length, board.sigma[name]))
-    square = 0.0
-    freedom = 0
-    for pairs in lengths.values():
-        length, sigma = np.transpose(pairs)
-        mean = np.average(length, weights=sigma**-2)
-        square += np.sum(((length - mean) / sigma) ** 2)
-        freedom += len(pairs) - 1
+    lengths = pd.DataFrame([board.lengths for board, _ in measured.values()])
+    weights = pd.DataFrame([board.sigma for board, _ in measured.values()]) ** -2
+    off = lengths - (weights * lengths).sum() / weights.sum()
+    square = (weights * off**2).sum().sum()
+    freedom = (lengths.count() - 1).sum()
     grow = float(np.sqrt(max(square / max(freedom, 1), 1.0)))
     grown = {}
     for placement, (board, scanned) in measured.items():
@@ -205,12 +194,11 @@ def case_of(joint, observations, placement):
     lines *= -np.where(lines[:, 2:] > 0, 1.0, -1.0)  # outwards: the face is in the middle
     obs = observations.with_cameras(solution.observations.cameras).select([placement])
     images = []
-    views = [prepared.views[camera].get(placement) for camera in obs.cameras]
-    posed = [view for view in views if view is not None and view.T_camera_board is not None]
-    for row, view in enumerate(posed):
-        for edge in view.edges:
-            number = edges.index(edge.name)
-            images.append(ImageSide(row, number, edge, prepared.models[view.camera]))
+    for row, number in enumerate(obs.view_camera):
+        camera = obs.cameras[number]
+        for edge in prepared.views[camera][placement].edges:
+            side = edges.index(edge.name)
+            images.append(ImageSide(row, side, edge, prepared.models[camera]))
     obs = obs.keep(beam=np.isin(obs.beam_edge, [edges.index(name) for name in sides]))
     state = replace(
         solution.state,
@@ -275,12 +263,12 @@ def moved(case, state, step):
     )
 
 
-def fitted(case, start, scale):
+def fitted(case, scale):
     """The most likely State and the covariance of all unknowns."""
     evaluate = partial(blocks_of, case=case, scale=scale)
     state = minimise(
         evaluate,
-        start,
+        case.start,
         partial(moved, case),
         shared=case.unknowns.shared,
         max_iterations=ITERATIONS,
@@ -291,7 +279,7 @@ def fitted(case, start, scale):
 
 
 def blocks_of(state, case, scale):
-    """All that is known of a placement, a list of Block (1, n, width)."""
+    """All that is known of a placement, each a Block (1, n, width)."""
     unknowns = case.unknowns
     of_joint = (state.joint, replace(case.data, lines=state.lines), unknowns)
     blocks = [joint_residuals.face_block(*of_joint)]
@@ -316,12 +304,10 @@ def blocks_of(state, case, scale):
     held[1:3, start + 3 : start + 6] = STILL * board[:, :2].T  # their shift
     held[3:, -count:] = np.diag(np.tile(FAR, len(case.middle)))
     blocks.append(_rows(np.zeros(len(held)), held))
-    wide = []
     for block in blocks:
         missing = width - block.jacobian.shape[-1]
         jacobian = np.pad(block.jacobian, [(0, 0), (0, 0), (0, missing)])
-        wide.append(replace(block, jacobian=jacobian))
-    return wide
+        yield replace(block, jacobian=jacobian)
 
 
 def _rows(residuals, jacobian):
@@ -357,10 +343,7 @@ def image_block(state, case, scale):
     off = joint_residuals.view_block(state.joint, case.data, case.unknowns).residuals
     poses = geometry.move_pose(view["pose"][..., :3, :], off.reshape(1, -1, 6))
     # with the poses as they are predicted: derivatives of [w, v] of every T_camera_board
-    as_predicted = view | {
-        "pose": np.concatenate([poses, view["pose"][..., 3:, :]], axis=-2)
-    }
-    data = replace(case.data, view=as_predicted)
+    data = replace(case.data, view=view | {"pose": poses})
     J = joint_residuals.view_block(state.joint, data, case.unknowns).jacobian
     by_all = J.reshape(-1, 6, J.shape[-1])
     residuals = []

@@ -4,8 +4,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.calibrate.observe import observe
-from lrfcal_lib.calibrate.recorded import platform_of, source_of
+from lrfcal_lib.calibrate.observe import observe, platform_of, source_of
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
@@ -47,9 +46,8 @@ def name_sides(
     if prepared.board.corners is None:
         return names, dropped, problems
     for camera, T_camera_source in rough.items():
-        for placement, view in prepared.views[camera].items():
-            posed = view.T_camera_board is not None and placement in prepared.scans
-            if not posed or placement in names:
+        for placement, view in prepared.posed(camera).items():
+            if placement not in prepared.scans or placement in names:
                 continue
             T_board_source = view.T_camera_board.inv() * T_camera_source
             sides = _sides_on_board(prepared, camera, placement, T_board_source)

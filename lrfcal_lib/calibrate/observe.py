@@ -1,43 +1,31 @@
-"""Stack what the LRF and the cameras saw of the board: the observations of every method."""
+"""What the LRF and the cameras saw of the board: moved into the frame that something is fixed to,
+and stacked as observations.
+"""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import combinations, pairwise, product
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.calibrate.outline import MeasuredBoard, outline_of
-from lrfcal_lib.calibrate.recorded import (
-    NamedSide,
-    named_sides,
-    platform_of,
-    source_of,
-)
+from lrfcal_lib.calibrate.outline import MeasuredBoard, measure_board
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import tilt
-from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections
-from lrfcal_lib.model.observations import (
-    LENS,
-    CameraObservations,
-    JointObservations,
-    PlatformObservations,
-    thin,
-)
-from lrfcal_lib.preprocess.board_in_image import BoardView
-from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edge_cells import edge_cells
-from lrfcal_lib.preprocess.intrinsics import raised_points
+from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections, SourceFrame
+from lrfcal_lib.model.observations import CameraObservations, PlatformObservations, thin
+from lrfcal_lib.preprocess.board_in_scan import BoardScan, face_points
+from lrfcal_lib.preprocess.edges_in_scan import ScanEdges
 from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
-from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 
 ONE_SCAN = "one_scan"
 # neighbouring scan lines repeat each other's errors; a line in space needs few points
 CROSSINGS_PER_EDGE = 24
 FACE_POINTS = 150  # a placement: neighbouring ranges of a real device share their errors
 PLATFORM_POINTS = 40  # per edge
-CELLS_PER_EDGE = 160  # a placement, for the joint estimate
 LEAST_CORNER_SIGMA = 0.05  # pixels; no chessboard corner is found better
+LEAST_STRETCH = 0.4  # share of an edge that must be seen before its line decides a corner
 # largest |cosine| between two sides that are taken for the board's perpendicular edges
 RIGHT_ANGLE = 0.15
 
@@ -50,7 +38,6 @@ def observe(
     corrections: Corrections = AS_RECORDED,
     crossings: int = CROSSINGS_PER_EDGE,
     faces: int = FACE_POINTS,
-    outlines: dict | None = None,
 ) -> CameraObservations:
     """Pair what the LRF and one camera saw of the board.
 
@@ -69,9 +56,6 @@ def observe(
     crossings, faces : int
         Kept of each edge and of the face of a placement, evenly spread; without `faces` only
         crossings are paired.
-    outlines : dict, optional
-        Filled with the outlines of the board by placement and variant, which other calls with the
-        same `T_head_lrf` need not measure again.
 
     Returns
     -------
@@ -79,7 +63,7 @@ def observe(
     """
     T_head_lrf = platform_of(prepared, T_head_lrf)
     views = prepared.views[camera]
-    posed = {p: view for p, view in views.items() if view.T_camera_board is not None}
+    posed = prepared.posed(camera)
     on_faces = []
     crossed = []
     for placement, scan in prepared.scans.items():
@@ -93,16 +77,20 @@ def observe(
         else:
             sides = named_sides(prepared, placement, variant)
         crossed += _crossings(prepared, views[placement], source, sides, crossings)
-    corners: list = []
+    corners: Iterable[dict] = ()
     if faces:
         rule = "last_beam" if variant == ONE_SCAN else variant
-        boards = {} if outlines is None else outlines
-        corners += _corners(prepared, camera, rule, T_head_lrf, boards)
+        corners = _corners(prepared, camera, rule, T_head_lrf)
+    pattern = prepared.pattern_points
+    model = prepared.models[camera]
     on_base = prepared.session.cameras[camera].mount == "platform"
     return CameraObservations(
+        model=model,
         camera=camera,
         source="platform" if on_base else "lrf",
-        **_boards_in_images(prepared, camera, posed),
+        pattern_points=pattern,
+        pattern_sigma_px=max(model.rms_px or 0.0, LEAST_CORNER_SIGMA),
+        **stack("", _boards_in_images(posed, len(pattern))),
         **stack("plane_", on_faces),
         **stack("crossing_", crossed),
         **stack("scene_", corners),
@@ -113,13 +101,10 @@ def observe_all(
     prepared: Prepared, T_head_lrf: RigidTransform | None = None
 ) -> dict[tuple[str, str], CameraObservations]:
     """Observations of all cameras in every edge-point variant, by camera and variant."""
-    outlines: dict = {}
-    observations = {}
-    for camera, variant in product(prepared.views, (*VARIANTS, ONE_SCAN)):
-        observations[camera, variant] = observe(
-            prepared, camera, variant, T_head_lrf, outlines=outlines
-        )
-    return observations
+    return {
+        (camera, variant): observe(prepared, camera, variant, T_head_lrf)
+        for camera, variant in product(prepared.views, (*VARIANTS, ONE_SCAN))
+    }
 
 
 def platform_observations(
@@ -146,67 +131,56 @@ def platform_observations(
         for number, (edges, side) in enumerate(feature, 1):
             rows = thin(np.flatnonzero(edges.side == side.side), PLATFORM_POINTS)
             columns = {
-                "points": edges.points[rows],
-                "covariance": edges.covariance[rows],
-                "pitch": edges.pitch[rows],
-                "placement": np.full(len(rows), placement),
-                "number": np.full(len(rows), number),
+                name: getattr(edges, name)[rows]
+                for name in ("points", "covariance", "pitch")
             }
+            columns["placement"] = np.full(len(rows), placement)
+            columns["number"] = np.full(len(rows), number)
             sides.append(columns)
-        points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
-        columns = {
-            "points": points,
-            "covariance": covariance,
-            "pitch": pitch,
-            "placement": np.full(len(pitch), placement),
-        }
-        faces.append(columns)
+        faces.append(face_columns(prepared.scans[placement], placement, FACE_POINTS))
     return PlatformObservations(**stack("edge_", sides), **stack("face_", faces))
 
 
-def observe_joint(
-    prepared: Prepared, views: dict[str, list[BoardView]]
-) -> JointObservations:
-    """Everything that the joint estimate uses of a session, of the placements that are not left
-    out.
+def outline_of(
+    prepared: Prepared,
+    placement: int,
+    variant: str = "half_step",
+    T_head_lrf: RigidTransform | None = None,
+) -> tuple[MeasuredBoard, frozenset[str]]:
+    """Measure the board's outline in the cloud of a placement by least squares.
+
+    Sides of which less than 40 % is seen are missing: a stub does not carry a line to its corners.
 
     Parameters
     ----------
     prepared : Prepared
-    views : dict of str to list of BoardView
-        By camera; :func:`lrfcal_lib.preprocess.survey.all_views` or some of them.
+    placement : int
+    variant : {'half_step', 'last_beam'}
+    T_head_lrf : RigidTransform, optional
+        The session's own platform when left out.
 
     Returns
     -------
-    JointObservations
+    board : MeasuredBoard
+    across : frozenset of str
+        The edges found across the scan lines (where the sweep enters or leaves the board): their
+        place hangs on the pitch.
+
+    Raises
+    ------
+    DegenerateGeometry
+        If the sweep does not cross enough scan lines to span a plane.
     """
-    session = prepared.session
-    board = prepared.board
-    scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.left_out}
-    if board.corners is None and board.pattern is not None:
-        # nobody knows the outline: no beam is named after the sides of the printed squares
-        corners = board.pattern.outline()
-    else:
-        corners = board.known_corners()
-    lens_covariance = np.zeros((len(views), LENS, LENS))
-    for number, camera in enumerate(views):
-        known = prepared.models[camera].covariance
-        if known is not None:
-            lens_covariance[number] = known
-    return JointObservations(
-        placements=np.array(list(scans), int),
-        direction=np.array([session.sweep_direction(p) for p in scans], int),
-        middle=np.array([float(np.mean(scan.sweep.pitch)) for scan in scans.values()]),
-        edges=tuple(board.edges),
-        corners=corners,
-        cameras=tuple(views),
-        mounts=tuple(session.cameras[camera].mount for camera in views),
-        T_head_lrf=session.T_head_lrf,
-        lens_covariance=lens_covariance,
-        **stack("face_", _ranges(scans)),
-        **stack("beam_", _beams(prepared, scans)),
-        **stack("view_", _views(prepared, views, list(scans))),
-    )
+    source = in_platform(placement, platform_of(prepared, T_head_lrf))
+    p_lrf, pitch, _ = face_points(prepared.scans[placement])
+    sides = {}
+    across = set()
+    for side in named_sides(prepared, placement, variant, LEAST_STRETCH):
+        sides[side.name] = source.points(side.points, side.pitch)
+        if side.across:
+            across.add(side.name)
+    board = measure_board(source.points(p_lrf, pitch), sides, prepared.board.edges)
+    return board, frozenset(across)
 
 
 def stack(prefix: str, parts: Iterable[dict]) -> dict[str, Any]:
@@ -217,29 +191,189 @@ def stack(prefix: str, parts: Iterable[dict]) -> dict[str, Any]:
     return {prefix + key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _boards_in_images(prepared, camera, posed):
-    """What one camera sees of the board: fields of CameraObservations by name."""
-    model = prepared.models[camera]
-    pattern = np.zeros((0, 3))
-    if prepared.board.pattern is not None:
-        pattern = raised_points(prepared.board.pattern, prepared.relief)
-    pixels = np.full((len(posed), len(pattern), 2), np.nan)
-    poses = np.zeros((len(posed), 4, 4))
-    covariances = np.zeros((len(posed), 6, 6))
-    for row, view in enumerate(posed.values()):
-        poses[row] = view.T_camera_board.as_matrix()
-        covariances[row] = view.covariance
-        if view.pixels is not None:
-            pixels[row] = view.pixels
+@dataclass(frozen=True)
+class RecordedSource:
+    """Points of one placement as recorded, moved into the frame that a camera is fixed to.
+
+    Known errors of ranges and pitch are taken out first; they change where a point lies, but not
+    how its noise turns.
+    """
+
+    placement: int
+    frame: SourceFrame
+    corrections: Corrections = AS_RECORDED
+
+    def points(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+        """Measured points (n, 3) at their recorded pitch (n,), in the camera's source frame,
+        metres.
+        """
+        corrected = self.corrections.pitch(self.placement, pitch)
+        return self.frame.apply(self.corrections.points(p_lrf), corrected)
+
+    def covariance(self, covariance: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+        """Covariances (n, 3, 3) of measured points, turned into the source frame."""
+        R = self.frame.rotation(self.corrections.pitch(self.placement, pitch))
+        return R @ covariance @ R.swapaxes(-1, -2)
+
+    def by_pitch(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+        """Derivative (n, 3) of :meth:`points` by an error of the recorded pitch, metres a
+        radian.
+        """
+        corrected = self.corrections.pitch(self.placement, pitch)
+        return self.frame.by_pitch(self.corrections.points(p_lrf), corrected)
+
+    def face(self, scan: BoardScan, count: int) -> dict[str, np.ndarray]:
+        """At most `count` points of a board's face, with covariance, pitch and placement: columns
+        by name.
+        """
+        columns = face_columns(scan, self.placement, count)
+        pitch = columns["pitch"]
+        return columns | {
+            "points": self.points(columns["points"], pitch),
+            "covariance": self.covariance(columns["covariance"], pitch),
+        }
+
+
+def face_columns(scan: BoardScan, placement: int, count: int) -> dict[str, np.ndarray]:
+    """At most `count` points of a board's face as recorded, columns by name."""
+    points, pitch, covariance = face_points(scan, count)
     return {
-        "model": model,
-        "placements": np.array(list(posed), int),
-        "board_poses": poses,
-        "board_covariance": covariances,
-        "pattern_points": pattern,
-        "pattern_pixels": pixels,
-        "pattern_sigma_px": max(model.rms_px or 0.0, LEAST_CORNER_SIGMA),
+        "points": points,
+        "covariance": covariance,
+        "pitch": pitch,
+        "placement": np.full(len(pitch), placement),
     }
+
+
+def source_of(
+    prepared: Prepared,
+    camera: str,
+    placement: int,
+    T_head_lrf: RigidTransform,
+    corrections: Corrections = AS_RECORDED,
+) -> RecordedSource:
+    """A placement in the frame that one of its cameras is fixed to.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    camera : str
+    placement : int
+    T_head_lrf : RigidTransform
+    corrections : Corrections
+
+    Returns
+    -------
+    RecordedSource
+    """
+    mount = prepared.session.cameras[camera].mount
+    image_pitch = corrections.pitch(placement, prepared.views[camera][placement].pitch)
+    frame = SourceFrame(T_head_lrf, mount, float(image_pitch))
+    return RecordedSource(placement, frame, corrections)
+
+
+def in_platform(
+    placement: int, T_head_lrf: RigidTransform, corrections: Corrections = AS_RECORDED
+) -> RecordedSource:
+    """A placement in the platform frame."""
+    return RecordedSource(placement, SourceFrame(T_head_lrf, "platform"), corrections)
+
+
+def platform_of(
+    prepared: Prepared, T_head_lrf: RigidTransform | None = None
+) -> RigidTransform:
+    """The platform to use.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    T_head_lrf : RigidTransform, optional
+
+    Returns
+    -------
+    RigidTransform
+        The one given, else the session's, else a tilt axis along x.
+    """
+    for T in (T_head_lrf, prepared.session.T_head_lrf):
+        if T is not None:
+            return T
+    return RigidTransform.identity()
+
+
+@dataclass(frozen=True)
+class NamedSide:
+    """A side of the scan that has the name of an edge.
+
+    Attributes
+    ----------
+    name : str
+        Of the board's edge.
+    edges : ScanEdges
+        That hold its points.
+    rows : ndarray of int
+        Which of them.
+    across : bool
+        Whether it was found across the scan lines.
+    """
+
+    name: str
+    edges: ScanEdges
+    rows: np.ndarray
+    across: bool
+
+    @property
+    def points(self) -> np.ndarray:
+        """LRF frame at their pitch, metres, shape (n, 3)."""
+        return self.edges.points[self.rows]
+
+    @property
+    def pitch(self) -> np.ndarray:
+        """As recorded, radians, shape (n,)."""
+        return self.edges.pitch[self.rows]
+
+
+def named_sides(
+    prepared: Prepared, placement: int, variant: str = "half_step", stretch: float = 0.0
+) -> Iterator[NamedSide]:
+    """The sides of a placement that have names, one by one.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    placement : int
+    variant : {'half_step', 'last_beam'}
+    stretch : float
+        Share of an edge that the sweep must show.
+
+    Yields
+    ------
+    NamedSide
+    """
+    along = prepared.edges[variant][placement]
+    swept = prepared.swept[variant].get(placement)
+    lengths = {}
+    if stretch > 0:
+        lengths = prepared.board.lengths()
+    for number, name in prepared.names.get(placement, {}).items():
+        across = number not in along.side
+        edges = swept if across else along
+        length = next((side.length for side in edges.sides if side.side == number), 0.0)
+        if length >= stretch * lengths.get(name, 0.0):
+            yield NamedSide(name, edges, np.flatnonzero(edges.side == number), across)
+
+
+def _boards_in_images(posed, corners):
+    """What the images of one camera show of the board and its so many corners of the pattern:
+    columns by name.
+    """
+    unseen = np.full((corners, 2), np.nan)
+    for placement, view in posed.items():
+        yield {
+            "placements": [placement],
+            "board_poses": [view.T_camera_board.as_matrix()],
+            "board_covariance": [view.covariance],
+            "pattern_pixels": [unseen if view.pixels is None else view.pixels],
+        }
 
 
 def _one_scan_line(prepared, placement, view):
@@ -287,7 +421,7 @@ def _crossings(prepared, view, source, sides, count):
         }
 
 
-def _corners(prepared, camera, variant, T_head_lrf, outlines) -> Iterator[dict]:
+def _corners(prepared, camera, variant, T_head_lrf) -> Iterator[dict]:
     """Corners of the outline that the cloud and the image can both name: where two fitted edges
     meet.
     """
@@ -298,11 +432,7 @@ def _corners(prepared, camera, variant, T_head_lrf, outlines) -> Iterator[dict]:
         swept = placement in prepared.scans and placement in prepared.swept[variant]
         if view is None or not swept:
             continue
-        if (placement, variant) not in outlines:  # the same for all cameras
-            outlines[placement, variant] = outline_of(
-                prepared, placement, variant, T_head_lrf
-            )[0]
-        board: MeasuredBoard = outlines[placement, variant]
+        board, _ = outline_of(prepared, placement, variant, T_head_lrf)
         for before, name in pairwise(around):
             edge = view.edge(name)
             previous = view.edge(before)
@@ -349,64 +479,3 @@ def _feature_sides(along, swept):
     return max(
         features, key=lambda it: np.prod([side.length for _, side in it]), default=()
     )
-
-
-def _ranges(scans):
-    """Ranges to the faces of boards, of placements by row: columns by name."""
-    for row, scan in enumerate(scans.values()):
-        p_lrf, pitch, _ = face_points(scan, FACE_POINTS)
-        yield {
-            "range": np.linalg.norm(p_lrf, axis=1),
-            "bearing": np.arctan2(p_lrf[:, 1], p_lrf[:, 0]),
-            "pitch": pitch,
-            "sigma": np.full(len(pitch), scan.sigma_range),
-            "placement": np.full(len(pitch), row),
-        }
-
-
-def _beams(prepared, scans):
-    """Beams about the named sides of placements, by row: columns by name."""
-    along = prepared.edges["half_step"]
-    swept = prepared.swept["half_step"]
-    for row, (placement, scan) in enumerate(scans.items()):
-        cells = edge_cells(
-            scan, along[placement], swept.get(placement), prepared.session.lrf
-        )
-        for side, name in prepared.names.get(placement, {}).items():
-            about = cells[thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE)]
-            yield {
-                "bearing": about.bearing,
-                "pitch": about.pitch,
-                "hit": about.hit,
-                "radius": about.radius,
-                "background": about.background,
-                "step": about.step * about.range_m,
-                "edge": np.full(len(about), prepared.board.edges.index(name)),
-                "placement": np.full(len(about), row),
-            }
-
-
-def _views(prepared, views, placements):
-    """Poses of the board in all images, of cameras by number and placements by row: columns by
-    name.
-    """
-    pattern = prepared.board.pattern
-    for number, (camera, of_camera) in enumerate(views.items()):
-        for view in of_camera:
-            if view.T_camera_board is None or view.placement not in placements:
-                continue
-            visible = np.zeros((0, 3))
-            if pattern is not None and view.pixels is not None:
-                visible = pattern.points()[np.isfinite(view.pixels).all(axis=1)]
-            yield {
-                "camera": [number],
-                "pitch": [np.nan_to_num(view.pitch)],
-                "pose": [view.T_camera_board.as_matrix()],
-                "covariance": [view.covariance],
-                "placement": [placements.index(view.placement)],
-                "lens": [
-                    pose_by_intrinsics(
-                        view.T_camera_board, visible, prepared.models[camera]
-                    )
-                ],
-            }

@@ -3,16 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.calibrate.recorded import in_platform, named_sides, platform_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import fit_line
-from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.prepared import Prepared
 
-LEAST_STRETCH = 0.4  # share of an edge that must be seen before its line decides a corner
 STEP = 1e-6  # of shifts and turns of lines, metres and radians: for derivatives of lengths
 
 
@@ -45,48 +40,6 @@ class MeasuredBoard:
             self.T_platform_plane[:3, 3]
             + self.T_platform_plane[:3, :2] @ self.corners[name]
         )
-
-
-def outline_of(
-    prepared: Prepared,
-    placement: int,
-    variant: str = "half_step",
-    T_head_lrf: RigidTransform | None = None,
-) -> tuple[MeasuredBoard, frozenset[str]]:
-    """Measure the board's outline in the cloud of a placement by least squares.
-
-    Sides of which less than 40 % is seen are missing: a stub does not carry a line to its corners.
-
-    Parameters
-    ----------
-    prepared : Prepared
-    placement : int
-    variant : {'half_step', 'last_beam'}
-    T_head_lrf : RigidTransform, optional
-        The session's own platform when left out.
-
-    Returns
-    -------
-    board : MeasuredBoard
-    across : frozenset of str
-        The edges found across the scan lines (where the sweep enters or leaves the board): their
-        place hangs on the pitch.
-
-    Raises
-    ------
-    DegenerateGeometry
-        If the sweep does not cross enough scan lines to span a plane.
-    """
-    source = in_platform(placement, platform_of(prepared, T_head_lrf))
-    p_lrf, pitch, _ = face_points(prepared.scans[placement])
-    sides = {}
-    across = set()
-    for side in named_sides(prepared, placement, variant, LEAST_STRETCH):
-        sides[side.name] = source.points(side.points, side.pitch)
-        if side.across:
-            across.add(side.name)
-    board = measure_board(source.points(p_lrf, pitch), sides, prepared.board.edges)
-    return board, frozenset(across)
 
 
 def measure_board(
@@ -132,11 +85,9 @@ def plane_frame(points: np.ndarray) -> np.ndarray:
     """A frame (4, 4) in the plane of points: origin in their middle, z towards their origin."""
     away, distance, _ = geometry.fit_plane(points)
     normal = -away
-    across = np.linalg.svd(geometry.hat(normal))[2][0]
     centre = np.nanmean(points, axis=0)
     pose = np.eye(4)
-    pose[:3, 0] = across
-    pose[:3, 1] = np.cross(normal, across)
+    pose[:3, :2] = geometry.plane_axes(normal).T
     pose[:3, 2] = normal
     pose[:3, 3] = centre - normal * (normal @ centre + distance)
     return pose

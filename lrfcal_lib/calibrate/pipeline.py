@@ -14,13 +14,14 @@ from lrfcal_lib.calibrate.cameras import (
     PlatformCalibration,
     calibrate_cameras,
     calibrate_platform,
+    result_problem,
     stated_covariance,
 )
+from lrfcal_lib.calibrate.joint_observations import observe_joint
 from lrfcal_lib.calibrate.naming import name_sides
 from lrfcal_lib.calibrate.observe import (
     observe,
     observe_all,
-    observe_joint,
     platform_observations,
 )
 from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig, joint_rig
@@ -130,10 +131,15 @@ class Calibration:
         """Why a method has no result, of a camera where it takes them one by one; None if it has
         one.
         """
-        for problem in self.problems:
-            if (problem.method, problem.camera) == (method, camera):
-                return problem
-        return None
+        return result_problem(self.problems, method, camera)
+
+    def cameras(self, method: str) -> dict[str, Solution]:
+        """What a method says of every camera that it has a result of."""
+        return {
+            camera: solution
+            for (camera, name), solution in self.solutions.items()
+            if name == method
+        }
 
     def rig(self, method: str) -> CalibratedRig:
         """The rig as a method has it: its cameras, the axis that goes with them, and what is known
@@ -156,15 +162,12 @@ class Calibration:
         if self.joint is not None and method == "joint":
             rig = joint_rig(self.joint.solution, self.prepared.models)
             return replace(rig, axis=axis, lrf=session.lrf, session=session.name)
-        solved = {}
+        solved = self.cameras(method)
         cameras = {}
-        for (camera, name), solution in self.solutions.items():
-            if name == method:
-                on_base = self.observations[camera, "half_step"].source == "platform"
-                mount = "platform" if on_base else "head"
-                model = solution.model or self.prepared.models[camera]
-                cameras[camera] = CalibratedCamera(solution.transform, mount, model)
-                solved[camera] = solution
+        for camera, solution in solved.items():
+            mount = session.cameras[camera].mount
+            model = solution.model or self.prepared.models[camera]
+            cameras[camera] = CalibratedCamera(solution.transform, mount, model)
         noise = [scan.sigma_range for scan in self.prepared.scans.values()]
         uncertainty = uncertainty_one_by_one(
             axis.covariance,
@@ -437,9 +440,8 @@ def with_joint(calibration: Calibration, joint: JointCalibration | Problem) -> C
     platform = calibration.platform
     observations = dict(calibration.observations)
     solutions = dict(calibration.solutions)
-    outlines: dict = {}
     for camera in joint.observations.cameras:
-        observations[camera, "joint"] = joint.seen_by(camera, outlines=outlines)
+        observations[camera, "joint"] = joint.seen_by(camera)
         solutions[camera, "joint"] = joint.solution.camera(camera)
     covariance = stated_covariance(platform.stated_sigma)
     if joint.settings["axis"]:  # scan lines of one pitch say nothing about it
@@ -498,8 +500,7 @@ def handed_over(calibration: Calibration) -> str | None:
     if joint is not None and joint.solution.converged and not joint.solution.unobservable:
         return "joint"
     half_step = {
-        camera: observations
-        for (camera, variant), observations in calibration.observations.items()
-        if variant == "half_step"
+        camera: calibration.observations[camera, "half_step"]
+        for camera in calibration.prepared.views
     }
     return best_method(half_step, calibration.solutions)

@@ -4,6 +4,7 @@ in bounded memory.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -167,7 +168,8 @@ class _Blocks:
         self.T_head_lrf = T_head_lrf
         self.corrections = corrections
         self.lrf = lrf
-        self.after = None
+        self.rate = np.zeros(len(sweep.pitch))
+        self.after = np.zeros(len(sweep.bearings))
         if continuous and len(sweep.pitch) > 1:
             self.rate = np.gradient(sweep.pitch, sweep.time_s)
             self.after = after_middle(sweep.bearings, lrf)
@@ -186,7 +188,9 @@ class _Blocks:
         high = min(len(sweep.ranges), stop + MARGIN)
         ranges = sweep.ranges[low:high].astype(float)
         p_lrf = self.corrections.points(polar_to_points(ranges, sweep.bearings))
-        pitch = self.corrections.pitch(sweep.placement, self._pitch(slice(low, high)))
+        # of every beam: between scan lines the mirror turns while the head moves
+        recorded = sweep.pitch[low:high, None] + self.rate[low:high, None] * self.after
+        pitch = self.corrections.pitch(sweep.placement, recorded)
         points = lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
         hiding = points
         good = self.sound.get(start, np.isfinite(ranges))
@@ -207,15 +211,6 @@ class _Blocks:
             hiding=hiding[inner],
             good=good[inner],
         )
-
-    def _pitch(self, lines):
-        """Recorded pitch of every beam, shape (l, B): between scan lines the mirror turns while
-        the head moves.
-        """
-        pitch = self.sweep.pitch[lines, None]
-        if self.after is None:
-            return np.repeat(pitch, len(self.sweep.bearings), axis=1)
-        return pitch + self.rate[lines, None] * self.after
 
 
 def after_middle(bearings: np.ndarray, lrf: LrfInfo) -> np.ndarray:
@@ -271,16 +266,15 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     least, middle, _ = np.moveaxis(variances, -1, 0)
     known = (share > 1 / 3) & (middle > LEAST_SPREAD)
     rough = np.where(known, np.maximum(least, 0.0), np.inf)
-    # the middles of the nine windows, (2, 9, l, b)
-    shifts = WINDOW * (np.indices((3, 3)).reshape(2, 9, 1, 1) - 1)
-    last = np.array(valid.shape)[:, None, None, None] - 1
-    places = np.clip(np.indices(valid.shape)[:, None] + shifts, 0, last)
-    flat = np.where(valid, rough[tuple(places)], np.inf)
-    chosen = np.argmin(flat, axis=0)[None]
-    best = np.take_along_axis(flat, chosen, axis=0)[0]
-    line, beam = np.take_along_axis(places, chosen[None], axis=1)[:, 0]
-    normals = directions[..., 0][line, beam]
-    sign = np.where(np.isfinite(best), 1.0, np.nan)
-    sign[np.sum(normals * (points - origins), axis=-1) > 0] = -1.0
-    scatter = np.sqrt(np.where(np.isfinite(best), best, np.nan))
-    return sign[..., None] * normals, scatter
+    normals = np.full(points.shape, np.nan)
+    flattest = np.full(valid.shape, np.inf)
+    lines, beams = map(np.arange, valid.shape)
+    for shift in product((-WINDOW, 0, WINDOW), repeat=2):  # to the middles of the windows
+        line = np.clip(lines + shift[0], 0, lines[-1])
+        window = np.ix_(line, np.clip(beams + shift[1], 0, beams[-1]))
+        flatter = valid & (rough[window] < flattest)
+        flattest[flatter] = rough[window][flatter]
+        normals[flatter] = directions[..., 0][window][flatter]
+    away = np.sum(normals * (points - origins), axis=-1) > 0
+    normals[away] *= -1
+    return normals, np.sqrt(np.where(np.isfinite(flattest), flattest, np.nan))

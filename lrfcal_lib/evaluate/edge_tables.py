@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtri
 
 from lrfcal_lib.calibrate.combined import combined_outlines
-from lrfcal_lib.calibrate.outline import outline_of
+from lrfcal_lib.calibrate.observe import outline_of
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth
 from lrfcal_lib.model import geometry

@@ -61,9 +61,8 @@ def calibration_record(
         **rig_record(calibration.rig(method)),
     }
     record["platform"]["axis_covariance_of"] = AXIS_PARAMETERS
-    for (camera, name), solution in calibration.solutions.items():
-        if name == method:
-            record["cameras"][camera] |= _camera(calibration, camera, method, solution)
+    for camera, solution in calibration.cameras(method).items():
+        record["cameras"][camera] |= _camera(calibration, camera, method, solution)
     if calibration.joint is not None and method == "joint":
         record["sensor"] = _sensor(calibration.joint.solution)
     # numbers of this recording stand behind those of the rig, hashes last

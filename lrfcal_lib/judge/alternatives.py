@@ -232,26 +232,18 @@ def doubt_about(kind, alternative, solution, admitted_offset):
 
     The standard deviation is the larger one of noise and scatter over placements.
     """
-    names = solution.solution.names
+    names = np.array(solution.solution.names)
     score = solution.score(alternative.change(solution.observations, STEP), STEP)
-    information = score.information.sum(axis=0)
-    gradient = score.gradient.sum(axis=0)
-    if "range_offset" in names:
-        where = names.index("range_offset")
-        expected = 1 / (ADMITTED * admitted_offset) ** 2
-        information[where, where] += expected
-        gradient[where] += expected * solution.sensor["range_offset"]
-    covariance = np.linalg.pinv(information, rcond=1e-13, hermitian=True)
-    step = -covariance @ gradient
+    expected = np.append(names == "range_offset", 0) / (ADMITTED * admitted_offset) ** 2
+    covariance, step, pulls = score.solved(expected, solution.sensor["range_offset"])
     value = float(step[-1])
-    # what each placement still pulls at the value found
-    pulls = (score.gradient + score.information @ step) @ covariance[-1]
+    pulls = pulls[:, -1]
     freedom = max(len(pulls) - 1, 1)
     noise = covariance[-1, -1]
     scatter = np.sum(pulls**2) * len(pulls) / freedom
     sigma = float(np.sqrt(max(noise, scatter)))
 
-    handed = [i for i, name in enumerate(names) if name not in SENSOR]
+    handed = np.flatnonzero(~np.isin(names, SENSOR))
     # what the accuracy of the angular step may do must not hide that it is wrong
     spread = np.sqrt(solution.solution.trusted_sigma**2 - solution.step**2)[handed]
     moves = covariance[handed, -1] / max(noise, 1e-300) * value / spread

@@ -7,13 +7,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc, fdtrc
 
+from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose
 from lrfcal_lib.preprocess.bundle import adjust_robust
-from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.joint_solution import JointSolution
+from lrfcal_lib.solvers.joint_solution import RCOND, JointSolution, Score
 
 POSE = 6  # numbers of a camera's pose
 BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong
@@ -27,7 +27,6 @@ NOISY = 10.0  # residuals in units of the stated noise: an estimate that explain
 MOST_CHANGES = 3  # in one recording
 FEWEST_VIEWS = 3  # of a chessboard, for a focal length
 ALL_BUT_FOCAL_LENGTH = tuple(range(2, 9))  # of fx, fy, cx, cy, k1..k5
-RCOND = 1e-13
 
 
 @dataclass(frozen=True)
@@ -166,28 +165,21 @@ def likeliest_step(solution):
     A score test with all that was estimated free. Where placements scatter more than their noise
     explains, the statistic is measured by their scatter.
     """
-    placements = len(solution.observations.placements)
-    last = placements - BESIDE
-    if last < BESIDE:
-        return None
+    obs = solution.observations
     score = solution.score()
 
     tested = []
-    for camera, name in enumerate(solution.observations.cameras):
+    for camera, name in enumerate(obs.cameras):
         columns = solution.columns(f"{name}_")
-        for row in range(BESIDE, last + 1):
-            if _seen_beside(solution.observations, camera, row):
+        shown = np.unique(obs.view_placement[obs.view_camera == camera])
+        for row in range(len(obs.placements)):
+            before = np.searchsorted(shown, row)
+            if BESIDE <= before <= len(shown) - BESIDE:
                 tested.append(Step(camera, row, *_chance_of_step(score, columns, row)))
     best = min(tested, key=lambda step: step.p_value, default=None)
     if best is None or best.p_value * len(tested) > LEVEL:
         return None
     return best
-
-
-def _seen_beside(obs, camera, row):
-    """Whether a camera sees boards in enough placements before and after a row."""
-    shown = np.unique(obs.view_placement[obs.view_camera == camera])
-    return min(np.sum(shown < row), np.sum(shown >= row)) >= BESIDE
 
 
 def _chance_of_step(score, columns, row):
@@ -204,29 +196,27 @@ def _chance_of_step(score, columns, row):
     kept[~later, shared:] = 0.0
     both = kept[:, :, None] * kept[:, None, :]
     whole = both * score.information[:, repeated[:, None], repeated]
-    gradient = score.gradient[:, repeated] * kept
+    parted = Score(whole, score.gradient[:, repeated] * kept)
 
-    covariance = np.linalg.pinv(whole.sum(axis=0), rcond=RCOND, hermitian=True)
-    step = -covariance @ gradient.sum(axis=0)
+    covariance, step, pulls = parted.solved()
     information = np.linalg.pinv(covariance[-POSE:, -POSE:], rcond=RCOND, hermitian=True)
-    square = step[-POSE:] @ information @ step[-POSE:]
-    # what each placement still pulls at the value found: its scatter is that of the placements
-    pull = (gradient + whole @ step) @ covariance[:, -POSE:]
+    change = step[-POSE:]
+    square = change @ information @ change
+    pull = pulls[:, -POSE:]  # its scatter is that of the placements
     scatter = np.einsum("pi,ij,pj->", pull, information, pull) / POSE * count / (count - 1)
     p_value = fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0))
-    return float(p_value), step[-POSE:]
+    return float(p_value), change
 
 
 def largest_motion(solution, step, model):
     """By how many pixels the change of a Step moves a corner of a board in an image, at most."""
     obs = solution.observations
     poses = obs.view_pose[obs.view_camera == step.camera]
-    corners = obs.corners @ np.swapaxes(poses[:, :3, :2], 1, 2) + poses[:, None, :3, 3]
-    corners = corners.reshape(-1, 3)
+    corners = apply_pose(poses[:, :3], outline(solution))
     origin = solution.transforms[obs.cameras[step.camera]].translation
     turned = Rotation.from_rotvec(step.change[:3]).apply(corners - origin)
     motion = project(turned + origin + step.change[3:], model) - project(corners, model)
-    return float(np.max(np.linalg.norm(motion, axis=1)))
+    return float(np.max(np.linalg.norm(motion, axis=-1)))
 
 
 def with_two_poses(obs, step, name):
@@ -258,7 +248,7 @@ def change_between(solution, first, later, camera, prepared):
     square = both_parts @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ both_parts
 
     views = obs.view_camera == index
-    middle = [*obs.corners.mean(axis=0), 0.0]
+    middle = outline(solution).mean(axis=0)
     middles = RigidTransform.from_matrix(obs.view_pose[views]).apply(middle)
     motion = project(middles, model) - project(change.inv().apply(middles), model)
     after = int(obs.placements[obs.view_placement[views].min()])
@@ -286,27 +276,21 @@ def growth_of_focal_length(prepared, camera, placement):
     From the corners of the chessboard, the rest of the lens held; 0 and infinity where too few
     images show them.
     """
-    unknown = (0.0, np.inf)
-    if prepared.board.pattern is None:
-        return unknown
-    points = raised_points(prepared.board.pattern, prepared.relief)
     model = prepared.models[camera]
     lengths = []
     spreads = []
     for later in (False, True):
         views = [
             view
-            for number, view in prepared.views[camera].items()
+            for number, view in prepared.patterned(camera).items()
             if (number >= placement) is later
-            and view.pixels is not None
-            and not view.reason
         ]
         if len(views) < FEWEST_VIEWS:
-            return unknown
+            return 0.0, np.inf
         pixels = np.array([[view.pixels for view in views]])
         poses = RigidTransform.concatenate([view.T_camera_board for view in views])
         lens = adjust_robust(
-            pixels, points, [model], poses, fixed=ALL_BUT_FOCAL_LENGTH
+            pixels, prepared.pattern_points, [model], poses, fixed=ALL_BUT_FOCAL_LENGTH
         ).models[0]
         lengths.append(np.mean([lens.fx / model.fx, lens.fy / model.fy]))
         spreads.append(lens.covariance[:2, :2].mean() / model.fx**2)
@@ -322,7 +306,5 @@ def growth_by_depth(solution, camera):
     nearer = obs.view_pose.copy()
     nearer[obs.view_camera == camera, 2, 3] *= 1 + STEP
     score = solution.score(replace(obs, view_pose=nearer), STEP)
-    information = score.information.sum(axis=0)
-    covariance = np.linalg.pinv(information, rcond=RCOND, hermitian=True)
-    growth = -(covariance @ score.gradient.sum(axis=0))[-1]
-    return float(growth), float(np.sqrt(max(covariance[-1, -1], 0.0)))
+    covariance, step, _ = score.solved()
+    return float(step[-1]), float(np.sqrt(max(covariance[-1, -1], 0.0)))

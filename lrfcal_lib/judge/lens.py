@@ -5,7 +5,6 @@ import pandas as pd
 
 from lrfcal_lib.judge.findings import Finding, Kind, no_if
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import Prepared
 
 LENS_PARTS = np.array([6, 4])  # columns and rows that an image is cut into
@@ -30,18 +29,13 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
     list of Finding
         One a camera.
     """
-    if prepared.board.pattern is None:
-        return []
     findings = []
     for camera, model in prepared.models.items():
-        views = prepared.views[camera].values()
-        views = [view for view in views if view.pixels is not None and not view.reason]
+        views = list(prepared.patterned(camera).values())
         if not views:
             continue
         faults = []
-        miss = common_miss(
-            views, raised_points(prepared.board.pattern, prepared.relief), model
-        )
+        miss = common_miss(views, prepared.pattern_points, model)
         if miss > LENS_MISS:
             faults.append(
                 f"in parts of the images the corners of the chessboard lie {miss:.2f} px beside "

@@ -229,7 +229,7 @@ def pitches_of_images(boards, solution, models, field_of_view):
         size = np.array([models[name].width, models[name].height])
         for row, pitch in enumerate(LATTICE):
             T_camera_platform = solution.camera_at(name, pitch)
-            p_camera = T_camera_platform.apply(points.reshape(-1, 3)).reshape(points.shape)
+            p_camera = T_camera_platform.apply(points)
             # far outside the image a lens model would fold back
             uv = pinhole(p_camera, models[name])
             inside = (uv > MARGIN * size) & (uv < size - MARGIN * size)

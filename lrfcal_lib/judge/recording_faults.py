@@ -9,8 +9,8 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtri
 
+from lrfcal_lib.calibrate.observe import observe
 from lrfcal_lib.calibrate.pipeline import Calibration
-from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.judge.alternatives import LEVER, far_axis, guesses_of
 from lrfcal_lib.judge.camera_changes import camera_changes, explains
@@ -20,8 +20,6 @@ from lrfcal_lib.model.geometry import (
     lrf_to_platform,
     transform_difference,
 )
-from lrfcal_lib.model.kinematics import SourceFrame
-from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -61,50 +59,59 @@ class Reading:
     kind : {'sense', 'unit', 'numbers'}
     words : str
         What is wrong if this way is right, and what to do about it.
-    ranges, pitch, image_pitch : float
-        Factors on what was recorded; the pitch is that of scans and images.
-    turned_round : bool
-        Bearings count the other way.
-    mirrored : bool
-        Images are mirrored.
+    length, turn, image_turn : float
+        Factors on ranges, on the pitch of scans and images, and on that of images.
+    across, image_across : float
+        -1 where bearings count the other way, and where images are mirrored.
     ahead : int
         By how much the placement numbers of images are ahead of those of scans.
     """
 
     kind: str
     words: str
-    ranges: float = 1.0
-    pitch: float = 1.0
-    image_pitch: float = 1.0
-    turned_round: bool = False
-    mirrored: bool = False
+    length: float = 1.0
+    turn: float = 1.0
+    image_turn: float = 1.0
+    across: float = 1.0
+    image_across: float = 1.0
     ahead: int = 0
 
-    def apply(self, points, pitch):
-        """Points (n, 3) of the range finder and their pitch (n,), read this way."""
-        points = self.ranges * points
-        if self.turned_round:
-            points = points * [-1.0, 1.0, 1.0]
-        return points, self.pitch * pitch
+    def points(self, p_lrf):
+        """Measured points (n, 3), read this way."""
+        return self.length * p_lrf * [self.across, 1.0, 1.0]
+
+    def pitch(self, placement, recorded):
+        """The recorded pitch of a placement, read this way."""
+        return self.turn * recorded
+
+    def view(self, view):
+        """A BoardView, read this way: the mirror image of a chessboard is one."""
+        mirror = np.diag([self.image_across, 1.0, 1.0, 1.0])
+        pose = mirror @ view.T_camera_board.as_matrix() @ mirror
+        return replace(
+            view,
+            pitch=self.image_turn * view.pitch,
+            T_camera_board=RigidTransform.from_matrix(pose),
+        )
 
 
 AS_STATED = Reading("", "")
 MIRRORED = Reading(
     "sense",
     "the images of all cameras are mirrored (turn mirroring off in the cameras, or flip them)",
-    mirrored=True,
+    image_across=-1.0,
 )
 SENSES = (
     MIRRORED,
     Reading(
         "sense",
         "bearings are counted in the opposite direction (reverse the columns of the ranges)",
-        turned_round=True,
+        across=-1.0,
     ),
     Reading(
         "sense",
         "the pitch has the opposite sign (positive pitch lifts the view: change the sign)",
-        pitch=-1.0,
+        turn=-1.0,
     ),
 )
 IMAGES = (
@@ -121,24 +128,24 @@ IMAGES = (
     Reading(
         "unit",
         "pitch_deg in images.csv is in radians: multiply it by 57.29578",
-        image_pitch=180 / np.pi,
+        image_turn=180 / np.pi,
     ),
     Reading(
         "sense",
         "pitch_deg in images.csv has the opposite sign to the pitch of the scans",
-        image_pitch=-1.0,
+        image_turn=-1.0,
     ),
 )
 UNITS = (
     Reading(
         "unit",
         "the recorded pitch is in radians where degrees are asked for: multiply it by 57.29578",
-        pitch=180 / np.pi,
+        turn=180 / np.pi,
     ),
-    Reading("unit", "the ranges are in inches: multiply them by 0.0254", ranges=0.0254),
-    Reading("unit", "the ranges are in feet: multiply them by 0.3048", ranges=0.3048),
-    Reading("unit", "the ranges are in centimetres: divide them by 100", ranges=0.01),
-    Reading("unit", "the ranges are in millimetres: divide them by 1000", ranges=0.001),
+    Reading("unit", "the ranges are in inches: multiply them by 0.0254", length=0.0254),
+    Reading("unit", "the ranges are in feet: multiply them by 0.3048", length=0.3048),
+    Reading("unit", "the ranges are in centimetres: divide them by 100", length=0.01),
+    Reading("unit", "the ranges are in millimetres: divide them by 1000", length=0.001),
 )
 
 
@@ -158,12 +165,9 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     prepared = calibration.prepared
     joint = calibration.joint
     session = prepared.session
-    found = faults_of_files(session)
-    found += dark_images(session)
-    if hopeless(joint):
-        misread = misread_recording(prepared)
-        if misread:
-            return found + misread
+    found = faults_of_files(session) + dark_images(session)
+    if hopeless(joint) and (misread := misread_recording(prepared)):
+        return found + misread
     if joint is not None:
         changes = camera_changes(joint.solution, prepared, joint.settings)
         found += faults_of_changes(changes, tuple(prepared.views))
@@ -210,8 +214,7 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     if 0 < len(mirrored) < len(stated):
         return mirrored
 
-    groups: tuple[tuple[Reading, ...], ...] = (SENSES, IMAGES, UNITS)
-    for group in groups:
+    for group in (SENSES, IMAGES, UNITS):
         misses = {reading: board_misses(prepared, reading) for reading in group}
         fitting = {reading: miss for reading, miss in misses.items() if _fits(miss, stated)}
         if fitting:
@@ -255,52 +258,20 @@ def board_misses(prepared, reading):
     misses = {}
     noise = np.median([scan.sigma_range for scan in prepared.scans.values()])
     for camera in prepared.views:
-        obs = plane_observations(prepared, camera, reading)
+        views = {
+            placement - reading.ahead: reading.view(view)
+            for placement, view in prepared.posed(camera).items()
+        }
+        read = replace(prepared, views={camera: views}, names={})
+        obs = observe(read, camera, corrections=reading, faces=POINTS)
         with suppress(DegenerateGeometry, np.linalg.LinAlgError):
             transform = solve_camera(obs, "zhang_pless_printed").transform
             residuals = pd.Series(np.abs(plane_residuals_m(obs, transform)))
             each = residuals.groupby(obs.plane_placement).median()
-            square = each.median() ** 2 - (HALF * reading.ranges * noise) ** 2
+            square = each.median() ** 2 - (HALF * reading.length * noise) ** 2
             size = float(np.sqrt(max(square, LEAST_MISS**2)))
             misses[camera] = BoardMiss(size, transform, planes=len(each))
     return misses
-
-
-def plane_observations(prepared, camera, reading):
-    """CameraObservations of the faces of boards only, with the platform as stated and a Reading."""
-    mount = prepared.session.cameras[camera].mount
-    T_head_lrf = platform_of(prepared)
-    views = {
-        placement - reading.ahead: view
-        for placement, view in prepared.views[camera].items()
-        if view.T_camera_board is not None
-    }
-    poses = np.array([view.T_camera_board.as_matrix() for view in views.values()]).reshape(
-        -1, 4, 4
-    )
-    if reading.mirrored:
-        # the mirror image of a chessboard is one: normal and place are mirrored
-        mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
-        poses = mirror @ poses @ mirror
-
-    points = [np.zeros((0, 3))]
-    placements = [np.zeros(0, int)]
-    for placement in views.keys() & prepared.scans.keys():
-        image_pitch = 0.0
-        if mount == "head":
-            image_pitch = reading.pitch * reading.image_pitch * views[placement].pitch
-        p_lrf, pitch, _ = face_points(prepared.scans[placement], POINTS)
-        frame = SourceFrame(T_head_lrf, mount, image_pitch)
-        points.append(frame.apply(*reading.apply(p_lrf, pitch)))
-        placements.append(np.full(len(pitch), placement))
-    return CameraObservations(
-        model=prepared.models[camera],
-        camera=camera,
-        placements=np.array(list(views), int),
-        board_poses=poses,
-        plane_points=np.concatenate(points),
-        plane_placement=np.concatenate(placements),
-    )
 
 
 def shows_boards(session, reading):
@@ -313,8 +284,8 @@ def shows_boards(session, reading):
             sweep = session.sweep(placement)
             sweep = replace(
                 sweep,
-                ranges=reading.ranges * sweep.ranges,
-                pitch=reading.pitch * sweep.pitch,
+                ranges=reading.length * sweep.ranges,
+                pitch=reading.turn * sweep.pitch,
             )
             find_board(sweep, session.board, session.T_head_lrf, session.lrf)
             found += 1
@@ -403,13 +374,9 @@ def exchanged_placements(calibration):
     prepared = calibration.prepared
     joint = calibration.joint
     session = prepared.session
-    lost = [
-        p
-        for p in session.board_placements
-        if p in prepared.left_out or p in joint.solution.excluded_placements
-    ]
+    lost = prepared.left_out | joint.solution.excluded_placements
     scans = {}
-    for placement in lost[:MOST_LOST]:
+    for placement in [p for p in session.board_placements if p in lost][:MOST_LOST]:
         with suppress(BoardNotFound, SessionError):
             sweep = session.sweep(placement)
             scans[placement] = find_board(
@@ -443,8 +410,8 @@ def _same_board(calibration, scan, placement):
     p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
     agree = []
     for camera in solution.transforms:
-        view = prepared.views[camera].get(placement)
-        if view is not None and view.T_camera_board is not None:
+        view = prepared.posed(camera).get(placement)
+        if view is not None:
             T_camera_platform = solution.camera_at(camera, view.pitch)
             on_board = (view.T_camera_board.inv() * T_camera_platform).apply(p_platform)
             beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)

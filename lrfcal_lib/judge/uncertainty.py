@@ -21,6 +21,7 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
     tilt,
 )
+from lrfcal_lib.preprocess.prepared import PitchNoise
 
 # a motion that moves a point less than this, relative to all others, does not matter to it
 SEEN = 1e-3
@@ -142,11 +143,10 @@ def projection_sigma(
     )
     points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
     P, *_ = project_jacobians(points, model)
-    offset, stretch = chain.sweep_sigma
-    sigma_pitch = np.hypot(offset, stretch * (pitch - np.mean(pitches)))
+    sigma_pitch = PitchNoise(*chain.sweep_sigma).sigma(pitch, sum(pitches) / 2)
     if chain.on_head:  # the offset is that of the image, too
-        sigma_pitch = stretch * (pitch - image_pitch)
-    by_sweep = sigma_pitch * np.linalg.norm((P @ by_pitch[..., None])[..., 0], axis=-1)
+        sigma_pitch = chain.sweep_sigma[1] * (pitch - image_pitch)
+    by_sweep = sigma_pitch * np.linalg.norm(np.matvec(P, by_pitch), axis=-1)
     sigma = np.hypot(spread(chain, P @ by_link), by_sweep)
     low, high = pitches
     return np.where((pitch >= low) & (pitch <= high), sigma, np.nan)
@@ -190,9 +190,8 @@ def point_sigma(
     """
     away = np.reshape(distances, (-1, 1, 1))
     _, by_link, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
-    offset, stretch = chain.sweep_sigma
-    sigma_pitch = np.hypot(offset, stretch * (pitches - reference))[:, None]
-    by_sweep = sigma_pitch * np.linalg.norm(by_pitch, axis=-1)
+    sigma_pitch = PitchNoise(*chain.sweep_sigma).sigma(pitches, reference)
+    by_sweep = sigma_pitch[:, None] * np.linalg.norm(by_pitch, axis=-1)
     return np.hypot(spread(chain, by_link), by_sweep)
 
 

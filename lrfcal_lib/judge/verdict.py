@@ -3,7 +3,6 @@ report.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import stdtrit
@@ -20,8 +19,8 @@ from lrfcal_lib.judge.uncertainty import (
     chain_of,
     point_sigma,
     projection_sigma,
+    range_noise,
     root_mean_square,
-    uncertainty_of,
 )
 from lrfcal_lib.judge.weaknesses import (
     FEW,
@@ -205,9 +204,13 @@ def judge(
         return _refused(calibration, findings)
 
     if method == "joint" and joint is not None:
-        field = prepared.session.lrf.field_of_view
-        options: dict[str, Any] = {"suggest": suggest, "doubt": doubt}
-        judged = verdict(joint.solution, prepared.models, field_of_view=field, **options)
+        judged = verdict(
+            joint.solution,
+            prepared.models,
+            suggest=suggest,
+            doubt=doubt,
+            field_of_view=prepared.session.lrf.field_of_view,
+        )
     else:
         judged = _without_joint(calibration, method, doubt)
     lost = left_out(calibration, method)
@@ -273,11 +276,12 @@ def _expected(rig, pitch, doubt):
     """A Verdict by the errors that are to be expected of a rig over the recorded pitch (n,), not a
     narrow strip, where all ranges may be wrong by `doubt` (metres) beside what is known.
     """
-    low = pitch.min(initial=np.inf)
-    high = pitch.max(initial=-np.inf)
-    middle = (low + high) / 2 if len(pitch) else 0.0
-    field = (min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD))
-    middle = sum(field) / 2
+    middle = 0.0
+    half = LEAST_FIELD
+    if len(pitch):
+        middle = (pitch.min() + pitch.max()) / 2
+        half = max(np.ptp(pitch) / 2, LEAST_FIELD)
+    field = (middle - half, middle + half)
     pitches = np.linspace(*field, PITCHES)
     chain = chain_of(rig).doubted(doubt)
     cloud = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
@@ -292,12 +296,7 @@ def _expected(rig, pitch, doubt):
         pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
         errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud[i])), pixels)
 
-    judged = Verdict(
-        YES,
-        (),
-        errors,
-        range_noise_mm=1000 * uncertainty_of(rig).range_noise,
-    )
+    judged = Verdict(YES, (), errors, range_noise_mm=1000 * range_noise(rig))
     large = errors[WORKING].words(POOR_MM, POOR_PX)
     if not large:
         return judged
@@ -313,11 +312,9 @@ def _refused(calibration, findings):
     """
     prepared = calibration.prepared
     at_once = calibration.problem("joint")
-    if at_once is not None:
-        why = at_once.words
-    else:
-        words = dict.fromkeys(problem.words for problem in calibration.problems)
-        why = "; ".join([*words][:3])
+    problems = calibration.problems if at_once is None else [at_once]
+    words = dict.fromkeys(problem.words for problem in problems)
+    why = "; ".join([*words][:3])
     if not prepared.views:
         lost = prepared.problems_of(ProblemKind.NO_IMAGES)
         why = lost[0].words if lost else "the session has no camera"
@@ -347,10 +344,7 @@ def _scatter_note(placements):
 def _without_joint(calibration, method, doubt):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
     prepared = calibration.prepared
-    solved = {}
-    for (camera, name), solution in calibration.solutions.items():
-        if name == method:
-            solved[camera] = solution
+    solved = calibration.cameras(method)
     pitch = np.concatenate([scan.sweep.pitch for scan in prepared.scans.values()])
     judged = _expected(calibration.rig(method), pitch, doubt)
     findings = [_not_joint(calibration)]
@@ -364,7 +358,7 @@ def _without_joint(calibration, method, doubt):
     for camera in prepared.views:
         if camera not in solved:
             problem = calibration.problem(method, camera)
-            why = "no result" if problem is None else problem.words
+            why = problem.words if problem else "no result"
             words = f"camera '{camera}' is not handed over ({why})"
             findings.append(Finding(CARE, Kind.CAMERAS, words))
     for camera, solution in solved.items():
@@ -378,7 +372,7 @@ def _without_joint(calibration, method, doubt):
             findings.append(Finding(NO, Kind.SECOND_MINIMUM, words))
     sweeps = any(np.ptp(scan.sweep.pitch) > LEAST_SWEEP for scan in prepared.scans.values())
     unknown = calibration.platform.problem("combined")
-    if unknown is not None and sweeps:
+    if unknown and sweeps:
         findings.append(Finding(NO, Kind.FAR_FROM_STATED, unknown.words))
     return judged.because(findings)
 
@@ -386,16 +380,12 @@ def _without_joint(calibration, method, doubt):
 def _not_joint(calibration):
     """The Finding that another method than the joint estimate is handed over, and why."""
     joint = calibration.joint
-    answer = NO
     at_once = calibration.problem("joint")
-    why = "another method was asked for" if at_once is None else at_once.words
+    bad = [at_once.words] if at_once else []
     if joint is not None:
-        bad = [
-            finding.words for finding in diagnose(joint.solution) if finding.answer == NO
-        ]
-        why = "; ".join(bad) or why
-        if joint.solution.converged:
-            answer = CARE
-    return Finding(
-        answer, Kind.HANDED_OVER, f"the joint estimate is not handed over ({why})"
-    )
+        findings = diagnose(joint.solution)
+        bad = [finding.words for finding in findings if finding.answer == NO]
+    why = "; ".join(bad) or "another method was asked for"
+    severe = joint is None or not joint.solution.converged
+    words = f"the joint estimate is not handed over ({why})"
+    return Finding(no_if(severe), Kind.HANDED_OVER, words)

@@ -17,8 +17,14 @@ from lrfcal_lib.plots.rig import SQUARE, Vector, look_at
 
 # of a box: the axis along which a face lies at the low or at the high end
 SIDES = tuple(product(range(3), (0, 1)))
-DIMENSION = {"arrowstyle": "<|-|>", "color": COLORS["truth"], "linewidth": 0.9}
-ARROW = DIMENSION | {"arrowstyle": "-|>", "linewidth": 1.8}
+DIMENSION = {
+    "arrowstyle": "<|-|>",
+    "color": COLORS["truth"],
+    "linewidth": 0.9,
+    "shrinkA": 0,
+    "shrinkB": 0,
+}
+ARROW = {"arrowstyle": "-|>", "linewidth": 1.8, "shrinkA": 0}
 Place = tuple[float, float]
 
 
@@ -43,8 +49,8 @@ class View:
 
     def flat(self, points: ArrayLike) -> np.ndarray:
         """Where points (..., 3), metres, stand on the axes, (..., 2)."""
-        seen = self.T_view.apply(np.reshape(points, (-1, 3)))
-        return (seen[:, :2] / seen[:, 2:]).reshape(np.shape(points)[:-1] + (2,))
+        seen = self.T_view.apply(np.asarray(points, float))
+        return seen[..., :2] / seen[..., 2:]
 
     def line(self, points: ArrayLike, style: str = "-", **looks: Any) -> None:
         """A line through points (n, 3), metres."""
@@ -65,13 +71,15 @@ class View:
         color: str = COLORS["truth"],
     ) -> None:
         """A text beside a point (3,), so many printer's points to the right and up."""
-        looks = {"xytext": away, "textcoords": "offset points", "color": color}
-        self.ax.annotate(text, self.flat(point), **looks, **CENTRED)
+        place = self.flat(point)
+        self.ax.annotate(
+            text, place, away, textcoords="offset points", color=color, **CENTRED
+        )
 
     def arrow(self, ends: ArrayLike, color: str) -> None:
         """From one to the other of two points (2, 3)."""
         start, end = self.flat(ends)
-        self.ax.annotate("", end, start, arrowprops=ARROW | {"color": color, "shrinkA": 0})
+        self.ax.annotate("", end, start, arrowprops=ARROW | {"color": color})
         self.ax.update_datalim([start, end])
 
     def frame(self, T: RigidTransform, length: float, names: str = "xyz") -> None:
@@ -84,9 +92,7 @@ class View:
     def dimension(self, ends: ArrayLike, text: str, away: Place = (0, 8)) -> None:
         """The distance of two points (2, 3) as in a drawing of a machine."""
         start, end = self.flat(ends)
-        self.ax.annotate(
-            "", end, start, arrowprops=DIMENSION | {"shrinkA": 0, "shrinkB": 0}
-        )
+        self.ax.annotate("", end, start, arrowprops=DIMENSION)
         self.name(np.asarray(ends).mean(axis=0), text, away)
 
     def box(self, T: RigidTransform, low: ArrayLike, high: ArrayLike, color: str) -> None:
@@ -190,7 +196,7 @@ def image_of_edges(
         uv[f"{name} on a{other}"] = foot
         ax.plot(*ends.T, color=color, label=f"image line a{other}")
         ax.plot(*uv[name], "o", color=COLORS["lrf"], markersize=6)
-        ax.annotate("", foot, uv[name], arrowprops=DIMENSION | {"shrinkA": 0, "shrinkB": 0})
+        ax.annotate("", foot, uv[name], arrowprops=DIMENSION)
         beside = np.sign(uv[name] - foot) * [30, -16]  # v runs downwards
         words = f"{name}, off by\nd({name}, a{other})"
         ax.annotate(words, uv[name], beside, textcoords="offset points", **CENTRED)

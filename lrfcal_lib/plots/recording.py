@@ -144,17 +144,18 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
     bearing = np.degrees(scan.sweep.bearings[near])
     raw = scan.sweep.ranges[line, near]
     board = scan.mask[line, near]
-    top = scan.fitted[line, near][board].max() + HEADROOM
-    shown = raw < top
-    ax.plot(bearing[shown], raw[shown], "o", color=COLORS["raw"], markersize=6, label="raw")
-    farther = raw >= top
-    if farther.any():
-        words = f"raw, farther: {raw[farther].min():.2f} to {raw[farther].max():.2f} m"
-        edge = 0 * raw[farther] + top
-        looks = {"color": COLORS["raw"], "clip_on": False, "label": words}
-        ax.plot(bearing[farther], edge, "^", **looks)
     filtered = scan.filtered[line, near][board]
     fitted = scan.fitted[line, near][board]
+    top = fitted.max() + HEADROOM
+    shown = raw < top
+    ax.plot(bearing[shown], raw[shown], "o", color=COLORS["raw"], markersize=6, label="raw")
+    farther = raw[raw >= top]
+    if farther.size:
+        words = f"raw, farther: {farther.min():.2f} to {farther.max():.2f} m"
+        edge = np.full(farther.shape, top)
+        ax.plot(
+            bearing[raw >= top], edge, "^", color=COLORS["raw"], clip_on=False, label=words
+        )
     ax.plot(bearing[board], filtered, "x", color=COLORS["truth"], label="filtered")
     ax.plot(bearing[board], fitted, color=COLORS["fit"], label="line fitted to the board")
     for crossed, style in zip(edges, ("--", "-"), strict=False):
@@ -271,11 +272,13 @@ def board_view(
         ax.plot(*view.pixels.T, "+", color=COLORS["filtered"], markersize=4, mew=0.8)
         drawn.append(view.pixels)
     box = {"facecolor": color, "edgecolor": "none", "boxstyle": "round,pad=0.2"}
-    looks: dict[str, Any] = {"color": "white", "fontsize": 8, "bbox": box, "clip_on": True}
     for edge in view.edges:
         stretch = stretch_in_image(edge, model)
         ax.plot(*stretch.T, color=color, linewidth=1.6)
-        ax.text(*stretch.mean(axis=0), edge.name, **looks, **CENTRED)
+        u, v = stretch.mean(axis=0)
+        ax.text(
+            u, v, edge.name, color="white", fontsize=8, bbox=box, clip_on=True, **CENTRED
+        )
         drawn.append(stretch)
     title = f"{view.camera}, placement {view.placement}"
     if view.rejected:
@@ -317,9 +320,16 @@ def seen_points(
         ax.plot(*stretch.T, color="white", linewidth=1.0)
     if edges:
         ax.lines[-1].set_label("edge in the image")
-    looks = {"markersize": 4.5, "markerfacecolor": "none"}
     for index, (method, uv) in enumerate(points.items()):
-        ax.plot(*uv.T, styles[index], color=series(index + 1), label=method, **looks)
+        color = series(index + 1)
+        ax.plot(
+            *uv.T,
+            styles[index],
+            color=color,
+            label=method,
+            markersize=4.5,
+            markerfacecolor="none",
+        )
     ax.legend(frameon=True, framealpha=0.8, labelcolor="white", **DARK)
     _cut(ax, [*points.values(), *edges], image, margin)
     ax.set_title(f"{view.camera}, placement {view.placement}")

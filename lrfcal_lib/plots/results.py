@@ -1,7 +1,6 @@
 """Figures of results: bars, strips and points."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,10 +12,6 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots.colors import COLORS, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
-SPREAD: dict[str, Any] = {
-    "capsize": 2,
-    "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]},
-}  # of bars
 ROOM = 1.4  # of an axis of bars, times the longest: the legend stands beside them
 WORST = 4.0  # times the median: a placement that fits so badly is an outlier
 
@@ -94,8 +89,16 @@ def pitch_offsets(
     kinds = {1: "upwards", -1: "downwards", 0: "unknown"}
     for index, (sign, label) in enumerate(kinds.items()):
         rows = np.flatnonzero(np.equal(direction, sign))
-        looks = {"color": series(index), "label": label} | SPREAD
-        ax.bar(rows, offset[rows], 0.75, yerr=sigma[rows], **looks)
+        ax.bar(
+            rows,
+            offset[rows],
+            0.75,
+            yerr=sigma[rows],
+            color=series(index),
+            label=label,
+            capsize=2,
+            error_kw={"linewidth": 0.9, "ecolor": COLORS["truth"]},
+        )
     by_placement(ax, placement, "pitch offset [deg]")
     ax.legend(title="head moved", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
 
@@ -218,10 +221,15 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> N
     ax.plot(points.distance, points.residual, ",", color=COLORS["raw"], zorder=0)
     bins = points.groupby(pd.qcut(points.distance, BINS, duplicates="drop"), observed=True)
     means = bins.mean()
-    looks = {"fmt": "o-", "color": COLORS["lrf"], "capsize": 2.5}
-    error = bins.residual.sem()
-    label = "mean and its standard error"
-    ax.errorbar(means.distance, means.residual, error, label=label, **looks)
+    ax.errorbar(
+        means.distance,
+        means.residual,
+        bins.residual.sem(),
+        fmt="o-",
+        color=COLORS["lrf"],
+        capsize=2.5,
+        label="mean and its standard error",
+    )
     _zero(ax.axhline)
     limit = 1.05 * points.residual.abs().quantile(0.995)
     ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit))
@@ -251,8 +259,15 @@ def residuals_by_region(
         length = np.linalg.norm(shift, axis=1)
         unit = float(f"{length.max() / 2:.1g}")
         scale = length.max() / (model.width / 8)
-        looks = {"angles": "xy", "scale_units": "xy", "width": 0.005}
-        drawn = ax.quiver(*uv.T, *shift.T, scale=scale, color=color_of(name), **looks)
+        drawn = ax.quiver(
+            *uv.T,
+            *shift.T,
+            scale=scale,
+            color=color_of(name),
+            angles="xy",
+            scale_units="xy",
+            width=0.005,
+        )
         ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S")
         title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
     ax.set(xlim=(0, model.width), ylim=(model.height, 0), aspect="equal")
@@ -272,13 +287,24 @@ def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollecti
     limit
         Where colours end, and at its negative where there are negative values.
     """
-    shades: dict[str, Any] = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
+    shades = "magma"
+    low = 0.0
     if np.nanmin(values, initial=0.0) < 0:
-        shades = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+        shades = "RdBu_r"
+        low = -limit
     bearing = np.degrees(cloud.bearing)
     pitch = np.degrees(cloud.pitch)
     drawn = ax.scatter(
-        bearing, pitch, 2.5, values, marker="s", linewidths=0, rasterized=True, **shades
+        bearing,
+        pitch,
+        2.5,
+        values,
+        marker="s",
+        linewidths=0,
+        rasterized=True,
+        cmap=shades,
+        vmin=low,
+        vmax=limit,
     )
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
     ax.set(xlim=(bearing.max(), bearing.min()), ylim=(pitch.min(), pitch.max()))

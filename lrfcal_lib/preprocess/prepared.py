@@ -8,8 +8,10 @@ import numpy as np
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.problem import LEAVES_OUT, Problem, ProblemKind, Stage
+from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
+from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.outline_in_images import Outline
 from lrfcal_lib.preprocess.survey import small_squares, views_of
 from lrfcal_lib.session.cache import cached
@@ -143,6 +145,25 @@ class Prepared:
         list of Problem
         """
         return [problem for problem in self.problems if problem.kind == kind]
+
+    @property
+    def pattern_points(self) -> np.ndarray:
+        """Corners of the printed pattern as they lie on the sheet, board frame, metres, shape
+        (k, 3); none without a pattern.
+        """
+        if self.board.pattern is None:
+            return np.zeros((0, 3))
+        return raised_points(self.board.pattern, self.relief)
+
+    def posed(self, camera: str) -> dict[int, BoardView]:
+        """The views of a camera that know where the board is, by placement."""
+        views = self.views[camera].items()
+        return {p: view for p, view in views if view.T_camera_board is not None}
+
+    def patterned(self, camera: str) -> dict[int, BoardView]:
+        """The usable views of a camera that show the printed pattern, by placement."""
+        views = self.views[camera].items()
+        return {p: view for p, view in views if view.pixels is not None and not view.reason}
 
     def seen(self, camera, placement):
         """The board in an image of a placement, and the very image that it was found in: there may

@@ -150,14 +150,12 @@ def table(
     """
     places = digits if isinstance(digits, dict) else dict.fromkeys(df.columns, digits)
     # none shows a minus before a zero
-    shapes = {
-        c: f"{{:z.{places.get(c, 3)}f}}" for c in df.columns if df[c].dtype.kind == "f"
-    }
+    shapes = {c: f"{{:z.{places.get(c, 3)}f}}" for c in df.select_dtypes("floating")}
     shapes |= {c: "{:.2g}" for c in shapes if c == "p_value"}  # a small chance is not none
     if path := report_file(f"tables/{name}.csv"):
         df.to_csv(path, index=False, float_format="%.9g")
     shown = df.reset_index(drop=True)
-    for column in shown.columns[[kind.kind not in "biuf" for kind in shown.dtypes]]:
+    for column in shown.select_dtypes(exclude=["number", "bool"]):
         words = str if column == "source" else in_words  # a session is called as it is
         shown[column] = [
             v if v is None or isinstance(v, Number) else escape(words(v))

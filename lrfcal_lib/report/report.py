@@ -78,17 +78,17 @@ class Run:
     notebook: nbformat.NotebookNode
 
 
-def make_report(session_path, out=None, jobs=2, notebooks=None):
+def make_report(session_path, out, jobs=2, notebooks=None):
     """Execute the notebooks on a session and write the report.
 
     Parameters
     ----------
     session_path : path
         Folder of a session.
-    out : path, optional
-        Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written
-        beside it and takes its place when it is whole, by one rename: until then an earlier report
-        stays as it is. Files in it that are no report's are kept.
+    out : path
+        Folder of the report. It is written beside it and takes its place when it is whole, by one
+        rename: until then an earlier report stays as it is. Files in it that are no report's are
+        kept.
     jobs : int
         Notebooks executed at the same time.
     notebooks : sequence of path, optional
@@ -103,7 +103,7 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     begin = time.monotonic()
     session_path = Path(session_path).resolve()
     session = open_session(session_path)
-    out = Path(out or ROOT / "reports" / session_path.name).resolve()
+    out = Path(out).resolve()
     paths = sorted(NOTEBOOKS.glob(NUMBERED) if notebooks is None else map(Path, notebooks))
     # a fresh cache: a report stands for its session
     with in_place_of(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:
@@ -111,9 +111,9 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
             "LRFCAL_SESSION": str(session_path),
             "LRFCAL_REPORT": str(new),
             CACHE: cache,
+            # what notebook 09 records with the emulated rig goes with the report's cache
+            RECORDINGS: cache,
         }
-        # what notebook 09 records with the emulated rig goes with the report's cache
-        environment[RECORDINGS] = cache
         runs = _execute_all(paths, environment, jobs)
         found = {
             run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []}
@@ -142,13 +142,14 @@ def execute(path, environment):
     """
     notebook = nbformat.read(path, as_version=4)
     error = ""
-    place = {"metadata": {"path": str(Path(path).parent)}}
-    options = {
-        "kernel_name": "python3",
-        "record_timing": False,
-        "extra_arguments": ["--log-level=ERROR"],
-    }
-    client = NotebookClient(notebook, timeout=CELL_SECONDS, resources=place, **options)
+    client = NotebookClient(
+        notebook,
+        timeout=CELL_SECONDS,
+        resources={"metadata": {"path": str(Path(path).parent)}},
+        kernel_name="python3",
+        record_timing=False,
+        extra_arguments=["--log-level=ERROR"],
+    )
     _CLIENTS.add(client)
     try:
         client.execute(
@@ -240,9 +241,7 @@ def _stop(number, frame):
     raise KeyboardInterrupt(number)
 
 
-def report_session(
-    session: str | Path, out: str | Path | None = None, jobs: int = 2
-) -> int:
+def report_session(session: str | Path, out: str | Path | None, jobs: int) -> int:
     """Write the report of a session and say so: 0, or 1 if a notebook failed."""
     begin = time.monotonic()
     session = Path(session)
@@ -401,15 +400,14 @@ def write_pages(out, session, runs, found, seconds):
         body, *drawn[run.name] = page.render(
             run.notebook, found[run.name], numbers[run.name], out
         )
-        file = out / f"{run.name}.html"
-        around = {"before": before, "after": after}
         _write_page(
-            file,
+            out / f"{run.name}.html",
             "notebook.html.jinja",
             session=session,
             run=run,
             body=body,
-            **around,
+            before=before,
+            after=after,
         )
 
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]

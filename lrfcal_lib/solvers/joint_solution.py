@@ -37,6 +37,7 @@ WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "pitch_by_direction": "the pitch offset by sweep direction",
 }
 SWEEP_HELD = (0.0, 0.0)  # standard deviations of what is not unknown
+RCOND = 1e-13  # of what is determined at all
 NAMED = 0.3  # share of a direction's largest component from which an unknown is named
 
 
@@ -53,6 +54,30 @@ class Score:
 
     information: np.ndarray
     gradient: np.ndarray
+
+    def solved(
+        self, expected: float | np.ndarray = 0.0, off: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What follows where everything is free.
+
+        Parameters
+        ----------
+        expected : float or ndarray, shape (c,)
+            Information about unknowns that are expected to be smaller by `off`.
+        off : float
+
+        Returns
+        -------
+        covariance : ndarray, shape (c, c)
+        step : ndarray, shape (c,)
+            To the likeliest values.
+        pulls : ndarray, shape (p, c)
+            Where each placement still pulls them from there.
+        """
+        whole = self.information.sum(axis=0) + expected * np.eye(self.gradient.shape[1])
+        covariance = np.linalg.pinv(whole, rcond=RCOND, hermitian=True)
+        step = -covariance @ (self.gradient.sum(axis=0) + np.multiply(expected, off))
+        return covariance, step, (self.gradient + self.information @ step) @ covariance
 
 
 @dataclass(frozen=True)

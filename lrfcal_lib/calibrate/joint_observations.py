@@ -1,0 +1,120 @@
+"""What the joint estimate uses of a session: ranges, beams about edges, poses in images."""
+
+import numpy as np
+
+from lrfcal_lib.calibrate.observe import FACE_POINTS, stack
+from lrfcal_lib.model.observations import LENS, JointObservations, thin
+from lrfcal_lib.preprocess.board_in_image import BoardView
+from lrfcal_lib.preprocess.board_in_scan import face_points
+from lrfcal_lib.preprocess.edge_cells import edge_cells
+from lrfcal_lib.preprocess.prepared import Prepared
+from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
+
+CELLS_PER_EDGE = 160  # a placement
+
+
+def observe_joint(
+    prepared: Prepared, views: dict[str, list[BoardView]]
+) -> JointObservations:
+    """Everything that the joint estimate uses of a session, of the placements that are not left
+    out.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    views : dict of str to list of BoardView
+        By camera; :func:`lrfcal_lib.preprocess.survey.all_views` or some of them.
+
+    Returns
+    -------
+    JointObservations
+    """
+    session = prepared.session
+    board = prepared.board
+    scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.left_out}
+    if board.corners is None and board.pattern is not None:
+        # nobody knows the outline: no beam is named after the sides of the printed squares
+        corners = board.pattern.outline()
+    else:
+        corners = board.known_corners()
+    lens_covariance = np.zeros((len(views), LENS, LENS))
+    for number, camera in enumerate(views):
+        known = prepared.models[camera].covariance
+        if known is not None:
+            lens_covariance[number] = known
+    return JointObservations(
+        placements=np.array(list(scans), int),
+        direction=np.array([session.sweep_direction(p) for p in scans], int),
+        middle=np.array([float(np.mean(scan.sweep.pitch)) for scan in scans.values()]),
+        edges=tuple(board.edges),
+        corners=corners,
+        cameras=tuple(views),
+        mounts=tuple(session.cameras[camera].mount for camera in views),
+        T_head_lrf=session.T_head_lrf,
+        lens_covariance=lens_covariance,
+        **stack("face_", _ranges(scans)),
+        **stack("beam_", _beams(prepared, scans)),
+        **stack("view_", _views(prepared, views, list(scans))),
+    )
+
+
+def _ranges(scans):
+    """Ranges to the faces of boards, of placements by row: columns by name."""
+    for row, scan in enumerate(scans.values()):
+        p_lrf, pitch, _ = face_points(scan, FACE_POINTS)
+        yield {
+            "range": np.linalg.norm(p_lrf, axis=1),
+            "bearing": np.arctan2(p_lrf[:, 1], p_lrf[:, 0]),
+            "pitch": pitch,
+            "sigma": np.full(len(pitch), scan.sigma_range),
+            "placement": np.full(len(pitch), row),
+        }
+
+
+def _beams(prepared, scans):
+    """Beams about the named sides of placements, by row: columns by name."""
+    along = prepared.edges["half_step"]
+    swept = prepared.swept["half_step"]
+    for row, (placement, scan) in enumerate(scans.items()):
+        cells = edge_cells(
+            scan, along[placement], swept.get(placement), prepared.session.lrf
+        )
+        for side, name in prepared.names.get(placement, {}).items():
+            about = cells[thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE)]
+            yield {
+                "bearing": about.bearing,
+                "pitch": about.pitch,
+                "hit": about.hit,
+                "radius": about.radius,
+                "background": about.background,
+                "step": about.step * about.range_m,
+                "edge": np.full(len(about), prepared.board.edges.index(name)),
+                "placement": np.full(len(about), row),
+            }
+
+
+def _views(prepared, views, placements):
+    """Poses of the board in all images, of cameras by number and placements by row: columns by
+    name.
+    """
+    for number, (camera, of_camera) in enumerate(views.items()):
+        for view in of_camera:
+            if view.T_camera_board is None or view.placement not in placements:
+                continue
+            visible = np.zeros((0, 3))
+            if view.pixels is not None:
+                visible = prepared.board.pattern.points()[
+                    np.isfinite(view.pixels).all(axis=1)
+                ]
+            yield {
+                "camera": [number],
+                "pitch": [np.nan_to_num(view.pitch)],
+                "pose": [view.T_camera_board.as_matrix()],
+                "covariance": [view.covariance],
+                "placement": [placements.index(view.placement)],
+                "lens": [
+                    pose_by_intrinsics(
+                        view.T_camera_board, visible, prepared.models[camera]
+                    )
+                ],
+            }
