@@ -39,7 +39,7 @@ def held(seen):
 
 
 def test_an_honest_calibration_holds_and_says_what_it_rests_on(held):
-    assert held.answer is Answer.HOLDS and held.culprit is None
+    assert held.answer is Answer.HOLDS and not held.culprits
     assert all(wall.bend < 2 * wall.allowed for wall in held.walls)
     words = held.sentences()
     assert words[0] == "the calibration: holds"
@@ -63,18 +63,24 @@ def test_what_would_not_show_is_not_called_holding(held):
 
 @pytest.mark.parametrize("way", ["down", "ahead"])
 def test_a_camera_that_moved_is_told(seen, way):
-    """8 mm up or down say whose; along the line of sight only that one of the two moved."""
+    """Among those that may have moved: the other one the other way looks nearly alike."""
     move = {"down": [0.0, MOVE, 0.0], "ahead": [0.0, 0.0, MOVE]}[way]
     held = holds(seen, changed(true_rig(seen), "right", [0.0, 0.0, 0.0, *move]))
-    assert held.answer is Answer.MOVED
-    assert held.culprit.camera == "right" or way == "ahead"
+    assert held.answer is Answer.MOVED and "right" in cameras(held)
+    words = held.sentences()[0]
+    assert "camera 'right'" in words and (" or camera" in words) == (len(cameras(held)) > 1)
+
+
+def cameras(held):
+    """That may have moved; None is the head."""
+    return [shift.camera for shift in held.culprits]
 
 
 def test_a_turned_camera_is_named(seen):
     held = holds(seen, changed(true_rig(seen), "left", [0.0, TURN, 0.0, 0.0, 0.0, 0.0]))
-    assert held.answer is Answer.MOVED and held.culprit.camera == "left"
+    assert held.answer is Answer.MOVED and cameras(held) == ["left"]
     assert "camera 'left' has moved: recalibrate" in held.sentences()[0]
-    np.testing.assert_allclose(held.culprit.change[1], TURN, atol=TURN / 2)
+    np.testing.assert_allclose(held.culprits[0].change[1], TURN, atol=TURN / 2)
 
 
 def test_too_little_to_see_is_not_called_holding(seen):
@@ -172,7 +178,7 @@ def drawn(where, draw, mount="head", slip=0.0):
 
 
 def draws_of_changed(where, kind, mount):
-    """Of each of 10 draws what was said, and whether it names the camera that was changed."""
+    """Of each of 10 draws what was said, which camera was changed, and which may have moved."""
     rng = np.random.default_rng(28)
     for draw in range(10):
         session, rig = drawn(where, draw, mount)
@@ -183,22 +189,24 @@ def draws_of_changed(where, kind, mount):
             increments[3:] = any_way(rng, MOVE)
         camera = ("left", "right")[draw % 2]
         held = holds(session, changed(erring(rig, rng), camera, increments))
-        yield held.answer, held.culprit is not None and held.culprit.camera == camera
+        yield held.answer, camera, cameras(held)
 
 
 @campaign
-@pytest.mark.parametrize("kind", ["turned", "moved"])
-def test_changed_cameras_are_named_in_9_of_10_draws(where, kind):
-    assert sum(named for _, named in draws_of_changed(where, kind, "head")) >= 9
+def test_a_turned_camera_is_named_in_9_of_10_draws(where):
+    """And no other."""
+    draws = draws_of_changed(where, "turned", "head")
+    assert sum(named == [camera] for _, camera, named in draws) >= 9
 
 
 @campaign
-def test_a_camera_on_the_base_that_moved_is_told_in_9_of_10_draws(where):
-    """Whose it was only in most: one image a station, and along the line of sight creases tell
-    places to 3 to 6 mm."""
-    answers, named = zip(*draws_of_changed(where, "moved", "platform"), strict=True)
+@pytest.mark.parametrize("mount", ["head", "platform"])
+def test_a_camera_that_moved_is_told_in_9_of_10_draws(where, mount):
+    """It is among those that may have moved: alone in few."""
+    answers, changed, named = zip(*draws_of_changed(where, "moved", mount), strict=True)
     assert answers.count(Answer.MOVED) >= 9
-    assert sum(named) >= 6
+    among = [camera in those for camera, those in zip(changed, named, strict=True)]
+    assert sum(among) >= 9
 
 
 @campaign
@@ -209,7 +217,7 @@ def test_a_head_that_slipped_under_cameras_on_the_base_is_named_in_9_of_10_draws
         slip = TURN * (-1) ** (draw // 2)
         session, rig = drawn(where, draw, "platform", slip)
         held = holds(session, erring(rig, rng))
-        named += held.culprit is not None and held.culprit.camera is None
+        named += cameras(held) == [None]
     assert named >= 9
 
 

@@ -327,10 +327,10 @@ def test_a_calibration_that_does_not_fit_is_said(panel, tmp_path):
 
 def test_what_check_says_of_the_calibration_is_marked(panel, fake, tmp_path, monkeypatch):
     """With a fresh recording, in words and about the image of the camera that has moved."""
-    culprit = SimpleNamespace(camera="left")
+    culprits = (SimpleNamespace(camera="left"),)
     words = ["the calibration: camera 'left' has moved: recalibrate", "by 3 px"]
     held = SimpleNamespace(
-        answer=page.Answer.MOVED, culprit=culprit, sentences=lambda name: words
+        answer=page.Answer.MOVED, culprits=culprits, sentences=lambda name: words
     )
     monkeypatch.setattr(page, "holds", lambda session, rig: held)
     image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)

@@ -291,7 +291,9 @@ class Panel(Closed):
         self._live: threading.Thread | None = None  # keeps looking
         self._quit = threading.Event()
         self._sweep: tuple[float, float] | None = None  # ends of the pitch, radians
-        self._moved: str | None = None  # camera that the chosen calibration has elsewhere
+        self._moved: set[str | None] = (
+            set()
+        )  # cameras that the calibration may have elsewhere
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         for name in ("rig", "session"):
@@ -328,7 +330,7 @@ class Panel(Closed):
 
     def _check_calibration(self):
         """Say whether the chosen calibration still holds for the scenes recorded last."""
-        self._moved = None
+        self._moved = set()
         self.parts.held.value = ""
         if self._calibrated is None or not self.collector.finished:
             return
@@ -344,8 +346,7 @@ class Panel(Closed):
         else:
             sentences = held.sentences("the calibration")
             sign = SIGNS[held.answer]
-            if held.culprit is not None:
-                self._moved = held.culprit.camera
+            self._moved = {shift.camera for shift in held.culprits}
         self.parts.held.value = HTML.held(sign, sentences)
 
     def show(self) -> None:
@@ -536,7 +537,7 @@ class Panel(Closed):
         pixels = rig.project_scan(name, view.ranges, view.bearings, view.pitch)
         image = with_scan(image, pixels, view.ranges)
         words = f"{words}; dots: the scan, near is bright"
-        if name == self._moved:
+        if name in self._moved:
             cv2.rectangle(image, (0, 0), (width - 1, height - 1), RED, round(width / 50))
             words = f"{words}; has moved since it was calibrated"
         return image, words

@@ -30,6 +30,9 @@ OWN = np.array([*np.radians([0.02, 0.02, 0.02]), 0.0005, 0.0005, 0.0005])
 COMMON = np.array([*np.radians([0.04, 0.04, 0.04]), 0.001, 0.001, 0.001])
 PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
 LEVEL = 0.01  # probability of an alarm for nothing, of a recording; 0.05 is asked for
+# between the probabilities of two suspects: nearer to each other either may be it. A camera that
+# moved to one side, and the other one to the other, look much alike
+AS_LIKELY = 100.0
 UNEVEN = 0.003  # metres, of real walls
 BENT = 3.0  # times what is allowed, of a wall
 FEWEST_POINTS = 200  # of a wall, or of two passes
@@ -168,8 +171,9 @@ class Held:
 
     Attributes
     ----------
-    culprit : Shift or None
-        The camera, or the head under cameras on the base, that has moved.
+    culprits : tuple of Shift
+        The camera, or the head under cameras on the base, that has moved, the most likely first;
+        several where any of them explains what is seen.
     shifts : tuple of Shift
         Of all cameras, and of the head where cameras stand on the base.
     walls : tuple of Wall
@@ -181,7 +185,7 @@ class Held:
         A slip of the head would only turn the whole cloud.
     """
 
-    culprit: Shift | None
+    culprits: tuple[Shift, ...]
     shifts: tuple[Shift, ...]
     walls: tuple[Wall, ...]
     passes: tuple[Passes, ...]
@@ -193,8 +197,8 @@ class Held:
     def moved(self) -> tuple[str, ...]:
         """What is no longer where the calibration has it."""
         moved = []
-        if self.culprit is not None:
-            moved.append(self.culprit.name)
+        if self.culprits:
+            moved.append(" or ".join(shift.name for shift in self.culprits))
         elif any(passes.slipped for passes in self.passes):
             moved.append("the head, between two passes,")
         # one wall alone may bend
@@ -298,8 +302,9 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     if pulls:
         shifts = suspects(pulls, rig)
     alarms = [s for s in shifts if s.p_value < LEVEL / len(shifts) and s.matters]
+    alarms.sort(key=lambda s: s.p_value)
     return Held(
-        culprit=min(alarms, key=lambda s: s.p_value, default=None),
+        culprits=tuple(s for s in alarms if s.p_value < AS_LIKELY * alarms[0].p_value),
         shifts=tuple(shifts),
         walls=tuple(walls),
         passes=tuple(passes_of(session)),
