@@ -71,10 +71,7 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     world = world_of(load_setup(truth.setup), None, T_room_platform=station)
     recorded = session.sweep(placement).pitch
     true_pitch = truth.pitch[placement]
-    gauge = truth.T_head_lrf * rig.T_head_lrf.inv()
-    turn = gauge.rotation.as_rotvec()[0]
-    turn += np.mean(true_pitch - rig.corrections.pitch(placement, recorded))
-    shift = np.array([gauge.translation[0], 0.0, 0.0])
+    turn, shift = truth.gauge(rig, placement, recorded)
     order = np.argsort(recorded)
     pitch = np.interp(cloud.pitch, recorded[order], true_pitch[order])
     points = tilt(cloud.points, turn) + shift

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
+from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
@@ -46,6 +47,24 @@ class Truth:
     stations: dict[int, RigidTransform]
     lengths: tuple[dict, ...]
     setup: str
+
+    def gauge(
+        self, rig: CalibratedRig, placement: int, recorded: np.ndarray
+    ) -> tuple[float, np.ndarray]:
+        """The turn about the tilt axis (radians) and then the shift along it (3,) that lead from a
+        rig's platform frame to the true one, which no data can show.
+
+        Parameters
+        ----------
+        rig : CalibratedRig
+        placement : int
+        recorded : ndarray
+            Pitch of its scan lines, radians.
+        """
+        apart = self.T_head_lrf * rig.T_head_lrf.inv()
+        turn = apart.rotation.as_rotvec()[0]
+        turn += np.mean(self.pitch[placement] - rig.corrections.pitch(placement, recorded))
+        return turn, apart.translation * [1, 0, 0]
 
 
 def read_truth(session: Session) -> Truth | None:

@@ -25,7 +25,7 @@ from lrfcal_lib.judge.uncertainty import (
     uncertainty_of,
 )
 from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.model.geometry import POSE_NAMES
+from lrfcal_lib.model.geometry import POSE_NAMES, pose_step
 from lrfcal_lib.session.read import open_session
 
 DISTANCE = 2.0  # metres, at which differences are looked at, as the verdict does
@@ -286,22 +286,16 @@ def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
 
 def _steps(first, second, shared):
     """Increments from the first rig to the second by name: radians, metres, a fraction."""
-    by_axis = _increments(first.T_head_lrf, second.T_head_lrf)[AXIS_COLUMNS]
+    by_axis = pose_step(first.T_head_lrf, second.T_head_lrf)[AXIS_COLUMNS]
     steps = dict(zip(AXIS_NAMES, by_axis, strict=True))
     for name in shared:
-        step = _increments(first.cameras[name].T_camera, second.cameras[name].T_camera)
+        step = pose_step(first.cameras[name].T_camera, second.cameras[name].T_camera)
         steps |= zip([f"{name}_{pose}" for pose in POSE_NAMES], step, strict=True)
     one = first.corrections
     other = second.corrections
     steps["range_offset"] = other.range_offset - one.range_offset
     steps["pitch_scale"] = other.pitch_scale - one.pitch_scale
     return pd.Series(steps)
-
-
-def _increments(first, second):
-    """``[w, v]`` (6,) from one RigidTransform to another."""
-    turn = second.rotation * first.rotation.inv()
-    return np.r_[turn.as_rotvec(), second.translation - first.translation]
 
 
 def _covariance(rig, names):

@@ -21,6 +21,7 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
+from lrfcal_lib.model.geometry import pose_step, transform_difference
 
 # metres, side of the cells whose points make one patch of a surface: for a start, for the fit
 COARSE = 0.1
@@ -203,9 +204,8 @@ def candidates(first: Surface, second: Surface) -> list[Candidate]:
 
 def _same(a, b):
     """Whether two poses are one."""
-    apart = a.inv() * b
-    near = np.linalg.norm(apart.translation) < SAME_PLACE
-    return near and apart.rotation.magnitude() < SAME_YAW
+    angle, distance = transform_difference(a, b)
+    return distance < SAME_PLACE and angle < SAME_YAW
 
 
 def starts(first: Surface, second: Surface) -> list[RigidTransform]:
@@ -371,8 +371,7 @@ class Pair:
     def miss(self, poses: Mapping[int, RigidTransform]) -> np.ndarray:
         """Turn and shift (6,) by which poses of the stations differ from it."""
         T = poses[self.first].inv() * poses[self.second]
-        turn = (T.rotation * self.T_first_second.rotation.inv()).as_rotvec()
-        return np.append(turn, T.translation - self.T_first_second.translation)
+        return pose_step(self.T_first_second, T)
 
 
 def fitted(

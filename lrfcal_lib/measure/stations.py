@@ -28,6 +28,7 @@ from lrfcal_lib.measure.pairs import (
     surface_of,
 )
 from lrfcal_lib.measure.pose_graph import connected, solved
+from lrfcal_lib.model.geometry import transform_difference
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 
 # Of pairs that were drawn (tests/rooms.py, other seeds than any test): right ones have an overlap
@@ -166,12 +167,12 @@ def join_pair(
     for other in tried:
         as_much = other.overlap > RIVAL * best.overlap and other.against < DOUBTFUL
         if other is not best and as_much:
-            apart = best.T_first_second.inv() * other.T_first_second
+            angle, far = transform_difference(best.T_first_second, other.T_first_second)
             return _problem(
                 names,
                 ProblemKind.AMBIGUOUS,
-                f"they fit together in two ways, {np.linalg.norm(apart.translation):.2f} m and "
-                f"{np.degrees(apart.rotation.magnitude()):.0f} deg apart (overlap "
+                f"they fit together in two ways, {far:.2f} m and {np.degrees(angle):.0f} deg apart "
+                f"(overlap "
                 f"{100 * best.overlap:.0f} % and {100 * other.overlap:.0f} %): the scene repeats "
                 "itself or is symmetric",
             )

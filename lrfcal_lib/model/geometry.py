@@ -457,6 +457,22 @@ def pose_parameters(pose: np.ndarray) -> np.ndarray:
     return np.concatenate([log_rotation(pose[..., :3]), pose[..., 3]], axis=-1)
 
 
+def pose_step(start: RigidTransform, end: RigidTransform) -> np.ndarray:
+    """The small change ``[w, v]`` of :func:`move_pose` that leads from one transform to another.
+
+    Parameters
+    ----------
+    start, end : RigidTransform
+
+    Returns
+    -------
+    ndarray, shape (6,)
+        Radians and metres.
+    """
+    turn = (end.rotation * start.rotation.inv()).as_rotvec()
+    return np.append(turn, end.translation - start.translation)
+
+
 def move_pose(pose: np.ndarray, delta: np.ndarray) -> np.ndarray:
     """Small change of poses: ``R <- exp(w) R``, ``t <- t + v``.
 

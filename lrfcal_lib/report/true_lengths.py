@@ -84,11 +84,7 @@ def _in_station(
     truth: Truth, rig: CalibratedRig, session: Session, station: int, end: np.ndarray
 ) -> np.ndarray:
     """Corners (n, 3) in the room as the platform frame of a station has them."""
-    gauge = truth.T_head_lrf * rig.T_head_lrf.inv()
-    recorded = session.sweep(station).pitch
-    turn = gauge.rotation.as_rotvec()[0]
-    turn += np.mean(truth.pitch[station] - rig.corrections.pitch(station, recorded))
-    shift = np.array([gauge.translation[0], 0.0, 0.0])
+    turn, shift = truth.gauge(rig, station, session.sweep(station).pitch)
     return tilt(truth.stations[station].inv().apply(end) - shift, -turn)
 
 
