@@ -171,7 +171,7 @@ def solve_joint(
     if chosen.noise == "estimate" or chosen.lapse:
         state = minimum(state, data, unknowns, LAST_STEP).state
     if required:  # a cause before what follows from it: edges that fit nowhere, say
-        refuse_contradiction(obs, state, LAST_MISS)
+        refuse_contradiction(obs, state, LAST_MISS, left_out)
     found = finished(obs, state, data, unknowns, required)
     return replace(found, excluded=tuple(left_out))
 

@@ -3,6 +3,7 @@
 By equations (4) to (6) and (16); a board lies where the images and where the scans put it.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -74,24 +75,30 @@ def without_lost_placements(obs):
     return obs.select(obs.placements[shown]), left_out
 
 
-def refuse_contradiction(obs: JointObservations, state: JointState, most: float) -> None:
+def refuse_contradiction(
+    obs: JointObservations, state: JointState, most: float, left_out: Sequence[Problem] = ()
+) -> None:
     """Raise DegenerateGeometry where images put the boards of a third of the placements more than
     `most` metres (and `MOST_SIGMA` of what is stated of the images) off where they are.
+
+    Placements that were left out for that already count with them.
     """
     place = obs.view_placement
     boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
     misses = np.linalg.norm(boards[..., 3] - state.boards[place, :, 3], axis=1)
     stated = np.sqrt(np.trace(obs.view_covariance[:, 3:, 3:], axis1=1, axis2=2))
     shown = np.unique(place)
+    before = sum(p.kind == CONTRADICTS and p.camera is None for p in left_out)
     wrong = 0
     for row in shown:
         mine = place == row
         limit = max(most, MOST_SIGMA * np.median(stated[mine]))
         wrong += int(np.median(misses[mine]) > limit)
-    if wrong and 3 * wrong > len(shown):
+    every = len(shown) + before
+    if wrong and 3 * (wrong + before) > every:
         raise DegenerateGeometry(
-            f"images and scans contradict each other: for {wrong} of {len(shown)} placements the "
-            f"board lies more than {1000 * most:.0f} mm off where the images put it; check "
+            f"images and scans contradict each other: for {wrong + before} of {every} placements "
+            f"the board lies more than {1000 * most:.0f} mm off where the images put it; check "
             "that images and scans carry the right numbers"
         )
 
