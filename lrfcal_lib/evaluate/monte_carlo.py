@@ -13,7 +13,12 @@ from lrfcal_lib.evaluate.tables import unit_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.covariance import name_words, null_space, pseudo_inverse
 from lrfcal_lib.fit.edge_likelihood import disc_share
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_transform
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    pose_array,
+    pose_step,
+    pose_transform,
+)
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint import in_stated_gauge
 from lrfcal_lib.solvers.joint_model import JointState, Unknowns
@@ -156,17 +161,11 @@ def state_errors(state: JointState, truth: JointState, unknowns: Unknowns) -> np
     """
     estimated = np.concatenate([state.head[None], state.cameras])
     true = np.concatenate([truth.head[None], truth.cameras])
-    poses = pose_errors(estimated, true)
+    poses = pose_step(pose_transform(true), pose_transform(estimated))
     sensor = state.sensor - truth.sensor
     return np.concatenate([poses[0, AXIS_COLUMNS], poses[1:].ravel(), sensor])[
         unknowns.mask
     ]
-
-
-def pose_errors(poses, true):
-    """``[w, v]`` (n, 6) with ``R = exp(w) R_true``, ``t = t_true + v`` of poses (n, 3, 4)."""
-    turn = pose_transform(poses).rotation * pose_transform(true).rotation.inv()
-    return np.concatenate([turn.as_rotvec(), poses[..., 3] - true[..., 3]], axis=-1)
 
 
 def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.ndarray:

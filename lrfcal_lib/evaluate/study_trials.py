@@ -11,13 +11,13 @@ from lrfcal_lib.evaluate.monte_carlo import (
     HALF_WIDTH,
     bound,
     joint_truth,
-    pose_errors,
 )
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     move_pose,
     polar_to_points,
     pose_array,
+    pose_step,
     pose_transform,
 )
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
@@ -154,7 +154,7 @@ def _judged(estimate, true, bounds):
     if isinstance(estimate, str):
         return {"outcome": f"refused: {estimate}"}
     pose, covariance, converged = estimate
-    error = pose_errors(pose[None], true[None])[0]
+    error = pose_step(pose_transform(true), pose_transform(pose))
     if not (np.isfinite(error).all() and np.isfinite(covariance).all()):
         return {"outcome": "not finite"}
     numbers = {part: np.linalg.norm(error[of]) for part, of in PARTS.items()}

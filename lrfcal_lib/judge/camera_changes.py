@@ -9,7 +9,7 @@ from scipy.special import chdtrc, fdtrc
 
 from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose
+from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose, pose_step
 from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
@@ -240,12 +240,11 @@ def change_between(solution, first, later, camera, prepared):
     model = prepared.models[camera]
     index = obs.cameras.index(later)
     change = solution.transforms[later] * solution.transforms[first].inv()
-    shift = solution.transforms[later].translation - solution.transforms[first].translation
     both = solution.covariance(f"{first}_", f"{later}_")
     later_less_first = np.hstack([-np.eye(POSE), np.eye(POSE)])
     spread = later_less_first @ both @ later_less_first.T
-    both_parts = np.concatenate([change.rotation.as_rotvec(), shift])
-    square = both_parts @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ both_parts
+    step = pose_step(solution.transforms[first], solution.transforms[later])
+    square = step @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ step
 
     views = obs.view_camera == index
     middle = outline(solution).mean(axis=0)
@@ -261,7 +260,7 @@ def change_between(solution, first, later, camera, prepared):
         camera=camera,
         after=after,
         turn=float(change.rotation.magnitude()),
-        shift=float(np.linalg.norm(shift)),
+        shift=float(np.linalg.norm(step[3:])),
         p_value=float(chdtrc(POSE, square)),
         motion_px=float(np.median(np.linalg.norm(motion, axis=1))),
         zoom=zoom,

@@ -463,14 +463,15 @@ def pose_step(start: RigidTransform, end: RigidTransform) -> np.ndarray:
     Parameters
     ----------
     start, end : RigidTransform
+        Or stacks of n.
 
     Returns
     -------
-    ndarray, shape (6,)
+    ndarray, shape (6,) or (n, 6)
         Radians and metres.
     """
     turn = (end.rotation * start.rotation.inv()).as_rotvec()
-    return np.append(turn, end.translation - start.translation)
+    return np.concatenate([turn, end.translation - start.translation], axis=-1)
 
 
 def move_pose(pose: np.ndarray, delta: np.ndarray) -> np.ndarray:
