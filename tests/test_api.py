@@ -4,6 +4,7 @@ import importlib
 import pydoc
 import re
 import tomllib
+from types import SimpleNamespace
 
 import pytest
 from shared import QUICK, ROOT
@@ -26,7 +27,19 @@ def test_the_functions_of_the_methods_page_are_there():
 def test_the_command_is_the_one_of_the_module():
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     module, function = scripts["lrfcal"].split(":")
-    assert getattr(importlib.import_module(module), function) is command_line.main
+    assert getattr(importlib.import_module(module), function) is command_line.program
+
+
+def test_a_process_of_its_own_ends_as_the_verb_does(monkeypatch):
+    done = []
+    collector = SimpleNamespace(
+        set_threshold=done.append, freeze=lambda: done.append("all")
+    )
+    monkeypatch.setattr(command_line, "gc", collector)
+    monkeypatch.setattr(command_line, "main", lambda: 3)
+    with pytest.raises(SystemExit) as ended:
+        command_line.program()
+    assert ended.value.code == 3 and done == [command_line.MADE_BETWEEN_SEARCHES, "all"]
 
 
 def test_a_session_is_one_line():
