@@ -34,6 +34,30 @@ def test_the_scatter_of_the_sides_is_found():
     assert np.mean([one["side_sigma"] for one in noise]) == pytest.approx(0.63, rel=0.25)
 
 
+@pytest.mark.parametrize(
+    ("true_deg", "least_deg", "most_deg"), [(0.0, 0.0, 0.02), (0.2, 0.14, 0.27)]
+)
+def test_errors_of_the_pitch_of_sweeps_are_found_whatever_was_believed(
+    true_deg, least_deg, most_deg
+):
+    """A first guess must not stay for ever where images and ranges say little about a sweep."""
+    own = rng(1)
+    obs, _, _ = draw(own, 14, mount="platform", see_images=1, pitch_step=FINE)
+    off = np.radians(true_deg) * own.standard_normal(14)
+    obs = replace(
+        obs,
+        face_pitch=obs.face_pitch + off[obs.face_placement],
+        beam_pitch=obs.beam_pitch + off[obs.beam_placement],
+    )
+    settings = {"noise": "estimate", "sweep": "offset_stretch", "required": False}
+    found = []
+    for believed in np.radians([0.03, 0.5]):
+        solution = solve_joint(obs, sweep_sigma=(believed, 0.01), **settings)
+        found.append(np.degrees(solution.data.levels.sweep_sigma[0]))
+    assert found[0] == pytest.approx(found[1], rel=0.05)
+    assert least_deg < found[0] < most_deg
+
+
 def most_likely(y, known, sigma):
     """Deviations that make measured ones `y` of information `known` most likely, and the weight of what is expected."""
     x = np.zeros_like(y)
@@ -67,6 +91,15 @@ def test_sides_that_beams_hardly_show_do_not_pull_their_scale_down(true, start):
             np.zeros((200, 9)),
         )
     assert level == pytest.approx(true, rel=0.15)
+
+
+@pytest.mark.parametrize("sigma_px", [0.05, 1.0])
+def test_ranges_are_independent_whether_images_or_ranges_show_the_plane(sigma_px):
+    """Images that show the plane better take up what residuals of ranges would have lost to it."""
+    noise = levels(4, sigma_range=0.012, sigma_px=sigma_px)
+    assert np.mean([one["face_share"] for one in noise]) > 0.8
+    scale = np.mean([one["face_scale"] for one in noise])
+    assert scale == pytest.approx(1.0, abs=0.03)
 
 
 def test_beams_of_the_model_itself_are_independent():

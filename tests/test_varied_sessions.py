@@ -12,6 +12,11 @@ from lrfcal_lib.solvers.joint import solve_joint
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 
+def is_plate(outcome):
+    """Whether its board is a rectangle."""
+    return outcome.calibration.prepared.board.name == "plate"
+
+
 @pytest.mark.parametrize("count", [12, pytest.param(100, marks=campaign)])
 def test_claims_hold_on_varied_draws(count):
     """All shared unknowns that have a truth, together with their full covariance and one by one."""
@@ -64,6 +69,8 @@ def test_claims_hold_on_varied_sessions(tmp_path):
     # cameras and axis lean on each other: some five independent numbers a session, 0.90 +- 0.03
     assert 0.84 < varied_sessions.inside(scores) < 0.96
     assert 0.86 < varied_sessions.inside(lengths) < 0.94
+    plates = [outcome.lengths for outcome in solved if is_plate(outcome)]
+    assert varied_sessions.inside(np.concatenate(plates)) < 0.96
     wrong = [
         outcome
         for outcome in solved

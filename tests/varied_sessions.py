@@ -5,10 +5,11 @@ finder, board (outline, size of its squares, dark or white), what stands behind 
 lies about its pitch. The rendering shares nothing with the library but lens, spot pattern and echo.
 ::
 
-    session = varied_sessions.record(folder / "a", seed=7)              # some seconds session =
-    varied_sessions.record(folder / "b", seed=7, mount="platform", white=True, square_px=7.0)
-    outcome = varied_sessions.judged(session)                           # chi-square, scores,
-    lengths, verdict
+    # some seconds
+    session = varied_sessions.record(folder / "a", seed=7)
+    session = varied_sessions.record(folder / "b", seed=7, mount="platform", white=True)
+    # chi-square, scores, lengths, verdict
+    outcome = varied_sessions.judged(session)
 """
 
 import json

@@ -291,9 +291,8 @@ class Panel(Closed):
         self._live: threading.Thread | None = None  # keeps looking
         self._quit = threading.Event()
         self._sweep: tuple[float, float] | None = None  # ends of the pitch, radians
-        self._moved: set[str | None] = (
-            set()
-        )  # cameras that the calibration may have elsewhere
+        # cameras that the calibration may have elsewhere
+        self._moved: set[str | None] = set()
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         for name in ("rig", "session"):

@@ -38,7 +38,9 @@ STILL = 1e5
 # are those of one line
 PLACES = np.array([-0.1, 0.1])
 SCALE_ROUNDS = 4  # of weighing image edges by how well they fit
-LEAST_SCALE = 0.1
+# of their stated errors, which hold a systematic one of a tenth of a pixel: sharp images of a
+# straight rim have next to none
+LEAST_SCALE = 0.02
 UNKNOWN = 1e6  # variance of what nothing determines
 KNOWN = 1e-18  # variance of what is held
 # share of its length by which an edge may be uncertain and still count as measured

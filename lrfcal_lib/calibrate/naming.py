@@ -143,7 +143,8 @@ def nearest_edges(
     dropped = {}
     cost = np.zeros((len(sides), len(lines)))
     for row, points in enumerate(sides.values()):
-        cost[row] = np.median(np.abs(points[:, :2] @ lines[:, :2].T + lines[:, 2]), axis=0)
+        distances = points[:, :2] @ lines[:, :2].T + lines[:, 2]
+        cost[row] = np.median(np.abs(distances), axis=0)
     numbers = list(sides)
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
         number = numbers[row]

@@ -24,7 +24,8 @@ def rows(*shape: int | None) -> PlainValidator:
     is infinite.
     """
 
-    def made(given):
+    def array_of(given):
+        """An array (shape) of what a file has."""
         values = np.array(given, float)
         if not len(given):
             values = np.zeros((0, *shape[1:]))
@@ -35,7 +36,7 @@ def rows(*shape: int | None) -> PlainValidator:
             raise ValueError(f"shape {values.shape} instead of {shape}")
         return np.where(np.isnan(values), np.inf, values)
 
-    return PlainValidator(made)
+    return PlainValidator(array_of)
 
 
 @dataclass(frozen=True)

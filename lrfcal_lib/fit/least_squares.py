@@ -224,7 +224,9 @@ def eliminate(
     else:
         back = np.linalg.pinv(own, rcond=OWN_RANK, hermitian=True) @ known
     taken = hessian[:, :c, c:] @ back
-    return hessian[:, :c, :c] - taken[..., :c], gradient[:, :c] - taken[..., c], back
+    reduced = hessian[:, :c, :c] - taken[..., :c]
+    reduced_gradient = gradient[:, :c] - taken[..., c]
+    return reduced, reduced_gradient, back
 
 
 def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:

@@ -26,7 +26,8 @@ def same_stop(pitch: np.ndarray, used: np.ndarray) -> np.ndarray:
     ndarray of bool, shape (p, v, v)
     """
     stop = np.rint(pitch / SAME_STOP)
-    return (stop[:, :, None] == stop[:, None, :]) & used[:, :, None] & used[:, None, :]
+    same = stop[:, :, None] == stop[:, None, :]
+    return same & used[:, :, None] & used[:, None, :]
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,9 @@ def cross(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     """
     a = np.asarray(a)
     b = np.asarray(b)
-    return a.take(NEXT, -1) * b.take(PREVIOUS, -1) - a.take(PREVIOUS, -1) * b.take(NEXT, -1)
+    forward = a.take(NEXT, -1) * b.take(PREVIOUS, -1)
+    backward = a.take(PREVIOUS, -1) * b.take(NEXT, -1)
+    return forward - backward
 
 
 def hat(v: ArrayLike) -> np.ndarray:

@@ -160,7 +160,9 @@ class Crossings:
         rays = self.points / np.linalg.norm(self.points, axis=1, keepdims=True)
         noise = rays * np.hypot(self.range_sigma, warp_sigma)[:, None]
         place = self.by_angle * np.reshape(sigma, (-1, 1))
-        return noise[:, :, None] * noise[:, None, :] + place[:, :, None] * place[:, None, :]
+        by_noise = noise[:, :, None] * noise[:, None, :]
+        by_place = place[:, :, None] * place[:, None, :]
+        return by_noise + by_place
 
 
 def crossings_of(

@@ -14,7 +14,6 @@ from lrfcal_lib.solvers.joint_residuals import (
 )
 
 PARTS = 3  # of a board in x and y, and of an edge
-PLANE = 3  # numbers of a plane, that a placement's own pose takes up
 # radians, errors of the pitch at a stop that are tried
 PITCH_LEVELS = np.radians(
     [0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1]
@@ -23,7 +22,9 @@ SCALE_ROUNDS = 4
 SCALE_LIMITS = (1e-4, 1e4)
 SIDE_ROUNDS = 20
 SIDE_LIMITS = (0.01, 2.0)  # log odds
-LEAST_SWEEP_SIGMA = 1e-6  # radians and fraction
+SWEEP_ROUNDS = 20
+# radians and fraction: what heads with a gear are off by, as one sweep more is believed to be
+USUAL_SWEEP = np.array([np.radians(0.02), 0.002])
 # curvature of the beams' cost, relative to their information: below 0 where most contradict their
 # edges
 LEAST_CURVATURE = 0.1
@@ -41,7 +42,7 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
     changed = {}
     if "face" in blocks:
         changed["face_scale"], changed["face_share"] = face_levels(
-            state, data, blocks["face"]
+            state, data, blocks["face"], c, spread
         )
     if "beam" in blocks:
         changed["beam_share"] = beam_share(state, data, blocks["beam"], c, spread)
@@ -54,10 +55,8 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
         changed["side_sigma"] = side_level(state.sides, data, own, gradient[:, c:])
     if "sweep" in blocks:
         number = SWEEPS[unknowns.sweep]
-        variance = np.diagonal(spread, axis1=1, axis2=2)[:, 6 : 6 + number]
-        scatter = np.sqrt(np.mean(state.sweeps[:, :number] ** 2 + variance, axis=0))
-        scatter = np.maximum(scatter, LEAST_SWEEP_SIGMA).tolist()
-        changed["sweep_sigma"] = (*scatter, *levels.sweep_sigma[number:])
+        scatter = sweep_levels(state.sweeps[:, :number], data, hessian, gradient, c)
+        changed["sweep_sigma"] = (*scatter.tolist(), *levels.sweep_sigma[number:])
     return replace(data, levels=replace(levels, **changed))
 
 
@@ -68,6 +67,7 @@ def settled(before: Levels, after: Levels) -> bool:
         after.face_share / before.face_share,
         after.beam_share / before.beam_share,
         after.view_scale / before.view_scale,
+        *np.divide(after.sweep_sigma, before.sweep_sigma),
     ]
     return bool(np.all(np.abs(np.log(ratios)) < SETTLED))
 
@@ -83,23 +83,56 @@ def on_board(state: JointState, data: JointData) -> np.ndarray:
     return (face_points(state, data) - state.boards[:, None, :, 3]) @ state.boards[:, :, :3]
 
 
-def face_levels(state, data, block):
+def face_levels(state, data, block, shared, spread):
     """Scale of the ranges' noise, and the share of independent errors, from means over parts of
     the boards.
+
+    What board poses take up of the residuals is told by `spread` (p, k, k), the covariance of a
+    placement's own unknowns, which follow the `shared` ones: three numbers of a plane where only
+    the scan shows it, next to nothing where images do.
     """
+    levels = data.levels
     used = data.face["used"]
-    z = np.where(used, block.residuals / np.where(used, data.face["sigma"], 1.0), 0.0)
-    number = used.sum(axis=1)
-    scale = np.sqrt(np.sum(z**2) / max(np.sum(np.maximum(number - PLANE, 1)), 1))
+    weight = used / np.where(used, data.face["sigma"], 1.0)
+    z = weight * block.residuals
+    by_own = (weight / levels.face_scale)[..., None] * block.jacobian[..., shared:]
+    taken = levels.face_share * np.sum(by_own * (by_own @ spread))
+    scale = np.sqrt(np.sum(z**2) / max(used.sum() - taken, 1))
     x, y, _ = np.moveaxis(on_board(state, data), -1, 0)
     part = _part(x, used) * PARTS + _part(y, used)
-    rows = np.arange(len(used))[:, None] * PARTS**2 + part
-    total = np.bincount(rows[used], z[used])
-    count = np.bincount(rows[used])
-    full = count > 1
-    free = full.sum() - PLANE * np.sum(number > 0)
-    ratio = np.sum(total[full] ** 2 / count[full]) / scale**2 / max(free, 1)
-    return float(scale), float(1 / max(ratio, 1.0))
+    root = used.astype(float)
+    ratio = scatter_of_parts(part, root, z / scale, by_own, levels.face_share, spread)
+    share = levels.face_share if np.isnan(ratio) else 1 / max(ratio, 1.0)
+    return float(scale), float(share)
+
+
+def scatter_of_parts(part, root, residuals, by_own, share, spread):
+    """Squared scores of parts of boards or edges, relative to those of independent errors.
+
+    NaN where placements' own unknowns take them up.
+
+    Parameters
+    ----------
+    part : ndarray of int, shape (p, n)
+        Of each measurement, from 0 for each placement.
+    root, residuals : ndarray, shape (p, n)
+        Root information, 0 where there is no measurement, and residuals in standard deviations.
+    by_own : ndarray, shape (p, n, k)
+        Derivatives of `residuals`.
+    share : float
+        Of the information that the estimate counts.
+    spread : ndarray, shape (p, k, k)
+        Covariance of own unknowns.
+    """
+    each = np.eye(part.max() + 1)[part] * root[..., None]
+    counted = np.sum(each**2, axis=1)
+    score = np.sum(each * residuals[..., None], axis=1)
+    pull = np.swapaxes(each, 1, 2) @ by_own
+    taken = share * np.sum(pull * (pull @ spread), axis=-1)
+    there = counted > 0
+    left = np.sum(1 - taken[there] / counted[there])
+    square = np.sum(score[there] ** 2 / counted[there])
+    return square / left if left >= 1 else np.nan
 
 
 def _part(values, used):
@@ -126,7 +159,7 @@ def beam_share(state, data, block, shared, spread):
     used = data.beam["used"]
     edge = data.beam["edge"]
     by_own = block.jacobian[..., shared:]
-    root = np.linalg.norm(by_own[..., 3:6], axis=-1)  # root information
+    root = used * np.linalg.norm(by_own[..., 3:6], axis=-1)  # root information
     lapsed = data.levels.lapse * np.exp(np.where(used, block.cost, 0.0) / before)
     curvature = root**2 * (1 - block.residuals**2 * lapsed / (1 - lapsed))
     along = _along_edges(state, data)
@@ -135,21 +168,12 @@ def beam_share(state, data, block, shared, spread):
     for number in range(edges):
         mine = used & (edge == number)
         part[mine] = _part(along, mine)[mine]
-    row = np.arange(len(used))[:, None]
-    group = ((row * edges + edge) * PARTS + part)[used]
-    counted = np.bincount(group, root[used] ** 2)
-    score = np.bincount(group, (root * block.residuals)[used])
-    pull = np.zeros((len(counted), by_own.shape[-1]))
-    np.add.at(pull, group, (root[..., None] * by_own)[used])
-    of_group = spread[np.arange(len(counted)) // (PARTS * edges)]
-    taken = before * np.vecdot(pull, np.matvec(of_group, pull))
-    there = counted > 0
-    left = np.sum(1 - taken[there] / counted[there])
-    if left < 1:
+    part += PARTS * edge
+    ratio = scatter_of_parts(part, root, block.residuals, by_own, before, spread)
+    if np.isnan(ratio):
         return before
-    gain = max(np.sum(curvature[used]) / np.sum(counted), LEAST_CURVATURE)
-    ratio = np.sum(score[there] ** 2 / counted[there]) / left / gain
-    return float(gain / max(ratio, 1.0))
+    gain = max(np.sum(curvature) / np.sum(root**2), LEAST_CURVATURE)
+    return float(gain / max(ratio / gain, 1.0))
 
 
 def _along_edges(state, data):
@@ -234,6 +258,39 @@ def judged(block, factor, others, rows, shared):
     )
     better = (left + f2) / (max(rows - taken / f2, 0.0) + 1)
     return cost, float(np.sqrt(better))
+
+
+def sweep_levels(sweeps, data, hessian, gradient, shared):
+    """Standard deviations of the sweeps' own errors (p, n) of the pitch, by restricted likelihood.
+
+    Each variance is the sum of the squared errors over the number of errors that the data tell
+    (MacKay's rule): what they do not tell has no say, or a first guess would stay for ever. One
+    sweep more is believed to err as `USUAL_SWEEP`. `hessian` (p, k, k) and `gradient` (p, k) are
+    of all blocks, `shared` unknowns first.
+    """
+    c = shared
+    number = sweeps.shape[1]
+    places = np.arange(c + 6, c + 6 + number)
+    usual = USUAL_SWEEP[:number] ** 2
+    before = np.square(data.levels.sweep_sigma[:number])
+    variance = before
+    for _ in range(SWEEP_ROUNDS):
+        whole = hessian.copy()
+        right = gradient.copy()
+        change = 1 / variance - 1 / before
+        whole[:, places, places] += change
+        right[:, places] += change * sweeps
+        reduced, score, back = eliminate(whole, right, c)
+        inverse = np.linalg.pinv(np.sum(reduced, axis=0), hermitian=True)
+        step = -inverse @ np.sum(score, axis=0)
+        rows = places - c
+        by_shared = back[:, rows, :c]
+        error = sweeps - back[:, rows, c] - by_shared @ step
+        own = np.linalg.pinv(whole[:, c:, c:], rcond=OWN_RANK, hermitian=True)
+        unknown = own[:, rows, rows] + np.vecdot(by_shared @ inverse, by_shared)
+        told = np.maximum(1 - unknown / variance, 0.0)
+        variance = (np.sum(error**2, axis=0) + usual) / (np.sum(told, axis=0) + 1)
+    return np.sqrt(variance)
 
 
 def side_level(sides, data, hessian, gradient):
