@@ -10,7 +10,7 @@ from joint_draws import draw, rng
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Levels
-from lrfcal_lib.solvers.joint_noise import beam_share, side_level
+from lrfcal_lib.solvers.joint_noise import beam_share, side_levels
 from lrfcal_lib.solvers.joint_residuals import SIDE_FREEDOM, named_blocks
 
 FINE = np.radians(0.5)
@@ -80,17 +80,30 @@ def test_sides_that_beams_hardly_show_do_not_pull_their_scale_down(true, start):
     level = start
     for _ in range(10):
         x, prior = most_likely(y, known, level)
-        hessian = np.zeros((200, 9, 9))
-        hessian[:, range(9), range(9)] = np.concatenate(
-            [np.ones((200, 6)), known + prior], axis=1
-        )
-        level = side_level(
-            x,
-            SimpleNamespace(levels=Levels(side_sigma=level), beam=used),
-            hessian,
-            np.zeros((200, 9)),
-        )
+        hessian = np.zeros((200, 10, 10))
+        # the last is of what sides have in common: known to be nothing
+        own = [np.ones((200, 6)), known + prior, np.full((200, 1), 1e9)]
+        hessian[:, range(10), range(10)] = np.concatenate(own, axis=1)
+        told = SimpleNamespace(levels=Levels(side_sigma=level), beam=used)
+        gradient = np.zeros((200, 10))
+        level, _ = side_levels(np.pad(x, [(0, 0), (0, 1)]), told, hessian, gradient)
     assert level == pytest.approx(true, rel=0.15)
+
+
+def test_what_sides_have_in_common_is_no_deviation_of_single_sides():
+    """One wall behind the board, brighter than another: four sides are not four witnesses."""
+    found = []
+    for seed in range(4):
+        own = rng(seed)
+        obs, _, _ = draw(own, 14, pitch_step=FINE, spread=0.2, spot=NARROW)
+        wall = 0.8 * own.standard_normal(14)
+        obs = replace(obs, beam_background=obs.beam_background + wall[obs.beam_placement])
+        solution = solve_joint(obs, noise="estimate", sides=True, required=False)
+        found.append([solution.noise[name] for name in ("side_sigma", "background_sigma")])
+    side, wall = np.mean(found, axis=0)
+    # Student's t has a scale of 0.79 of the standard deviation of what is normal
+    assert side < 0.3
+    assert wall == pytest.approx(0.63, rel=0.3)
 
 
 @pytest.mark.parametrize("sigma_px", [0.05, 1.0])

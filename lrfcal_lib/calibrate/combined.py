@@ -206,7 +206,7 @@ def case_of(joint, observations, placement):
         solution.state,
         boards=board[None, :3],
         sweeps=np.zeros((1, 2)),
-        sides=np.zeros((1, len(edges))),
+        sides=np.zeros((1, len(edges) + 1)),
     )
     whitener = whitener_of(solution.solution.trusted)
     return Case(

@@ -26,6 +26,7 @@ NOISE_WORDS = {
     "beam_share": "independent errors per beam at an edge",
     "sigma_pitch": "error of the pitch at a stop [deg]",
     "side_sigma": "spread of the edge bias from side to side [log odds]",
+    "background_sigma": "spread of the edge bias from placement to placement [log odds]",
 }
 HALVES_COLUMNS = (
     "pair",

@@ -105,7 +105,7 @@ def joint_truth(
     )
     count = len(boards)
     boards = np.stack([pose_array(T) for T in boards])
-    own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges)))
+    own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges) + 1))
     return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, *own), obs)
 
 

@@ -217,8 +217,11 @@ def weigh(
     """
     # sides that may deviate, and beams that may say nothing, would take up what a wrong statement
     # does to edges
-    side_sigma = min(solution.noise["side_sigma"], ALIKE)
-    tested = solution.with_levels(side_sigma=side_sigma, lapse=0.0)
+    tested = solution.with_levels(
+        side_sigma=min(solution.noise["side_sigma"], ALIKE),
+        background_sigma=min(solution.noise["background_sigma"], ALIKE),
+        lapse=0.0,
+    )
     doubts = []
     for kind, alternative in stated.items():
         doubt = doubt_about(kind, alternative, tested, admitted_offset)

@@ -40,9 +40,10 @@ class JointState:
         In the order of `SENSOR`: metres, log odds, log of spot radii, fraction, radians.
     sweeps : ndarray, shape (p, 2)
         Offset (radians) and stretch of the recorded pitch of each sweep.
-    sides : ndarray, shape (p, e)
+    sides : ndarray, shape (p, e + 1)
         By how much the log odds of each side differ from the sensor's: what stands behind it is
-        darker or brighter.
+        darker or brighter. The last column is common to all sides of a placement: one wall behind
+        the board.
     """
 
     head: np.ndarray
@@ -64,8 +65,8 @@ class Unknowns:
     """Which columns of the full Jacobian are unknown.
 
     `cameras` and `edges` are their numbers, `sensor` names some of `SENSOR`, `sweep` one of
-    `SWEEPS`; `poses` tells whether the cameras' are unknown, `sides` whether every side of every
-    placement has a deviation of its own from the sensor's edge bias.
+    `SWEEPS`; `poses` tells whether the cameras' are unknown, `sides` whether every placement, and
+    every side of it, has a deviation of its own from the sensor's edge bias.
     """
 
     cameras: int
@@ -92,7 +93,7 @@ class Unknowns:
         widths |= {
             "board": 6,
             "sweep": SWEEPS[self.sweep],
-            "sides": self.edges * self.sides,
+            "sides": (self.edges + 1) * self.sides,
         }
         columns = {}
         end = 0
@@ -139,6 +140,8 @@ class Levels:
         Of the sweeps' own offset (radians) and stretch.
     side_sigma : float
         Scale of the sides' deviations of the log odds, Student's t.
+    background_sigma : float
+        The same of what these have in common at a placement.
     prior : PlatformPrior or None
         The stated platform, which yields where the data contradict it.
     step_sigma : float
@@ -153,8 +156,13 @@ class Levels:
     lapse: float = 0.0
     sweep_sigma: tuple[float, float] = (np.radians(0.5), 0.05)
     side_sigma: float = 0.35
+    background_sigma: float = 0.35
     prior: PlatformPrior | None = None
     step_sigma: float = 0.0
+
+    def of_sides(self, edges: int) -> np.ndarray:
+        """Scales of the deviations that a placement has, (e + 1,)."""
+        return np.array([self.side_sigma] * edges + [self.background_sigma])
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,8 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
         changed["view_scale"] = float(scale)
         changed["sigma_pitch"] = sigma
     if "side" in blocks and "beam" in blocks:
-        changed["side_sigma"] = side_level(state.sides, data, own, gradient[:, c:])
+        scales = side_levels(state.sides, data, own, gradient[:, c:])
+        changed["side_sigma"], changed["background_sigma"] = scales
     if "sweep" in blocks:
         number = SWEEPS[unknowns.sweep]
         scatter = sweep_levels(state.sweeps[:, :number], data, hessian, gradient, c)
@@ -293,22 +294,26 @@ def sweep_levels(sweeps, data, hessian, gradient, shared):
     return np.sqrt(variance)
 
 
-def side_level(sides, data, hessian, gradient):
-    """Scale of the sides' deviations, Student's t, by expectation and maximisation.
+def side_levels(sides, data, hessian, gradient):
+    """Scales of the sides' deviations and of what those of a placement have in common, Student's t,
+    by expectation and maximisation.
 
     Student's t is a normal distribution whose precision varies from side to side; what is expected
     of it hangs on the whole expected square of a deviation. A side that the beams hardly show is as
-    uncertain as the scale says, and must not pull it down. One side more is believed to deviate as
-    is usual: where nothing shows the scale, that is it. `hessian` (p, k, k) and `gradient` (p, k)
-    are of a placement's own unknowns, the sides last; shared ones are held.
+    uncertain as the scale says, and must not pull it down. One side, and one placement, more is
+    believed to deviate as is usual: where nothing shows the scale, that is it. `hessian` (p, k, k)
+    and `gradient` (p, k) are of a placement's own unknowns, the deviations (p, e + 1) last; shared
+    ones are held.
     """
-    edges = sides.shape[1]
-    sigma2 = data.levels.side_sigma**2
+    edges = sides.shape[1] - 1
+    sigma2 = data.levels.of_sides(edges) ** 2
     shown = np.zeros(sides.shape, bool)
     place, beam = np.nonzero(data.beam["used"])
     shown[place, data.beam["edge"][place, beam]] = True
+    shown[place, -1] = True
+    counted = np.sum(shown, axis=0)
     prior = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM * sigma2 + sides**2)  # as in `side_block`
-    last = np.arange(hessian.shape[-1])[-edges:]
+    last = np.arange(hessian.shape[-1])[-edges - 1 :]
     weight = prior * sigma2
     for _ in range(SIDE_ROUNDS):
         whole = hessian.copy()
@@ -319,6 +324,9 @@ def side_level(sides, data, hessian, gradient):
         step = -(spread @ right[..., None])[..., 0]
         square = (sides + step[:, last]) ** 2 + spread[:, last, last]
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)
-        total = np.sum((weight * square)[shown]) + Levels.side_sigma**2
-        sigma2 = np.clip(total / (shown.sum() + 1), *np.square(SIDE_LIMITS))
-    return float(np.sqrt(sigma2))
+        total = np.sum(weight * square * shown, axis=0)
+        of_side = (total[:-1].sum() + Levels.side_sigma**2) / (counted[:-1].sum() + 1)
+        of_placement = (total[-1] + Levels.background_sigma**2) / (counted[-1] + 1)
+        both = np.clip([of_side, of_placement], *np.square(SIDE_LIMITS))
+        sigma2 = np.repeat(both, [edges, 1])
+    return np.sqrt(both).tolist()

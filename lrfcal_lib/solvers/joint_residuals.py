@@ -216,7 +216,7 @@ def beam_block(state, data, unknowns):
     group = data.beam
     ray = rays(state, data, group)
     edge = edge_distance(state, data, group, ray)
-    of_side = np.take_along_axis(state.sides, group["edge"], axis=1)
+    of_side = np.take_along_axis(state.sides, group["edge"], axis=1) + state.sides[:, -1:]
     odds = group["background"] + of_side
     shift, slope = edge_shift(state.sensor[1], group["radius"], odds)
     radius = np.where(group["used"], group["radius"], 1.0)
@@ -226,12 +226,14 @@ def beam_block(state, data, unknowns):
     cost, score, information = beam_terms(margin, sigma, group["hit"], lapse)
     head, parts = ray_columns(-edge.by_origin, -edge.by_direction, ray)
     by_turn = cross(edge.along, -edge.by_edge) + cross(edge.point, edge.by_origin)
+    mine = group["edge"][..., None] == np.arange(unknowns.edges + 1)
+    mine[..., -1] = True
     J = assemble(
         unknowns,
         parts,
         axis=head,
         board=np.concatenate([by_turn, edge.by_origin], axis=-1),
-        sides=slope[..., None] * (group["edge"][..., None] == np.arange(unknowns.edges)),
+        sides=slope[..., None] * mine,
         edge_log_odds=slope[..., None],
         edge_log_softness=(-margin * share_soft)[..., None],
     )
@@ -335,11 +337,11 @@ def sweep_block(state, data, unknowns):
 
 
 def side_block(state, data, unknowns):
-    """What is expected of the sides' deviations from the sensor's edge bias: Student's t, as a
-    likelihood.
+    """What is expected of the deviations from the sensor's edge bias, of sides and of what those
+    of a placement have in common: Student's t, as a likelihood.
     """
     x = state.sides
-    spread = SIDE_FREEDOM * data.levels.side_sigma**2
+    spread = SIDE_FREEDOM * data.levels.of_sides(unknowns.edges) ** 2
     J = own_jacobian(unknowns, len(x), "sides")
     root = np.sqrt((SIDE_FREEDOM + 1) / (spread + x**2))
     cost = 0.5 * (SIDE_FREEDOM + 1) * np.log1p(x**2 / spread)

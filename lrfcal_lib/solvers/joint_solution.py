@@ -187,7 +187,7 @@ class JointSolution:
     @property
     def side_odds(self) -> np.ndarray:
         """By how much the log odds of each side differ from the sensor's, shape (p, e)."""
-        return self.state.sides
+        return self.state.sides[:, :-1] + self.state.sides[:, -1:]
 
     @property
     def noise(self) -> dict[str, float]:
@@ -195,6 +195,7 @@ class JointSolution:
         estimated.
         """
         names = ["face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma"]
+        names.append("background_sigma")
         if self.observations.cameras:
             names.append("view_scale")
         return {name: float(getattr(self.data.levels, name)) for name in names}

@@ -109,7 +109,7 @@ def state_of(obs: JointObservations, head: np.ndarray, cameras: np.ndarray) -> J
         sensor=np.array([0.0, 0.0, np.log(START_SOFTNESS), 0.0, 0.0]),
         boards=boards_in_images(obs, head, cameras, first),
         sweeps=np.zeros((count, 2)),
-        sides=np.zeros((count, len(obs.edges))),
+        sides=np.zeros((count, len(obs.edges) + 1)),
     )
 
 
