@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 from scipy.special import polygamma
 
@@ -21,6 +22,28 @@ AXIS_WORDS = (
     "the offset of the axis within the scan plane",
     "the offset of the axis across the scan plane",
 )
+
+
+def beyond_chance(excess: ArrayLike, freedom: ArrayLike) -> np.ndarray:
+    """How far a variance is above another one, when what chance does is taken off.
+
+    Off the square of the logarithm of the ratio goes its variance by chance, trigamma of half the
+    degrees of freedom. A large excess of many numbers counts in full.
+
+    Parameters
+    ----------
+    excess : array_like
+        Logarithm of the ratio of both variances, 0 or more.
+    freedom : array_like
+        Of the first.
+
+    Returns
+    -------
+    ndarray
+        Logarithm of the ratio that is believed, 0 or more.
+    """
+    chance = polygamma(1, np.asarray(freedom) / 2)
+    return np.maximum(excess - chance / np.maximum(excess, 1e-9), 0.0)
 
 
 @dataclass(frozen=True)
@@ -125,18 +148,14 @@ class Solution:
         camera lean on the same axis, and growing one of them by itself (``g C g``) would claim that
         their difference is known better than anybody measured it.
 
-        Of the square of the logarithm of the ratio of both variances, what n placements leave to
-        chance (trigamma of (n - 1) / 2) is taken off. A large excess over many placements counts in
-        full.
+        What n placements leave to chance is taken off, see :func:`beyond_chance`.
         """
         known = (self.sigma > 0) & np.isfinite(self.sigma)
         ratio = np.divide(
             self.sigma_placements, self.sigma, out=np.ones_like(self.sigma), where=known
         )
         excess = 2 * np.log(np.fmax(ratio, 1.0))
-        chance = polygamma(1, (self.n_placements - 1) / 2)
-        believed = np.maximum(excess - chance / np.maximum(excess, 1e-9), 0.0)
-        h = np.sqrt(np.expm1(believed))
+        h = np.sqrt(np.expm1(beyond_chance(excess, self.n_placements - 1)))
         finite = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
         return self.covariance + h[..., :, None] * finite * h[..., None, :]
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from lrfcal_lib.fit.least_squares import OWN_RANK, eliminate, linearise
+from lrfcal_lib.fit.result import beyond_chance
 from lrfcal_lib.solvers.joint_model import SWEEPS, JointData, JointState, Levels, Unknowns
 from lrfcal_lib.solvers.joint_residuals import (
     SIDE_FREEDOM,
@@ -85,12 +86,13 @@ def on_board(state: JointState, data: JointData) -> np.ndarray:
 
 
 def face_levels(state, data, block, shared, spread):
-    """Scale of the ranges' noise, and the share of independent errors, from means over parts of
-    the boards.
+    """Scale of the ranges' noise, and the share of independent errors, from what ranges have in
+    common over a board and over parts of it.
 
     What board poses take up of the residuals is told by `spread` (p, k, k), the covariance of a
     placement's own unknowns, which follow the `shared` ones: three numbers of a plane where only
-    the scan shows it, next to nothing where images do.
+    the scan shows it, next to nothing where images do. These three carry all that ranges say, so
+    that errors in them count, however small a part of the scatter they are.
     """
     levels = data.levels
     used = data.face["used"]
@@ -99,25 +101,35 @@ def face_levels(state, data, block, shared, spread):
     by_own = (weight / levels.face_scale)[..., None] * block.jacobian[..., shared:]
     taken = levels.face_share * np.sum(by_own * (by_own @ spread))
     scale = np.sqrt(np.sum(z**2) / max(used.sum() - taken, 1))
-    x, y, _ = np.moveaxis(on_board(state, data), -1, 0)
+    # where the ranges should end: noise must not decide which part a point lies in
+    exact = data.face | {"range": data.face["range"] + block.residuals}
+    x, y, _ = np.moveaxis(on_board(state, replace(data, face=exact)), -1, 0)
     part = _part(x, used) * PARTS + _part(y, used)
-    root = used.astype(float)
-    ratio = scatter_of_parts(part, root, z / scale, by_own, levels.face_share, spread)
-    share = levels.face_share if np.isnan(ratio) else 1 / max(ratio, 1.0)
+    parts = np.eye(PARTS**2)[part] * used[..., None]
+    planes = np.linalg.qr(np.stack([used, x * used, y * used], axis=-1))[0]
+    excess = []
+    for modes in (parts, planes):
+        variance, told = scatter(modes, z / scale, by_own, levels.face_share, spread)
+        if told >= 1:
+            excess.append(beyond_chance(np.log(max(variance, 1.0)), told))
+    share = np.exp(-max(excess)) if excess else levels.face_share
     return float(scale), float(share)
 
 
-def scatter_of_parts(part, root, residuals, by_own, share, spread):
-    """Squared scores of parts of boards or edges, relative to those of independent errors.
+def scatter(modes, residuals, by_own, share, spread):
+    """Variance of scores of modes of boards or edges, 1 for independent errors, and how many
+    numbers tell it.
 
-    NaN where placements' own unknowns take them up.
+    Placements' own unknowns take a part t of a mode. What is left of its score has the part
+    ``(1 - t)^2`` of the variance asked for and, from all else that the estimate weighs against it,
+    ``t (1 - t) / share``.
 
     Parameters
     ----------
-    part : ndarray of int, shape (p, n)
-        Of each measurement, from 0 for each placement.
-    root, residuals : ndarray, shape (p, n)
-        Root information, 0 where there is no measurement, and residuals in standard deviations.
+    modes : ndarray, shape (p, n, m)
+        What measurements of a placement have in common, such as those of a part; orthogonal.
+    residuals : ndarray, shape (p, n)
+        In standard deviations.
     by_own : ndarray, shape (p, n, k)
         Derivatives of `residuals`.
     share : float
@@ -125,15 +137,15 @@ def scatter_of_parts(part, root, residuals, by_own, share, spread):
     spread : ndarray, shape (p, k, k)
         Covariance of own unknowns.
     """
-    each = np.eye(part.max() + 1)[part] * root[..., None]
-    counted = np.sum(each**2, axis=1)
-    score = np.sum(each * residuals[..., None], axis=1)
-    pull = np.swapaxes(each, 1, 2) @ by_own
+    counted = np.sum(modes**2, axis=1)
+    score = np.sum(modes * residuals[..., None], axis=1)
+    pull = np.swapaxes(modes, 1, 2) @ by_own
     taken = share * np.sum(pull * (pull @ spread), axis=-1)
     there = counted > 0
-    left = np.sum(1 - taken[there] / counted[there])
+    taken = taken[there] / counted[there]
     square = np.sum(score[there] ** 2 / counted[there])
-    return square / left if left >= 1 else np.nan
+    told = np.sum((1 - taken) ** 2)
+    return (square - np.sum(taken * (1 - taken)) / share) / max(told, 1e-9), told
 
 
 def _part(values, used):
@@ -169,12 +181,12 @@ def beam_share(state, data, block, shared, spread):
     for number in range(edges):
         mine = used & (edge == number)
         part[mine] = _part(along, mine)[mine]
-    part += PARTS * edge
-    ratio = scatter_of_parts(part, root, block.residuals, by_own, before, spread)
-    if np.isnan(ratio):
+    modes = np.eye(PARTS * edges)[part + PARTS * edge] * root[..., None]
+    variance, told = scatter(modes, block.residuals, by_own, before, spread)
+    if told < 1:
         return before
     gain = max(np.sum(curvature) / np.sum(root**2), LEAST_CURVATURE)
-    return float(gain / max(ratio / gain, 1.0))
+    return float(gain / max(variance / gain, 1.0))
 
 
 def _along_edges(state, data):
