@@ -14,7 +14,7 @@ from lrfcal_lib.solvers.joint_residuals import (
     rays,
 )
 
-PARTS = 3  # of a board in x and y, and of an edge
+PARTS = 3  # of a board in x and in y
 # radians, errors of the pitch at a stop that are tried
 PITCH_LEVELS = np.radians(
     [0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1]
@@ -107,18 +107,17 @@ def face_levels(state, data, block, shared, spread):
     part = _part(x, used) * PARTS + _part(y, used)
     parts = np.eye(PARTS**2)[part] * used[..., None]
     planes = np.linalg.qr(np.stack([used, x * used, y * used], axis=-1))[0]
-    excess = []
-    for modes in (parts, planes):
-        variance, told = scatter(modes, z / scale, by_own, levels.face_share, spread)
-        if told >= 1:
-            excess.append(beyond_chance(np.log(max(variance, 1.0)), told))
-    share = np.exp(-max(excess)) if excess else levels.face_share
+    excess = [
+        common_errors(modes, z / scale, by_own, levels.face_share, spread)
+        for modes in (parts, planes)
+    ]
+    share = levels.face_share if np.isnan(excess).all() else np.exp(-np.nanmax(excess))
     return float(scale), float(share)
 
 
-def scatter(modes, residuals, by_own, share, spread):
-    """Variance of scores of modes of boards or edges, 1 for independent errors, and how many
-    numbers tell it.
+def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
+    """Logarithm of how much more modes of boards or edges scatter than by independent errors, as
+    far as chance does not explain it; NaN where nothing tells it.
 
     Placements' own unknowns take a part t of a mode. What is left of its score has the part
     ``(1 - t)^2`` of the variance asked for and, from all else that the estimate weighs against it,
@@ -136,16 +135,20 @@ def scatter(modes, residuals, by_own, share, spread):
         Of the information that the estimate counts.
     spread : ndarray, shape (p, k, k)
         Covariance of own unknowns.
+    usual : float
+        Variance of independent errors.
     """
     counted = np.sum(modes**2, axis=1)
     score = np.sum(modes * residuals[..., None], axis=1)
     pull = np.swapaxes(modes, 1, 2) @ by_own
-    taken = share * np.sum(pull * (pull @ spread), axis=-1)
     there = counted > 0
-    taken = taken[there] / counted[there]
-    square = np.sum(score[there] ** 2 / counted[there])
+    taken = share * np.sum(pull * (pull @ spread), axis=-1)[there] / counted[there]
     told = np.sum((1 - taken) ** 2)
-    return (square - np.sum(taken * (1 - taken)) / share) / max(told, 1e-9), told
+    if told < 1:
+        return np.nan
+    square = np.sum(score[there] ** 2 / counted[there])
+    variance = (square - np.sum(taken * (1 - taken)) / share) / told
+    return beyond_chance(np.log(max(variance / usual, 1.0)), told)
 
 
 def _part(values, used):
@@ -156,9 +159,10 @@ def _part(values, used):
 
 
 def beam_share(state, data, block, shared, spread):
-    """Share of independent errors among neighbouring beams, from the scores of parts of every edge.
+    """Share of independent errors among neighbouring beams, from the scores of every edge's slope.
 
-    What board and sides take up of the scores is told by `spread` (p, k, k), the covariance of a
+    Slopes carry most of what beams say, and a background that changes along a side turns it. What
+    board and sides take up of the scores is told by `spread` (p, k, k), the covariance of a
     placement's own unknowns, which follow the `shared` ones. The steps count a little more
     information than there is where beams may say nothing (`lapse`, see
     :func:`lrfcal_lib.fit.edge_likelihood.beam_terms`); the share brings that down to the true
@@ -170,23 +174,18 @@ def beam_share(state, data, block, shared, spread):
     """
     before = data.levels.beam_share
     used = data.beam["used"]
-    edge = data.beam["edge"]
     by_own = block.jacobian[..., shared:]
     root = used * np.linalg.norm(by_own[..., 3:6], axis=-1)  # root information
     lapsed = data.levels.lapse * np.exp(np.where(used, block.cost, 0.0) / before)
     curvature = root**2 * (1 - block.residuals**2 * lapsed / (1 - lapsed))
-    along = _along_edges(state, data)
-    edges = len(data.lines)
-    part = np.zeros(used.shape, int)
-    for number in range(edges):
-        mine = used & (edge == number)
-        part[mine] = _part(along, mine)[mine]
-    modes = np.eye(PARTS * edges)[part + PARTS * edge] * root[..., None]
-    variance, told = scatter(modes, block.residuals, by_own, before, spread)
-    if told < 1:
-        return before
     gain = max(np.sum(curvature) / np.sum(root**2), LEAST_CURVATURE)
-    return float(gain / max(variance / gain, 1.0))
+    along = np.where(used, _along_edges(state, data), 0.0)[..., None]
+    edges = np.eye(len(data.lines))[data.beam["edge"]] * root[..., None]
+    information = np.maximum(np.sum(edges**2, axis=1, keepdims=True), 1e-300)
+    middle = np.sum(edges**2 * along, axis=1, keepdims=True) / information
+    slopes = edges * (along - middle)
+    excess = common_errors(slopes, block.residuals, by_own, before, spread, gain)
+    return before if np.isnan(excess) else float(gain * np.exp(-excess))
 
 
 def _along_edges(state, data):
