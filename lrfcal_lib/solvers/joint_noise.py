@@ -107,6 +107,7 @@ def face_levels(state, data, block, shared, spread):
     part = _part(x, used) * PARTS + _part(y, used)
     parts = np.eye(PARTS**2)[part] * used[..., None]
     planes = np.linalg.qr(np.stack([used, x * used, y * used], axis=-1))[0]
+    planes *= used[..., None]  # of a placement without ranges it makes something else
     excess = [
         common_errors(modes, z / scale, by_own, levels.face_share, spread)
         for modes in (parts, planes)
