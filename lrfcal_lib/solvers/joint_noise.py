@@ -283,7 +283,8 @@ def sweep_levels(sweeps, data, hessian, gradient, shared):
     """
     c = shared
     number = sweeps.shape[1]
-    places = np.arange(c + 6, c + 6 + number)
+    rows = np.arange(6, 6 + number)  # of a placement's own unknowns
+    places = c + rows
     usual = USUAL_SWEEP[:number] ** 2
     before = np.square(data.levels.sweep_sigma[:number])
     variance = before
@@ -296,7 +297,6 @@ def sweep_levels(sweeps, data, hessian, gradient, shared):
         reduced, score, back = eliminate(whole, right, c)
         inverse = np.linalg.pinv(np.sum(reduced, axis=0), hermitian=True)
         step = -inverse @ np.sum(score, axis=0)
-        rows = places - c
         by_shared = back[:, rows, :c]
         error = sweeps - back[:, rows, c] - by_shared @ step
         own = np.linalg.pinv(whole[:, c:, c:], rcond=OWN_RANK, hermitian=True)
