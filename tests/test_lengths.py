@@ -141,6 +141,17 @@ def test_a_list_that_is_not_there_is_named_once(tmp_path):
         lengths.read_picks(tmp_path / "none.csv")
 
 
+def test_a_point_that_noise_put_on_another_plane_does_not_choose_it(scene):
+    inner = scene.planes[0].foot(np.median(scene.cloud.points[scene.of_point == 0], axis=0))
+    away = np.linalg.norm(scene.cloud.points - inner, axis=1)
+    clicked = np.argmin(np.where(scene.of_point == 0, away, np.inf))
+    of_point = scene.of_point.copy()
+    of_point[clicked] = 1
+    place = scene.cloud.points[clicked]
+    plane, distance = replace(scene, of_point=of_point).at("plane", place)
+    assert plane is scene.planes[0] and distance == 0
+
+
 def test_places_where_nothing_is_are_named(scene):
     inside = ("point", scene.cloud.points[0])
     for kind, reach in (("plane", 100), ("edge", 10), ("point", 100)):

@@ -332,13 +332,15 @@ def _stations(session, rig):
 
 def _cloud(session, rig, placement) -> Cloud:
     """The points of a station; what the calibration knows of single sweeps is of other ones."""
-    clean = replace(rig.corrections, sweeps={})
-    sweep = session.sweep(placement)
-    continuous = session.continuous
-    head = rig.T_head_lrf
-    return join_clouds(
-        reconstruct(sweep, [], head, clean, lrf=session.lrf, continuous=continuous)
+    blocks = reconstruct(
+        session.sweep(placement),
+        [],
+        rig.T_head_lrf,
+        replace(rig.corrections, sweeps={}),
+        lrf=session.lrf,
+        continuous=session.continuous,
     )
+    return join_clouds(blocks)
 
 
 def flat_cloud(cloud, planes, of_point):

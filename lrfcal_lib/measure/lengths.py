@@ -40,7 +40,7 @@ REACH = (
     0.1  # metres from a picked place to points of its plane, and from a click to its edge
 )
 ON_IT = 0.01  # metres from a place on a feature of one station to the same one of another
-ABOUT = 9  # points whose middle a picked point is
+ABOUT = 9  # points whose middle a picked point is, and that show which plane is picked
 PLACE = ("x", "y", "z")
 PICKED = tuple(
     f"{what}_{number}" for number in (1, 2) for what in ("kind", "x_m", "y_m", "z_m")
@@ -82,11 +82,15 @@ class SceneFeatures:
             about = np.argsort(away)[:ABOUT]
             return fit_feature(self.cloud, about, self.rig, plane=False), away.min()
         fits = np.array([*(plane.lies_along(axis) for plane in self.planes), False])
-        away[~fits[self.of_point]] = np.inf
-        nearest = int(np.argmin(away))
-        if not np.isfinite(away[nearest]):
+        rows = np.flatnonzero(fits[self.of_point])
+        about = rows[np.argsort(away[rows])[:ABOUT]]
+        if not len(about):
             return None, np.inf
-        return self.planes[self.of_point[nearest]], away[nearest]
+        middle = self.cloud.points[about].mean(axis=0)
+        # where a picture hangs, the nearest point may be one of the wall that noise put on it
+        planes = [self.planes[number] for number in np.unique(self.of_point[about])]
+        plane = min(planes, key=lambda each: np.linalg.norm(each.foot(middle) - middle))
+        return plane, away[about[0]]
 
 
 def nearest_edge(
@@ -237,9 +241,10 @@ def _shown(scenes, poses, kind, place) -> dict[int, Feature]:
         there = T.apply(foot)
         axis = (T * poses[clicked]).rotation.apply(feature.axis)
         other, away = scene.at(kind, there, axis)
-        if number != clicked and away < REACH:
-            if np.linalg.norm(other.foot(there) - there) < ON_IT:
-                shown[number] = other
+        if number == clicked or away >= REACH:
+            continue
+        if np.linalg.norm(other.foot(there) - there) < ON_IT:
+            shown[number] = other
     return shown
 
 

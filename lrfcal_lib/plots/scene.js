@@ -278,16 +278,24 @@ function panel(page, data) {
     return found.sort((a, b) => a.away - b.away);
   }
 
+  // The plane of a station, of those along an axis, that the points nearest to a place in its frame lie on as a whole.
+  function nearestPlane(station, place, axis) {
+    const fits = (s, number) => s === station && number >= 0 && measurer.liesAlong(measurer.feature(number), axis);
+    const about = near(measurer.inPage(station, place), fits).slice(0, data.about);
+    if (!about.length) return { away: Infinity };
+    const sum = about.reduce((total, each) => plus(total, measurer.inStation(station, each.p)), [0, 0, 0]);
+    const middle = times(sum, 1 / about.length);
+    const off = (plane) => norm(minus(measurer.foot(plane, middle), middle));
+    const candidates = [...new Set(about.map((each) => each.plane))].map((plane) => measurer.feature(plane));
+    return { away: about[0].away, feature: candidates.reduce((a, b) => (off(b) < off(a) ? b : a)) };
+  }
+
   function at(kind, place, curve, number) {
     const own = stations[curve][number];
     if (kind === "plane") {
-      const plane = planes[curve][number];
-      if (plane < 0) return "no flat surface here: pick an edge or a point";
-      return measurer.shown(measurer.feature(plane), place, (station, there, axis) => {
-        const fits = (s, number) => s === station && number >= 0 && measurer.liesAlong(measurer.feature(number), axis);
-        const [first] = near(measurer.inPage(station, there), fits);
-        return first ? { away: first.away, feature: measurer.feature(first.plane) } : { away: Infinity };
-      });
+      if (planes[curve][number] < 0) return "no flat surface here: pick an edge or a point";
+      const clicked = nearestPlane(own, measurer.inStation(own, place));
+      return measurer.shown(clicked.feature, place, nearestPlane);
     }
     if (kind === "edge") {
       const nearest = (station, there, axis) => measurer.nearestEdge(station, there, axis);
