@@ -162,6 +162,15 @@ def problem(count):
     return obs.keep(**masks)
 
 
+def data_of_placement(data, p):
+    """The part of the joint estimate's data that one placement has."""
+    groups = {
+        name: {key: values[[p]] for key, values in getattr(data, name).items()}
+        for name in ("face", "beam", "view")
+    }
+    return replace(data, **groups, middle=data.middle[[p]], direction=data.direction[[p]])
+
+
 def with_gtsam(count):
     """What runs GTSAM's iterations from the start value, with a Python factor a placement.
 
@@ -174,16 +183,7 @@ def with_gtsam(count):
     unknowns = Unknowns(2, 3, sensor=("range_offset",))
     start = next(start_states(obs))[0]
     c = unknowns.shared
-    pieces = []
-    for p in range(count):
-        groups = {
-            name: {k: v[[p]] for k, v in getattr(data, name).items()}
-            for name in ("face", "beam", "view")
-        }
-        piece = replace(
-            data, **groups, middle=data.middle[[p]], direction=data.direction[[p]]
-        )
-        pieces.append((start.of_placements([p]), piece))
+    pieces = [(start.of_placements([p]), data_of_placement(data, p)) for p in range(count)]
 
     def error(p, values, jacobians):
         at, piece = pieces[p]

@@ -101,13 +101,28 @@ def picture(seed):
 
 def make_sessions(folder):
     """Scan lines, and telegrams of a recording that was interrupted; each with images; and a rig file."""
+    make_scans(folder / "scans")
+    with recorder(folder / "telegrams") as writer:
+        add(writer, 1)
+        writer.begin_placement(2)
+        record(writer, 2)
+    make_rig_file(folder / "rig")
+    write_source(folder / "import", np.random.default_rng(0))
+    (folder / "outside").mkdir()
+    png = cv2.imencode(".png", picture(0))[1].tobytes()
+    for name in ("secret", "secret.png"):
+        (folder / "outside" / name).write_bytes(png)
+
+
+def make_scans(folder):
+    """A session of scan lines, images, drawn edges and a truth."""
     cameras = [
         CameraInfo("left", "head", 160, 120, None, HEAD),
         CameraInfo("right", "platform", 160, 120, MODEL),
     ]
     bearings = np.radians(np.arange(60.0, 121.0))
     pitch = np.radians([-1.0, 0.0, 1.0])
-    with SessionWriter(folder / "scans", SQUARE, LRF, cameras, HEAD) as writer:
+    with SessionWriter(folder, SQUARE, LRF, cameras, HEAD) as writer:
         for placement in (1, 2):
             writer.add_sweep(
                 placement,
@@ -127,8 +142,8 @@ def make_sessions(folder):
     rows = (
         "left,images/left/0001.png,ab,1,2,20,3\nright,images/right/0001.png,bc,1,2,30,3\n"
     )
-    (folder / "scans" / "edges.csv").write_text("camera,file,edge,u1,v1,u2,v2\n" + rows)
-    stated = json.loads((folder / "scans" / "session.json").read_text())
+    (folder / "edges.csv").write_text("camera,file,edge,u1,v1,u2,v2\n" + rows)
+    stated = json.loads((folder / "session.json").read_text())
     head = transform_to_json(HEAD)
     truth = {
         "T_head_lrf": head,
@@ -139,12 +154,12 @@ def make_sessions(folder):
         "cameras": {c: {"T_camera_lrf": head} for c in ("left", "right")},
         "sweeps": {"1": {"pitch_rad": [0.1]}},
     }
-    (folder / "scans" / "truth.json").write_text(json.dumps(truth))
-    with recorder(folder / "telegrams") as writer:
-        add(writer, 1)
-        writer.begin_placement(2)
-        record(writer, 2)
-    (folder / "rig").mkdir()
+    (folder / "truth.json").write_text(json.dumps(truth))
+
+
+def make_rig_file(folder):
+    """A folder with ``rig.json``."""
+    folder.mkdir()
     rig = rig_data(
         placements=[
             {"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}
@@ -154,13 +169,7 @@ def make_sessions(folder):
         mode="json"
     )
     rig["devices"]["cameras"]["left"] |= {"exposure": 0.01, "silence_s": 10}
-    (folder / "rig" / "rig.json").write_text(json.dumps(rig))
-    write_source(folder / "import", np.random.default_rng(0))
-    (folder / "outside").mkdir()
-    for name in ("secret", "secret.png"):
-        (folder / "outside" / name).write_bytes(
-            cv2.imencode(".png", picture(0))[1].tobytes()
-        )
+    (folder / "rig.json").write_text(json.dumps(rig))
 
 
 def recorder(path):
@@ -415,6 +424,11 @@ def array_of(header, version=1):
     return b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<H", len(header)) + header
 
 
+# what headers of arrays state: too much, nothing, no numbers, not even a shape
+STATED_SHAPES = "(100000, 100000)|(-1, 61)|()|(6,)|(2**40,)|(6, 61|(6, 61, 1)".split("|")
+STATED_KINDS = "<f8 <f4 |O <U9 |b1 <c16 |V1000000 <i8 <M8[s] >f8 x |S0".split()
+
+
 def arrays(rng, file):
     """Other arrays than a session's, headers that lie, and archives that unpack to much."""
     with zipfile.ZipFile(file) as archive:
@@ -422,34 +436,8 @@ def arrays(rng, file):
     name = any_of(rng, *sorted(members))
     how = rng.integers(4)
     if how == 0:
-        shape = any_of(
-            rng,
-            "(100000, 100000)",
-            "(-1, 61)",
-            "()",
-            "(6,)",
-            "(2**40,)",
-            "(6, 61",
-            "(6, 61, 1)",
-        )
-        kind = any_of(
-            rng,
-            "<f8",
-            "<f4",
-            "|O",
-            "<U9",
-            "|b1",
-            "<c16",
-            "|V1000000",
-            "<i8",
-            "<M8[s]",
-            ">f8",
-            "x",
-            "|S0",
-        )
-        members[name] = array_of(header_of(shape, kind), any_of(rng, 1, 1, 2, 9)) + bytes(
-            1000
-        )
+        header = header_of(any_of(rng, *STATED_SHAPES), any_of(rng, *STATED_KINDS))
+        members[name] = array_of(header, any_of(rng, 1, 1, 2, 9)) + bytes(1000)
     elif how == 1:
         value = any_of(rng, 0.0, np.nan, np.inf, -1.0, 1e300)
         shape = any_of(rng, (6, 61), (0, 61), (61,), (3, 3000))

@@ -35,6 +35,27 @@ def panel_only(folder):
     nbformat.write(notebook, folder / NOTEBOOK.name)
 
 
+def free_port():
+    """Of this machine; nobody else is likely to take it before JupyterLab does."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def started(folder, port, token, log):
+    """The process of a JupyterLab that serves a folder; its settings stand beside the folder."""
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    places = {
+        f"JUPYTER_{kind}_DIR": str(folder.parent / kind.lower())
+        for kind in ("CONFIG", "RUNTIME")
+    }
+    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root"]
+    command += ["--ip=127.0.0.1", f"--port={port}", "--ServerApp.port_retries=0"]
+    command += [f"--ServerApp.root_dir={folder}", QUIET, option()]
+    environment = os.environ | threads | places | {"JUPYTER_TOKEN": token}
+    return subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+
+
 @pytest.fixture
 def lab(tmp_path):
     """Address of a JupyterLab with the panel's notebook, its token included."""
@@ -43,21 +64,8 @@ def lab(tmp_path):
     token = secrets.token_hex(16)
     work.mkdir()
     panel_only(work)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"http://127.0.0.1:{probe.getsockname()[1]}"
-    environment = os.environ | {
-        f"JUPYTER_{kind}_DIR": str(tmp_path / kind.lower())
-        for kind in ("CONFIG", "RUNTIME")
-    }
-    environment |= {
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "JUPYTER_TOKEN": token,
-    }
-    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ip=127.0.0.1",
-               f"--port={address.rpartition(':')[2]}", "--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}",
-               QUIET, option()]  # fmt: skip
+    port = free_port()
+    address = f"http://127.0.0.1:{port}"
 
     def call(path, **options):
         request = urllib.request.Request(
@@ -70,7 +78,7 @@ def lab(tmp_path):
             return call("/api")
 
     with log.open("w") as stream:
-        server = subprocess.Popen(command, env=environment, stdout=stream, stderr=stream)
+        server = started(work, port, token, stream)
         try:
             until(lambda: server.poll() is not None or responds(), START_S)
             assert server.poll() is None, (

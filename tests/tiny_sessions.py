@@ -61,6 +61,25 @@ def rectangle(shift=0.0, columns=9, rows=5, square=0.036, size=(0.46, 0.34)):
     )
 
 
+def _truth(board, cameras):
+    """What ``truth.json`` says of a session before its first placement."""
+    lens = model_to_json(MODEL)
+    of_cameras = {
+        name: {"T_camera_lrf": transform_to_json(CAMERAS[name]), "intrinsics": lens}
+        for name in cameras
+    }
+    return {
+        "simulated": True,
+        "T_head_lrf": transform_to_json(HEAD),
+        "board": board_to_json(board),
+        "boards": {},
+        "cameras": of_cameras,
+        "images": {},
+        "sweeps": {},
+        "lrf": {},
+    }
+
+
 def record(
     path, board, seed=0, *, placements=4, pitch_deg=None, on_wall=False, image_pitch_deg=(0.0,), cameras=CAMERAS,
     platform=STATED, still=(), purpose="board",
@@ -91,23 +110,10 @@ def record(
     pitch = np.radians(np.arange(-14, 14.1, 1.0) if pitch_deg is None else pitch_deg)
     info = LrfInfo("pinpoint", (BEARINGS[0], BEARINGS[-1]), np.radians(0.5), SIGMA_RANGE)
     infos = [CameraInfo(name, "head", MODEL.width, MODEL.height, MODEL) for name in cameras]
-    stated = (
-        Board(board.name, board.edges, None, board.pattern, board.features)
-        if on_wall
-        else board
-    )
-    truth = {
-        "simulated": True,
-        "T_head_lrf": transform_to_json(HEAD),
-        "board": board_to_json(board),
-        "boards": {},
-    }
-    lens = model_to_json(MODEL)
-    truth["cameras"] = {
-        n: {"T_camera_lrf": transform_to_json(CAMERAS[n]), "intrinsics": lens}
-        for n in cameras
-    }
-    truth |= {"images": {}, "sweeps": {}, "lrf": {}}
+    stated = board
+    if on_wall:
+        stated = Board(board.name, board.edges, None, board.pattern, board.features)
+    truth = _truth(board, cameras)
     own = {"platform_sigma": (0.03, 0.02), "simulated": True}
     with SessionWriter(path, stated, info, infos, platform, **own) as writer:
         for number in range(1, placements + 1):
