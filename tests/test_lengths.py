@@ -164,6 +164,32 @@ def test_places_where_nothing_is_are_named(scene):
     assert "deg from parallel" in length(scene, *ends).problem
 
 
+def test_a_feature_taken_twice_is_named(scene):
+    for kind in features.Kind:
+        place = scene.cloud.points[scene.of_point == 0][0]
+        if kind == "edge":
+            place = scene.edges[0].centre
+        row = length(scene, (kind, place), (kind, place + 1e-4))
+        assert row.problem.startswith(f"both places are on the same {kind}: pick two")
+        assert np.isnan(row.length_m)
+
+
+def test_a_station_that_shows_both_ends_as_one_is_left_out(scene):
+    """Where noise is large, a picture and its wall are one plane from some stations."""
+    i, j = parallel(scene.planes)
+    ends = [("plane", scene.cloud.points[scene.of_point == k][0]) for k in (i, j)]
+    row = pd.DataFrame([{"name": "it"} | pick(*ends[0], 1) | pick(*ends[1], 2)])
+    alone = lengths.measure({1: scene}, row).iloc[0]
+    blind = replace(scene, planes=[scene.planes[i]] * len(scene.planes))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lengths, "ON_IT", np.inf)
+        both = lengths.measure(
+            {1: scene, 2: blind}, row, dict.fromkeys((1, 2), lengths.IN_PLACE)
+        )
+    assert both.stations[0] == "1"
+    assert both.length_m[0] == alone.length_m
+
+
 def seen_from(scene, T_station_scene, shift):
     """The same scene from another station, whose surfaces are off by a shift along their normals."""
     turn = T_station_scene.rotation

@@ -211,8 +211,7 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
         parts.append(part)
     cloud = shifts(first, second_there)
     moved = (cloud.amount("mm in the cloud", 1000),)
-    chi2, freedom, p = _chi2(step, covariance)
-    whole = Part("everything", moved, chi2, freedom, p, p_of_others=1.0)
+    whole = Part("everything", moved, *_chi2(step, covariance), 1.0)
     return Comparison(first, second, tuple(parts), whole, images, cloud, one_lens)
 
 

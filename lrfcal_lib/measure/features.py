@@ -161,6 +161,10 @@ class Feature:
     ends: np.ndarray
     image: int = -1
 
+    def is_same(self, other: "Feature") -> bool:
+        """Whether another one is this feature, taken once more."""
+        return np.array_equal(self.centre, other.centre)
+
     def lies_along(self, axis: np.ndarray | None) -> bool:
         """Whether its axis is parallel to another one (3,) to 15 deg; None is to all."""
         return axis is None or abs(self.axis @ axis) > np.cos(ALIKE)
@@ -354,8 +358,12 @@ def length_between(first: Feature, second: Feature) -> Length:
     Raises
     ------
     DegenerateGeometry
-        For planes or edges that are not parallel to 15 deg.
+        For planes or edges that are not parallel to 15 deg, and for one feature taken twice.
     """
+    if first.is_same(second):
+        raise DegenerateGeometry(
+            f"both places are on the same {first.kind}: pick two, or two points of it"
+        )
     _refuse_askew(first, second)
     kind, weights = _axes(first, second)
     place = np.concatenate([first.centre, first.axis, second.centre, second.axis])

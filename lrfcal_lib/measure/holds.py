@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.cloud import join as join_clouds
-from lrfcal_lib.calibrate.reconstruct import reconstruct
+from lrfcal_lib.calibrate.clouds import sweep_blocks
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
 from lrfcal_lib.measure.creases import Sights, creases_of, creases_pulls, sights
@@ -331,16 +331,8 @@ def _stations(session, rig):
 
 
 def _cloud(session, rig, placement) -> Cloud:
-    """The points of a station; what the calibration knows of single sweeps is of other ones."""
-    blocks = reconstruct(
-        session.sweep(placement),
-        [],
-        rig.T_head_lrf,
-        replace(rig.corrections, sweeps={}),
-        lrf=session.lrf,
-        continuous=session.continuous,
-    )
-    return join_clouds(blocks)
+    """The points of a station."""
+    return join_clouds(sweep_blocks(session, rig.for_scenes, session.sweep(placement), []))
 
 
 def flat_cloud(cloud, planes, of_point):

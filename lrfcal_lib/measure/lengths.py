@@ -217,14 +217,14 @@ def _lengths(scenes, poses, row) -> dict[int, Length]:
         raise DegenerateGeometry(
             "no station shows both places: pick places that one of them shows"
         )
-    return {s: length_between(first[s], second[s]) for s in both}
+    # where noise is large, a picture and its wall are one plane from some stations
+    apart = [station for station in both if not first[station].is_same(second[station])]
+    return {s: length_between(first[s], second[s]) for s in apart or both}
 
 
 def _shown(scenes, poses, kind, place) -> dict[int, Feature]:
     """The features that stations show at a place; a point is of the station that is nearest."""
-    near = {}
-    for number, scene in scenes.items():
-        near[number] = scene.at(kind, poses[number].inv().apply(place))
+    near = {n: s.at(kind, poses[n].inv().apply(place)) for n, s in scenes.items()}
     clicked = min(near, key=lambda number: near[number][1])
     feature, away = near[clicked]
     reach = ON_IT if kind == Kind.EDGE else REACH
@@ -234,12 +234,12 @@ def _shown(scenes, poses, kind, place) -> dict[int, Feature]:
         )
     if kind == Kind.POINT:
         return {clicked: feature}
-    foot = poses[clicked].apply(feature.foot(poses[clicked].inv().apply(place)))
+    foot = feature.foot(poses[clicked].inv().apply(place))
     shown = {clicked: feature}
     for number, scene in scenes.items():
-        T = poses[number].inv()
+        T = poses[number].inv() * poses[clicked]
         there = T.apply(foot)
-        axis = (T * poses[clicked]).rotation.apply(feature.axis)
+        axis = T.rotation.apply(feature.axis)
         other, away = scene.at(kind, there, axis)
         if number == clicked or away >= REACH:
             continue

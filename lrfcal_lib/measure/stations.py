@@ -223,7 +223,7 @@ def _joined(numbers, pairs, problems, of_rig):
             f"station {number} is left out: nothing joins it to station {reference}; record one "
             "between them that sees what both see"
         )
-        problems.append(Problem(Stage.STATIONS, ProblemKind.NO_OVERLAP, words))
+        problems.append(Problem(Stage.STATIONS, ProblemKind.LEFT_OUT, words))
     return replace(joined, problems=tuple(problems))
 
 
@@ -252,8 +252,7 @@ def advice(joined: Joined) -> list[str]:
     joined : Joined
     """
     sentences = []
-    missing = [p.words for p in joined.problems if p.kind is ProblemKind.NO_OVERLAP]
-    if any(words.startswith("station ") for words in missing):
+    if ProblemKind.LEFT_OUT in [problem.kind for problem in joined.problems]:
         sentences.append(
             "Some stations are left out: record one between them and the others, that sees what "
             "both see, at most 1 m and 40 deg from each."

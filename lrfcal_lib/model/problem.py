@@ -30,6 +30,7 @@ class ProblemKind(Enum):
     TOO_LITTLE = auto()  # neither images nor edges enough for the pose of a board
     CONTRADICTS = auto()  # placement, image or pair of stations: all others
     NO_OVERLAP = auto()  # of two stations
+    LEFT_OUT = auto()  # a station that no other one joins
     AMBIGUOUS = auto()  # two stations fit together in more than one way
 
 

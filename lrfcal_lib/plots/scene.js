@@ -146,6 +146,7 @@ class Measurer {
   // Length between two features of a station, the variance of what only this station has wrong, and derivatives by
   // what all have wrong alike; a text where there is none.
   between(first, second) {
+    if (isSame(first, second)) return `both places are on the same ${first.kind}: pick two, or two points of it`;
     const order = ["point", "edge", "plane"];
     const kind = order[Math.max(order.indexOf(first.kind), order.indexOf(second.kind))];
     if (first.kind !== "point" && second.kind !== "point") {
@@ -206,11 +207,13 @@ class Measurer {
   measured(first, second) {
     const both = Object.keys(first.features).filter((station) => station in second.features);
     if (!both.length) return "no station shows both places: pick places that one of them shows";
-    const lengths = both.map((station) => this.between(first.features[station], second.features[station]));
+    const apart = both.filter((station) => !isSame(first.features[station], second.features[station]));
+    const lengths = (apart.length ? apart : both).map((station) => this.between(first.features[station], second.features[station]));
     return lengths.find((each) => typeof each === "string") || this.mean(lengths);
   }
 }
 
+const isSame = (first, second) => norm(minus(first.centre, second.centre)) === 0;
 const transposed = (R) => R[0].map((_, i) => R.map((row) => row[i]));
 
 // The list of lengths as CSV: `measure --picks` reads it.
