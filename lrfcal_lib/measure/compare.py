@@ -244,7 +244,7 @@ def _without_lens(rig):
     return replace(rig, uncertainty=known)
 
 
-def _chi2(step, covariance):
+def _chi2(step, covariance) -> tuple[float, int, float]:
     """Chi-square of differences, its degrees of freedom, and how often chance exceeds it.
 
     Without what nothing bounds, or one of the two took as it is.
