@@ -74,6 +74,8 @@ class SceneFeatures:
     ) -> tuple[Feature | None, float]:
         """The feature of a kind that is nearest to a place (3,), platform frame, of those along an
         axis (3,), and how near its points or the edge are, metres; None where there is none.
+
+        Of planes it is the one on which the nearest points lie as a whole.
         """
         if kind == Kind.EDGE:
             return nearest_edge([e for e in self.edges if e.lies_along(axis)], place)
