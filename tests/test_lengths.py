@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from drawn_rooms import simulate_room
+from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 from shared import DATA
 
@@ -150,6 +151,22 @@ def test_a_point_that_noise_put_on_another_plane_does_not_choose_it(scene):
     place = scene.cloud.points[clicked]
     plane, distance = replace(scene, of_point=of_point).at("plane", place)
     assert plane is scene.planes[0] and distance == 0
+
+
+def test_at_a_crease_the_nearest_point_chooses_the_plane(scene):
+    """Where floor and wall meet, points of both are about: the floor must not be taken for the wall."""
+    tree = KDTree(scene.cloud.points)
+    normals = np.array([plane.axis for plane in scene.planes])
+    checked = 0
+    for clicked in np.flatnonzero(scene.of_point >= 0)[::11]:
+        about = scene.of_point[tree.query(scene.cloud.points[clicked], lengths.ABOUT)[1]]
+        about = about[about >= 0]
+        facing = np.abs(normals[about] @ normals[scene.of_point[clicked]])
+        if facing.min() < 0.5:
+            plane, _ = scene.at("plane", scene.cloud.points[clicked])
+            checked += 1
+            assert plane.lies_along(normals[scene.of_point[clicked]])
+    assert checked > 5
 
 
 def test_places_where_nothing_is_are_named(scene):

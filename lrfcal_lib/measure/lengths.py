@@ -75,7 +75,8 @@ class SceneFeatures:
         """The feature of a kind that is nearest to a place (3,), platform frame, of those along an
         axis (3,), and how near its points or the edge are, metres; None where there is none.
 
-        Of planes it is the one on which the nearest points lie as a whole.
+        Of planes it is the one on which the nearest points lie as a whole, of those parallel to
+        that of the nearest.
         """
         if kind == Kind.EDGE:
             return nearest_edge([e for e in self.edges if e.lies_along(axis)], place)
@@ -88,6 +89,8 @@ class SceneFeatures:
         about = rows[np.argsort(away[rows])[:ABOUT]]
         if not len(about):
             return None, np.inf
+        if axis is None:  # at a crease the nearest point tells which way the surface faces
+            return self.at(kind, place, self.planes[self.of_point[about[0]]].axis)
         middle = self.cloud.points[about].mean(axis=0)
         # where a picture hangs, the nearest point may be one of the wall that noise put on it
         planes = [self.planes[number] for number in np.unique(self.of_point[about])]
@@ -146,8 +149,7 @@ def features_of_station(session: Session, rig: CalibratedRig, number: int) -> Sc
     """
     views = views_of(session, rig, number)
     sweep, _ = without_closing(session.sweep(number))
-    cloud = join(sweep_blocks(session, rig, sweep, views))
-    return features_of(cloud, rig, views)
+    return features_of(join(sweep_blocks(session, rig, sweep, views)), rig, views)
 
 
 def measure(
@@ -181,7 +183,7 @@ def measure(
     poses = poses or dict.fromkeys(scenes, IN_PLACE)
     rows = []
     for row in picks.to_dict("records"):
-        length, sigma = np.nan, np.nan
+        length = sigma = np.nan
         stations: list[int] = []
         problem = ""
         try:
@@ -328,8 +330,10 @@ def for_page(
         rows.append(np.concatenate(parts))
     frames = {}
     for number, T in poses.items():
-        R = T.rotation.as_matrix().tolist()
-        frames[number] = {"R": R, "t": T.translation.tolist()}
+        frames[number] = {
+            "R": T.rotation.as_matrix().tolist(),
+            "t": T.translation.tolist(),
+        }
     rig = next(iter(scenes.values())).rig
     known = uncertainty_of(rig)
     return {

@@ -214,8 +214,9 @@ def _joined(numbers, pairs, problems, of_rig):
             f"the loops through them miss by {np.degrees(turn):.2f} deg and {1000 * shift:.0f} mm: "
             "they are not used together"
         )
-        names = (worst.first, worst.second)
-        problems.append(_problem(names, ProblemKind.CONTRADICTS, words))
+        problems.append(
+            _problem((worst.first, worst.second), ProblemKind.CONTRADICTS, words)
+        )
         if len(connected(pairs, reference)) < len(poses):
             return _joined(numbers, pairs, problems, of_rig)
     for number in sorted(set(numbers) - set(poses)):

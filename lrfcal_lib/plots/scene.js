@@ -286,6 +286,8 @@ function panel(page, data) {
     const fits = (s, number) => s === station && number >= 0 && measurer.liesAlong(measurer.feature(number), axis);
     const about = near(measurer.inPage(station, place), fits).slice(0, data.about);
     if (!about.length) return { away: Infinity };
+    // at a crease the nearest point tells which way the surface faces
+    if (!axis) return nearestPlane(station, place, measurer.feature(about[0].plane).axis);
     const sum = about.reduce((total, each) => plus(total, measurer.inStation(station, each.p)), [0, 0, 0]);
     const middle = times(sum, 1 / about.length);
     const off = (plane) => norm(minus(measurer.foot(plane, middle), middle));

@@ -95,25 +95,23 @@ def _on_face(scene, corners):
     near = (np.abs(off) < half).all(axis=1) & (np.abs(cloud.normals @ axes[2]) > INSIDE)
     shown = cloud.points[near & (scene.of_point >= 0)]
     _, about = KDTree(cloud.points).query(shown, FEWEST)
-    on_it = np.abs(off[about, 2].mean(axis=1)) < MEAN
-    return shown[on_it]
+    return shown[np.abs(off[about, 2].mean(axis=1)) < MEAN]
 
 
 def _on_edge(scene, ends):
     """Middles of the edges that a station shows along one with these ends (2, 3)."""
     way = ends[1] - ends[0]
     length = np.linalg.norm(way)
+    way = way / length
     shown = []
     for edge in scene.edges:
         off = edge.centre - ends[0]
-        along = off @ way / length
-        miss = off - along * way / length
+        along = off @ way
+        miss = off - along * way
         away = np.linalg.norm(miss)
-        of_edge = edge.noise[:3, :3] + SYSTEMATIC**2 * np.outer(
-            *[edge.jacobian[:3, -1]] * 2
-        )
-        sigma = np.sqrt(miss @ of_edge @ miss) / away
-        same = abs(edge.axis @ way) > PARALLEL * length and 0 < along < length
+        by_surface = SYSTEMATIC * miss @ edge.jacobian[:3, -1]
+        sigma = np.sqrt(miss @ edge.noise[:3, :3] @ miss + by_surface**2) / away
+        same = abs(edge.axis @ way) > PARALLEL and 0 < along < length
         if same and away < max(ON_IT, 3 * sigma):
             shown.append(edge.centre)
     return np.array(shown).reshape(-1, 3)
