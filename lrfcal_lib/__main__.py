@@ -212,11 +212,7 @@ def _add_sessions(verbs):
     calibrate = verbs.add_parser(
         "calibrate", help="calibrate the rig of a session, or of many"
     )
-    calibrate.add_argument("sessions", nargs="+", metavar="session")
-    calibrate.add_argument(
-        "--out", help="folder of its files (default reports/<session> under this folder)"
-    )
-    _add_scheduler(calibrate)
+    _add_many(calibrate)
 
     compare = verbs.add_parser(
         "compare", help="say how far calibrations of one rig differ, beside what they claim"
@@ -234,13 +230,17 @@ def _add_sessions(verbs):
         ("merge", "join the stations of a scene in one cloud"),
     ):
         scenes = verbs.add_parser(name, help=words)
-        scenes.add_argument("sessions", nargs="+", metavar="session", help=SCENE)
-        scenes.add_argument(
-            "--out",
-            help="folder of its files (default reports/<session> under this folder)",
-        )
         _add_calibration(scenes)
-        _add_scheduler(scenes)
+        _add_many(scenes, SCENE)
+
+
+def _add_many(verb, words=None):
+    """What the work on many sessions takes."""
+    verb.add_argument("sessions", nargs="+", metavar="session", help=words)
+    verb.add_argument(
+        "--out", help="folder of its files (default reports/<session> under this folder)"
+    )
+    _add_scheduler(verb)
 
 
 def _add_calibration(verb):

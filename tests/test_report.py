@@ -45,7 +45,8 @@ notebook.table(pd.DataFrame({"method": ["joint", "line"], "error_mm": [-2.0, flo
 JUDGED = """
 record = {"answer": "yes", "expected_error_at_m": {"1": {"cloud_mm": 2.0, "left_px": 1.0},
                                                    "2": {"cloud_mm": 3.0, "left_px": 1.5}}}
-said = ["this can be trusted", "expected error at 2 m: 3 mm", "handed over: 'joint'", "rest", "record next: nothing"]
+said = ["this can be trusted", "expected error at 1 m: 2 mm", "expected error at 2 m: 3 mm", "handed over: 'joint'",
+        "rest", "record next: nothing"]
 notebook.verdict("Can it be trusted?", said, record)
 notebook.table(pd.DataFrame({"placement": range(3), "used": True}), "placements")
 lengths = {"source": ["wall"] * 4 + ["paper"], "placement": [1, 1, 2, 2, None],

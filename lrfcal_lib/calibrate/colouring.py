@@ -28,8 +28,13 @@ STEEPEST = (
 DARK = 6.0
 BRIGHT = 248.0
 CLIPPED = 1e-3  # weight of such a colour
+# literals would turn single precision into double
+ZERO = np.float32(0)
+HALF = np.float32(0.5)
+ONE = np.float32(1)
 
-lens_terms = njit(**COMPILED)(camera.lens_terms)
+# a call, or rows taken out of an array at once, would keep the compiler from taking many at a time
+lens_terms = njit(inline="always", **COMPILED)(camera.lens_terms)
 
 
 class Eye(NamedTuple):
@@ -153,7 +158,12 @@ def _locate(points, eye, rows, at):
 
     The cell is -1 behind the camera, beyond the fold of its lens and outside the image.
     """
-    x, y, z, u, v, far = rows
+    x = rows[0]
+    y = rows[1]
+    z = rows[2]
+    u = rows[3]
+    v = rows[4]
+    far = rows[5]
     for i in range(len(points)):
         x[i] = points[i, 0]
         y[i] = points[i, 1]
@@ -162,9 +172,6 @@ def _locate(points, eye, rows, at):
     r10, r11, r12, t1 = eye.pose[1]
     r20, r21, r22, t2 = eye.pose[2]
     fx, fy, cx, cy, k1, k2, p1, p2, k5, fold = eye.lens
-    zero = np.float32(0)
-    half = np.float32(0.5)
-    one = np.float32(1)
     share = np.float32(1 / eye.cell)
     height, width, _ = eye.image.shape
     right = np.float32(width)
@@ -178,20 +185,20 @@ def _locate(points, eye, rows, at):
         a = a / c
         b = b / c
         growth, shift_a, shift_b = lens_terms(a, b, k1, k2, p1, p2, k5)
-        u[i] = fx * (a * (one + growth) + shift_a) + cx
-        v[i] = fy * (b * (one + growth) + shift_b) + cy
-        column = u[i] + half
-        row = v[i] + half
+        u[i] = fx * (a * (ONE + growth) + shift_a) + cx
+        v[i] = fy * (b * (ONE + growth) + shift_b) + cy
+        column = u[i] + HALF
+        row = v[i] + HALF
         inside = (
-            (c > zero)
+            (c > ZERO)
             & (a * a + b * b < fold)
-            & (column >= zero)
+            & (column >= ZERO)
             & (column < right)
-            & (row >= zero)
+            & (row >= ZERO)
             & (row < low)
         )
-        column = column if inside else zero
-        row = row if inside else zero
+        column = column if inside else ZERO
+        row = row if inside else ZERO
         cell_of_it = np.int32(row * share) * columns + np.int32(column * share)
         at[i] = cell_of_it if inside else np.int32(-1)
 

@@ -213,7 +213,7 @@ class RecordedSource:
     def covariance(self, covariance: np.ndarray, pitch: np.ndarray) -> np.ndarray:
         """Covariances (n, 3, 3) of measured points, turned into the source frame."""
         R = self.frame.rotation(self.corrections.pitch(self.placement, pitch))
-        return R @ covariance @ R.swapaxes(-1, -2)
+        return R @ covariance @ R.mT
 
     def by_pitch(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
         """Derivative (n, 3) of :meth:`points` by an error of the recorded pitch, metres a

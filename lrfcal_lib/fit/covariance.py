@@ -57,7 +57,7 @@ def pseudo_inverse(hessian: np.ndarray) -> np.ndarray:
     inverse = np.divide(
         1.0, values, out=np.zeros_like(values), where=values > RANK * values[..., -1:]
     )
-    return (vectors * inverse[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return (vectors * inverse[..., None, :]) @ vectors.mT
 
 
 def covariance_of(hessian, scales, lost):
@@ -128,7 +128,7 @@ def placement_covariance(
     without = np.linalg.inv(scaled)
     shifts = (without @ (scores / diagonal)[..., None])[..., 0] / diagonal
     share = (groups - 1) / groups
-    squares = share * np.swapaxes(shifts, -1, -2) @ shifts
+    squares = share * shifts.mT @ shifts
     whole = np.diagonal(np.linalg.inv(total / outer), axis1=-2, axis2=-1)
     gained = np.diagonal(without, axis1=-2, axis2=-1) - whole
     factor = np.sqrt(whole[..., 0, :] / (share * gained.sum(axis=-2)))

@@ -178,7 +178,7 @@ def linearise(blocks: Iterable[Block], axes=(-2, -1)) -> Linearised:
     hessian = gradient = cost = np.zeros(())
     for block in blocks:
         J = block.white_jacobian
-        transposed = J.swapaxes(-1, -2)
+        transposed = J.mT
         hessian = hessian + transposed @ J
         gradient = gradient + (transposed @ block.white[..., None])[..., 0]
         cost = cost + _cost(block, axes)

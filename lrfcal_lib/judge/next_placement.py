@@ -271,7 +271,7 @@ def candidate_information(boards, pitches, solution, models):
             sigma = np.hypot(by_image, by_scan * model.fx / p_camera[..., 2])
             J = (by_point @ by_link)[..., unknown] / sigma[..., None, None]
             J = J.reshape(len(boards), -1, len(index))
-            information[:, index[:, None], index] += np.swapaxes(J, -1, -2) @ J
+            information[:, index[:, None], index] += J.mT @ J
     return information
 
 

@@ -258,7 +258,7 @@ def carried(
     beam = polar_to_points(1.0, bearing) @ R.T
     p_head = distance[..., None] * beam
     x = tilt(p_head + t, turn)
-    M = np.swapaxes(tilt(np.eye(3), turn[..., None]), -1, -2)
+    M = tilt(np.eye(3), turn[..., None]).mT
     # a turn of the head about x and a shift along it change nothing
     by_turn_of_axis = (back * hat(x - t) - M @ hat(p_head))[..., 1:]
     by_shift_of_axis = (M - back * np.eye(3))[..., 1:]

@@ -51,7 +51,11 @@ def hat(v: ArrayLike) -> np.ndarray:
     -------
     ndarray, shape (..., 3, 3)
     """
-    return cross(np.eye(3), np.asarray(v, float)[..., None, :])
+    v = np.asarray(v, float)
+    return (v @ HATS).reshape(*v.shape, 3)
+
+
+HATS = cross(np.eye(3), np.eye(3)[:, None]).reshape(3, 9)  # of the axes, a row each
 
 
 def polar_to_points(ranges: ArrayLike, bearings: ArrayLike) -> np.ndarray:
@@ -505,7 +509,7 @@ def rotate_points(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (..., n, 3)
     """
-    return points @ np.swapaxes(pose[..., :3], -1, -2)
+    return points @ pose[..., :3].mT
 
 
 def apply_pose(pose: np.ndarray, points: np.ndarray) -> np.ndarray:

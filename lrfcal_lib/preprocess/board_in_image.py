@@ -192,7 +192,7 @@ def pose_with_edges(view, board, model: CameraModel) -> tuple[RigidTransform, np
     if not view.edges:
         return pose, covariance
     misses, by_pose = line_residuals(view.edges, board, model, pose_array(pose))
-    expected = np.eye(2) + by_pose @ covariance @ np.swapaxes(by_pose, 1, 2)
+    expected = np.eye(2) + by_pose @ covariance @ by_pose.mT
     chi2 = np.sum(misses * np.linalg.solve(expected, misses[..., None])[..., 0], axis=1)
     agreeing = [view.edges[i] for i in np.flatnonzero(chi2 < AGREE_CHI2)]
     if not agreeing:

@@ -281,14 +281,14 @@ def symmetric_points(picture, points, size, reach, look):
     slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
     for _ in range(REFINE_ROUNDS):
         axes = square_axes(points, size) * reach[:, None, None]
-        arms = np.swapaxes(axes @ offsets, 1, 2)  # (n, m, 2)
+        arms = (axes @ offsets).mT  # (n, m, 2)
         pairs = np.stack([points[:, None] + arms, points[:, None] - arms])
         differs = np.subtract(*interpolated(spline, pairs, look.order))
         slopes = [np.subtract(*interpolated(slope, pairs)) for slope in (slope_u, slope_v)]
         jacobian = np.stack(slopes, axis=2)
         weighted = weight[:, None] * jacobian
-        normal = weighted.swapaxes(1, 2) @ jacobian
-        right = weighted.swapaxes(1, 2) @ differs[..., None]
+        normal = weighted.mT @ jacobian
+        right = weighted.mT @ differs[..., None]
         step = -(np.linalg.pinv(normal, hermitian=True) @ right)[..., 0]
         length = np.linalg.norm(step, axis=1)
         # a third of the window at most: farther away other corners begin

@@ -115,6 +115,4 @@ def _whiteners(edges, lines, uv):
     along = np.stack([lines[:, 1], -lines[:, 0]], axis=1)
     lever = np.einsum("enk,ek->en", uv - centres[:, None], along)
     design = np.stack([np.ones_like(lever), lever], axis=2)
-    return np.linalg.inv(
-        np.linalg.cholesky(design @ covariance @ np.swapaxes(design, 1, 2))
-    )
+    return np.linalg.inv(np.linalg.cholesky(design @ covariance @ design.mT))

@@ -5,8 +5,6 @@ import json
 import numpy as np
 import pandas as pd
 
-# begin sentences of a verdict that the first screen tells in numbers
-BESIDE = ("Expected error", "In the image of")
 PICTURES = (
     "scene",
     "cloud",
@@ -28,7 +26,9 @@ def sentences_below(verdict):
     """Sentences of a verdict that the first screen does not tell in numbers."""
     if verdict is None:
         return []
-    return [words for words in verdict["sentences"][1:] if not words.startswith(BESIDE)]
+    errors = (verdict["record"] or {}).get("expected_error_at_m", {})
+    # the answer comes first, then a sentence for each distance
+    return verdict["sentences"][1 + len(errors) :]
 
 
 def first_picture(drawn):

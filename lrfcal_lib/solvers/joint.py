@@ -155,15 +155,18 @@ def solve_joint(
     obs, left_out = without_blind_cameras(obs, required)
     unknowns = chosen.unknowns(obs)
     levels = Levels(sweep_sigma=chosen.sweep_sigma, step_sigma=chosen.step_sigma)
+    arrived = False
     if start is None:
         obs, lost = without_lost_placements(obs)
         best = best_start(obs, unknowns, levels)
         obs = best.kept
         start = best.state
+        arrived = best.converged and chosen.prior is None
         left_out += lost + best.left_out
     data = gather(obs, replace(levels, prior=chosen.prior))
     # stated levels of the noise may be wrong by far: what takes many steps with them leads away
-    start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
+    if not arrived:
+        start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
     state = minimum(start, data, unknowns, LAST_STEP, FIRST_STEPS).state
     data = replace(data, levels=replace(data.levels, lapse=chosen.lapse))
     if chosen.noise == "estimate":

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from lrfcal_lib.fit.least_squares import Block
-from lrfcal_lib.fit.padding import medians
+from lrfcal_lib.fit.padding import medians, pad
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
@@ -87,14 +87,11 @@ def refuse_contradiction(
     boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
     misses = np.linalg.norm(boards[..., 3] - state.boards[place, :, 3], axis=1)
     stated = np.sqrt(np.trace(obs.view_covariance[:, 3:, 3:], axis1=1, axis2=2))
-    shown = np.unique(place)
     before = sum(p.kind == CONTRADICTS and p.camera is None for p in left_out)
-    wrong = 0
-    for row in shown:
-        mine = place == row
-        limit = max(most, MOST_SIGMA * np.median(stated[mine]))
-        wrong += int(np.median(misses[mine]) > limit)
-    every = len(shown) + before
+    of = pad(place, len(obs.placements), miss=misses, stated=stated)
+    limit = np.maximum(most, MOST_SIGMA * medians(of["stated"], of["used"]))
+    wrong = np.sum(medians(of["miss"], of["used"]) > limit)
+    every = len(np.unique(place)) + before
     if wrong and 3 * (wrong + before) > every:
         raise DegenerateGeometry(
             f"images and scans contradict each other: for {wrong + before} of {every} placements "

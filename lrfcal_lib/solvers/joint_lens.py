@@ -82,12 +82,12 @@ def lens_share(
     by_lens = among_cameras(data.view["lens"], data.view["camera"], len(obs.cameras))
     shift = block.whitened(by_lens.reshape(*J.shape[:2], -1))
     spread = block_diag(*obs.lens_covariance)
-    hessian = np.swapaxes(found.jacobian, -1, -2) @ found.jacobian
+    hessian = found.jacobian.mT @ found.jacobian
     own = np.linalg.pinv(hessian[:, c:, c:], rcond=OWN_RANK, hermitian=True)
     reduced = J[..., :c] - J_own @ own @ hessian[:, c:, :c]
     finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
-    gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
-    left = shift - reduced @ gain - J_own @ (own @ (np.swapaxes(J_own, -1, -2) @ shift))
+    gain = finite @ np.sum(reduced.mT @ shift, axis=0)
+    left = shift - reduced @ gain - J_own @ (own @ (J_own.mT @ shift))
     square = np.sum(left @ spread * left)
     level = data.levels.view_scale**2
     taken = np.sum((J_own @ own) * J_own) + np.sum((reduced @ finite) * reduced)

@@ -141,7 +141,7 @@ def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
     """
     counted = np.sum(modes**2, axis=1)
     score = np.sum(modes * residuals[..., None], axis=1)
-    pull = np.swapaxes(modes, 1, 2) @ by_own
+    pull = modes.mT @ by_own
     there = counted > 0
     taken = share * np.sum(pull * (pull @ spread), axis=-1)[there] / counted[there]
     told = np.sum((1 - taken) ** 2)

@@ -113,21 +113,19 @@ def rays(state, data, group):
     """The Rays of a group."""
     pitch, by_parts = true_pitch(state, data, group["pitch"])
     in_head = group["ray"] @ state.head[:, :3].T
-    return Rays(
-        tilt(state.head[:, 3], pitch), tilt(in_head, pitch), in_head, pitch, by_parts
-    )
+    origin = np.broadcast_to(state.head[:, 3], in_head.shape)
+    return Rays(*tilt(np.stack([origin, in_head]), pitch), in_head, pitch, by_parts)
 
 
 def ray_columns(by_o, by_d, ray):
     """Columns of the axis (4), of the pitch's parts (4) from the gradients by origin and
     direction.
     """
-    x, y, z = np.moveaxis(ray.in_head, -1, 0)
-    x_d, y_d, z_d = np.moveaxis(tilt(by_d, -ray.pitch), -1, 0)  # back in the head's frame
-    _, y_o, z_o = np.moveaxis(tilt(by_o, -ray.pitch), -1, 0)
+    shift, push = tilt(np.stack([by_o, by_d]), -ray.pitch)  # in the head's frame
+    turned = cross(ray.in_head, push)
     # as in `AXIS_COLUMNS`: turns about y and z, shifts along y and z
-    head = np.stack([z * x_d - x * z_d, x * y_d - y * x_d, y_o, z_o], axis=-1)
-    turn = cross(ray.origin, by_o)[..., 0] + cross(ray.direction, by_d)[..., 0]
+    head = np.concatenate([turned[..., 1:], shift[..., 1:]], axis=-1)
+    turn = cross(ray.origin, by_o)[..., 0] + turned[..., 0]
     return head, turn[..., None] * ray.by_parts
 
 
@@ -190,10 +188,10 @@ class EdgeDistance(NamedTuple):
 def edge_distance(state, data, group, ray):
     """The EdgeDistance of the beams of a group."""
     normal = data.lines * [1.0, 1.0, 0.0]
-    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     # of every edge: its point, its direction, its normal
-    each = np.stack([-data.lines[:, 2:] * normal, normal @ turn, normal])
-    each = each @ np.swapaxes(state.boards[:, None, :, :3], -1, -2)
+    along = cross([0.0, 0.0, 1.0], normal)
+    each = np.stack([-data.lines[:, 2:] * normal, along, normal])
+    each = each @ state.boards[:, None, :, :3].mT
     point, along, outwards = (
         part[np.arange(len(part))[:, None], group["edge"]]
         for part in np.moveaxis(each, 1, 0)
@@ -261,14 +259,12 @@ def view_block(state, data, unknowns):
     board = np.broadcast_to(state.boards[:, None], pitch.shape + (3, 4))
     # T_camera_board = T_camera_lrf T_head_lrf^-1 Rx(-pitch) T_platform_board for a camera on the
     # head
-    R_camera_head = camera[..., :3] @ np.swapaxes(head[..., :3], -1, -2)
-    R_head_platform = np.swapaxes(tilt(np.eye(3), -pitch[..., None]), -1, -2)
+    R_camera_head = camera[..., :3] @ head[..., :3].mT
+    R_head_platform = tilt(np.eye(3), -pitch[..., None]).mT
     R_camera_platform = R_camera_head @ R_head_platform
     origin = tilt(board[..., 3], -pitch)  # of the board, in the head frame
     arm = (R_camera_head @ (origin - head[..., 3])[..., None])[..., 0]
-    w = geometry.log_rotation(
-        R_camera_platform @ board[..., :3] @ np.swapaxes(pose[..., :3, :3], -1, -2)
-    )
+    w = geometry.log_rotation(R_camera_platform @ board[..., :3] @ pose[..., :3, :3].mT)
     residuals = np.concatenate([w, arm + camera[..., 3] - pose[..., :3, 3]], axis=-1)
 
     left = inverse_left_jacobian(w)

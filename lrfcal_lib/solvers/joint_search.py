@@ -47,6 +47,8 @@ class Start:
         Mean half squared residual of what is kept; the share that is left out counts against it.
     miss : float
         By how much the closed form, before any step, puts points off their boards, metres (median).
+    converged : bool
+        Whether the few steps led to the end.
     """
 
     kept: JointObservations
@@ -54,6 +56,7 @@ class Start:
     left_out: list[Problem]
     badness: float
     miss: float
+    converged: bool
 
 
 def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> Start:
@@ -111,7 +114,8 @@ def agreeing_start(obs, state, data, unknowns):
         count = len(kept.face_range) + len(kept.beam_hit) + len(kept.view_pitch)
         cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / count
         badness = cost * (1 + PENALTY * share)
-        attempts.append(Start(kept, found.state, left_out, badness, miss))
+        start = Start(kept, found.state, left_out, badness, miss, bool(found.converged))
+        attempts.append(start)
         if not left_out or share > LARGEST_SHARE:
             break
         state = state_of(obs, found.state.head, found.state.cameras)

@@ -70,8 +70,8 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     in_frame = three_planes(triangles[few] @ frame, sets.boards[few])
     forms = [in_frame.reshape(-1, 3, 4) @ frame.T]
     if not flat:
-        forms.append(closed_form(triangles[threes], sets.boards[threes]))
-        forms.append(closed_form(triangles[None], sets.boards[None]))
+        for rows in (threes, np.arange(p)[None]):
+            forms.append(closed_form(triangles, sets.boards, rows))
     candidates = _before_boards(np.concatenate(forms), sets, _centred(triangles)[1])
 
     # more placements than a closed form uses; half of them may be wrong, or all but one right
@@ -126,15 +126,17 @@ def common_plane(triangles):
     return frame, bool(spread[2] < FLAT * spread[0])
 
 
-def closed_form(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
+def closed_form(triangles: np.ndarray, boards: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """The linear solution of Zhang and Pless: the rotation from the planes' normals.
 
     Parameters
     ----------
-    triangles : ndarray, shape (n, k, 4, 4)
-        Compressed points of n sets of k placements, which span a plane each.
-    boards : ndarray, shape (n, k, 3, 4)
+    triangles : ndarray, shape (p, 4, 4)
+        Compressed points of placements, which span a plane each.
+    boards : ndarray, shape (p, 3, 4)
         ``T_camera_board``.
+    rows : ndarray of int, shape (n, k)
+        Sets of k placements, a solution each.
 
     Returns
     -------
@@ -147,7 +149,8 @@ def closed_form(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
     source = source * np.sign(np.vecdot(source, centre))[..., None]
     outward = np.vecdot(normal, boards[..., 3]) >= 0
     camera = np.where(outward[..., None], normal, -normal)
-    return _on_planes(camera.mT @ source, normal, boards[..., 3], centre)
+    across = camera[rows].mT @ source[rows]
+    return _on_planes(across, normal[rows], boards[rows, :, 3], centre[rows])
 
 
 def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
