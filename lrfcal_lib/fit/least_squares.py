@@ -150,6 +150,24 @@ def _level(z, count, block, axes):
     return np.maximum(np.expand_dims(level, axes), 1e-9)
 
 
+def remembered(evaluate: Callable) -> Callable:
+    """The same function, which is not asked twice in a row about one state.
+
+    Parameters
+    ----------
+    evaluate : callable
+        Of a state, which nobody changes in place.
+    """
+    last: list = [None, None]
+
+    def once(state):
+        if state is not last[0]:
+            last[:] = state, evaluate(state)
+        return last[1]
+
+    return once
+
+
 def _blocks(evaluate, state):
     """What a problem hands over, as a list."""
     blocks = evaluate(state)

@@ -10,7 +10,7 @@ import numpy as np
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.covariance import RANK
-from lrfcal_lib.fit.least_squares import solve
+from lrfcal_lib.fit.least_squares import remembered, solve
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
@@ -225,9 +225,9 @@ def in_stated_gauge(state: JointState, obs: JointObservations) -> JointState:
 def finished(obs, state, data, unknowns, required):
     """The last steps, in the gauge of the stated platform, and all that a solution says."""
     names = unknowns.names(obs.cameras)
-
+    blocks = remembered(lambda at: named_blocks(at, data, unknowns))
     found = solve(
-        lambda at: named_blocks(at, data, unknowns).values(),
+        lambda at: blocks(at).values(),
         in_stated_gauge(state, obs),
         lambda at, step: move_state(at, step, unknowns),
         shared=unknowns.shared,
@@ -252,7 +252,7 @@ def finished(obs, state, data, unknowns, required):
         covariance=found.covariance + lens.covariance - lens.counted,
         covariance_placements=by_placements,
     )
-    squares = misfits(named_blocks(found.state, data, unknowns), data)
+    squares = misfits(blocks(found.state), data)
     solution = JointSolution(
         found,
         obs,

@@ -125,7 +125,8 @@ def ray_columns(by_o, by_d, ray):
     turned = cross(ray.in_head, push)
     # as in `AXIS_COLUMNS`: turns about y and z, shifts along y and z
     head = np.concatenate([turned[..., 1:], shift[..., 1:]], axis=-1)
-    turn = cross(ray.origin, by_o)[..., 0] + turned[..., 0]
+    _, y, z = np.moveaxis(ray.origin, -1, 0)
+    turn = y * by_o[..., 2] - z * by_o[..., 1] + turned[..., 0]
     return head, turn[..., None] * ray.by_parts
 
 
