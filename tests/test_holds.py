@@ -21,7 +21,7 @@ from shared import campaign
 from lrfcal_lib.calibrate.cloud import join
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.measure.features import largest_plane
-from lrfcal_lib.measure.holds import Answer, Passes, holds, passes_of, wall_of
+from lrfcal_lib.measure.holds import Answer, Passes, holds, most_likely, passes_of, wall_of
 from lrfcal_lib.simulate import scene
 
 TURN = np.radians(0.3)
@@ -81,6 +81,18 @@ def test_a_turned_camera_is_named(seen):
     assert held.answer is Answer.MOVED and cameras(held) == ["left"]
     assert "camera 'left' has moved: recalibrate" in held.sentences()[0]
     np.testing.assert_allclose(held.culprits[0].change[1], TURN, atol=TURN / 2)
+
+
+def test_of_two_likely_suspects_a_turn_alone_decides(held):
+    """Edges taken for others look like a move of either camera; where no turn is seen, both stay."""
+    left, right = (replace(shift, p_value=1e-90) for shift in held.shifts)
+    head = replace(left, camera=None)
+    turned = replace(left, p_turn=1e-30)
+    other = replace(right, p_turn=1e-20, p_value=3e-91)
+    assert most_likely([turned, other, head]) == [turned, head]
+    left, right = (replace(shift, p_turn=0.1) for shift in (left, other))
+    assert most_likely([left, right]) == [right, left]
+    assert most_likely([]) == []
 
 
 def test_too_little_to_see_is_not_called_holding(seen):

@@ -41,7 +41,7 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
                 f"in parts of the images the corners of the chessboard lie {miss:.2f} px beside "
                 "their prediction, all in one direction"
             )
-        middle = np.array([model.cx / model.width, model.cy / model.height])
+        middle = np.array([model.cx, model.cy]) / model.size
         other_size = np.abs(middle - 0.5).max() > OFF_MIDDLE
         if other_size:
             faults.append(
@@ -65,7 +65,7 @@ def common_miss(views, points, model):
     uv = np.concatenate([view.pixels for view in views])
     expected = [project(view.T_camera_board.apply(points), model) for view in views]
     miss = uv - np.concatenate(expected)
-    part = np.floor(LENS_PARTS * uv / [model.width, model.height])
+    part = np.floor(LENS_PARTS * uv / model.size)
     table = pd.DataFrame(np.hstack([part, miss]), columns=["column", "row", "u", "v"])
     parts = table.dropna().groupby(["column", "row"])
     noise = parts.var(ddof=0).div(parts.size(), axis=0)

@@ -226,7 +226,7 @@ def pitches_of_images(boards, solution, models, field_of_view):
     inside &= np.abs(pitch) < LARGEST_PITCH
     visible = np.tile(inside.all(axis=1), (len(LATTICE), 1))
     for name in solution.transforms:
-        size = np.array([models[name].width, models[name].height])
+        size = models[name].size
         for row, pitch in enumerate(LATTICE):
             T_camera_platform = solution.camera_at(name, pitch)
             p_camera = T_camera_platform.apply(points)

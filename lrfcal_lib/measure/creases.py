@@ -146,9 +146,8 @@ def sights(creases: Creases, view: View) -> Sights:
     model = view.model
     points, J = view.carried(creases.points)
     reach = REACH * model.width
-    size = np.array([model.width, model.height])
     recorded = project(points, model)
-    inside = ((recorded > reach) & (recorded < size - 1 - reach)).all(axis=1)
+    inside = model.shows(recorded, reach)
     by_point = pinhole_jacobian(points[inside], model)
     way = view.rotation.apply(creases.along[inside])
     tangent = np.einsum("nij,nj->ni", by_point, way)

@@ -72,7 +72,7 @@ def _lines_on_planes(cloud, surfaces, views, view):
     rows = np.flatnonzero(np.isin(cloud.image, of_camera))
     p_camera = view.T_camera_platform.apply(cloud.points[rows])
     uv = pinhole(p_camera, view.model)
-    size = np.array([view.model.width, view.model.height])
+    size = view.model.size
     inside = np.flatnonzero((np.abs(uv - size / 2) < size).all(axis=1))
     rows = rows[inside]
     uv = uv[inside]

@@ -71,8 +71,8 @@ class Shift:
         has moved.
     pixels, pixels_sigma : ndarray, shape (2,)
         To the right and down in the middle of the image, 3 m away; NaN for the head.
-    p_value : float
-        Probability of as much where nothing has moved.
+    p_value, p_turn : float
+        Probability of as much where nothing has moved, and of as much of a turn alone.
     shows : tuple of float
         The least turn (radians), and the least move of a camera (metres), that raise an alarm in 9
         of 10 cases, whichever way they go.
@@ -84,6 +84,7 @@ class Shift:
     pixels: np.ndarray
     pixels_sigma: np.ndarray
     p_value: float
+    p_turn: float
     shows: tuple[float, ...]
 
     @property
@@ -302,9 +303,8 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     if pulls:
         shifts = suspects(pulls, rig)
     alarms = [s for s in shifts if s.p_value < LEVEL / len(shifts) and s.matters]
-    alarms.sort(key=lambda s: s.p_value)
     return Held(
-        culprits=tuple(s for s in alarms if s.p_value < AS_LIKELY * alarms[0].p_value),
+        culprits=tuple(most_likely(alarms)),
         shifts=tuple(shifts),
         walls=tuple(walls),
         passes=tuple(passes_of(session)),
@@ -312,6 +312,22 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         regions=sum(pull.groups for pull in of_pairs),
         all_on_head=all(c.mount == "head" for c in rig.cameras.values()),
     )
+
+
+def most_likely(alarms: list[Shift]) -> list[Shift]:
+    """Those of some suspects that may have moved, the most likely first.
+
+    By all that is seen; and of cameras by what a turn alone explains of it, because edges that were
+    taken for others look like a move.
+
+    Parameters
+    ----------
+    alarms : list of Shift
+    """
+    likely = sorted(alarms, key=lambda s: s.p_value)
+    likely = [s for s in likely if s.p_value < AS_LIKELY * likely[0].p_value]
+    least = min((s.p_turn for s in likely if s.camera), default=0.0)
+    return [s for s in likely if s.camera is None or s.p_turn <= AS_LIKELY * least]
 
 
 def _stations(session, rig):
@@ -458,9 +474,6 @@ def _shift(camera, columns, score, sharp, rig):
     # turns and moves apart: the first three unknowns, and the others
     of_change = [part for part in (known[:3, :3], known[3:, 3:]) if part.size]
     least = [max(np.linalg.eigvalsh(part)[0], 1e-12) for part in of_change]
-    # the score test, of what is known at all
-    inverse = np.linalg.pinv(known, rcond=1e-6, hermitian=True)
-    square = score[columns] @ inverse @ score[columns]
     motion = np.full((2, len(columns)), np.nan)
     if camera:
         by_point = pinhole_jacobian([0.0, 0.0, AWAY], rig.cameras[camera].model)
@@ -471,6 +484,13 @@ def _shift(camera, columns, score, sharp, rig):
         sigma=np.sqrt(np.diag(covariance)),
         pixels=motion @ change,
         pixels_sigma=np.sqrt(np.diag(motion @ covariance @ motion.T)),
-        p_value=float(chdtrc(len(columns), square)),
+        p_value=_chance(score[columns], known),
+        p_turn=_chance(score[columns[:3]], known[:3, :3]),
         shows=tuple(SHOWS[len(columns)] / np.sqrt(least)),
     )
+
+
+def _chance(score, known):
+    """Probability of a score (k,) of an information (k, k), of what is known at all."""
+    square = score @ np.linalg.pinv(known, rcond=1e-6, hermitian=True) @ score
+    return float(chdtrc(len(score), square))

@@ -118,8 +118,7 @@ def _samples(normals, view, middle, spacing):
     steps = np.indices((2 * HALF + 1,) * 2).reshape(2, -1) - HALF
     points = middle[:, None] + np.einsum("is,nij->nsj", steps, sides)
     recorded = project(points, view.model)
-    size = np.array([view.model.width, view.model.height])
-    inside = ((recorded > BORDER) & (recorded < size - BORDER)).all(axis=(1, 2))
+    inside = view.model.shows(recorded, BORDER).all(axis=1)
     return pinhole(points, view.model), inside
 
 

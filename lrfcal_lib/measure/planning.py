@@ -88,10 +88,8 @@ def seen_at(
         for name, camera in rig.cameras.items():
             p_camera = rig.camera_at(name, pitch).apply(points)
             uv = project(p_camera, camera.model)
-            size = [camera.model.width, camera.model.height]
-            inside = np.all((uv > -0.5) & (uv < np.subtract(size, 0.5)), axis=1)
             squared = np.sum(p_camera[:, :2] ** 2, axis=1) / p_camera[:, 2] ** 2
-            row |= inside & (squared < fold(camera.model))
+            row |= camera.model.shows(uv) & (squared < fold(camera.model))
     return visible
 
 

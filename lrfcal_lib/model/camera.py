@@ -42,6 +42,15 @@ class CameraModel:
     rms_px: float | None = None
 
     @property
+    def size(self):
+        """(width, height), pixels."""
+        return np.array([self.width, self.height])
+
+    def shows(self, pixels: np.ndarray, margin: float = -0.5) -> np.ndarray:
+        """Whether pixels (..., 2) are inside the image by more than a margin, (...)."""
+        return np.all((pixels > margin) & (pixels < self.size - 1 - margin), axis=-1)
+
+    @property
     def matrix(self):
         """The 3 x 3 matrix K."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])

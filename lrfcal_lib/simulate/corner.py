@@ -83,8 +83,7 @@ def _image_lines(setup, rng, T_camera_target):
     edges = SIZE * np.array([0 * EDGE, *PLATES])[:, None] + along
     seen = apply_pose(pose_array(T_camera_target)[:, None], edges)
     uv = pinhole(seen, setup.model)  # (n, 3, s, 2), NaN behind the camera
-    size = [setup.model.width, setup.model.height]
-    inside = ((uv > -0.5) & (uv < np.subtract(size, 0.5))).all(axis=-1)
+    inside = setup.model.shows(uv)
     first = inside.argmax(axis=-1)
     last = SAMPLES - 1 - inside[..., ::-1].argmax(axis=-1)
     ends = np.take_along_axis(uv, np.stack([first, last], axis=-1)[..., None], axis=2)

@@ -193,11 +193,9 @@ class Rig:
             points = self.board.points()
         p = apply_pose(pose_array(T_camera_board), points)
         uv = project(p, camera.model)
-        size = np.array([camera.model.width, camera.model.height])
         within_45_deg = np.abs(p[..., :2]) <= p[..., 2:]
         ahead = (p[..., 2] >= 0.1) & within_45_deg.all(axis=-1)
-        inside = (uv > margin) & (uv < size - 1 - margin)
-        return np.all(ahead & inside.all(axis=-1), axis=-1)
+        return np.all(ahead & camera.model.shows(uv, margin), axis=-1)
 
 
 @pydantic.dataclasses.dataclass(frozen=True)
@@ -463,18 +461,17 @@ def held_close(
     """
     m = camera.model
     points = rig.board.pattern.points()
-    size = np.array([m.width, m.height])
     columns = max(int(np.ceil(np.sqrt(count * 4 / 3))), 1)
     rows = np.ceil(count / columns)
     to_camera = Rotation.from_euler("x", 180, degrees=True)
     out = []
     for i in range(count):
         row, column = divmod(i, columns)
-        pixel = np.array([(column + 0.5) / columns, (row + 0.5) / rows]) * size
+        pixel = np.array([(column + 0.5) / columns, (row + 0.5) / rows]) * m.size
         # towards the middle of the image first, then away from the camera
         for attempt in range(2 * MOST_TRIES):
             tried = attempt / MOST_TRIES
-            inwards = (size / 2 - pixel) * min(tried, 1.0)
+            inwards = (m.size / 2 - pixel) * min(tried, 1.0)
             u, v = pixel + inwards + rng.normal(0, 15, 2)
             z = rng.uniform(*CLOSE) * max(tried, 1.0)
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])

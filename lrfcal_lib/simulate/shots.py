@@ -116,7 +116,7 @@ class Scenario(Devices):
         axis = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
         rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
         away = rng.uniform(*self.distances, count)
-        pixels = rng.uniform(0, [self.model.width, self.model.height], (count, 2))
+        pixels = rng.uniform(0, self.model.size, (count, 2))
         ray = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(self.model.matrix).T
         centre = away[:, None] * ray
         return RigidTransform.from_components(centre - rotation.apply(middle), rotation)
@@ -213,7 +213,7 @@ def board_shots(setup, rng, T_camera_lrf):
     true = pose_array(T_camera_lrf * T_lrf_board)
     corners = apply_pose(true, board.points())
     uv = pinhole(corners, setup.model)
-    inside = (uv > 0) & (uv < [setup.model.width, setup.model.height])
+    inside = (uv > 0) & (uv < setup.model.size)
     ahead = (corners[..., 2] > LEAST_DEPTH).all(axis=1)
     if setup.whole_image:
         ahead &= inside.all(axis=(1, 2))
