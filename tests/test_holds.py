@@ -95,6 +95,20 @@ def test_of_two_likely_suspects_a_turn_alone_decides(held):
     assert most_likely([]) == []
 
 
+def test_what_no_float_can_tell_from_zero_is_no_reason_to_hold(held):
+    """Probabilities of a large change underflow."""
+    sure = [replace(shift, p_value=0.0, p_turn=0.0) for shift in held.shifts]
+    assert most_likely(sure) == sure
+
+
+def test_a_camera_turned_too_far_to_be_found_is_not_called_holding(seen, held):
+    """Images that do not show the same where the calibration puts them say that something is wrong."""
+    far = [4 * np.pi / 180, 0.0, 0.0, 0.0, 0.0, 0.0]
+    lost = holds(seen, changed(true_rig(seen), "left", far))
+    assert lost.alike < 0.5 < held.alike and lost.answer is not Answer.HOLDS
+    assert "% only of the places that they share" in lost.missing()
+
+
 def test_too_little_to_see_is_not_called_holding(seen):
     first = tuple(record for record in seen.image_records if record.camera == "left")[:1]
     rig = true_rig(seen)

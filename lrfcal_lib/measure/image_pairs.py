@@ -2,7 +2,7 @@
 or at two pitch angles: a camera that sits otherwise shifts one against the other.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import cv2
@@ -78,7 +78,8 @@ def pairs_pull(cloud: Cloud, views: list[View], known: list[Pull]) -> Pull | Non
         compared_at = x.copy()
         x[poses] += np.linalg.solve(information[np.ix_(poses, poses)] + prior, left)
     cell = np.concatenate([pair.cell for pair in pairs])
-    return pull_of_groups(information, by_row, cell, compared_at)
+    alike = H.any(axis=(1, 2)).mean()
+    return replace(pull_of_groups(information, by_row, cell, compared_at), alike=alike)
 
 
 def _pair(patches, first, second):

@@ -82,11 +82,14 @@ class Pull:
         Information times the change of the unknowns that they ask for.
     groups : float
         Of observations that err together.
+    alike : float
+        Share of the places that two images show alike, where images are compared.
     """
 
     information: np.ndarray
     slope: np.ndarray
     groups: float
+    alike: float = 1.0
 
 
 def poses_of(rig: CalibratedRig, camera: str) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Sizes of PNG and JPEG images by their headers, without decoding what may be made to take long."""
 
+import struct
 from io import BytesIO
 from os import PathLike
 
@@ -47,7 +48,11 @@ def image_size(file: str | PathLike, data: bytes) -> tuple[int, int]:
     if end not in data[-64:]:
         raise SessionError(f"{file}: {cut}")
     with reading(file, cut):
-        with Image.open(BytesIO(data[:HEADER]), formats=["PNG", "JPEG"]) as image:
+        if (
+            end == b"IEND"
+        ):  # its size is first; Pillow goes on to the pixels, behind all remarks
+            return struct.unpack_from(">II", data, len(PNG) + 8)
+        with Image.open(BytesIO(data[:HEADER]), formats=["JPEG"]) as image:
             return image.size
 
 

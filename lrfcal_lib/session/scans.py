@@ -6,6 +6,7 @@ from io import BytesIO
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
+from numpy.lib import format as npy
 
 from lrfcal_lib.session.files import (
     SessionError,
@@ -90,8 +91,10 @@ def _read_arrays(file, archive):
             )
         with archive.open(name) as member:
             beginning = BytesIO(member.read(LONGEST_HEADER))
-        np.lib.format.read_magic(beginning)
-        shape, _, kind = np.lib.format.read_array_header_1_0(beginning)
+        header = npy.read_array_header_1_0
+        if npy.read_magic(beginning) != (1, 0):
+            header = npy.read_array_header_2_0
+        shape, _, kind = header(beginning)
         if kind.kind not in "fiub" or kind.itemsize > 8:
             raise SessionError(
                 f"{file}: {key} cannot be read: it holds {kind}, not numbers; write it without "
@@ -101,7 +104,7 @@ def _read_arrays(file, archive):
         with naming(file):
             check_amount(values)
         with archive.open(name) as member:
-            scans[key] = np.lib.format.read_array(member, allow_pickle=False)
+            scans[key] = npy.read_array(member, allow_pickle=False)
     return scans
 
 

@@ -114,8 +114,9 @@ def agreeing_start(obs, state, data, unknowns):
         count = len(kept.face_range) + len(kept.beam_hit) + len(kept.view_pitch)
         cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / count
         badness = cost * (1 + PENALTY * share)
-        start = Start(kept, found.state, left_out, badness, miss, bool(found.converged))
-        attempts.append(start)
+        attempts.append(
+            Start(kept, found.state, left_out, badness, miss, bool(found.converged))
+        )
         if not left_out or share > LARGEST_SHARE:
             break
         state = state_of(obs, found.state.head, found.state.cameras)
