@@ -80,7 +80,8 @@ def spread(work: Callable, items: Iterable) -> list:
     for number, item in enumerate(items):
         if number not in results:
             results[number] = _packed(work, item)
-    return [pickle.loads(results[number]) for number in range(len(items))]
+    # of each result what it was packed as goes as it is unpacked
+    return [pickle.loads(results.pop(number)) for number in range(len(items))]
 
 
 def _can_travel(work):
