@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.edges_in_scan import crossings
@@ -193,8 +194,7 @@ def _check_sides(scan):
         f"{side.n_points} crossings at {np.degrees(side.angle):.0f} deg" for side in good
     ]
     text = f"{len(good)} sides: {', '.join(each)}"
-    ways = np.array([np.subtract(*side.ends) for side in good])
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    ways = unit_vector(np.array([np.subtract(*side.ends) for side in good]))
     if np.abs(ways @ ways.T).min() < PARALLEL:
         return Light("edges", "ok", text)
     return Light("edges", "warn", f"{text}; turn the board to show another side")

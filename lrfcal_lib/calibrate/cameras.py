@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
+from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, unit_vector
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.solvers import METHODS, row_of, solve_camera
@@ -48,7 +49,7 @@ class KnownAxis:
     @property
     def sigma(self) -> np.ndarray:
         """Standard deviations of `parameters`, shape (4,)."""
-        return np.sqrt(np.diag(self.covariance))
+        return sigma_of(self.covariance)
 
 
 @dataclass(frozen=True)
@@ -219,7 +220,6 @@ def axis_from_chart(parameters: np.ndarray) -> geometry.TiltAxis:
     Undoes :func:`lrfcal_lib.fit.axis_chart.chart_parameters`.
     """
     out_of_plane, within, y, z = parameters * [1, 1, -1, -1]
-    direction = np.array([1.0, -np.tan(within), np.tan(out_of_plane)])
-    direction /= np.linalg.norm(direction)
+    direction = unit_vector(np.array([1.0, -np.tan(within), np.tan(out_of_plane)]))
     x = -(direction[1] * y + direction[2] * z) / direction[0]
     return geometry.TiltAxis(direction, np.array([x, y, z]))

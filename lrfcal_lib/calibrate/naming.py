@@ -6,7 +6,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.observe import observe, platform_of, source_of
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line
+from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, unit_vector
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.pattern_in_image import SMALL_SQUARE_PX
 from lrfcal_lib.preprocess.prepared import DroppedSide, Prepared
@@ -167,6 +167,6 @@ def _turn(points, line):
     if len(points) <= 2:
         return 0.0, NAME_ANGLE
     _, direction, rms = fit_line(points)
-    flat = direction[:2] / np.linalg.norm(direction[:2])
+    flat = unit_vector(direction[:2])
     noise = TURNED * rms * np.sqrt(12 / len(points)) / np.ptp(points @ direction)
     return float(np.arcsin(min(abs(flat @ line[:2]), 1.0))), np.hypot(NAME_ANGLE, noise)

@@ -27,6 +27,7 @@ from lrfcal_lib.calibrate.observe import (
 from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig, joint_rig
 from lrfcal_lib.calibrate.rig_uncertainty import uncertainty_one_by_one
 from lrfcal_lib.fit.result import PlatformPrior, Solution
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.kinematics import AS_RECORDED
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
@@ -302,8 +303,8 @@ def pitch_noise(errors: PitchErrors | None) -> PitchNoise:
     if errors is None or errors.wanted == "none":
         return PitchNoise()
     model = errors.models[errors.wanted]
-    offset = np.sqrt(np.mean(model.offset**2))
-    stretch = np.sqrt(np.mean(model.stretch**2))
+    offset = rms(model.offset)
+    stretch = rms(model.stretch)
     return PitchNoise(float(offset), float(stretch))
 
 

@@ -11,8 +11,9 @@ from scipy.stats import binom, chi2
 
 from lrfcal_lib.evaluate.tables import unit_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
-from lrfcal_lib.fit.covariance import name_words, null_space, pseudo_inverse
+from lrfcal_lib.fit.covariance import name_words, null_space, pseudo_inverse, sigma_of
 from lrfcal_lib.fit.edge_likelihood import disc_share
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     pose_array,
@@ -269,16 +270,16 @@ def _judge(trials, index, factor):
     C = trials.covariances[block]
     B = trials.bounds[block]
     mean = np.mean(C, axis=0)
-    sigma = np.sqrt(np.diagonal(mean))
+    sigma = sigma_of(mean)
     seen = max(round(len(e) * _freedom(mean / np.outer(sigma, sigma))), 1)
     unit = np.full(e.shape, factor)
     if factor is None:
-        unit = 1 / np.sqrt(np.diagonal(B, axis1=1, axis2=2))
+        unit = 1 / sigma_of(B)
     B = unit[:, :, None] * B * unit[:, None]
     crb = np.sqrt(np.mean(np.trace(B, axis1=1, axis2=2)))
-    rmse = np.sqrt(np.mean(np.sum((unit * e) ** 2, axis=1)))
+    rmse = rms(np.linalg.norm(unit * e, axis=1))
     free = len(e) * _freedom(np.mean(B, axis=0))
-    half_width = HALF_WIDTH * np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    half_width = HALF_WIDTH * sigma_of(C)
     normalised = np.linalg.solve(C, e[..., None])[..., 0]
     row = {
         "rmse": rmse,

@@ -11,8 +11,10 @@ import pandas as pd
 from lrfcal_lib.calibrate.cameras import PlatformCalibration
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
+from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
 from lrfcal_lib.fit.result import AXIS_NAMES, Solution
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, CameraModel
 from lrfcal_lib.model.observations import CameraObservations
@@ -61,25 +63,6 @@ def unit_of(parameter: str) -> tuple[str, float]:
         if re.fullmatch(names, parameter):
             return unit
     return "1", 1.0
-
-
-def rms(values: np.ndarray) -> float:
-    """Root mean square.
-
-    Parameters
-    ----------
-    values : array_like
-
-    Returns
-    -------
-    float
-        Of the finite values; NaN where there are none.
-    """
-    values = np.asarray(values, float)
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return np.nan
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def poses_under(obs: CameraObservations, model: CameraModel | None) -> np.ndarray:
@@ -374,7 +357,7 @@ def intrinsics_table(models: dict[str, CameraModel]) -> pd.DataFrame:
     for camera, model in models.items():
         sigma = np.full(9, np.nan)
         if model.covariance is not None:
-            sigma = np.sqrt(np.diag(model.covariance))
+            sigma = sigma_of(model.covariance)
         parameters[camera,] = INTRINSIC_NAMES, model.parameters, sigma
     return _parameter_table(["camera"], parameters)
 

@@ -16,6 +16,20 @@ ZERO = 1e-5  # a component of a direction below is a rounding error
 FEWEST = 3  # placements whose scatter tells anything
 
 
+def sigma_of(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., k, k)
+
+    Returns
+    -------
+    ndarray, shape (..., k)
+    """
+    return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+
+
 def null_space(hessian: np.ndarray, scales: np.ndarray, limit: float = 1.0) -> np.ndarray:
     """Directions that normal equations of whitened residuals do not determine.
 

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 from scipy.special import polygamma
 
+from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.model.camera import CameraModel
 
 AXIS_NAMES = (
@@ -126,17 +127,13 @@ class Solution:
     @property
     def sigma(self):
         """Standard deviations of the increments from `covariance`, shape (..., k)."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+        return sigma_of(self.covariance)
 
     @property
     def sigma_placements(self):
         """Standard deviations from `covariance_placements`, shape (..., k); NaN without."""
         found = self.covariance_placements
-        return (
-            np.full_like(self.sigma, np.nan)
-            if found is None
-            else np.sqrt(np.diagonal(found, axis1=-2, axis2=-1))
-        )
+        return np.full_like(self.sigma, np.nan) if found is None else sigma_of(found)
 
     @property
     def trusted(self):
@@ -162,7 +159,7 @@ class Solution:
     @property
     def trusted_sigma(self):
         """Standard deviations from `trusted`, shape (..., k)."""
-        return np.sqrt(np.diagonal(self.trusted, axis1=-2, axis2=-1))
+        return sigma_of(self.trusted)
 
     def __repr__(self):
         state = (

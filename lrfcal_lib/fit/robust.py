@@ -1,4 +1,5 @@
-"""Outliers: the spread of errors that are normal but for them, and what is left of their weight.
+"""How large errors are; and outliers: the spread of errors that are normal but for them, and what
+is left of their weight.
 
 One rule for every fit that does not go through :func:`lrfcal_lib.fit.least_squares.minimise`.
 """
@@ -21,6 +22,25 @@ def robust_sigma(misses: np.ndarray, least: float = 0.0) -> float:
         Never smaller than this.
     """
     return max(NORMAL * float(np.median(np.abs(misses))), least)
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square.
+
+    Parameters
+    ----------
+    values : array_like
+
+    Returns
+    -------
+    float
+        Of the finite values; NaN where there are none.
+    """
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return np.nan
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def biweight(misses: np.ndarray, sigma: float | np.ndarray) -> np.ndarray:

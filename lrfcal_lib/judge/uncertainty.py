@@ -20,6 +20,7 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     pose_transform,
     tilt,
+    unit_vector,
 )
 from lrfcal_lib.preprocess.prepared import PitchNoise
 
@@ -340,8 +341,9 @@ def beams_to(
 
 def beams_of_pixels(chain, model, uv, distance, image_pitch):
     """Bearing and pitch of beams of a given length that end on the rays of pixels (..., 2)."""
-    ray = np.insert(undistort(uv, model), 2, 1.0, axis=-1) @ np.linalg.inv(model.matrix).T
-    ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    ray = unit_vector(
+        np.insert(undistort(uv, model), 2, 1.0, axis=-1) @ np.linalg.inv(model.matrix).T
+    )
     depth = distance * np.ones(ray.shape[:-1])
     for _ in range(ROUNDS):
         x = (depth[..., None] * ray - chain.camera[:, 3]) @ chain.camera[:, :3]

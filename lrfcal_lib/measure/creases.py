@@ -13,6 +13,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.features import Feature
 from lrfcal_lib.measure.pulls import SPREAD, Pull, View, poses_of, pull_of_groups
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
+from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import (
     ACROSS_STEP_PX,
     FULL_CONTRAST,
@@ -149,9 +150,8 @@ def sights(creases: Creases, view: View) -> Sights:
     recorded = project(points, model)
     inside = model.shows(recorded, reach)
     by_point = pinhole_jacobian(points[inside], model)
-    way = view.rotation.apply(creases.along[inside])
-    tangent = np.einsum("nij,nj->ni", by_point, way)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    way = view.T_camera_platform.rotation.apply(creases.along[inside])
+    tangent = unit_vector(np.einsum("nij,nj->ni", by_point, way))
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
     return Sights(
@@ -215,20 +215,22 @@ def creases_pulls(of_creases: dict[str, list[Sights]], rig: CalibratedRig) -> li
 
 def _slip(fixed):
     """By how much the head slipped under cameras on the base that creases meet edges, radians; 0
-    where that explains no more than chance finds (Schwarz's criterion).
+    where that explains no more than chance finds (Schwarz's criterion), of edges in reach of a
+    calibration that holds and of the nearest ones.
     """
     explained = np.zeros(len(SLIPS))
     for seen, _ in fixed:
         by_slip = seen.by_unknown[:, -1]
         explained += [_explained(seen, by_slip * slip, SCANNED) for slip in SLIPS]
     slip = float(SLIPS[np.argmax(explained)])
+    scanned = explained.max() - explained[len(SLIPS) // 2]
     gain = 0.0
     creases = 1
     for seen, poses in fixed:
         creases += len(np.unique(seen.number))
         gain += _fitted(seen.after(slip), poses, HONEST)[1]
         gain -= _fitted(seen, poses, HONEST)[1]
-    return slip if gain > np.log(creases) / 2 else 0.0
+    return slip if min(scanned, gain) > np.log(creases) / 2 else 0.0
 
 
 def _pull(seen, poses, slip):

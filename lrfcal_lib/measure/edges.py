@@ -19,6 +19,7 @@ from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.judge.uncertainty import beams_to
 from lrfcal_lib.measure.features import Feature, Kind, beams_moved
 from lrfcal_lib.model.camera import pinhole
+from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge, refine_edge
 from lrfcal_lib.session.workers import spread
 
@@ -247,7 +248,7 @@ def _edge(plane, line, ends, by_noise, jacobian, number):
         plane,
         kind=Kind.EDGE,
         centre=ends.mean(axis=0),
-        axis=way / np.linalg.norm(way),
+        axis=unit_vector(way),
         noise=by_noise @ noise @ by_noise.T,
         jacobian=jacobian,
         ends=ends,

@@ -18,7 +18,7 @@ from lrfcal_lib.judge.uncertainty import (
     spread,
     uncertainty_of,
 )
-from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane
+from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, unit_vector
 
 AT_ONCE = 1 << 16  # points
 ALIKE = np.radians(15.0)  # between normals of one plane
@@ -325,7 +325,7 @@ def fit_feature(
         noise[:3, :3] = rough**2 / count * np.outer(normal, normal)
         noise[3:, 3:] = -(rough**2) / count * turned
     else:
-        beams = part.points / np.linalg.norm(part.points, axis=1, keepdims=True)
+        beams = unit_vector(part.points)
         noise[:3, :3] = range_noise(rig) ** 2 * beams.T @ beams / count**2
     return Feature(
         kind=Kind.PLANE if plane else Kind.POINT,

@@ -13,6 +13,7 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.cloud import join as join_clouds
 from lrfcal_lib.calibrate.clouds import sweep_blocks
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
 from lrfcal_lib.measure.creases import Sights, creases_of, creases_pulls, sights
 from lrfcal_lib.measure.features import flatness, largest_plane
@@ -305,7 +306,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         creases = creases_of(cloud, planes, of_point, placement)
         for view in views:
             of_creases[view.camera].append(sights(creases, view))
-        stations.append((flat_cloud(cloud, planes, of_point), views))
+        stations.append((flattened(cloud, planes, of_point), of_point >= 0, views))
     by_camera = creases_pulls(of_creases, rig)
     of_pairs = [pairs_pull(*station, by_camera) for station in stations]
     of_pairs = [pull for pull in of_pairs if pull is not None]
@@ -363,14 +364,15 @@ def _cloud(session, rig, placement) -> Cloud:
     return join_clouds(sweep_blocks(session, rig.for_scenes, session.sweep(placement), []))
 
 
-def flat_cloud(cloud, planes, of_point):
-    """The points of flat surfaces, moved onto them: single readings are noisy."""
-    cloud = cloud.rows(of_point >= 0)
-    plane = of_point[of_point >= 0]
+def flattened(cloud, planes, of_point):
+    """A cloud whose points of flat surfaces are moved onto them: single readings are noisy."""
+    flat = of_point >= 0
+    plane = of_point[flat]
     normal = np.reshape([plane.axis for plane in planes], (-1, 3))[plane]
     centre = np.reshape([plane.centre for plane in planes], (-1, 3))[plane]
-    off = np.vecdot(cloud.points - centre, normal)
-    return replace(cloud, points=cloud.points - off[:, None] * normal)
+    points = cloud.points.copy()
+    points[flat] -= np.vecdot(points[flat] - centre, normal)[:, None] * normal
+    return replace(cloud, points=points)
 
 
 def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
@@ -493,9 +495,9 @@ def _shift(camera, columns, score, sharp, rig):
     return Shift(
         camera=camera,
         change=change,
-        sigma=np.sqrt(np.diag(covariance)),
+        sigma=sigma_of(covariance),
         pixels=motion @ change,
-        pixels_sigma=np.sqrt(np.diag(motion @ covariance @ motion.T)),
+        pixels_sigma=sigma_of(motion @ covariance @ motion.T),
         p_value=_chance(score[columns], known),
         p_turn=_chance(score[columns[:3]], known[:3, :3]),
         shows=tuple(SHOWS[len(columns)] / np.sqrt(least)),

@@ -7,10 +7,12 @@ from itertools import combinations
 
 import cv2
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.measure.pulls import SPREAD, Pull, View, poses_of, pull_of_groups
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
+from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import sample
 
 EVERY = 9  # points of a surface between patches
@@ -23,6 +25,9 @@ BLURS = (6.0, 4.0, 2.5, 1.5, 1.0, 1.0)  # pixels, round by round
 ALIKE = 0.7  # correlation below which patches do not show the same
 CELL = np.radians(6.0)  # patches nearer together err together
 BORDER = 20  # pixels
+APART = 12.0  # pixels, side of cells: a patch is alone in its own and in those about it
+REACH = 2**1.5 * APART  # pixels, to their farthest corner
+BEFORE = 4.0  # standard deviations of a range by which something else is nearer or farther
 
 
 @dataclass(frozen=True)
@@ -37,7 +42,9 @@ class _Pair:
     cell: np.ndarray
 
 
-def pairs_pull(cloud: Cloud, views: list[View], known: list[Pull]) -> Pull | None:
+def pairs_pull(
+    cloud: Cloud, flat: np.ndarray, views: list[View], known: list[Pull]
+) -> Pull | None:
     """What pairs of images say about a rig; None where no pair does.
 
     Every camera's pose is found by Gauss-Newton from blurred to sharp images.
@@ -45,19 +52,23 @@ def pairs_pull(cloud: Cloud, views: list[View], known: list[Pull]) -> Pull | Non
     Parameters
     ----------
     cloud : Cloud
-        Of flat surfaces that a station shows.
+        Of n points that a station shows, those of flat surfaces moved onto them.
+    flat : ndarray of bool, shape (n,)
+        Which are of a flat surface.
     views : list of View
         Images of the station.
     known : list of Pull
         What else tells the cameras: pairs leave open what moves both images alike.
     """
-    patches = cloud.rows(slice(None, None, EVERY))
+    patches = np.flatnonzero(flat)[::EVERY]
+    clear = {id(view): clear_places(cloud, view)[patches] for view in views}
     pairs = []
     for first, second in combinations(views, 2):
         turned = abs(first.pitch - second.pitch)
         same = first.camera == second.camera
         if turned < (NEAR_PITCH if same else 1e-3) and not (same and first.fixed):
-            pairs.append(_pair(patches, first, second))
+            both = clear[id(first)] & clear[id(second)]
+            pairs.append(_pair(cloud.rows(patches[both]), first, second))
     if not sum(len(pair.cell) for pair in pairs):
         return None
     cameras = dict.fromkeys(view.camera for view in views)
@@ -82,6 +93,30 @@ def pairs_pull(cloud: Cloud, views: list[View], known: list[Pull]) -> Pull | Non
     return replace(pull_of_groups(information, by_row, cell, compared_at), alike=alike)
 
 
+def clear_places(cloud, view):
+    """Which points (n,) a view shows with nothing nearer or farther beside them: of a plane the
+    inverse of the depth is linear in the pixels.
+    """
+    model = view.model
+    p_camera = view.T_camera_platform.apply(cloud.points)
+    uv = project(p_camera, model)
+    clear = model.shows(uv)
+    p_camera = p_camera[clear]
+    cells = tuple((uv[clear] / APART).astype(int).T)
+    nearness = 1 / p_camera[:, 2]
+    normals = view.T_camera_platform.rotation.apply(cloud.normals[clear])
+    slope = np.linalg.norm(normals[:, :2], axis=1) / np.abs(np.vecdot(normals, p_camera))
+    noise = BEFORE * view.rig.lrf.sigma_range * nearness**2
+    off = REACH * slope / model.fx + noise
+    alone = np.ones(len(nearness), bool)
+    for side in (1, -1):  # what is nearer, then what is farther
+        most = np.full((model.size / APART).astype(int) + 1, -np.inf)
+        np.maximum.at(most, cells, side * nearness)
+        alone &= maximum_filter(most, 3)[cells] < side * nearness + off
+    clear[clear] = alone
+    return clear
+
+
 def _pair(patches, first, second):
     """The clearest patches that two images show."""
     p_first, J_first = first.carried(patches.points)
@@ -90,11 +125,10 @@ def _pair(patches, first, second):
     a, inside = _samples(patches.normals, first, p_first, spacing)
     b, also = _samples(patches.normals, second, p_second, spacing)
     rows = np.flatnonzero(inside & also)
-    texture = np.nan_to_num(sample(first.grey, first.model, a[rows])[..., 0].std(axis=1))
+    texture = sample(first.grey, first.model, a[rows])[..., 0].std(axis=1)
     order = np.argsort(-texture)[:CLEAREST]
     rows = rows[order[texture[order] > LEAST_TEXTURE]]
-    cells = np.floor(np.stack([patches.bearing, patches.pitch], axis=1) / CELL)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    cell = np.floor(patches.bearing / CELL) + 1000 * np.floor(patches.pitch / CELL)
     return _Pair(
         views=(first, second),
         uv=(a[rows], b[rows]),
@@ -102,7 +136,7 @@ def _pair(patches, first, second):
             pinhole_jacobian(p_first[rows], first.model) @ J_first[rows],
             pinhole_jacobian(p_second[rows], second.model) @ J_second[rows],
         ),
-        cell=cell.ravel()[rows],
+        cell=cell[rows],
     )
 
 
@@ -112,14 +146,15 @@ def _samples(normals, view, middle, spacing):
     """
     right = np.cross(normals, [0.0, 0.0, 1.0])
     right[np.linalg.norm(right, axis=1) < 0.1] = [1.0, 0.0, 0.0]
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    right = unit_vector(right)
     down = np.cross(normals, right)
-    sides = view.rotation.apply(np.stack([right, down], axis=1).reshape(-1, 3))
+    sides = view.T_camera_platform.rotation.apply(
+        np.stack([right, down], axis=1).reshape(-1, 3)
+    )
     sides = sides.reshape(-1, 2, 3) * spacing[:, None, None]
     steps = np.indices((2 * HALF + 1,) * 2).reshape(2, -1) - HALF
     points = middle[:, None] + np.einsum("is,nij->nsj", steps, sides)
-    recorded = project(points, view.model)
-    inside = view.model.shows(recorded, BORDER).all(axis=1)
+    inside = view.model.shows(project(points, view.model), BORDER).all(axis=1)
     return pinhole(points, view.model), inside
 
 

@@ -21,7 +21,7 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
-from lrfcal_lib.model.geometry import pose_step, transform_difference
+from lrfcal_lib.model.geometry import pose_step, transform_difference, unit_vector
 
 # metres, side of the cells whose points make one patch of a surface: for a start, for the fit
 COARSE = 0.1
@@ -228,8 +228,7 @@ def _directions(surface):
         best = near[np.argmax(near.sum(axis=1))]
         if best.sum() < least:
             break
-        mean = left[best].mean(axis=0)
-        mean /= np.linalg.norm(mean)
+        mean = unit_vector(left[best].mean(axis=0))
         found.append(mean)
         left = left[left @ mean < NEAR]
     return np.array(found).reshape(-1, 3)
@@ -422,7 +421,7 @@ def fitted(
         covariance=inverse @ (sums.T @ sums) @ inverse + by_sweeps @ by_sweeps.T,
         by_rig=(by_second - by_first)[:, :-2],
         overlap=agreement(first, second, T).overlap,
-        rms=float(np.sqrt(np.sum(weight * r**2) / np.sum(weight))),
+        rms=float(np.sqrt(np.average(r**2, weights=weight))),
         loose=loose,
         held=float(np.mean(np.abs(J[:, 3:] @ loose) > ACROSS)),
     )
@@ -431,8 +430,7 @@ def fitted(
 def _distances(first, second, T, here, there):
     """Distances (m,) of matched patches along the normal, by turn and shift (m, 6)."""
     turned = T.rotation.apply(second.points[there])
-    normals = first.normals[here] + T.rotation.apply(second.normals[there])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit_vector(first.normals[here] + T.rotation.apply(second.normals[there]))
     r = np.vecdot(normals, turned + T.translation - first.points[here])
     return np.hstack([np.cross(turned, normals), normals]), r
 

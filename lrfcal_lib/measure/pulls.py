@@ -44,9 +44,9 @@ class View:
         return self.rig.cameras[self.camera].mount == "platform"
 
     @property
-    def rotation(self):
-        """From the platform to the camera."""
-        return self.rig.camera_at(self.camera, self.pitch).rotation
+    def T_camera_platform(self):
+        """Pose of the platform in the camera."""
+        return self.rig.camera_at(self.camera, self.pitch)
 
     @cached_property
     def grey(self):

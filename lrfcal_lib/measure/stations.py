@@ -17,6 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud, join
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.judge.uncertainty import COLUMNS, chain_of
 from lrfcal_lib.measure.pairs import (
     COARSE,
@@ -240,7 +241,7 @@ def _covariance(pairs, response, of_rig):
 def _excess(joined, pair):
     """By how much a pair misses the poses of all, as a share of what is allowed."""
     miss = pair.miss(joined.T_world_station)
-    allowed = GREATEST_MISS * np.sqrt(np.diag(pair.covariance))
+    allowed = GREATEST_MISS * sigma_of(pair.covariance)
     allowed = np.maximum(allowed, np.repeat(ALLOWED_MISS, 3))
     return float(np.max(np.abs(miss) / allowed))
 

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lrfcal_lib.model.geometry import unit_vector
+
 
 def point_set(
     positions: ArrayLike, point: ArrayLike, distance: float, tolerance: float
@@ -128,8 +130,7 @@ def ball(radius: float, count: int, rng: np.random.Generator) -> np.ndarray:
     -------
     ndarray, shape (count, 3)
     """
-    positions = rng.normal(size=(count, 3))
-    positions /= np.linalg.norm(positions, axis=1, keepdims=True)
+    positions = unit_vector(rng.normal(size=(count, 3)))
     return radius * positions * np.cbrt(rng.uniform(size=(count, 1)))
 
 

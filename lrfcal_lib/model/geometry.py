@@ -40,6 +40,20 @@ def cross(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     return forward - backward
 
 
+def unit_vector(vectors: np.ndarray) -> np.ndarray:
+    """Vectors of length 1 that point the same way.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (..., k)
+
+    Returns
+    -------
+    ndarray, shape (..., k)
+    """
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 def hat(v: ArrayLike) -> np.ndarray:
     """Cross-product matrices, ``hat(v) @ u == cross(v, u)``.
 
@@ -349,8 +363,7 @@ def plane_axes(normal: np.ndarray) -> np.ndarray:
     ndarray, shape (2, 3)
     """
     other = [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0]
-    across = np.cross(normal, other)
-    across /= np.linalg.norm(across)
+    across = unit_vector(np.cross(normal, other))
     return np.stack([np.cross(across, normal), across])
 
 
@@ -548,7 +561,7 @@ def gradient_by_pose(rotated: np.ndarray, gradient: np.ndarray) -> np.ndarray:
 
 def axis_words(direction):
     """A direction in words: the name of an axis within 8 degrees, otherwise its components."""
-    direction = np.asarray(direction, float) / np.linalg.norm(direction)
+    direction = unit_vector(np.asarray(direction, float))
     largest = int(np.argmax(np.abs(direction)))
     direction = direction * np.sign(direction[largest])
     if direction[largest] > np.cos(np.radians(8)):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.camera import CameraModel, pinhole
+from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.plots.colors import AXES_RGB, COLORS, closed
 from lrfcal_lib.plots.recording import CENTRED, to_scale
 from lrfcal_lib.plots.rig import SQUARE, Vector, look_at
@@ -191,7 +192,7 @@ def image_of_edges(
     for name, other, color in (("e", "b", COLORS["left"]), ("f", "c", COLORS["right"])):
         uv[name] = pinhole(T_guess.apply(points[name.upper()]), model)
         ends = np.array([uv["a"], uv[other]])
-        along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        along = unit_vector(ends[1] - ends[0])
         foot = ends[0] + (uv[name] - ends[0]) @ along * along
         uv[f"{name} on a{other}"] = foot
         ax.plot(*ends.T, color=color, label=f"image line a{other}")

@@ -5,6 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 from scipy.special import ndtr
 
+from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.plots.colors import COLORS
 
 BEAMS = 12  # drawn of a scan
@@ -33,7 +34,7 @@ def plane_constraint(
     height = abs(distance)
     across = points.mean(axis=0) - origin
     across = across - up * (up @ across)
-    section = np.stack([across / np.linalg.norm(across), up])
+    section = np.stack([unit_vector(across), up])
     flat = points @ section.T
     lrf = section @ origin
     first = flat[:, 0].min() - 0.15
@@ -48,8 +49,11 @@ def plane_constraint(
     ax.annotate("", (0, height), (0, 0), arrowprops={"arrowstyle": "->"})
     ax.text(last, height + ABOVE, "plane of the board", ha="right")
     ax.text(-ABOVE, height / 2, f"n, d = {height:.2f} m", ha="right")
-    ax.text(-ABOVE, 0, "camera", va="center", ha="right", color=COLORS["left"])
-    ax.text(lrf[0] + ABOVE, lrf[1], "LRF", va="center", color=COLORS["lrf"])
+    # each name on the side where the other sensor is not
+    beside = np.copysign(ABOVE, lrf[0])
+    sides = ("right", "left")[:: int(np.sign(beside))]
+    ax.text(-beside, 0, "camera", va="center", ha=sides[0], color=COLORS["left"])
+    ax.text(lrf[0] + beside, lrf[1], "LRF", va="center", ha=sides[1], color=COLORS["lrf"])
     ax.set(xlabel="along the board [m]", ylabel="along its normal [m]", aspect="equal")
     ax.set_xlim(min(0.0, first, lrf[0]) - ROOM * height, max(last, lrf[0] + ROOM * height))
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import fit_plane
+from lrfcal_lib.model.geometry import fit_plane, unit_vector
 from lrfcal_lib.plots.colors import COLORS
 from lrfcal_lib.plots.recording import CENTRED
 
@@ -113,7 +113,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
         raise ValueError(
             f"no view from {eye} to {target} with {up} upwards: choose another eye or another up"
         )
-    right = right / np.linalg.norm(right)
+    right = unit_vector(right)
     ahead = ahead / distance
     rotation = Rotation.from_matrix(np.stack([right, np.cross(ahead, right), ahead]))
     return RigidTransform.from_components(-rotation.apply(eye), rotation)
@@ -181,6 +181,6 @@ def measured_edges(
         uv = pixels(T_view.apply(ends), size, focal)
         ax.plot(*uv.T, "o-", color=COLORS["fit"])
         away = uv.mean(axis=0) - middle
-        at = uv.mean(axis=0) + 0.07 * size[1] * away / np.linalg.norm(away)
+        at = uv.mean(axis=0) + 0.07 * size[1] * unit_vector(away)
         words = f"{1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
         ax.text(*at, f"{name.upper()} {words}", color=COLORS["fit"], **CENTRED)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.robust import NORMAL, biweight
+from lrfcal_lib.fit.robust import NORMAL, biweight, rms
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import polar_covariance, polar_to_points
 from lrfcal_lib.preprocess.surfaces import (
@@ -124,7 +124,7 @@ def find_board(
     residuals = residuals[np.abs(residuals) <= PLANE_NOISE * 2]
     if not len(residuals):
         raise BoardNotFound(f"no scan line has {FEWEST_BEAMS} beams on the board")
-    sigma = float(np.sqrt(np.mean(residuals**2)))
+    sigma = rms(residuals)
     spot = 0.0
     if lrf is not None and lrf.spot_exit is not None:
         reach = float(np.nanmedian(fitted))

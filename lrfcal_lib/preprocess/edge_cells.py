@@ -3,7 +3,12 @@
 import numpy as np
 from scipy import ndimage
 
-from lrfcal_lib.model.geometry import lrf_to_platform, plane_axes, polar_to_points
+from lrfcal_lib.model.geometry import (
+    lrf_to_platform,
+    plane_axes,
+    polar_to_points,
+    unit_vector,
+)
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
     BORDER,
@@ -156,7 +161,7 @@ def _on_one_side(scan, cells, board, reach, sides, side):
     alone = np.ones(len(side), bool)
     for s in sides:
         first, last = s.ends @ axes.T
-        x, y = (last - first) / np.linalg.norm(last - first)
+        x, y = unit_vector(last - first)
         along = (flat - first) @ [x, y]
         apart = np.abs((flat - first) @ [-y, x])
         mine = side == s.side

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from lrfcal_lib.fit.robust import biweight, robust_sigma
+from lrfcal_lib.fit.robust import biweight, rms, robust_sigma
 from lrfcal_lib.model.camera import CameraModel, distort, fold, line_through, pinhole
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
@@ -332,7 +332,7 @@ def _fit_line(column, place, offset, slope):
     about_middle = np.column_stack([np.ones(len(column)), column - column.mean()])
     covariance = np.linalg.inv(about_middle.T @ about_middle) * variance * factor
     covariance += np.diag([1.0, 12 / np.ptp(column) ** 2]) * SYSTEMATIC_PX**2
-    return _Fit(*line, covariance, column, float(np.sqrt(np.mean(residuals**2))))
+    return _Fit(*line, covariance, column, rms(residuals))
 
 
 def _correlation_factor(column, residuals):

@@ -4,7 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lrfcal_lib.model.geometry import lrf_to_platform, plane_axes, polar_to_points, tilt
+from lrfcal_lib.fit.robust import rms
+from lrfcal_lib.model.geometry import (
+    lrf_to_platform,
+    plane_axes,
+    polar_to_points,
+    tilt,
+    unit_vector,
+)
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.straight_runs import LEAST_TURN, line_of, straight_runs
 from lrfcal_lib.preprocess.surfaces import SAME_PITCH, depth_jump, row_ends
@@ -157,7 +164,7 @@ class Crossings:
         warp_sigma : float
             Of the range, beside that of the fit, metres.
         """
-        rays = self.points / np.linalg.norm(self.points, axis=1, keepdims=True)
+        rays = unit_vector(self.points)
         noise = rays * np.hypot(self.range_sigma, warp_sigma)[:, None]
         place = self.by_angle * np.reshape(sigma, (-1, 1))
         by_noise = noise[:, :, None] * noise[:, None, :]
@@ -423,7 +430,7 @@ def _inflation(by_angle, sigma, side, sides):
         rows = side == s.side
         along = by_angle[rows] @ s.direction
         across = by_angle[rows] - along[:, None] * s.direction
-        expected = np.sqrt(np.mean(sigma[rows] ** 2 * np.sum(across**2, axis=1)))
+        expected = rms(sigma[rows] * np.linalg.norm(across, axis=1))
         if expected > 0:
             factor[rows] = max(1.0, s.rms / expected)
     return factor
@@ -476,7 +483,7 @@ def _side_through(scan, flat, axes, pitch, end):
     ends = centre + np.outer([along.min(), along.max()], direction)
     scan_normal = _to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch)
     level = np.cross(scan_normal, scan.normal)  # of the scan line on the board
-    cosine = abs(level @ (direction @ axes)) / np.linalg.norm(level)
+    cosine = abs(unit_vector(level) @ (direction @ axes))
     variance = np.sum(across**2) / max(len(flat) - 2, 1)
     return ScanSide(
         side=-1,

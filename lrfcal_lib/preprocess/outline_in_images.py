@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.fit.robust import robust_sigma
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import DegenerateGeometry, unit_vector
 from lrfcal_lib.preprocess.edges_in_image import (
     board_line,
     on_board,
@@ -293,8 +293,7 @@ def _outer_peak(votes):
 
 def _median_line(lines, ends):
     """Median line (of n, 3) from its offsets at two ends, and the spread at the middle."""
-    normal = np.median(lines[:, :2], axis=0)
-    normal /= np.linalg.norm(normal)
+    normal = unit_vector(np.median(lines[:, :2], axis=0))
     # where every line crosses the normals raised at the two ends
     distance = lines[:, :2] @ ends.T + lines[:, 2:]
     cosine = lines[:, :2] @ normal

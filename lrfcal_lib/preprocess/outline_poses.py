@@ -8,6 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.camera import CameraModel, pinhole
+from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge
 from lrfcal_lib.preprocess.pattern_in_image import grey
 from lrfcal_lib.preprocess.pose_from_lines import pose_from_edges
@@ -129,7 +130,7 @@ def frontal(pose: RigidTransform) -> float:
     1 seen from the front, below 0 from behind.
     """
     normal = pose.rotation.as_matrix()[:, 2]
-    return float(-normal @ pose.translation / np.linalg.norm(pose.translation))
+    return float(-normal @ unit_vector(pose.translation))
 
 
 def _polygon(contour, n_corners):

@@ -8,6 +8,7 @@ from numpy.polynomial.polynomial import polyvander2d
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial.distance import cdist
 
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.board import Chessboard
 
 # larger images are searched at a reduced size: the detectors' time grows with it
@@ -228,7 +229,7 @@ def grid_noise(corners, size):
     powers = np.add.outer(np.arange(order + 1), np.arange(order + 1)).ravel()
     design = design[:, powers <= order]
     noise = left - design @ np.linalg.lstsq(design, left, rcond=None)[0]
-    return float(np.sqrt(np.mean(np.sum(noise**2, axis=1))))
+    return rms(np.linalg.norm(noise, axis=1))
 
 
 def refine_corners(picture, corners, size):

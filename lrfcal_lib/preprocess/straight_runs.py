@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from lrfcal_lib.model.geometry import unit_vector
+
 FEWEST_POINTS = 5  # of a run
 MOST_RUNS = 4  # on one hand of a board
 LEAST_TURN = np.radians(
@@ -93,7 +95,7 @@ def _consensus(points, tolerance, apart, rng):
         return np.zeros(len(points), bool)
     a = a[far]
     along = b[far] - a
-    normal = along[:, ::-1] * [-1, 1] / np.linalg.norm(along, axis=1, keepdims=True)
+    normal = unit_vector(along[:, ::-1] * [-1, 1])
     distance = normal @ points.T - np.sum(normal * a, axis=1)[:, None]
     # The sum of truncated squares ranks lines through the middle of a trace above those along its
     # rim.

@@ -18,6 +18,7 @@ from lrfcal_lib.model.geometry import (
     plane_axes,
     polar_to_points,
     tilt,
+    unit_vector,
 )
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import LrfInfo
@@ -334,7 +335,7 @@ def _fault(surface, points, pitch, T_head_lrf):
     """
     cells = np.argwhere(surface.mask)
     rays = points[surface.mask] - tilt(T_head_lrf.translation, pitch[cells[:, 0]])
-    cosine = np.abs(rays @ surface.normal) / np.linalg.norm(rays, axis=1)
+    cosine = np.abs(unit_vector(rays) @ surface.normal)
     if np.median(cosine) * STEEPEST < 1:
         return " seen along itself"
     hull = cv2.convexHull(cells[:, ::-1].astype(np.int32))

@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt
 from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.geometry import polar_to_points, tilt
+from lrfcal_lib.model.geometry import polar_to_points, tilt, unit_vector
 from lrfcal_lib.session.lms2xx_codec import REASONS, encode_values, largest
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.scene import World, need
@@ -241,8 +241,7 @@ def _sub_rays(beam, bearings):
     up = np.array([0.0, 0.0, 1.0])
     middle = polar_to_points(1.0, bearings)
     shift = right * np.cross(up, middle)[:, None] + over * up
-    directions = middle[:, None] + beam.divergence / 2 * shift
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions = unit_vector(middle[:, None] + beam.divergence / 2 * shift)
     return beam.spot_exit / 2 * shift, directions
 
 

@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, project, undistort
-from lrfcal_lib.model.geometry import plane_axes
+from lrfcal_lib.model.geometry import plane_axes, unit_vector
 from lrfcal_lib.simulate import textures
 from lrfcal_lib.simulate.textures import chessboard, plain
 
@@ -350,7 +350,7 @@ def board_on_stand(board, T_platform_board, ring):
     behind = T_platform_board.apply([*centre, -0.07])
     away = T_platform_board.rotation.apply([0.0, 0.0, -1.0]) * [1, 1, 0]
     # a tilted board stays clear of it
-    head = behind + 0.3 * away / np.linalg.norm(away) + np.array([0.0, 0.0, -0.02])
+    head = behind + 0.3 * unit_vector(away) + np.array([0.0, 0.0, -0.02])
     knee = np.array([*head[:2], min(head[2] - 0.3, FLOOR + 0.75)])
     rods = [(middle, behind, 0.006), (behind, head, 0.008), (head, knee, 0.011)]
     for turn in np.radians([80, 200, 320]):
@@ -478,8 +478,7 @@ class Imager:
         """Light and thing along viewing rays (..., 2)."""
         back = T_camera_platform.inv()
         flat = rays.reshape(-1, 2)
-        directions = np.column_stack([flat, np.ones(len(flat))])
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        directions = unit_vector(np.column_stack([flat, np.ones(len(flat))]))
         directions = directions @ back.rotation.as_matrix().T
         origins = np.broadcast_to(back.translation, directions.shape)
         hits = world.cast(origins, directions)

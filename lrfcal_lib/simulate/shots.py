@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
+from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array, unit_vector
 from lrfcal_lib.simulate.corner import corner_shots
 from lrfcal_lib.simulate.draw import (
     Devices,
@@ -127,11 +127,10 @@ class Scenario(Devices):
         open_ = np.ones(count, bool)
         while open_.any():
             v = rng.uniform(0, 1, (open_.sum(), 3))
-            direction[open_] = v / np.linalg.norm(v, axis=1, keepdims=True)
+            direction[open_] = unit_vector(v)
             open_ = direction.min(axis=1) < np.sin(self.least_angle)
         z = -direction
-        x = np.cross(z, [0.0, 0.0, 1.0])
-        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        x = unit_vector(np.cross(z, [0.0, 0.0, 1.0]))
         looking = np.stack([x, np.cross(z, x), z], axis=-1)
         turns = rng.uniform(-1, 1, (count, 3)) * self.extra
         turned = Rotation.from_matrix(looking) * Rotation.from_euler("ZXY", turns)

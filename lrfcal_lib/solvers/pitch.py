@@ -9,8 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import fdtrc
 
+from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.residuals import sight_normals
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
     DegenerateGeometry,
@@ -343,7 +345,7 @@ def _model(name, solution, rows, turn, numbers):
         first = 6 * len(poses)
         offset = centre @ errors[:p]
         of_offsets = known.covariance[first : first + p, first : first + p]
-        sigma = np.sqrt(np.diag(centre @ of_offsets @ centre))
+        sigma = sigma_of(centre @ of_offsets @ centre)
         stretch[: len(errors) - p] = errors[p:]
     return PitchModel(
         name,
@@ -351,7 +353,7 @@ def _model(name, solution, rows, turn, numbers):
         offset_sigma=sigma,
         stretch=stretch,
         misfit=misfit,
-        plane_rms=float(np.sqrt(np.mean(distances[rows.on_face] ** 2))),
+        plane_rms=rms(distances[rows.on_face]),
         n_parameters=POSE_NUMBERS + free,
         converged=bool(solution.converged),
     )

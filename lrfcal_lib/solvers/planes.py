@@ -11,6 +11,7 @@ from lrfcal_lib.fit.least_squares import Block, minimise_in_rounds, solve
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m, read_pose
 from lrfcal_lib.fit.result import Solution
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, project, project_jacobians
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
@@ -287,7 +288,7 @@ def plane_error(obs: CameraObservations, solution: Solution) -> float:
     known = np.isfinite(distance)
     _, index = np.unique(obs.plane_placement[known], return_inverse=True)
     means = np.bincount(index, distance[known]) / np.bincount(index)
-    return float(np.sqrt(np.mean(means**2)))
+    return rms(means)
 
 
 def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> list[Block]:
@@ -431,7 +432,7 @@ def _with_refined_model(solution, obs, lens):
     corners = 2 * len(obs.pattern_points)
     errors = solution.residuals[:, -corners:] * obs.pattern_sigma_px
     visible = np.isfinite(obs.pattern_pixels).sum() / 2
-    rms = float(np.sqrt(np.sum(errors**2) / visible))  # per corner, as OpenCV has it
+    miss = float(np.sqrt(np.sum(errors**2) / visible))  # per corner, as OpenCV has it
     covariance = np.pad(solution.covariance[6:, 6:], (0, LENS - lens))
-    model = obs.model.with_parameters(intrinsics, covariance, rms)
+    model = obs.model.with_parameters(intrinsics, covariance, miss)
     return replace(solution, model=model, board_poses=pose_transform(boards).as_matrix())

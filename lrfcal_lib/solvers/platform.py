@@ -31,6 +31,7 @@ from lrfcal_lib.model.geometry import (
     head_from_axis,
     lrf_to_platform,
     tilt,
+    unit_vector,
 )
 from lrfcal_lib.model.observations import PlatformObservations
 
@@ -235,7 +236,7 @@ def _start_board(edges, face):
         z = normal - x * (x @ normal)
     else:
         raise DegenerateGeometry("only one edge, and no points on the face")
-    z /= np.linalg.norm(z)
+    z = unit_vector(z)
     return np.column_stack([x, np.cross(z, x), z, point])
 
 
@@ -483,7 +484,7 @@ def _projected_line(q):
     u = np.concatenate([a, 1 / c, 1 + 0 * a], axis=-1)
     point = np.concatenate([b, -d / c, 0 * b], axis=-1)
     errors = np.concatenate([e1, e2], axis=-1) / np.sqrt(x.shape[-1])
-    return errors, u / np.linalg.norm(u, axis=-1, keepdims=True), point
+    return errors, unit_vector(u), point
 
 
 def _regression(s, v):
