@@ -251,14 +251,17 @@ def _pull(seen, poses, slip):
 
 
 def _fitted(seen, poses, spread):
-    """A camera's pose (6,) that is likely to `spread` (6,), and how much it explains."""
+    """A camera's pose (6,) that is likely to `spread` (6,), and how much it explains, less what it
+    takes for that.
+    """
     by_pose = seen.by_unknown[:, poses]
     x = np.zeros(len(spread))
     for width in WIDTHS:
         weight, pull = _weighed(seen, by_pose @ x, width)
         H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(spread**-2.0)
         x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / spread**2)
-    return x, _explained(seen, by_pose @ x, WIDTHS[-1])
+    cost = np.sum((x / spread) ** 2) / 2
+    return x, _explained(seen, by_pose @ x, WIDTHS[-1]) - cost
 
 
 def _explained(seen, moved, width):
