@@ -132,7 +132,7 @@ class _Planes:
         inverse = 1 / np.where(valid, ranges, 1.0)
         basis = np.stack([valid, *np.indices(ranges.shape), inverse], axis=-1)
         basis = basis * valid[..., None]
-        products = basis[..., :, None] * basis[..., None, :]
+        products = np.einsum("...i,...j->...ij", basis, basis)
         before = products.cumsum(axis=0).cumsum(axis=1)
         self.table = np.pad(before, ((1, 0), (1, 0), (0, 0), (0, 0)))
 

@@ -406,7 +406,7 @@ def _crossings(prepared, view, source, sides, count):
         pitch = edges.pitch[rows]
         sigma_pitch = prepared.pitch_noise.sigma(pitch, middle)
         by_pitch = source.by_pitch(p_lrf, pitch) * sigma_pitch[:, None]
-        pitch_error = by_pitch[:, :, None] * by_pitch[:, None, :]
+        pitch_error = np.einsum("...i,...j->...ij", by_pitch, by_pitch)
         yield {
             "points": source.points(p_lrf, pitch),
             "pitch": pitch,

@@ -260,8 +260,8 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     share = sums(valid.astype(float))
     whole = np.maximum(share, 0.5 / width**2)[..., None]
     mean = sums(p) / whole
-    square = sums(p[..., :, None] * p[..., None, :]) / whole[..., None]
-    spread = square - mean[..., :, None] * mean[..., None, :]
+    square = sums(np.einsum("...i,...j->...ij", p, p)) / whole[..., None]
+    spread = square - np.einsum("...i,...j->...ij", mean, mean)
     variances, directions = np.linalg.eigh(spread)
     least, middle, _ = np.moveaxis(variances, -1, 0)
     known = (share > 1 / 3) & (middle > LEAST_SPREAD)

@@ -84,7 +84,7 @@ def view_residuals(
     turned = pose[:, :3, :3] @ outline(solution).mean(axis=0)
     at = pose[:, :3, 3]
     seen = project(turned + at, model)
-    moved = (geometry.exp_rotation(turn) @ turned[..., None])[..., 0]
+    moved = np.matvec(geometry.exp_rotation(turn), turned)
     return seen, project(moved + at + shift, model) - seen
 
 

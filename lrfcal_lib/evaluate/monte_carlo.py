@@ -11,7 +11,13 @@ from scipy.stats import binom, chi2
 
 from lrfcal_lib.evaluate.tables import unit_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
-from lrfcal_lib.fit.covariance import name_words, null_space, pseudo_inverse, sigma_of
+from lrfcal_lib.fit.covariance import (
+    name_words,
+    null_space,
+    pseudo_inverse,
+    sigma_of,
+    solve_each,
+)
 from lrfcal_lib.fit.edge_likelihood import disc_share
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
@@ -280,7 +286,7 @@ def _judge(trials, index, factor):
     rmse = rms(np.linalg.norm(unit * e, axis=1))
     free = len(e) * _freedom(np.mean(B, axis=0))
     half_width = HALF_WIDTH * sigma_of(C)
-    normalised = np.linalg.solve(C, e[..., None])[..., 0]
+    normalised = solve_each(C, e)
     row = {
         "rmse": rmse,
         "crb": crb,

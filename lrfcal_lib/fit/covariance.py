@@ -30,6 +30,21 @@ def sigma_of(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
+def solve_each(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """The vectors x for which ``matrices @ x`` are some vectors.
+
+    Parameters
+    ----------
+    matrices : ndarray, shape (..., k, k)
+    vectors : ndarray, shape (..., k)
+
+    Returns
+    -------
+    ndarray, shape (..., k)
+    """
+    return np.linalg.solve(matrices, vectors[..., None])[..., 0]
+
+
 def null_space(hessian: np.ndarray, scales: np.ndarray, limit: float = 1.0) -> np.ndarray:
     """Directions that normal equations of whitened residuals do not determine.
 
@@ -131,7 +146,7 @@ def placement_covariance(
     groups = hessians.shape[-3]
     total = np.sum(hessians, axis=-3, keepdims=True)
     diagonal = np.sqrt(np.maximum(np.diagonal(total, axis1=-2, axis2=-1), 1e-300))
-    outer = diagonal[..., :, None] * diagonal[..., None, :]
+    outer = np.einsum("...i,...j->...ij", diagonal, diagonal)
     scaled = (total - hessians) / outer
     try:  # squared pivots: what the others say about one unknown more
         pivots = np.linalg.cholesky(scaled).diagonal(axis1=-2, axis2=-1)
@@ -140,10 +155,10 @@ def placement_covariance(
     if groups < FEWEST or pivots.min() < 1e-6:
         return None, None
     without = np.linalg.inv(scaled)
-    shifts = (without @ (scores / diagonal)[..., None])[..., 0] / diagonal
+    shifts = np.matvec(without, scores / diagonal) / diagonal
     share = (groups - 1) / groups
     squares = share * shifts.mT @ shifts
     whole = np.diagonal(np.linalg.inv(total / outer), axis1=-2, axis2=-1)
     gained = np.diagonal(without, axis1=-2, axis2=-1) - whole
     factor = np.sqrt(whole[..., 0, :] / (share * gained.sum(axis=-2)))
-    return factor[..., :, None] * squares * factor[..., None, :], shifts
+    return squares * np.einsum("...i,...j->...ij", factor, factor), shifts

@@ -26,6 +26,7 @@ from lrfcal_lib.fit.covariance import (
     name_words,
     null_space,
     placement_covariance,
+    solve_each,
 )
 from lrfcal_lib.fit.padding import medians
 from lrfcal_lib.fit.result import Solution
@@ -198,7 +199,7 @@ def linearise(blocks: Iterable[Block], axes=(-2, -1)) -> Linearised:
         J = block.white_jacobian
         transposed = J.mT
         hessian = hessian + transposed @ J
-        gradient = gradient + (transposed @ block.white[..., None])[..., 0]
+        gradient = gradient + np.matvec(transposed, block.white)
         cost = cost + _cost(block, axes)
     return Linearised(hessian, gradient, cost)
 
@@ -273,7 +274,7 @@ def _step(hessian, gradient, damping, shared):
     extra = extra + (1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300)
     damped = hessian + extra[..., None] * np.eye(hessian.shape[-1])
     if shared is None:
-        step = whole = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        step = whole = -solve_each(damped, gradient)
     else:
         reduced, right, back = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
@@ -281,7 +282,7 @@ def _step(hessian, gradient, damping, shared):
         whole = np.concatenate(
             [np.broadcast_to(common, (len(back), shared)), step[1]], axis=-1
         )
-    length = np.vecdot(whole, (hessian @ whole[..., None])[..., 0])
+    length = np.vecdot(whole, np.matvec(hessian, whole))
     promised = -np.vecdot(whole, gradient) - 0.5 * length
     if shared is None:
         return step, length, promised

@@ -154,7 +154,7 @@ class Solution:
         excess = 2 * np.log(np.fmax(ratio, 1.0))
         h = np.sqrt(np.expm1(beyond_chance(excess, self.n_placements - 1)))
         finite = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
-        return self.covariance + h[..., :, None] * finite * h[..., None, :]
+        return self.covariance + finite * np.einsum("...i,...j->...ij", h, h)
 
     @property
     def trusted_sigma(self):

@@ -54,8 +54,8 @@ class ViewBlock(Block):
     @cached_property
     def white_by_pitch(self):
         """The vectors g (p, v, 6), and the square of the whole one of a view's stop (p, v)."""
-        g = (self.whitener @ self.by_pitch[..., None])[..., 0]
-        return g, (self.same @ np.vecdot(g, g)[..., None])[..., 0]
+        g = np.matvec(self.whitener, self.by_pitch)
+        return g, np.matvec(self.same, np.vecdot(g, g))
 
     @cached_property
     def shared_error(self):

@@ -194,7 +194,7 @@ def _chance_of_step(score, columns, row):
     repeated = np.concatenate([np.arange(shared), columns])
     kept = np.ones((count, len(repeated)))
     kept[~later, shared:] = 0.0
-    both = kept[:, :, None] * kept[:, None, :]
+    both = np.einsum("...i,...j->...ij", kept, kept)
     whole = both * score.information[:, repeated[:, None], repeated]
     parted = Score(whole, score.gradient[:, repeated] * kept)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.calibrate.pipeline import Calibration, largest_range
+from lrfcal_lib.fit.covariance import solve_each
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, no_if
 from lrfcal_lib.judge.next_placement import group_sigma, sights
@@ -185,7 +186,7 @@ def noise_of_images(solution: JointSolution) -> dict[str, float]:
         return {}
     level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)
     factors = np.linalg.cholesky(obs.view_covariance)
-    white = np.linalg.solve(factors, solution.residuals("view")[..., None])[..., 0]
+    white = solve_each(factors, solution.residuals("view"))
     squares = np.mean(white**2, axis=1)
     usual = max(np.mean(squares), np.finfo(float).tiny)
     scatter = {}

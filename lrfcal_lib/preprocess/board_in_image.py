@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.fit.covariance import solve_each
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.camera import CameraModel, line_distance, undistort
 from lrfcal_lib.model.geometry import pose_array
@@ -193,7 +194,7 @@ def pose_with_edges(view, board, model: CameraModel) -> tuple[RigidTransform, np
         return pose, covariance
     misses, by_pose = line_residuals(view.edges, board, model, pose_array(pose))
     expected = np.eye(2) + by_pose @ covariance @ by_pose.mT
-    chi2 = np.sum(misses * np.linalg.solve(expected, misses[..., None])[..., 0], axis=1)
+    chi2 = np.sum(misses * solve_each(expected, misses), axis=1)
     agreeing = [view.edges[i] for i in np.flatnonzero(chi2 < AGREE_CHI2)]
     if not agreeing:
         return pose, covariance

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.fit.covariance import solve_each
 from lrfcal_lib.fit.robust import NORMAL, biweight, rms
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import polar_covariance, polar_to_points
@@ -202,7 +203,7 @@ def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.
         beams.
     """
     rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-    products = rays[:, :, None] * rays[:, None, :]
+    products = np.einsum("...i,...j->...ij", rays, rays)
     valid = np.isfinite(ranges)
     r = np.where(valid, ranges, 1.0)
     enough = valid.sum(axis=1) >= FEWEST_BEAMS
@@ -213,7 +214,7 @@ def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.
         right = (weights / r) @ rays
         information[~enough] = np.eye(2)
         right[~enough] = np.nan
-        lines = np.linalg.solve(information, right[..., None])[..., 0]
+        lines = solve_each(information, right)
         misses = np.where(valid, np.abs(r - _line_ranges(lines, bearings)), np.nan)
         misses[~enough] = 0.0
         sigma = np.maximum(NORMAL * np.nanmedian(misses, axis=1), LEAST_SIGMA)[:, None]

@@ -105,7 +105,7 @@ def line_misses(edges, points, model: CameraModel, pose):
     by_point = np.einsum("ek,enkj->enj", lines[:, :2], pinhole_jacobian(p_camera, model))
     by_pose = gradient_by_pose(turned, by_point)
     white = _whiteners(edges, lines, uv)
-    return (white @ distance[..., None])[..., 0], white @ by_pose
+    return np.matvec(white, distance), white @ by_pose
 
 
 def _whiteners(edges, lines, uv):

@@ -257,7 +257,7 @@ def judged(block, factor, others, rows, shared):
     step = -inverse @ np.sum(score, axis=0)
     own = -(back[..., c] + back[..., :c] @ step)
     moved = np.concatenate([np.broadcast_to(step, (len(own), c)), own], axis=-1)
-    left = np.sum((z + (J @ moved[..., None])[..., 0]) ** 2)
+    left = np.sum((z + np.matvec(J, moved)) ** 2)
     # share of the views in what is known of the unknowns: rows that these take up
     inner = np.linalg.inv(whole[:, c:, c:])
     every = np.broadcast_to(np.eye(c), (len(own), c, c))
@@ -333,7 +333,7 @@ def side_levels(sides, data, hessian, gradient):
         whole[:, last, last] += weight / sigma2 - prior
         right[:, last] += (weight / sigma2 - prior) * sides
         spread = np.linalg.pinv(whole, rcond=OWN_RANK, hermitian=True)
-        step = -(spread @ right[..., None])[..., 0]
+        step = -np.matvec(spread, right)
         square = (sides + step[:, last]) ** 2 + spread[:, last, last]
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)
         total = np.sum(weight * square * shown, axis=0)

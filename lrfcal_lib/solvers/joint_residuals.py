@@ -264,7 +264,7 @@ def view_block(state, data, unknowns):
     R_head_platform = tilt(np.eye(3), -pitch[..., None]).mT
     R_camera_platform = R_camera_head @ R_head_platform
     origin = tilt(board[..., 3], -pitch)  # of the board, in the head frame
-    arm = (R_camera_head @ (origin - head[..., 3])[..., None])[..., 0]
+    arm = np.matvec(R_camera_head, origin - head[..., 3])
     w = geometry.log_rotation(R_camera_platform @ board[..., :3] @ pose[..., :3, :3].mT)
     residuals = np.concatenate([w, arm + camera[..., 3] - pose[..., :3, 3]], axis=-1)
 

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.fit.covariance import solve_each
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import (
     moved_noise,
@@ -65,7 +66,7 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     by_source = by_point @ pose[..., None, :, :3]  # by the point in the source frame
     pulled = obs.scene_covariance @ by_source.mT
     noise = by_source @ pulled + obs.scene_sigma_px[..., None, None] ** 2 * np.eye(2)
-    force = np.linalg.solve(noise, errors[..., None])[..., 0]
+    force = solve_each(noise, errors)
     shift = np.matvec(pulled, force) @ pose[..., :3].mT
 
     rotated = rotated[..., None, :]  # u and v, two scalars of one point

@@ -175,7 +175,7 @@ def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
     normal = boards[..., 2]
     root, centre = _centred(triangles)
     along = np.linalg.svd(root[..., :2])[2][..., 0, :]
-    rows = along[..., :, None] * normal[..., None, :]
+    rows = np.einsum("...i,...j->...ij", along, normal)
     null = np.linalg.svd(rows.reshape(*normal.shape[:-1], 6))[2][..., 3:, :]
     first = null[..., :3]
     second = null[..., 3:]

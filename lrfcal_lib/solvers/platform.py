@@ -16,7 +16,7 @@ from lrfcal_lib.fit.axis_chart import (
     chart_parameters,
     move_head,
 )
-from lrfcal_lib.fit.covariance import name_words
+from lrfcal_lib.fit.covariance import name_words, solve_each
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR
@@ -281,8 +281,8 @@ def distance_block(state, group, sigma_pitch, which):
     r, J, by_point, by_pitch = (x[:, :, which] for x in distances(state, group))
     pull = group["covariance"] @ by_point.mT
     by_pitch = sigma_pitch * by_pitch
-    noise = by_point @ pull + by_pitch[..., :, None] * by_pitch[..., None, :]
-    force = np.linalg.solve(noise, r[..., None])[..., 0]
+    noise = by_point @ pull + np.einsum("...i,...j->...ij", by_pitch, by_pitch)
+    force = solve_each(noise, r)
     points = group["points"] - np.matvec(pull, force)
     pitch = group["pitch"] - sigma_pitch * np.vecdot(by_pitch, force)
     moved = group | {"points": points, "pitch": pitch}
