@@ -83,22 +83,31 @@ def test_a_turned_camera_is_named(seen):
     np.testing.assert_allclose(held.culprits[0].change[1], TURN, atol=TURN / 2)
 
 
-def test_of_two_likely_suspects_a_turn_alone_decides(held):
-    """Edges taken for others look like a move of either camera; where no turn is seen, both stay."""
-    left, right = (replace(shift, p_value=1e-90) for shift in held.shifts)
-    head = replace(left, camera=None)
-    turned = replace(left, p_turn=1e-30)
-    other = replace(right, p_turn=1e-20, p_value=3e-91)
-    assert most_likely([turned, other, head]) == [turned, head]
-    left, right = (replace(shift, p_turn=0.1) for shift in (left, other))
-    assert most_likely([left, right]) == [right, left]
+def test_of_suspects_those_that_are_nearly_as_likely_are_said_too(held):
+    """The most likely first; odds of 100 to 1 are enough to name it alone."""
+    left, right = held.shifts
+    head = replace(left, camera=None, evidence=70.0)
+    left = replace(left, evidence=80.0)
+    assert most_likely([head, replace(right, evidence=82.0), left])[1:] == [left]
+    assert most_likely([replace(right, evidence=75.0), left, head]) == [left]
     assert most_likely([]) == []
 
 
 def test_what_no_float_can_tell_from_zero_is_no_reason_to_hold(held):
     """Probabilities of a large change underflow."""
-    sure = [replace(shift, p_value=0.0, p_turn=0.0) for shift in held.shifts]
+    sure = [replace(shift, p_value=0.0, evidence=1e6) for shift in held.shifts]
     assert most_likely(sure) == sure
+
+
+def test_what_needs_less_to_have_happened_is_likelier(seen):
+    """A turn alone explains a turned camera; of the other one it takes a turn and a move."""
+    turned = holds(seen, changed(true_rig(seen), "left", [0.0, TURN, 0.0, 0.0, 0.0, 0.0]))
+    left, right = turned.shifts
+    assert left.evidence > right.evidence + 5
+    assert (
+        left.evidence > 10
+        and max(s.evidence for s in holds(seen, true_rig(seen)).shifts) < 0
+    )
 
 
 def test_a_camera_turned_too_far_to_be_found_is_not_called_holding(seen, held):

@@ -10,7 +10,15 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from lrfcal_lib.calibrate.cloud import Cloud
-from lrfcal_lib.measure.pulls import SPREAD, Pull, View, poses_of, pull_of_groups
+from lrfcal_lib.measure.pulls import (
+    PITCH_NOISE,
+    SPREAD,
+    Pull,
+    View,
+    poses_of,
+    pull_of_groups,
+    without,
+)
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import sample
@@ -20,6 +28,7 @@ HALF = 3  # samples from the middle of a patch to its side
 SPACING = 2.0  # pixels between them, in the first image
 LEAST_TEXTURE = 4.0  # grey levels of standard deviation
 CLEAREST = 250  # patches of a pair
+FEWEST = 20  # patches of a station
 NEAR_PITCH = np.radians(15.0)  # between images of a camera that are compared
 BLURS = (6.0, 4.0, 2.5, 1.5, 1.0, 1.0)  # pixels, round by round
 ALIKE = 0.7  # correlation below which patches do not show the same
@@ -45,7 +54,7 @@ class _Pair:
 def pairs_pull(
     cloud: Cloud, flat: np.ndarray, views: list[View], known: list[Pull]
 ) -> Pull | None:
-    """What pairs of images say about a rig; None where no pair does.
+    """What pairs of images say about a rig; None where they show too little.
 
     Every camera's pose is found by Gauss-Newton from blurred to sharp images.
 
@@ -62,35 +71,40 @@ def pairs_pull(
     """
     patches = np.flatnonzero(flat)[::EVERY]
     clear = {id(view): clear_places(cloud, view)[patches] for view in views}
+    stops = np.unique([view.pitch for view in views if not view.fixed])
     pairs = []
     for first, second in combinations(views, 2):
         turned = abs(first.pitch - second.pitch)
         same = first.camera == second.camera
         if turned < (NEAR_PITCH if same else 1e-3) and not (same and first.fixed):
             both = clear[id(first)] & clear[id(second)]
-            pairs.append(_pair(cloud.rows(patches[both]), first, second))
-    if not sum(len(pair.cell) for pair in pairs):
+            pairs.append(_pair(cloud.rows(patches[both]), first, second, stops))
+    if sum(len(pair.cell) for pair in pairs) < FEWEST:
         return None
     cameras = dict.fromkeys(view.camera for view in views)
     poses = np.concatenate([poses_of(views[0].rig, camera) for camera in cameras])
-    x = np.zeros(pairs[0].by_unknown[0].shape[-1])
-    prior = np.diag(np.tile(SPREAD**-2.0, len(cameras)))
-    slope = np.zeros(len(poses))
+    of_poses = slice(len(poses))
+    count = len(views[0].rig.uncertainty.names) + 1
+    x = np.zeros(count + len(stops))
+    fitted = np.r_[poses, count : len(x)]
+    noise = np.full(len(stops), PITCH_NOISE)
+    prior = np.diag(np.r_[np.tile(SPREAD, len(cameras)), noise] ** -2.0)
+    slope = np.zeros(len(fitted))
     for pull in known:
-        prior = prior + pull.information[np.ix_(poses, poses)]
-        slope = slope + pull.slope[poses]
+        prior[of_poses, of_poses] += pull.information[np.ix_(poses, poses)]
+        slope[of_poses] += pull.slope[poses]
     for blur in BLURS:
         sharp = {id(view): cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
         parts = [_compared(pair, sharp, x) for pair in pairs]
         H, b, D = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
         by_row = np.einsum("nia,ni->na", D, -b)
-        left = by_row.sum(axis=0)[poses] + slope - prior @ x[poses]
+        left = by_row.sum(axis=0)[fitted] + slope - prior @ x[fitted]
         compared_at = x.copy()
-        x[poses] += np.linalg.solve(information[np.ix_(poses, poses)] + prior, left)
+        x[fitted] += np.linalg.solve(information[np.ix_(fitted, fitted)] + prior, left)
     cell = np.concatenate([pair.cell for pair in pairs])
-    alike = H.any(axis=(1, 2)).mean()
-    return replace(pull_of_groups(information, by_row, cell, compared_at), alike=alike)
+    pull = pull_of_groups(information, by_row, cell, compared_at)
+    return replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())
 
 
 def clear_places(cloud, view):
@@ -117,7 +131,7 @@ def clear_places(cloud, view):
     return clear
 
 
-def _pair(patches, first, second):
+def _pair(patches, first, second, stops):
     """The clearest patches that two images show."""
     p_first, J_first = first.carried(patches.points)
     p_second, J_second = second.carried(patches.points)
@@ -133,11 +147,21 @@ def _pair(patches, first, second):
         views=(first, second),
         uv=(a[rows], b[rows]),
         by_unknown=(
-            pinhole_jacobian(p_first[rows], first.model) @ J_first[rows],
-            pinhole_jacobian(p_second[rows], second.model) @ J_second[rows],
+            _by_unknown(first, p_first[rows], J_first[rows], stops),
+            _by_unknown(second, p_second[rows], J_second[rows], stops),
         ),
         cell=cell[rows],
     )
+
+
+def _by_unknown(view, points, J, stops):
+    """Derivatives (n, 2, c + s) of pixels, by the unknowns of a Pull and by the pitch at which the
+    head stopped (s,).
+    """
+    by_unknown = pinhole_jacobian(points, view.model) @ J
+    here = (stops == view.pitch) & (not view.fixed)
+    # an image pitched more sees what a sweep pitched less shows
+    return np.concatenate([by_unknown, -by_unknown[..., -1:] * here], axis=-1)
 
 
 def _samples(normals, view, middle, spacing):

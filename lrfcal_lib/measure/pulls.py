@@ -1,6 +1,6 @@
 """What observations say about all unknowns of a calibrated rig: a slope, and its information."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -13,6 +13,7 @@ from lrfcal_lib.session.read import Session
 
 # a camera's likely changes, radians and metres of its pose
 SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
+PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,11 @@ def views_of_station(session: Session, rig: CalibratedRig, placement: int) -> li
 
 
 def pull_of_groups(
-    information: np.ndarray, by_row: np.ndarray, group: np.ndarray, x: np.ndarray
+    information: np.ndarray,
+    by_row: np.ndarray,
+    group: np.ndarray,
+    x: np.ndarray,
+    worth: float = 1.0,
 ) -> Pull:
     """A Pull whose information is what the scatter of groups leaves of it.
 
@@ -135,15 +140,37 @@ def pull_of_groups(
         Those of one group err together.
     x : ndarray, shape (c,)
         Change of the unknowns, of which those that are not 0 were fitted.
+    worth : float
+        Share of the information that is to be relied on.
     """
     _, group = np.unique(group, return_inverse=True)
     sums = np.zeros((group.max() + 1, len(x)))
     np.add.at(sums, group, by_row)
     load = np.bincount(group, np.linalg.norm(by_row, axis=1))
-    groups = float(load.sum() ** 2 / np.sum(load**2))
+    groups = load.sum() ** 2 / max(load @ load, 1e-300)
     fitted = np.flatnonzero(x)
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
     excess = np.trace(own @ sums[:, fitted].T @ sums[:, fitted]) / len(fitted)
     few = groups / max(groups - len(fitted), 1.0)
-    scale = 1 / max(excess * few, 1e-12)
+    scale = worth / max(excess * few, 1e-12)
     return Pull(scale * information, scale * (information @ x + sums.sum(axis=0)), groups)
+
+
+def without(pull: Pull, sigma: np.ndarray) -> Pull:
+    """What a Pull says of all unknowns but the last ones, which are not known better than so.
+
+    Parameters
+    ----------
+    pull : Pull
+    sigma : ndarray, shape (s,)
+        Of the last unknowns before.
+    """
+    kept = slice(len(pull.slope) - len(sigma))
+    last = slice(kept.stop, None)
+    known = pull.information[last, last] + np.diag(sigma**-2.0)
+    share = np.linalg.solve(known, pull.information[last, kept])
+    return replace(
+        pull,
+        information=pull.information[kept, kept] - pull.information[kept, last] @ share,
+        slope=pull.slope[kept] - pull.slope[last] @ share,
+    )
