@@ -144,16 +144,16 @@ def pull_of_groups(
         Share of the information that is to be relied on.
     """
     _, group = np.unique(group, return_inverse=True)
-    sums = np.zeros((group.max() + 1, len(x)))
-    np.add.at(sums, group, by_row)
+    fitted = np.flatnonzero(x)
+    sums = np.zeros((group.max() + 1, len(fitted)))
+    np.add.at(sums, group, by_row[:, fitted])
     load = np.bincount(group, np.linalg.norm(by_row, axis=1))
     groups = load.sum() ** 2 / max(load @ load, 1e-300)
-    fitted = np.flatnonzero(x)
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
-    excess = np.trace(own @ sums[:, fitted].T @ sums[:, fitted]) / len(fitted)
+    excess = np.trace(own @ sums.T @ sums) / max(len(fitted), 1)
     few = groups / max(groups - len(fitted), 1.0)
     scale = worth / max(excess * few, 1e-12)
-    return Pull(scale * information, scale * (information @ x + sums.sum(axis=0)), groups)
+    return Pull(scale * information, scale * (information @ x + by_row.sum(axis=0)), groups)
 
 
 def without(pull: Pull, sigma: np.ndarray) -> Pull:
