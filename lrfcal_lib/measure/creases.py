@@ -33,8 +33,10 @@ ALONG = 5  # pixels of a profile that are averaged
 HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
 WIDTHS = np.append(np.geomspace(0.3, 0.04, 12), np.full(8, 0.04))
-SCANNED = 0.09  # of REACH, for a slip: what a calibration that holds is off
-SLIPS = np.radians(np.linspace(-1.0, 1.0, 81))  # that are tried
+SLIPS = np.radians(np.arange(-10, 11) / 10)  # that are tried
+MATTERS = np.radians(
+    0.15
+)  # of a slip: one that may be, but for chance, leaves nothing to be said
 OUTLIERS = 0.15  # of the clearest edge's weight
 # of what edges say: those that agree are taken for those of creases, also where they are others
 # (simulated rooms, cameras that moved by 8 mm: off by 2 sigma)
@@ -211,29 +213,26 @@ def creases_pulls(of_creases: dict[str, list[Sights]], rig: CalibratedRig) -> li
             rows = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
             looks = mounted[rig.cameras[camera].mount]
             looks.append((Sights(**rows), poses_of(rig, camera)))
-    slip = _slip(mounted["platform"])
     pulls = [_pull(seen, poses, 0.0) for seen, poses in mounted["head"]]
-    return pulls + [_pull(seen, poses, slip) for seen, poses in mounted["platform"]]
+    slip = _slip(mounted["platform"])
+    if slip is not None:
+        pulls += [_pull(seen, poses, slip) for seen, poses in mounted["platform"]]
+    return pulls
 
 
 def _slip(fixed):
     """By how much the head slipped under cameras on the base that creases meet edges, radians; 0
-    where that explains no more than chance finds (Schwarz's criterion), of edges in reach of a
-    calibration that holds and of the nearest ones.
+    where that explains no more than chance finds (Schwarz's criterion), None where it must matter.
     """
     explained = np.zeros(len(SLIPS))
-    for seen, _ in fixed:
-        by_slip = seen.by_unknown[:, -1]
-        explained += [_explained(seen, by_slip * slip, SCANNED) for slip in SLIPS]
-    slip = float(SLIPS[np.argmax(explained)])
-    scanned = explained.max() - explained[len(SLIPS) // 2]
-    gain = 0.0
     creases = 1
     for seen, poses in fixed:
+        explained += [_fitted(seen.after(slip), poses, HONEST)[1] for slip in SLIPS]
         creases += len(np.unique(seen.number))
-        gain += _fitted(seen.after(slip), poses, HONEST)[1]
-        gain -= _fitted(seen, poses, HONEST)[1]
-    return slip if min(scanned, gain) > np.log(creases) / 2 else 0.0
+    slip = SLIPS[np.argmax(explained)]
+    if explained.max() - explained[SLIPS == 0] > np.log(creases) / 2:
+        return slip
+    return None if abs(slip) > MATTERS else 0.0
 
 
 def _pull(seen, poses, slip):
