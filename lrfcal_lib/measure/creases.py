@@ -34,9 +34,7 @@ HONEST = SPREAD / 10  # of a calibration that holds
 # of REACH: how far off an edge may lie, while it is sought
 WIDTHS = np.append(np.geomspace(0.3, 0.04, 12), np.full(8, 0.04))
 SLIPS = np.radians(np.arange(-10, 11) / 10)  # that are tried
-MATTERS = np.radians(
-    0.15
-)  # of a slip: one that may be, but for chance, leaves nothing to be said
+MATTERS = np.radians(0.15)  # of a slip: where one may be, or chance, nothing can be said
 OUTLIERS = 0.15  # of the clearest edge's weight
 # of what edges say: those that agree are taken for those of creases, also where they are others
 # (simulated rooms, cameras that moved by 8 mm: off by 2 sigma)
