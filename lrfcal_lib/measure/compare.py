@@ -16,7 +16,6 @@ from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.uncertainty import (
     beams_of_pixels,
     carried,
@@ -111,7 +110,7 @@ class Shifts:
     def amount(self, unit: str, scale: float = 1.0) -> Amount:
         """Root mean squares as an Amount, times `scale`."""
         value = scale * np.sqrt(np.nanmean(np.sum(self.off**2, axis=-1)))
-        claimed = scale * rms(self.claimed[np.isfinite(self.off[..., 0])])
+        claimed = scale * np.sqrt(np.mean(self.claimed[np.isfinite(self.off[..., 0])] ** 2))
         return Amount(f"at {DISTANCE:g} m", float(value), float(claimed), unit)
 
 
