@@ -228,7 +228,7 @@ class Held:
     def missing(self) -> str:
         """What a scene lacks to tell it; '' where nothing."""
         if not self.shifts:
-            return "no image shows beyond doubt where surfaces meet, or a surface that another shows too"
+            return "no image shows without doubt where surfaces meet, or what another one shows"
         if self.alike < LEAST_ALIKE:
             return (
                 f"images agree at {100 * self.alike:.0f} % only of the places that they share: a "
