@@ -1,46 +1,107 @@
-"""Creases against edges of images: a slip of the head is begun with where it explains more than chance finds."""
+"""Where surfaces meet, also behind a skirting board, and what edges beside that ask for."""
 
 import numpy as np
 import pytest
-from holds_draws import ROOM, on_base, true_rig
+from holds_draws import ROOM, true_rig
 
-from lrfcal_lib.measure.creases import WIDTHS, Sights, creases_pulls
-from lrfcal_lib.measure.holds import suspects
+from lrfcal_lib.calibrate.cloud import ROWS, Cloud
+from lrfcal_lib.measure.creases import EDGE, Sights, creases_of
+from lrfcal_lib.measure.features import fit_feature
 from lrfcal_lib.session.read import open_session
 
-SLIP = np.radians(0.4)
-PLACES = 8  # one of each crease
+NOISE = 0.01  # metres
+BOARD = (0.015, 0.09)  # metres, a skirting board: how thick, how high
 
 
-def sights_of(rig, offsets):
-    """Places that move with pose and pitch as they like, whose images have edges so far off, (n, k)."""
-    rng = np.random.default_rng(3)
-    by_unknown = rng.normal(0, 10.0, (PLACES, len(rig.uncertainty.names) + 1))
-    by_unknown[:, -1] = 40.0  # 1 deg is 0.7 of the reach
-    clear = np.full(offsets.shape, 0.9)
-    return Sights(by_unknown, offsets, clear, np.arange(PLACES))
+@pytest.fixture(scope="module")
+def rig():
+    return true_rig(open_session(ROOM))
 
 
-def heard(rig, sights):
-    """By how much the head slipped as creases say, radians; None where cameras on the base are not heard."""
-    pulls = creases_pulls({"left": [sights], "right": [sights]}, rig)
-    return suspects(pulls, rig)[-1].change[0] if pulls else None
+def corner(rig, seed, thick=0.0, high=0.0):
+    """A floor at z = -1 that meets a wall at y = 3, as noisy readings show both."""
+    rng = np.random.default_rng(seed)
+    x, along = np.meshgrid(np.arange(-1, 1, 0.02), np.arange(0.01, 1.5, 0.02))
+    x, along = x.ravel(), along.ravel()
+    floor = np.stack([x, 3 - along, np.full_like(x, -1.0)], axis=1)
+    wall = np.stack([x, 3 - thick * (along < high), along - 1], axis=1)
+    floor[:, 2] += rng.normal(0, NOISE, len(x))
+    wall[:, 1] += rng.normal(0, NOISE, len(x))
+    points = np.concatenate([floor, wall])
+    values = dict.fromkeys(ROWS, np.zeros(len(points)))
+    values["range"] = np.linalg.norm(points, axis=1)
+    values["bearing"] = np.arctan2(points[:, 0], points[:, 1])
+    cloud = Cloud(**values | {"points": points, "normals": np.zeros_like(points)})
+    of_point = np.repeat([0, 1], len(x))
+    far = np.tile(along > 0.2, 2)
+    planes = [fit_feature(cloud, far & (of_point == k), rig) for k in (0, 1)]
+    return creases_of(cloud, planes, of_point)
 
 
-@pytest.mark.parametrize(
-    ("near", "slip"), [(0.0, 0.0), (0.5 * WIDTHS[-1], None), (5 * WIDTHS[-1], SLIP)]
-)
-def test_a_slip_must_explain_more_than_edges_beside_creases(near, slip):
-    """Where edges lie beside creases by what an honest calibration errs, and better ones afar, nothing is said."""
-    rig = on_base(true_rig(open_session(ROOM)), 0.0)
-    sides = near * np.where(np.arange(PLACES) % 2, 1.0, -1.0)
-    afar = 40.0 * SLIP + np.random.default_rng(4).normal(0, WIDTHS[-1] / 8, PLACES)
-    said = heard(rig, sights_of(rig, np.stack([sides, afar], axis=1)))
-    assert (said is None) == (slip is None)
-    assert slip is None or abs(said - slip) < SLIP / 5
+@pytest.mark.parametrize("thick", [0.0, 0.015])
+def test_a_crease_is_where_readings_beside_it_are(rig, thick):
+    """It errs as it says; a skirting board moves it, by its thickness, and makes it less certain."""
+    squares = []
+    for seed in range(20):
+        creases = corner(rig, seed, thick, 0.09)
+        assert len(creases.points) > 30
+        np.testing.assert_allclose(np.abs(creases.along[:, 0]), 1.0, atol=1e-3)
+        miss = creases.points - [0.0, 3.0 - thick, -1.0]
+        off = np.linalg.norm(creases.off, axis=1)
+        squares.append((miss / off)[:, 1:].mean(axis=0) ** 2)
+        assert (off[:, 1] > 0.003).all() == (thick > 0)
+        assert np.abs(miss[:, 1]).max() < 0.006
+    assert np.mean(squares) < 1.5
 
 
-def test_cameras_on_the_head_are_heard_whatever_a_slip_explains():
-    rig = true_rig(open_session(ROOM))
-    sights = sights_of(rig, np.full((PLACES, 1), 40.0 * SLIP))
-    assert len(creases_pulls({"left": [sights], "right": [sights]}, rig)) == 2
+def test_surfaces_that_do_not_reach_each_other_have_no_crease(rig):
+    creases = corner(rig, 1)
+    assert creases.off.shape == (len(creases.points), 2, 3)
+    cloud = Cloud(**{name: np.zeros((0, 3)) for name in ("points", "normals", *ROWS)})
+    assert len(creases_of(cloud, [], np.zeros(0, int)).points) == 0
+
+
+def sights_of(seed, places=30, edges=5, unknowns=4):
+    """Places with edges at random."""
+    rng = np.random.default_rng(seed)
+    return Sights(
+        by_unknown=rng.normal(size=(places, unknowns)),
+        across=rng.uniform(-1, 1, (places, edges)),
+        clear=rng.uniform(0, 1, (places, edges)),
+        sigma=rng.uniform(EDGE, 0.3, places),
+    )
+
+
+def test_edges_ask_for_what_makes_them_likelier():
+    """Their pull is the slope of the likelihood, wherever it is asked."""
+    sights = sights_of(1)
+    rng = np.random.default_rng(2)
+    for change in 0.1 * rng.normal(size=(5, 4)):
+        pull = sights.pull(change, 0.0)
+        slope = []
+        for step in 1e-6 * np.eye(4):
+            more, less = sights.explained(change + step), sights.explained(change - step)
+            slope.append((more - less) / 2e-6)
+        np.testing.assert_allclose(
+            pull.slope - pull.information @ change, slope, rtol=1e-5, atol=1e-7
+        )
+
+
+def test_places_without_an_edge_say_nothing():
+    sights = sights_of(3)
+    blind = Sights(
+        sights.by_unknown, sights.across, np.zeros_like(sights.clear), sights.sigma
+    )
+    pull = blind.pull(np.zeros(4), 0.1)
+    assert not pull.information.any() and not pull.slope.any() and pull.groups == 0
+    assert blind.explained(np.ones(4)) == 0
+
+
+def test_edges_are_heard_from_farther_away_while_they_are_sought():
+    sights = Sights(
+        np.ones((8, 1)), np.full((8, 1), 0.3), np.ones((8, 1)), np.full(8, EDGE)
+    )
+    start = np.zeros(1)
+    assert sights.pull(start, 0.3).groups > 100 * sights.pull(start, 0.0).groups
+    at_edge = sights.pull(np.array([0.3]), 0.0)
+    assert at_edge.slope / at_edge.information == pytest.approx(0.3)

@@ -3,15 +3,15 @@
 A crease is known to millimetres from planes through hundreds of readings, and no spot widens it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from lrfcal_lib.calibrate.cloud import Cloud
-from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.measure.features import Feature
-from lrfcal_lib.measure.pulls import SPREAD, Pull, View, poses_of, pull_of_groups
+from lrfcal_lib.measure.features import SYSTEMATIC, Feature
+from lrfcal_lib.measure.pulls import Pull, View
+from lrfcal_lib.measure.surfaces import BENT, LIMIT
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import (
@@ -26,41 +26,34 @@ from lrfcal_lib.preprocess.edges_in_image import (
 LEAST_SINE = 0.5  # of the angle between two surfaces that make an edge
 BESIDE = 0.1  # metres from a crease, within which both surfaces have readings
 STEP = 0.05  # metres between places of a crease
-MOST = 100_000  # creases of a station
 FEWEST = 4  # places of a crease
 REACH = 0.016  # of the image's width: 0.9 deg of a camera that sees 56 deg
 ALONG = 5  # pixels of a profile that are averaged
-HONEST = SPREAD / 10  # of a calibration that holds
-# of REACH: how far off an edge may lie, while it is sought
-WIDTHS = np.append(np.geomspace(0.3, 0.04, 12), np.full(8, 0.04))
-SLIPS = np.radians(np.arange(-10, 11) / 10)  # that are tried
-MATTERS = np.radians(0.15)  # of a slip: where one may be, or chance, nothing can be said
-OUTLIERS = 0.15  # of the clearest edge's weight
-# of what edges say: those that agree are taken for those of creases, also where they are others
-# (simulated rooms, cameras that moved by 8 mm: off by 2 sigma)
-WORTH = 0.5
+EDGE = 0.01  # of REACH: how well an image tells where an edge is, 0.009 deg of that camera
+PLACES = 5  # of a crease, 0.25 m of it, that are worth one observation
+OTHERS = (
+    1.5  # as likely in a REACH are edges that are no crease's as the clearest one that is
+)
 
 
 @dataclass(frozen=True)
 class Creases:
-    """Places where two flat surfaces meet, a row each.
+    """Places where two flat surfaces meet, a row each; platform frame, metres.
 
     Attributes
     ----------
     points, along : ndarray, shape (n, 3)
-        Metres, and unit vectors along the crease; platform frame.
-    number : ndarray of int, shape (n,)
-        Of the crease. Its places err together.
+        And unit vectors along the crease.
+    off : ndarray, shape (n, 2, 3)
+        By how much an error of each surface, of one standard deviation, moves the place.
     """
 
     points: np.ndarray
     along: np.ndarray
-    number: np.ndarray
+    off: np.ndarray
 
 
-def creases_of(
-    cloud: Cloud, planes: list[Feature], of_point: np.ndarray, station: int = 0
-) -> Creases:
+def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Creases:
     """Where flat surfaces of a cloud meet.
 
     Parameters
@@ -68,8 +61,6 @@ def creases_of(
     cloud : Cloud
     planes, of_point
         What :func:`lrfcal_lib.measure.surfaces.planes_of` found.
-    station : int
-        Its placement, for the numbers of creases.
 
     Returns
     -------
@@ -77,31 +68,50 @@ def creases_of(
     """
     points = [np.zeros((0, 3))]
     along = [np.zeros((0, 3))]
+    off = [np.zeros((0, 2, 3))]
     for (i, first), (j, second) in combinations(enumerate(planes), 2):
         way = np.cross(first.axis, second.axis)
         sine = np.linalg.norm(way)
         if sine < LEAST_SINE:
             continue
         way /= sine
-        rows = np.array([first.axis, second.axis, way])
+        by_height = np.linalg.inv([first.axis, second.axis, way])
         middle = (first.centre + second.centre) / 2
-        origin = np.linalg.solve(
-            rows, np.vecdot(rows, [first.centre, second.centre, middle])
-        )
-        places = []
-        for plane in (i, j):
-            off = cloud.points[of_point == plane] - origin
-            place = off @ way
-            near = np.linalg.norm(off - place[:, None] * way, axis=1) < BESIDE
-            places.append(np.rint(place[near] / STEP))
-        common = np.intersect1d(*places)
+        heights = [first.axis @ first.centre, second.axis @ second.centre, way @ middle]
+        origin = by_height @ heights
+        one, lift_one = _beside(cloud.points[of_point == i] - origin, first, way)
+        other, lift_other = _beside(cloud.points[of_point == j] - origin, second, way)
+        common = np.intersect1d(one, other)
         if len(common) < FEWEST:
             continue
-        points.append(origin + STEP * common[:, None] * way)
+        origin = origin + by_height @ [lift_one, lift_other, 0.0]
+        places = origin + STEP * common[:, None] * way
+        sigma = [_sigma(first, places, lift_one), _sigma(second, places, lift_other)]
+        points.append(places)
         along.append(np.tile(way, (len(common), 1)))
-    number = np.repeat(np.arange(len(points)), [len(part) for part in points])
-    number = number + MOST * station
-    return Creases(np.concatenate(points), np.concatenate(along), number)
+        off.append(np.einsum("kn,ik->nki", sigma, by_height[:, :2]))
+    return Creases(np.concatenate(points), np.concatenate(along), np.concatenate(off))
+
+
+def _beside(points, plane, way):
+    """Numbers of the places of a line through the origin beside which a plane has points (n, 3),
+    and how far these are off it, metres, if that is not chance: there is a skirting board, a frame.
+    """
+    place = points @ way
+    near = np.linalg.norm(points - place[:, None] * way, axis=1) < BESIDE
+    height = points[near] @ plane.axis
+    lift = 0.0
+    if abs(height.sum()) > BENT * len(height) + LIMIT * np.linalg.norm(height):
+        lift = height.mean()
+    return np.rint(place[near] / STEP), lift
+
+
+def _sigma(plane, points, lift):
+    """How well the height of a plane is known at points (n, 3) where it is lifted, metres."""
+    away = points - plane.centre
+    tilted = np.vecdot(away @ plane.noise[3:, 3:], away)
+    level = plane.axis @ plane.noise[:3, :3] @ plane.axis
+    return np.sqrt(level + tilted + SYSTEMATIC**2 + (lift / 2) ** 2)
 
 
 @dataclass(frozen=True)
@@ -114,24 +124,57 @@ class Sights:
         How far the place moves along the normal of the crease, by the unknowns of a Pull.
     across, clear : ndarray, shape (n, k)
         Distances along the normal, and how clear an edge of the image is there, 0 to 1.
-    number : ndarray of int, shape (n,)
-        Of the crease.
+    sigma : ndarray, shape (n,)
+        How well the place and its edge are known.
     """
 
     by_unknown: np.ndarray
     across: np.ndarray
     clear: np.ndarray
-    number: np.ndarray
+    sigma: np.ndarray
 
-    @property
-    def trust(self) -> np.ndarray:
-        """Places of one crease count as one together, (n,)."""
-        _, crease, count = np.unique(self.number, return_inverse=True, return_counts=True)
-        return 1 / count[crease]
+    def pull(self, change: np.ndarray, width: float) -> Pull:
+        """What edges ask for: each place may go with one of several edges, or with none.
 
-    def after(self, slip: float) -> "Sights":
-        """The same where the head slipped, radians."""
-        return replace(self, across=self.across - slip * self.by_unknown[:, -1:])
+        Parameters
+        ----------
+        change : ndarray, shape (c,)
+            Of the unknowns, about which they are sought.
+        width : float
+            By how much more than by their errors.
+
+        Returns
+        -------
+        Pull
+            Its groups are as many observations as have an edge.
+        """
+        share, miss, sigma = self._shares(change, width)
+        matched = share.sum(axis=1)
+        weight = 1 / (PLACES * sigma**2)
+        wanted = np.sum(share * miss, axis=1) + matched * (self.by_unknown @ change)
+        return Pull(
+            information=(self.by_unknown.T * (weight * matched)) @ self.by_unknown,
+            slope=self.by_unknown.T @ (weight * wanted),
+            groups=matched.sum() / PLACES,
+        )
+
+    def explained(self, change: np.ndarray) -> float:
+        """Logarithm of the likelihood of a change (c,), beside edges that are no crease's.
+
+        Parameters
+        ----------
+        change : ndarray, shape (c,)
+        """
+        share, _, _ = self._shares(change, 0.0)
+        return -float(np.log(1 - share.sum(axis=1)).sum() / PLACES)
+
+    def _shares(self, change, width):
+        """What each edge has of its place (n, k), how far off it is, and how far it may be (n,)."""
+        sigma = np.hypot(self.sigma, width)
+        miss = self.across - (self.by_unknown @ change)[:, None]
+        likely = self.clear * np.exp(-0.5 * (miss / sigma[:, None]) ** 2)
+        others = OTHERS * sigma
+        return likely / (others + likely.sum(axis=1))[:, None], miss, sigma
 
 
 def sights(creases: Creases, view: View) -> Sights:
@@ -153,15 +196,18 @@ def sights(creases: Creases, view: View) -> Sights:
     recorded = project(points, model)
     inside = model.shows(recorded, reach)
     by_point = pinhole_jacobian(points[inside], model)
-    way = view.T_camera_platform.rotation.apply(creases.along[inside])
+    R = view.T_camera_platform.rotation.as_matrix()
+    way = creases.along[inside] @ R.T
     tangent = unit_vector(np.einsum("nij,nj->ni", by_point, way))
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
+    by_place = np.einsum("ni,nij->nj", normal, by_point) / reach
+    off = np.einsum("nj,nkj->nk", by_place, creases.off[inside] @ R.T)
     return Sights(
-        by_unknown=np.einsum("ni,nij,njk->nk", normal, by_point, J[inside]) / reach,
+        by_unknown=np.einsum("nj,njk->nk", by_place, J[inside]),
         across=across / reach,
         clear=clear,
-        number=creases.number[inside],
+        sigma=np.hypot(np.linalg.norm(off, axis=1), EDGE),
     )
 
 
@@ -185,101 +231,3 @@ def _edges(view, places, tangent, normal):
         across[row, cell] = grid[0] + ACROSS_STEP_PX * place
         clear[row, cell] = contrast / (contrast + FULL_CONTRAST)
     return across, clear
-
-
-def creases_pulls(of_creases: dict[str, list[Sights]], rig: CalibratedRig) -> list[Pull]:
-    """What creases and edges say about each camera that sees some: each place may go with one of
-    several edges, or with none.
-
-    A slip of the head is sought under all cameras on the base, then the pose of each camera with a
-    width that narrows (expectation and maximisation). Places of one crease err together.
-
-    Parameters
-    ----------
-    of_creases : dict of str to list of Sights
-        By camera and image.
-    rig : CalibratedRig
-
-    Returns
-    -------
-    list of Pull
-    """
-    names = Sights.__dataclass_fields__
-    mounted: dict[str, list] = {"head": [], "platform": []}
-    for camera, parts in of_creases.items():
-        if sum(len(part.number) for part in parts):
-            rows = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
-            looks = mounted[rig.cameras[camera].mount]
-            looks.append((Sights(**rows), poses_of(rig, camera)))
-    pulls = [_pull(seen, poses, 0.0) for seen, poses in mounted["head"]]
-    slip = _slip(mounted["platform"])
-    if slip is not None:
-        pulls += [_pull(seen, poses, slip) for seen, poses in mounted["platform"]]
-    return pulls
-
-
-def _slip(fixed):
-    """By how much the head slipped under cameras on the base that creases meet edges, radians; 0
-    where that explains no more than chance finds (Schwarz's criterion), None where it must matter.
-    """
-    explained = np.zeros(len(SLIPS))
-    creases = 1
-    for seen, poses in fixed:
-        explained += [_fitted(seen.after(slip), poses, HONEST)[1] for slip in SLIPS]
-        creases += len(np.unique(seen.number))
-    slip = SLIPS[np.argmax(explained)]
-    if explained.max() - explained[SLIPS == 0] > np.log(creases) / 2:
-        return slip
-    return None if abs(slip) > MATTERS else 0.0
-
-
-def _pull(seen, poses, slip):
-    """The Pull of a camera whose pose stands in these columns (6,), after a slip of the head."""
-    after = seen.after(slip)
-    x, fit = _fitted(after, poses, HONEST)
-    moved, fit_moved = _fitted(after, poses, SPREAD)
-    # edges run beside each other: what has moved must explain more than chance finds
-    if fit_moved - fit > len(x) / 2 * np.log(len(np.unique(seen.number))):
-        x = moved
-
-    weight, pull = _weighed(after, seen.by_unknown[:, poses] @ x, WIDTHS[-1])
-    information = (seen.by_unknown.T * weight) @ seen.by_unknown
-    fitted = np.zeros(seen.by_unknown.shape[1])
-    fitted[poses] = x
-    fitted[-1] = slip
-    return pull_of_groups(
-        information, pull[:, None] * seen.by_unknown, seen.number, fitted, WORTH
-    )
-
-
-def _fitted(seen, poses, spread):
-    """A camera's pose (6,) that is likely to `spread` (6,), and how much it explains, less what it
-    takes for that.
-    """
-    by_pose = seen.by_unknown[:, poses]
-    x = np.zeros(len(spread))
-    for width in WIDTHS:
-        weight, pull = _weighed(seen, by_pose @ x, width)
-        H = (by_pose.T * weight) @ by_pose / width**2 + np.diag(spread**-2.0)
-        x = x + np.linalg.solve(H, by_pose.T @ pull / width**2 - x / spread**2)
-    cost = np.sum((x / spread) ** 2) / 2
-    return x, _explained(seen, by_pose @ x, WIDTHS[-1]) - cost
-
-
-def _explained(seen, moved, width):
-    """Log likelihood of places that have moved (n,), but for a constant."""
-    share, _ = _shares(seen, moved, width)
-    return -float(seen.trust @ np.log(1 - share.sum(axis=1)))
-
-
-def _weighed(seen, moved, width):
-    """What places that have moved (n,) count, (n,), and that times how far off their edges are."""
-    share, miss = _shares(seen, moved, width)
-    return seen.trust * share.sum(axis=1), seen.trust * np.sum(share * miss, axis=1)
-
-
-def _shares(seen, moved, width):
-    """What each edge has of its place (n, k) that has moved (n,), and how far off it is."""
-    miss = seen.across - moved[:, None]
-    likely = seen.clear * np.exp(-0.5 * (miss / width) ** 2)
-    return likely / (OUTLIERS + likely.sum(axis=1, keepdims=True)), miss

@@ -19,6 +19,7 @@ from lrfcal_lib.measure.pulls import (
     pull_of_groups,
     without,
 )
+from lrfcal_lib.measure.surfaces import BENT
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import sample
@@ -52,7 +53,7 @@ class _Pair:
 
 
 def pairs_pull(
-    cloud: Cloud, flat: np.ndarray, views: list[View], known: list[Pull]
+    cloud: Cloud, of_point: np.ndarray, views: list[View], start: np.ndarray
 ) -> Pull | None:
     """What pairs of images say about a rig; None where they show too little.
 
@@ -62,14 +63,15 @@ def pairs_pull(
     ----------
     cloud : Cloud
         Of n points that a station shows, those of flat surfaces moved onto them.
-    flat : ndarray of bool, shape (n,)
-        Which are of a flat surface.
+    of_point : ndarray of int, shape (n,)
+        The number of the surface, -1 for none.
     views : list of View
         Images of the station.
-    known : list of Pull
-        What else tells the cameras: pairs leave open what moves both images alike.
+    start : ndarray, shape (c,)
+        Change of the unknowns that creases ask for: pairs leave open what moves both images alike.
     """
-    patches = np.flatnonzero(flat)[::EVERY]
+    patches = np.flatnonzero(of_point >= 0)[::EVERY]
+    surfaces = of_point[patches, None] == np.unique(of_point[patches])
     clear = {id(view): clear_places(cloud, view)[patches] for view in views}
     stops = np.unique([view.pitch for view in views if not view.fixed])
     pairs = []
@@ -78,32 +80,29 @@ def pairs_pull(
         same = first.camera == second.camera
         if turned < (NEAR_PITCH if same else 1e-3) and not (same and first.fixed):
             both = clear[id(first)] & clear[id(second)]
-            pairs.append(_pair(cloud.rows(patches[both]), first, second, stops))
+            rows = cloud.rows(patches[both])
+            pairs.append(_pair(rows, surfaces[both], first, second, stops))
     if sum(len(pair.cell) for pair in pairs) < FEWEST:
         return None
     cameras = dict.fromkeys(view.camera for view in views)
     poses = np.concatenate([poses_of(views[0].rig, camera) for camera in cameras])
-    of_poses = slice(len(poses))
-    count = len(views[0].rig.uncertainty.names) + 1
-    x = np.zeros(count + len(stops))
-    fitted = np.r_[poses, count : len(x)]
-    noise = np.full(len(stops), PITCH_NOISE)
-    prior = np.diag(np.r_[np.tile(SPREAD, len(cameras)), noise] ** -2.0)
-    slope = np.zeros(len(fitted))
-    for pull in known:
-        prior[of_poses, of_poses] += pull.information[np.ix_(poses, poses)]
-        slope[of_poses] += pull.slope[poses]
+    noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
+    x = np.concatenate([start, np.zeros(len(noise))])
+    fitted = np.r_[poses, len(start) : len(x)]
+    begun = x[fitted]
+    # what moves both images alike stays where creases have it
+    prior = np.diag(np.r_[np.tile(SPREAD / 4, len(cameras)), noise] ** -2.0)
     for blur in BLURS:
         sharp = {id(view): cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
         parts = [_compared(pair, sharp, x) for pair in pairs]
         H, b, D = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
         by_row = np.einsum("nia,ni->na", D, -b)
-        left = by_row.sum(axis=0)[fitted] + slope - prior @ x[fitted]
+        left = by_row.sum(axis=0)[fitted] - prior @ (x[fitted] - begun)
         compared_at = x.copy()
         x[fitted] += np.linalg.solve(information[np.ix_(fitted, fitted)] + prior, left)
     cell = np.concatenate([pair.cell for pair in pairs])
-    pull = pull_of_groups(information, by_row, cell, compared_at)
+    pull = pull_of_groups(information, by_row, cell, compared_at, poses)
     return replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())
 
 
@@ -131,10 +130,10 @@ def clear_places(cloud, view):
     return clear
 
 
-def _pair(patches, first, second, stops):
-    """The clearest patches that two images show."""
-    p_first, J_first = first.carried(patches.points)
-    p_second, J_second = second.carried(patches.points)
+def _pair(patches, surfaces, first, second, stops):
+    """The clearest patches that two images show, each of one of some surfaces (n, s)."""
+    p_first, J_first = _carried(first, patches, surfaces, stops)
+    p_second, J_second = _carried(second, patches, surfaces, stops)
     spacing = SPACING * p_first[:, 2] / first.model.fx
     a, inside = _samples(patches.normals, first, p_first, spacing)
     b, also = _samples(patches.normals, second, p_second, spacing)
@@ -147,21 +146,23 @@ def _pair(patches, first, second, stops):
         views=(first, second),
         uv=(a[rows], b[rows]),
         by_unknown=(
-            _by_unknown(first, p_first[rows], J_first[rows], stops),
-            _by_unknown(second, p_second[rows], J_second[rows], stops),
+            pinhole_jacobian(p_first[rows], first.model) @ J_first[rows],
+            pinhole_jacobian(p_second[rows], second.model) @ J_second[rows],
         ),
         cell=cell[rows],
     )
 
 
-def _by_unknown(view, points, J, stops):
-    """Derivatives (n, 2, c + s) of pixels, by the unknowns of a Pull and by the pitch at which the
-    head stopped (s,).
+def _carried(view, patches, surfaces, stops):
+    """Patches (n, 3) in the camera frame, and their derivatives by the unknowns of a Pull, by the
+    pitch at which the head stopped, and by the height of each surface.
     """
-    by_unknown = pinhole_jacobian(points, view.model) @ J
+    p_camera, J = view.carried(patches.points)
     here = (stops == view.pitch) & (not view.fixed)
+    raised = view.T_camera_platform.rotation.apply(patches.normals)
     # an image pitched more sees what a sweep pitched less shows
-    return np.concatenate([by_unknown, -by_unknown[..., -1:] * here], axis=-1)
+    parts = [J, -J[..., -1:] * here, raised[..., None] * surfaces[:, None]]
+    return p_camera, np.concatenate(parts, axis=-1)
 
 
 def _samples(normals, view, middle, spacing):

@@ -127,7 +127,7 @@ def pull_of_groups(
     by_row: np.ndarray,
     group: np.ndarray,
     x: np.ndarray,
-    worth: float = 1.0,
+    fitted: np.ndarray,
 ) -> Pull:
     """A Pull whose information is what the scatter of groups leaves of it.
 
@@ -139,12 +139,11 @@ def pull_of_groups(
     group : ndarray of int, shape (n,)
         Those of one group err together.
     x : ndarray, shape (c,)
-        Change of the unknowns, of which those that are not 0 were fitted.
-    worth : float
-        Share of the information that is to be relied on.
+        Change of the unknowns.
+    fitted : ndarray of int, shape (f,)
+        Which of them were fitted: by their slopes groups scatter.
     """
     _, group = np.unique(group, return_inverse=True)
-    fitted = np.flatnonzero(x)
     sums = np.zeros((group.max() + 1, len(fitted)))
     np.add.at(sums, group, by_row[:, fitted])
     load = np.bincount(group, np.linalg.norm(by_row, axis=1))
@@ -152,7 +151,7 @@ def pull_of_groups(
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
     excess = np.trace(own @ sums.T @ sums) / max(len(fitted), 1)
     few = groups / max(groups - len(fitted), 1.0)
-    scale = worth / max(excess * few, 1e-12)
+    scale = 1 / max(excess * few, 1e-12)
     return Pull(scale * information, scale * (information @ x + by_row.sum(axis=0)), groups)
 
 
