@@ -86,7 +86,12 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
             continue
         origin = origin + by_height @ [lift_one, lift_other, 0.0]
         places = origin + STEP * common[:, None] * way
-        sigma = [_sigma(first, places, lift_one), _sigma(second, places, lift_other)]
+        # the smaller a surface, the more of it is rim, where spots are mixed with what is beside
+        rim = SYSTEMATIC / min(STEP * len(common), 1.0)
+        sigma = [
+            _sigma(first, places, np.hypot(rim, lift_one / 2)),
+            _sigma(second, places, np.hypot(rim, lift_other / 2)),
+        ]
         points.append(places)
         along.append(np.tile(way, (len(common), 1)))
         off.append(np.einsum("kn,ik->nki", sigma, by_height[:, :2]))
@@ -106,12 +111,14 @@ def _beside(points, plane, way):
     return np.rint(place[near] / STEP), lift
 
 
-def _sigma(plane, points, lift):
-    """How well the height of a plane is known at points (n, 3) where it is lifted, metres."""
+def _sigma(plane, points, systematic):
+    """How well the height of a plane is known at points (n, 3), with what all have in common,
+    metres.
+    """
     away = points - plane.centre
     tilted = np.vecdot(away @ plane.noise[3:, 3:], away)
     level = plane.axis @ plane.noise[:3, :3] @ plane.axis
-    return np.sqrt(level + tilted + SYSTEMATIC**2 + (lift / 2) ** 2)
+    return np.sqrt(level + tilted + systematic**2)
 
 
 @dataclass(frozen=True)
