@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from holds_draws import ROOM, on_base, true_rig
+from scipy.special import chdtrc
 
 from lrfcal_lib.measure.creases import EDGE, PLACES, Sights
 from lrfcal_lib.measure.pulls import poses_of
@@ -64,17 +65,19 @@ def seen_by(rig, suspect, rng, clutter=3):
 
 @pytest.mark.parametrize("suspect", ["left", "right", "head"])
 def test_who_moved_is_named_and_by_how_much(rig, suspect):
-    """Its change errs as it says."""
+    """Its change errs as it says, pooled over all parameters with their correlations."""
     if suspect == "head":
         rig = on_base(rig, 0.0)
-    squares = []
-    for seed in range(6):
+    pooled = 0.0
+    parameters = 0
+    for seed in range(8):
         seen, moved = seen_by(rig, suspect, np.random.default_rng(seed))
         (named,) = most_likely(suspects(seen, [], rig))
         assert (named.camera or "head") == suspect
         miss = named.change - moved[columns_of(rig, suspect)]
-        squares.append((miss / named.sigma) ** 2)
-    assert np.mean(squares) < 2.0
+        pooled += miss @ np.linalg.solve(named.covariance, miss)
+        parameters += len(miss)
+    assert chdtrc(parameters, pooled) > 1e-3
 
 
 @pytest.mark.parametrize("mount", ["head", "platform"])

@@ -38,9 +38,11 @@ class Shift:
     ----------
     camera : str or None
         None for the head.
-    change, sigma : ndarray, shape (6,) or (1,)
+    change : ndarray, shape (6,) or (1,)
         Of the camera's pose ``[w, v]`` (radians, metres) or of the pitch (radians), if nothing else
         has moved.
+    covariance : ndarray, shape (6, 6) or (1, 1)
+        Of the change.
     pixels, pixels_sigma : ndarray, shape (2,)
         To the right and down in the middle of the image, 3 m away; NaN for the head.
     evidence : float
@@ -53,7 +55,7 @@ class Shift:
 
     camera: str | None
     change: np.ndarray
-    sigma: np.ndarray
+    covariance: np.ndarray
     pixels: np.ndarray
     pixels_sigma: np.ndarray
     evidence: float
@@ -83,7 +85,7 @@ class Shift:
     def sentence(self) -> str:
         """What was found."""
         odds = f"odds of 10^{self.evidence / np.log(10):+.1f} that it has"
-        turn, sigma = np.degrees([self.change, self.sigma])
+        turn, sigma = np.degrees([self.change, sigma_of(self.covariance)])
         if self.camera is None:
             amount = f"by {turn[0]:+.2f} +- {sigma[0]:.2f} deg"
             least = f"slips from {np.degrees(self.shows[0]):.2f} deg on show"
@@ -244,7 +246,7 @@ def _shift(camera, columns, fit, evidence, rig):
     return Shift(
         camera=camera,
         change=change,
-        sigma=sigma_of(covariance),
+        covariance=covariance,
         pixels=motion @ change,
         pixels_sigma=sigma_of(motion @ covariance @ motion.T),
         evidence=evidence,
