@@ -39,8 +39,8 @@ class Shift:
     camera : str or None
         None for the head.
     change : ndarray, shape (6,) or (1,)
-        Of the camera's pose ``[w, v]`` (radians, metres) or of the pitch (radians), if nothing else
-        has moved.
+        Of the camera's pose ``[w, v]`` (radians, metres) or of the pitch (radians), beside what the
+        calibration errs by, if nothing else has moved.
     covariance : ndarray, shape (6, 6) or (1, 1)
         Of the change.
     pixels, pixels_sigma : ndarray, shape (2,)
@@ -113,12 +113,12 @@ def most_likely(shifts: list[Shift]) -> list[Shift]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """What observations ask for: a change of the unknowns (c,), its covariance (c, c), their
-    information (c, c) there, and the logarithm of the evidence.
+    """What observations ask for: a change of the unknowns (c,), their slope (c,) and information
+    (c, c) there, and the logarithm of the evidence.
     """
 
     change: np.ndarray
-    covariance: np.ndarray
+    slope: np.ndarray
     information: np.ndarray
     evidence: float
 
@@ -201,8 +201,7 @@ def _fitted(seen, pairs, C):
     for pull in pairs:
         evidence += pull.slope @ change - change @ pull.information @ change / 2
     cost = change @ (slope - information @ change) + np.linalg.slogdet(shares)[1]
-    covariance = np.linalg.solve(shares, C)
-    return _Fit(change, covariance, information, float(evidence - cost / 2))
+    return _Fit(change, slope, information, float(evidence - cost / 2))
 
 
 def _allowed(rig):
@@ -225,9 +224,10 @@ def _allowed(rig):
 def _shift(camera, columns, fit, evidence, rig):
     """The Shift of one suspect, of unknowns in these columns."""
     likely = SPREAD if camera else SLIP
-    # what is known of its changes where all else errs as it may
+    # what is known of its changes where the calibration errs as it may
     both = np.eye(len(fit.change)) + fit.information @ _allowed(rig)
     known = np.linalg.solve(both, fit.information)[np.ix_(columns, columns)]
+    score = np.linalg.solve(both, fit.slope)[columns]
     # a turn, a move: the first three unknowns, and the others
     shows = []
     for part in (slice(3), slice(3, None)):
@@ -237,8 +237,8 @@ def _shift(camera, columns, fit, evidence, rig):
             sigma = max(np.linalg.eigvalsh(information)[0], 1e-12) ** -0.5
             wanted = np.sqrt(2 * SURE + np.linalg.slogdet(shares)[1])
             shows.append((wanted + IN_9_OF_10) * sigma)
-    change = fit.change[columns]
-    covariance = fit.covariance[np.ix_(columns, columns)]
+    covariance = np.linalg.inv(known + np.diag(likely**-2.0))
+    change = covariance @ score
     motion = np.full((2, len(columns)), np.nan)
     if camera:
         by_point = pinhole_jacobian([0.0, 0.0, AWAY], rig.cameras[camera].model)
