@@ -31,19 +31,18 @@ REACH = 0.016  # of the image's width: 0.9 deg of a camera that sees 56 deg
 ALONG = 5  # pixels of a profile that are averaged
 EDGE = 0.01  # of REACH: how well an image tells where an edge is, 0.009 deg of that camera
 PLACES = 5  # of a crease, 0.25 m of it, that are worth one observation
-OTHERS = (
-    1.5  # as likely in a REACH are edges that are no crease's as the clearest one that is
-)
+# edges that are no crease's lie anywhere: how dense they are, beside a crease's own one
+OTHERS = 1.5
 
 
 @dataclass(frozen=True)
 class Creases:
-    """Places where two flat surfaces meet, a row each; platform frame, metres.
+    """Places where two flat surfaces meet, a row each; platform frame.
 
     Attributes
     ----------
     points, along : ndarray, shape (n, 3)
-        And unit vectors along the crease.
+        Metres, and unit vectors along the crease.
     off : ndarray, shape (n, 2, 3)
         By how much an error of each surface, of one standard deviation, moves the place.
     """
