@@ -68,7 +68,8 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
     points = [np.zeros((0, 3))]
     along = [np.zeros((0, 3))]
     off = [np.zeros((0, 2, 3))]
-    for (i, first), (j, second) in combinations(enumerate(planes), 2):
+    surfaces = [(plane, cloud.points[of_point == k]) for k, plane in enumerate(planes)]
+    for (first, points_one), (second, points_other) in combinations(surfaces, 2):
         way = np.cross(first.axis, second.axis)
         sine = np.linalg.norm(way)
         if sine < LEAST_SINE:
@@ -78,8 +79,8 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
         middle = (first.centre + second.centre) / 2
         heights = [first.axis @ first.centre, second.axis @ second.centre, way @ middle]
         origin = by_height @ heights
-        one, lift_one = _beside(cloud.points[of_point == i] - origin, first, way)
-        other, lift_other = _beside(cloud.points[of_point == j] - origin, second, way)
+        one, lift_one = _beside(points_one - origin, first, way)
+        other, lift_other = _beside(points_other - origin, second, way)
         common = np.intersect1d(one, other)
         if len(common) < FEWEST:
             continue
