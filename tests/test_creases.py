@@ -10,7 +10,6 @@ from lrfcal_lib.measure.features import fit_feature
 from lrfcal_lib.session.read import open_session
 
 NOISE = 0.01  # metres
-BOARD = (0.015, 0.09)  # metres, a skirting board: how thick, how high
 
 
 @pytest.fixture(scope="module")
