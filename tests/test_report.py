@@ -174,8 +174,11 @@ OVER = """() => {
     for (const part of document.querySelectorAll("details")) part.open = true;
     const width = document.documentElement.clientWidth, over = [];
     for (const part of document.querySelectorAll("body, body *")) {
+        const formula = width < 500 && part.closest(".formula div");  // scrolls on a telephone
+        if (formula && formula !== part) continue;
         const inline = getComputedStyle(part).display.startsWith("inline");
-        if (part.getBoundingClientRect().right > width + 1 || !inline && part.scrollWidth > part.clientWidth + 1)
+        const wide = !inline && !formula && part.scrollWidth > part.clientWidth + 1;
+        if (part.getBoundingClientRect().right > width + 1 || wide)
             over.push([part.tagName, part.textContent.slice(0, 80)]);
     }
     return over;
