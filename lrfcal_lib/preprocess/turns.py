@@ -22,12 +22,12 @@ class Alike:
     ----------
     leader : ndarray of int, shape (m,)
         The first image of the same placement.
-    order : ndarray of int, shape (m, n)
-        The order in the image that goes with each order in the leader.
+    order : list of ndarray of int, shape (n,)
+        By image (m), the order in it that goes with each order in the leader.
     """
 
     leader: np.ndarray
-    order: np.ndarray
+    order: list[np.ndarray]
 
 
 def turned_boards(pattern: Chessboard, orders: np.ndarray) -> RigidTransform:
@@ -52,7 +52,7 @@ def turned_boards(pattern: Chessboard, orders: np.ndarray) -> RigidTransform:
     return RigidTransform.from_components(middle - rotation.apply(middle), rotation)
 
 
-def alike(rotations, placements, cameras) -> Alike:
+def alike(rotations, views) -> Alike:
     """Which orders of a pattern's corners belong together in the images of one placement.
 
     Between two images of one camera the head turns by less than any two orders differ. How a camera
@@ -63,17 +63,16 @@ def alike(rotations, placements, cameras) -> Alike:
     ----------
     rotations : sequence of Rotation
         From the board to the camera, by image (m) a stack for every order that the corners may have
-        (n), the same orders in all images.
-    placements : sequence of int
-        By image; negative for an image of none, which stands alone.
-    cameras : sequence of str
-        By image.
+        (n).
+    views : sequence of BoardView
+        By image; one of no placement stands alone.
 
     Returns
     -------
     Alike
     """
-    placements = list(placements)
+    placements = [view.placement for view in views]
+    cameras = [view.camera for view in views]
     leader = [i if p < 0 else placements.index(p) for i, p in enumerate(placements)]
     turn_of_camera = {
         camera: _between(rotations, placements, cameras, camera) for camera in set(cameras)
@@ -83,7 +82,7 @@ def alike(rotations, placements, cameras) -> Alike:
         turn = turn_of_camera[cameras[i]] * turn_of_camera[cameras[j]].inv()
         off = [(rotations[i] * ahead.inv()).magnitude() for ahead in turn * rotations[j]]
         order.append(np.argmin(off, axis=1))
-    return Alike(np.array(leader, int), np.array(order, int))
+    return Alike(np.array(leader, int), order)
 
 
 def _between(rotations, placements, cameras, camera):
