@@ -94,42 +94,16 @@ class Shot:
         return read(self.record) if self.part is None else self.part.image()
 
 
-def views_of(session: Session) -> Survey:
-    """:func:`survey` of a session's images.
+def survey(session: Session) -> Survey:
+    """Find the board in the images of all cameras, one of each camera and placement.
+
+    Of those that show the board it is the one whose pitch is nearest to the middle of the
+    placement's images. Images of no placement are all used, those of a scene are not.
 
     Parameters
     ----------
     session : Session
-
-    Returns
-    -------
-    Survey
-    """
-    return survey(
-        session.image_records,
-        session.read_image,
-        session.board,
-        {name: info.model for name, info in session.cameras.items()},
-        session.picks,
-    )
-
-
-def survey(records, read, board: Board, models, picks=()) -> Survey:
-    """Find the board in the images of several cameras, one of each camera and placement.
-
-    Of those that show the board it is the one whose pitch is nearest to the middle of the
-    placement's images. Images of no placement are all used.
-
-    Parameters
-    ----------
-    records : sequence of ImageRecord
-        Of these cameras; images of a scene are not looked at.
-    read : callable
-        ``read(record)`` gives the image, uint8.
-    board : Board
-    models : dict of str to (CameraModel or None)
-        By camera; None asks for an estimate from these images.
-    picks : sequence of EdgePick
+        A camera without a model asks for an estimate from these images.
 
     Returns
     -------
@@ -141,37 +115,41 @@ def survey(records, read, board: Board, models, picks=()) -> Survey:
         If a camera has no intrinsics and the board no pattern, or too few images show it; if a pick
         names an edge that the board does not have.
     """
-    _check_picks(picks, board)
-    look = partial(_look, read=read, board=board, picks=picks)
+    board = session.board
+    stated = {name: camera.model for name, camera in session.cameras.items()}
+    unknown = [name for name, model in stated.items() if model is None]
+    _check_picks(session.picks, board)
+    read = session.read_image
+    look = partial(_look, read=read, board=board, picks=session.picks)
     if board.pattern is None:
-        return _survey_plain(_choices(records, {"board"}), look, board, models)
+        return _survey_plain(session, look, stated, unknown)
 
-    groups = _choices(records, {"board", "intrinsics"})
+    groups = _choices(session, {"board", "intrinsics"})
     finder = PatternFinder(board.pattern)
     begin = partial(_begin, read=read, board=board, finder=finder, count=len(groups))
     begun = spread(partial(_first, begin=begin), groups)
     shots = [shot for shot in begun if not shot.reason]
-    find = partial(_intrinsics, models=models, shots=shots, board=board, read=read)
-    rough = dict(zip(models, spread(find, models), strict=True))
+    rough, _ = _adjusted(unknown, stated, shots, session)
     if board.corners is None:
         _check_measurable(board, begun)
     shots, lines, unseen = _ordered(shots, read, board, rough)
-    refined, relief = _with_relief(shots, board, models, rough)
+    often = [name for name in rough if len(_corners(shots, name)) >= LEAST_VIEWS_FOR_RELIEF]
+    models, relief = _adjusted(often, rough, shots, session, relief=True)
     shots = [shot for shot in shots if shot.record.purpose != "intrinsics"]
 
     def see(lines):
-        return spread(partial(look, models=refined, lines=lines, relief=relief), shots)
+        return spread(partial(look, models=models, lines=lines, relief=relief), shots)
 
     views = see(lines)
     outline = None
     if board.corners is None and not unseen:
-        views = see(measure_outline(views, board, refined).lines)
-        outline = measure_outline(views, board, refined)
+        views = see(measure_outline(views, board, models).lines)
+        outline = measure_outline(views, board, models)
         board = outline.board
     lost = [shot.view for shot in begun if shot.reason]
     return Survey(
         views=_by_camera(models, views + lost),
-        models=refined,
+        models=models,
         outline=outline,
         board=board,
         relief=relief,
@@ -313,10 +291,10 @@ def _by_camera(cameras, views):
     return {camera: [view for view in views if view.camera == camera] for camera in cameras}
 
 
-def _choices(records, purposes):
+def _choices(session, purposes):
     """Records in lists of those of which one is to be used, the best first."""
     groups = {}
-    for record in records:
+    for record in session.image_records:
         if record.purpose in purposes:
             placement = _placement(record)
             alone = record.file if placement < 0 else None
@@ -340,16 +318,17 @@ def _first(group, begin):
     return begun[0]
 
 
-def _survey_plain(groups, look, board, models):
+def _survey_plain(session, look, models, unknown):
     """The survey of a board without pattern."""
-    unknown = [camera for camera, model in models.items() if model is None]
+    board = session.board
     if unknown:
         raise ValueError(
             f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find "
             "them with: state them"
         )
     begin = partial(_begin_plain, look=partial(look, models=models))
-    views = _turned_alike(spread(partial(_first, begin=begin), groups))
+    first = partial(_first, begin=begin)
+    views = _turned_alike(spread(first, _choices(session, {"board"})))
     return Survey(_by_camera(models, views), models, None, board)
 
 
@@ -375,7 +354,7 @@ def _begin(record, read, board, finder, count):
     return _with_pixels(shot, corners)
 
 
-def _for_intrinsics(shots, camera):
+def _corners(shots, camera):
     """Corners to estimate intrinsics with: the images taken for that, and the most different others
     up to a number.
 
@@ -393,45 +372,32 @@ def _for_intrinsics(shots, camera):
     return chosen + spread_views(others, VIEWS_FOR_INTRINSICS - len(chosen))
 
 
-def _intrinsics(camera, models, shots, board, read):
-    """Intrinsics of a camera as stated, or from the corners in its images, in any order."""
-    if models[camera] is not None:
-        return models[camera]
-    pixels = _for_intrinsics(shots, camera)
-    sizes = (
-        read(shot.record).shape[1::-1] for shot in shots if shot.record.camera == camera
-    )
-    try:
-        size = next(sizes, None)
-        return estimate_intrinsics(pixels, board.pattern, size).models[0]
-    except ValueError as error:
-        raise DegenerateGeometry(f"camera '{camera}': {error}") from error
+def _adjusted(cameras, models, shots, session, relief=False):
+    """Models by camera, some of them estimated anew, and the heights of the sheet (k,), metres.
 
-
-def _with_relief(shots, board, models, rough):
-    """Intrinsics by camera and the heights of the sheet (k,), metres, from corners in one order.
-
-    `models` are those that are stated, `rough` also those estimated of a flat sheet.
+    For the heights the corners are in one order; there are none without cameras.
     """
-    estimate = partial(_adjustment, shots=shots, board=board, models=models, rough=rough)
-    refined = dict(rough)
+    estimate = partial(_adjustment, shots=shots, session=session, relief=relief)
+    adjusted = dict(models)
     reliefs = []
-    for camera, adjustment in zip(rough, spread(estimate, rough), strict=True):
-        if adjustment is not None:
-            refined[camera] = adjustment.models[0]
-            reliefs.append(adjustment.relief)
-    return refined, np.mean(reliefs, axis=0) if reliefs else None
+    for camera, adjustment in zip(cameras, spread(estimate, cameras), strict=True):
+        adjusted[camera] = adjustment.models[0]
+        reliefs.append(adjustment.relief)
+    return adjusted, np.mean(reliefs, axis=0) if reliefs else None
 
 
-def _adjustment(camera, shots, board, models, rough):
-    """The Adjustment of a camera that sees the pattern often enough."""
-    pixels = _for_intrinsics(shots, camera)
-    if len(pixels) < LEAST_VIEWS_FOR_RELIEF:
-        return None
-    if models[camera] is None:
-        size = (rough[camera].width, rough[camera].height)
-        return estimate_intrinsics(pixels, board.pattern, size, relief=True)
-    return estimate_relief(pixels, board.pattern, models[camera])
+def _adjustment(name, shots, session, relief):
+    """The Adjustment of a camera: its intrinsics where they are not stated, and the relief."""
+    camera = session.cameras[name]
+    pattern = session.board.pattern
+    corners = _corners(shots, name)
+    if camera.model is not None:
+        return estimate_relief(corners, pattern, camera.model)
+    size = (camera.width, camera.height)
+    try:
+        return estimate_intrinsics(corners, pattern, size, relief=relief)
+    except ValueError as error:
+        raise DegenerateGeometry(f"camera '{name}': {error}") from error
 
 
 def _check_measurable(board, shots):
