@@ -15,7 +15,7 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
     line_lost,
 )
-from lrfcal_lib.session.lms2xx_frame import OVERHEAD, encode_telegram, split_stream
+from lrfcal_lib.session.lms2xx_frame import OVERHEAD, encode_telegram, split_stream, whole
 
 ACK = 0x06
 NAK = 0x15
@@ -197,9 +197,8 @@ class Link:
             self._kept = []
             return kept
         missing = 1
-        if len(self._rest) >= 4:  # a telegram has begun that states its length
-            whole = int.from_bytes(self._rest[2:4], "little") + OVERHEAD
-            missing = max(1, whole - len(self._rest))
+        if self._rest:  # a telegram has begun; bytes 2 and 3 state its length
+            missing = max(1, whole(self._rest[2:4]) + OVERHEAD - len(self._rest))
         with line_lost(self.path):
             data = self._port.read(missing)
             data += self._port.read(self._port.in_waiting)
