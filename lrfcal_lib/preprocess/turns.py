@@ -72,33 +72,34 @@ def alike(rotations, views) -> Alike:
     Alike
     """
     placements = [view.placement for view in views]
-    cameras = [view.camera for view in views]
     leader = [i if p < 0 else placements.index(p) for i, p in enumerate(placements)]
+    # by camera and placement, of the first image
+    first: dict[str, dict] = {view.camera: {} for view in views}
+    for rotation, view in zip(rotations, views, strict=True):
+        if view.placement >= 0:
+            first[view.camera].setdefault(view.placement, rotation)
     turn_of_camera = {
-        camera: _between(rotations, placements, cameras, camera) for camera in set(cameras)
+        camera: _between(first[views[0].camera], of_camera)
+        for camera, of_camera in first.items()
     }
     order = []
     for i, j in enumerate(leader):
-        turn = turn_of_camera[cameras[i]] * turn_of_camera[cameras[j]].inv()
+        turn = turn_of_camera[views[i].camera] * turn_of_camera[views[j].camera].inv()
         off = [(rotations[i] * ahead.inv()).magnitude() for ahead in turn * rotations[j]]
         order.append(np.argmin(off, axis=1))
     return Alike(np.array(leader, int), order)
 
 
-def _between(rotations, placements, cameras, camera):
-    """Rotation from the first camera to another on which most placements agree."""
-    base = cameras[0]
-    if base == camera:
-        return Rotation.identity()
-    first = {base: {}, camera: {}}  # image of a placement
-    for rotation, placement, name in zip(rotations, placements, cameras, strict=True):
-        if name in first and placement >= 0:
-            first[name].setdefault(placement, rotation)
-    common = sorted(first[base].keys() & first[camera].keys())
-    if not common:
+def _between(base, other):
+    """Rotation from the first camera to another on which most placements agree.
+
+    `base` and `other` are the rotations of their first images by placement.
+    """
+    common = sorted(base.keys() & other.keys())
+    if other is base or not common:
         return Rotation.identity()
     # every order in the one image that might go with the first order in the other
-    possible = [first[camera][p] * first[base][p][0].inv() for p in common]
+    possible = [other[p] * base[p][0].inv() for p in common]
     candidates = Rotation.concatenate(possible)
     cost = UPRIGHT * candidates.magnitude()
     for turns in possible:
