@@ -16,6 +16,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 
 import cv2
 import matplotlib.pyplot as plt
@@ -36,7 +37,7 @@ from lrfcal_lib.measure.stations import join_stations
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
-from lrfcal_lib.preprocess.survey import survey, views_of
+from lrfcal_lib.preprocess.survey import survey
 from lrfcal_lib.session.cluster import workers_at
 from lrfcal_lib.session.lms2xx_codec import (
     decode_scan,
@@ -323,7 +324,7 @@ def images(size):
     """Large images decoded and the board found in them, as JPEG the corners alone: nothing else does the same."""
     session = open_session(ROOT / "data" / "sim_quick")
     record = session.images("left", purpose="board")[0]
-    model = views_of(session).models["left"]
+    model = survey(session).models["left"]
     board = session.board
     small = session.read_image(record)
     times = np.sqrt(size["pixels"] / (small.shape[0] * small.shape[1]))
@@ -344,7 +345,13 @@ def images(size):
             replace(record, placement=i, file=Path(f"{i}.png")) for i in range(SURVEYED)
         ]
         return survey(
-            records, lambda r: cv2.imdecode(png, cv2.IMREAD_COLOR), board, {"left": model}
+            SimpleNamespace(
+                image_records=records,
+                read_image=lambda r: cv2.imdecode(png, cv2.IMREAD_COLOR),
+                board=board,
+                cameras={"left": replace(session.cameras["left"], model=model)},
+                picks=(),
+            )
         )
 
     repeats = min(size["repeats"], 3)

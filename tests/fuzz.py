@@ -36,7 +36,7 @@ from lrfcal_lib.evaluate.export import file_hashes
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.preprocess.survey import views_of
+from lrfcal_lib.preprocess.survey import survey
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.importers import import_lasersetero
 from lrfcal_lib.session.read import open_session, validate
@@ -562,7 +562,7 @@ OWN = {
 
 
 def _survey(path):
-    views_of(read_all(path))
+    survey(read_all(path))
 
 
 def read_all(path):

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from lrfcal_lib.preprocess.pattern_in_image import (
     PatternFinder,
 )
 from lrfcal_lib.session.read import ImageRecord
+from lrfcal_lib.session.stated import CameraInfo
 
 SIZE = 640, 480
 MODEL = CameraModel(
@@ -34,6 +36,16 @@ BLANK = np.zeros((480, 640, 3), np.uint8)
 
 def record(camera, file, placement, pitch=0.0, purpose="board"):
     return ImageRecord(camera, Path(file), placement, pitch, 0.0, purpose)
+
+
+def seen_by(models, records, read, board, picks=()):
+    """What a survey needs of a session, by the models of its cameras."""
+    cameras = {
+        name: CameraInfo(name, "head", *SIZE, model) for name, model in models.items()
+    }
+    return SimpleNamespace(
+        image_records=records, read_image=read, board=board, cameras=cameras, picks=picks
+    )
 
 
 @lru_cache(maxsize=4)
@@ -179,9 +191,8 @@ def up_to_a_turn(corners, exact):
 def seen(picture, board=SHEET, picks=()):
     """The view of a single image."""
     records = [record("left", "a.png", 3, 0.1)]
-    return survey.survey(records, lambda r: picture, board, {"left": MODEL}, picks).views[
-        "left"
-    ][0]
+    session = seen_by({"left": MODEL}, records, lambda r: picture, board, picks)
+    return survey.survey(session).views["left"][0]
 
 
 def pixels_of_squares(side):

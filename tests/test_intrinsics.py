@@ -48,9 +48,7 @@ def test_small_squares_widen_the_covariance_and_are_named():
             {"left": {4: BoardView(pixels=pixels), 7: BoardView()}}, PATTERN
         )
         assert ("left" in words) == (side < 9)
-    assert (
-        words == {} == survey.small_squares({"left": {4: BoardView(pixels=pixels)}}, None)
-    )
+    assert words == {} == survey.small_squares({"left": {4: BoardView()}}, None)
     assert scale_error(np.nan) == 0.01  # no two neighbours are left
 
 

@@ -20,7 +20,7 @@ def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
         "right": [BoardView("right", placement=4, pixels=pixels_of_squares(12.0))],
     }
     seen = survey.Survey(views, {}, None, SHEET)
-    monkeypatch.setattr(prepared, "views_of", lambda session, **options: seen)
+    monkeypatch.setattr(prepared, "survey", lambda session, **options: seen)
     problems = prepared.prepare_images(prepared.Prepared(None, SHEET, {}, {}, {})).problems
     (problem,) = problems
     assert problem.kind == ProblemKind.SMALL_SQUARES and problem.camera == "left"

@@ -14,6 +14,7 @@ from rendered_boards import (
     clutter,
     record,
     render,
+    seen_by,
     turned,
     view_poses,
 )
@@ -47,7 +48,8 @@ def session():
 @pytest.fixture(scope="module")
 def surveyed(session):
     _, records, read = session
-    return survey.survey(records, read, UNKNOWN, {"left": MODEL, "right": MODEL})
+    models = {"left": MODEL, "right": MODEL}
+    return survey.survey(seen_by(models, records, read, UNKNOWN))
 
 
 def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed):
@@ -88,11 +90,13 @@ def test_surveys_that_cannot_work(session, surveyed):
             {"left": None},
             "no intrinsics and board 'triangle' no pattern",
         ),
+        (0, read, SHEET, {"left": None}, "camera 'left': intrinsics need .*, got 0"),
         (2, read, triple, {"left": MODEL}, "has 3 edges and no known corners"),
         (2, lambda r: BLANK, UNKNOWN, both, "none of 2 images shows the pattern"),
     ):
         with pytest.raises(ValueError, match=message):
-            survey.survey(records[:count], see, board, models)
+            own = [each for each in records[:count] if each.camera in models]
+            survey.survey(seen_by(models, own, see, board))
     views = [
         replace(v, edges=v.edges[:1]) for group in surveyed.views.values() for v in group
     ]

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -36,8 +37,7 @@ def centred(tmp_path_factory):
 )
 def test_a_centred_chessboard_is_turned_alike_in_all_images_of_a_placement(centred, stated):
     board = centred.board if stated else replace(centred.board, corners=None)
-    models = {name: camera.model for name, camera in centred.cameras.items()}
-    found = survey.survey(centred.images(), centred.read_image, board, models)
+    found = survey.survey(replace(centred, board=board))
     truth = json.loads((centred.path / "truth.json").read_text())["images"]
     turns = {}
     for view in (v for views in found.views.values() for v in views if not v.reason):
@@ -81,9 +81,14 @@ def test_a_plain_rectangle_is_turned_alike_in_both_cameras():
     records = [
         ImageRecord(n[:-1], Path(n), int(n[-1]), 0.0, 0.0, "board") for n in pictures
     ]
-    views = survey.survey(
-        records, lambda r: pictures[r.file.name], board, dict.fromkeys(CAMERAS, MODEL)
-    ).views
+    session = SimpleNamespace(
+        image_records=records,
+        read_image=lambda r: pictures[r.file.name],
+        board=board,
+        cameras=dict.fromkeys(CAMERAS, SimpleNamespace(model=MODEL)),
+        picks=(),
+    )
+    views = survey.survey(session).views
     off = [
         [true[c, v.placement].inv() * v.T_camera_board.rotation for v in views[c]]
         for c in CAMERAS

@@ -3,6 +3,8 @@
 import logging
 import math
 import os
+import struct
+from functools import partial
 from threading import Thread
 
 from lrfcal_lib.drivers import lms2xx_link as wire
@@ -101,18 +103,11 @@ class LMS2xx(Closed):
         self._interrupted = host.event()
         self._link = None
         self._thread: Thread | None = None
-        self._interlaced = False
-        self._readings: list[Reading] = []
-        self._trouble = ""  # why no reading came
         self._news = host.event()
         try:
-            self._connect(baudrate or USUAL_RATE, host.now() + find_s)
-            if baudrate is not None and baudrate != self.baudrate:
-                self._set_rate(baudrate)
-            if configuration:
-                self.configure(**configuration)
-            else:
-                self._prepare()
+            self._connect(baudrate or USUAL_RATE, find_s)
+            self._set_rate(baudrate or self.baudrate)
+            self.configure(**configuration)
             if variant is not None:
                 self.set_variant(*variant)
         except BaseException:
@@ -137,24 +132,23 @@ class LMS2xx(Closed):
     @property
     def baudrate(self) -> int:
         """Of both ends of the line."""
-        return self._opened().baudrate
+        return self._line.baudrate
 
-    def _connect(self, first, end, deadline=math.inf):
-        """Open the port and leave the device quiet, with everything about it read.
+    def _connect(self, first, find_s, deadline=math.inf):
+        """Open the port and leave the device quiet, with everything read but its configuration.
 
-        The rate is found by `end`, and no request lasts beyond the deadline.
+        The rate is found in `find_s` seconds, and no request lasts beyond the deadline.
         """
-        host = self._host
         self._link = Link(
             self.port,
             first,
             address=self._address,
             interrupted=self._interrupted,
-            host=host,
+            host=self._host,
         )
         self._clock = ScanClock()
         self._link.deadline = deadline
-        self._link.find([first, *RATES], end - host.now())
+        self._link.find(first, find_s)
         self._link.hush()
         self._read_status()
         self._link.senders = {0x80, 0x80 | self.status.address}
@@ -164,7 +158,6 @@ class LMS2xx(Closed):
                 f"{self.port}: '{model}' answers, not an LMS2xx: name the port of the LMS2xx"
             )
         self.type = "-".join([model, *rest[:1]])
-        self._read_configuration()
 
     def _prepare(self, interlaced=False):
         """Expect scans as the device is set now; these settings are those to come back to."""
@@ -182,14 +175,16 @@ class LMS2xx(Closed):
         self._settled = self.variant, self.configuration, self.baudrate
         self._assembler = Assembler(*self._settled, interlaced, self._clock)
 
-    def _opened(self):
+    @property
+    def _line(self):
+        """The link, while it is open."""
         if self._link is None:
             raise LineLost(f"{self.port} is closed: open it, or call reconnect()")
         return self._link
 
     def _read(self, code, parse):
         """What a reply says."""
-        raw = self._opened().ask(code).raw
+        raw = self._line.ask(code).raw
         try:
             return parse(raw)
         except TelegramError as error:
@@ -232,17 +227,15 @@ class LMS2xx(Closed):
         self._release()
         while self._link is None:
             try:
-                self._connect(rate, min(end, host.now() + FIND_S), end)
+                self._connect(rate, FIND_S, end)
             except (PortError, LineLost) as error:
                 self._release()
                 if self._interrupted.wait(AGAIN_S) or host.now() > end - AGAIN_S:
                     raise LineLost(f"the line did not come back: {error}") from error
-        if self.variant != variant:
-            self._set_variant(variant)
-        if self.configuration.block != configuration.block:
-            self._write(configuration)
-        if self.baudrate != rate:
-            self._set_rate(rate)
+        self._set_variant(variant)
+        self._read_configuration()
+        self._write(configuration)
+        self._set_rate(rate)
         self._prepare()
         self._link.deadline = math.inf
         LOG.warning("%s: the device is back at %d Bd", self.port, rate)
@@ -253,12 +246,14 @@ class LMS2xx(Closed):
         return self.status.scan_angle_deg, self.status.resolution_deg
 
     def _set_rate(self, rate):
-        """Change the rate of both ends; flash is not written.
+        """Set the rate of both ends; flash is not written.
 
         Where it does not come through the old one holds.
         """
-        link = self._opened()
-        before = self.baudrate
+        link = self._line
+        before = link.baudrate
+        if rate == before:
+            return
         link.set_rate(rate)  # before the device is told: raises where this end cannot
         link.set_rate(before)
         self._mode(bytes([RATES[rate]]), f"{rate} Bd")
@@ -266,7 +261,7 @@ class LMS2xx(Closed):
         try:
             link.ask(wire.TYPE)
         except (NoReply, Refused) as error:
-            link.find([before, *RATES], FIND_S)
+            link.find(before, FIND_S)
             raise NoReply(
                 f"{self.port}: nothing comes through at {rate} Bd: 500000 needs RS-422 (a jumper "
                 "in the plug of the device), others a shorter cable; "
@@ -275,7 +270,7 @@ class LMS2xx(Closed):
 
     def _mode(self, data, what):
         """Change the operating mode; replies A0 other than 00 are refusals."""
-        result = self._opened().ask(wire.MODE, data).raw[5]
+        result = self._line.ask(wire.MODE, data).raw[5]
         if result:
             raise Refused(f"{self.port}: the device declines {what} (A0 {result:02X})")
 
@@ -307,17 +302,18 @@ class LMS2xx(Closed):
                 f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}"
             )
         self._read_status()
-        differs = self.variant != wanted
-        if differs:
-            self._set_variant(wanted)
-            self._prepare()
+        differs = self._set_variant(wanted)
+        self._prepare()
         return differs
 
     def _set_variant(self, wanted):
+        """Set the variant where it was read to be another one; whether it was."""
+        if self.variant == wanted:
+            return False
         view, step = wanted
-        data = round(view).to_bytes(2, "little") + round(100 * step).to_bytes(2, "little")
+        data = struct.pack("<HH", round(view), round(100 * step))
         try:
-            self._opened().ask(wire.VARIANT, data)
+            self._line.ask(wire.VARIANT, data)
         except NoReply as error:  # the reply may be lost and the variant set
             LOG.warning("%s; reading the variant", error)
         self._read_status()
@@ -326,6 +322,7 @@ class LMS2xx(Closed):
                 f"{self.port}: the {self.type} has no variant {view:g}/{step:g}; it keeps "
                 "{:g} deg in steps of {:g} deg".format(*self.variant)
             )
+        return True
 
     def configure(
         self,
@@ -360,27 +357,30 @@ class LMS2xx(Closed):
         wanted = self.configuration.changed(
             unit=unit, measuring_mode=measuring_mode, realtime_indices=realtime_indices
         )
-        differs = wanted.block != self.configuration.block
-        if differs:
-            self._write(wanted)
+        differs = self._write(wanted)
         self._prepare()
         return differs
 
     def _write(self, wanted):
-        """Write a configuration in installation mode, and read it back."""
+        """Write a configuration that differs from the one read, in installation mode, and read it
+        back; whether it differed.
+        """
+        if self.configuration == wanted:
+            return False
         try:
             self._mode(INSTALLATION, "the password of the installation mode")
-            self._opened().ask(wire.CONFIGURE, wanted.block)
+            self._line.ask(wire.CONFIGURE, wanted.block)
         except NoReply as error:
             # the reply may be lost and the flash written: read it, do not write again
             LOG.warning("%s; reading the configuration", error)
         finally:
             self._mode(wire.ON_REQUEST, "to leave the installation mode")
         self._read_configuration()
-        if self.configuration.block != wanted.block:
+        if self.configuration != wanted:
             raise Refused(
                 f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}"
             )
+        return True
 
     def request(self, timeout: float = 4.0) -> Reading:
         """One scan.
@@ -398,12 +398,11 @@ class LMS2xx(Closed):
             If the port vanished.
         """
         self._need_quiet()
-        link = self._opened()
+        link = self._line
         end = self._host.now() + timeout
         usual_s = REPLY_S + self._assembler.duration_s
         while True:
-            left = max(0.0, end - self._host.now())
-            arrival = link.ask(wire.VALUES, ALL_VALUES, limit_s=left)
+            arrival = link.ask(wire.VALUES, ALL_VALUES, limit_s=end - self._host.now())
             # nobody knows the instant of a scan that came late
             if arrival.time_s - link.asked_s <= usual_s:
                 reading = self._assembler.feed(*arrival)
@@ -430,20 +429,19 @@ class LMS2xx(Closed):
             If the device does not stream.
         """
         self._need_quiet()
-        self._interlaced = interlaced
         if interlaced:
             self.set_variant(*FINE)
-        self._stream()
-        self._readings = []
-        self._trouble = ""
-        self._thread = self._host.thread(self._run, "LMS2xx reader")
+        self._stream(interlaced)
+        self._readings: list[Reading] = []
+        self._trouble = ""  # why no reading came
+        self._thread = self._host.thread(partial(self._run, interlaced), "LMS2xx reader")
         self._thread.start()
 
-    def _stream(self):
-        self._prepare(self._interlaced)
-        self._mode(STREAMS[self._interlaced], "to stream")
+    def _stream(self, interlaced):
+        self._prepare(interlaced)
+        self._mode(STREAMS[interlaced], "to stream")
 
-    def _run(self):
+    def _run(self, interlaced):
         """Read until the stream is to stop; whatever goes wrong with the line, find the device
         again.
         """
@@ -452,7 +450,7 @@ class LMS2xx(Closed):
             try:
                 if lost:
                     self._mend(RECOVERY_S)
-                    self._stream()
+                    self._stream(interlaced)
                     lost = False
                 self._post()
             except DeviceError as error:
@@ -475,19 +473,15 @@ class LMS2xx(Closed):
         last = host.now()
         quiet_s = max(LEAST_QUIET_S, 2.2 * self._assembler.interval_s + 0.15)
         while not self._interrupted.is_set():
-            arrivals = self._opened().receive()
-            fresh = []
-            for arrival in arrivals:
+            for arrival in self._line.receive():
                 if arrival.code == POWER_ON:
                     raise NoReply("the device started anew")
                 reading = self._assembler.feed(*arrival)
                 if reading is not None:
-                    fresh.append(reading)
-            if fresh:
-                self._readings = [*self._readings, *fresh][-KEPT:]
-                self._trouble = ""
-                self._news.set()
-                last = host.now()
+                    self._readings = [*self._readings, reading][-KEPT:]
+                    self._trouble = ""
+                    self._news.set()
+                    last = host.now()
             if host.now() - last > quiet_s:
                 raise NoReply("the stream stopped")
 

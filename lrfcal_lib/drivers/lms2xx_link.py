@@ -3,6 +3,7 @@
 import itertools
 import math
 import os
+from collections.abc import Collection
 from typing import NamedTuple
 
 from lrfcal_lib.drivers.port import (
@@ -14,7 +15,7 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
     line_lost,
 )
-from lrfcal_lib.session.lms2xx_frame import OVERHEAD, encode_telegram, split_stream
+from lrfcal_lib.session.lms2xx_frame import OVERHEAD, encode_telegram, split_stream, whole
 
 ACK = 0x06
 NAK = 0x15
@@ -81,8 +82,8 @@ class Link:
 
     Attributes
     ----------
-    senders : set of int or None
-        Address bytes of the replies that count; None: any.
+    senders : collection of int
+        Address bytes of the replies that count; at first any.
     deadline : float
         By ``host.now()``, beyond which no request lasts.
     asked_s : float
@@ -104,7 +105,7 @@ class Link:
         self.address = address
         self.host = host
         self.interrupted = interrupted or host.event()
-        self.senders: set[int] | None = None
+        self.senders: Collection[int] = range(256)
         self.deadline = math.inf
         self.asked_s = 0.0
         self.heard = 0
@@ -196,9 +197,8 @@ class Link:
             self._kept = []
             return kept
         missing = 1
-        if len(self._rest) >= 4:  # a telegram has begun that states its length
-            whole = int.from_bytes(self._rest[2:4], "little") + OVERHEAD
-            missing = max(1, whole - len(self._rest))
+        if self._rest:  # a telegram has begun; bytes 2 and 3 state its length
+            missing = max(1, whole(self._rest[2:4]) + OVERHEAD - len(self._rest))
         with line_lost(self.path):
             data = self._port.read(missing)
             data += self._port.read(self._port.in_waiting)
@@ -212,13 +212,11 @@ class Link:
         self._rest = data[stream.pending :]
         arrivals = []
         end = 0
-        for begin, length in zip(
-            stream.offset.tolist(), stream.length.tolist(), strict=True
-        ):
+        for begin, length in zip(stream.offset, stream.length, strict=True):
             self._stray = None
             end = begin + length
             arrived = now - (len(data) - end) * 10 / self.baudrate
-            if self.senders is None or data[begin + 1] in self.senders:
+            if data[begin + 1] in self.senders:
                 arrivals.append(Arrival(data[begin:end], arrived))
         if stream.pending > end:
             self._stray = data[stream.pending - 1]
@@ -292,15 +290,15 @@ class Link:
     # ------------------------------------------------------------------------------------------
     # finding the rate
 
-    def find(self, rates: list[int], limit_s: float) -> None:
+    def find(self, first: int, limit_s: float) -> None:
         """Set the rate at which the device answers, and stop whatever it does.
 
         Parameters
         ----------
-        rates
-            To try, in their order, bits a second.
+        first
+            Rate to try before the others, bits a second.
         limit_s
-            Seconds that it may take.
+            Seconds that it may take, beside the deadline.
 
         Raises
         ------
@@ -309,16 +307,17 @@ class Link:
         WrongDevice
             If only bytes came that make no telegram.
         """
-        end = self.host.now() + limit_s
+        end = min(self.host.now() + limit_s, self.deadline)
         heard = self.heard
+        rates = dict.fromkeys([first, *RATES])
         for window in itertools.cycle(WINDOWS_S):
             if self.host.now() >= end:
                 break
-            for rate in dict.fromkeys(rates):
+            for rate in rates:
                 if self._answers(rate, window, end):
                     return
-        tried = f"{', '.join(map(str, dict.fromkeys(rates)))} Bd, address {self.address}"
-        if self.address == 0:
+        tried = f"{', '.join(map(str, rates))} Bd, address {self.address}"
+        if not self.address:
             tried += " (any)"
         if self.heard > heard:
             raise WrongDevice(
@@ -373,10 +372,10 @@ class Link:
         for _ in range(TRIES):
             end = self.host.now() + 5 * SILENCE_S
             heard = self.heard
-            while self.host.now() < end and self.heard == heard:
+            while self.heard == heard:
+                if self.host.now() >= end:
+                    return
                 self.receive()
-            if self.heard == heard:
-                return
             self.ask(MODE, ON_REQUEST)
         raise Refused(
             f"{self.path}: the device confirms to stop streaming and goes on; switch it off and on"

@@ -146,9 +146,7 @@ class EmulatedLms(SerialDevice):
         raw = self._buffer + data
         stream = split_stream(raw, replies=False)
         self._buffer = raw[stream.pending :]
-        for offset, length in zip(
-            stream.offset.tolist(), stream.length.tolist(), strict=True
-        ):
+        for offset, length in zip(stream.offset, stream.length, strict=True):
             self.heard(raw[offset : offset + length], at)
         if len(stream.rejected) and not len(stream.offset):
             self.heard(raw[stream.rejected[0] :], at, sound=False)

@@ -145,7 +145,7 @@ def edge_in_image(
     fan = np.array([np.zeros(3), *(1.25 * points[name] for name in "EF")])
     view.face(fan, COLORS["lrf"], 0.12)
     view.line([points["E"], points["F"]], color=COLORS["lrf"], linewidth=2)
-    half = np.array([model.width, model.height]) / 2
+    half = model.size / 2
     rim = np.column_stack([SQUARE * half / model.fx, np.ones(4)])
     view.face(T_lrf_camera.apply(depth * rim), COLORS["left"], 0.12)
     view.line([points["E"], centre, points["F"]], ":", color=COLORS["left"], linewidth=1)

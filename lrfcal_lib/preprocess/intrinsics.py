@@ -222,7 +222,7 @@ def scale_covariance(pose: RigidTransform, pixels, pattern: Chessboard) -> np.nd
     ndarray, shape (6, 6)
         Of ``[w, v]``.
     """
-    side = square_px(pixels, (pattern.columns, pattern.rows))
+    side = square_px(pixels, pattern)
     away = np.zeros(6)
     away[3:] = scale_error(side) * pose.apply(pattern.points().mean(axis=0))
     return np.outer(away, away)

@@ -316,12 +316,12 @@ def square_axes(corners, size):
     return np.stack([along, across], axis=-1).reshape(-1, 2, 2)
 
 
-def square_px(corners, size):
+def square_px(corners, pattern):
     """Mean side of a chessboard's squares in an image along the shorter of its two axes, pixels.
 
     Corners (n, 2) that are NaN do not count.
     """
-    grid = np.reshape(corners, (size[1], size[0], 2))
+    grid = np.reshape(corners, (pattern.rows, pattern.columns, 2))
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2) for axis in (0, 1)]
     return float(min(np.nanmean(side) for side in sides))
 
@@ -380,24 +380,24 @@ def pattern_orders(pattern: Chessboard, mirrored: bool = True) -> np.ndarray:
     return np.stack([order.ravel() for order in orders])
 
 
-def spread_views(pixels, count: int) -> list[int]:
-    """Which views of a pattern differ most: all, or the largest and then so many others.
+def spread_views(pixels, count: int) -> list:
+    """The views of a pattern that differ most: all, or the largest and then so many others.
 
     Each of those is the one whose corners lie farthest from those of all views before it.
 
     Parameters
     ----------
-    pixels : sequence of ndarray, shape (k, 2)
+    pixels : list of ndarray, shape (k, 2)
         Corners by view.
     count : int
         At most.
 
     Returns
     -------
-    list of int
+    list of ndarray, shape (k, 2)
     """
-    if len(pixels) <= count or count == 0:
-        return list(range(min(len(pixels), count)))
+    if len(pixels) <= count:
+        return pixels
     pixels = np.asarray(pixels, float)
     flat = pixels.reshape(len(pixels), -1)
     apart = cdist(flat, flat)
@@ -405,4 +405,4 @@ def spread_views(pixels, count: int) -> list[int]:
     chosen = [int(np.argmax(size))]
     while len(chosen) < count:
         chosen.append(int(apart[:, chosen].min(axis=1).argmax()))
-    return chosen
+    return [pixels[i] for i in chosen[:count]]

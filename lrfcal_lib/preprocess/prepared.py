@@ -13,7 +13,7 @@ from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.outline_in_images import Outline
-from lrfcal_lib.preprocess.survey import small_squares, views_of
+from lrfcal_lib.preprocess.survey import small_squares, survey
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session
@@ -247,7 +247,7 @@ def prepare_images(prepared: Prepared) -> Prepared:
         With the board in every image, the cameras' intrinsics, and the board's outline.
     """
     try:
-        surveyed = views_of(prepared.session)
+        surveyed = survey(prepared.session)
     except DegenerateGeometry as error:  # what remains is a session without cameras
         words = f"no image can be used: {error}"
         lost = Problem(Stage.IMAGES, ProblemKind.NO_IMAGES, words)

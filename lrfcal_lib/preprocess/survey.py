@@ -1,11 +1,10 @@
 """What the cameras of a session see of the board: intrinsics, poses, turns, edges, its outline."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import PurePath
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import Rotation
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.camera import CameraModel
@@ -73,7 +72,7 @@ class Survey:
     models: dict[str, CameraModel]
     outline: Outline | None
     board: Board
-    relief: np.ndarray | None = field(default=None, repr=False)
+    relief: np.ndarray | None = None
     unseen: str = ""
 
 
@@ -83,52 +82,28 @@ class Shot:
 
     record: ImageRecord
     view: BoardView
-    part: Part | None = field(default=None, repr=False)
+    part: Part | None = None
+
+    @property
+    def reason(self):
+        """Why it cannot be used."""
+        return self.view.reason
 
     def image(self, read):
         """The image; black away from the board where a part is kept."""
         return read(self.record) if self.part is None else self.part.image()
 
 
-def views_of(session: Session) -> Survey:
-    """:func:`survey` of a session's images.
+def survey(session: Session) -> Survey:
+    """Find the board in the images of all cameras, one of each camera and placement.
+
+    Of those that show the board it is the one whose pitch is nearest to the middle of the
+    placement's images. Images of no placement are all used, those of a scene are not.
 
     Parameters
     ----------
     session : Session
-
-    Returns
-    -------
-    Survey
-    """
-    return survey(
-        [
-            record
-            for record in session.images()
-            if record.purpose in ("board", "intrinsics")
-        ],
-        session.read_image,
-        session.board,
-        {name: info.model for name, info in session.cameras.items()},
-        session.picks,
-    )
-
-
-def survey(records, read, board: Board, models, picks=()) -> Survey:
-    """Find the board in the images of several cameras, one of each camera and placement.
-
-    Of those that show the board it is the one whose pitch is nearest to the middle of the
-    placement's images. Images of no placement are all used.
-
-    Parameters
-    ----------
-    records : sequence of ImageRecord
-    read : callable
-        ``read(record)`` gives the image, uint8.
-    board : Board
-    models : dict of str to (CameraModel or None)
-        By camera; None asks for an estimate from these images.
-    picks : sequence of EdgePick
+        A camera without a model asks for an estimate from these images.
 
     Returns
     -------
@@ -140,36 +115,41 @@ def survey(records, read, board: Board, models, picks=()) -> Survey:
         If a camera has no intrinsics and the board no pattern, or too few images show it; if a pick
         names an edge that the board does not have.
     """
-    look = partial(_look, read=read, board=board, marks=_marks(picks, board))
+    board = session.board
+    stated = {name: camera.model for name, camera in session.cameras.items()}
+    unknown = [name for name, model in stated.items() if model is None]
+    _check_picks(session.picks, board)
+    read = session.read_image
+    look = partial(_look, read=read, board=board, picks=session.picks)
     if board.pattern is None:
-        records = [record for record in records if record.purpose != "intrinsics"]
-    groups = _choices(records, list(models))
-    if board.pattern is None:
-        return _survey_plain(groups, look, board, models)
+        return _survey_plain(session, look, stated, unknown)
 
+    groups = _choices(session, {"board", "intrinsics"})
     finder = PatternFinder(board.pattern)
-    room = KEPT_BYTES // max(len(groups), 1)
-    begin = partial(_shot_with_corners, read=read, board=board, finder=finder, room=room)
-    shots = spread(partial(_first, begin=begin), groups)
-    find = partial(_intrinsics, models=models, shots=shots, board=board, read=read)
-    rough = dict(zip(models, spread(find, models), strict=True))
+    begin = partial(_begin, read=read, board=board, finder=finder, count=len(groups))
+    begun = spread(partial(_first, begin=begin), groups)
+    shots = [shot for shot in begun if not shot.reason]
+    rough, _ = _adjusted(unknown, stated, shots, session)
+    if board.corners is None:
+        _check_measurable(board, begun)
     shots, lines, unseen = _ordered(shots, read, board, rough)
-    refined, relief = _with_relief(shots, board, models, rough)
+    often = [name for name in rough if len(_corners(shots, name)) >= LEAST_VIEWS_FOR_RELIEF]
+    models, relief = _adjusted(often, rough, shots, session, relief=True)
     shots = [shot for shot in shots if shot.record.purpose != "intrinsics"]
 
     def see(lines):
-        again = partial(look, models=refined, lines=lines, relief=relief)
-        return spread(partial(_unless_unseen, look=again), shots)
+        return spread(partial(look, models=models, lines=lines, relief=relief), shots)
 
     views = see(lines)
     outline = None
     if board.corners is None and not unseen:
-        views = see(measure_outline(views, board, refined).lines)
-        outline = measure_outline(views, board, refined)
+        views = see(measure_outline(views, board, models).lines)
+        outline = measure_outline(views, board, models)
         board = outline.board
+    lost = [shot.view for shot in begun if shot.reason]
     return Survey(
-        views=_by_camera(models, views),
-        models=refined,
+        views=_by_camera(models, views + lost),
+        models=models,
         outline=outline,
         board=board,
         relief=relief,
@@ -213,19 +193,18 @@ def _like_prepared(record, prepared, finder):
     view = _view(record)
     if known.file == view.file or known.pixels is None:
         return replace(known, file=view.file, pitch=record.pitch)
-    image = prepared.session.read_image(record)
-    view = _corners(view, image, finder)
-    if view.reason:
-        return view
-    orders = pattern_orders(board.pattern)
-    shifts = view.pixels[orders] - known.pixels
-    order = orders[np.nanstd(shifts, axis=1).sum(axis=1).argmin()]
+    read = prepared.session.read_image
+    shot = _begin(record, read, board, finder, 1)
+    if shot.reason:
+        return shot.view
+    corners = shot.view.pixels[pattern_orders(board.pattern)]
+    order = np.nanstd(corners - known.pixels, axis=1).sum(axis=1).argmin()
     return _look(
-        Shot(record, replace(view, pixels=view.pixels[order])),
+        _with_pixels(shot, corners[order]),
         prepared.models,
-        read=lambda _: image,
+        read=read,
         board=board,
-        marks=_marks(prepared.session.picks, board),
+        picks=prepared.session.picks,
         lines=None if board.corners is None else board.lines(),
         relief=prepared.relief,
     )
@@ -246,12 +225,12 @@ def small_squares(views, pattern) -> dict[str, str]:
         By camera; those that have such images.
     """
     words: dict[str, str] = {}
-    if pattern is None:
-        return words
-    size = (pattern.columns, pattern.rows)
     for camera, of_camera in views.items():
-        seen = {p: view.pixels for p, view in of_camera.items() if view.pixels is not None}
-        sides = {p: square_px(pixels, size) for p, pixels in seen.items()}
+        sides = {
+            placement: square_px(view.pixels, pattern)
+            for placement, view in of_camera.items()
+            if view.pixels is not None
+        }
         small = [p for p, side in sides.items() if side < SMALL_SQUARE_PX]
         if small:
             least = min(sides.values())
@@ -264,114 +243,118 @@ def small_squares(views, pattern) -> dict[str, str]:
     return words
 
 
-def _marks(picks, board):
-    """Ends of edges picked by hand, by camera and file, then by edge."""
-    marks = {}
+def _check_picks(picks, board):
+    """Refuse edges that the board does not have."""
     for pick in picks:
         if pick.edge not in board.edges:
             raise ValueError(
                 f"{pick.file}: picked edge '{pick.edge}' is not one of the board's edges "
                 f"{board.edges}"
             )
-        marks.setdefault((pick.camera, pick.file), {})[pick.edge] = np.asarray(
-            pick.ends, float
-        )
-    return marks
+
+
+def _placement(record):
+    """Placement of which an image is one, negative for none."""
+    return -1 if record.purpose == "intrinsics" else record.placement
 
 
 def _view(record):
     """The view of an image in which nothing was looked for yet."""
-    return BoardView(
-        record.camera, PurePath(record.file).name, record.placement, record.pitch
-    )
+    return BoardView(record.camera, record.file.name, _placement(record), record.pitch)
 
 
-def _look(shot, models, *, read, board, marks, lines=None, relief=None):
+def _look(shot, models, *, read, board, picks, lines=None, relief=None):
     """The board in one image, with what was picked in it by hand."""
     record = shot.record
+    ends = {
+        pick.edge: pick.ends
+        for pick in picks
+        if (pick.camera, pick.file) == (record.camera, record.file)
+    }
     return view_board(
         shot.image(read),
         board,
         models[record.camera],
         shot.view,
-        marks.get((record.camera, record.file)),
+        ends,
         lines=lines,
         relief=relief,
     )
 
 
-def _unless_unseen(shot, look):
-    """The view of a shot, looked at again unless it does not show the pattern."""
-    return shot.view if shot.view.reason else look(shot)
-
-
-def _corners(view, image, finder):
-    """The view with the corners of the pattern in any order, or with the reason why not."""
-    try:
-        return replace(view, pixels=finder(image))
-    except PatternNotFound as error:
-        return replace(view, reason=str(error))
+def _with_pixels(shot, pixels):
+    """The shot with corners of the pattern."""
+    return replace(shot, view=replace(shot.view, pixels=pixels))
 
 
 def _by_camera(cameras, views):
     return {camera: [view for view in views if view.camera == camera] for camera in cameras}
 
 
-def _choices(records, cameras):
+def _choices(session, purposes):
     """Records in lists of those of which one is to be used, the best first."""
     groups = {}
-    for number, record in enumerate(r for r in records if r.camera in cameras):
-        shared = record.placement >= 0 and record.purpose != "intrinsics"
-        key = (record.camera, record.placement) if shared else number
-        groups.setdefault(key, []).append(record)
+    for record in session.image_records:
+        if record.purpose in purposes:
+            placement = _placement(record)
+            alone = record.file if placement < 0 else None
+            groups.setdefault((record.camera, placement, alone), []).append(record)
     for group in groups.values():
         pitch = [record.pitch for record in group]
         middle = (min(pitch) + max(pitch)) / 2
         group.sort(key=lambda record: abs(record.pitch - middle))
-    return sorted(groups.values(), key=lambda group: cameras.index(group[0].camera))
+    return groups.values()
 
 
 def _first(group, begin):
-    """The first image of a list that shows the board; the first one if none does."""
-    shots = []
+    """What begins with the first image of a list that shows the board; the first one if none
+    does.
+    """
+    begun = []
     for record in group:
-        shots.append(begin(record))
-        if not shots[-1].view.reason:
-            return shots[-1]
-    return shots[0]
+        begun.append(begin(record))
+        if not begun[-1].reason:
+            return begun[-1]
+    return begun[0]
 
 
-def _survey_plain(groups, look, board, models):
+def _survey_plain(session, look, models, unknown):
     """The survey of a board without pattern."""
-    unknown = [camera for camera, model in models.items() if model is None]
+    board = session.board
     if unknown:
         raise ValueError(
             f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find "
             "them with: state them"
         )
-    begin = partial(_plain_shot, look=partial(look, models=models))
-    shots = spread(partial(_first, begin=begin), groups)
-    views = _turned_alike([shot.view for shot in shots])
-    return Survey(_by_camera(models, views), dict(models), None, board)
+    begin = partial(_begin_plain, look=partial(look, models=models))
+    first = partial(_first, begin=begin)
+    views = _turned_alike(spread(first, _choices(session, {"board"})))
+    return Survey(_by_camera(models, views), models, None, board)
 
 
-def _plain_shot(record, look):
-    """A shot of a board without pattern, with its view."""
-    shot = Shot(record, _view(record))
-    return replace(shot, view=look(shot))
+def _begin_plain(record, look):
+    """The view of a board without pattern."""
+    return look(Shot(record, _view(record)))
 
 
-def _shot_with_corners(record, read, board, finder, room):
-    """A shot with its corners and, within `room` bytes, the part that is looked at again."""
+def _begin(record, read, board, finder, count):
+    """A shot with the corners of the pattern in any order, or with the reason why not.
+
+    With the part of the image that is looked at again, where there is room for so many.
+    """
     image = read(record)
-    view = _corners(_view(record), image, finder)
-    if view.reason:
-        return Shot(record, view)
-    part = part_around(image, view.pixels, board)
-    return Shot(record, view, part if part.pixels.nbytes <= room else None)
+    shot = Shot(record, _view(record))
+    try:
+        corners = finder(image)
+    except PatternNotFound as error:
+        return replace(shot, view=replace(shot.view, reason=str(error)))
+    part = part_around(image, corners, board)
+    if part.pixels.nbytes * count <= KEPT_BYTES:
+        shot = replace(shot, part=part)
+    return _with_pixels(shot, corners)
 
 
-def _for_intrinsics(shots, camera):
+def _corners(shots, camera):
     """Corners to estimate intrinsics with: the images taken for that, and the most different others
     up to a number.
 
@@ -380,53 +363,54 @@ def _for_intrinsics(shots, camera):
     meant = []
     others = []
     for shot in shots:
-        if shot.record.camera == camera and shot.view.pixels is not None:
+        if shot.record.camera == camera:
             taken = meant if shot.record.purpose == "intrinsics" else others
             taken.append(shot.view.pixels)
     if not meant:
         return others
-    chosen = [meant[i] for i in spread_views(meant, VIEWS_FOR_INTRINSICS)]
-    more = spread_views(others, VIEWS_FOR_INTRINSICS - len(chosen))
-    return chosen + [others[i] for i in more]
+    chosen = spread_views(meant, VIEWS_FOR_INTRINSICS)
+    return chosen + spread_views(others, VIEWS_FOR_INTRINSICS - len(chosen))
 
 
-def _intrinsics(camera, models, shots, board, read):
-    """Intrinsics of a camera as stated, or from the corners in its images, in any order."""
-    if models[camera] is not None:
-        return models[camera]
-    pixels = _for_intrinsics(shots, camera)
-    record = next(shot.record for shot in shots if shot.record.camera == camera)
-    try:
-        size = read(record).shape[1::-1]
-        return estimate_intrinsics(pixels, board.pattern, size).models[0]
-    except ValueError as error:
-        raise DegenerateGeometry(f"camera '{camera}': {error}") from error
+def _adjusted(cameras, models, shots, session, relief=False):
+    """Models by camera, some of them estimated anew, and the heights of the sheet (k,), metres.
 
-
-def _with_relief(shots, board, models, rough):
-    """Intrinsics by camera and the heights of the sheet (k,), metres, from corners in one order.
-
-    `models` are those that are stated, `rough` also those estimated of a flat sheet.
+    For the heights the corners are in one order; there are none without cameras.
     """
-    estimate = partial(_adjustment, shots=shots, board=board, models=models, rough=rough)
-    refined = dict(rough)
+    estimate = partial(_adjustment, shots=shots, session=session, relief=relief)
+    adjusted = dict(models)
     reliefs = []
-    for camera, adjustment in zip(rough, spread(estimate, rough), strict=True):
-        if adjustment is not None:
-            refined[camera] = adjustment.models[0]
-            reliefs.append(adjustment.relief)
-    return refined, np.mean(reliefs, axis=0) if reliefs else None
+    for camera, adjustment in zip(cameras, spread(estimate, cameras), strict=True):
+        adjusted[camera] = adjustment.models[0]
+        reliefs.append(adjustment.relief)
+    return adjusted, np.mean(reliefs, axis=0) if reliefs else None
 
 
-def _adjustment(camera, shots, board, models, rough):
-    """The Adjustment of a camera that sees the pattern often enough."""
-    pixels = _for_intrinsics(shots, camera)
-    if len(pixels) < LEAST_VIEWS_FOR_RELIEF:
-        return None
-    if models[camera] is None:
-        size = (rough[camera].width, rough[camera].height)
-        return estimate_intrinsics(pixels, board.pattern, size, relief=True)
-    return estimate_relief(pixels, board.pattern, models[camera])
+def _adjustment(name, shots, session, relief):
+    """The Adjustment of a camera: its intrinsics where they are not stated, and the relief."""
+    camera = session.cameras[name]
+    pattern = session.board.pattern
+    corners = _corners(shots, name)
+    if camera.model is not None:
+        return estimate_relief(corners, pattern, camera.model)
+    size = (camera.width, camera.height)
+    try:
+        return estimate_intrinsics(corners, pattern, size, relief=relief)
+    except ValueError as error:
+        raise DegenerateGeometry(f"camera '{name}': {error}") from error
+
+
+def _check_measurable(board, shots):
+    """Refuse a board whose outline images cannot tell."""
+    if len(board.edges) != 4:
+        raise ValueError(
+            f"board '{board.name}' has {len(board.edges)} edges and no known corners: only four "
+            "edges around a pattern can be measured from images, give the corners"
+        )
+    if all(shot.reason for shot in shots):
+        raise DegenerateGeometry(
+            f"none of {len(shots)} images shows the pattern of board '{board.name}'"
+        )
 
 
 def _ordered(shots, read, board, models):
@@ -435,47 +419,43 @@ def _ordered(shots, read, board, models):
     And the lines of the outline (E, 3): rough where it is not known; None, and the reason why,
     where the images do not show it.
     """
+    if not shots:
+        return shots, None, ""
     known = board.corners is not None
-    visible = [shot for shot in shots if shot.view.pixels is not None]
-    if not known and len(board.edges) != 4:
-        raise ValueError(
-            f"board '{board.name}' has {len(board.edges)} edges and no known corners: only four "
-            "edges around a pattern can be measured from images, give the corners"
-        )
-    if not known and not visible:
-        raise DegenerateGeometry(
-            f"none of {len(shots)} images shows the pattern of board '{board.name}'"
-        )
-    lines = board.lines() if known else None
-    if not visible:
-        return shots, lines, ""
-    corners, poses, leader = _orders(visible, board.pattern, models, mirrored=known)
+    corners, poses, leader = _orders(shots, board.pattern, models, mirrored=known)
     unseen = ""
     if known:
+        lines = board.lines()
         score = partial(_order_scores, read=read, board=board, models=models)
-        scores = spread(score, zip(visible, poses, strict=True))
+        scores = spread(score, zip(shots, poses, strict=True))
         chosen = decide(np.array(scores), leader)
     else:
-        votes = []
-        up = []
-        for shot, pixels in zip(visible, corners[:, 0], strict=True):
-            model = models[shot.record.camera]
-            pose = board_pose(pixels, board.pattern, model)[0]
-            votes.append(edge_votes(shot.image(read), board.pattern, model, pose))
-            up.append(pose.rotation.as_matrix()[1, 1])
-        turned = turned_views(np.stack(votes), np.array(up), leader)
+        votes, up = _votes(shots, corners[:, 0], read, board.pattern, models)
+        turned = turned_views(votes, up, leader)
+        votes[turned] = votes[turned][:, OPPOSITE]
         chosen = turned.astype(int)
-        for number in np.flatnonzero(turned):
-            votes[number] = votes[number][OPPOSITE]
         try:
-            lines = common_lines(np.stack(votes), board)
+            lines = common_lines(votes, board)
         except OutlineNotSeen as error:
+            lines = None
             unseen = str(error)
-    ordered = {id(shot): shot for shot in shots}
-    for shot, orders, column in zip(visible, corners, chosen, strict=True):
-        view = replace(shot.view, pixels=orders[column])
-        ordered[id(shot)] = replace(shot, view=view)
-    return list(ordered.values()), lines, unseen
+    ordered = [
+        _with_pixels(shot, orders[column])
+        for shot, orders, column in zip(shots, corners, chosen, strict=True)
+    ]
+    return ordered, lines, unseen
+
+
+def _votes(shots, corners, read, pattern, models):
+    """For edges (m, 4, n) of m shots, see :func:`edge_votes`, and how far y points down in them."""
+    votes = []
+    up = []
+    for shot, pixels in zip(shots, corners, strict=True):
+        model = models[shot.record.camera]
+        pose = board_pose(pixels, pattern, model)[0]
+        votes.append(edge_votes(shot.image(read), pattern, model, pose))
+        up.append(pose.rotation.as_matrix()[1, 1])
+    return np.array(votes), np.array(up)
 
 
 def _orders(shots, pattern, models, mirrored):
@@ -488,19 +468,16 @@ def _orders(shots, pattern, models, mirrored):
     orders = pattern_orders(pattern, mirrored=mirrored)
     turns = turned_boards(pattern, orders)
     poses = []
-    placements = []
-    cameras = []
     for shot in shots:
         model = models[shot.record.camera]
         poses.append(first_pose(pattern.points(), shot.view.pixels, model) * turns)
-        alone = shot.record.purpose == "intrinsics"
-        placements.append(-1 if alone else shot.record.placement)
-        cameras.append(shot.record.camera)
-    together = alike([pose.rotation for pose in poses], placements, cameras)
-    pairs = list(zip(shots, together.order, strict=True))
-    corners = np.array([shot.view.pixels[orders[order]] for shot, order in pairs])
-    posed = [pose[order] for pose, order in zip(poses, together.order, strict=True)]
-    return corners, posed, together.leader
+    together = alike([pose.rotation for pose in poses], [shot.view for shot in shots])
+    corners = []
+    posed = []
+    for shot, pose, order in zip(shots, poses, together.order, strict=True):
+        corners.append(shot.view.pixels[orders[order]])
+        posed.append(pose[order])
+    return np.array(corners), posed, together.leader
 
 
 def _order_scores(shot_and_poses, read, board, models):
@@ -511,29 +488,16 @@ def _order_scores(shot_and_poses, read, board, models):
 
 def _turned_alike(views):
     """Views of a plain board, turned alike in a placement where it looks the same when turned."""
-    posed = [view for view in views if view.T_camera_board is not None]
+    posed = [view for view in views if not view.reason]
     turned = []  # of every view those that differ by a turn in the board's plane
+    rotations = []
     for view in posed:
-        same = [
-            each
-            for each in (view, *view.alternatives)
-            if _normal(each) @ _normal(view) > SAME_PLANE
-        ]
-        turned.append(same)
-    most = max(map(len, turned), default=0)
-    stacks = []
-    for same in turned:
-        same += same[:1] * (most - len(same))
-        poses = RigidTransform.concatenate([view.T_camera_board for view in same])
-        stacks.append(poses.rotation)
-    placements = [view.placement for view in posed]
-    together = alike(stacks, placements, [view.camera for view in posed])
-    chosen = {}
-    for view, same, order in zip(posed, turned, together.order, strict=True):
-        chosen[id(view)] = same[order[0]]
-    return [chosen.get(id(view), view) for view in views]
-
-
-def _normal(view):
-    """Normal (3,) of the board in a view, camera frame."""
-    return view.T_camera_board.rotation.as_matrix()[:, 2]
+        poses = [view, *view.alternatives]
+        rotation = Rotation.concatenate([each.T_camera_board.rotation for each in poses])
+        normals = rotation.as_matrix()[:, :, 2]
+        same = np.flatnonzero(normals @ normals[0] > SAME_PLANE)
+        turned.append([poses[i] for i in same])
+        rotations.append(rotation[same])
+    together = alike(rotations, posed)
+    chosen = [same[order[0]] for same, order in zip(turned, together.order, strict=True)]
+    return chosen + [view for view in views if view.reason]

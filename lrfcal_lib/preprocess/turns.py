@@ -22,12 +22,12 @@ class Alike:
     ----------
     leader : ndarray of int, shape (m,)
         The first image of the same placement.
-    order : ndarray of int, shape (m, n)
-        The order in the image that goes with each order in the leader.
+    order : list of ndarray of int, shape (n,)
+        By image (m), the order in it that goes with each order in the leader.
     """
 
     leader: np.ndarray
-    order: np.ndarray
+    order: list[np.ndarray]
 
 
 def turned_boards(pattern: Chessboard, orders: np.ndarray) -> RigidTransform:
@@ -52,7 +52,7 @@ def turned_boards(pattern: Chessboard, orders: np.ndarray) -> RigidTransform:
     return RigidTransform.from_components(middle - rotation.apply(middle), rotation)
 
 
-def alike(rotations, placements, cameras) -> Alike:
+def alike(rotations, views) -> Alike:
     """Which orders of a pattern's corners belong together in the images of one placement.
 
     Between two images of one camera the head turns by less than any two orders differ. How a camera
@@ -63,43 +63,43 @@ def alike(rotations, placements, cameras) -> Alike:
     ----------
     rotations : sequence of Rotation
         From the board to the camera, by image (m) a stack for every order that the corners may have
-        (n), the same orders in all images.
-    placements : sequence of int
-        By image; negative for an image of none, which stands alone.
-    cameras : sequence of str
-        By image.
+        (n).
+    views : sequence of BoardView
+        By image; one of no placement stands alone.
 
     Returns
     -------
     Alike
     """
-    placements = list(placements)
+    placements = [view.placement for view in views]
     leader = [i if p < 0 else placements.index(p) for i, p in enumerate(placements)]
+    # by camera and placement, of the first image
+    first: dict[str, dict] = {view.camera: {} for view in views}
+    for rotation, view in zip(rotations, views, strict=True):
+        if view.placement >= 0:
+            first[view.camera].setdefault(view.placement, rotation)
     turn_of_camera = {
-        camera: _between(rotations, placements, cameras, camera) for camera in set(cameras)
+        camera: _between(first[views[0].camera], of_camera)
+        for camera, of_camera in first.items()
     }
     order = []
     for i, j in enumerate(leader):
-        turn = turn_of_camera[cameras[i]] * turn_of_camera[cameras[j]].inv()
+        turn = turn_of_camera[views[i].camera] * turn_of_camera[views[j].camera].inv()
         off = [(rotations[i] * ahead.inv()).magnitude() for ahead in turn * rotations[j]]
         order.append(np.argmin(off, axis=1))
-    return Alike(np.array(leader, int), np.array(order, int))
+    return Alike(np.array(leader, int), order)
 
 
-def _between(rotations, placements, cameras, camera):
-    """Rotation from the first camera to another on which most placements agree."""
-    base = cameras[0]
-    if base == camera:
-        return Rotation.identity()
-    first = {base: {}, camera: {}}  # image of a placement
-    for rotation, placement, name in zip(rotations, placements, cameras, strict=True):
-        if name in first and placement >= 0:
-            first[name].setdefault(placement, rotation)
-    common = sorted(first[base].keys() & first[camera].keys())
-    if not common:
+def _between(base, other):
+    """Rotation from the first camera to another on which most placements agree.
+
+    `base` and `other` are the rotations of their first images by placement.
+    """
+    common = sorted(base.keys() & other.keys())
+    if other is base or not common:
         return Rotation.identity()
     # every order in the one image that might go with the first order in the other
-    possible = [first[camera][p] * first[base][p][0].inv() for p in common]
+    possible = [other[p] * base[p][0].inv() for p in common]
     candidates = Rotation.concatenate(possible)
     cost = UPRIGHT * candidates.magnitude()
     for turns in possible:

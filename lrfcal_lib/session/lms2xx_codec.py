@@ -13,6 +13,7 @@ from lrfcal_lib.session.lms2xx_frame import (
     cut,
     encode_telegram,
     parse_telegram,
+    whole,
     word,
 )
 
@@ -302,11 +303,6 @@ VARIANT = 0xBB
 CONFIGURATION = 0xF4
 CONFIGURED = 0xF7
 CONFIGURATION_BYTES = 34
-
-
-def whole(raw):
-    """Bytes as a number, the least first."""
-    return int.from_bytes(raw, "little")
 
 
 def text(raw):

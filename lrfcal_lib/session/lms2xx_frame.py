@@ -99,6 +99,11 @@ def encode_telegram(
     return raw + crc16(raw).to_bytes(2, "little")
 
 
+def whole(raw):
+    """Bytes as a number, the least first."""
+    return int.from_bytes(raw, "little")
+
+
 def parse_telegram(raw: bytes) -> Telegram:
     """The telegram in bytes from the start byte to the CRC.
 
@@ -115,12 +120,12 @@ def parse_telegram(raw: bytes) -> Telegram:
         raise TelegramError(
             f"a telegram begins with 02 and has 7 or more bytes, got {raw[:8].hex(' ') or 'none'}"
         )
-    stated = int.from_bytes(raw[2:4], "little") + OVERHEAD
+    stated = whole(raw[2:4]) + OVERHEAD
     if stated != len(raw):
         raise TelegramError(
             f"the telegram states {stated} bytes, got {len(raw)}: cut it with split_stream"
         )
-    sent = int.from_bytes(raw[-2:], "little")
+    sent = whole(raw[-2:])
     computed = crc16(raw[:-2])
     if sent != computed:
         raise TelegramError(
@@ -157,9 +162,9 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
     plausible = (length > OVERHEAD) & (length <= LONGEST)
     offset = offset[plausible]
     length = length[plausible]
-    whole = offset + length <= len(raw)
+    complete = offset + length <= len(raw)
     good = np.zeros(len(offset), bool)
-    good[whole] = check_crc(raw, offset[whole], length[whole])
+    good[complete] = check_crc(raw, offset[complete], length[complete])
 
     sound = []
     rejected = []
@@ -172,7 +177,7 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
             sound.append(row)
             free = begin + int(length[row])
             begun = []
-        elif whole[row]:
+        elif complete[row]:
             rejected.append(begin)
         else:
             begun.append(begin)

@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +212,25 @@ class Sweep:
     time_s: np.ndarray
     intensities: np.ndarray | None = None
 
+    def part(self, lines, beams=slice(None)) -> "Sweep":
+        """Some of the scan lines, and of their beams.
+
+        Parameters
+        ----------
+        lines, beams : slice or ndarray
+        """
+        intensities = self.intensities
+        if intensities is not None:
+            intensities = intensities[lines, beams]
+        return replace(
+            self,
+            ranges=self.ranges[lines, beams],
+            bearings=self.bearings[beams],
+            pitch=self.pitch[lines],
+            time_s=self.time_s[lines],
+            intensities=intensities,
+        )
+
 
 @dataclass(frozen=True)
 class Session:
@@ -285,23 +304,14 @@ class Session:
                 f"{self.path}: no placement {placement}; the session has {short(self.placements)}"
             )
         rows = self.scans["placement"] == placement
-        ranges = self.scans["ranges"][rows]
-        if not np.isfinite(ranges).any():
+        arrays: dict[str, Any] = {**self.scans, "placement": int(placement)}
+        sweep = Sweep(**arrays).part(rows)
+        if not np.isfinite(sweep.ranges).any():
             raise SessionError(
                 f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in "
                 "them"
             )
-        intensities = self.scans.get("intensities")
-        if intensities is not None:
-            intensities = intensities[rows]
-        return Sweep(
-            placement=int(placement),
-            ranges=ranges,
-            bearings=self.scans["bearings"],
-            pitch=self.scans["pitch"][rows],
-            time_s=self.scans["time_s"][rows],
-            intensities=intensities,
-        )
+        return sweep
 
     def images(
         self,

@@ -2,11 +2,13 @@
 
 import math
 import os
+from collections.abc import Mapping
 from io import BytesIO
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 from numpy.lib import format as npy
+from numpy.typing import ArrayLike
 
 from lrfcal_lib.session.files import (
     SessionError,
@@ -20,7 +22,6 @@ from lrfcal_lib.session.files import (
 from lrfcal_lib.session.stated import MILLIMETRES
 from lrfcal_lib.session.telegrams import read_telegrams
 
-SOURCES = ("lrf/scans.npz", "lrf/telegrams.bin")
 ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
 ENTRY = b"PK\1\2"  # begins each line of an archive's table of contents
 MOST_ENTRIES = 100  # of an archive; a session's has the six arrays
@@ -38,7 +39,8 @@ def read_scans(path):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or
     None).
     """
-    arrays, telegrams = (path / name for name in SOURCES)
+    arrays = path / "lrf/scans.npz"
+    telegrams = path / "lrf/telegrams.bin"
     if os.path.lexists(arrays):
         return read_npz(arrays, path), None
     if os.path.lexists(telegrams):
@@ -69,9 +71,11 @@ def read_npz(file, within):
             f"{file}: holds {entries} files, more than {MOST_ENTRIES}; write it again with the "
             f"arrays {short(ARRAYS)} only"
         )
-    with reading(file, "cannot be read ({}); truncated?"):
-        with ZipFile(BytesIO(content)) as archive:
-            scans = _read_arrays(file, archive)
+    with (
+        reading(file, "cannot be read ({}); truncated?"),
+        ZipFile(BytesIO(content)) as archive,
+    ):
+        scans = _read_arrays(file, archive)
     with naming(file):
         return check_scans(scans)
 
@@ -108,7 +112,7 @@ def _read_arrays(file, archive):
     return scans
 
 
-def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def check_scans(scans: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
     """Scan lines with consistent shapes and credible units.
 
     Parameters
@@ -131,20 +135,24 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if ranges.ndim != 2:
         raise ValueError(f"ranges must be scan lines x beams, got shape {ranges.shape}")
     lines, beams = ranges.shape
-    lengths = {"bearings": beams, "placement": lines, "pitch": lines, "time_s": lines}
-    shapes: dict[str, tuple] = {key: (length,) for key, length in lengths.items()}
-    if "intensities" in scans:
-        shapes["intensities"] = (lines, beams)
-    for key, shape in shapes.items():
-        if scans[key].shape != shape:
-            raise ValueError(
-                f"{key} has shape {scans[key].shape}, the ranges {ranges.shape} ask for {shape}"
-            )
-    scans = {
-        key: np.asarray(scans[key], int if key == "placement" else float) for key in shapes
+    shapes = {
+        "bearings": (beams,),
+        "placement": (lines,),
+        "pitch": (lines,),
+        "time_s": (lines,),
     }
+    if "intensities" in scans:
+        shapes["intensities"] = ranges.shape
+    checked = {"ranges": ranges}
+    for key, shape in shapes.items():
+        values = np.asarray(scans[key], int if key == "placement" else float)
+        if values.shape != shape:
+            raise ValueError(
+                f"{key} has shape {values.shape}, the ranges {ranges.shape} ask for {shape}"
+            )
+        checked[key] = values
     seen = ranges[np.isfinite(ranges)]
-    if seen.size == 0:
+    if not seen.size:
         raise ValueError(f"no range in {lines} scan lines (all NaN): nothing was recorded")
     if np.median(seen) > LONGEST_MEDIAN_RANGE:
         raise ValueError(f"the median range is {np.median(seen):g} m: {MILLIMETRES}")
@@ -152,14 +160,14 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         raise ValueError(
             f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN"
         )
-    _check_angles("bearing", scans["bearings"], 2 * np.pi)
-    _check_angles("pitch", scans["pitch"], np.pi)
-    if np.any(np.diff(scans["bearings"]) <= 0):
+    _check_angles("bearing", checked["bearings"], 2 * np.pi)
+    _check_angles("pitch", checked["pitch"], np.pi)
+    if np.any(np.diff(checked["bearings"]) <= 0):
         raise ValueError(
             "bearings must ascend (0 right, pi/2 ahead): turn the columns of the ranges round"
         )
-    ranges[~(ranges > 0) | np.isinf(ranges)] = np.nan
-    return {**scans, "ranges": ranges}
+    ranges[(ranges == 0) | np.isinf(ranges)] = np.nan
+    return checked
 
 
 def _check_angles(name, angles, limit):
@@ -167,6 +175,6 @@ def _check_angles(name, angles, limit):
     endless = np.sum(~np.isfinite(angles))
     if endless:
         raise ValueError(f"{endless} values of {name} are not finite")
-    largest = np.abs(angles).max(initial=0)
+    largest = np.abs(angles).max()
     if largest > limit + 1e-6:
         raise ValueError(f"a {name} is {largest:g} rad: degrees? Convert to radians")

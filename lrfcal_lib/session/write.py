@@ -190,20 +190,20 @@ class SessionWriter:
                 "another one"
             )
         ranges = np.array(ranges, float, ndmin=2)
-        bearings = np.asarray(bearings, float)
-        scans = {
+        if np.ndim(time_s) == 0:
+            time_s = np.full(len(ranges), time_s)
+        recorded = {
             "ranges": ranges,
             "bearings": bearings,
-            "pitch": np.asarray(pitch, float),
-            "time_s": np.asarray(time_s, float),
+            "pitch": pitch,
+            "time_s": time_s,
             "placement": np.full(len(ranges), placement),
         }
-        if np.ndim(time_s) == 0:
-            scans["time_s"] = np.full(len(ranges), time_s)
         if intensities is not None:
-            scans["intensities"] = np.asarray(intensities, float)
+            recorded["intensities"] = intensities
         with naming(f"{self.path}: placement {placement}"):
-            scans = check_scans(scans)
+            scans = check_scans(recorded)
+            bearings = scans["bearings"]
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError(
                     "the bearings differ from those of the sweeps before: one grid a session"
