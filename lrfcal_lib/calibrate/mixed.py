@@ -112,10 +112,11 @@ def _beside(ranges, spots, sigma):
         beside.append(around[line + by_line * lines, beam + by_beam * beams])
     away = np.reshape(beside, (2, 9, *ranges.shape)) - ranges
     away = np.nan_to_num(away, nan=np.inf)
-    both = np.stack([away, away[:, ::-1]])  # opposite ones
-    least = np.abs(both).min(axis=0)
+    apart = np.abs(away)
+    least = np.minimum(apart, apart[:, ::-1])  # of opposite ones
     other = (least > 3 * sigma) & (least < PULSE)
-    farther = (both[:, 1].min(axis=0) > 2 * sigma) & (least[1] < PULSE)
+    farther = np.minimum(away[1], away[1, ::-1]) > 2 * sigma
+    farther &= least[1] < PULSE
     nearer = np.where(away > -PULSE, -away, 0.0).max(axis=(0, 1))
     return other.any(axis=(0, 1)), farther.any(axis=0), nearer
 
