@@ -11,7 +11,8 @@ from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.simulate.beam import ideal_readings, measured
 from lrfcal_lib.simulate.rig import Setup, load_setup
-from lrfcal_lib.simulate.scene import Thing, World, box, cylinder, rectangle
+from lrfcal_lib.simulate.scene import Thing, World
+from lrfcal_lib.simulate.shapes import box, cylinder, rectangle
 from lrfcal_lib.simulate.textures import plain
 
 FLOOR = -1.1

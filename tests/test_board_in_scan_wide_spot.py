@@ -12,7 +12,8 @@ from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.beam import LMS221, ideal_readings
-from lrfcal_lib.simulate.scene import Thing, World, plain, polygon, rectangle
+from lrfcal_lib.simulate.scene import Thing, World, plain
+from lrfcal_lib.simulate.shapes import polygon, rectangle
 
 HEAD = RigidTransform.identity()
 BOARD = triangle_board()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.calibrate.observe import RecordedSource
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_covariance, polar_to_points
 from lrfcal_lib.model.kinematics import (
     AS_RECORDED,
@@ -31,7 +30,7 @@ PITCH = np.radians([-20.0, -3.0, 4.0, 18.0])
 
 
 def source(mount, corrections):
-    return RecordedSource(4, SourceFrame(HEAD, mount, image_pitch=0.1), corrections)
+    return SourceFrame(HEAD, mount, 0.1, 4, corrections)
 
 
 @pytest.mark.parametrize("mount", ["head", "platform"])
@@ -52,10 +51,14 @@ def test_a_range_offset_does_not_shrink_the_noise(mount):
 def test_rotation_and_derivative_are_those_of_the_points(mount):
     frame = SourceFrame(HEAD, mount, image_pitch=0.1)
     p_lrf = polar_to_points(RANGES, BEARINGS)
-    origin = frame.apply(np.zeros_like(p_lrf), PITCH)
-    rotated = (frame.rotation(PITCH) @ p_lrf[..., None])[..., 0]
-    np.testing.assert_allclose(frame.apply(p_lrf, PITCH), origin + rotated, atol=1e-14)
-    beside = [frame.apply(p_lrf, PITCH + step) for step in (1e-6, -1e-6)]
+    rotated = frame.points(p_lrf, PITCH) - frame.points(np.zeros_like(p_lrf), PITCH)
+    outer = "ni,nj->nij"
+    np.testing.assert_allclose(
+        frame.covariance(np.einsum(outer, p_lrf, p_lrf), PITCH),
+        np.einsum(outer, rotated, rotated),
+        atol=1e-14,
+    )
+    beside = [frame.points(p_lrf, PITCH + step) for step in (1e-6, -1e-6)]
     np.testing.assert_allclose(
         frame.by_pitch(p_lrf, PITCH), (beside[0] - beside[1]) / 2e-6, atol=1e-8
     )
@@ -64,11 +67,11 @@ def test_rotation_and_derivative_are_those_of_the_points(mount):
 @pytest.mark.parametrize("corrections", [AS_RECORDED, WRONG])
 def test_a_point_reaches_a_camera_on_the_head_over_the_base_as_well(corrections):
     """Through the frame the camera is fixed to, or through the platform and the camera's pose at that pitch."""
-    frame = SourceFrame(HEAD, "head", image_pitch=0.1)
-    p_lrf = corrections.points(polar_to_points(RANGES, BEARINGS))
+    recorded = polar_to_points(RANGES, BEARINGS)
+    direct = CAMERA.apply(source("head", corrections).points(recorded, PITCH))
+    p_lrf = corrections.points(recorded)
     pitch = corrections.pitch(4, PITCH)
-    direct = CAMERA.apply(frame.apply(p_lrf, pitch))
-    T_camera_platform = camera_at(CAMERA, "head", HEAD, 0.1)
+    T_camera_platform = camera_at(CAMERA, "head", HEAD, corrections.pitch(4, 0.1))
     np.testing.assert_allclose(
         T_camera_platform.apply(lrf_to_platform(p_lrf, pitch, HEAD)), direct, atol=1e-12
     )
@@ -88,9 +91,9 @@ def test_corrections_take_off_what_was_added():
 def test_head_and_platform_sources_agree_through_the_head():
     """And a camera on the head sees a scan at its own pitch unchanged."""
     p_lrf = polar_to_points(RANGES, BEARINGS)
-    on_head = SourceFrame(HEAD, "head", 0.2).apply(p_lrf, PITCH)
-    on_base = SourceFrame(HEAD, "platform").apply(p_lrf, PITCH)
+    on_head = SourceFrame(HEAD, "head", 0.2).points(p_lrf, PITCH)
+    on_base = SourceFrame(HEAD, "platform").points(p_lrf, PITCH)
     np.testing.assert_allclose(lrf_to_platform(on_head, 0.2, HEAD), on_base, atol=1e-14)
     np.testing.assert_allclose(
-        SourceFrame(HEAD, "head", 0.3).apply(p_lrf, np.full(4, 0.3)), p_lrf, atol=1e-14
+        SourceFrame(HEAD, "head", 0.3).points(p_lrf, np.full(4, 0.3)), p_lrf, atol=1e-14
     )

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.simulate.beam import LMS221, echo, ideal_readings, scan
-from lrfcal_lib.simulate.scene import Thing, World, plain, rectangle
+from lrfcal_lib.simulate.scene import Thing, World, plain
+from lrfcal_lib.simulate.shapes import rectangle
 
 HEAD = RigidTransform.identity()
 UPRIGHT = Rotation.from_euler("x", 90, degrees=True)

@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.simulate import scene
 from lrfcal_lib.simulate.rig import printed_triangle
 from lrfcal_lib.simulate.scene import (
     Exposure,
@@ -18,8 +17,8 @@ from lrfcal_lib.simulate.scene import (
     World,
     chessboard,
     plain,
-    polygon,
 )
+from lrfcal_lib.simulate.shapes import polygon, rectangle
 
 HERE = RigidTransform.identity()
 LENS = CameraModel(
@@ -31,7 +30,7 @@ LIGHT = Lights(np.array([[0.3, -1.0, -0.5]]), np.array([0.6]), 0.5)
 
 def sheet(size, albedo, by):
     return Thing(
-        scene.rectangle(size, size),
+        rectangle(size, size),
         (plain, (albedo,) * 3),
         RigidTransform.from_translation(by),
     )

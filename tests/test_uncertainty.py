@@ -39,7 +39,7 @@ def moved_points(chain, bearing, pitch, distance, change, image_pitch):
     scale = lambda angle: angle * (1 + change[11]) + change[12]  # noqa: E731
     p = geometry.polar_to_points(distance - change[10], bearing)
     frame = SourceFrame(head, "head" if chain.on_head else "platform", scale(image_pitch))
-    source = frame.apply(p, scale(pitch))
+    source = frame.points(p, scale(pitch))
     if chain.camera is None:
         return source
     return geometry.pose_transform(geometry.move_pose(chain.camera, change[4:10])).apply(

@@ -317,20 +317,20 @@ def _photo(imager, scene, T_camera_platform, rng):
     T, lines, _, _, _ = scene["camera"]
     R = back.rotation.as_matrix().T
     light = cv2.resize(
-        _light(imager.grid[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE], R, back.translation, scene),
+        _light(imager.rays[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE], R, back.translation, scene),
         (model.width, model.height), interpolation=cv2.INTER_LINEAR,
     )  # fmt: skip
     rows, columns = _where(imager, T, lines, R, back.translation)
     if rows.stop > rows.start and columns.stop > columns.start:
         f = (np.arange(SAMPLES) + 0.5) / SAMPLES
-        grid = imager.grid[rows.start : rows.stop + 1, columns.start : columns.stop + 1]
+        grid = imager.rays[rows.start : rows.stop + 1, columns.start : columns.stop + 1]
         down = f[:, None, None]
         side = f[None, :, None]
         top = grid[:-1, None, :-1, None] * (1 - side) + grid[:-1, None, 1:, None] * side
         low = grid[1:, None, :-1, None] * (1 - side) + grid[1:, None, 1:, None] * side
         rays = (
             top * (1 - down[:, None]) + low * down[:, None]
-        )  # (rows, SAMPLES, columns, SAMPLES, 2)
+        )  # (rows, SAMPLES, columns, SAMPLES, 3)
         light[rows, columns] = _light(rays, R, back.translation, scene).mean(axis=(1, 3))
     level = 250.0 * cv2.GaussianBlur(light, (0, 0), BLUR)
     grey = np.clip(np.rint(level + rng.normal(0, NOISE, level.shape)), 0, 255).astype(
@@ -342,16 +342,14 @@ def _photo(imager, scene, T_camera_platform, rng):
 
 
 def _light(rays, R, centre, scene):
-    """Light along viewing rays (..., 2) of a camera at `centre` whose axes are the rows of `R`."""
-    flat = rays.reshape(-1, 2)
-    direction = np.column_stack([flat, np.ones(len(flat))]) @ R
+    """Light along viewing rays (..., 3) of a camera at `centre` whose axes are the rows of `R`."""
+    direction = rays.reshape(-1, 3) @ R
     return _cast(centre[None], direction, *scene["camera"])[1].reshape(rays.shape[:-1])
 
 
 def _where(imager, T, lines, R, centre):
     """Rows and columns of pixels about the board: those whose viewing ray meets its outline, with some more."""
-    grid = imager.grid[:-1:COARSE, :-1:COARSE]
-    direction = np.concatenate([grid, np.ones((*grid.shape[:2], 1))], axis=-1) @ R
+    direction = imager.rays[:-1:COARSE, :-1:COARSE] @ R
     reach = (T[:, 2] @ (T[:, 3] - centre)) / (direction @ T[:, 2])
     at = (centre + reach[..., None] * direction - T[:, 3]) @ T[:, :2]
     met = np.all(at @ lines[:, :2].T + lines[:, 2] < 0, axis=-1) & (reach > 0)

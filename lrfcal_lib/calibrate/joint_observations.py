@@ -66,8 +66,8 @@ def _ranges(scans):
             "range": np.linalg.norm(p_lrf, axis=1),
             "bearing": np.arctan2(p_lrf[:, 1], p_lrf[:, 0]),
             "pitch": pitch,
-            "sigma": np.full(len(pitch), scan.sigma_range),
-            "placement": np.full(len(pitch), row),
+            "sigma": scan.sigma_range,
+            "placement": row,
         }
 
 
@@ -88,8 +88,8 @@ def _beams(prepared, scans):
                 "radius": about.radius,
                 "background": about.background,
                 "step": about.step * about.range_m,
-                "edge": np.full(len(about), prepared.board.edges.index(name)),
-                "placement": np.full(len(about), row),
+                "edge": prepared.board.edges.index(name),
+                "placement": row,
             }
 
 
@@ -107,14 +107,14 @@ def _views(prepared, views, placements):
                     np.isfinite(view.pixels).all(axis=1)
                 ]
             yield {
-                "camera": [number],
-                "pitch": [np.nan_to_num(view.pitch)],
                 "pose": [view.T_camera_board.as_matrix()],
                 "covariance": [view.covariance],
-                "placement": [placements.index(view.placement)],
                 "lens": [
                     pose_by_intrinsics(
                         view.T_camera_board, visible, prepared.models[camera]
                     )
                 ],
+                "camera": number,
+                "pitch": np.nan_to_num(view.pitch),
+                "placement": placements.index(view.placement),
             }

@@ -3,8 +3,8 @@ and stacked as observations.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from itertools import combinations, pairwise, product
+from dataclasses import dataclass, replace
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,9 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard, measure_board
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections, SourceFrame
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations, thin
-from lrfcal_lib.preprocess.board_in_scan import BoardScan, face_points
+from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_scan import ScanEdges
 from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
 
@@ -64,6 +63,7 @@ def observe(
     T_head_lrf = platform_of(prepared, T_head_lrf)
     views = prepared.views[camera]
     posed = prepared.posed(camera)
+    rule = "last_beam" if variant == ONE_SCAN else variant
     on_faces = []
     crossed = []
     for placement, scan in prepared.scans.items():
@@ -71,15 +71,13 @@ def observe(
             continue
         source = source_of(prepared, camera, placement, T_head_lrf, corrections)
         if placement in posed and faces:
-            on_faces.append(source.face(scan, faces))
+            on_faces.append(_face(source, scan, faces))
+        sides = named_sides(prepared, placement, rule)
         if variant == ONE_SCAN:
-            sides = _one_scan_line(prepared, placement, views[placement])
-        else:
-            sides = named_sides(prepared, placement, variant)
+            sides = _one_scan_line(prepared.board.features, views[placement], sides)
         crossed += _crossings(prepared, views[placement], source, sides, crossings)
     corners: Iterable[dict] = ()
     if faces:
-        rule = "last_beam" if variant == ONE_SCAN else variant
         corners = _corners(prepared, camera, rule, T_head_lrf)
     pattern = prepared.pattern_points
     model = prepared.models[camera]
@@ -130,14 +128,24 @@ def platform_observations(
         feature = _feature_sides(prepared.edges[variant][placement], swept)
         for number, (edges, side) in enumerate(feature, 1):
             rows = thin(np.flatnonzero(edges.side == side.side), PLATFORM_POINTS)
-            columns = {
-                name: getattr(edges, name)[rows]
-                for name in ("points", "covariance", "pitch")
+            sides.append(
+                {
+                    "points": edges.points[rows],
+                    "covariance": edges.covariance[rows],
+                    "pitch": edges.pitch[rows],
+                    "placement": placement,
+                    "number": number,
+                }
+            )
+        points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
+        faces.append(
+            {
+                "points": points,
+                "covariance": covariance,
+                "pitch": pitch,
+                "placement": placement,
             }
-            columns["placement"] = np.full(len(rows), placement)
-            columns["number"] = np.full(len(rows), number)
-            sides.append(columns)
-        faces.append(face_columns(prepared.scans[placement], placement, FACE_POINTS))
+        )
     return PlatformObservations(**stack("edge_", sides), **stack("face_", faces))
 
 
@@ -184,65 +192,17 @@ def outline_of(
 
 
 def stack(prefix: str, parts: Iterable[dict]) -> dict[str, Any]:
-    """Parts of a table end to end: its columns by name, with a prefix; none without parts."""
-    parts = list(parts)
-    if not parts:
-        return {}
-    return {prefix + key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    """Parts of a table end to end: its columns by name, with a prefix; none without parts.
 
-
-@dataclass(frozen=True)
-class RecordedSource:
-    """Points of one placement as recorded, moved into the frame that a camera is fixed to.
-
-    Known errors of ranges and pitch are taken out first; they change where a point lies, but not
-    how its noise turns.
+    The first column of a part has its rows; a number or a name alone is the same in all of them.
     """
-
-    placement: int
-    frame: SourceFrame
-    corrections: Corrections = AS_RECORDED
-
-    def points(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-        """Measured points (n, 3) at their recorded pitch (n,), in the camera's source frame,
-        metres.
-        """
-        corrected = self.corrections.pitch(self.placement, pitch)
-        return self.frame.apply(self.corrections.points(p_lrf), corrected)
-
-    def covariance(self, covariance: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-        """Covariances (n, 3, 3) of measured points, turned into the source frame."""
-        R = self.frame.rotation(self.corrections.pitch(self.placement, pitch))
-        return R @ covariance @ R.mT
-
-    def by_pitch(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-        """Derivative (n, 3) of :meth:`points` by an error of the recorded pitch, metres a
-        radian.
-        """
-        corrected = self.corrections.pitch(self.placement, pitch)
-        return self.frame.by_pitch(self.corrections.points(p_lrf), corrected)
-
-    def face(self, scan: BoardScan, count: int) -> dict[str, np.ndarray]:
-        """At most `count` points of a board's face, with covariance, pitch and placement: columns
-        by name.
-        """
-        columns = face_columns(scan, self.placement, count)
-        pitch = columns["pitch"]
-        return columns | {
-            "points": self.points(columns["points"], pitch),
-            "covariance": self.covariance(columns["covariance"], pitch),
-        }
-
-
-def face_columns(scan: BoardScan, placement: int, count: int) -> dict[str, np.ndarray]:
-    """At most `count` points of a board's face as recorded, columns by name."""
-    points, pitch, covariance = face_points(scan, count)
-    return {
-        "points": points,
-        "covariance": covariance,
-        "pitch": pitch,
-        "placement": np.full(len(pitch), placement),
-    }
+    columns: dict = {}
+    for part in parts:
+        count = len(next(iter(part.values())))
+        for key, value in part.items():
+            column = np.broadcast_to(value, np.shape(value) or count)
+            columns.setdefault(prefix + key, []).append(column)
+    return {key: np.concatenate(column) for key, column in columns.items()}
 
 
 def source_of(
@@ -251,7 +211,7 @@ def source_of(
     placement: int,
     T_head_lrf: RigidTransform,
     corrections: Corrections = AS_RECORDED,
-) -> RecordedSource:
+) -> SourceFrame:
     """A placement in the frame that one of its cameras is fixed to.
 
     Parameters
@@ -264,19 +224,18 @@ def source_of(
 
     Returns
     -------
-    RecordedSource
+    SourceFrame
     """
     mount = prepared.session.cameras[camera].mount
-    image_pitch = corrections.pitch(placement, prepared.views[camera][placement].pitch)
-    frame = SourceFrame(T_head_lrf, mount, float(image_pitch))
-    return RecordedSource(placement, frame, corrections)
+    pitch = prepared.views[camera][placement].pitch
+    return SourceFrame(T_head_lrf, mount, pitch, placement, corrections)
 
 
 def in_platform(
     placement: int, T_head_lrf: RigidTransform, corrections: Corrections = AS_RECORDED
-) -> RecordedSource:
+) -> SourceFrame:
     """A placement in the platform frame."""
-    return RecordedSource(placement, SourceFrame(T_head_lrf, "platform"), corrections)
+    return SourceFrame(T_head_lrf, "platform", 0.0, placement, corrections)
 
 
 def platform_of(
@@ -351,14 +310,11 @@ def named_sides(
     """
     along = prepared.edges[variant][placement]
     swept = prepared.swept[variant].get(placement)
-    lengths = {}
-    if stretch > 0:
-        lengths = prepared.board.lengths()
     for number, name in prepared.names.get(placement, {}).items():
         across = number not in along.side
         edges = swept if across else along
         length = next((side.length for side in edges.sides if side.side == number), 0.0)
-        if length >= stretch * lengths.get(name, 0.0):
+        if length >= stretch * prepared.board.lengths()[name]:
             yield NamedSide(name, edges, np.flatnonzero(edges.side == number), across)
 
 
@@ -369,27 +325,37 @@ def _boards_in_images(posed, corners):
     unseen = np.full((corners, 2), np.nan)
     for placement, view in posed.items():
         yield {
-            "placements": [placement],
             "board_poses": [view.T_camera_board.as_matrix()],
+            "placements": placement,
             "board_covariance": [view.covariance],
             "pattern_pixels": [unseen if view.pixels is None else view.pixels],
         }
 
 
-def _one_scan_line(prepared, placement, view):
-    """The paper's choice: of the two edges of `features`, the last beams of the middle one of the
-    lines crossing both.
+def _face(source, scan, count):
+    """At most `count` points of a board's face: columns by name."""
+    p_lrf, pitch, covariance = face_points(scan, count)
+    return {
+        "points": source.points(p_lrf, pitch),
+        "covariance": source.covariance(covariance, pitch),
+        "pitch": pitch,
+        "placement": source.placement,
+    }
+
+
+def _one_scan_line(features, view, sides):
+    """The paper's choice: of the two edges of `features`, the points of the middle one of the lines
+    crossing both.
     """
-    features = [name for name in prepared.board.features if view.edge(name) is not None]
-    sides = named_sides(prepared, placement, "last_beam")
-    sides = [side for side in sides if side.name in features and not side.across]
+    seen = [name for name in features if view.edge(name) is not None]
+    sides = [side for side in sides if side.name in seen and not side.across]
     if len(sides) != 2:
         return
     both = np.intersect1d(*(side.edges.line[side.rows] for side in sides))
     middle = both[len(both) // 2 :][:1]
     for side in sides:
-        rows = side.rows[np.isin(side.edges.line[side.rows], middle)]
-        yield NamedSide(side.name, side.edges, rows, side.across)
+        on_it = np.isin(side.edges.line[side.rows], middle)
+        yield replace(side, rows=side.rows[on_it])
 
 
 def _crossings(prepared, view, source, sides, count):
@@ -401,7 +367,6 @@ def _crossings(prepared, view, source, sides, count):
             continue
         edges = side.edges
         rows = thin(side.rows, count)
-        n = len(rows)
         p_lrf = edges.points[rows]
         pitch = edges.pitch[rows]
         sigma_pitch = prepared.pitch_noise.sigma(pitch, middle)
@@ -413,11 +378,11 @@ def _crossings(prepared, view, source, sides, count):
             "covariance": source.covariance(edges.covariance[rows], pitch) + pitch_error,
             "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
             "background": edges.background[rows],
-            "lines": np.tile(edge.line, (n, 1)),
-            "line_sigma": np.full(n, np.sqrt(edge.covariance[0, 0])),
-            "placement": np.full(n, source.placement),
-            "edge": np.full(n, side.name),
-            "across": np.full(n, side.across),
+            "lines": np.tile(edge.line, (len(rows), 1)),
+            "line_sigma": np.sqrt(edge.covariance[0, 0]),
+            "placement": source.placement,
+            "edge": side.name,
+            "across": side.across,
         }
 
 
@@ -425,33 +390,31 @@ def _corners(prepared, camera, variant, T_head_lrf) -> Iterator[dict]:
     """Corners of the outline that the cloud and the image can both name: where two fitted edges
     meet.
     """
-    on_head = prepared.session.cameras[camera].mount == "head"
-    around = [*prepared.board.edges[-1:], *prepared.board.edges]
-    for placement in prepared.names:
-        view = prepared.views[camera].get(placement)
-        swept = placement in prepared.scans and placement in prepared.swept[variant]
-        if view is None or not swept:
+    names = prepared.board.edges
+    for placement, view in prepared.views[camera].items():
+        if placement not in prepared.names or placement not in prepared.swept[variant]:
             continue
         board, _ = outline_of(prepared, placement, variant, T_head_lrf)
-        for before, name in pairwise(around):
+        T_source_platform = source_of(
+            prepared, camera, placement, T_head_lrf
+        ).T_source_platform
+        for name in board.corners:
+            before = names[names.index(name) - 1]
             edge = view.edge(name)
             previous = view.edge(before)
-            if name not in board.corners or edge is None or previous is None:
+            if edge is None or previous is None:
                 continue
             corner = board.corner_point(name)
             error = _pitch_error(prepared, corner, board.T_platform_plane[:3, 3])
-            if on_head:
-                back = T_head_lrf.inv()
-                corner = back.apply(tilt(corner, -view.pitch))
-                error = back.rotation.apply(tilt(error, -view.pitch))
+            error = T_source_platform.rotation.apply(error)
             # not averaged down: neighbours share errors
             scatter = max(board.scatter[name], board.scatter[before])
             yield {
-                "points": corner[None],
+                "points": T_source_platform.apply(corner)[None],
                 "covariance": [scatter**2 * np.eye(3) + np.outer(error, error)],
                 "pixels": [corners_of_lines(np.stack([previous.line, edge.line]))[1]],
-                "sigma_px": [np.sqrt(edge.covariance[0, 0] + previous.covariance[0, 0])],
-                "placement": [placement],
+                "sigma_px": np.sqrt(edge.covariance[0, 0] + previous.covariance[0, 0]),
+                "placement": placement,
             }
 
 
@@ -468,9 +431,10 @@ def _feature_sides(along, swept):
     """The longest pair of perpendicular sides, else the longest side: tuple of (ScanEdges,
     ScanSide).
     """
-    known = {side.side for side in along.sides}
-    sides = [(along, side) for side in along.sides]
-    sides += [(swept, side) for side in swept.sides if side.side not in known]
+    numbered = {
+        side.side: (edges, side) for edges in (swept, along) for side in edges.sides
+    }
+    sides = [numbered[number] for number in sorted(numbered)]
     pairs = []
     for one, other in combinations(sides, 2):
         if abs(one[1].direction @ other[1].direction) < RIGHT_ANGLE:

@@ -88,10 +88,10 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
         painted = np.flatnonzero((cloud.image == view.number) & np.isfinite(depth))
         eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
         blocked[painted] = _hidden(world, eye, true[painted])
-    light = 255 * world.radiance(origins, directions, hits)
+    light = 255 * world.radiance(hits)
     return SceneErrors(
         depth=depth,
-        normal=depth * np.abs(np.vecdot(world.normals[hits.face], directions)),
+        normal=depth * hits.cosine,
         color=_color_errors(cloud, light),
         blocked=blocked,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import lrf_to_platform, tilt
+from lrfcal_lib.model.geometry import lrf_to_platform
 
 TILT_AXIS = np.array([1.0, 0.0, 0.0])  # of the head and of the platform
 MIRROR_TURN = (
@@ -72,7 +72,10 @@ AS_RECORDED = Corrections()
 
 @dataclass(frozen=True)
 class SourceFrame:
-    """The frame that a camera is fixed to, as scan lines at any pitch reach it.
+    """The frame that a camera is fixed to, as points of scans reach it as they are recorded.
+
+    Known errors of ranges and pitch are taken out first; they change where a point lies, but not
+    how its noise turns.
 
     Attributes
     ----------
@@ -80,43 +83,46 @@ class SourceFrame:
     mount : {'head', 'platform'}
         What the camera is fixed to.
     image_pitch : float
-        True pitch at which the image was taken, radians; it matters for a camera on the head only.
+        Recorded when the image was taken, radians; it matters for a camera on the head only.
+    placement : int or None
+        Of scans and image.
+    corrections : Corrections
     """
 
     T_head_lrf: RigidTransform
     mount: str
     image_pitch: float = 0.0
-
-    def apply(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-        """Points (..., 3) of scans at some true pitch (...), moved from the LRF frame to this one,
-        metres.
-        """
-        p_platform = lrf_to_platform(p_lrf, self._turn(pitch), self.T_head_lrf)
-        return self._from_platform.apply(p_platform)
-
-    def rotation(self, pitch: np.ndarray) -> np.ndarray:
-        """Rotation matrices (n, 3, 3) from the LRF at some true pitch (n,) to this frame."""
-        turn = Rotation.from_rotvec(np.multiply.outer(self._turn(pitch), TILT_AXIS))
-        R_platform_lrf = turn * self.T_head_lrf.rotation
-        return (self._from_platform.rotation * R_platform_lrf).as_matrix()
-
-    def by_pitch(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-        """Derivative (n, 3) of :meth:`apply` by the pitch, metres a radian."""
-        p_platform = tilt(self.T_head_lrf.apply(p_lrf), self._turn(pitch))
-        return self._from_platform.rotation.apply(np.cross(TILT_AXIS, p_platform))
+    placement: int | None = None
+    corrections: Corrections = AS_RECORDED
 
     @property
-    def _from_platform(self):
-        """The transform to this frame while the head stands at the pitch of the image."""
-        if self.mount == "platform":
-            return RigidTransform.identity()
-        return self.T_head_lrf.inv()
+    def T_source_platform(self) -> RigidTransform:
+        """While the head stands at the pitch of the image."""
+        pitch = self.corrections.pitch(self.placement, self.image_pitch)
+        return camera_at(RigidTransform.identity(), self.mount, self.T_head_lrf, pitch)
 
-    def _turn(self, pitch):
-        """By how much the head turns from where the points of this frame are taken to be seen."""
-        if self.mount == "platform":
-            return np.asarray(pitch)
-        return np.asarray(pitch) - self.image_pitch
+    def points(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+        """Measured points (..., 3) at their recorded pitch (...), in this frame, metres."""
+        return self.T_source_platform.apply(self._in_platform(p_lrf, pitch))
+
+    def covariance(self, covariance: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+        """Covariances (n, 3, 3) of measured points, turned into this frame."""
+        corrected = self.corrections.pitch(self.placement, pitch)
+        turn = Rotation.from_rotvec(np.multiply.outer(corrected, TILT_AXIS))
+        R_source_head = self.T_source_platform.rotation * turn
+        R = (R_source_head * self.T_head_lrf.rotation).as_matrix()
+        return R @ covariance @ R.mT
+
+    def by_pitch(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+        """Derivative (n, 3) of :meth:`points` by an error of the recorded pitch, metres a
+        radian.
+        """
+        moved = np.cross(TILT_AXIS, self._in_platform(p_lrf, pitch))
+        return self.T_source_platform.rotation.apply(moved)
+
+    def _in_platform(self, p_lrf, pitch):
+        corrected = self.corrections.pitch(self.placement, pitch)
+        return lrf_to_platform(self.corrections.points(p_lrf), corrected, self.T_head_lrf)
 
 
 def camera_at(

@@ -221,14 +221,8 @@ def ideal_readings(
     origins = origins.reshape(-1, 3)
     directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
     hits = world.cast(origins, directions)
-    seen = hits.face >= 0
-    distance = hits.distance[seen]
-    points = origins[seen] + distance[:, None] * directions[seen]
-    normals = world.normals[hits.face[seen]]
-    cosine = np.abs(np.sum(normals * directions[seen], axis=1))
-    albedo = world.infrared(points, hits.thing[seen])
-    energy = np.zeros(len(seen))
-    energy[seen] = albedo * cosine / distance**2 / beam.rays
+    reflected = world.infrared(hits.points, hits.thing) * hits.cosine
+    energy = reflected / hits.distance**2 / beam.rays
     shape = len(bearings), beam.rays
     reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
     dazzled = world.dazzling[hits.thing].reshape(shape).any(axis=1)

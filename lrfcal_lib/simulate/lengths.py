@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib.simulate.scene import ROOM, furnished, need
+from lrfcal_lib.simulate.shapes import BOX_CORNERS
 
 LENGTHS = json.loads(Path(__file__).with_name("lengths.json").read_text())
 PARALLEL = 1e-9  # sine of the angle between the ends of a length
@@ -52,9 +53,9 @@ def _corners(part, number, sides):
         sizes = sizes[0]
     else:
         need(shape == "rectangle", f"{part} {number} is a {shape}: it has no such faces")
-    signs = np.array(list(np.ndindex(2, 2, 2)), float) * 2 - 1
+    signs = BOX_CORNERS
     for sign, axis in zip(sides[::2], sides[1::2], strict=True):
-        signs = signs[signs[:, "xyz".index(axis)] == float(f"{sign}1")]
+        signs = signs[signs[:, "xyz".index(axis)] == int(f"{sign}1")]
     corners = signs * np.resize([*sizes, 0.0], 3) / 2
     return furnished(part)[number].pose.apply(np.unique(corners, axis=0))
 

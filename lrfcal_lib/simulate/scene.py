@@ -2,7 +2,8 @@
 
 Things with textures stand in a furnished room (``room.json``).
 
-A row of ``room.json`` is a shape and a texture with their settings (functions of this module), the
+A row of ``room.json`` is a shape and a texture with their settings (functions of
+:mod:`lrfcal_lib.simulate.shapes` and :mod:`lrfcal_lib.simulate.textures`), the
 pose of the thing (``at``, metres; turned about the vertical, then tipped about its own x, degrees)
 and more settings of :class:`Thing`. Its numbers are kept to the last bit: the shipped sessions are
 rebuilt from them to the byte.
@@ -16,21 +17,22 @@ from typing import Annotated
 import numpy as np
 import open3d as o3d
 import pydantic
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, project, undistort
-from lrfcal_lib.model.geometry import plane_axes, unit_vector
-from lrfcal_lib.simulate import textures
+from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.simulate import shapes, textures
+from lrfcal_lib.simulate.shapes import polygon, rod
 from lrfcal_lib.simulate.textures import chessboard, plain
 
 FLOOR = -1.1  # metres, below the platform
 SKY = (0.95, 0.98, 1.0)  # light from where there is nothing
 FLAT = 0.03  # difference of light over a block of pixels below which its four corners tell the rest
 BLOCK = 2  # pixels
-Mesh = tuple[np.ndarray, np.ndarray]  # vertices (n, 3), metres, and faces (m, 3)
 BATCH = 1 << 19  # rays that are cast at once
 ROOM = json.loads(Path(__file__).with_name("room.json").read_text())
 
@@ -47,116 +49,11 @@ def need(good: object, words: str) -> None:
         raise ValueError(words)
 
 
-def polygon(corners: ArrayLike) -> Mesh:
-    """A flat convex sheet of no thickness in the plane z = 0.
-
-    Parameters
-    ----------
-    corners
-        Shape (n, 2), metres.
-    """
-    corners = np.asarray(corners, float)
-    fan = np.arange(1, len(corners) - 1)
-    faces = np.stack([0 * fan, fan, fan + 1], axis=1)
-    return np.column_stack([corners, np.zeros(len(corners))]), faces
-
-
-def rectangle(width: float, height: float) -> Mesh:
-    """A sheet about the origin in the plane z = 0.
-
-    Parameters
-    ----------
-    width, height
-        Along x and y, metres.
-    """
-    w = width / 2
-    h = height / 2
-    return polygon([[-w, -h], [w, -h], [w, h], [-w, h]])
-
-
-def grid_surface(points):
-    """A sheet through a grid of points, shape (rows, columns, 3)."""
-    rows, columns = points.shape[:2]
-    number = np.arange(rows * columns).reshape(rows, columns)
-    first = number[:-1, :-1].ravel()
-    low = np.stack([first, first + 1, first + columns], axis=1)
-    high = np.stack([first + 1, first + columns + 1, first + columns], axis=1)
-    return points.reshape(-1, 3), np.concatenate([low, high])
-
-
-def box(size):
-    """A box about the origin with edges along the axes."""
-    corners = np.array(list(np.ndindex(2, 2, 2)), float)[:, ::-1]  # x changes fastest
-    quads = np.array(
-        [
-            [0, 2, 3, 1],
-            [4, 5, 7, 6],
-            [0, 1, 5, 4],
-            [2, 6, 7, 3],
-            [0, 4, 6, 2],
-            [1, 3, 7, 5],
-        ]
-    )
-    faces = np.stack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], axis=1)
-    return (2 * corners - 1) * np.asarray(size, float) / 2, faces.reshape(-1, 3)
-
-
-def lathe(radius, height, sides=48):
-    """A body of revolution about z: its outline from below to above.
-
-    A radius of zero closes an end.
-    """
-    turn = np.linspace(0, 2 * np.pi, sides + 1)
-    radius = np.asarray(radius, float)[:, None]
-    height = np.asarray(height, float)[:, None]
-    x = radius * np.cos(turn)
-    y = radius * np.sin(turn)
-    return grid_surface(np.stack([x, y, height + 0 * turn], axis=-1))
-
-
-def cylinder(radius, height, sides=48, top=None):
-    """A closed cylinder about z from z = 0 upwards; `top` is the upper radius of a cone."""
-    return lathe(
-        [0, radius, radius if top is None else top, 0], [0, 0, height, height], sides
-    )
-
-
-def sphere(radius):
-    """A ball about the origin."""
-    turn = np.linspace(-np.pi / 2, np.pi / 2, 24)
-    return lathe(radius * np.cos(turn), radius * np.sin(turn))
-
-
-def rod(start, end, radius, sides=12):
-    """A thin round bar between two points."""
-    start = np.asarray(start, float)
-    end = np.asarray(end, float)
-    length = np.linalg.norm(end - start)
-    z = (end - start) / length
-    y, x = plane_axes(z)
-    vertices, faces = cylinder(radius, length, sides)
-    return start + vertices @ np.stack([x, -y, z]), faces
-
-
-def curtain(width, height, depth, folds):
-    """A hanging cloth in the plane y = 0, sine-shaped along x, `depth` from trough to crest."""
-    s = np.linspace(-0.5, 0.5, 24 * folds)
-    z = np.linspace(0.0, height, 5)[:, None]
-    swing = 0.7 + 0.3 * z / height  # less at the top
-    wave = depth / 2 * np.sin(2 * np.pi * folds * s) * swing
-    return grid_surface(np.stack(np.broadcast_arrays(width * s, wave, z), axis=-1))
-
-
-SHAPES = {
-    f.__name__: f for f in (polygon, rectangle, box, lathe, cylinder, sphere, rod, curtain)
-}
-
-
 @dataclass(frozen=True)
 class Thing:
     """A mesh with what its surface does with light."""
 
-    mesh: Mesh  # in the thing's own frame
+    mesh: np.ndarray  # corners of triangles (m, 3, 3) in the thing's own frame, metres
     # function of points (n, 3) in the thing's frame and settings to albedo (n, 3), then the
     # settings
     texture: tuple
@@ -172,21 +69,24 @@ class Thing:
 class Lights:
     """Point lights and the same light from everywhere.
 
-    Strengths (k,) are irradiances at 1 m and normal incidence, in units of full white.
+    Positions (k, 3) are in metres; strengths (k,) are irradiances at 1 m and normal incidence, in
+    units of full white.
     """
 
-    positions: np.ndarray
-    strengths: np.ndarray
+    positions: ArrayLike
+    strengths: ArrayLike
     ambient: float
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays end, metres (inf: nowhere), and numbers of the triangle and thing (-1: none)."""
+    """Where n rays end, and what is there."""
 
-    distance: np.ndarray
-    face: np.ndarray
-    thing: np.ndarray
+    distance: np.ndarray  # metres, inf: nowhere
+    points: np.ndarray  # (n, 3), metres; their origin for those that end nowhere
+    thing: np.ndarray  # its number, -1: none
+    normal: np.ndarray  # (n, 3), of its surface, on the side that the ray comes from
+    cosine: np.ndarray  # of the angle between the two
 
 
 class World:
@@ -198,28 +98,24 @@ class World:
 
     def __init__(self, things, lights=None):
         need(things, "a world needs at least one thing to see, got none")
-        self.things = tuple(things)
+        self.things = things
         self.lights = lights
         # by the number of a thing, the last: nothing
         self.dazzling = np.array([t.dazzles for t in things] + [False])
-        vertices = [thing.pose.apply(thing.mesh[0]) for thing in self.things]
-        starts = np.cumsum([0] + [len(v) for v in vertices[:-1]])
-        meshes = [thing.mesh[1] for thing in self.things]
-        faces = np.concatenate([mesh + s for mesh, s in zip(meshes, starts, strict=True)])
-        vertices = np.concatenate(vertices)
-        corners = vertices[faces]
+        meshes = [thing.pose.apply(thing.mesh) for thing in things]
+        corners = np.concatenate(meshes)
         first, second, third = np.moveaxis(corners, 1, 0)
         normals = np.cross(second - first, third - first)
-        size = np.linalg.norm(normals, axis=1)
-        whole = size > 1e-12  # the poles of a lathe make empty triangles
-        self.normals = normals[whole] / size[whole, None]
-        self.offsets = np.sum(self.normals * corners[whole, 0], axis=1)
-        numbers = np.arange(len(self.things))
-        self.thing_of = np.repeat(numbers, [len(mesh) for mesh in meshes])[whole]
+        # the poles of a lathe make empty triangles
+        whole = np.linalg.norm(normals, axis=1) > 1e-12
+        self.normals = unit_vector(normals[whole])
+        self.offsets = np.vecdot(self.normals, first[whole])
+        number = np.arange(len(meshes))
+        self.thing_of = np.repeat(number, [len(mesh) for mesh in meshes])[whole]
+        vertices = corners[whole].reshape(-1, 3).astype(np.float32)
+        faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            vertices.astype(np.float32), faces[whole].astype(np.uint32)
-        )
+        self._scene.add_triangles(vertices, faces)
 
     def seen_from(self, T_world_platform: RigidTransform) -> "World":
         """The same world in the frame of a platform that stands elsewhere."""
@@ -238,18 +134,22 @@ class World:
         origins, directions
             Metres and unit vectors in the platform frame, shape (n, 3).
         """
-        origins = np.asarray(origins, float)
-        directions = np.asarray(directions, float)
         origins, directions = np.broadcast_arrays(origins, directions)
-        rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
-        ids = self._scene.cast_rays(o3d.core.Tensor(rays))["primitive_ids"].numpy()
-        seen = ids != o3d.t.geometry.RaycastingScene.INVALID_ID
-        face = np.where(seen, ids.astype(np.int64), -1)
-        distance = np.full(len(face), np.inf)
-        normal = self.normals[face[seen]]
-        height = self.offsets[face[seen]] - np.einsum("ni,ni->n", normal, origins[seen])
-        distance[seen] = height / np.einsum("ni,ni->n", normal, directions[seen])
-        return Hits(distance, face, np.where(seen, self.thing_of[face], -1))
+        rays = _rays(origins, directions)
+        ids = self._scene.cast_rays(rays)["primitive_ids"].numpy()
+        face = ids.astype(np.int32)  # none is the greatest unsigned number
+        seen = face >= 0
+        normal = self.normals[face]
+        along = np.vecdot(normal, directions)
+        height = self.offsets[face] - np.vecdot(normal, origins)
+        reach = np.divide(height, along, out=np.zeros(len(face)), where=seen)
+        return Hits(
+            distance=np.where(seen, reach, np.inf),
+            points=origins + reach[:, None] * directions,
+            thing=np.where(seen, self.thing_of[face], -1),
+            normal=-np.sign(along)[:, None] * normal,
+            cosine=np.abs(along),
+        )
 
     def albedo(self, points: np.ndarray, thing: np.ndarray) -> np.ndarray:
         """Albedo (n, 3) of points (n, 3) on things of these numbers (n,)."""
@@ -276,14 +176,10 @@ class World:
         ndarray, shape (n,)
         """
         stated = np.array([t.infrared for t in self.things], float)  # NaN for None
-        out = stated[thing]
-        ask = np.isnan(out)
-        out[ask] = self.albedo(points[ask], thing[ask])[:, 0]
-        return out
+        red = self.albedo(points, thing)[:, 0]
+        return np.where(np.isnan(stated[thing]), red, stated[thing])
 
-    def radiance(
-        self, origins: np.ndarray, directions: np.ndarray, hits: Hits
-    ) -> np.ndarray:
+    def radiance(self, hits: Hits) -> np.ndarray:
         """Light that comes back along rays, linear.
 
         Lambert's law for every point light, each casting hard shadows, over an even background
@@ -291,36 +187,30 @@ class World:
 
         Parameters
         ----------
-        origins, directions
-            Metres and unit vectors in the platform frame, shape (n, 3).
         hits
-            Of these rays.
+            Of n rays.
 
         Returns
         -------
         ndarray, shape (n, 3)
         """
-        seen = hits.face >= 0
-        points = origins[seen] + hits.distance[seen, None] * directions[seen]
-        thing = hits.thing[seen]
-        normal = self.normals[hits.face[seen]]
-        normal *= -np.sign(np.einsum("ni,ni->n", normal, directions[seen]))[:, None]
-        light = np.full(len(points), self.lights.ambient)
+        light = np.array([t.glow for t in self.things])[hits.thing] + self.lights.ambient
         lamps = zip(self.lights.positions, self.lights.strengths, strict=True)
         for position, strength in lamps:
-            way = position - points
-            squared = np.einsum("ni,ni->n", way, way)
-            share = np.einsum("ni,ni->n", normal, way) / (squared * np.sqrt(squared))
-            ask = share > 1e-3
+            way = position - hits.points
+            share = np.vecdot(hits.normal, way) / np.linalg.norm(way, axis=1) ** 3
             # 2 mm off, so that no surface shades itself
-            off = points[ask] + 2e-3 * normal[ask]
-            rays = np.concatenate([off, 0.999 * way[ask]], axis=1, dtype=np.float32)
-            dark = self._scene.test_occlusions(o3d.core.Tensor(rays), 0.0, 1.0).numpy()
-            light[ask] += strength * (share[ask] * ~dark)
-        out = np.tile(SKY, (len(seen), 1))
-        glow = np.array([t.glow for t in self.things])[thing]
-        out[seen] = self.albedo(points, thing) * (light + glow)[:, None]
+            rays = _rays(hits.points + 2e-3 * hits.normal, 0.999 * way)
+            dark = self._scene.test_occlusions(rays, 0.0, 1.0).numpy()
+            light += strength * np.where(dark | (share < 1e-3), 0.0, share)
+        out = self.albedo(hits.points, hits.thing) * light[:, None]
+        out[hits.thing < 0] = SKY
         return out
+
+
+def _rays(origins, directions):
+    """Rays (n, 6) as Open3D takes them."""
+    return o3d.core.Tensor(np.concatenate([origins, directions], axis=1, dtype=np.float32))
 
 
 def furnished(*parts: str) -> list[Thing]:
@@ -330,7 +220,7 @@ def furnished(*parts: str) -> list[Thing]:
 
 def _thing(shape, texture, at=(0.0, 0.0, 0.0), turn=0.0, tip=0.0, **settings):
     """The thing of a row."""
-    mesh = SHAPES[shape[0]](*shape[1:])
+    mesh = getattr(shapes, shape[0])(*shape[1:])
     pattern = (getattr(textures, texture[0]), *texture[1:])
     turned = Rotation.from_euler("ZX", [turn, tip], degrees=True)
     return Thing(mesh, pattern, RigidTransform.from_components(at, turned), **settings)
@@ -338,9 +228,7 @@ def _thing(shape, texture, at=(0.0, 0.0, 0.0), turn=0.0, tip=0.0, **settings):
 
 def furnished_room(*more: Thing) -> World:
     """The room around the rig with further things in it, under two lamps."""
-    lamps = ROOM["lights"]
-    lights = Lights(np.array(lamps["positions"]), lamps["strengths"], lamps["ambient"])
-    return World([*furnished(*ROOM["parts"]), *more], lights)
+    return World([*furnished(*ROOM["parts"]), *more], Lights(**ROOM["lights"]))
 
 
 def board_on_stand(board, T_platform_board, ring):
@@ -350,8 +238,8 @@ def board_on_stand(board, T_platform_board, ring):
     behind = T_platform_board.apply([*centre, -0.07])
     away = T_platform_board.rotation.apply([0.0, 0.0, -1.0]) * [1, 1, 0]
     # a tilted board stays clear of it
-    head = behind + 0.3 * unit_vector(away) + np.array([0.0, 0.0, -0.02])
-    knee = np.array([*head[:2], min(head[2] - 0.3, FLOOR + 0.75)])
+    head = behind + 0.3 * unit_vector(away) + [0.0, 0.0, -0.02]
+    knee = [*head[:2], min(head[2] - 0.3, FLOOR + 0.75)]
     rods = [(middle, behind, 0.006), (behind, head, 0.008), (head, knee, 0.011)]
     for turn in np.radians([80, 200, 320]):
         foot = [head[0] + 0.38 * np.cos(turn), head[1] + 0.38 * np.sin(turn), FLOOR]
@@ -391,17 +279,17 @@ class Imager:
     """
 
     def __init__(self, model: CameraModel, exposure: Exposure | None = None):
-        size = f"{model.width} x {model.height} pixels"
-        whole = not (model.width % BLOCK or model.height % BLOCK)
-        need(whole, f"the image is {size}, both must be multiples of {BLOCK}")
+        need(
+            not np.any(model.size % BLOCK),
+            f"the image is {model.width} x {model.height} pixels, both must be multiples of "
+            f"{BLOCK}",
+        )
         self.model = model
         self.exposure = exposure or Exposure()
-        v, u = np.mgrid[: model.height + 1, : model.width + 1] - 0.5
-        corners = np.stack([u, v], axis=-1)
-        middle = [model.cx, model.cy]
-        self.grid = (undistort(corners, model) - middle) / [model.fx, model.fy]
-        rays = np.dstack([self.grid, np.ones(u.shape)])
-        miss = np.abs(project(rays, model) - corners).max()
+        corners = np.indices(model.size + 1).T - 0.5  # u, v
+        flat = (undistort(corners, model) - [model.cx, model.cy]) / [model.fx, model.fy]
+        self.rays = np.insert(flat, 2, 1.0, axis=-1)
+        miss = np.abs(project(self.rays, model) - corners).max()
         need(miss < 1e-3, f"lens {model.distortion} folds the image: weaken the distortion")
 
     def render(
@@ -424,18 +312,20 @@ class Imager:
         """
         e = self.exposure
         m = self.model
-        light = self.light(world, T_camera_platform, rng)
         light = gaussian_filter(
-            light, (e.blur_px, e.blur_px, 0), mode="nearest", truncate=5.0
+            self.light(world, T_camera_platform, rng),
+            e.blur_px,
+            axes=(0, 1),
+            mode="nearest",
+            truncate=5.0,
         )
-        v, u = np.mgrid[: m.height, : m.width]
-        squared = (u - m.cx) ** 2 + (v - m.cy) ** 2
-        radius = squared / (m.width**2 + m.height**2) * 4
+        away = np.indices(m.size).T - [m.cx, m.cy]
+        radius = 4 * np.vecdot(away, away) / (m.size @ m.size)
         brightest = max(np.quantile(light, 0.998), 1e-6)
         gain = np.clip(e.bright / brightest, *e.gain)
         level = light * (gain * (1 - e.vignetting * radius))[..., None]
         sigma = np.sqrt(e.read_noise**2 + e.shot_noise * level)
-        noisy = level + sigma * rng.standard_normal(level.shape)
+        noisy = rng.normal(level, sigma)
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., ::-1]
 
     def light(self, world, T_camera_platform, rng):
@@ -445,50 +335,35 @@ class Imager:
         thing changes are interpolated; every pixel of the others gets `samples` x `samples` rays,
         one at a random place in each cell.
         """
-        g = self.grid
         n = self.exposure.samples
-        color, thing = self._trace(world, T_camera_platform, g[::BLOCK, ::BLOCK])
-        four = _corners(color)
-        things = _corners(thing)
-        changes = np.ptp(four, axis=0).max(axis=-1) > FLAT
-        changes |= np.ptp(things, axis=0) > 0
-        f = (np.arange(BLOCK) + 0.5) / BLOCK
-        out = np.zeros((four.shape[1], BLOCK, four.shape[2], BLOCK, 3))
-        shares = ((1 - f, 1 - f), (1 - f, f), (f, 1 - f), (f, f))
-        for corner, (down, across) in zip(four, shares, strict=True):
-            rows = corner[:, None, :, None] * down[:, None, None, None]
-            out += rows * across[:, None]
-        out = out.reshape(self.model.height, self.model.width, 3)
-        rows, columns = np.nonzero(np.kron(changes, np.ones((BLOCK, BLOCK), bool)))
+        color, thing = self._trace(world, T_camera_platform, self.rays[::BLOCK, ::BLOCK])
+        corners = sliding_window_view(np.dstack([color, thing]), (2, 2), axis=(0, 1))
+        # another thing is a change of one at least
+        changes = np.ptp(corners, axis=(3, 4)).max(axis=2) > FLAT
+        block, within = np.divmod(np.indices(self.model.size[::-1]), BLOCK)
+        middle = (within[..., None] + 0.5) / BLOCK
+        out = _between(color, *block, *middle)
+        mixed = np.argwhere(changes[tuple(block)])
         cells = np.array(list(np.ndindex(n, n)))
-        batches = 1 + len(rows) * n * n // BATCH
-        for part in np.array_split(np.arange(len(rows)), batches):
-            f = (cells + rng.random((len(part), n * n, 2))) / n
-            row = rows[part, None]
-            column = columns[part, None]
-            down = f[..., :1]
-            across = f[..., 1:]
-            top = g[row, column] * (1 - across) + g[row, column + 1] * across
-            low = g[row + 1, column] * (1 - across) + g[row + 1, column + 1] * across
-            color, _ = self._trace(world, T_camera_platform, top * (1 - down) + low * down)
-            out[rows[part], columns[part]] = color.mean(axis=1)
+        for part in np.array_split(mixed, 1 + len(mixed) * n * n // BATCH):
+            row, column = np.hsplit(part, 2)
+            places = (cells + rng.random((len(part), n * n, 2))) / n
+            down, across = np.dsplit(places, 2)
+            rays = _between(self.rays, row, column, down, across)
+            color, _ = self._trace(world, T_camera_platform, rays)
+            out[tuple(part.T)] = color.mean(axis=1)
         return out
 
     def _trace(self, world, T_camera_platform, rays):
-        """Light and thing along viewing rays (..., 2)."""
+        """Light and thing along viewing rays (..., 3)."""
         back = T_camera_platform.inv()
-        flat = rays.reshape(-1, 2)
-        directions = unit_vector(np.column_stack([flat, np.ones(len(flat))]))
-        directions = directions @ back.rotation.as_matrix().T
-        origins = np.broadcast_to(back.translation, directions.shape)
-        hits = world.cast(origins, directions)
-        light = world.radiance(origins, directions, hits)
-        shape = rays.shape[:-1]
-        return light.reshape(*shape, 3), hits.thing.reshape(shape)
+        directions = unit_vector(rays.reshape(-1, 3)) @ back.rotation.as_matrix().T
+        hits = world.cast(back.translation, directions)
+        return world.radiance(hits).reshape(rays.shape), hits.thing.reshape(rays.shape[:-1])
 
 
-def _corners(grid):
-    """The four corners of every block of a grid of block corners, shape (4, rows, columns, ...)."""
-    above = [grid[:-1, :-1], grid[:-1, 1:]]
-    below = [grid[1:, :-1], grid[1:, 1:]]
-    return np.stack(above + below)
+def _between(grid, row, column, down, across):
+    """What a grid holds at shares of the way from points of it to the next rows and columns."""
+    top = grid[row, column] * (1 - across) + grid[row, column + 1] * across
+    low = grid[row + 1, column] * (1 - across) + grid[row + 1, column + 1] * across
+    return top * (1 - down) + low * down

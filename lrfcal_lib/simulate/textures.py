@@ -44,16 +44,14 @@ def plain(
     ndarray, shape (n, 3)
     """
     if not rough:
-        return np.broadcast_to(np.asarray(color, float), points.shape)
-    return (
-        np.asarray(color, float) * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
-    )
+        return np.broadcast_to(color, points.shape)
+    return color * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
 
 
 def wood(points, color, cell=(0.5, 0.03, 0.03)):
     """Grain along x."""
-    tone = 0.8 + 0.4 * value_noise(points, np.asarray(cell))
-    return np.asarray(color, float) * tone[:, None]
+    tone = 0.8 + 0.4 * value_noise(points, cell)
+    return color * tone[:, None]
 
 
 def planks(points, color, width=0.18, length=1.4):
@@ -70,15 +68,15 @@ def planks(points, color, width=0.18, length=1.4):
 def stripes(points, first, second, period, axis=0):
     """Two colours in turn along an axis."""
     stripe = np.floor(2 * points[:, axis] / period).astype(int)
-    return np.array([first, second], float)[stripe & 1]
+    return np.array([first, second])[stripe & 1]
 
 
 def tiles(points, color, joint, size):
     """Square tiles in x and z with joints of 4 mm."""
     at = points[:, [0, 2]] / size
     near = np.abs(at - np.round(at)).min(axis=1) * size < 0.002
-    tile = np.asarray(color, float) * (0.94 + 0.12 * value_noise(points, size))[:, None]
-    return np.where(near[:, None], np.asarray(joint, float), tile)
+    tile = color * (0.94 + 0.12 * value_noise(points, size))[:, None]
+    return np.where(near[:, None], joint, tile)
 
 
 def printed_page(points, width, height, heading=0.1, line=0.0055):
@@ -109,7 +107,7 @@ def between(values, low, high):
 
 def poster(points, width, height, colors):
     """A picture: hills under a sky with a sun, in the plane z = 0 about the origin."""
-    sky, sun, far, near = np.asarray(colors, float)
+    sky, sun, far, near = colors
     x = points[:, 0] / width + 0.5
     y = points[:, 1] / height + 0.5
     out = sky * (0.7 + 0.4 * y)[:, None]
@@ -147,7 +145,7 @@ def chessboard(points, board, dark, light, ring=0.5):
     grey = np.full(len(points), float(dark))
     pattern = board.pattern
     if pattern is not None:
-        at = (points[:, :2] - np.asarray(pattern.origin)) / pattern.square
+        at = (points[:, :2] - pattern.origin) / pattern.square
         last = np.array([pattern.columns, pattern.rows]) - 1
         inside = np.all((at > -ring) & (at < last + ring), axis=1)
         even = np.floor(at).astype(int).sum(axis=1) % 2 == 0

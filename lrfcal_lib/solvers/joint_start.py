@@ -84,7 +84,7 @@ def _camera(obs, camera, head):
             continue
         p = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
         frame = SourceFrame(head, obs.mounts[camera], obs.view_pitch[view])
-        points.append(frame.apply(p, obs.face_pitch[rows]))
+        points.append(frame.points(p, obs.face_pitch[rows]))
         views.append(view)
     if not views:
         raise DegenerateGeometry(f"camera '{name}' never sees a board that the scans hit")
