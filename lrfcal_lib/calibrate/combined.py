@@ -307,8 +307,8 @@ def blocks_of(state, case, scale):
     held[3:, -count:] = np.diag(np.tile(FAR, len(case.middle)))
     blocks.append(_rows(np.zeros(len(held)), held))
     for block in blocks:
-        missing = width - block.jacobian.shape[-1]
-        jacobian = np.pad(block.jacobian, [(0, 0), (0, 0), (0, missing)])
+        jacobian = np.zeros((*block.residuals.shape, width))
+        jacobian[..., : block.jacobian.shape[-1]] = block.jacobian
         yield replace(block, jacobian=jacobian)
 
 

@@ -10,6 +10,7 @@ from lrfcal_lib.solvers.joint_model import SWEEPS, JointData, JointState, Levels
 from lrfcal_lib.solvers.joint_residuals import (
     SIDE_FREEDOM,
     edge_distance,
+    meeting,
     named_blocks,
     rays,
 )
@@ -96,14 +97,14 @@ def face_levels(state, data, block, shared, spread):
     """
     levels = data.levels
     used = data.face["used"]
-    weight = used / np.where(used, data.face["sigma"], 1.0)
+    weight = data.face["weight"]
     z = weight * block.residuals
     by_own = (weight / levels.face_scale)[..., None] * block.jacobian[..., shared:]
     taken = levels.face_share * np.sum(by_own * (by_own @ spread))
     scale = np.sqrt(np.sum(z**2) / max(used.sum() - taken, 1))
     # where the ranges should end: noise must not decide which part a point lies in
-    exact = data.face | {"range": data.face["range"] + block.residuals}
-    x, y, _ = np.moveaxis(on_board(state, replace(data, face=exact)), -1, 0)
+    exact = meeting(state, rays(state, data, data.face)).point
+    x, y, _ = np.moveaxis(exact @ state.boards[:, :, :3], -1, 0)
     part = _part(x, used) * PARTS + _part(y, used)
     parts = np.eye(PARTS**2)[part] * used[..., None]
     planes = np.linalg.qr(np.stack([used, x * used, y * used], axis=-1))[0]
@@ -193,10 +194,7 @@ def _along_edges(state, data):
     """Where beams meet the boards along their edges, metres, (p, n)."""
     ray = rays(state, data, data.beam)
     edge = edge_distance(state, data, data.beam, ray)
-    normal = state.boards[:, None, :, 2]
-    away = state.boards[:, None, :, 3] - ray.origin
-    r = np.vecdot(normal, away) / np.vecdot(normal, ray.direction)
-    return np.vecdot(r[..., None] * ray.direction - away - edge.point, edge.along)
+    return np.vecdot(meeting(state, ray).point, edge.along)
 
 
 def view_levels(data, block, hessian, gradient, shared):
