@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from lrfcal_lib.fit.robust import biweight, rms, robust_sigma
-from lrfcal_lib.model.camera import CameraModel, distort, fold, line_through, pinhole
+from lrfcal_lib.model.camera import CameraModel, fold, line_through, pinhole, project
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -186,12 +186,10 @@ def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:
 
     `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid.
     """
-    focal = np.array([model.fx, model.fy])
-    centre = np.array([model.cx, model.cy])
-    normalized = (uv - centre) / focal
-    recorded = distort(normalized, model.distortion) * focal + centre
+    sights = model.sights(uv)
+    recorded = project(sights, model)
     # the lens would fold what is farther out back into the image
-    recorded[np.sum(normalized**2, axis=-1) >= fold(model)] = BEHIND
+    recorded[np.sum(sights[..., :2] ** 2, axis=-1) >= fold(model)] = BEHIND
     places = np.moveaxis(recorded, -1, 0)[::-1]
     channels = np.moveaxis(np.atleast_3d(image), -1, 0)
     colours = [

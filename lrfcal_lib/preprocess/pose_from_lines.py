@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.camera import CameraModel, pinhole, pinhole_jacobian
+from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, pinhole_jacobian
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
     move_pose,
@@ -101,8 +101,8 @@ def line_misses(edges, points, model: CameraModel, pose):
     turned = rotate_points(pose, points)
     p_camera = turned + pose[:, 3]
     uv = pinhole(p_camera, model)
-    distance = np.einsum("enk,ek->en", uv, lines[:, :2]) + lines[:, 2:]
-    by_point = np.einsum("ek,enkj->enj", lines[:, :2], pinhole_jacobian(p_camera, model))
+    distance = line_distance(uv, lines[:, None])
+    by_point = np.vecmat(lines[:, None, :2], pinhole_jacobian(p_camera, model))
     by_pose = gradient_by_pose(turned, by_point)
     white = _whiteners(edges, lines, uv)
     return np.matvec(white, distance), white @ by_pose

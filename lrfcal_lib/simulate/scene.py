@@ -398,9 +398,8 @@ class Imager:
         self.exposure = exposure or Exposure()
         v, u = np.mgrid[: model.height + 1, : model.width + 1] - 0.5
         corners = np.stack([u, v], axis=-1)
-        middle = [model.cx, model.cy]
-        self.grid = (undistort(corners, model) - middle) / [model.fx, model.fy]
-        rays = np.dstack([self.grid, np.ones(u.shape)])
+        rays = model.sights(undistort(corners, model))
+        self.grid = rays[..., :2]
         miss = np.abs(project(rays, model) - corners).max()
         need(miss < 1e-3, f"lens {model.distortion} folds the image: weaken the distortion")
 

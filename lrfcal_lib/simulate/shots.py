@@ -117,8 +117,7 @@ class Scenario(Devices):
         rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
         away = rng.uniform(*self.distances, count)
         pixels = rng.uniform(0, self.model.size, (count, 2))
-        ray = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(self.model.matrix).T
-        centre = away[:, None] * ray
+        centre = away[:, None] * self.model.sights(pixels)
         return RigidTransform.from_components(centre - rotation.apply(middle), rotation)
 
     def _around(self, rng, count):

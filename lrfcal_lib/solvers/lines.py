@@ -16,7 +16,7 @@ from lrfcal_lib.fit.residuals import (
     sight_normals,
 )
 from lrfcal_lib.fit.result import Solution
-from lrfcal_lib.model.camera import pinhole_jacobian
+from lrfcal_lib.model.camera import mirrored, pinhole_jacobian
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     apply_pose,
@@ -58,10 +58,7 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     rotated = rotate_points(pose, obs.scene_points)
     moved = rotated + pose[..., None, :, 3]
     by_point = pinhole_jacobian(moved, obs.model)
-    # behind the camera the formula goes on (mirrored), as in `line_residuals`
-    u = obs.model.fx * moved[..., 0] / moved[..., 2] + obs.model.cx
-    v = obs.model.fy * moved[..., 1] / moved[..., 2] + obs.model.cy
-    errors = np.stack([u, v], axis=-1) - obs.scene_pixels
+    errors = mirrored(moved, obs.model) - obs.scene_pixels
 
     by_source = by_point @ pose[..., None, :, :3]  # by the point in the source frame
     pulled = obs.scene_covariance @ by_source.mT
