@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from lrfcal_lib.model.geometry import dyads
 from lrfcal_lib.session.stated import LrfInfo
 
 PULSE = 1.0  # metres; surfaces farther apart give two echoes and no mixed pixel (see simulate.beam)
@@ -132,7 +133,7 @@ class _Planes:
         inverse = 1 / np.where(valid, ranges, 1.0)
         basis = np.stack([valid, *np.indices(ranges.shape), inverse], axis=-1)
         basis = basis * valid[..., None]
-        products = np.einsum("...i,...j->...ij", basis, basis)
+        products = dyads(basis)
         before = products.cumsum(axis=0).cumsum(axis=1)
         self.table = np.pad(before, ((1, 0), (1, 0), (0, 0), (0, 0)))
 

@@ -26,6 +26,7 @@ from lrfcal_lib.fit.covariance import (
     name_words,
     null_space,
     placement_covariance,
+    pseudo_inverse,
     solve_each,
 )
 from lrfcal_lib.fit.padding import medians
@@ -33,7 +34,6 @@ from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
 CAUCHY = 2.385  # 95 % efficiency for normal errors
-OWN_RANK = 1e-13  # the same of what a placement owns
 FIRST_DAMPING = 1e-7  # of the normal equations' diagonal
 LEAST_DAMPING = 1e-12
 MOST_DAMPING = 1e14
@@ -241,7 +241,7 @@ def eliminate(
     if regular:
         back = np.linalg.solve(own, known)
     else:
-        back = np.linalg.pinv(own, rcond=OWN_RANK, hermitian=True) @ known
+        back = pseudo_inverse(own) @ known
     taken = hessian[:, :c, c:] @ back
     reduced = hessian[:, :c, :c] - taken[..., :c]
     reduced_gradient = gradient[:, :c] - taken[..., c]
@@ -268,7 +268,7 @@ def _step(hessian, gradient, damping, shared):
     """A damped step, its squared length in standard deviations, and the fall of the cost it
     promises.
     """
-    diagonal = hessian.diagonal(axis1=-2, axis2=-1)
+    diagonal = np.linalg.diagonal(hessian)
     extra = damping[..., None] * diagonal
     # what nobody sees stays where it is
     extra = extra + (1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300)

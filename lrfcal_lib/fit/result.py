@@ -10,6 +10,7 @@ from scipy.special import polygamma
 
 from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import dyads
 
 AXIS_NAMES = (
     "axis_out_of_scan_plane",
@@ -153,8 +154,8 @@ class Solution:
         )
         excess = 2 * np.log(np.fmax(ratio, 1.0))
         h = np.sqrt(np.expm1(beyond_chance(excess, self.n_placements - 1)))
-        finite = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
-        return self.covariance + finite * np.einsum("...i,...j->...ij", h, h)
+        finite = np.nan_to_num(self.covariance, posinf=0.0, neginf=0.0)
+        return self.covariance + finite * dyads(h)
 
     @property
     def trusted_sigma(self):

@@ -13,7 +13,7 @@ from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
-from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
+from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, dyads
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
 # how a board leans out of the upright plane that faces the LRF: turns about its x and y, degrees
@@ -148,7 +148,7 @@ def total_sigma(information, solution):
     What is not observed counts as known to a metre at 2 m, so that it can be compared as well.
     """
     scales = scales_of(solution)
-    unit = np.outer(scales, scales)
+    unit = dyads(scales)
     covariance = np.linalg.inv(information * unit + np.eye(len(unit))) * unit
     return np.sqrt(sum(sigma**2 for sigma in group_sigma(covariance, solution).values()))
 
@@ -174,7 +174,7 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
     dict of str to ndarray, shape (...)
         Of 'axis' and of each camera, as far as they were unknown.
     """
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1) / scales_of(solution) ** 2
+    variance = np.linalg.diagonal(covariance) / scales_of(solution) ** 2
     columns = {"axis": solution.columns("axis_") + solution.columns("offset_")}
     for camera in solution.transforms:
         columns[camera] = solution.columns(f"{camera}_")

@@ -239,7 +239,7 @@ def shared_covariances(rig: CalibratedRig) -> list[np.ndarray]:
     covariances = []
     for whole in (known.covariance, known.trusted):
         unbounded = ~np.isfinite(np.diag(whole))
-        bounded = np.where(np.isfinite(whole), whole, 0.0)
+        bounded = np.nan_to_num(whole, posinf=0.0, neginf=0.0)
         covariances.append(bounded + UNBOUNDED * np.diag(unbounded))
     return covariances
 

@@ -160,7 +160,7 @@ def _look(points):
     nearest = np.full(shape, np.inf)
     np.minimum.at(nearest, (row, column), distance)
     nearest = minimum_filter(nearest, 3)
-    return np.where(np.isfinite(nearest), nearest, 0.0)
+    return np.nan_to_num(nearest, posinf=0.0, neginf=0.0)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import numpy as np
 
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
+    dyads,
     lrf_to_platform,
     plane_axes,
     polar_to_points,
@@ -167,8 +168,8 @@ class Crossings:
         rays = unit_vector(self.points)
         noise = rays * np.hypot(self.range_sigma, warp_sigma)[:, None]
         place = self.by_angle * np.reshape(sigma, (-1, 1))
-        by_noise = np.einsum("...i,...j->...ij", noise, noise)
-        by_place = np.einsum("...i,...j->...ij", place, place)
+        by_noise = dyads(noise)
+        by_place = dyads(place)
         return by_noise + by_place
 
 

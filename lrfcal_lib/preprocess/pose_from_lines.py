@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, pinhole_jacobian
 from lrfcal_lib.model.geometry import (
@@ -46,7 +47,7 @@ def pose_from_edges(
     first = pose_array(start)
     white = np.zeros((0, 6))
     if covariance is not None:
-        white = np.linalg.inv(np.linalg.cholesky(covariance))
+        white = inverse_root(covariance)
 
     def system(pose):
         misses, by_pose = line_residuals(edges, board, model, pose)
@@ -115,4 +116,4 @@ def _whiteners(edges, lines, uv):
     along = np.stack([lines[:, 1], -lines[:, 0]], axis=1)
     lever = np.einsum("enk,ek->en", uv - centres[:, None], along)
     design = np.stack([np.ones_like(lever), lever], axis=2)
-    return np.linalg.inv(np.linalg.cholesky(design @ covariance @ design.mT))
+    return inverse_root(design @ covariance @ design.mT)

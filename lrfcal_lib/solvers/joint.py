@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
-from lrfcal_lib.fit.covariance import RANK
+from lrfcal_lib.fit.covariance import pseudo_inverse
 from lrfcal_lib.fit.least_squares import remembered, solve
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
+    dyads,
     pose_array,
     pose_parameters,
     pose_transform,
@@ -275,9 +276,9 @@ def with_step_error(solution: JointSolution) -> JointSolution:
     changed = gather(solution.observations.stretched(STEP), solution.data.levels)
     here = solution.score()
     pull = replace(solution, data=changed).score().gradient - here.gradient
-    free = np.linalg.pinv(here.information.sum(axis=0), rcond=RANK, hermitian=True)
+    free = pseudo_inverse(here.information.sum(axis=0))
     moved = -free @ pull.sum(axis=0) / STEP * sigma
-    spread = np.outer(moved, moved)
+    spread = dyads(moved)
     estimate = solution.solution
     by_placements = estimate.covariance_placements
     if by_placements is not None:

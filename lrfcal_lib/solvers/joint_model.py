@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from lrfcal_lib.fit.axis_chart import move_head
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
 from lrfcal_lib.model import geometry
@@ -221,7 +222,7 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
         camera=obs.view_camera,
         pitch=obs.view_pitch,
         pose=obs.view_pose,
-        whitener=np.linalg.inv(np.linalg.cholesky(obs.view_covariance)),
+        whitener=inverse_root(obs.view_covariance),
         lens=obs.view_lens,
     )
     for group in (face, beam):

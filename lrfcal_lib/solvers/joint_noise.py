@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from lrfcal_lib.fit.least_squares import OWN_RANK, eliminate, linearise
+from lrfcal_lib.fit.covariance import pseudo_inverse
+from lrfcal_lib.fit.least_squares import eliminate, linearise
 from lrfcal_lib.fit.result import beyond_chance
 from lrfcal_lib.solvers.joint_model import SWEEPS, JointData, JointState, Levels, Unknowns
 from lrfcal_lib.solvers.joint_residuals import (
@@ -39,7 +40,7 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
     hessian, gradient, *_ = linearise(blocks.values())
     c = unknowns.shared
     own = hessian[:, c:, c:]
-    spread = np.linalg.pinv(own, rcond=OWN_RANK, hermitian=True)  # shared ones held
+    spread = pseudo_inverse(own)  # shared ones held
     levels = data.levels
     changed = {}
     if "face" in blocks:
@@ -247,7 +248,7 @@ def judged(block, factor, others, rows, shared):
     hessian, gradient, half_square = linearise([block])
     whole = others[0] + hessian / f2
     right = others[1] + gradient / f2
-    size = np.trace(whole, axis1=1, axis2=2)[:, None, None]
+    size = np.linalg.trace(whole)[:, None, None]
     whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
     reduced, score, back = eliminate(whole, right, c, regular=True)
     total = np.sum(reduced, axis=0)
@@ -297,7 +298,7 @@ def sweep_levels(sweeps, data, hessian, gradient, shared):
         step = -inverse @ np.sum(score, axis=0)
         by_shared = back[:, rows, :c]
         error = sweeps - back[:, rows, c] - by_shared @ step
-        own = np.linalg.pinv(whole[:, c:, c:], rcond=OWN_RANK, hermitian=True)
+        own = pseudo_inverse(whole[:, c:, c:])
         unknown = own[:, rows, rows] + np.vecdot(by_shared @ inverse, by_shared)
         told = np.maximum(1 - unknown / variance, 0.0)
         variance = (np.sum(error**2, axis=0) + usual) / (np.sum(told, axis=0) + 1)
@@ -330,7 +331,7 @@ def side_levels(sides, data, hessian, gradient):
         right = gradient.copy()
         whole[:, last, last] += weight / sigma2 - prior
         right[:, last] += (weight / sigma2 - prior) * sides
-        spread = np.linalg.pinv(whole, rcond=OWN_RANK, hermitian=True)
+        spread = pseudo_inverse(whole)
         step = -np.matvec(spread, right)
         square = (sides + step[:, last]) ** 2 + spread[:, last, last]
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.covariance import solve_each
+from lrfcal_lib.fit.covariance import inverse_root, solve_each
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import (
     moved_noise,
@@ -75,7 +75,7 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     return Block(
         errors.reshape(shape),
         jacobian.reshape(shape + (6,)),
-        np.linalg.inv(np.linalg.cholesky(noise)),
+        inverse_root(noise),
         corrected=corrected.reshape(shape + (6,)),
     )
 

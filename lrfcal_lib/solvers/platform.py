@@ -16,7 +16,7 @@ from lrfcal_lib.fit.axis_chart import (
     chart_parameters,
     move_head,
 )
-from lrfcal_lib.fit.covariance import name_words, solve_each
+from lrfcal_lib.fit.covariance import inverse_root, name_words, solve_each
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR
@@ -26,6 +26,7 @@ from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     axis_of,
     cross,
+    dyads,
     fit_line,
     gradient_by_pose,
     head_from_axis,
@@ -281,13 +282,13 @@ def distance_block(state, group, sigma_pitch, which):
     r, J, by_point, by_pitch = (x[:, :, which] for x in distances(state, group))
     pull = group["covariance"] @ by_point.mT
     by_pitch = sigma_pitch * by_pitch
-    noise = by_point @ pull + np.einsum("...i,...j->...ij", by_pitch, by_pitch)
+    noise = by_point @ pull + dyads(by_pitch)
     force = solve_each(noise, r)
     points = group["points"] - np.matvec(pull, force)
     pitch = group["pitch"] - sigma_pitch * np.vecdot(by_pitch, force)
     moved = group | {"points": points, "pitch": pitch}
     corrected = distances(state, moved)[1][:, :, which]
-    whitener = np.linalg.inv(np.linalg.cholesky(noise)) * group["used"][..., None, None]
+    whitener = inverse_root(noise) * group["used"][..., None, None]
     p = len(r)
     J = J.reshape(p, -1, 12)
     return Block(r.reshape(p, -1), J, whitener, corrected=corrected.reshape(J.shape))
