@@ -80,9 +80,10 @@ class CameraModel:
         covariance : ndarray, shape (9, 9), optional
         rms_px : float, optional
         """
-        pinhole = map(float, values[:4])
+        fx, fy, cx, cy = map(float, values[:4])
+        size = self.width, self.height
         lens = np.array(values[4:])
-        return CameraModel(self.width, self.height, *pinhole, lens, covariance, rms_px)
+        return CameraModel(*size, fx, fy, cx, cy, lens, covariance, rms_px)
 
 
 def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:

@@ -210,15 +210,11 @@ def in_stated_gauge(state: JointState, obs: JointObservations) -> JointState:
     them.
     """
     found = pose_transform(state.head)
-    head = geometry.head_from_axis(geometry.axis_of(found))
-    if obs.T_head_lrf is not None:
-        stated = geometry.head_from_axis(geometry.axis_of(obs.T_head_lrf))
-        head = obs.T_head_lrf * stated.inv() * head
+    head = geometry.head_from_axis(geometry.axis_of(found), obs.T_head_lrf)
     change = head * found.inv()
     cameras = state.cameras.copy()
-    for i, mount in enumerate(obs.mounts):
-        if mount == "platform":
-            cameras[i] = pose_array(pose_transform(cameras[i]) * change.inv())
+    on_base = np.isin(obs.mounts, "platform")
+    cameras[on_base] = pose_array(pose_transform(cameras[on_base]) * change.inv())
     boards = pose_array(change * pose_transform(state.boards))
     return replace(state, head=pose_array(head), boards=boards, cameras=cameras)
 

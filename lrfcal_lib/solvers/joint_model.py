@@ -228,7 +228,7 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
     for group in (face, beam):
         group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
     view["pose"][~view["used"]] = np.eye(4)
-    on_head = np.array([mount == "head" for mount in obs.mounts], bool)
+    on_head = np.isin(obs.mounts, "head")
     return JointData(
         face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, levels
     )

@@ -121,7 +121,7 @@ def boards_in_images(
     `head` and `cameras` as in JointState.
     """
     camera = obs.view_camera[views]
-    on_head = np.array([mount == "head" for mount in obs.mounts])[camera]
+    on_head = np.isin(obs.mounts, "head")[camera]
     pitch = np.where(on_head, obs.view_pitch[views], 0.0)
     turn = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(pitch, TILT_AXIS)))
     T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
