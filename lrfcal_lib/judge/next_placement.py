@@ -208,7 +208,7 @@ def board_poses(solution, grid):
     gaze = Rotation.from_euler("ZX", np.column_stack([bearing, elevation]), degrees=True)
     leans = np.array([(*angles, 0) for angles in LEANS.values()])[lean.astype(int)]
     tip = Rotation.from_rotvec(leans, degrees=True)
-    spin = Rotation.from_rotvec(turn[:, None] * [0, 0, 1], degrees=True)
+    spin = Rotation.from_euler("z", turn[:, None], degrees=True)
     rotation = solution.T_head_lrf.rotation * gaze * geometry.AHEAD * tip * spin
     middle = solution.T_head_lrf.apply(distance[:, None] * gaze.apply([0.0, 1.0, 0.0]))
     origin = middle - rotation.apply(outline(solution).mean(axis=0))

@@ -205,13 +205,13 @@ def sights(creases: Creases, view: View) -> Sights:
     by_point = pinhole_jacobian(points[inside], model)
     R = view.T_camera_platform.rotation.as_matrix()
     way = creases.along[inside] @ R.T
-    tangent = unit_vector(np.einsum("nij,nj->ni", by_point, way))
+    tangent = unit_vector(np.matvec(by_point, way))
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
-    by_place = np.einsum("ni,nij->nj", normal, by_point) / reach
+    by_place = np.vecmat(normal, by_point) / reach
     off = np.einsum("nj,nkj->nk", by_place, creases.off[inside] @ R.T)
     return Sights(
-        by_unknown=np.einsum("nj,njk->nk", by_place, J[inside]),
+        by_unknown=np.vecmat(by_place, J[inside]),
         across=across / reach,
         clear=clear,
         sigma=np.hypot(np.linalg.norm(off, axis=1), EDGE),

@@ -308,7 +308,7 @@ def _fit_line(column, place, offset, slope):
     Neighbouring profiles share pixels and the same dents, so errors are correlated along the edge;
     the covariance is multiplied by the integrated autocorrelation of the residuals.
     """
-    design = np.column_stack([np.ones(len(column)), column])
+    design = np.vander(column, 2, increasing=True)
     line = np.array([offset, slope])
     for _ in range(FIT_ROUNDS):
         residuals = place - design @ line
@@ -327,7 +327,7 @@ def _fit_line(column, place, offset, slope):
     residuals = (place - design @ line)[kept]
     variance = residuals @ residuals / (len(residuals) - 2)
     factor = max(_correlation_factor(column, residuals), LEAST_CORRELATION)
-    about_middle = np.column_stack([np.ones(len(column)), column - column.mean()])
+    about_middle = np.vander(column - column.mean(), 2, increasing=True)
     covariance = np.linalg.inv(about_middle.T @ about_middle) * variance * factor
     covariance += np.diag([1.0, 12 / np.ptp(column) ** 2]) * SYSTEMATIC_PX**2
     return _Fit(*line, covariance, column, rms(residuals))

@@ -477,7 +477,7 @@ class Imager:
         """Light and thing along viewing rays (..., 2)."""
         back = T_camera_platform.inv()
         flat = rays.reshape(-1, 2)
-        directions = unit_vector(np.column_stack([flat, np.ones(len(flat))]))
+        directions = unit_vector(np.insert(flat, 2, 1.0, axis=1))
         directions = directions @ back.rotation.as_matrix().T
         origins = np.broadcast_to(back.translation, directions.shape)
         hits = world.cast(origins, directions)

@@ -82,7 +82,7 @@ class Scenario(Devices):
         """True poses ``T_camera_lrf``, one a trial."""
         if self.T_camera_lrf is not None:
             return RigidTransform.concatenate([self.T_camera_lrf] * trials)
-        roll = Rotation.from_rotvec([0.0, 0.0, self.roll])
+        roll = Rotation.from_euler("z", self.roll)
         return RigidTransform.from_rotation(roll) * upright_camera(rng, 1, trials)
 
     def boards(self, rng, T_camera_lrf):

@@ -35,7 +35,7 @@ def start_states(obs: JointObservations) -> Iterator[list[JointState]]:
         raise DegenerateGeometry(
             "no ranges on the boards' faces: a start value needs them; give one as start="
         )
-    backwards = Rotation.from_rotvec([0.0, 0.0, np.pi])
+    backwards = Rotation.from_euler("z", np.pi)
     heads = [RigidTransform.identity(), RigidTransform.from_rotation(backwards)]
     if obs.T_head_lrf is not None:
         heads.insert(0, obs.T_head_lrf)

@@ -187,7 +187,7 @@ def source_planes(pose, boards):
 
 def _with_one(points):
     """Rows ``[p, 1]``."""
-    return np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
+    return np.insert(points, 3, 1.0, axis=-1)
 
 
 def compress(sets: PlaneSets, weights) -> np.ndarray:
