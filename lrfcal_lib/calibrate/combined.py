@@ -313,7 +313,7 @@ def blocks_of(state, case, scale):
 
 def _rows(residuals, jacobian):
     """White residuals (n,) and their Jacobian (n, c), a Block of one placement."""
-    return Block(residuals[None], jacobian[None], np.ones((1, len(residuals))))
+    return Block(residuals[None], jacobian[None])
 
 
 def side_columns(J, edge, state, case):

@@ -96,9 +96,8 @@ class SourceFrame:
 
     def rotation(self, pitch: np.ndarray) -> np.ndarray:
         """Rotation matrices (n, 3, 3) from the LRF at some true pitch (n,) to this frame."""
-        turn = Rotation.from_rotvec(np.multiply.outer(self._turn(pitch), TILT_AXIS))
-        R_platform_lrf = turn * self.T_head_lrf.rotation
-        return (self._from_platform.rotation * R_platform_lrf).as_matrix()
+        T_platform_lrf = platform_from_head(self._turn(pitch)) * self.T_head_lrf
+        return (self._from_platform * T_platform_lrf).rotation.as_matrix()
 
     def by_pitch(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
         """Derivative (n, 3) of :meth:`apply` by the pitch, metres a radian."""
@@ -119,6 +118,12 @@ class SourceFrame:
         return np.asarray(pitch) - self.image_pitch
 
 
+def platform_from_head(pitch: ArrayLike) -> RigidTransform:
+    """``T_platform_head`` of the head at a true pitch (radians), or at several, equation (4)."""
+    turn = Rotation.from_rotvec(np.multiply.outer(pitch, TILT_AXIS))
+    return RigidTransform.from_rotation(turn)
+
+
 def camera_at(
     T_camera: RigidTransform, mount: str, T_head_lrf: RigidTransform, pitch: ArrayLike
 ) -> RigidTransform:
@@ -135,5 +140,4 @@ def camera_at(
     """
     if mount == "platform":
         return T_camera
-    back = Rotation.from_rotvec(np.multiply.outer(pitch, -TILT_AXIS))
-    return T_camera * T_head_lrf.inv() * RigidTransform.from_rotation(back)
+    return T_camera * (platform_from_head(pitch) * T_head_lrf).inv()

@@ -223,7 +223,7 @@ def adjust(
     def evaluate(bundle):
         predicted, jacobian = bundle.predict(points, basis)
         misses = (predicted - pixels)[visible]
-        return Block(misses, jacobian[visible][:, free], np.ones(len(misses)))
+        return Block(misses, jacobian[visible][:, free])
 
     def retract(bundle, step):
         whole = np.zeros(len(free))

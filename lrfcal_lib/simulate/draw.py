@@ -25,6 +25,7 @@ from lrfcal_lib.model.geometry import (
     rotate_points,
     tilt,
 )
+from lrfcal_lib.model.kinematics import camera_at
 
 # corners of a pattern that fills the triangle, metres, where the board has none
 PLACES = [(i, j, 0) for i in range(5) for j in range(6) if i + j < 7]
@@ -267,12 +268,8 @@ def _views(bench, pose, at, rng, noise):
     if bench.sigma_stop:  # one error for all cameras
         pitch = pitch + noise * bench.sigma_stop * rng.standard_normal(len(at))
     for camera in bench.cameras.values():
-        T_source_platform = RigidTransform.identity(len(at))
-        if bench.mount == "head":
-            turn = np.outer(-pitch, [1.0, 0.0, 0.0])
-            T_head_platform = RigidTransform.from_rotation(Rotation.from_rotvec(turn))
-            T_source_platform = bench.T_head_lrf.inv() * T_head_platform
-        true.append((camera * T_source_platform * pose).as_matrix())
+        seen = camera_at(camera, bench.mount, bench.T_head_lrf, pitch) * pose
+        true.append(np.broadcast_to(seen.as_matrix(), (len(at), 4, 4)))
     true = np.concatenate([*true, np.zeros((0, 4, 4))])
     drawn, covariance, _ = seen_poses(bench, true[:, :3], rng, noise)
     return {

@@ -21,6 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import AHEAD, apply_pose, pose_array, tilt
+from lrfcal_lib.model.kinematics import camera_at
 from lrfcal_lib.session.stated import (
     CameraInfo,
     board_to_json,
@@ -146,10 +147,7 @@ class Rig:
         pitch
             True one of the head, or many, radians.
         """
-        back = RigidTransform.from_rotation(
-            Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0]))
-        )
-        return camera.mounting * self.T_head_lrf.inv() * back
+        return camera_at(camera.mounting, "head", self.T_head_lrf, pitch)
 
     def camera_infos(self) -> list[CameraInfo]:
         """What a session states of the cameras."""

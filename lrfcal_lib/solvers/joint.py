@@ -241,14 +241,7 @@ def finished(obs, state, data, unknowns, required):
         n_observations=len(obs.face_range) + len(obs.beam_hit) + len(obs.view_pitch),
     )
     lens = lens_share(obs, found, data, unknowns)
-    by_placements = found.covariance_placements
-    if by_placements is not None:
-        by_placements = by_placements + lens.covariance
-    found = replace(
-        found,
-        covariance=found.covariance + lens.covariance - lens.counted,
-        covariance_placements=by_placements,
-    )
+    found = found.widened(lens.covariance - lens.counted, lens.covariance)
     squares = misfits(blocks(found.state), data)
     solution = JointSolution(
         found,
@@ -275,15 +268,7 @@ def with_step_error(solution: JointSolution) -> JointSolution:
     free = pseudo_inverse(here.information.sum(axis=0))
     moved = -free @ pull.sum(axis=0) / STEP * sigma
     spread = dyads(moved)
-    estimate = solution.solution
-    by_placements = estimate.covariance_placements
-    if by_placements is not None:
-        by_placements = by_placements + spread
-    estimate = replace(
-        estimate,
-        covariance=estimate.covariance + spread,
-        covariance_placements=by_placements,
-    )
+    estimate = solution.solution.widened(spread, spread)
     return replace(solution, solution=estimate, step=moved)
 
 

@@ -264,16 +264,16 @@ def view_block(state, data, unknowns):
     # T_camera_board = T_camera_lrf T_head_lrf^-1 Rx(-pitch) T_platform_board for a camera on the
     # head
     R_camera_head = camera[..., :3] @ head[..., :3].mT
-    R_head_platform = tilt(np.eye(3), -pitch[..., None]).mT
-    R_camera_platform = R_camera_head @ R_head_platform
+    R_camera_platform = tilt(R_camera_head, pitch[..., None])  # row by row
     origin = tilt(board[..., 3], -pitch)  # of the board, in the head frame
-    arm = np.matvec(R_camera_head, origin - head[..., 3])
+    from_lrf = origin - head[..., 3]
+    arm = np.matvec(R_camera_head, from_lrf)
     w = geometry.log_rotation(R_camera_platform @ board[..., :3] @ pose[..., :3, :3].mT)
     residuals = np.concatenate([w, arm + camera[..., 3] - pose[..., :3, 3]], axis=-1)
 
     left = inverse_left_jacobian(w)
     turned = left @ -R_camera_head
-    lever = R_camera_head @ hat(origin - head[..., 3])
+    lever = R_camera_head @ hat(from_lrf)
     of_head = _by_pose(turned, lever, -R_camera_head) * moved
     by_pitch = _by_pose(turned, R_camera_head @ hat(origin), 0.0)[..., :1] * moved
     of_camera = _by_pose(left, -hat(arm), np.eye(3))
@@ -344,7 +344,7 @@ def side_block(state, data, unknowns):
     J = own_jacobian(unknowns, "sides")
     root = np.sqrt((SIDE_FREEDOM + 1) / (spread + x**2))
     cost = 0.5 * (SIDE_FREEDOM + 1) * np.log1p(x**2 / spread)
-    return Block(root * x, root[..., None] * J, np.ones_like(x), cost=cost)
+    return Block(root * x, root[..., None] * J, cost=cost)
 
 
 def prior_block(state, data, unknowns):

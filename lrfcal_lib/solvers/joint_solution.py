@@ -335,7 +335,7 @@ class JointSolution:
             for name, block in self.blocks.items():
                 by_one_more = (after[name].white - block.white) / step
                 J = np.insert(block.white_jacobian, shared, by_one_more, axis=-1)
-                blocks[name] = Block(block.white, J, np.ones_like(block.white))
+                blocks[name] = Block(block.white, J)
             shared += 1
         hessian, gradient, *_ = linearise(blocks.values())
         return Score(*eliminate(hessian, gradient, shared)[:2])

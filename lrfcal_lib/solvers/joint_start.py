@@ -14,7 +14,7 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     pose_transform,
 )
-from lrfcal_lib.model.kinematics import TILT_AXIS, SourceFrame
+from lrfcal_lib.model.kinematics import SourceFrame, platform_from_head
 from lrfcal_lib.model.observations import CameraObservations, JointObservations, thin
 from lrfcal_lib.solvers.joint_model import JointState
 from lrfcal_lib.solvers.plane_start import start_from_planes
@@ -123,8 +123,9 @@ def boards_in_images(
     camera = obs.view_camera[views]
     on_head = np.isin(obs.mounts, "head")[camera]
     pitch = np.where(on_head, obs.view_pitch[views], 0.0)
-    turn = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(pitch, TILT_AXIS)))
     T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
     T_camera_board = RigidTransform.from_matrix(obs.view_pose[views])
-    boards = turn * T_head_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
-    return pose_array(boards)
+    T_platform_lrf = platform_from_head(pitch) * T_head_lrf
+    return pose_array(
+        T_platform_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
+    )

@@ -117,8 +117,7 @@ def estimate_pose(
 
         def plain(pose):
             block = residual(pose, obs)
-            weights = np.broadcast_to(weight, block.residuals.shape)
-            return Block(block.residuals, block.jacobian, weights)
+            return Block(block.residuals, block.jacobian, weight)
 
         return plain
 

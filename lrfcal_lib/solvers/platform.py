@@ -450,7 +450,7 @@ def projected_block(head, obs, groups, scatter=1.0, printed=False):
         return np.concatenate(every, axis=1) / scatter
 
     residuals, jacobian = by_chart(terms, head)
-    return Block(residuals, jacobian, np.ones_like(residuals))
+    return Block(residuals, jacobian)
 
 
 def points_of(heads, obs, printed):
