@@ -275,6 +275,6 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
         flatter = valid & (rough[window] < flattest)
         flattest[flatter] = rough[window][flatter]
         normals[flatter] = directions[..., 0][window][flatter]
-    away = np.sum(normals * (points - origins), axis=-1) > 0
+    away = np.vecdot(normals, points - origins) > 0
     normals[away] *= -1
     return normals, np.sqrt(np.where(np.isfinite(flattest), flattest, np.nan))

@@ -99,7 +99,7 @@ def sight_block(
         Of every distance, metres.
     """
     rotated = rotate_points(pose, points)
-    residuals = np.sum(normals * (rotated + pose[..., None, :, 3]), axis=-1)
+    residuals = np.vecdot(normals, rotated + pose[..., None, :, 3])
     jacobian = gradient_by_pose(rotated, np.broadcast_to(normals, rotated.shape))
     return Block(residuals, jacobian, np.full(residuals.shape, 1.0 / sigma))
 
@@ -149,9 +149,8 @@ def edge_residuals_px(
         uv = mirrored(transform.apply(obs.crossing_points), obs.model)
         foot = uv - line_distance(uv, lines)[:, None] * lines[:, :2]
         along = lines[:, [1, 0]] * [10.0, -10.0]
-        sights = obs.model.sights(np.stack([foot - along, foot + along]))
+        sights = obs.model.sights(np.stack([foot + along, foot - along]))
         moved = line_through(*undistort(project(sights, obs.model), model))
-        moved *= np.sign(np.sum(moved[:, :2] * lines[:, :2], axis=1))[:, None]
         obs = replace(obs, crossing_lines=moved, model=model)
     return line_block(geometry.pose_array(transform), obs).residuals
 
@@ -181,7 +180,7 @@ def plane_residuals_m(
     row, known = np.nonzero(obs.placements[:, None] == obs.plane_placement)
     normal = poses[row, :3, 2]
     point = poses[row, :3, 3]
-    out[known] = np.sum(normal * (transform.apply(obs.plane_points[known]) - point), axis=1)
+    out[known] = np.vecdot(normal, transform.apply(obs.plane_points[known]) - point)
     return out
 
 

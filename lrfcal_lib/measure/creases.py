@@ -158,7 +158,7 @@ class Sights:
         share, miss, sigma = self._shares(change, width)
         matched = share.sum(axis=1)
         weight = 1 / (PLACES * sigma**2)
-        wanted = np.sum(share * miss, axis=1) + matched * (self.by_unknown @ change)
+        wanted = np.vecdot(share, miss) + matched * (self.by_unknown @ change)
         return Pull(
             information=(self.by_unknown.T * (weight * matched)) @ self.by_unknown,
             slope=self.by_unknown.T @ (weight * wanted),

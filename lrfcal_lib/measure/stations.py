@@ -294,7 +294,7 @@ def placed(cloud: Cloud, T: RigidTransform, covariance: np.ndarray) -> Cloud:
     turned = T.rotation.apply(cloud.points)
     normals = T.rotation.apply(cloud.normals)
     J = gradient_by_pose(turned, normals)
-    of_pose = np.einsum("ni,ij,nj->n", J, covariance, J)
+    of_pose = np.vecdot(J @ covariance, J)
     return replace(
         cloud,
         points=turned + T.translation,

@@ -142,10 +142,10 @@ def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
         Variance of independent errors.
     """
     counted = np.sum(modes**2, axis=1)
-    score = np.sum(modes * residuals[..., None], axis=1)
+    score = np.vecmat(residuals, modes)
     pull = modes.mT @ by_own
     there = counted > 0
-    taken = share * np.sum(pull * (pull @ spread), axis=-1)[there] / counted[there]
+    taken = share * np.vecdot(pull, pull @ spread)[there] / counted[there]
     told = np.sum((1 - taken) ** 2)
     if told < 1:
         return np.nan

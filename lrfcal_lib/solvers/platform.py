@@ -306,7 +306,7 @@ def platform_blocks(state, edge, face, sigma_pitch):
     r, J, *_ = distances(state, edge)
     count = np.maximum(used.sum(axis=1, keepdims=True), 1)
     middle = np.sum(r[..., 2] * used, axis=1, keepdims=True) / count
-    by_sum = np.sum(J[..., 2, :] * used[..., None], axis=1)[:, None]
+    by_sum = np.vecmat(used, J[..., 2, :])[:, None]
     by_middle = by_sum / count[..., None]
     stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))
     return [
