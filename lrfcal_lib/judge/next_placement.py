@@ -193,7 +193,7 @@ def outline(solution: JointSolution) -> np.ndarray:
     solution
     """
     corners = solution.observations.corners
-    return np.column_stack([corners, np.zeros(len(corners))])
+    return np.insert(corners, 2, 0.0, axis=1)
 
 
 def sights(boards: np.ndarray, solution: JointSolution) -> np.ndarray:

@@ -58,7 +58,7 @@ def polygon(corners: ArrayLike) -> Mesh:
     corners = np.asarray(corners, float)
     fan = np.arange(1, len(corners) - 1)
     faces = np.stack([0 * fan, fan, fan + 1], axis=1)
-    return np.column_stack([corners, np.zeros(len(corners))]), faces
+    return np.insert(corners, 2, 0.0, axis=1), faces
 
 
 def rectangle(width: float, height: float) -> Mesh:
