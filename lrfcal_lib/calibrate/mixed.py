@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from lrfcal_lib.model.geometry import dyads
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.session.stated import LrfInfo
 
 PULSE = 1.0  # metres; surfaces farther apart give two echoes and no mixed pixel (see simulate.beam)

@@ -11,8 +11,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard, measure_board
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.geometry import dyads, tilt
+from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections, SourceFrame
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations, thin
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, face_points

@@ -13,7 +13,8 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.mixed import mixed
 from lrfcal_lib.calibrate.painting import Painter, View
-from lrfcal_lib.model.geometry import dyads, lrf_to_platform, polar_to_points
+from lrfcal_lib.fit.covariance import dyads
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.model.kinematics import MIRROR_TURN, Corrections
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import LrfInfo

@@ -12,6 +12,7 @@ from scipy.stats import binom, chi2
 from lrfcal_lib.evaluate.tables import unit_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.covariance import (
+    dyads,
     name_words,
     null_space,
     pseudo_inverse,
@@ -22,7 +23,6 @@ from lrfcal_lib.fit.edge_likelihood import disc_share
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
-    dyads,
     pose_array,
     pose_step,
     pose_transform,

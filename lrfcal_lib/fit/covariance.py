@@ -8,14 +8,26 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import qr
 
-from lrfcal_lib.model.geometry import dyads
-
 # eigenvalues of scaled normal equations below this share of the largest are rounding errors
 RANK = 1e-13
 # share of a direction's largest component from which an unknown takes part in it
 PARTAKES = 0.05
 ZERO = 1e-5  # a component of a direction below is a rounding error
 FEWEST = 3  # placements whose scatter tells anything
+
+
+def dyads(vectors: np.ndarray) -> np.ndarray:
+    """Products ``v v^T`` of vectors with themselves.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (..., k)
+
+    Returns
+    -------
+    ndarray, shape (..., k, k)
+    """
+    return vectors[..., None] * vectors[..., None, :]
 
 
 def sigma_of(covariance: np.ndarray) -> np.ndarray:

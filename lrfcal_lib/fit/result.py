@@ -8,9 +8,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 from scipy.special import polygamma
 
-from lrfcal_lib.fit.covariance import sigma_of
+from lrfcal_lib.fit.covariance import dyads, sigma_of
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import dyads
 
 AXIS_NAMES = (
     "axis_out_of_scan_plane",

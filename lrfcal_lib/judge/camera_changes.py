@@ -7,10 +7,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc, fdtrc
 
-from lrfcal_lib.fit.covariance import pseudo_inverse
+from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose, dyads, pose_step
+from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose, pose_step
 from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint

@@ -8,12 +8,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
-from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, dyads
+from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
 # how a board leans out of the upright plane that faces the LRF: turns about its x and y, degrees

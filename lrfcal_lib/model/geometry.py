@@ -40,20 +40,6 @@ def cross(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     return forward - backward
 
 
-def dyads(vectors: np.ndarray) -> np.ndarray:
-    """Products ``v v^T`` of vectors with themselves.
-
-    Parameters
-    ----------
-    vectors : ndarray, shape (..., k)
-
-    Returns
-    -------
-    ndarray, shape (..., k, k)
-    """
-    return vectors[..., None] * vectors[..., None, :]
-
-
 def unit_vector(vectors: np.ndarray) -> np.ndarray:
     """Vectors of length 1 that point the same way.
 

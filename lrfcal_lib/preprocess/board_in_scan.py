@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.covariance import solve_each
+from lrfcal_lib.fit.covariance import dyads, solve_each
 from lrfcal_lib.fit.robust import NORMAL, biweight, rms
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.geometry import dyads, polar_covariance, polar_to_points
+from lrfcal_lib.model.geometry import polar_covariance, polar_to_points
 from lrfcal_lib.preprocess.surfaces import (
     PLANE_NOISE,
     BoardNotFound,

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
-    dyads,
     lrf_to_platform,
     plane_axes,
     polar_to_points,

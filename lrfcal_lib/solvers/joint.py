@@ -9,13 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
-from lrfcal_lib.fit.covariance import pseudo_inverse
+from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.fit.least_squares import remembered, solve
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
-    dyads,
     pose_array,
     pose_parameters,
     pose_transform,

@@ -16,7 +16,7 @@ from lrfcal_lib.fit.axis_chart import (
     chart_parameters,
     move_head,
 )
-from lrfcal_lib.fit.covariance import inverse_root, name_words, solve_each
+from lrfcal_lib.fit.covariance import dyads, inverse_root, name_words, solve_each
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR
@@ -26,7 +26,6 @@ from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     axis_of,
     cross,
-    dyads,
     fit_line,
     gradient_by_pose,
     head_from_axis,
