@@ -5,6 +5,7 @@ import pytest
 from joint_draws import MOUNTS, draw, rng
 
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
+from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Levels, Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import view_block
@@ -18,13 +19,14 @@ def test_whitened_views_are_those_of_the_whole_covariance(mount):
     obs, truth, _ = draw(rng(1), 3, mount=mount)
     data = gather(obs, Levels(sigma_pitch=0.3, view_scale=2.0))
     block = view_block(truth, data, Unknowns(2, 3))
+    stated = pad(obs.view_placement, 3, covariance=obs.view_covariance)["covariance"]
     p, v = data.view["used"].shape
     for i in range(p):
         whole = np.zeros((6 * v, 6 * v))
         g = block.by_pitch[i]
         for a in range(v):
             rows = slice(6 * a, 6 * a + 6)
-            whole[rows, rows] += data.view["covariance"][i, a] * data.levels.view_scale**2
+            whole[rows, rows] += stated[i, a] * data.levels.view_scale**2
             for b in np.flatnonzero(data.view["pitch"][i] == data.view["pitch"][i, a]):
                 whole[rows, 6 * b : 6 * b + 6] += 0.3**2 * np.outer(g[a], g[b])
         np.testing.assert_allclose(

@@ -1,6 +1,6 @@
 """The tilt axis and the cameras, each by itself, from observations alone: no session is needed."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -116,9 +116,9 @@ def calibrate_platform(
         Where the platform is neither stated nor determined, 'combined' is an assumption, and so
         named in `problems`.
     """
-    ways: dict[str, tuple[str, Callable[..., PlatformSolution]]] = {
+    ways = {
         "projected_printed": ("last_beam", partial(solve_projected, printed=True)),
-        "projected_last_beam": ("last_beam", solve_projected),
+        "projected_last_beam": ("last_beam", partial(solve_projected)),
         "line_3d": ("half_step", partial(solve_platform, sigma_pitch=sigma_pitch)),
     }
     solutions = {}
@@ -206,12 +206,8 @@ def combine(estimated: KnownAxis, stated: KnownAxis) -> KnownAxis:
     gain = prior @ np.linalg.inv(prior + estimated.covariance)
     change = gain @ (estimated.parameters - stated.parameters)
     axis = axis_from_chart(stated.parameters + change)
-    # turn about the axis, shift along it
-    unobservable = (
-        stated.T_head_lrf
-        * geometry.head_from_axis(geometry.axis_of(stated.T_head_lrf)).inv()
-    )
-    return KnownAxis(unobservable * geometry.head_from_axis(axis), prior - gain @ prior)
+    head = geometry.head_from_axis(axis, stated.T_head_lrf)
+    return KnownAxis(head, prior - gain @ prior)
 
 
 def axis_from_chart(parameters: np.ndarray) -> geometry.TiltAxis:
@@ -219,7 +215,8 @@ def axis_from_chart(parameters: np.ndarray) -> geometry.TiltAxis:
 
     Undoes :func:`lrfcal_lib.fit.axis_chart.chart_parameters`.
     """
-    out_of_plane, within, y, z = parameters * [1, 1, -1, -1]
-    direction = unit_vector(np.array([1.0, -np.tan(within), np.tan(out_of_plane)]))
-    x = -(direction[1] * y + direction[2] * z) / direction[0]
-    return geometry.TiltAxis(direction, np.array([x, y, z]))
+    rise, sideways = np.tan(parameters[:2])
+    y, z = -parameters[2:]
+    along = np.array([1.0, -sideways, rise])
+    foot = np.array([sideways * y - rise * z, y, z])
+    return geometry.TiltAxis(unit_vector(along), foot)

@@ -22,7 +22,7 @@ from lrfcal_lib.calibrate.outline import (
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.camera import CameraModel, line_distance
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import ImageEdge
@@ -238,9 +238,8 @@ def edges_in_cloud(solution, prepared, placement, face):
         height = (plane[:3, 3] - centre) @ normal
         for edge in view.edges:
             a = edge.line[:2]
-            uv = edge.ends - np.outer(edge.ends @ a + edge.line[2], a)
-            rays = np.insert(uv, 2, 1.0, axis=1) @ np.linalg.inv(lens.matrix).T
-            sight = T_platform_camera.rotation.apply(rays)
+            uv = edge.ends - np.outer(line_distance(edge.ends, edge.line), a)
+            sight = T_platform_camera.rotation.apply(lens.sights(uv))
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
     return {name: np.concatenate(points) for name, points in sides.items()}
@@ -307,14 +306,14 @@ def blocks_of(state, case, scale):
     held[3:, -count:] = np.diag(np.tile(FAR, len(case.middle)))
     blocks.append(_rows(np.zeros(len(held)), held))
     for block in blocks:
-        missing = width - block.jacobian.shape[-1]
-        jacobian = np.pad(block.jacobian, [(0, 0), (0, 0), (0, missing)])
+        jacobian = np.zeros((*block.residuals.shape, width))
+        jacobian[..., : block.jacobian.shape[-1]] = block.jacobian
         yield replace(block, jacobian=jacobian)
 
 
 def _rows(residuals, jacobian):
     """White residuals (n,) and their Jacobian (n, c), a Block of one placement."""
-    return Block(residuals[None], jacobian[None], np.ones((1, len(residuals))))
+    return Block(residuals[None], jacobian[None])
 
 
 def side_columns(J, edge, state, case):

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard, measure_board
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections, SourceFrame
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations, thin
@@ -371,7 +372,7 @@ def _crossings(prepared, view, source, sides, count):
         pitch = edges.pitch[rows]
         sigma_pitch = prepared.pitch_noise.sigma(pitch, middle)
         by_pitch = source.by_pitch(p_lrf, pitch) * sigma_pitch[:, None]
-        pitch_error = np.einsum("...i,...j->...ij", by_pitch, by_pitch)
+        pitch_error = dyads(by_pitch)
         yield {
             "points": source.points(p_lrf, pitch),
             "pitch": pitch,

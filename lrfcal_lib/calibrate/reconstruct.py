@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.mixed import mixed
 from lrfcal_lib.calibrate.painting import Painter, View
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.model.kinematics import MIRROR_TURN, Corrections
 from lrfcal_lib.session.read import Sweep
@@ -260,8 +261,8 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     share = sums(valid.astype(float))
     whole = np.maximum(share, 0.5 / width**2)[..., None]
     mean = sums(p) / whole
-    square = sums(np.einsum("...i,...j->...ij", p, p)) / whole[..., None]
-    spread = square - np.einsum("...i,...j->...ij", mean, mean)
+    square = sums(dyads(p)) / whole[..., None]
+    spread = square - dyads(mean)
     variances, directions = np.linalg.eigh(spread)
     least, middle, _ = np.moveaxis(variances, -1, 0)
     known = (share > 1 / 3) & (middle > LEAST_SPREAD)
@@ -275,6 +276,6 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
         flatter = valid & (rough[window] < flattest)
         flattest[flatter] = rough[window][flatter]
         normals[flatter] = directions[..., 0][window][flatter]
-    away = np.sum(normals * (points - origins), axis=-1) > 0
+    away = np.vecdot(normals, points - origins) > 0
     normals[away] *= -1
     return normals, np.sqrt(np.where(np.isfinite(flattest), flattest, np.nan))

@@ -12,6 +12,7 @@ from scipy.stats import binom, chi2
 from lrfcal_lib.evaluate.tables import unit_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.covariance import (
+    dyads,
     name_words,
     null_space,
     pseudo_inverse,
@@ -203,7 +204,8 @@ def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.n
     if len(left):
         open_ = name_words(left[0] / scale, unknowns.names(obs.cameras), LARGE)
         raise DegenerateGeometry(f"no bound: the data leave {open_} open")
-    return pseudo_inverse(total * scale[:, None] * scale) * scale[:, None] * scale
+    unit = dyads(scale)
+    return pseudo_inverse(total * unit) * unit
 
 
 def groups_of(names: Sequence[str]) -> dict[str, tuple[list[int], str, float]]:
@@ -282,7 +284,7 @@ def _judge(trials, index, factor):
     if factor is None:
         unit = 1 / sigma_of(B)
     B = unit[:, :, None] * B * unit[:, None]
-    crb = np.sqrt(np.mean(np.trace(B, axis1=1, axis2=2)))
+    crb = np.sqrt(np.mean(np.linalg.trace(B)))
     rmse = rms(np.linalg.norm(unit * e, axis=1))
     free = len(e) * _freedom(np.mean(B, axis=0))
     half_width = HALF_WIDTH * sigma_of(C)

@@ -208,6 +208,6 @@ def on_true_edges(observations: PlatformObservations, truth: Truth) -> PlatformO
         away = flat @ lines[:, :2].T + lines[:, 2]
         edge = np.median(np.abs(away), axis=0).argmin()
         flat = flat - away[:, [edge]] * lines[edge, :2]
-        on_edge = board.apply(np.column_stack([flat, np.zeros(len(flat))]))
+        on_edge = board.apply(np.insert(flat, 2, 0.0, axis=1))
         points[rows] = truth.T_head_lrf.inv().apply(geometry.tilt(on_edge, -pitch))
     return replace(observations, edge_points=points)

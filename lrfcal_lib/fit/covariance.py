@@ -16,6 +16,20 @@ ZERO = 1e-5  # a component of a direction below is a rounding error
 FEWEST = 3  # placements whose scatter tells anything
 
 
+def dyads(vectors: np.ndarray) -> np.ndarray:
+    """Products ``v v^T`` of vectors with themselves.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (..., k)
+
+    Returns
+    -------
+    ndarray, shape (..., k, k)
+    """
+    return vectors[..., None] * vectors[..., None, :]
+
+
 def sigma_of(covariance: np.ndarray) -> np.ndarray:
     """Standard deviations.
 
@@ -27,7 +41,7 @@ def sigma_of(covariance: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (..., k)
     """
-    return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    return np.sqrt(np.linalg.diagonal(covariance))
 
 
 def solve_each(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -43,6 +57,20 @@ def solve_each(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     ndarray, shape (..., k)
     """
     return np.linalg.solve(matrices, vectors[..., None])[..., 0]
+
+
+def inverse_root(covariance: np.ndarray) -> np.ndarray:
+    """Inverse Cholesky factors, which make what has these covariances white.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., k, k)
+
+    Returns
+    -------
+    ndarray, shape (..., k, k)
+    """
+    return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
 def null_space(hessian: np.ndarray, scales: np.ndarray, limit: float = 1.0) -> np.ndarray:
@@ -61,8 +89,8 @@ def null_space(hessian: np.ndarray, scales: np.ndarray, limit: float = 1.0) -> n
     ndarray, shape (m, k)
         Increments, largest component 1, the worst first.
     """
-    values, vectors = np.linalg.eigh(hessian * scales[:, None] * scales)
-    basis = vectors[:, values < np.maximum(RANK * values[-1], limit**-2)].T
+    values, vectors = np.linalg.eigh(hessian * dyads(scales))
+    basis = vectors[:, values < max(RANK * values[-1], limit**-2)].T
     # reduced echelon form with pivots at large entries: a basis with many zeros
     pivots = qr(basis, mode="r", pivoting=True)[1][: len(basis)]
     basis = np.linalg.solve(basis[:, pivots], basis)
@@ -96,13 +124,15 @@ def covariance_of(hessian, scales, lost):
     A pseudo-inverse calls such unknowns perfectly known; their covariances with others are set to
     zero.
     """
-    unit = scales[:, None] * scales
+    unit = dyads(scales)
     covariance = pseudo_inverse(hessian * unit) * unit
     if not lost:  # or many trials
         return covariance
     lost = np.any(np.abs(null_space(hessian, scales, np.inf)) > PARTAKES, axis=0)
-    covariance = np.where(lost[:, None] | lost, 0.0, covariance)
-    return covariance + np.diag(np.where(lost, np.inf, 0.0))
+    covariance[lost] = 0.0
+    covariance[:, lost] = 0.0
+    covariance[lost, lost] = np.inf
+    return covariance
 
 
 def name_words(direction: np.ndarray, names: Sequence[str], share: float = PARTAKES) -> str:
@@ -141,24 +171,23 @@ def placement_covariance(
     -----
     The sum of squared changes (CR3) is too large in the mean where placements carry unequal weight:
     noise alone gives ``(g - 1) / g sum_g (inv(H - H_g) - inv(H))`` instead of ``inv(H)``. That
-    factor is taken off every unknown, so that scatter and noise can be compared.
+    factor is taken off every unknown, so that scatter and noise can be compared; ``(g - 1) / g``
+    cancels.
     """
-    groups = hessians.shape[-3]
     total = np.sum(hessians, axis=-3, keepdims=True)
-    diagonal = np.sqrt(np.maximum(np.diagonal(total, axis1=-2, axis2=-1), 1e-300))
-    outer = np.einsum("...i,...j->...ij", diagonal, diagonal)
+    diagonal = np.sqrt(np.maximum(np.linalg.diagonal(total), 1e-300))
+    outer = dyads(diagonal)
     scaled = (total - hessians) / outer
     try:  # squared pivots: what the others say about one unknown more
-        pivots = np.linalg.cholesky(scaled).diagonal(axis1=-2, axis2=-1)
+        pivots = np.linalg.diagonal(np.linalg.cholesky(scaled))
     except np.linalg.LinAlgError:
         return None, None
-    if groups < FEWEST or pivots.min() < 1e-6:
+    if hessians.shape[-3] < FEWEST or pivots.min() < 1e-6:
         return None, None
     without = np.linalg.inv(scaled)
     shifts = np.matvec(without, scores / diagonal) / diagonal
-    share = (groups - 1) / groups
-    squares = share * shifts.mT @ shifts
-    whole = np.diagonal(np.linalg.inv(total / outer), axis1=-2, axis2=-1)
-    gained = np.diagonal(without, axis1=-2, axis2=-1) - whole
-    factor = np.sqrt(whole[..., 0, :] / (share * gained.sum(axis=-2)))
-    return squares * np.einsum("...i,...j->...ij", factor, factor), shifts
+    squares = shifts.mT @ shifts
+    whole = np.linalg.diagonal(np.linalg.inv(total / outer))
+    gained = np.linalg.diagonal(without) - whole
+    factor = np.sqrt(whole[..., 0, :] / gained.sum(axis=-2))
+    return squares * dyads(factor), shifts

@@ -13,7 +13,7 @@ weights are frozen while a step is judged and renewed for the next one.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ from lrfcal_lib.fit.covariance import (
     name_words,
     null_space,
     placement_covariance,
+    pseudo_inverse,
     solve_each,
 )
 from lrfcal_lib.fit.padding import medians
@@ -33,7 +34,6 @@ from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
 CAUCHY = 2.385  # 95 % efficiency for normal errors
-OWN_RANK = 1e-13  # the same of what a placement owns
 FIRST_DAMPING = 1e-7  # of the normal equations' diagonal
 LEAST_DAMPING = 1e-12
 MOST_DAMPING = 1e14
@@ -58,7 +58,8 @@ class Block:
         Derivative of the residuals.
     whitener : ndarray, shape (..., n) or (..., n / d, d, d)
         Reciprocal standard deviations, or inverse Cholesky factors of the covariance of d
-        consecutive residuals. A zero switches a residual off.
+        consecutive residuals. A zero switches a residual off. One by default, for residuals in
+        standard deviations.
     count : float or ndarray, shape (..., n / d), optional
         Number of measurements that each group of residuals stands for (d when left out): only
         losses use it.
@@ -73,7 +74,7 @@ class Block:
 
     residuals: np.ndarray
     jacobian: np.ndarray
-    whitener: np.ndarray
+    whitener: np.ndarray = field(default_factory=lambda: np.ones(()))
     count: float | np.ndarray | None = None
     corrected: np.ndarray | None = None
     cost: np.ndarray | None = None
@@ -86,7 +87,7 @@ class Block:
     def whitened(self, rows):
         """Rows (..., n, k), such as a Jacobian, in independent standard deviations."""
         w = self.whitener
-        if w.ndim == self.residuals.ndim:
+        if w.ndim <= self.residuals.ndim:
             return w[..., None] * rows
         groups = rows.reshape(rows.shape[:-2] + (-1, w.shape[-1], rows.shape[-1]))
         return (w @ groups).reshape(rows.shape)
@@ -241,7 +242,7 @@ def eliminate(
     if regular:
         back = np.linalg.solve(own, known)
     else:
-        back = np.linalg.pinv(own, rcond=OWN_RANK, hermitian=True) @ known
+        back = pseudo_inverse(own) @ known
     taken = hessian[:, :c, c:] @ back
     reduced = hessian[:, :c, :c] - taken[..., :c]
     reduced_gradient = gradient[:, :c] - taken[..., c]
@@ -268,7 +269,7 @@ def _step(hessian, gradient, damping, shared):
     """A damped step, its squared length in standard deviations, and the fall of the cost it
     promises.
     """
-    diagonal = hessian.diagonal(axis1=-2, axis2=-1)
+    diagonal = np.linalg.diagonal(hessian)
     extra = damping[..., None] * diagonal
     # what nobody sees stays where it is
     extra = extra + (1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300)
@@ -420,9 +421,9 @@ class Question:
         See :func:`null_space`.
     words : callable, optional
         Puts a direction (k,) into words; by default the names with its largest components.
-    groups : ndarray, optional
-        The placement of every residual, or of every few in a row, for `covariance_placements`; with
-        `shared` the leading axis is the placement.
+    groups : array_like
+        The placement of every residual, or of every few in a row, for `covariance_placements`; one
+        by default. With `shared` the leading axis is the placement.
     freedom, n_observations : int, optional
         By default those of the residuals.
     chi2_rest : float
@@ -437,7 +438,7 @@ class Question:
     scales: ArrayLike = 1.0
     limit: float = 1.0
     words: Callable | None = None
-    groups: np.ndarray | None = None
+    groups: ArrayLike = (0,)
     freedom: int | None = None
     n_observations: int | None = None
     chi2_rest: float | np.ndarray = 0.0
@@ -519,9 +520,7 @@ def _by_placement(r, J, weights, groups, shared):
     if shared is not None:
         scores = np.matvec(weighted, r)
         return reduced_hessian(weighted @ J, shared), scores[:, :shared]
-    index = (
-        np.zeros(1, int) if groups is None else np.unique(groups, return_inverse=True)[1]
-    )
+    index = np.unique(groups, return_inverse=True)[1]
     index = np.repeat(index, r.shape[-1] // len(index))
     member = index == np.arange(index.max() + 1)[:, None]
     weighted = weighted[..., None, :, :] * member[:, None]
@@ -545,9 +544,6 @@ def _solution(question, minimum, blocks, weights, shared):
         freedom = r.size // chi2.size - own
     too_large = (freedom > 0) & (chi2 > chdtri(max(freedom, 1), LARGE_CHI2))
     inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
-    covariance_placements = None
-    if question.groups is not None or shared is not None:
-        covariance_placements = placement_covariance(hessians, scores)[0]
     transform, parameters = question.read(minimum.state)
     return Solution(
         transform,
@@ -557,7 +553,7 @@ def _solution(question, minimum, blocks, weights, shared):
         residuals=r,
         jacobian=J,
         covariance=covariance_of(hessian, scales, motions) * inflation[..., None, None],
-        covariance_placements=covariance_placements,
+        covariance_placements=placement_covariance(hessians, scores)[0],
         unobservable=motions,
         method=question.method,
         n_observations=question.n_observations or r.shape[-1],

@@ -13,6 +13,8 @@ from lrfcal_lib.model.camera import (
     CameraModel,
     line_distance,
     line_through,
+    mirrored,
+    pinhole_jacobian,
     project,
     undistort,
 )
@@ -30,8 +32,7 @@ SIGMA_FLOOR = 1e-4
 def line_residuals(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) -> np.ndarray:
     """Signed distances of projected points from image lines, equations (19) and (20).
 
-    Behind the camera the formula goes on (mirrored), so that a poor start value can still find its
-    way.
+    Behind the camera, too, see :func:`lrfcal_lib.model.camera.mirrored`.
 
     Parameters
     ----------
@@ -46,17 +47,12 @@ def line_residuals(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) ->
     ndarray, shape (..., n)
         Undistorted pixels; the sign is that of the line.
     """
-    u = camera.fx * moved[..., 0] / moved[..., 2] + camera.cx  # (19)
-    v = camera.fy * moved[..., 1] / moved[..., 2] + camera.cy
-    return lines[..., 0] * u + lines[..., 1] * v + lines[..., 2]  # (20)
+    return line_distance(mirrored(moved, camera), lines)
 
 
 def line_gradients(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) -> np.ndarray:
     """Derivatives (..., n, 3) of :func:`line_residuals` by the moved points, pixels a metre."""
-    by_x = lines[..., 0] * camera.fx / moved[..., 2]
-    by_y = lines[..., 1] * camera.fy / moved[..., 2]
-    by_z = -(by_x * moved[..., 0] + by_y * moved[..., 1]) / moved[..., 2]
-    return np.stack([by_x, by_y, by_z], axis=-1)
+    return np.vecmat(lines[..., :2], pinhole_jacobian(moved, camera))
 
 
 def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
@@ -103,7 +99,7 @@ def sight_block(
         Of every distance, metres.
     """
     rotated = rotate_points(pose, points)
-    residuals = np.sum(normals * (rotated + pose[..., None, :, 3]), axis=-1)
+    residuals = np.vecdot(normals, rotated + pose[..., None, :, 3])
     jacobian = gradient_by_pose(rotated, np.broadcast_to(normals, rotated.shape))
     return Block(residuals, jacobian, np.full(residuals.shape, 1.0 / sigma))
 
@@ -150,17 +146,11 @@ def edge_residuals_px(
     """
     if model is not None and len(obs.crossing_points):
         lines = obs.crossing_lines
-        to_rays = np.linalg.inv(obs.model.matrix).T
-        q = transform.apply(obs.crossing_points) @ obs.model.matrix.T
-        uv = q[:, :2] / q[:, 2:]
+        uv = mirrored(transform.apply(obs.crossing_points), obs.model)
         foot = uv - line_distance(uv, lines)[:, None] * lines[:, :2]
         along = lines[:, [1, 0]] * [10.0, -10.0]
-        rays = (
-            np.column_stack([foot + side * along, np.ones(len(foot))]) @ to_rays
-            for side in (-1, 1)
-        )
-        moved = line_through(*(undistort(project(ray, obs.model), model) for ray in rays))
-        moved *= np.sign(np.sum(moved[:, :2] * lines[:, :2], axis=1))[:, None]
+        sights = obs.model.sights(np.stack([foot + along, foot - along]))
+        moved = line_through(*undistort(project(sights, obs.model), model))
         obs = replace(obs, crossing_lines=moved, model=model)
     return line_block(geometry.pose_array(transform), obs).residuals
 
@@ -190,7 +180,7 @@ def plane_residuals_m(
     row, known = np.nonzero(obs.placements[:, None] == obs.plane_placement)
     normal = poses[row, :3, 2]
     point = poses[row, :3, 3]
-    out[known] = np.sum(normal * (transform.apply(obs.plane_points[known]) - point), axis=1)
+    out[known] = np.vecdot(normal, transform.apply(obs.plane_points[known]) - point)
     return out
 
 

@@ -1,6 +1,6 @@
 """What every solver hands back, and the names of unknowns."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 from scipy.special import polygamma
 
-from lrfcal_lib.fit.covariance import sigma_of
+from lrfcal_lib.fit.covariance import dyads, sigma_of
 from lrfcal_lib.model.camera import CameraModel
 
 AXIS_NAMES = (
@@ -153,8 +153,16 @@ class Solution:
         )
         excess = 2 * np.log(np.fmax(ratio, 1.0))
         h = np.sqrt(np.expm1(beyond_chance(excess, self.n_placements - 1)))
-        finite = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
-        return self.covariance + finite * np.einsum("...i,...j->...ij", h, h)
+        finite = np.nan_to_num(self.covariance, posinf=0.0, neginf=0.0)
+        return self.covariance + finite * dyads(h)
+
+    def widened(self, by_noise: np.ndarray, by_placements: np.ndarray) -> "Solution":
+        """The same with covariances (k, k) added, to that of the noise and that by placement."""
+        scatter = self.covariance_placements
+        if scatter is not None:
+            scatter = scatter + by_placements
+        covariance = self.covariance + by_noise
+        return replace(self, covariance=covariance, covariance_placements=scatter)
 
     @property
     def trusted_sigma(self):

@@ -7,13 +7,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc, fdtrc
 
+from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose, pose_step
 from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.joint_solution import RCOND, JointSolution, Score
+from lrfcal_lib.solvers.joint_solution import JointSolution, Score
 
 POSE = 6  # numbers of a camera's pose
 BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong
@@ -194,12 +195,12 @@ def _chance_of_step(score, columns, row):
     repeated = np.concatenate([np.arange(shared), columns])
     kept = np.ones((count, len(repeated)))
     kept[~later, shared:] = 0.0
-    both = np.einsum("...i,...j->...ij", kept, kept)
+    both = dyads(kept)
     whole = both * score.information[:, repeated[:, None], repeated]
     parted = Score(whole, score.gradient[:, repeated] * kept)
 
     covariance, step, pulls = parted.solved()
-    information = np.linalg.pinv(covariance[-POSE:, -POSE:], rcond=RCOND, hermitian=True)
+    information = pseudo_inverse(covariance[-POSE:, -POSE:])
     change = step[-POSE:]
     square = change @ information @ change
     pull = pulls[:, -POSE:]  # its scatter is that of the placements
@@ -244,7 +245,7 @@ def change_between(solution, first, later, camera, prepared):
     later_less_first = np.hstack([-np.eye(POSE), np.eye(POSE)])
     spread = later_less_first @ both @ later_less_first.T
     step = pose_step(solution.transforms[first], solution.transforms[later])
-    square = step @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ step
+    square = step @ pseudo_inverse(spread) @ step
 
     views = obs.view_camera == index
     middle = outline(solution).mean(axis=0)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
@@ -148,7 +149,7 @@ def total_sigma(information, solution):
     What is not observed counts as known to a metre at 2 m, so that it can be compared as well.
     """
     scales = scales_of(solution)
-    unit = np.outer(scales, scales)
+    unit = dyads(scales)
     covariance = np.linalg.inv(information * unit + np.eye(len(unit))) * unit
     return np.sqrt(sum(sigma**2 for sigma in group_sigma(covariance, solution).values()))
 
@@ -174,7 +175,7 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
     dict of str to ndarray, shape (...)
         Of 'axis' and of each camera, as far as they were unknown.
     """
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1) / scales_of(solution) ** 2
+    variance = np.linalg.diagonal(covariance) / scales_of(solution) ** 2
     columns = {"axis": solution.columns("axis_") + solution.columns("offset_")}
     for camera in solution.transforms:
         columns[camera] = solution.columns(f"{camera}_")
@@ -193,7 +194,7 @@ def outline(solution: JointSolution) -> np.ndarray:
     solution
     """
     corners = solution.observations.corners
-    return np.column_stack([corners, np.zeros(len(corners))])
+    return np.insert(corners, 2, 0.0, axis=1)
 
 
 def sights(boards: np.ndarray, solution: JointSolution) -> np.ndarray:
@@ -208,7 +209,7 @@ def board_poses(solution, grid):
     gaze = Rotation.from_euler("ZX", np.column_stack([bearing, elevation]), degrees=True)
     leans = np.array([(*angles, 0) for angles in LEANS.values()])[lean.astype(int)]
     tip = Rotation.from_rotvec(leans, degrees=True)
-    spin = Rotation.from_rotvec(turn[:, None] * [0, 0, 1], degrees=True)
+    spin = Rotation.from_euler("z", turn[:, None], degrees=True)
     rotation = solution.T_head_lrf.rotation * gaze * geometry.AHEAD * tip * spin
     middle = solution.T_head_lrf.apply(distance[:, None] * gaze.apply([0.0, 1.0, 0.0]))
     origin = middle - rotation.apply(outline(solution).mean(axis=0))

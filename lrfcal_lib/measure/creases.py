@@ -158,7 +158,7 @@ class Sights:
         share, miss, sigma = self._shares(change, width)
         matched = share.sum(axis=1)
         weight = 1 / (PLACES * sigma**2)
-        wanted = np.sum(share * miss, axis=1) + matched * (self.by_unknown @ change)
+        wanted = np.vecdot(share, miss) + matched * (self.by_unknown @ change)
         return Pull(
             information=(self.by_unknown.T * (weight * matched)) @ self.by_unknown,
             slope=self.by_unknown.T @ (weight * wanted),
@@ -205,13 +205,13 @@ def sights(creases: Creases, view: View) -> Sights:
     by_point = pinhole_jacobian(points[inside], model)
     R = view.T_camera_platform.rotation.as_matrix()
     way = creases.along[inside] @ R.T
-    tangent = unit_vector(np.einsum("nij,nj->ni", by_point, way))
+    tangent = unit_vector(np.matvec(by_point, way))
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
-    by_place = np.einsum("ni,nij->nj", normal, by_point) / reach
+    by_place = np.vecmat(normal, by_point) / reach
     off = np.einsum("nj,nkj->nk", by_place, creases.off[inside] @ R.T)
     return Sights(
-        by_unknown=np.einsum("nj,njk->nk", by_place, J[inside]),
+        by_unknown=np.vecmat(by_place, J[inside]),
         across=across / reach,
         clear=clear,
         sigma=np.hypot(np.linalg.norm(off, axis=1), EDGE),

@@ -139,10 +139,7 @@ def _depth(view, planes, number, pixel):
     plane = planes[number]
     T = view.T_camera_platform
     normal = T.rotation.apply(plane.axis)
-    ray = np.append(
-        (pixel - [view.model.cx, view.model.cy]) / [view.model.fx, view.model.fy], 1
-    )
-    depth = normal @ T.apply(plane.centre) / (normal @ ray)
+    depth = normal @ T.apply(plane.centre) / (normal @ view.model.sights(pixel))
     return depth if depth > 0 else np.inf
 
 
@@ -228,8 +225,7 @@ def _on_planes(
 def _where_seen(view, normal, centre, pixels):
     """Where the sights through pixels (k, 2, 2) meet planes (k, 3), platform frame, (k, 2, 3)."""
     T_platform_camera = view.T_camera_platform.inv()
-    rays = np.insert(pixels, 2, 1.0, axis=-1) @ np.linalg.inv(view.model.matrix).T
-    rays = rays @ T_platform_camera.rotation.as_matrix().T
+    rays = view.model.sights(pixels) @ T_platform_camera.rotation.as_matrix().T
     eye = T_platform_camera.translation
     far = np.vecdot(normal, centre - eye)[:, None] / np.vecdot(rays, normal[:, None])
     return eye + far[..., None] * rays

@@ -60,7 +60,7 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
         normals = cloud.normals[part] @ chain.head[:, :3]
         beams = -J[..., COLUMNS.index("range_offset")]
         normals = np.where(np.isfinite(normals), normals, beams)
-        calibration = spread(chain, np.einsum("ni,nij->nj", normals, J)[:, None])
+        calibration = spread(chain, np.vecmat(normals, J)[:, None])
         sweep = np.hypot(offset, stretch * pitch) * np.vecdot(normals, by_pitch)
         reading = np.maximum(np.abs(noise * np.vecdot(normals, beams)), cloud.sigma[part])
         sigma[part] = np.sqrt(calibration**2 + sweep**2 + reading**2)
@@ -239,7 +239,7 @@ def shared_covariances(rig: CalibratedRig) -> list[np.ndarray]:
     covariances = []
     for whole in (known.covariance, known.trusted):
         unbounded = ~np.isfinite(np.diag(whole))
-        bounded = np.where(np.isfinite(whole), whole, 0.0)
+        bounded = np.nan_to_num(whole, posinf=0.0, neginf=0.0)
         covariances.append(bounded + UNBOUNDED * np.diag(unbounded))
     return covariances
 

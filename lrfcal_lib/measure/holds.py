@@ -294,11 +294,11 @@ def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
     _, J, _ = carried(
         chain, wall.bearing, rig.corrections.pitch(-1, wall.pitch), wall.range
     )
-    by_link = np.einsum("i,nij->nj", normal @ chain.head[:, :3], J)
+    by_link = np.vecmat(normal @ chain.head[:, :3], J)
     # a plane turns and shifts with the errors: only what bends it shows
-    plane = np.column_stack([np.ones(len(by_link)), wall.points - wall.points.mean(axis=0)])
+    plane = np.insert(wall.points - wall.points.mean(axis=0), 0, 1.0, axis=1)
     by_link -= plane @ np.linalg.lstsq(plane, by_link, rcond=None)[0]
-    squares = [np.mean(np.sum(by_link @ C * by_link, axis=1)) for C in chain.covariances]
+    squares = [np.mean(np.vecdot(by_link @ C, by_link)) for C in chain.covariances]
     allowed = np.sqrt(max(squares) + UNEVEN**2)
     return Wall(placement, flatness(wall.points)[1], float(allowed))
 

@@ -196,7 +196,7 @@ def _compared(pair, sharp, x):
     gradient = np.mean(gradients, axis=0)
     weighted = gradient * weight[:, None, None]
     tensor = np.einsum("nsi,nsj->nij", weighted, gradient)
-    slope = np.einsum("nsi,ns->ni", weighted, values[1] - values[0])
+    slope = np.vecmat(values[1] - values[0], weighted)
     by_first, by_second = pair.by_unknown
     return np.nan_to_num(tensor), np.nan_to_num(slope), by_second - by_first
 

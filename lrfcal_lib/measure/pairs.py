@@ -21,7 +21,12 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
-from lrfcal_lib.model.geometry import pose_step, transform_difference, unit_vector
+from lrfcal_lib.model.geometry import (
+    gradient_by_pose,
+    pose_step,
+    transform_difference,
+    unit_vector,
+)
 
 # metres, side of the cells whose points make one patch of a surface: for a start, for the fit
 COARSE = 0.1
@@ -137,7 +142,7 @@ def _moves(cloud, rig):
     # as the platform sees it, whatever stands on the head
     chain = replace(chain_of(rig), on_head=False)
     _, J, by_pitch = carried(chain, cloud.bearing, cloud.pitch, cloud.range)
-    by_rig = np.einsum("ni,nij->nj", cloud.normals, J)
+    by_rig = np.vecmat(cloud.normals, J)
     turn = np.vecdot(cloud.normals, by_pitch)
     offset, stretch = chain.sweep_sigma
     return np.column_stack([by_rig, offset * turn, stretch * cloud.pitch * turn])
@@ -160,7 +165,7 @@ def _look(points):
     nearest = np.full(shape, np.inf)
     np.minimum.at(nearest, (row, column), distance)
     nearest = minimum_filter(nearest, 3)
-    return np.where(np.isfinite(nearest), nearest, 0.0)
+    return np.nan_to_num(nearest, posinf=0.0, neginf=0.0)
 
 
 @dataclass(frozen=True)
@@ -432,7 +437,7 @@ def _distances(first, second, T, here, there):
     turned = T.rotation.apply(second.points[there])
     normals = unit_vector(first.normals[here] + T.rotation.apply(second.normals[there]))
     r = np.vecdot(normals, turned + T.translation - first.points[here])
-    return np.hstack([np.cross(turned, normals), normals]), r
+    return gradient_by_pose(turned, normals), r
 
 
 def moved(T: RigidTransform, step: np.ndarray) -> RigidTransform:

@@ -29,7 +29,7 @@ from lrfcal_lib.measure.pairs import (
     surface_of,
 )
 from lrfcal_lib.measure.pose_graph import connected, solved
-from lrfcal_lib.model.geometry import transform_difference
+from lrfcal_lib.model.geometry import gradient_by_pose, transform_difference
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 
 # Of pairs that were drawn (tests/rooms.py, other seeds than any test): right ones have an overlap
@@ -293,8 +293,8 @@ def placed(cloud: Cloud, T: RigidTransform, covariance: np.ndarray) -> Cloud:
     """A cloud after a pose with the (6, 6) covariance of its turn and shift."""
     turned = T.rotation.apply(cloud.points)
     normals = T.rotation.apply(cloud.normals)
-    J = np.hstack([np.cross(turned, normals), normals])
-    of_pose = np.einsum("ni,ij,nj->n", J, covariance, J)
+    J = gradient_by_pose(turned, normals)
+    of_pose = np.vecdot(J @ covariance, J)
     return replace(
         cloud,
         points=turned + T.translation,

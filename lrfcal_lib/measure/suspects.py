@@ -209,7 +209,7 @@ def _allowed(rig):
     known = rig.uncertainty
     count = len(known.names)
     C = np.zeros((count + 1,) * 2)
-    C[:count, :count] = np.where(np.isfinite(known.trusted), known.trusted, 0.0)
+    C[:count, :count] = np.nan_to_num(known.trusted, posinf=0.0, neginf=0.0)
     common = np.zeros((len(C), 6))
     for name, camera in rig.cameras.items():
         columns = poses_of(rig, name)

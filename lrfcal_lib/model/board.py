@@ -106,7 +106,7 @@ def outline_lines(corners: ArrayLike) -> np.ndarray:
         Row i from corner i to i + 1.
     """
     corners = np.asarray(corners, float)
-    points = np.column_stack([corners, np.ones(len(corners))])
+    points = np.insert(corners, 2, 1.0, axis=1)
     lines = cross(points, np.roll(points, -1, axis=0))
     twice_area = lines[:, 2].sum()
     length = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)

@@ -50,6 +50,11 @@ class CameraModel:
         """Whether pixels (..., 2) are inside the image by more than a margin, (...)."""
         return np.all((pixels > margin) & (pixels < self.size - 1 - margin), axis=-1)
 
+    def sights(self, pixels: ArrayLike) -> np.ndarray:
+        """Points at depth 1 that undistorted pixels (..., 2) show, camera frame, (..., 3)."""
+        normalized = (pixels - np.array([self.cx, self.cy])) / [self.fx, self.fy]
+        return np.insert(normalized, 2, 1.0, axis=-1)
+
     @property
     def matrix(self):
         """The 3 x 3 matrix K."""
@@ -75,9 +80,10 @@ class CameraModel:
         covariance : ndarray, shape (9, 9), optional
         rms_px : float, optional
         """
-        fx, fy, cx, cy, *distortion = map(float, values)
+        fx, fy, cx, cy = map(float, values[:4])
         size = self.width, self.height
-        return CameraModel(*size, fx, fy, cx, cy, np.array(distortion), covariance, rms_px)
+        lens = np.array(values[4:])
+        return CameraModel(*size, fx, fy, cx, cy, lens, covariance, rms_px)
 
 
 def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
@@ -94,7 +100,24 @@ def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2)
         NaN where z <= 0.
     """
-    return _before(p_camera) * [model.fx, model.fy] + [model.cx, model.cy]
+    return _pixels(_before(p_camera), model)
+
+
+def mirrored(p_camera: np.ndarray, model: CameraModel) -> np.ndarray:
+    """As :func:`pinhole`, but behind the camera the formula goes on (mirrored), so that a poor
+    start value can still find its way.
+
+    Parameters
+    ----------
+    p_camera : ndarray, shape (..., 3)
+        Metres.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+    """
+    return _pixels(p_camera[..., :2] / p_camera[..., 2:], model)
 
 
 def _before(p_camera):
@@ -102,6 +125,11 @@ def _before(p_camera):
     p_camera = np.asarray(p_camera, float)
     z = p_camera[..., 2:]
     return p_camera[..., :2] / np.where(z > 0, z, np.nan)
+
+
+def _pixels(normalized, model):
+    """Equation (19): pixels of normalised coordinates."""
+    return normalized * [model.fx, model.fy] + [model.cx, model.cy]
 
 
 def pinhole_jacobian(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
@@ -118,13 +146,9 @@ def pinhole_jacobian(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2, 3)
         Pixels per metre.
     """
-    p_camera = np.asarray(p_camera, float)
-    x, y, z = np.moveaxis(p_camera, -1, 0)
-    J = np.zeros(p_camera.shape[:-1] + (2, 3))
-    J[..., 0, 0] = model.fx / z  # u by x
-    J[..., 0, 2] = -model.fx * x / z**2  # u by z
-    J[..., 1, 1] = model.fy / z  # v by y
-    J[..., 1, 2] = -model.fy * y / z**2  # v by z
+    z = np.asarray(p_camera)[..., 2:]
+    J = model.matrix[:2] / z[..., None]  # of which pixels are J @ p_camera
+    J[..., 2] -= np.matvec(J, p_camera) / z
     return J
 
 
@@ -164,9 +188,7 @@ def distort(normalized: ArrayLike, distortion: np.ndarray) -> np.ndarray:
     ndarray, shape (..., 2)
         Normalised coordinates.
     """
-    normalized = np.asarray(normalized, float)
-    x = normalized[..., 0]
-    y = normalized[..., 1]
+    x, y = np.moveaxis(np.asarray(normalized, float), -1, 0)
     growth, shift_x, shift_y = lens_terms(x, y, *distortion)
     return np.stack([x * (1 + growth) + shift_x, y * (1 + growth) + shift_y], axis=-1)
 
@@ -185,8 +207,8 @@ def fold(model: CameraModel) -> float:
         Infinite for a lens that never does: ``1 + 3 k1 r^2 + 5 k2 r^4 + 7 k5 r^6`` is the slope of
         equation (18).
     """
-    k1, k2, _, _, k5 = model.distortion
-    return _fold(float(k1), float(k2), float(k5))
+    radial = model.distortion[[0, 1, 4]]
+    return _fold(*radial.tolist())
 
 
 @lru_cache
@@ -213,8 +235,7 @@ def project(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2)
         NaN where z <= 0.
     """
-    distorted = distort(_before(p_camera), model.distortion)
-    return distorted * [model.fx, model.fy] + [model.cx, model.cy]
+    return _pixels(distort(_before(p_camera), model.distortion), model)
 
 
 def project_jacobians(
@@ -236,16 +257,13 @@ def project_jacobians(
         In the order of `CameraModel.parameters`.
     """
     p_camera = np.asarray(p_camera, float)
-    shape = (*p_camera.shape[:-1], 2)
-    if p_camera.size == 0:
-        return np.zeros((*shape, 3)), np.zeros((*shape, 9))
-    still = np.zeros(3)
-    flat = p_camera.reshape(-1, 1, 3)
-    J = cv2.projectPoints(flat, still, still, model.matrix, model.distortion)[1]
-    J = J.reshape(
-        *shape, -1
-    )  # by rotation (3), translation (3), focal lengths, centre, lens
-    return J[..., 3:6], J[..., 6:15]
+    J = np.zeros((0, 15))  # by rotation (3), translation (3), focal lengths, centre, lens
+    if p_camera.size:
+        still = np.zeros(3)
+        flat = p_camera.reshape(-1, 1, 3)
+        J = cv2.projectPoints(flat, still, still, model.matrix, model.distortion)[1]
+    J = J.reshape(*p_camera.shape[:-1], 2, 15)
+    return J[..., 3:6], J[..., 6:]
 
 
 def undistort(uv: ArrayLike, model: CameraModel) -> np.ndarray:
@@ -261,14 +279,12 @@ def undistort(uv: ArrayLike, model: CameraModel) -> np.ndarray:
     -------
     ndarray, shape (..., 2)
     """
-    uv = np.asarray(uv, float)
+    uv = np.ascontiguousarray(uv, float)
     if uv.size == 0:
-        return uv.copy()
+        return uv
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
-    flat = np.ascontiguousarray(uv.reshape(-1, 1, 2))
-    out = cv2.undistortPoints(
-        flat, model.matrix, model.distortion, None, None, model.matrix, stop
-    )
+    flat = uv.reshape(-1, 1, 2)
+    out = cv2.undistortImagePoints(flat, model.matrix, model.distortion, arg1=stop)
     return out.reshape(uv.shape)
 
 
@@ -284,13 +300,13 @@ def line_through(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     -------
     ndarray, shape (..., 3)
     """
-    a, b = np.broadcast_arrays(np.asarray(a, float), b)
+    a = np.asarray(a, float)
     along = b - a
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     if np.any(length == 0):
         raise ValueError(f"a line needs two different points, got {a} twice")
-    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1) / length
-    return np.concatenate([normal, -np.sum(normal * a, axis=-1, keepdims=True)], axis=-1)
+    normal = along[..., [1, 0]] * [1, -1] / length
+    return np.insert(normal, 2, -np.vecdot(normal, a), axis=-1)
 
 
 def line_distance(uv: ArrayLike, line: ArrayLike) -> np.ndarray:
@@ -307,4 +323,4 @@ def line_distance(uv: ArrayLike, line: ArrayLike) -> np.ndarray:
     ndarray, shape (...)
     """
     line = np.asarray(line, float)
-    return np.sum(np.asarray(uv, float) * line[..., :2], axis=-1) + line[..., 2]
+    return np.vecdot(uv, line[..., :2]) + line[..., 2]

@@ -205,12 +205,14 @@ def axis_of(T_head_lrf: RigidTransform) -> TiltAxis:
     return TiltAxis(direction, point - direction * (direction @ point))
 
 
-def head_from_axis(axis: TiltAxis) -> RigidTransform:
+def head_from_axis(axis: TiltAxis, stated: RigidTransform | None = None) -> RigidTransform:
     """The head transform that turns the LRF least: the gauge used in this repository.
 
     Parameters
     ----------
     axis : TiltAxis
+    stated : RigidTransform, optional
+        Turn about the axis and shift along it, which no data show, are those of this one.
 
     Returns
     -------
@@ -224,7 +226,10 @@ def head_from_axis(axis: TiltAxis) -> RigidTransform:
     rotation = Rotation.identity()
     if sine > 0:
         rotation = Rotation.from_rotvec(turn / sine * np.arctan2(sine, direction[0]))
-    return RigidTransform.from_components(-rotation.apply(axis.foot), rotation)
+    head = RigidTransform.from_components(-rotation.apply(axis.foot), rotation)
+    if stated is None:
+        return head
+    return stated * head_from_axis(axis_of(stated)).inv() * head
 
 
 def paper_parameters(T_head_lrf: RigidTransform) -> tuple[np.ndarray, float]:

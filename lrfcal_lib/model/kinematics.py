@@ -108,9 +108,8 @@ class SourceFrame:
     def covariance(self, covariance: np.ndarray, pitch: np.ndarray) -> np.ndarray:
         """Covariances (n, 3, 3) of measured points, turned into this frame."""
         corrected = self.corrections.pitch(self.placement, pitch)
-        turn = Rotation.from_rotvec(np.multiply.outer(corrected, TILT_AXIS))
-        R_source_head = self.T_source_platform.rotation * turn
-        R = (R_source_head * self.T_head_lrf.rotation).as_matrix()
+        T_platform_lrf = platform_from_head(corrected) * self.T_head_lrf
+        R = (self.T_source_platform * T_platform_lrf).rotation.as_matrix()
         return R @ covariance @ R.mT
 
     def by_pitch(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
@@ -123,6 +122,12 @@ class SourceFrame:
     def _in_platform(self, p_lrf, pitch):
         corrected = self.corrections.pitch(self.placement, pitch)
         return lrf_to_platform(self.corrections.points(p_lrf), corrected, self.T_head_lrf)
+
+
+def platform_from_head(pitch: ArrayLike) -> RigidTransform:
+    """``T_platform_head`` of the head at a true pitch (radians), or at several, equation (4)."""
+    turn = Rotation.from_rotvec(np.multiply.outer(pitch, TILT_AXIS))
+    return RigidTransform.from_rotation(turn)
 
 
 def camera_at(
@@ -141,5 +146,4 @@ def camera_at(
     """
     if mount == "platform":
         return T_camera
-    back = Rotation.from_rotvec(np.multiply.outer(pitch, -TILT_AXIS))
-    return T_camera * T_head_lrf.inv() * RigidTransform.from_rotation(back)
+    return T_camera * (platform_from_head(pitch) * T_head_lrf).inv()

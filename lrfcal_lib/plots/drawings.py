@@ -146,7 +146,7 @@ def edge_in_image(
     view.face(fan, COLORS["lrf"], 0.12)
     view.line([points["E"], points["F"]], color=COLORS["lrf"], linewidth=2)
     half = model.size / 2
-    rim = np.column_stack([SQUARE * half / model.fx, np.ones(4)])
+    rim = np.insert(SQUARE * half / model.fx, 2, 1.0, axis=1)
     view.face(T_lrf_camera.apply(depth * rim), COLORS["left"], 0.12)
     view.line([points["E"], centre, points["F"]], ":", color=COLORS["left"], linewidth=1)
     for name, point in list(points.items()):

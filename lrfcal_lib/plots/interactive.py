@@ -207,8 +207,6 @@ def _frustum(model, depth):
     """The edges of what a camera sees up to a depth, metres, in its own frame."""
     u = np.array([0, model.width, model.width, 0])
     v = np.array([0, 0, model.height, model.height])
-    rim = depth * np.stack(
-        [(u - model.cx) / model.fx, (v - model.cy) / model.fy, np.ones(4)], axis=1
-    )
+    rim = depth * model.sights(np.stack([u, v], axis=1))
     legs = [np.vstack([np.zeros(3), corner, GAP]) for corner in rim]
     return np.vstack([closed(rim), GAP, *legs])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.covariance import solve_each
+from lrfcal_lib.fit.covariance import dyads, solve_each
 from lrfcal_lib.fit.robust import NORMAL, biweight, rms
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import polar_covariance, polar_to_points
@@ -203,7 +203,7 @@ def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.
         beams.
     """
     rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-    products = np.einsum("...i,...j->...ij", rays, rays)
+    products = dyads(rays)
     valid = np.isfinite(ranges)
     r = np.where(valid, ranges, 1.0)
     enough = valid.sum(axis=1) >= FEWEST_BEAMS

@@ -163,7 +163,7 @@ def waves(points: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (k, k - 3)
     """
-    planes = np.column_stack([np.ones(len(points)), points[:, :2]])
+    planes = np.insert(points[:, :2], 0, 1.0, axis=1)
     u, _, _ = np.linalg.svd(planes)
     return u[:, 3:]
 
@@ -223,7 +223,7 @@ def adjust(
     def evaluate(bundle):
         predicted, jacobian = bundle.predict(points, basis)
         misses = (predicted - pixels)[visible]
-        return Block(misses, jacobian[visible][:, free], np.ones(len(misses)))
+        return Block(misses, jacobian[visible][:, free])
 
     def retract(bundle, step):
         whole = np.zeros(len(free))

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from lrfcal_lib.fit.robust import biweight, rms, robust_sigma
-from lrfcal_lib.model.camera import CameraModel, distort, fold, line_through, pinhole
+from lrfcal_lib.model.camera import CameraModel, fold, line_through, pinhole, project
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -186,12 +186,10 @@ def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:
 
     `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid.
     """
-    focal = np.array([model.fx, model.fy])
-    centre = np.array([model.cx, model.cy])
-    normalized = (uv - centre) / focal
-    recorded = distort(normalized, model.distortion) * focal + centre
+    sights = model.sights(uv)
+    recorded = project(sights, model)
     # the lens would fold what is farther out back into the image
-    recorded[np.sum(normalized**2, axis=-1) >= fold(model)] = BEHIND
+    recorded[np.sum(sights[..., :2] ** 2, axis=-1) >= fold(model)] = BEHIND
     places = np.moveaxis(recorded, -1, 0)[::-1]
     channels = np.moveaxis(np.atleast_3d(image), -1, 0)
     colours = [
@@ -310,7 +308,7 @@ def _fit_line(column, place, offset, slope):
     Neighbouring profiles share pixels and the same dents, so errors are correlated along the edge;
     the covariance is multiplied by the integrated autocorrelation of the residuals.
     """
-    design = np.column_stack([np.ones(len(column)), column])
+    design = np.vander(column, 2, increasing=True)
     line = np.array([offset, slope])
     for _ in range(FIT_ROUNDS):
         residuals = place - design @ line
@@ -329,7 +327,7 @@ def _fit_line(column, place, offset, slope):
     residuals = (place - design @ line)[kept]
     variance = residuals @ residuals / (len(residuals) - 2)
     factor = max(_correlation_factor(column, residuals), LEAST_CORRELATION)
-    about_middle = np.column_stack([np.ones(len(column)), column - column.mean()])
+    about_middle = np.vander(column - column.mean(), 2, increasing=True)
     covariance = np.linalg.inv(about_middle.T @ about_middle) * variance * factor
     covariance += np.diag([1.0, 12 / np.ptp(column) ** 2]) * SYSTEMATIC_PX**2
     return _Fit(*line, covariance, column, rms(residuals))

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     lrf_to_platform,
@@ -167,8 +168,8 @@ class Crossings:
         rays = unit_vector(self.points)
         noise = rays * np.hypot(self.range_sigma, warp_sigma)[:, None]
         place = self.by_angle * np.reshape(sigma, (-1, 1))
-        by_noise = np.einsum("...i,...j->...ij", noise, noise)
-        by_place = np.einsum("...i,...j->...ij", place, place)
+        by_noise = dyads(noise)
+        by_place = dyads(place)
         return by_noise + by_place
 
 
@@ -190,7 +191,7 @@ def crossings_of(
     """
     rays = polar_to_points(1.0, bearings)
     flat = rays[:, :2]
-    fitted = 1 / np.sum(lines * flat, axis=1)
+    fitted = 1 / np.vecdot(lines, flat)
     variance = np.einsum("ni,nij,nj->n", flat, covariance, flat)
     points = fitted[:, None] * rays
     normal = np.pad(lines, ((0, 0), (0, 1)))
@@ -384,7 +385,7 @@ def _at(scan, line, bearing, pitch, across=False, shift=0.0):
 
 def _slid(turned, normal, rays):
     """How points on a surface with these normals move when their rays turn, all (n, 3)."""
-    slide = np.sum(normal * turned, axis=1) / np.sum(normal * rays, axis=1)
+    slide = np.vecdot(normal, turned) / np.vecdot(normal, rays)
     return turned - slide[:, None] * rays
 
 

@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.camera import CameraModel, pinhole, pinhole_jacobian
+from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, pinhole_jacobian
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
     move_pose,
@@ -46,7 +47,7 @@ def pose_from_edges(
     first = pose_array(start)
     white = np.zeros((0, 6))
     if covariance is not None:
-        white = np.linalg.inv(np.linalg.cholesky(covariance))
+        white = inverse_root(covariance)
 
     def system(pose):
         misses, by_pose = line_residuals(edges, board, model, pose)
@@ -101,8 +102,8 @@ def line_misses(edges, points, model: CameraModel, pose):
     turned = rotate_points(pose, points)
     p_camera = turned + pose[:, 3]
     uv = pinhole(p_camera, model)
-    distance = np.einsum("enk,ek->en", uv, lines[:, :2]) + lines[:, 2:]
-    by_point = np.einsum("ek,enkj->enj", lines[:, :2], pinhole_jacobian(p_camera, model))
+    distance = line_distance(uv, lines[:, None])
+    by_point = np.vecmat(lines[:, None, :2], pinhole_jacobian(p_camera, model))
     by_pose = gradient_by_pose(turned, by_point)
     white = _whiteners(edges, lines, uv)
     return np.matvec(white, distance), white @ by_pose
@@ -115,4 +116,4 @@ def _whiteners(edges, lines, uv):
     along = np.stack([lines[:, 1], -lines[:, 0]], axis=1)
     lever = np.einsum("enk,ek->en", uv - centres[:, None], along)
     design = np.stack([np.ones_like(lever), lever], axis=2)
-    return np.linalg.inv(np.linalg.cholesky(design @ covariance @ design.mT))
+    return inverse_root(design @ covariance @ design.mT)

@@ -6,7 +6,7 @@ and the outer edges only to tell which shots show the whole corner.
 
 import numpy as np
 
-from lrfcal_lib.model.camera import pinhole
+from lrfcal_lib.model.camera import line_through, pinhole
 from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
 
 EDGE = np.array(
@@ -68,7 +68,7 @@ def _scanned(setup, rng, T_lrf_target):
 def _fitted(points, used):
     """Total least-squares lines (n, 3) through the used ones of some points (n, B, 2)."""
     weight = used / np.maximum(used.sum(axis=1, keepdims=True), 1)
-    middle = np.sum(weight[..., None] * points, axis=1)
+    middle = np.vecmat(weight, points)
     away = points - middle[:, None]
     scatter = (weight[..., None] * away).mT @ away
     normal = np.linalg.eigh(scatter)[1][..., 0]
@@ -91,6 +91,4 @@ def _image_lines(setup, rng, T_camera_target):
     whole = (inside.any(axis=-1) & (length > LEAST_LENGTH)).all(axis=1)
 
     noisy = ends[:, 0] + setup.sigma_px * rng.standard_normal(ends[:, 0].shape)
-    start, end = np.moveaxis(np.insert(noisy, 2, 1.0, axis=-1), 1, 0)
-    lines = np.cross(start, end)
-    return lines / np.linalg.norm(lines[:, :2], axis=-1, keepdims=True), whole
+    return line_through(noisy[:, 1], noisy[:, 0]), whole

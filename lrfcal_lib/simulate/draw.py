@@ -285,7 +285,7 @@ def posed(spin, lean, centre, middle):
     """Poses of boards with their middle (board frame) at a centre (n, 3), which face the LRF but
     for a lean (n, 2) about x and y, and are turned in their plane by a spin (n,).
     """
-    leant = np.column_stack([lean, np.zeros(len(lean))])
+    leant = np.insert(lean, 2, 0.0, axis=1)
     turned = np.outer(spin, [0.0, 0.0, 1.0])
     facing = AHEAD * Rotation.from_rotvec(leant) * Rotation.from_rotvec(turned)
     return RigidTransform.from_components(centre - facing.apply(middle), facing)

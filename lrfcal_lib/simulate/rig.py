@@ -470,11 +470,11 @@ def held_close(
         for attempt in range(2 * MOST_TRIES):
             tried = attempt / MOST_TRIES
             inwards = (m.size / 2 - pixel) * min(tried, 1.0)
-            u, v = pixel + inwards + rng.normal(0, 15, 2)
+            shown = pixel + inwards + rng.normal(0, 15, 2)
             z = rng.uniform(*CLOSE) * max(tried, 1.0)
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])
             turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
-            place = z * np.array([(u - m.cx) / m.fx, (v - m.cy) / m.fy, 1.0])
+            place = z * m.sights(shown)
             shift = place - turn.apply(points.mean(axis=0))
             pose = RigidTransform.from_components(shift, turn)
             if rig.shows(camera, pose, points, margin=18.0):

@@ -287,8 +287,7 @@ class Imager:
         self.model = model
         self.exposure = exposure or Exposure()
         corners = np.indices(model.size + 1).T - 0.5  # u, v
-        flat = (undistort(corners, model) - [model.cx, model.cy]) / [model.fx, model.fy]
-        self.rays = np.insert(flat, 2, 1.0, axis=-1)
+        self.rays = model.sights(undistort(corners, model))
         miss = np.abs(project(self.rays, model) - corners).max()
         need(miss < 1e-3, f"lens {model.distortion} folds the image: weaken the distortion")
 

@@ -82,7 +82,7 @@ class Scenario(Devices):
         """True poses ``T_camera_lrf``, one a trial."""
         if self.T_camera_lrf is not None:
             return RigidTransform.concatenate([self.T_camera_lrf] * trials)
-        roll = Rotation.from_rotvec([0.0, 0.0, self.roll])
+        roll = Rotation.from_euler("z", self.roll)
         return RigidTransform.from_rotation(roll) * upright_camera(rng, 1, trials)
 
     def boards(self, rng, T_camera_lrf):
@@ -117,8 +117,7 @@ class Scenario(Devices):
         rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
         away = rng.uniform(*self.distances, count)
         pixels = rng.uniform(0, self.model.size, (count, 2))
-        ray = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(self.model.matrix).T
-        centre = away[:, None] * ray
+        centre = away[:, None] * self.model.sights(pixels)
         return RigidTransform.from_components(centre - rotation.apply(middle), rotation)
 
     def _around(self, rng, count):

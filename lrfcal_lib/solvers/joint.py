@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
-from lrfcal_lib.fit.covariance import RANK
+from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.fit.least_squares import remembered, solve
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
@@ -209,15 +209,11 @@ def in_stated_gauge(state: JointState, obs: JointObservations) -> JointState:
     them.
     """
     found = pose_transform(state.head)
-    head = geometry.head_from_axis(geometry.axis_of(found))
-    if obs.T_head_lrf is not None:
-        stated = geometry.head_from_axis(geometry.axis_of(obs.T_head_lrf))
-        head = obs.T_head_lrf * stated.inv() * head
+    head = geometry.head_from_axis(geometry.axis_of(found), obs.T_head_lrf)
     change = head * found.inv()
     cameras = state.cameras.copy()
-    for i, mount in enumerate(obs.mounts):
-        if mount == "platform":
-            cameras[i] = pose_array(pose_transform(cameras[i]) * change.inv())
+    on_base = np.isin(obs.mounts, "platform")
+    cameras[on_base] = pose_array(pose_transform(cameras[on_base]) * change.inv())
     boards = pose_array(change * pose_transform(state.boards))
     return replace(state, head=pose_array(head), boards=boards, cameras=cameras)
 
@@ -244,14 +240,7 @@ def finished(obs, state, data, unknowns, required):
         n_observations=len(obs.face_range) + len(obs.beam_hit) + len(obs.view_pitch),
     )
     lens = lens_share(obs, found, data, unknowns)
-    by_placements = found.covariance_placements
-    if by_placements is not None:
-        by_placements = by_placements + lens.covariance
-    found = replace(
-        found,
-        covariance=found.covariance + lens.covariance - lens.counted,
-        covariance_placements=by_placements,
-    )
+    found = found.widened(lens.covariance - lens.counted, lens.covariance)
     squares = misfits(blocks(found.state), data)
     solution = JointSolution(
         found,
@@ -275,18 +264,10 @@ def with_step_error(solution: JointSolution) -> JointSolution:
     changed = gather(solution.observations.stretched(STEP), solution.data.levels)
     here = solution.score()
     pull = replace(solution, data=changed).score().gradient - here.gradient
-    free = np.linalg.pinv(here.information.sum(axis=0), rcond=RANK, hermitian=True)
+    free = pseudo_inverse(here.information.sum(axis=0))
     moved = -free @ pull.sum(axis=0) / STEP * sigma
-    spread = np.outer(moved, moved)
-    estimate = solution.solution
-    by_placements = estimate.covariance_placements
-    if by_placements is not None:
-        by_placements = by_placements + spread
-    estimate = replace(
-        estimate,
-        covariance=estimate.covariance + spread,
-        covariance_placements=by_placements,
-    )
+    spread = dyads(moved)
+    estimate = solution.solution.widened(spread, spread)
     return replace(solution, solution=estimate, step=moved)
 
 

@@ -86,7 +86,7 @@ def refuse_contradiction(
     place = obs.view_placement
     boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
     misses = np.linalg.norm(boards[..., 3] - state.boards[place, :, 3], axis=1)
-    stated = np.sqrt(np.trace(obs.view_covariance[:, 3:, 3:], axis1=1, axis2=2))
+    stated = np.sqrt(np.linalg.trace(obs.view_covariance[:, 3:, 3:]))
     before = sum(p.kind == CONTRADICTS and p.camera is None for p in left_out)
     of = pad(place, len(obs.placements), miss=misses, stated=stated)
     limit = np.maximum(most, MOST_SIGMA * medians(of["stated"], of["used"]))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.least_squares import OWN_RANK
+from lrfcal_lib.fit.covariance import pseudo_inverse
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import CameraModel, project_jacobians
 from lrfcal_lib.model.geometry import gradient_by_pose
@@ -83,9 +83,9 @@ def lens_share(
     shift = block.whitened(by_lens.reshape(*J.shape[:2], -1))
     spread = block_diag(*obs.lens_covariance)
     hessian = found.jacobian.mT @ found.jacobian
-    own = np.linalg.pinv(hessian[:, c:, c:], rcond=OWN_RANK, hermitian=True)
+    own = pseudo_inverse(hessian[:, c:, c:])
     reduced = J[..., :c] - J_own @ own @ hessian[:, c:, :c]
-    finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
+    finite = np.nan_to_num(found.covariance, posinf=0.0, neginf=0.0)
     gain = finite @ np.sum(reduced.mT @ shift, axis=0)
     left = shift - reduced @ gain - J_own @ (own @ (J_own.mT @ shift))
     square = np.sum(left @ spread * left)

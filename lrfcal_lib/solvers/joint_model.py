@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from lrfcal_lib.fit.axis_chart import move_head
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
 from lrfcal_lib.model import geometry
@@ -172,8 +173,8 @@ class JointData:
     Attributes
     ----------
     face, beam, view : dict of str to ndarray
-        Fields of that group of JointObservations, with ``ray`` (LRF frame) or, for views,
-        ``whitener`` (p, v, 6, 6).
+        Fields of that group of JointObservations, with ``ray`` (LRF frame); for standard deviations
+        of ranges ``weight``, their reciprocals, for covariances of views ``whitener`` (p, v, 6, 6).
     lines : ndarray, shape (e, 3)
         Sides of the board.
     middle, direction : ndarray, shape (p,)
@@ -202,7 +203,7 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
         range=obs.face_range,
         bearing=obs.face_bearing,
         pitch=obs.face_pitch,
-        sigma=obs.face_sigma,
+        weight=1 / obs.face_sigma,
     )
     beam = pad(
         obs.beam_placement,
@@ -221,16 +222,13 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
         camera=obs.view_camera,
         pitch=obs.view_pitch,
         pose=obs.view_pose,
-        covariance=obs.view_covariance,
+        whitener=inverse_root(obs.view_covariance),
         lens=obs.view_lens,
     )
     for group in (face, beam):
         group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
-    padding = ~view["used"][..., None, None]
-    covariance = np.where(padding, np.eye(6), view["covariance"])
-    view["whitener"] = np.where(padding, 0.0, np.linalg.inv(np.linalg.cholesky(covariance)))
-    view["pose"] = np.where(padding, np.eye(4), view["pose"])
-    on_head = np.array([mount == "head" for mount in obs.mounts], bool)
+    view["pose"][~view["used"]] = np.eye(4)
+    on_head = np.isin(obs.mounts, "head")
     return JointData(
         face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, levels
     )

@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from lrfcal_lib.fit.least_squares import OWN_RANK, eliminate, linearise
+from lrfcal_lib.fit.covariance import pseudo_inverse
+from lrfcal_lib.fit.least_squares import eliminate, linearise
 from lrfcal_lib.fit.result import beyond_chance
 from lrfcal_lib.solvers.joint_model import SWEEPS, JointData, JointState, Levels, Unknowns
 from lrfcal_lib.solvers.joint_residuals import (
     SIDE_FREEDOM,
     edge_distance,
+    meeting,
     named_blocks,
     rays,
 )
@@ -38,7 +40,7 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
     hessian, gradient, *_ = linearise(blocks.values())
     c = unknowns.shared
     own = hessian[:, c:, c:]
-    spread = np.linalg.pinv(own, rcond=OWN_RANK, hermitian=True)  # shared ones held
+    spread = pseudo_inverse(own)  # shared ones held
     levels = data.levels
     changed = {}
     if "face" in blocks:
@@ -96,14 +98,14 @@ def face_levels(state, data, block, shared, spread):
     """
     levels = data.levels
     used = data.face["used"]
-    weight = used / np.where(used, data.face["sigma"], 1.0)
+    weight = data.face["weight"]
     z = weight * block.residuals
     by_own = (weight / levels.face_scale)[..., None] * block.jacobian[..., shared:]
     taken = levels.face_share * np.sum(by_own * (by_own @ spread))
     scale = np.sqrt(np.sum(z**2) / max(used.sum() - taken, 1))
     # where the ranges should end: noise must not decide which part a point lies in
-    exact = data.face | {"range": data.face["range"] + block.residuals}
-    x, y, _ = np.moveaxis(on_board(state, replace(data, face=exact)), -1, 0)
+    exact = meeting(state, rays(state, data, data.face)).point
+    x, y, _ = np.moveaxis(exact @ state.boards[:, :, :3], -1, 0)
     part = _part(x, used) * PARTS + _part(y, used)
     parts = np.eye(PARTS**2)[part] * used[..., None]
     planes = np.linalg.qr(np.stack([used, x * used, y * used], axis=-1))[0]
@@ -140,10 +142,10 @@ def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
         Variance of independent errors.
     """
     counted = np.sum(modes**2, axis=1)
-    score = np.sum(modes * residuals[..., None], axis=1)
+    score = np.vecmat(residuals, modes)
     pull = modes.mT @ by_own
     there = counted > 0
-    taken = share * np.sum(pull * (pull @ spread), axis=-1)[there] / counted[there]
+    taken = share * np.vecdot(pull, pull @ spread)[there] / counted[there]
     told = np.sum((1 - taken) ** 2)
     if told < 1:
         return np.nan
@@ -193,10 +195,7 @@ def _along_edges(state, data):
     """Where beams meet the boards along their edges, metres, (p, n)."""
     ray = rays(state, data, data.beam)
     edge = edge_distance(state, data, data.beam, ray)
-    normal = state.boards[:, None, :, 2]
-    away = state.boards[:, None, :, 3] - ray.origin
-    r = np.vecdot(normal, away) / np.vecdot(normal, ray.direction)
-    return np.vecdot(r[..., None] * ray.direction - away - edge.point, edge.along)
+    return np.vecdot(meeting(state, ray).point, edge.along)
 
 
 def view_levels(data, block, hessian, gradient, shared):
@@ -249,7 +248,7 @@ def judged(block, factor, others, rows, shared):
     hessian, gradient, half_square = linearise([block])
     whole = others[0] + hessian / f2
     right = others[1] + gradient / f2
-    size = np.trace(whole, axis1=1, axis2=2)[:, None, None]
+    size = np.linalg.trace(whole)[:, None, None]
     whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
     reduced, score, back = eliminate(whole, right, c, regular=True)
     total = np.sum(reduced, axis=0)
@@ -299,7 +298,7 @@ def sweep_levels(sweeps, data, hessian, gradient, shared):
         step = -inverse @ np.sum(score, axis=0)
         by_shared = back[:, rows, :c]
         error = sweeps - back[:, rows, c] - by_shared @ step
-        own = np.linalg.pinv(whole[:, c:, c:], rcond=OWN_RANK, hermitian=True)
+        own = pseudo_inverse(whole[:, c:, c:])
         unknown = own[:, rows, rows] + np.vecdot(by_shared @ inverse, by_shared)
         told = np.maximum(1 - unknown / variance, 0.0)
         variance = (np.sum(error**2, axis=0) + usual) / (np.sum(told, axis=0) + 1)
@@ -332,7 +331,7 @@ def side_levels(sides, data, hessian, gradient):
         right = gradient.copy()
         whole[:, last, last] += weight / sigma2 - prior
         right[:, last] += (weight / sigma2 - prior) * sides
-        spread = np.linalg.pinv(whole, rcond=OWN_RANK, hermitian=True)
+        spread = pseudo_inverse(whole)
         step = -np.matvec(spread, right)
         square = (sides + step[:, last]) ** 2 + spread[:, last, last]
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)

@@ -13,7 +13,7 @@ from lrfcal_lib.fit.edge_likelihood import beam_terms, edge_shift, flip_sigma
 from lrfcal_lib.fit.least_squares import Block, Minimum, minimise
 from lrfcal_lib.fit.stops import ViewBlock, same_stop
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import cross, hat, tilt
+from lrfcal_lib.model.geometry import cross, gradient_by_pose, hat, tilt
 from lrfcal_lib.solvers.joint_model import (
     SENSOR,
     SWEEPS,
@@ -36,7 +36,9 @@ GRAZING = 1e-9  # cosine of the incidence below which a beam is taken not to be 
 LEAST_ROOT = 1e-7
 ROUGH_STEP = 1e-2  # standard deviations: a shorter step ends a round
 MOST_STEPS = 300
-SMALL_TURN = 1e-4  # radians; below, the series of the rotation vector's derivative is exact
+SMALL_TURN = (
+    1e-4  # radians; below, the derivative of the rotation vector bends by no other factor
+)
 
 
 def named_blocks(
@@ -46,12 +48,10 @@ def named_blocks(
     side, `USUAL`, prior.
     """
     blocks = {}
-    if data.face["used"].any():
-        blocks["face"] = face_block(state, data, unknowns)
-    if data.beam["used"].any():
-        blocks["beam"] = beam_block(state, data, unknowns)
-    if data.view["used"].any():
-        blocks["view"] = view_block(state, data, unknowns)
+    of_groups = {"face": face_block, "beam": beam_block, "view": view_block}
+    for name, block_of in of_groups.items():
+        if getattr(data, name)["used"].any():
+            blocks[name] = block_of(state, data, unknowns)
     if SWEEPS[unknowns.sweep]:
         blocks["sweep"] = sweep_block(state, data, unknowns)
     if unknowns.sides:
@@ -86,25 +86,23 @@ def true_pitch(state, data, pitch):
     """Corrected pitch (p, n) and its derivatives by (scale, direction, offset, stretch), (p, n,
     4).
     """
-    scale, by_direction = state.sensor[3:5]
-    offset = state.sweeps[:, :1]
-    stretch = state.sweeps[:, 1:]
     away = pitch - data.middle[:, None]
     turn = np.broadcast_to(data.direction[:, None], pitch.shape)
-    corrected = pitch * (1 + scale) + by_direction * turn + offset + stretch * away
-    return corrected, np.stack([pitch, turn, np.ones_like(pitch), away], axis=-1)
+    by_parts = np.stack([pitch, turn, np.ones_like(pitch), away], axis=-1)
+    shared = by_parts[..., :2] @ state.sensor[3:]
+    own = np.matvec(by_parts[..., 2:], state.sweeps)
+    return pitch + shared + own, by_parts
 
 
 class Rays(NamedTuple):
     """Beams of a group.
 
-    Origins and directions (p, n, 3) in the platform frame, directions in the head frame, true pitch
-    (p, n) and its derivatives (p, n, 4), see :func:`true_pitch`.
+    Origins and directions (p, n, 3) in the platform frame, true pitch (p, n) and its derivatives
+    (p, n, 4), see :func:`true_pitch`.
     """
 
     origin: np.ndarray
     direction: np.ndarray
-    in_head: np.ndarray
     pitch: np.ndarray
     by_parts: np.ndarray
 
@@ -112,22 +110,20 @@ class Rays(NamedTuple):
 def rays(state, data, group):
     """The Rays of a group."""
     pitch, by_parts = true_pitch(state, data, group["pitch"])
-    in_head = group["ray"] @ state.head[:, :3].T
-    origin = np.broadcast_to(state.head[:, 3], in_head.shape)
-    return Rays(*tilt(np.stack([origin, in_head]), pitch), in_head, pitch, by_parts)
+    origin = tilt(state.head[:, 3], pitch)
+    direction = tilt(group["ray"] @ state.head[:, :3].T, pitch)
+    return Rays(origin, direction, pitch, by_parts)
 
 
-def ray_columns(by_o, by_d, ray):
-    """Columns of the axis (4), of the pitch's parts (4) from the gradients by origin and
-    direction.
+def ray_columns(gradient, reach, ray):
+    """Columns of the axis (4), of the pitch's parts (4) from the gradients (p, n, 3) by the points
+    of rays at a reach (p, n, 1).
     """
-    shift, push = tilt(np.stack([by_o, by_d]), -ray.pitch)  # in the head's frame
-    turned = cross(ray.in_head, push)
-    # as in `AXIS_COLUMNS`: turns about y and z, shifts along y and z
-    head = np.concatenate([turned[..., 1:], shift[..., 1:]], axis=-1)
-    _, y, z = np.moveaxis(ray.origin, -1, 0)
-    turn = y * by_o[..., 2] - z * by_o[..., 1] + turned[..., 0]
-    return head, turn[..., None] * ray.by_parts
+    lever = reach * ray.direction
+    in_head = tilt(np.stack([lever, gradient]), -ray.pitch)
+    head = gradient_by_pose(*in_head)[..., AXIS_COLUMNS]
+    turn = cross(ray.origin + lever, gradient)[..., :1]  # about the tilt axis
+    return head, turn * ray.by_parts
 
 
 def assemble(unknowns, parts, **derivatives):
@@ -149,65 +145,73 @@ def assemble(unknowns, parts, **derivatives):
     return J
 
 
+class Meeting(NamedTuple):
+    """Where rays meet the planes of their boards.
+
+    Ranges (p, n, 1), their gradients by the board's origin (p, n, 3), points relative to that
+    origin, platform frame (p, n, 3).
+    """
+
+    range: np.ndarray
+    by_board: np.ndarray
+    point: np.ndarray
+
+
+def meeting(state, ray):
+    """The Meeting of rays."""
+    normal = state.boards[:, None, :, 2]
+    away = state.boards[:, None, :, 3] - ray.origin
+    along = np.vecdot(normal, ray.direction)[..., None]
+    by_board = normal / np.where(np.abs(along) < GRAZING, GRAZING, along)
+    r = np.vecdot(by_board, away)[..., None]
+    return Meeting(r, by_board, r * ray.direction - away)
+
+
 def face_block(state, data, unknowns):
     """Predicted minus measured ranges to the board's plane, metres."""
     group = data.face
     ray = rays(state, data, group)
-    normal = state.boards[:, None, :, 2]
-    away = state.boards[:, None, :, 3] - ray.origin
-    along = np.vecdot(normal, ray.direction)[..., None]
-    along = np.where(np.abs(along) < GRAZING, GRAZING, along)
-    r = np.vecdot(normal, away)[..., None] / along
-    by_point = normal / along
-    by_normal = (away - r * ray.direction) / along
-    head, parts = ray_columns(-by_point, -r * by_point, ray)
-    by_turn = cross(np.broadcast_to(normal, by_normal.shape), by_normal)
-    board = np.concatenate([by_turn, by_point], axis=-1)
+    r, by_board, point = meeting(state, ray)
+    head, parts = ray_columns(-by_board, r, ray)
+    board = gradient_by_pose(point, by_board)
     J = assemble(unknowns, parts, axis=head, board=board, range_offset=np.ones_like(r))
     residuals = r[..., 0] + state.sensor[0] - group["range"]
-    sigma = np.where(group["used"], group["sigma"], 1.0) * data.levels.face_scale
-    weight = group["used"] * np.sqrt(data.levels.face_share)
-    return Block(residuals * group["used"], J, weight / sigma)
+    root = np.sqrt(data.levels.face_share) / data.levels.face_scale
+    return Block(residuals, J, root * group["weight"])
 
 
 class EdgeDistance(NamedTuple):
     """Signed distance (p, n) of rays from their edges, positive outside, and what it hangs on.
 
-    Gradients (p, n, 3) by the ray's origin and direction and by the edge's direction (that by the
-    edge's point is ``-by_origin``); point (relative to the board's origin) and direction of the
-    edge, platform frame.
+    Its gradient (p, n, 3) by the ray, a unit vector across both lines; where they are nearest, on
+    the ray by the reach (p, n, 1), on the edge as a point relative to the board's origin; direction
+    of the edge, platform frame.
     """
 
     distance: np.ndarray
-    by_origin: np.ndarray
-    by_direction: np.ndarray
-    by_edge: np.ndarray
-    point: np.ndarray
+    across: np.ndarray
+    reach: np.ndarray
+    nearest: np.ndarray
     along: np.ndarray
 
 
 def edge_distance(state, data, group, ray):
     """The EdgeDistance of the beams of a group."""
-    normal = data.lines * [1.0, 1.0, 0.0]
-    # of every edge: its point, its direction, its normal
-    along = cross([0.0, 0.0, 1.0], normal)
-    each = np.stack([-data.lines[:, 2:] * normal, along, normal])
-    each = each @ state.boards[:, None, :, :3].mT
-    point, along, outwards = (
-        part[np.arange(len(part))[:, None], group["edge"]]
-        for part in np.moveaxis(each, 1, 0)
-    )
-    away = ray.origin - point - state.boards[:, None, :, 3]
+    lines = data.lines[group["edge"]]
+    normal = lines * [1.0, 1.0, 0.0]
+    turn = state.boards[..., :3].mT
+    outwards = normal @ turn
+    along = cross([0.0, 0.0, 1.0], normal) @ turn
+    origin = ray.origin - state.boards[:, None, :, 3]
+    away = origin + lines[..., 2:] * outwards
     m = cross(ray.direction, along)
-    length = np.sqrt(np.vecdot(m, m))[..., None]
+    square = np.vecdot(m, m)[..., None]
     sign = np.where(np.vecdot(m, outwards) < 0, -1.0, 1.0)[..., None]
-    across = sign * m / length
+    across = sign * m / np.sqrt(square)
     distance = np.vecdot(across, away)
-    g = (away * sign - distance[..., None] * m / length) / length
-    by_direction = cross(along, g)
-    return EdgeDistance(
-        distance, across, by_direction, cross(g, ray.direction), point, along
-    )
+    reach = np.vecdot(cross(along, away), m)[..., None] / square
+    nearest = origin + reach * ray.direction - distance[..., None] * across
+    return EdgeDistance(distance, across, reach, nearest, along)
 
 
 def beam_block(state, data, unknowns):
@@ -223,15 +227,14 @@ def beam_block(state, data, unknowns):
     margin = shift - edge.distance
     lapse = data.levels.lapse
     cost, score, information = beam_terms(margin, sigma, group["hit"], lapse)
-    head, parts = ray_columns(-edge.by_origin, -edge.by_direction, ray)
-    by_turn = cross(edge.along, -edge.by_edge) + cross(edge.point, edge.by_origin)
+    head, parts = ray_columns(-edge.across, edge.reach, ray)
     mine = group["edge"][..., None] == np.arange(unknowns.edges + 1)
     mine[..., -1] = True
     J = assemble(
         unknowns,
         parts,
         axis=head,
-        board=np.concatenate([by_turn, edge.by_origin], axis=-1),
+        board=gradient_by_pose(edge.nearest, edge.across),
         sides=slope[..., None] * mine,
         edge_log_odds=slope[..., None],
         edge_log_softness=(-margin * share_soft)[..., None],
@@ -254,23 +257,23 @@ def view_block(state, data, unknowns):
     camera = state.cameras[view["camera"]]
     on_head = data.on_head[view["camera"]]
     moved = on_head[..., None, None]
-    pitch, by_parts = true_pitch(state, data, np.where(on_head, view["pitch"], 0.0))
+    pitch, by_parts = true_pitch(state, data, view["pitch"])
     pitch = np.where(on_head, pitch, 0.0)
     head = np.where(moved, state.head, np.eye(3, 4))
-    board = np.broadcast_to(state.boards[:, None], pitch.shape + (3, 4))
+    board = state.boards[:, None]
     # T_camera_board = T_camera_lrf T_head_lrf^-1 Rx(-pitch) T_platform_board for a camera on the
     # head
     R_camera_head = camera[..., :3] @ head[..., :3].mT
-    R_head_platform = tilt(np.eye(3), -pitch[..., None]).mT
-    R_camera_platform = R_camera_head @ R_head_platform
+    R_camera_platform = tilt(R_camera_head, pitch[..., None])  # row by row
     origin = tilt(board[..., 3], -pitch)  # of the board, in the head frame
-    arm = np.matvec(R_camera_head, origin - head[..., 3])
+    from_lrf = origin - head[..., 3]
+    arm = np.matvec(R_camera_head, from_lrf)
     w = geometry.log_rotation(R_camera_platform @ board[..., :3] @ pose[..., :3, :3].mT)
     residuals = np.concatenate([w, arm + camera[..., 3] - pose[..., :3, 3]], axis=-1)
 
     left = inverse_left_jacobian(w)
     turned = left @ -R_camera_head
-    lever = R_camera_head @ hat(origin - head[..., 3])
+    lever = R_camera_head @ hat(from_lrf)
     of_head = _by_pose(turned, lever, -R_camera_head) * moved
     by_pitch = _by_pose(turned, R_camera_head @ hat(origin), 0.0)[..., :1] * moved
     of_camera = _by_pose(left, -hat(arm), np.eye(3))
@@ -311,25 +314,24 @@ def among_cameras(by_one, camera, count):
 def inverse_left_jacobian(w):
     """How a small turn of a rotation changes its rotation vector, shape (..., 3) -> (..., 3, 3)."""
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    safe = np.maximum(angle, SMALL_TURN)
-    bend = 1 / safe**2 - 1 / (2 * safe * np.tan(safe / 2))
-    bend = np.where(angle > SMALL_TURN, bend, 1 / 12)
+    safe = np.maximum(angle, SMALL_TURN)  # so that nothing is divided by zero
+    half = safe / 2
+    bend = (1 - half / np.tan(half)) / safe**2
     W = hat(w)
     return np.eye(3) - 0.5 * W + bend * (W @ W)
 
 
-def own_jacobian(unknowns, p, name):
-    """Jacobian of unknowns that all p placements have (or share) by themselves."""
-    rows = np.eye(unknowns.shared + unknowns.own)[unknowns.columns[name]]
-    return np.broadcast_to(rows, (p, *rows.shape))
+def own_jacobian(unknowns, name):
+    """Jacobian (n, k) of unknowns that every placement has (or shares) by themselves."""
+    return np.eye(unknowns.shared + unknowns.own)[unknowns.columns[name]]
 
 
 def sweep_block(state, data, unknowns):
     """What is expected of the sweeps' own errors of the pitch."""
     number = SWEEPS[unknowns.sweep]
     values = state.sweeps[:, :number]
-    whitener = 1 / np.array(data.levels.sweep_sigma[:number])
-    J = own_jacobian(unknowns, len(values), "sweep")
+    whitener = np.reciprocal(data.levels.sweep_sigma[:number])
+    J = own_jacobian(unknowns, "sweep")
     return Block(values, J, np.broadcast_to(whitener, values.shape))
 
 
@@ -339,10 +341,10 @@ def side_block(state, data, unknowns):
     """
     x = state.sides
     spread = SIDE_FREEDOM * data.levels.of_sides(unknowns.edges) ** 2
-    J = own_jacobian(unknowns, len(x), "sides")
+    J = own_jacobian(unknowns, "sides")
     root = np.sqrt((SIDE_FREEDOM + 1) / (spread + x**2))
     cost = 0.5 * (SIDE_FREEDOM + 1) * np.log1p(x**2 / spread)
-    return Block(root * x, root[..., None] * J, np.ones_like(x), cost=cost)
+    return Block(root * x, root[..., None] * J, cost=cost)
 
 
 def prior_block(state, data, unknowns):
@@ -356,7 +358,7 @@ def prior_block(state, data, unknowns):
     square = np.sum((r / sigma) ** 2)
     p = len(state.boards)
     root = np.sqrt((PRIOR_FREEDOM + 4) / (PRIOR_FREEDOM + square) / p) / sigma
-    jacobian = root[:, None] * J @ own_jacobian(unknowns, p, "axis")
+    jacobian = root[:, None] * J @ own_jacobian(unknowns, "axis")
     cost = 0.125 * (PRIOR_FREEDOM + 4) * np.log1p(square / PRIOR_FREEDOM) / p
     return Block(
         np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=np.full((p, 4), cost)
@@ -378,5 +380,5 @@ def usual_block(state, unknowns, name):
         # where the floor of `flip_sigma` takes over, the beams' gradient by ln softness falls with
         # the softness squared: without this curvature steps overshoot twofold
         bend = np.sqrt(1 + 2 * max(usual - value, 0.0))
-    J = own_jacobian(unknowns, len(one), name)
+    J = own_jacobian(unknowns, name)
     return Block(away / bend * one, J * bend / scale, one, cost=0.5 * away**2 * one)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.fit.covariance import pseudo_inverse
 from lrfcal_lib.fit.edge_likelihood import disc_edge
 from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
@@ -37,7 +38,6 @@ WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "pitch_by_direction": "the pitch offset by sweep direction",
 }
 SWEEP_HELD = (0.0, 0.0)  # standard deviations of what is not unknown
-RCOND = 1e-13  # of what is determined at all
 NAMED = 0.3  # share of a direction's largest component from which an unknown is named
 
 
@@ -75,7 +75,7 @@ class Score:
             Where each placement still pulls them from there.
         """
         whole = self.information.sum(axis=0) + expected * np.eye(self.gradient.shape[1])
-        covariance = np.linalg.pinv(whole, rcond=RCOND, hermitian=True)
+        covariance = pseudo_inverse(whole)
         step = -covariance @ (self.gradient.sum(axis=0) + np.multiply(expected, off))
         return covariance, step, (self.gradient + self.information @ step) @ covariance
 
@@ -335,7 +335,7 @@ class JointSolution:
             for name, block in self.blocks.items():
                 by_one_more = (after[name].white - block.white) / step
                 J = np.insert(block.white_jacobian, shared, by_one_more, axis=-1)
-                blocks[name] = Block(block.white, J, np.ones_like(block.white))
+                blocks[name] = Block(block.white, J)
             shared += 1
         hessian, gradient, *_ = linearise(blocks.values())
         return Score(*eliminate(hessian, gradient, shared)[:2])

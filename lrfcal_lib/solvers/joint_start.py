@@ -14,7 +14,7 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     pose_transform,
 )
-from lrfcal_lib.model.kinematics import TILT_AXIS, SourceFrame
+from lrfcal_lib.model.kinematics import SourceFrame, platform_from_head
 from lrfcal_lib.model.observations import CameraObservations, JointObservations, thin
 from lrfcal_lib.solvers.joint_model import JointState
 from lrfcal_lib.solvers.plane_start import start_from_planes
@@ -35,7 +35,7 @@ def start_states(obs: JointObservations) -> Iterator[list[JointState]]:
         raise DegenerateGeometry(
             "no ranges on the boards' faces: a start value needs them; give one as start="
         )
-    backwards = Rotation.from_rotvec([0.0, 0.0, np.pi])
+    backwards = Rotation.from_euler("z", np.pi)
     heads = [RigidTransform.identity(), RigidTransform.from_rotation(backwards)]
     if obs.T_head_lrf is not None:
         heads.insert(0, obs.T_head_lrf)
@@ -121,10 +121,11 @@ def boards_in_images(
     `head` and `cameras` as in JointState.
     """
     camera = obs.view_camera[views]
-    on_head = np.array([mount == "head" for mount in obs.mounts])[camera]
+    on_head = np.isin(obs.mounts, "head")[camera]
     pitch = np.where(on_head, obs.view_pitch[views], 0.0)
-    turn = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(pitch, TILT_AXIS)))
     T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
     T_camera_board = RigidTransform.from_matrix(obs.view_pose[views])
-    boards = turn * T_head_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
-    return pose_array(boards)
+    T_platform_lrf = platform_from_head(pitch) * T_head_lrf
+    return pose_array(
+        T_platform_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
+    )

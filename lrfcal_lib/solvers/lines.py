@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.covariance import solve_each
+from lrfcal_lib.fit.covariance import inverse_root, solve_each
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import (
     moved_noise,
@@ -16,7 +16,7 @@ from lrfcal_lib.fit.residuals import (
     sight_normals,
 )
 from lrfcal_lib.fit.result import Solution
-from lrfcal_lib.model.camera import pinhole_jacobian
+from lrfcal_lib.model.camera import mirrored, pinhole_jacobian
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     apply_pose,
@@ -58,10 +58,7 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     rotated = rotate_points(pose, obs.scene_points)
     moved = rotated + pose[..., None, :, 3]
     by_point = pinhole_jacobian(moved, obs.model)
-    # behind the camera the formula goes on (mirrored), as in `line_residuals`
-    u = obs.model.fx * moved[..., 0] / moved[..., 2] + obs.model.cx
-    v = obs.model.fy * moved[..., 1] / moved[..., 2] + obs.model.cy
-    errors = np.stack([u, v], axis=-1) - obs.scene_pixels
+    errors = mirrored(moved, obs.model) - obs.scene_pixels
 
     by_source = by_point @ pose[..., None, :, :3]  # by the point in the source frame
     pulled = obs.scene_covariance @ by_source.mT
@@ -78,7 +75,7 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     return Block(
         errors.reshape(shape),
         jacobian.reshape(shape + (6,)),
-        np.linalg.inv(np.linalg.cholesky(noise)),
+        inverse_root(noise),
         corrected=corrected.reshape(shape + (6,)),
     )
 
@@ -120,8 +117,7 @@ def estimate_pose(
 
         def plain(pose):
             block = residual(pose, obs)
-            weights = np.broadcast_to(weight, block.residuals.shape)
-            return Block(block.residuals, block.jacobian, weights)
+            return Block(block.residuals, block.jacobian, weight)
 
         return plain
 

@@ -247,7 +247,7 @@ def _apart(poses, order):
     while len(left) and len(chosen) < MOST_APART:
         first = left[0]
         chosen.append(first)
-        turns = np.trace(poses[left, :, :3] @ poses[first, :, :3].T, axis1=1, axis2=2)
+        turns = np.linalg.trace(poses[left, :, :3] @ poses[first, :, :3].T)
         left = left[turns < 1 + 2 * np.cos(SAME_TURN)]
     return chosen
 

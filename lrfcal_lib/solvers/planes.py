@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.least_squares import Block, minimise_in_rounds, solve
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m, read_pose
@@ -186,7 +187,7 @@ def source_planes(pose, boards):
 
 def _with_one(points):
     """Rows ``[p, 1]``."""
-    return np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
+    return np.insert(points, 3, 1.0, axis=-1)
 
 
 def compress(sets: PlaneSets, weights) -> np.ndarray:
@@ -254,7 +255,7 @@ def board_whitener(pose, triangles, boards, board_covariance):
     """
     _, _, by_board = plane_terms(pose[..., None, :, :], triangles, boards)
     covariance = np.eye(4) + by_board @ board_covariance @ by_board.mT
-    return np.linalg.inv(np.linalg.cholesky(covariance))
+    return inverse_root(covariance)
 
 
 def plane_terms(pose, triangles, boards, offset=0.0):

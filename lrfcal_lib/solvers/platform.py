@@ -16,7 +16,7 @@ from lrfcal_lib.fit.axis_chart import (
     chart_parameters,
     move_head,
 )
-from lrfcal_lib.fit.covariance import name_words, solve_each
+from lrfcal_lib.fit.covariance import dyads, inverse_root, name_words, solve_each
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR
@@ -281,13 +281,13 @@ def distance_block(state, group, sigma_pitch, which):
     r, J, by_point, by_pitch = (x[:, :, which] for x in distances(state, group))
     pull = group["covariance"] @ by_point.mT
     by_pitch = sigma_pitch * by_pitch
-    noise = by_point @ pull + np.einsum("...i,...j->...ij", by_pitch, by_pitch)
+    noise = by_point @ pull + dyads(by_pitch)
     force = solve_each(noise, r)
     points = group["points"] - np.matvec(pull, force)
     pitch = group["pitch"] - sigma_pitch * np.vecdot(by_pitch, force)
     moved = group | {"points": points, "pitch": pitch}
     corrected = distances(state, moved)[1][:, :, which]
-    whitener = np.linalg.inv(np.linalg.cholesky(noise)) * group["used"][..., None, None]
+    whitener = inverse_root(noise) * group["used"][..., None, None]
     p = len(r)
     J = J.reshape(p, -1, 12)
     return Block(r.reshape(p, -1), J, whitener, corrected=corrected.reshape(J.shape))
@@ -305,7 +305,7 @@ def platform_blocks(state, edge, face, sigma_pitch):
     r, J, *_ = distances(state, edge)
     count = np.maximum(used.sum(axis=1, keepdims=True), 1)
     middle = np.sum(r[..., 2] * used, axis=1, keepdims=True) / count
-    by_sum = np.sum(J[..., 2, :] * used[..., None], axis=1)[:, None]
+    by_sum = np.vecmat(used, J[..., 2, :])[:, None]
     by_middle = by_sum / count[..., None]
     stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))
     return [
@@ -449,7 +449,7 @@ def projected_block(head, obs, groups, scatter=1.0, printed=False):
         return np.concatenate(every, axis=1) / scatter
 
     residuals, jacobian = by_chart(terms, head)
-    return Block(residuals, jacobian, np.ones_like(residuals))
+    return Block(residuals, jacobian)
 
 
 def points_of(heads, obs, printed):
