@@ -10,10 +10,15 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
 Array = np.ndarray
-LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 ROUGH_NOISE = 1e-4 * np.eye(
     3
 )  # a centimetre every way, for points whose covariance is not told
+# observations that a pose takes at least, by kind
+NEEDED = {
+    "crossing": (6, "crossings of scan lines with edges"),
+    "plane": (3, "placements with a board pose and points on the board"),
+    "scene": (3, "scene points"),
+}
 
 
 def thin(rows: np.ndarray, count: int) -> np.ndarray:
@@ -23,35 +28,46 @@ def thin(rows: np.ndarray, count: int) -> np.ndarray:
     return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
 
 
-def rows(group: str, *shape: int, default=0.0):
+def rows(*shape: int | str, default=0.0, group: str | None = None):
     """A field of arrays with a row for each member of a group, which is as long as its first field.
 
-    Where it is not given, every row is the default; None: the row's number.
+    Unless told, the group is the first word of the field's name; in `shape` a group is its length.
+    Where the field is not given, every row is the default; None: the row's number.
     """
-    metadata = {"group": group, "shape": shape, "default": default}
+    metadata = {"shape": shape, "default": default, "group": group}
     return field(default=None, metadata=metadata)
 
 
-class _Grouped:
-    """Arrays in groups of equal length; every field of :func:`rows` says which one is its."""
+def _group_of(f):
+    """The group of a field of :func:`rows`."""
+    return f.metadata["group"] or f.name.partition("_")[0]
 
-    def complete(self, whose="", gaps=()):
-        """Give missing arrays their default, and refuse what is not finite but in `gaps`."""
-        counts: dict[str, int] = {}
+
+class _Grouped:
+    """Arrays in groups of equal length; every field of :func:`rows` belongs to one."""
+
+    def complete(self, whose="", **counts):
+        """Give missing arrays their default, and refuse what is not finite; `counts` are lengths of
+        groups that are known.
+        """
         for f in fields(self):
             if not f.metadata:
                 continue
-            group, shape, default = f.metadata.values()
+            shape, default, _ = f.metadata.values()
+            group = _group_of(f)
             value = getattr(self, f.name)
             if value is None:
                 count = counts.get(group, 0)
                 value = np.arange(count)
                 if default is not None:
-                    value = np.broadcast_to(default, (count, *shape)).copy()
+                    sizes = [counts.get(size, size) for size in shape]
+                    value = np.full((count, *sizes), default)
                 object.__setattr__(self, f.name, value)
             counts.setdefault(group, value.shape[value.ndim - len(shape) - 1])
         for name, value in vars(self).items():
-            if name in gaps or not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+            if name == "pattern_pixels":  # NaN where not seen
+                continue
+            if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
                 continue
             bad = ~np.isfinite(value)
             if bad.any():
@@ -65,9 +81,8 @@ class _Grouped:
         """The observations with some rows of groups left out, e.g. ``keep(view=mask)``."""
         changed = {}
         for f in fields(self):
-            group = f.metadata.get("group")
-            if group in masks:
-                changed[f.name] = getattr(self, f.name)[masks[group]]
+            if f.metadata and _group_of(f) in masks:
+                changed[f.name] = getattr(self, f.name)[masks[_group_of(f)]]
         return replace(self, **changed)
 
 
@@ -154,37 +169,34 @@ class CameraObservations(_Grouped):
     model: CameraModel
     camera: str = "camera"
     source: str = "lrf"
-    crossing_points: Array = rows("crossing", 3)
-    crossing_covariance: Array = rows("crossing", 3, 3, default=ROUGH_NOISE)
-    crossing_lines: Array = rows("crossing", 3, default=np.nan)
-    crossing_line_sigma: Array = rows("crossing", default=0.5)
-    crossing_placement: Array = rows("crossing", default=None)
-    crossing_edge: Array = rows("crossing", default="")
-    crossing_pitch: Array = rows("crossing")
-    crossing_across: Array = rows("crossing", default=False)
-    crossing_radius: Array = rows("crossing", default=0.005)
-    crossing_background: Array = rows("crossing")
-    plane_points: Array = rows("plane", 3)
-    plane_covariance: Array = rows("plane", 3, 3, default=ROUGH_NOISE)
-    plane_placement: Array = rows("plane", default=None)
-    plane_pitch: Array = rows("plane")
-    board_poses: Array = rows("board", 4, 4)
-    placements: Array = rows("board", default=None)
-    board_covariance: Array = rows("board", 6, 6)
-    pattern_points: Array = rows("pattern", 3)
-    pattern_pixels: Array = rows("board", default=np.nan)
+    crossing_points: Array = rows(3)
+    crossing_covariance: Array = rows(3, 3, default=ROUGH_NOISE)
+    crossing_lines: Array = rows(3, default=np.nan)
+    crossing_line_sigma: Array = rows(default=0.5)
+    crossing_placement: Array = rows(default=None)
+    crossing_edge: Array = rows(default="")
+    crossing_pitch: Array = rows()
+    crossing_across: Array = rows(default=False)
+    crossing_radius: Array = rows(default=0.005)
+    crossing_background: Array = rows()
+    plane_points: Array = rows(3)
+    plane_covariance: Array = rows(3, 3, default=ROUGH_NOISE)
+    plane_placement: Array = rows(default=None)
+    plane_pitch: Array = rows()
+    board_poses: Array = rows(4, 4)
+    placements: Array = rows(default=None, group="board")
+    board_covariance: Array = rows(6, 6)
+    pattern_points: Array = rows(3)
+    pattern_pixels: Array = rows("pattern", 2, default=np.nan, group="board")
     pattern_sigma_px: float = 0.2
-    scene_points: Array = rows("scene", 3)
-    scene_covariance: Array = rows("scene", 3, 3, default=ROUGH_NOISE)
-    scene_pixels: Array = rows("scene", 2, default=np.nan)
-    scene_sigma_px: Array = rows("scene", default=0.5)
-    scene_placement: Array = rows("scene", default=None)
+    scene_points: Array = rows(3)
+    scene_covariance: Array = rows(3, 3, default=ROUGH_NOISE)
+    scene_pixels: Array = rows(2, default=np.nan)
+    scene_sigma_px: Array = rows(default=0.5)
+    scene_placement: Array = rows(default=None)
 
     def __post_init__(self):
-        self.complete(f" of camera '{self.camera}'", gaps=("pattern_pixels",))
-        if self.pattern_pixels.ndim == 1:  # none was seen
-            unseen = np.full((len(self.placements), len(self.pattern_points), 2), np.nan)
-            object.__setattr__(self, "pattern_pixels", unseen)
+        self.complete(f" of camera '{self.camera}'")
 
     @property
     def all_placements(self):
@@ -197,20 +209,15 @@ class CameraObservations(_Grouped):
         )
         return np.unique(np.concatenate(parts))
 
-    def require(self, kind, least):
-        """Refuse fewer than `least` of a kind: 'crossing', 'plane' or 'scene'."""
-        if kind == "crossing":
-            count = len(self.crossing_placement)
-            what = "crossings of scan lines with edges"
-        elif kind == "plane":
-            count = len(np.intersect1d(self.placements, self.plane_placement))
-            what = "placements with a board pose and points on the board"
-        else:
-            count = len(self.scene_placement)
-            what = "scene points"
-        if count < least:
+    def require(self, kind):
+        """Refuse fewer than are `NEEDED` of a kind."""
+        least, what = NEEDED[kind]
+        placements = getattr(self, f"{kind}_placement")
+        if kind == "plane":
+            placements = np.intersect1d(self.placements, placements)
+        if len(placements) < least:
             raise DegenerateGeometry(
-                f"camera '{self.camera}': {count} {what}, at least {least} needed: "
+                f"camera '{self.camera}': {len(placements)} {what}, at least {least} needed: "
                 "the rest of the pose stays unobservable"
             )
 
@@ -245,15 +252,15 @@ class PlatformObservations(_Grouped):
         1 or 2: the two perpendicular edges of equations (7) to (14).
     """
 
-    edge_points: Array = rows("edge", 3)
-    edge_covariance: Array = rows("edge", 3, 3)
-    edge_pitch: Array = rows("edge")
-    edge_placement: Array = rows("edge", default=0)
-    edge_number: Array = rows("edge", default=1)
-    face_points: Array = rows("face", 3)
-    face_covariance: Array = rows("face", 3, 3)
-    face_pitch: Array = rows("face")
-    face_placement: Array = rows("face", default=0)
+    edge_points: Array = rows(3)
+    edge_covariance: Array = rows(3, 3)
+    edge_pitch: Array = rows()
+    edge_placement: Array = rows(default=0)
+    edge_number: Array = rows(default=1)
+    face_points: Array = rows(3)
+    face_covariance: Array = rows(3, 3)
+    face_pitch: Array = rows()
+    face_placement: Array = rows(default=0)
 
     def __post_init__(self):
         self.complete()
@@ -315,45 +322,42 @@ class JointObservations(_Grouped):
     placements: Array
     direction: Array
     middle: Array
-    face_range: Array = rows("face")
-    face_bearing: Array = rows("face")
-    face_pitch: Array = rows("face")
-    face_sigma: Array = rows("face")
-    face_placement: Array = rows("face", default=0)
-    beam_bearing: Array = rows("beam")
-    beam_pitch: Array = rows("beam")
-    beam_hit: Array = rows("beam", default=False)
-    beam_edge: Array = rows("beam", default=0)
-    beam_radius: Array = rows("beam")
-    beam_background: Array = rows("beam")
-    beam_step: Array = rows("beam")
-    beam_placement: Array = rows("beam", default=0)
-    view_pose: Array = rows("view", 4, 4)
-    view_camera: Array = rows("view", default=0)
-    view_pitch: Array = rows("view")
-    view_covariance: Array = rows("view", 6, 6)
-    view_placement: Array = rows("view", default=0)
+    face_range: Array = rows()
+    face_bearing: Array = rows()
+    face_pitch: Array = rows()
+    face_sigma: Array = rows()
+    face_placement: Array = rows(default=0)
+    beam_bearing: Array = rows()
+    beam_pitch: Array = rows()
+    beam_hit: Array = rows(default=False)
+    beam_edge: Array = rows(default=0)
+    beam_radius: Array = rows()
+    beam_background: Array = rows()
+    beam_step: Array = rows()
+    beam_placement: Array = rows(default=0)
+    view_pose: Array = rows(4, 4)
+    view_camera: Array = rows(default=0)
+    view_pitch: Array = rows()
+    view_covariance: Array = rows(6, 6)
+    view_placement: Array = rows(default=0)
     edges: tuple
     corners: Array
     cameras: tuple
     mounts: tuple
     T_head_lrf: RigidTransform | None = None
-    view_lens: Array = rows("view", 6, 9)
-    lens_covariance: Array = rows("camera", 9, 9)
+    view_lens: Array = rows(6, 9)
+    lens_covariance: Array = rows(9, 9, group="camera")
 
     def __post_init__(self):
-        self.complete()
-        if len(self.lens_covariance) != len(self.cameras):
-            exact = np.zeros((len(self.cameras), LENS, LENS))
-            object.__setattr__(self, "lens_covariance", exact)
+        self.complete(camera=len(self.cameras))
         count = len(self.placements)
         for name in ("face_placement", "beam_placement", "view_placement"):
             place = getattr(self, name)
-            if len(place) and not 0 <= place.min() <= place.max() < count:
+            if not np.isin(place, np.arange(count)).all():
                 raise ValueError(
                     f"{name} are indices below {count}, got up to {place.max()}"
                 )
-        if len(self.face_sigma) and self.face_sigma.min() <= 0:
+        if np.any(self.face_sigma <= 0):
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
 
     def lines(self):
@@ -382,8 +386,8 @@ class JointObservations(_Grouped):
         """The observations with bearings stretched by a share about the middle one, pi / 2."""
         return replace(
             self,
-            face_bearing=np.pi / 2 + (self.face_bearing - np.pi / 2) * (1 + share),
-            beam_bearing=np.pi / 2 + (self.beam_bearing - np.pi / 2) * (1 + share),
+            face_bearing=self.face_bearing + share * (self.face_bearing - np.pi / 2),
+            beam_bearing=self.beam_bearing + share * (self.beam_bearing - np.pi / 2),
         )
 
     def with_cameras(self, names):
