@@ -2,11 +2,13 @@
 
 import math
 import os
+from collections.abc import Mapping
 from io import BytesIO
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 from numpy.lib import format as npy
+from numpy.typing import ArrayLike
 
 from lrfcal_lib.session.files import (
     SessionError,
@@ -108,7 +110,7 @@ def _read_arrays(file, archive):
     return scans
 
 
-def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def check_scans(scans: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
     """Scan lines with consistent shapes and credible units.
 
     Parameters
@@ -131,18 +133,22 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if ranges.ndim != 2:
         raise ValueError(f"ranges must be scan lines x beams, got shape {ranges.shape}")
     lines, beams = ranges.shape
-    lengths = {"bearings": beams, "placement": lines, "pitch": lines, "time_s": lines}
-    shapes: dict[str, tuple] = {key: (length,) for key, length in lengths.items()}
+    shapes: dict[str, tuple] = {
+        "bearings": (beams,),
+        "placement": (lines,),
+        "pitch": (lines,),
+        "time_s": (lines,),
+    }
     if "intensities" in scans:
         shapes["intensities"] = (lines, beams)
+    arrays = {}
     for key, shape in shapes.items():
-        if scans[key].shape != shape:
+        values = np.asarray(scans[key], int if key == "placement" else float)
+        if values.shape != shape:
             raise ValueError(
-                f"{key} has shape {scans[key].shape}, the ranges {ranges.shape} ask for {shape}"
+                f"{key} has shape {values.shape}, the ranges {ranges.shape} ask for {shape}"
             )
-    scans = {
-        key: np.asarray(scans[key], int if key == "placement" else float) for key in shapes
-    }
+        arrays[key] = values
     seen = ranges[np.isfinite(ranges)]
     if seen.size == 0:
         raise ValueError(f"no range in {lines} scan lines (all NaN): nothing was recorded")
@@ -152,14 +158,14 @@ def check_scans(scans: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         raise ValueError(
             f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN"
         )
-    _check_angles("bearing", scans["bearings"], 2 * np.pi)
-    _check_angles("pitch", scans["pitch"], np.pi)
-    if np.any(np.diff(scans["bearings"]) <= 0):
+    _check_angles("bearing", arrays["bearings"], 2 * np.pi)
+    _check_angles("pitch", arrays["pitch"], np.pi)
+    if np.any(np.diff(arrays["bearings"]) <= 0):
         raise ValueError(
             "bearings must ascend (0 right, pi/2 ahead): turn the columns of the ranges round"
         )
     ranges[~(ranges > 0) | np.isinf(ranges)] = np.nan
-    return {**scans, "ranges": ranges}
+    return {**arrays, "ranges": ranges}
 
 
 def _check_angles(name, angles, limit):

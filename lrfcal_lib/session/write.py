@@ -79,7 +79,7 @@ class SessionWriter:
         self.bearings: np.ndarray | None = None  # of the sweeps so far
         self.parts = 0  # files of sweeps so far
         self.shots = dict.fromkeys(self.cameras, 0)  # images so far, by camera
-        self.telegrams = self.path / "lrf" / "telegrams.bin"
+        self.telegrams = self.path / "lrf/telegrams.bin"
         if not about.keys() <= ABOUT.keys():
             raise TypeError(f"a session has {short(ABOUT)}, got {short(about)}")
         self.data = {
@@ -99,20 +99,21 @@ class SessionWriter:
         }
         with naming(self.path):
             stated.parse_session(json.loads(json.dumps(self.data)))
-        if self.path.exists() and not self.path.is_dir():
-            self._refuse("choose another name or remove it first")
-        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            self._refuse()
         with contextlib.ExitStack() as stack:
             stack.enter_context(alone(self.path))
             self._create()
             self._held = stack.pop_all()
 
-    def _refuse(self, remedy):
+    def _refuse(self, remedy="choose another name or remove it first"):
         raise SessionError(f"{self.path}: exists already; {remedy}")
 
     def _create(self):
         if set(os.listdir(self.path)) - {LOCK}:
-            self._refuse("choose another name or remove it first")
+            self._refuse()
         self._make_folders()
         self._state()
 
@@ -140,7 +141,7 @@ class SessionWriter:
     def _state(self, **changes):
         """Change session.json; where that cannot be written, nothing is changed."""
         data = self.data | changes
-        self._write("session.json", json.dumps(data, indent=1) + "\n")
+        self._write("session.json", (json.dumps(data, indent=1) + "\n").encode())
         self.data = data
 
     def _begin_table(self, name, columns):
@@ -190,20 +191,20 @@ class SessionWriter:
                 "another one"
             )
         ranges = np.array(ranges, float, ndmin=2)
-        bearings = np.asarray(bearings, float)
-        scans = {
+        if np.ndim(time_s) == 0:
+            time_s = np.full(len(ranges), time_s)
+        given = {
             "ranges": ranges,
             "bearings": bearings,
-            "pitch": np.asarray(pitch, float),
-            "time_s": np.asarray(time_s, float),
+            "pitch": pitch,
+            "time_s": time_s,
             "placement": np.full(len(ranges), placement),
         }
-        if np.ndim(time_s) == 0:
-            scans["time_s"] = np.full(len(ranges), time_s)
         if intensities is not None:
-            scans["intensities"] = np.asarray(intensities, float)
+            given["intensities"] = intensities
         with naming(f"{self.path}: placement {placement}"):
-            scans = check_scans(scans)
+            scans = check_scans(given)
+            bearings = scans["bearings"]
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError(
                     "the bearings differ from those of the sweeps before: one grid a session"
@@ -252,7 +253,7 @@ class SessionWriter:
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
         offset = append_file(self.telegrams, b"".join(telegrams), self.path)
-        offsets = offset + np.cumsum([0, *lengths[:-1]])
+        offsets = offset + np.cumsum(lengths) - lengths
         number = number_cell(placement)
         columns = zip(time_s, offsets, lengths, np.degrees(pitch), strict=True)
         rows = [[cell(t), at, size, number, cell(angle)] for t, at, size, angle in columns]
@@ -292,19 +293,17 @@ class SessionWriter:
         with naming(self.path):
             read.known(camera, self.cameras, "camera")
             read.known(purpose, read.PURPOSES, "purpose")
-        what: str | os.PathLike = f"camera '{camera}'"
+        what = f"camera '{camera}'"
         if isinstance(image, np.ndarray):
-            content = cv2.imencode(".png", image)[1].tobytes()
-        elif isinstance(image, bytes):
-            content = image
-        else:
-            what = image
-            content = files.read_bytes(image)
-        check_image_size(what, content, self.cameras[camera])
+            image = bytes(cv2.imencode(".png", image)[1])
+        if not isinstance(image, bytes):
+            what = str(image)
+            image = files.read_bytes(image)
+        check_image_size(what, image, self.cameras[camera])
         self.shots[camera] += 1
-        kind = "jpg" if content.startswith(JPEG) else "png"
+        kind = "jpg" if image.startswith(JPEG) else "png"
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
-        self._write(name, content)
+        self._write(name, image)
         self._note_placement(placement)
         angle = cell(math.degrees(pitch))
         row = [cell(time_s), camera, name, number_cell(placement), angle, purpose]
@@ -337,7 +336,7 @@ def finish(path: str | os.PathLike) -> None:
 def complete(path):
     """As :func:`finish`, for who writes the session already; telegrams are complete as they are."""
     mend_tables(path)
-    if os.path.lexists(path / "lrf" / "telegrams.bin"):
+    if os.path.lexists(path / "lrf/telegrams.bin"):
         return
     parts = parts_of(path)
     if not parts:
@@ -350,7 +349,7 @@ def complete(path):
         if key != "bearings" and all(key in sweep for sweep in sweeps):
             scans[key] = np.concatenate([sweep[key] for sweep in sweeps])
     scans["bearings"] = sweeps[0]["bearings"]
-    write_file(path / "lrf" / "scans.npz", scans, path)
+    write_file(path / "lrf/scans.npz", scans, path)
     for part in parts:
         part.unlink()
 
@@ -367,8 +366,8 @@ def mend_tables(path):
 
 
 def as_lines(rows):
-    """Text of the rows of a table."""
-    return "".join(",".join(map(str, row)) + "\n" for row in rows)
+    """Bytes of the rows of a table."""
+    return "".join(",".join(map(str, row)) + "\n" for row in rows).encode()
 
 
 def cell(value):
@@ -381,14 +380,14 @@ def number_cell(placement):
     return "" if placement < 0 else str(placement)
 
 
-def write_file(file: Path, content: str | bytes | dict, within: str | os.PathLike) -> None:
+def write_file(file: Path, content: bytes | dict, within: str | os.PathLike) -> None:
     """Write a file of a session under another name, fsync, rename: it is whole or not there.
 
     Parameters
     ----------
     file
     content
-        Text, bytes, or arrays by name.
+        Bytes, or arrays by name.
     within
         The session's folder.
     """
@@ -398,7 +397,7 @@ def write_file(file: Path, content: str | bytes | dict, within: str | os.PathLik
         if isinstance(content, dict):
             np.savez_compressed(stream, **content)
         else:
-            stream.write(content.encode() if isinstance(content, str) else content)
+            stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
     draft.replace(file)
@@ -454,10 +453,10 @@ def append_file(file, content, within):
     """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk
     all or nothing.
     """
-    left = memoryview(content.encode() if isinstance(content, str) else content)
+    left = memoryview(content)
     with files.opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
         handle = stream.fileno()
-        begin = os.fstat(stream.fileno()).st_size
+        begin = os.fstat(handle).st_size
         try:
             while left:
                 left = left[os.write(handle, left) :]
