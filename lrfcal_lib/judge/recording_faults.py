@@ -165,7 +165,7 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     prepared = calibration.prepared
     joint = calibration.joint
     session = prepared.session
-    found = faults_of_files(session) + dark_images(session)
+    found = [*faults_of_files(session), *dark_images(session)]
     if hopeless(joint) and (misread := misread_recording(prepared)):
         return found + misread
     if joint is not None:
