@@ -46,7 +46,7 @@ def observe_joint(
     return JointObservations(
         placements=np.array(list(scans), int),
         direction=np.array([session.sweep_direction(p) for p in scans], int),
-        middle=np.array([float(np.mean(scan.sweep.pitch)) for scan in scans.values()]),
+        middle=np.array([np.mean(scan.sweep.pitch) for scan in scans.values()]),
         edges=tuple(board.edges),
         corners=corners,
         cameras=tuple(views),
@@ -67,8 +67,8 @@ def _ranges(scans):
             "range": np.linalg.norm(p_lrf, axis=1),
             "bearing": np.arctan2(p_lrf[:, 1], p_lrf[:, 0]),
             "pitch": pitch,
-            "sigma": np.full(len(pitch), scan.sigma_range),
-            "placement": np.full(len(pitch), row),
+            "sigma": scan.sigma_range,
+            "placement": row,
         }
 
 
@@ -89,8 +89,8 @@ def _beams(prepared, scans):
                 "radius": about.radius,
                 "background": about.background,
                 "step": about.step * about.range_m,
-                "edge": np.full(len(about), prepared.board.edges.index(name)),
-                "placement": np.full(len(about), row),
+                "edge": prepared.board.edges.index(name),
+                "placement": row,
             }
 
 

@@ -2,6 +2,7 @@
 and stacked as observations.
 """
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import combinations, pairwise, product
@@ -134,9 +135,7 @@ def platform_observations(
                 name: getattr(edges, name)[rows]
                 for name in ("points", "covariance", "pitch")
             }
-            columns["placement"] = np.full(len(rows), placement)
-            columns["number"] = np.full(len(rows), number)
-            sides.append(columns)
+            sides.append(columns | {"placement": placement, "number": number})
         faces.append(face_columns(prepared.scans[placement], placement, FACE_POINTS))
     return PlatformObservations(**stack("edge_", sides), **stack("face_", faces))
 
@@ -184,11 +183,17 @@ def outline_of(
 
 
 def stack(prefix: str, parts: Iterable[dict]) -> dict[str, Any]:
-    """Parts of a table end to end: its columns by name, with a prefix; none without parts."""
-    parts = list(parts)
-    if not parts:
-        return {}
-    return {prefix + key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    """Parts of a table end to end: its columns by name, with a prefix; none without parts.
+
+    A part is as long as its first column; what is no column stands for all of its rows.
+    """
+    columns = defaultdict(list)
+    for part in parts:
+        count = len(next(iter(part.values())))
+        for key, values in part.items():
+            rows = np.broadcast_to(values, (count, *np.shape(values)[1:]))
+            columns[prefix + key].append(rows)
+    return {key: np.concatenate(rows) for key, rows in columns.items()}
 
 
 @dataclass(frozen=True)
@@ -222,7 +227,7 @@ class RecordedSource:
         corrected = self.corrections.pitch(self.placement, pitch)
         return self.frame.by_pitch(self.corrections.points(p_lrf), corrected)
 
-    def face(self, scan: BoardScan, count: int) -> dict[str, np.ndarray]:
+    def face(self, scan: BoardScan, count: int) -> dict[str, Any]:
         """At most `count` points of a board's face, with covariance, pitch and placement: columns
         by name.
         """
@@ -234,14 +239,14 @@ class RecordedSource:
         }
 
 
-def face_columns(scan: BoardScan, placement: int, count: int) -> dict[str, np.ndarray]:
+def face_columns(scan: BoardScan, placement: int, count: int) -> dict[str, Any]:
     """At most `count` points of a board's face as recorded, columns by name."""
     points, pitch, covariance = face_points(scan, count)
     return {
         "points": points,
         "covariance": covariance,
         "pitch": pitch,
-        "placement": np.full(len(pitch), placement),
+        "placement": placement,
     }
 
 
@@ -401,7 +406,6 @@ def _crossings(prepared, view, source, sides, count):
             continue
         edges = side.edges
         rows = thin(side.rows, count)
-        n = len(rows)
         p_lrf = edges.points[rows]
         pitch = edges.pitch[rows]
         sigma_pitch = prepared.pitch_noise.sigma(pitch, middle)
@@ -413,11 +417,11 @@ def _crossings(prepared, view, source, sides, count):
             "covariance": source.covariance(edges.covariance[rows], pitch) + pitch_error,
             "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
             "background": edges.background[rows],
-            "lines": np.tile(edge.line, (n, 1)),
-            "line_sigma": np.full(n, np.sqrt(edge.covariance[0, 0])),
-            "placement": np.full(n, source.placement),
-            "edge": np.full(n, side.name),
-            "across": np.full(n, side.across),
+            "lines": np.tile(edge.line, (len(rows), 1)),
+            "line_sigma": np.sqrt(edge.covariance[0, 0]),
+            "placement": source.placement,
+            "edge": side.name,
+            "across": side.across,
         }
 
 
