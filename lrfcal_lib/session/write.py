@@ -240,8 +240,8 @@ class SessionWriter:
         """
         with naming(f"{self.path}: placement {placement}"):
             lengths = [len(raw) for raw in telegrams]
-            pitch = np.broadcast_to(np.asarray(pitch, float), len(telegrams))
-            time_s = np.broadcast_to(np.asarray(time_s, float), len(telegrams))
+            pitch = np.full(len(telegrams), pitch, float)
+            time_s = np.full(len(telegrams), time_s, float)
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
                 raise ValueError(
                     f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed"
