@@ -201,13 +201,14 @@ class CameraObservations(_Grouped):
     @property
     def all_placements(self):
         """Every placement that contributes anything, sorted."""
-        parts = (
-            self.crossing_placement,
-            self.plane_placement,
-            self.placements,
-            self.scene_placement,
+        return np.unique(
+            np.r_[
+                self.crossing_placement,
+                self.plane_placement,
+                self.placements,
+                self.scene_placement,
+            ]
         )
-        return np.unique(np.concatenate(parts))
 
     def require(self, kind):
         """Refuse fewer than are `NEEDED` of a kind."""
@@ -265,9 +266,9 @@ class PlatformObservations(_Grouped):
     def __post_init__(self):
         self.complete()
         if not np.isin(self.edge_number, (1, 2)).all():
-            found = np.unique(self.edge_number)
             raise ValueError(
-                f"edge_number must be 1 or 2 (the two perpendicular edges), got {found}"
+                "edge_number must be 1 or 2 (the two perpendicular edges), got "
+                f"{np.unique(self.edge_number)}"
             )
 
 
