@@ -16,6 +16,7 @@ from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.uncertainty import (
     beams_of_pixels,
     carried,
@@ -110,7 +111,7 @@ class Shifts:
 
     def amount(self, unit: str, scale: float = 1.0) -> Amount:
         """Root mean squares as an Amount, times `scale`."""
-        value = np.sqrt(np.nanmean(np.sum(self.off**2, axis=-1)))
+        value = rms(np.linalg.norm(self.off, axis=-1))
         claimed = root_mean_square(self.claimed[np.isfinite(self.off[..., 0])])
         return Amount(f"at {DISTANCE:g} m", scale * value, scale * claimed, unit)
 
