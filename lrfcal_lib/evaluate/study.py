@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from lrfcal_lib.evaluate.study_trials import BATCHED, STUDIED, Task, run_task
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.session.write import whole
 from lrfcal_lib.simulate.scenarios import load_scenario, varied
 from lrfcal_lib.simulate.shots import Scenario
@@ -170,7 +171,7 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
             ("_bound", f"bound_{name}"),
             ("_known", f"known_{name}"),
         ):
-            columns[end] = good[of].agg(lambda values: np.sqrt(np.mean(values**2)))
+            columns[end] = good[of].agg(rms)
         for end, values in columns.items():
             table[f"{name}_{unit}{end}"] = factor * values
     table["rmse_over_bound"] = np.sqrt(good.over_bound.mean())
