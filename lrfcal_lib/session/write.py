@@ -135,18 +135,15 @@ class SessionWriter:
         """Write nothing any more: others may."""
         self._held.close()
 
-    def _write(self, name, content):
-        write_file(self.path / name, content, self.path)
-
     def _state(self, **changes):
         """Change session.json; where that cannot be written, nothing is changed."""
         data = self.data | changes
-        self._write("session.json", (json.dumps(data, indent=1) + "\n").encode())
+        write_file(self.path, "session.json", (json.dumps(data, indent=1) + "\n").encode())
         self.data = data
 
     def _begin_table(self, name, columns):
         if not os.path.lexists(self.path / name):
-            self._write(name, as_lines([columns]))
+            write_file(self.path, name, as_lines([columns]))
 
     def _append_rows(self, name, rows):
         append_file(self.path / name, as_lines(rows), self.path)
@@ -211,7 +208,7 @@ class SessionWriter:
                 )
         self.bearings = bearings
         self.parts += 1
-        self._write(f"lrf/part_{self.parts:06d}.npz", scans)
+        write_file(self.path, f"lrf/part_{self.parts:06d}.npz", scans)
         self._note_placement(placement)
 
     def add_telegrams(
@@ -303,7 +300,7 @@ class SessionWriter:
         self.shots[camera] += 1
         kind = "jpg" if image.startswith(JPEG) else "png"
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
-        self._write(name, image)
+        write_file(self.path, name, image)
         self._note_placement(placement)
         angle = cell(math.degrees(pitch))
         row = [cell(time_s), camera, name, number_cell(placement), angle, purpose]
@@ -349,7 +346,7 @@ def complete(path):
         if key != "bearings" and all(key in sweep for sweep in sweeps):
             scans[key] = np.concatenate([sweep[key] for sweep in sweeps])
     scans["bearings"] = sweeps[0]["bearings"]
-    write_file(path / "lrf/scans.npz", scans, path)
+    write_file(path, "lrf/scans.npz", scans)
     for part in parts:
         part.unlink()
 
@@ -362,7 +359,7 @@ def mend_tables(path):
             continue
         data = files.read_bytes(table, path)
         if not data.endswith(b"\n"):
-            write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
+            write_file(path, name, data.rpartition(b"\n")[0] + b"\n")
 
 
 def as_lines(rows):
@@ -380,20 +377,22 @@ def number_cell(placement):
     return "" if placement < 0 else str(placement)
 
 
-def write_file(file: Path, content: bytes | dict, within: str | os.PathLike) -> None:
+def write_file(folder: Path, name: str, content: bytes | dict) -> None:
     """Write a file of a session under another name, fsync, rename: it is whole or not there.
 
     Parameters
     ----------
-    file
+    folder
+        Of the session.
+    name
+        Of the file in it.
     content
         Bytes, or arrays by name.
-    within
-        The session's folder.
     """
-    draft = files.checked(file, within).with_name(file.name + ".draft")
+    file = files.checked(folder / name, folder)
+    draft = file.with_name(file.name + ".draft")
     draft.unlink(missing_ok=True)
-    with files.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
+    with files.opened(draft, folder, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
         if isinstance(content, dict):
             np.savez_compressed(stream, **content)
         else:

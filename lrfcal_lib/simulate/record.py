@@ -242,8 +242,8 @@ def _record(folder, name, setup):
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}",
     ) as writer:
         log = _add_placements(writer, setup, placements, truth)
-    write_file(folder / "platform.csv", as_lines([PLATFORM_COLUMNS, *log]), folder)
-    write_file(folder / "truth.json", (json.dumps(truth, indent=1) + "\n").encode(), folder)
+    write_file(folder, "platform.csv", as_lines([PLATFORM_COLUMNS, *log]))
+    write_file(folder, "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
 
 
 def _truth(setup, placements):
