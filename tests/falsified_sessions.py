@@ -92,7 +92,7 @@ def change_rows(folder, change, name="images.csv", columns=IMAGE_COLUMNS):
     rows = read_table(folder / name, columns, folder)[0]
     change(rows)
     lines = as_lines([columns, *(row.values() for row in rows)])
-    replaced(folder / name, lines.encode())
+    replaced(folder / name, lines)
 
 
 def change_scans(folder, change):

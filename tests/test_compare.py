@@ -121,6 +121,15 @@ def test_what_no_data_show_does_not_count(days):
     assert np.abs(found.cloud.off).max() < 1e-9
 
 
+def test_what_has_no_bound_is_told_so_and_not_tested(days):
+    known = days[0].uncertainty
+    trusted = known.trusted.copy()
+    trusted[0, 0] = np.inf
+    found = compare(replace(days[0], uncertainty=replace(known, trusted=trusted)), days[1])
+    axis = found.parts[0]
+    assert axis.freedom == 3 and "(claimed no bound), shift" in str(axis)
+
+
 def test_shifts_are_those_of_the_same_records(days):
     """A longer range offset moves points along their beams by as much."""
     rig = days[0]

@@ -187,7 +187,9 @@ def test_finish_needs_sweeps(path):
 
 def test_an_existing_target_is_refused(path):
     before = (path / "session.json").read_text()
-    for target in (path, path / "session.json"):
+    nowhere = path.with_name("link")
+    nowhere.symlink_to("nowhere")
+    for target in (path, path / "session.json", nowhere):
         with pytest.raises(SessionError, match="exists already"):
             SessionWriter(target, triangle_board(), LRF)
     assert (path / "session.json").read_text() == before

@@ -15,7 +15,7 @@ from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
-from lrfcal_lib.session.faults import DARK, dark_image, repeated_images, repeated_scans
+from lrfcal_lib.session.faults import DARK, brightness, repeated_images, repeated_scans
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session, Sweep
 from lrfcal_lib.session.stated import LrfInfo
@@ -129,10 +129,9 @@ def check_repetition(session: Session, placement: int) -> list[Light]:
     placement
         Its number.
     """
-    faults = repeated_images(session) + repeated_scans(session)
     return [
         Light("recording", "bad", fault.words)
-        for fault in faults
+        for fault in (*repeated_images(session), *repeated_scans(session))
         if placement in fault.placements
     ]
 
@@ -223,7 +222,7 @@ def check_image(
         corners = PatternFinder(pattern)(image)
     except PatternNotFound as error:
         text = str(error)
-        if dark_image(image):
+        if brightness(image) < DARK:
             text = f"{text}; {DARKNESS}"
         return Light(name, "bad", text)
     scale = math.ceil(LEAST_SQUARE_PX / np.linalg.norm(corners[1] - corners[0]))

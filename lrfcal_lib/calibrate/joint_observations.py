@@ -3,7 +3,8 @@
 import numpy as np
 
 from lrfcal_lib.calibrate.observe import FACE_POINTS, stack
-from lrfcal_lib.model.observations import LENS, JointObservations, thin
+from lrfcal_lib.model.camera import LENS
+from lrfcal_lib.model.observations import JointObservations, thin
 from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edge_cells import edge_cells
@@ -45,7 +46,7 @@ def observe_joint(
     return JointObservations(
         placements=np.array(list(scans), int),
         direction=np.array([session.sweep_direction(p) for p in scans], int),
-        middle=np.array([float(np.mean(scan.sweep.pitch)) for scan in scans.values()]),
+        middle=np.array([np.mean(scan.sweep.pitch) for scan in scans.values()]),
         edges=tuple(board.edges),
         corners=corners,
         cameras=tuple(views),

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, as_completed
 from contextlib import suppress
 from itertools import product
@@ -94,17 +94,18 @@ def tasks_of(scenarios, methods, n_poses, trials, seed=0) -> list[Task]:
         raise ValueError(f"no method: name some of {', '.join(STUDIED)}")
     if trials < 1:
         raise ValueError(f"{trials} trials: 1 or more are needed")
-    if not n_poses or min(n_poses) < 3:
+    if min(n_poses, default=0) < 3:
         raise ValueError(f"{list(n_poses)} placements: 3 or more are needed for a camera")
     known = [s if isinstance(s, Scenario) else load_scenario(s) for s in scenarios]
     for scenario in known:
         if scenario.corner and not BATCHED.keys() >= set(methods):
             raise ValueError(f"{scenario.name} shows no board: use {', '.join(BATCHED)}")
-    counts = sorted(n_poses, reverse=True)  # the longest first
     return [
         Task(scenario, tuple(methods), count, seed, first, min(CHUNK, trials - first))
         for first in range(0, trials, CHUNK)
-        for scenario, count in product(known, counts)
+        for scenario, count in product(
+            known, sorted(n_poses, reverse=True)
+        )  # longest first
     ]
 
 
@@ -148,15 +149,19 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
         (``_bound``) and known (``_known``) sensor; of trials that did not fail rmse_over_bound,
         with its interval, nees and coverage of the six numbers of the pose.
     """
-    settings = list(rows.columns[: rows.columns.get_loc("n_poses") + 1])
-    keys = [*settings, "method"]
-    rows = rows.reindex(columns=list(dict.fromkeys([*rows.columns, *NUMBERS])))
-    rows = rows.assign(method=pd.Categorical(rows.method, STUDIED))
-    rows = rows.assign(failed=rows.outcome != "ok").sort_values([*keys, "trial"])
+    keys = [*rows.loc[:, :"n_poses"], "method"]
+    rows = rows.reindex(columns=rows.columns.union(NUMBERS, sort=False))
+    rows = rows.assign(
+        method=pd.Categorical(rows.method, STUDIED), failed=rows.outcome != "ok"
+    ).sort_values("trial")
     every = rows.groupby(keys, observed=True)
     good = rows[~rows.failed].groupby(keys, observed=True)
-    table = pd.DataFrame({"trials": every.size(), "failed": every.failed.sum()})
-    table["failures"] = every.outcome.agg(_reasons)
+    columns = {
+        "trials": every.size(),
+        "failed": every.failed.sum(),
+        "failures": every.outcome.agg(_reasons),
+    }
+    table = pd.DataFrame(columns)
     for name, (unit, factor) in UNITS.items():
         columns = {"": every[name].median(), "_mean": every[name].mean()}
         for end, share in INTERVAL.items():
@@ -195,7 +200,7 @@ def resampled(values: np.ndarray, share: float, statistic=np.median) -> float:
         Of the resamples below the bound.
     statistic : callable
     """
-    values = np.sort(np.asarray(values, float))
+    values = np.sort(values)
     values = values[np.isfinite(values)]
     if len(values) == 0:
         return np.nan
@@ -203,7 +208,12 @@ def resampled(values: np.ndarray, share: float, statistic=np.median) -> float:
     return float(np.quantile(statistic(drawn, axis=1), share))
 
 
-def study_to_file(tasks: Sequence[Task], out: str | os.PathLike, executor=None, bar=None):
+def study_to_file(
+    tasks: Sequence[Task],
+    out: str | os.PathLike,
+    executor: Executor | None = None,
+    bar: Callable[[int], object] = lambda count: None,
+) -> pd.DataFrame:
     """Run a study and write its table; a study that was killed goes on.
 
     Every finished task is a line of ``OUT.part``, which goes when the table is written.
@@ -229,7 +239,6 @@ def study_to_file(tasks: Sequence[Task], out: str | os.PathLike, executor=None, 
     """
     part = Path(f"{out}.part")
     kept = _kept(part, {task.key for task in tasks})
-    bar = bar or (lambda count: None)
     bar(len(kept))
     missing = [task for task in tasks if task.key not in kept]
     with part.open("a") as file:

@@ -252,7 +252,6 @@ def plane_observations(
         plane_points=obs.face_range[:, None] * rays,
         plane_covariance=scenario.sigma_range**2 * rays[:, :, None] * rays[:, None] + thick,
         plane_placement=obs.face_placement,
-        placements=np.arange(len(obs.placements)),
         board_poses=obs.view_pose,
         board_covariance=obs.view_covariance,
     )
@@ -276,8 +275,6 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
         middle=np.zeros(count),
         direction=np.zeros(count, int),
         **_readings(shots, scenario, trial),
-        view_camera=np.zeros(count, int),
-        view_pitch=np.zeros(count),
         view_pose=pose_transform(shots["boards"][trial]).as_matrix(),
         view_covariance=shots["board_covariance"][trial],
         view_placement=np.arange(count),
@@ -321,15 +318,12 @@ def _readings(shots, scenario, trial):
     return {
         "face_range": ranges[line, beam],
         "face_bearing": bearings[beam],
-        "face_pitch": np.zeros(len(beam)),
         "face_sigma": np.full(len(beam), scenario.sigma_range),
         "face_placement": of_line[line],
         "beam_bearing": bearings[window],
-        "beam_pitch": np.zeros(len(row)),
         "beam_hit": hit[row, window],
         "beam_edge": edges[row, end],
         "beam_radius": scenario.radius(at_end),
-        "beam_background": np.zeros(len(row)),
         "beam_step": scenario.step * at_end,
         "beam_placement": of_line[row],
     }

@@ -10,13 +10,12 @@ from scipy.special import chdtrc, fdtrc
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose, pose_step
+from lrfcal_lib.model.geometry import POSE, DegenerateGeometry, apply_pose, pose_step
 from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_solution import JointSolution, Score
 
-POSE = 6  # numbers of a camera's pose
 BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong
 # false alarms a recording, over all cameras and places that a step might be at
 LEVEL = 0.001

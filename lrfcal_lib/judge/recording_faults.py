@@ -16,6 +16,7 @@ from lrfcal_lib.judge.alternatives import LEVER, far_axis, guesses_of
 from lrfcal_lib.judge.camera_changes import camera_changes, explains
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
+    POSE,
     DegenerateGeometry,
     lrf_to_platform,
     transform_difference,
@@ -42,7 +43,6 @@ POINTS = 60  # of a placement's face
 CHANCE = 0.9999  # a reading that fits better by chance alone does so less often than once in 10 000
 LOOKED_AT = 4  # placements in which a board is searched for again
 PLANE = 3  # numbers of a plane
-POSE = 6  # numbers of a camera's pose
 HALF = 0.6745  # standard deviations of normal noise that half of all values stay below
 LEAST_MISS = 0.001  # metres; paper is no flatter
 MOST_LOST = 8  # placements; where more are left out, something else is wrong
@@ -165,7 +165,7 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     prepared = calibration.prepared
     joint = calibration.joint
     session = prepared.session
-    found = faults_of_files(session) + dark_images(session)
+    found = [*faults_of_files(session), *dark_images(session)]
     if hopeless(joint) and (misread := misread_recording(prepared)):
         return found + misread
     if joint is not None:

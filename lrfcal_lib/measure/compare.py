@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from scipy.linalg import pinvh
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 from scipy.special import chdtrc
 
 from lrfcal_lib.calibrate.calibration_file import load_calibration, require_same_rig
@@ -16,11 +16,13 @@ from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.uncertainty import (
     beams_of_pixels,
     carried,
     chain_of,
     pixel_grid,
+    root_mean_square,
     spread,
     uncertainty_of,
 )
@@ -109,9 +111,9 @@ class Shifts:
 
     def amount(self, unit: str, scale: float = 1.0) -> Amount:
         """Root mean squares as an Amount, times `scale`."""
-        value = scale * np.sqrt(np.nanmean(np.sum(self.off**2, axis=-1)))
-        claimed = scale * np.sqrt(np.mean(self.claimed[np.isfinite(self.off[..., 0])] ** 2))
-        return Amount(f"at {DISTANCE:g} m", float(value), float(claimed), unit)
+        value = rms(np.linalg.norm(self.off, axis=-1))
+        claimed = root_mean_square(self.claimed[np.isfinite(self.off[..., 0])])
+        return Amount(f"at {DISTANCE:g} m", scale * value, scale * claimed, unit)
 
 
 @dataclass(frozen=True)
@@ -188,13 +190,18 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
     """
     require_same_rig(first, second)
     shared = [name for name in first.cameras if name in second.cameras]
-    one_lens = all(_same_lens(first, second, name) for name in shared)
+    # intrinsics from the same place are equal to the last bit
+    one_lens = all(
+        np.array_equal(
+            first.cameras[name].model.parameters, second.cameras[name].model.parameters
+        )
+        for name in shared
+    )
     if one_lens:
         first = _without_lens(first)
         second = _without_lens(second)
     second_there = in_gauge_of(first, second)
-    step = _steps(first, second_there, shared)
-    covariance = _covariance(first, step.index) + _covariance(second, step.index)
+    tested = _tested(first, second_there, shared)
     images = {name: shifts(first, second_there, name) for name in shared}
     groups = {
         "axis": {"turn": [*AXIS_NAMES[:2]], "shift": [*AXIS_NAMES[2:]]},
@@ -203,37 +210,25 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
     for name in shared:
         pose = [f"{name}_{part}" for part in POSE_NAMES]
         groups[name] = {"turn": pose[:3], "shift": pose[3:]}
-    parts = []
-    for name, of_part in groups.items():
-        part = _part(name, of_part, step, covariance)
-        if name in images:
-            part = replace(part, amounts=(*part.amounts, images[name].amount("px")))
-        parts.append(part)
+    parts = [_part(name, of_part, tested, images) for name, of_part in groups.items()]
     cloud = shifts(first, second_there)
     moved = (cloud.amount("mm in the cloud", 1000),)
-    whole = Part("everything", moved, *_chi2(step, covariance), 1.0)
+    whole = Part("everything", moved, *tested.chi2(tested.table.index), 1.0)
     return Comparison(first, second, tuple(parts), whole, images, cloud, one_lens)
 
 
-def _part(name, groups, step, covariance):
-    """The Part of some differences: turns, shifts, a scale."""
+def _part(name, groups, tested, images):
+    """The Part of some differences: turns, shifts, a scale, and pixels of a camera."""
     amounts = []
     for what, members in groups.items():
         scale, unit = UNITS[what]
-        value = scale * float(np.linalg.norm(step[members]))
-        claimed = scale * np.sqrt(np.diag(covariance.loc[members, members]).sum())
-        amounts.append(Amount(what, value, float(np.nan_to_num(claimed, nan=np.inf)), unit))
-    mine = [member for members in groups.values() for member in members]
-    others = step.index.difference(mine)
-    *_, p_of_others = _chi2(step[others], covariance.loc[others, others])
-    chi2 = _chi2(step[mine], covariance.loc[mine, mine])
-    return Part(name, tuple(amounts), *chi2, p_of_others)
-
-
-def _same_lens(first, second, camera):
-    """Whether both rigs have a camera's intrinsics from the same place: equal to the last bit."""
-    one = first.cameras[camera].model
-    return np.array_equal(one.parameters, second.cameras[camera].model.parameters)
+        value, claimed = scale * np.linalg.norm(tested.table.loc[members], axis=0)
+        amounts.append(Amount(what, value, claimed, unit))
+    if name in images:
+        amounts.append(images[name].amount("px"))
+    mine = sum(groups.values(), [])
+    *_, p_of_others = tested.chi2(tested.table.index.difference(mine))
+    return Part(name, tuple(amounts), *tested.chi2(mine), p_of_others)
 
 
 def _without_lens(rig):
@@ -244,21 +239,27 @@ def _without_lens(rig):
     return replace(rig, uncertainty=known)
 
 
-def _chi2(step, covariance) -> tuple[float, int, float]:
-    """Chi-square of differences, its degrees of freedom, and how often chance exceeds it.
+@dataclass(frozen=True)
+class _Tested:
+    """Differences with their standard deviations by name, and what of these can be tested.
 
-    Without what nothing bounds, or one of the two took as it is.
+    The correlation is without what nothing bounds, or one of the two took as it is.
     """
-    variance = np.diag(covariance)
-    known = np.isfinite(variance) & (variance > 0)
-    if not known.any():
-        return 0.0, 0, 1.0
-    sigma = np.sqrt(variance[known])
-    z = step.to_numpy()[known] / sigma
-    correlation = covariance.to_numpy()[np.ix_(known, known)] / np.outer(sigma, sigma)
-    inverse, freedom = pinvh(correlation, rtol=TOLD, return_rank=True)
-    chi2 = float(z @ inverse @ z)
-    return chi2, int(freedom), float(chdtrc(freedom, chi2))
+
+    table: pd.DataFrame
+    correlation: pd.DataFrame
+
+    def chi2(self, names) -> tuple[float, int, float]:
+        """Chi-square of differences, its degrees of freedom, and how often chance exceeds it."""
+        names = self.correlation.index.intersection(names)
+        if names.empty:
+            return 0.0, 0, 1.0
+        inverse, freedom = pinvh(
+            self.correlation.loc[names, names], rtol=TOLD, return_rank=True
+        )
+        z = self.table.step[names] / self.table.sigma[names]
+        chi2 = z @ inverse @ z
+        return chi2, freedom, chdtrc(freedom, chi2)
 
 
 def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
@@ -269,11 +270,9 @@ def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
     ----------
     first, second : CalibratedRig
     """
-    apart = first.T_head_lrf * second.T_head_lrf.inv()
-    turn = Rotation.from_rotvec(apart.rotation.as_rotvec() * [1, 0, 0])
-    moved = second.T_head_lrf.translation
-    shift = (first.T_head_lrf.translation - turn.apply(moved)) * [1, 0, 0]
-    gauge = RigidTransform.from_components(shift, turn)
+    step = pose_step(second.T_head_lrf, first.T_head_lrf)
+    step[AXIS_COLUMNS] = 0  # what is left turns about x, and shifts along it
+    gauge = RigidTransform.from_exp_coords(step)
     cameras = {}
     for name, camera in second.cameras.items():
         if camera.mount == "platform":
@@ -283,6 +282,18 @@ def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
     return replace(second, axis=axis, cameras=cameras)
 
 
+def _tested(first, second, shared) -> _Tested:
+    """The _Tested of increments from the first rig to the second: radians, metres, a fraction."""
+    step = _steps(first, second, shared)
+    covariance = _covariance(first) + _covariance(second)  # NaN for what only one estimated
+    covariance = covariance.reindex(index=step.index, columns=step.index)
+    sigma = pd.Series(np.sqrt(np.diag(covariance)), step.index)
+    known = step.index[np.isfinite(sigma) & (sigma > 0)]
+    correlation = covariance.loc[known, known] / np.outer(sigma[known], sigma[known])
+    table = pd.DataFrame({"step": step, "sigma": sigma.fillna(np.inf)})
+    return _Tested(table, correlation)
+
+
 def _steps(first, second, shared):
     """Increments from the first rig to the second by name: radians, metres, a fraction."""
     by_axis = pose_step(first.T_head_lrf, second.T_head_lrf)[AXIS_COLUMNS]
@@ -290,18 +301,15 @@ def _steps(first, second, shared):
     for name in shared:
         step = pose_step(first.cameras[name].T_camera, second.cameras[name].T_camera)
         steps |= zip([f"{name}_{pose}" for pose in POSE_NAMES], step, strict=True)
-    one = first.corrections
-    other = second.corrections
-    steps["range_offset"] = other.range_offset - one.range_offset
-    steps["pitch_scale"] = other.pitch_scale - one.pitch_scale
+    steps["range_offset"] = second.corrections.range_offset - first.corrections.range_offset
+    steps["pitch_scale"] = second.corrections.pitch_scale - first.corrections.pitch_scale
     return pd.Series(steps)
 
 
-def _covariance(rig, names):
-    """Covariance to rely on of shared unknowns, a DataFrame; NaN for what was taken as it is."""
+def _covariance(rig):
+    """Covariance to rely on of shared unknowns, a DataFrame."""
     known = uncertainty_of(rig)
-    covariance = pd.DataFrame(known.trusted, known.names, known.names)
-    return covariance.reindex(index=names, columns=names)
+    return pd.DataFrame(known.trusted, known.names, known.names)
 
 
 def shifts(
@@ -322,8 +330,8 @@ def shifts(
     """
     if camera is None:
         bearings = np.linspace(*first.lrf.field_of_view, BEARINGS)
-        at = np.stack(np.meshgrid(bearings, PITCHES), axis=-1)
-        bearing, pitch = np.moveaxis(at, -1, 0)
+        bearing, pitch = np.meshgrid(bearings, PITCHES)
+        at = np.stack([bearing, pitch], axis=-1)
     else:
         model = first.cameras[camera].model
         at = pixel_grid(model, PIXELS)
@@ -331,7 +339,7 @@ def shifts(
         bearing, pitch = beams_of_pixels(chain, model, at, DISTANCE, 0.0)
     recorded = pitch / (1 + first.corrections.pitch_scale)
     ends = []
-    variance = np.zeros(bearing.shape)
+    sigma = np.zeros_like(bearing)
     for rig in (first, second):
         chain = chain_of(rig, camera)
         true = recorded * (1 + rig.corrections.pitch_scale)
@@ -342,8 +350,8 @@ def shifts(
             derivative = project_jacobians(end, model)[0] @ derivative
             end = project(end, model)
         ends.append(end)
-        variance = variance + spread(chain, derivative) ** 2
-    return Shifts(at, ends[1] - ends[0], np.sqrt(variance))
+        sigma = np.hypot(sigma, spread(chain, derivative))
+    return Shifts(at, ends[1] - ends[0], sigma)
 
 
 def rig_at(path: str | Path) -> CalibratedRig:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 # in the order of CameraModel.parameters
 INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
+LENS = len(INTRINSIC_NAMES)
 
 
 @dataclass(frozen=True)

@@ -400,6 +400,7 @@ def fit_line(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
+POSE = 6  # numbers of a pose, [w, v]
 
 
 def pose_array(transform: RigidTransform) -> np.ndarray:

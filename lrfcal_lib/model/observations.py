@@ -10,10 +10,15 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
 Array = np.ndarray
-LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 ROUGH_NOISE = 1e-4 * np.eye(
     3
 )  # a centimetre every way, for points whose covariance is not told
+# observations that a pose takes at least, by kind
+NEEDED = {
+    "crossing": (6, "crossings of scan lines with edges"),
+    "plane": (3, "placements with a board pose and points on the board"),
+    "scene": (3, "scene points"),
+}
 
 
 def thin(rows: np.ndarray, count: int) -> np.ndarray:
@@ -23,10 +28,11 @@ def thin(rows: np.ndarray, count: int) -> np.ndarray:
     return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
 
 
-def rows(group: str, *shape: int, default=0.0):
+def rows(group: str, *shape: int | str, default=0.0):
     """A field of arrays with a row for each member of a group, which is as long as its first field.
 
-    Where it is not given, every row is the default; None: the row's number.
+    In `shape` a group is its length. Where the field is not given, every row is the default; None:
+    the row's number.
     """
     metadata = {"group": group, "shape": shape, "default": default}
     return field(default=None, metadata=metadata)
@@ -35,9 +41,10 @@ def rows(group: str, *shape: int, default=0.0):
 class _Grouped:
     """Arrays in groups of equal length; every field of :func:`rows` says which one is its."""
 
-    def complete(self, whose="", gaps=()):
-        """Give missing arrays their default, and refuse what is not finite but in `gaps`."""
-        counts: dict[str, int] = {}
+    def complete(self, whose="", **counts):
+        """Give missing arrays their default, and refuse what is not finite; `counts` are lengths of
+        groups that are known.
+        """
         for f in fields(self):
             if not f.metadata:
                 continue
@@ -47,11 +54,14 @@ class _Grouped:
                 count = counts.get(group, 0)
                 value = np.arange(count)
                 if default is not None:
-                    value = np.broadcast_to(default, (count, *shape)).copy()
+                    sizes = [counts.get(size, size) for size in shape]
+                    value = np.full((count, *sizes), default)
                 object.__setattr__(self, f.name, value)
             counts.setdefault(group, value.shape[value.ndim - len(shape) - 1])
         for name, value in vars(self).items():
-            if name in gaps or not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+            if name == "pattern_pixels":  # NaN where not seen
+                continue
+            if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
                 continue
             bad = ~np.isfinite(value)
             if bad.any():
@@ -172,7 +182,7 @@ class CameraObservations(_Grouped):
     placements: Array = rows("board", default=None)
     board_covariance: Array = rows("board", 6, 6)
     pattern_points: Array = rows("pattern", 3)
-    pattern_pixels: Array = rows("board", default=np.nan)
+    pattern_pixels: Array = rows("board", "pattern", 2, default=np.nan)
     pattern_sigma_px: float = 0.2
     scene_points: Array = rows("scene", 3)
     scene_covariance: Array = rows("scene", 3, 3, default=ROUGH_NOISE)
@@ -181,36 +191,29 @@ class CameraObservations(_Grouped):
     scene_placement: Array = rows("scene", default=None)
 
     def __post_init__(self):
-        self.complete(f" of camera '{self.camera}'", gaps=("pattern_pixels",))
-        if self.pattern_pixels.ndim == 1:  # none was seen
-            unseen = np.full((len(self.placements), len(self.pattern_points), 2), np.nan)
-            object.__setattr__(self, "pattern_pixels", unseen)
+        self.complete(f" of camera '{self.camera}'")
 
     @property
     def all_placements(self):
         """Every placement that contributes anything, sorted."""
-        parts = (
-            self.crossing_placement,
-            self.plane_placement,
-            self.placements,
-            self.scene_placement,
+        return np.unique(
+            np.r_[
+                self.crossing_placement,
+                self.plane_placement,
+                self.placements,
+                self.scene_placement,
+            ]
         )
-        return np.unique(np.concatenate(parts))
 
-    def require(self, kind, least):
-        """Refuse fewer than `least` of a kind: 'crossing', 'plane' or 'scene'."""
-        if kind == "crossing":
-            count = len(self.crossing_placement)
-            what = "crossings of scan lines with edges"
-        elif kind == "plane":
-            count = len(np.intersect1d(self.placements, self.plane_placement))
-            what = "placements with a board pose and points on the board"
-        else:
-            count = len(self.scene_placement)
-            what = "scene points"
-        if count < least:
+    def require(self, kind):
+        """Refuse fewer than are `NEEDED` of a kind."""
+        least, what = NEEDED[kind]
+        placements = getattr(self, f"{kind}_placement")
+        if kind == "plane":
+            placements = np.intersect1d(self.placements, placements)
+        if len(placements) < least:
             raise DegenerateGeometry(
-                f"camera '{self.camera}': {count} {what}, at least {least} needed: "
+                f"camera '{self.camera}': {len(placements)} {what}, at least {least} needed: "
                 "the rest of the pose stays unobservable"
             )
 
@@ -258,9 +261,9 @@ class PlatformObservations(_Grouped):
     def __post_init__(self):
         self.complete()
         if not np.isin(self.edge_number, (1, 2)).all():
-            found = np.unique(self.edge_number)
             raise ValueError(
-                f"edge_number must be 1 or 2 (the two perpendicular edges), got {found}"
+                "edge_number must be 1 or 2 (the two perpendicular edges), got "
+                f"{np.unique(self.edge_number)}"
             )
 
 
@@ -342,18 +345,15 @@ class JointObservations(_Grouped):
     lens_covariance: Array = rows("camera", 9, 9)
 
     def __post_init__(self):
-        self.complete()
-        if len(self.lens_covariance) != len(self.cameras):
-            exact = np.zeros((len(self.cameras), LENS, LENS))
-            object.__setattr__(self, "lens_covariance", exact)
+        self.complete(camera=len(self.cameras))
         count = len(self.placements)
         for name in ("face_placement", "beam_placement", "view_placement"):
             place = getattr(self, name)
-            if len(place) and not 0 <= place.min() <= place.max() < count:
+            if not np.isin(place, np.arange(count)).all():
                 raise ValueError(
                     f"{name} are indices below {count}, got up to {place.max()}"
                 )
-        if len(self.face_sigma) and self.face_sigma.min() <= 0:
+        if np.any(self.face_sigma <= 0):
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
 
     def lines(self):
@@ -382,8 +382,8 @@ class JointObservations(_Grouped):
         """The observations with bearings stretched by a share about the middle one, pi / 2."""
         return replace(
             self,
-            face_bearing=np.pi / 2 + (self.face_bearing - np.pi / 2) * (1 + share),
-            beam_bearing=np.pi / 2 + (self.beam_bearing - np.pi / 2) * (1 + share),
+            face_bearing=self.face_bearing + share * (self.face_bearing - np.pi / 2),
+            beam_bearing=self.beam_bearing + share * (self.beam_bearing - np.pi / 2),
         )
 
     def with_cameras(self, names):

@@ -6,8 +6,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block, minimise
-from lrfcal_lib.model.camera import CameraModel, project_jacobians
+from lrfcal_lib.model.camera import LENS, CameraModel, project_jacobians
 from lrfcal_lib.model.geometry import (
+    POSE,
     gradient_by_pose,
     move_pose,
     pose_array,
@@ -20,8 +21,6 @@ OUTLIER_SIGMAS = 4.5
 RAYLEIGH_MEDIAN = 1.1774  # median of the length of a vector (2,) of normal variables
 ROBUST_ROUNDS = 7
 UP = np.array([0.0, 0.0, 1.0])
-LENS = 9  # fx, fy, cx, cy, k1..k5
-POSE = 6  # [w, v]
 
 
 @dataclass(frozen=True)

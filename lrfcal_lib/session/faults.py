@@ -1,7 +1,7 @@
 """What cannot be right about a recording, as far as its files alone show it."""
 
-import hashlib
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,22 +55,21 @@ def faults_of_files(session) -> list[Fault]:
     -------
     list of Fault
     """
-    found = repeated_images(session) + repeated_scans(session)
-    return found + ranges_beyond(session) + bearings_beyond(session)
+    finders = (repeated_images, repeated_scans, ranges_beyond, bearings_beyond)
+    return [fault for find in finders for fault in find(session)]
 
 
-def repeated_images(session) -> list[Fault]:
+def repeated_images(session) -> Iterator[Fault]:
     """Images whose files are the same to the byte; one Fault a pair of cameras."""
-    groups = defaultdict(list)
+    firsts = {}  # by the hash of their content
+    pairs = defaultdict(list)
     for record in session.image_records:
         content = read_bytes(record.file, session.path)
-        groups[hashlib.blake2b(content).digest()].append(record)
-
-    pairs = defaultdict(list)
-    for first, *others in groups.values():
-        for other in others:
-            pairs[first.camera, other.camera].append((first, other))
-    return [_repeated(session, *cameras, both) for cameras, both in pairs.items()]
+        first = firsts.setdefault(hash(content), record)
+        if first is not record:
+            pairs[first.camera, record.camera].append((first, record))
+    for cameras, both in pairs.items():
+        yield _repeated(session, *cameras, both)
 
 
 def _repeated(session, first_camera, camera, pairs):
@@ -80,7 +79,7 @@ def _repeated(session, first_camera, camera, pairs):
         f"{other.file.relative_to(session.path)} is {first.file.relative_to(session.path)}"
         for first, other in pairs
     )
-    placements = sorted({other.placement for _, other in pairs} - {-1})
+    placements = tuple(sorted({other.placement for _, other in pairs} - {-1}))
     cause = "a camera that stood still, or a copy"
     if first_camera != camera:
         cause = f"was the folder of camera '{first_camera}' copied?"
@@ -89,75 +88,68 @@ def _repeated(session, first_camera, camera, pairs):
         f"{short(placements)}) are identical to others: {examples}: {cause}; put the right "
         "images there or remove their rows from images.csv"
     )
-    severe = len(pairs) > MANY * count
-    return Fault(
-        "repeated image", words, severe, camera=camera, placements=tuple(placements)
-    )
+    return Fault("repeated image", words, len(pairs) > MANY * count, camera, placements)
 
 
-def repeated_scans(session) -> list[Fault]:
+def repeated_scans(session) -> Iterator[Fault]:
     """Placements whose ranges are the same to the last digit: noise never repeats itself."""
     same_ranges = defaultdict(list)
     placement = session.scans["placement"]
     for number in session.placements:
         ranges = session.scans["ranges"][placement == number]
         if np.isfinite(ranges).any():
-            same_ranges[ranges.shape, hashlib.blake2b(ranges.tobytes()).digest()].append(
-                number
-            )
+            same_ranges[len(ranges), hash(ranges.tobytes())].append(number)
 
-    found = []
-    for ((lines, _), _), numbers in same_ranges.items():
+    for (lines, _), numbers in same_ranges.items():
         if len(numbers) > 1:
             words = (
                 f"the scans of placements {' and '.join(map(str, numbers))} are the same to the "
                 f"last digit ({lines} scan lines): a copy; record one of them again or remove it "
                 "from placements in session.json"
             )
-            found.append(Fault("repeated scan", words, placements=tuple(numbers)))
-    return found
+            yield Fault("repeated scan", words, placements=tuple(numbers))
 
 
-def ranges_beyond(session) -> list[Fault]:
+def ranges_beyond(session) -> Iterator[Fault]:
     """Ranges that the range finder cannot have measured, as session.json states it."""
     ranges = session.scans["ranges"]
     known = ranges[np.isfinite(ranges)]
     limit = session.lrf.max_range
-    share = float(np.mean(known > limit))
+    share = np.mean(known > limit)
     if share <= BEYOND:
-        return []
+        return
     words = (
         f"{100 * share:.3g} % of the ranges exceed the max_range_m of {limit:g} m that "
         f"session.json states (half of all ranges: {np.median(known):.3g} m or more, largest: "
         f"{known.max():.3g} m): state the range finder's own max_range_m, or convert the ranges "
         "to metres"
     )
-    return [Fault("beyond range", words)]
+    yield Fault("beyond range", words)
 
 
-def bearings_beyond(session) -> list[Fault]:
+def bearings_beyond(session) -> Iterator[Fault]:
     """Bearings, or steps between them, that are not those which session.json states."""
     lrf = session.lrf
     bearings = session.scans["bearings"]
     gaps = len(bearings) - 1
     if gaps == 0:
-        return []
-    step = (bearings[-1] - bearings[0]) / gaps
-    first, last = lrf.field_of_view
-    half = lrf.bearing_step / 2
-    inside = first - half <= bearings[0] and bearings[-1] <= last + half
-    if inside and abs(step - lrf.bearing_step) * gaps <= half:
-        return []
+        return
+    first, *_, last = bearings
+    step = (last - first) / gaps
+    low, high = lrf.field_of_view
+    drift = abs(step - lrf.bearing_step) * gaps
+    if max(low - first, last - high, drift) <= lrf.bearing_step / 2:
+        return
     has, says = (
         "{:.5g} to {:.5g} deg in steps of {:.4g} deg".format(*np.degrees(values))
-        for values in ((bearings[0], bearings[-1], step), (first, last, lrf.bearing_step))
+        for values in ((first, last, step), (low, high, lrf.bearing_step))
     )
     words = (
         f"the bearings of the scan lines (lrf) cover {has}, session.json states field_of_view_deg "
         f"and bearing_step_deg as {says}: the scan lines count; correct session.json, or the "
         "bearings if they are wrong"
     )
-    return [Fault("field of view", words)]
+    yield Fault("field of view", words)
 
 
 def brightness(image: np.ndarray) -> int:
@@ -171,25 +163,13 @@ def brightness(image: np.ndarray) -> int:
     return int(np.quantile(image[::4, ::4].max(axis=2), WHITE))
 
 
-def dark_image(image: np.ndarray) -> bool:
-    """Whether the brightest surface of an image is darker than a white square may be.
-
-    Parameters
-    ----------
-    image
-        Of uint8, shape (h, w, 3).
-    """
-    return brightness(image) < DARK
-
-
-def dark_images(session) -> list[Fault]:
+def dark_images(session) -> Iterator[Fault]:
     """Cameras whose images of the board are too dark; SHOWN of each are looked at.
 
     Parameters
     ----------
     session : Session
     """
-    found = []
     for camera in session.cameras:
         records = session.images(camera, purpose="board")
         records = records[:: max(len(records) // SHOWN, 1)][:SHOWN]
@@ -206,5 +186,4 @@ def dark_images(session) -> list[Fault]:
                 "convert the images"
             )
             placements = tuple(sorted({record.placement for record in dark}))
-            found.append(Fault("dark", words, camera=camera, placements=placements))
-    return found
+            yield Fault("dark", words, camera=camera, placements=placements)

@@ -163,7 +163,7 @@ def import_lasersetero(src: str | PathLike, dst: str | PathLike) -> float:
             misses.append(sweep.miss)
         for name, files in images.items():
             for placement, file in files.items():
-                writer.add_image(name, file, placement, purpose="board")
+                writer.add_image(name, file, placement)
     return max(misses)
 
 

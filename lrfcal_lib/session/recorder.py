@@ -10,7 +10,7 @@ from lrfcal_lib.session.files import SessionError, naming, short
 from lrfcal_lib.session.lock import LOCK
 from lrfcal_lib.session.tables import read_table
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
-from lrfcal_lib.session.write import SessionWriter, as_lines, cell, mend_tables
+from lrfcal_lib.session.write import SessionWriter, as_lines, cell, mend_tables, write_file
 
 
 class SessionRecorder(SessionWriter):
@@ -185,7 +185,7 @@ class SessionRecorder(SessionWriter):
         for row in rows:
             if row["placement"] == str(placement):
                 row.update(mark)
-        self._write(name, as_lines([columns, *(row.values() for row in rows)]))
+        write_file(self.path, name, as_lines([columns, *(row.values() for row in rows)]))
 
 
 def _first_difference(old, new, where):

@@ -79,7 +79,7 @@ class SessionWriter:
         self.bearings: np.ndarray | None = None  # of the sweeps so far
         self.parts = 0  # files of sweeps so far
         self.shots = dict.fromkeys(self.cameras, 0)  # images so far, by camera
-        self.telegrams = self.path / "lrf" / "telegrams.bin"
+        self.telegrams = self.path / "lrf/telegrams.bin"
         if not about.keys() <= ABOUT.keys():
             raise TypeError(f"a session has {short(ABOUT)}, got {short(about)}")
         self.data = {
@@ -99,20 +99,21 @@ class SessionWriter:
         }
         with naming(self.path):
             stated.parse_session(json.loads(json.dumps(self.data)))
-        if self.path.exists() and not self.path.is_dir():
-            self._refuse("choose another name or remove it first")
-        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            self._refuse()
         with contextlib.ExitStack() as stack:
             stack.enter_context(alone(self.path))
             self._create()
             self._held = stack.pop_all()
 
-    def _refuse(self, remedy):
+    def _refuse(self, remedy="choose another name or remove it first"):
         raise SessionError(f"{self.path}: exists already; {remedy}")
 
     def _create(self):
         if set(os.listdir(self.path)) - {LOCK}:
-            self._refuse("choose another name or remove it first")
+            self._refuse()
         self._make_folders()
         self._state()
 
@@ -134,18 +135,15 @@ class SessionWriter:
         """Write nothing any more: others may."""
         self._held.close()
 
-    def _write(self, name, content):
-        write_file(self.path / name, content, self.path)
-
     def _state(self, **changes):
         """Change session.json; where that cannot be written, nothing is changed."""
         data = self.data | changes
-        self._write("session.json", json.dumps(data, indent=1) + "\n")
+        write_file(self.path, "session.json", (json.dumps(data, indent=1) + "\n").encode())
         self.data = data
 
     def _begin_table(self, name, columns):
         if not os.path.lexists(self.path / name):
-            self._write(name, as_lines([columns]))
+            write_file(self.path, name, as_lines([columns]))
 
     def _append_rows(self, name, rows):
         append_file(self.path / name, as_lines(rows), self.path)
@@ -210,7 +208,7 @@ class SessionWriter:
                 )
         self.bearings = bearings
         self.parts += 1
-        self._write(f"lrf/part_{self.parts:06d}.npz", scans)
+        write_file(self.path, f"lrf/part_{self.parts:06d}.npz", scans)
         self._note_placement(placement)
 
     def add_telegrams(
@@ -239,8 +237,8 @@ class SessionWriter:
         """
         with naming(f"{self.path}: placement {placement}"):
             lengths = [len(raw) for raw in telegrams]
-            pitch = np.broadcast_to(np.asarray(pitch, float), len(telegrams))
-            time_s = np.broadcast_to(np.asarray(time_s, float), len(telegrams))
+            pitch = np.full(len(telegrams), pitch, float)
+            time_s = np.full(len(telegrams), time_s, float)
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
                 raise ValueError(
                     f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed"
@@ -252,7 +250,7 @@ class SessionWriter:
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
         offset = append_file(self.telegrams, b"".join(telegrams), self.path)
-        offsets = offset + np.cumsum([0, *lengths[:-1]])
+        offsets = offset + np.cumsum(lengths) - lengths
         number = number_cell(placement)
         columns = zip(time_s, offsets, lengths, np.degrees(pitch), strict=True)
         rows = [[cell(t), at, size, number, cell(angle)] for t, at, size, angle in columns]
@@ -292,19 +290,17 @@ class SessionWriter:
         with naming(self.path):
             read.known(camera, self.cameras, "camera")
             read.known(purpose, read.PURPOSES, "purpose")
-        what: str | os.PathLike = f"camera '{camera}'"
+        what = f"camera '{camera}'"
         if isinstance(image, np.ndarray):
-            content = cv2.imencode(".png", image)[1].tobytes()
-        elif isinstance(image, bytes):
-            content = image
-        else:
-            what = image
-            content = files.read_bytes(image)
-        check_image_size(what, content, self.cameras[camera])
+            image = bytes(cv2.imencode(".png", image)[1])
+        if not isinstance(image, bytes):
+            what = str(image)
+            image = files.read_bytes(image)
+        check_image_size(what, image, self.cameras[camera])
         self.shots[camera] += 1
-        kind = "jpg" if content.startswith(JPEG) else "png"
+        kind = "jpg" if image.startswith(JPEG) else "png"
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
-        self._write(name, content)
+        write_file(self.path, name, image)
         self._note_placement(placement)
         angle = cell(math.degrees(pitch))
         row = [cell(time_s), camera, name, number_cell(placement), angle, purpose]
@@ -337,7 +333,7 @@ def finish(path: str | os.PathLike) -> None:
 def complete(path):
     """As :func:`finish`, for who writes the session already; telegrams are complete as they are."""
     mend_tables(path)
-    if os.path.lexists(path / "lrf" / "telegrams.bin"):
+    if os.path.lexists(path / "lrf/telegrams.bin"):
         return
     parts = parts_of(path)
     if not parts:
@@ -350,7 +346,7 @@ def complete(path):
         if key != "bearings" and all(key in sweep for sweep in sweeps):
             scans[key] = np.concatenate([sweep[key] for sweep in sweeps])
     scans["bearings"] = sweeps[0]["bearings"]
-    write_file(path / "lrf" / "scans.npz", scans, path)
+    write_file(path, "lrf/scans.npz", scans)
     for part in parts:
         part.unlink()
 
@@ -363,12 +359,12 @@ def mend_tables(path):
             continue
         data = files.read_bytes(table, path)
         if not data.endswith(b"\n"):
-            write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
+            write_file(path, name, data.rpartition(b"\n")[0] + b"\n")
 
 
 def as_lines(rows):
-    """Text of the rows of a table."""
-    return "".join(",".join(map(str, row)) + "\n" for row in rows)
+    """Bytes of the rows of a table."""
+    return "".join(",".join(map(str, row)) + "\n" for row in rows).encode()
 
 
 def cell(value):
@@ -381,24 +377,26 @@ def number_cell(placement):
     return "" if placement < 0 else str(placement)
 
 
-def write_file(file: Path, content: str | bytes | dict, within: str | os.PathLike) -> None:
+def write_file(folder: Path, name: str, content: bytes | dict) -> None:
     """Write a file of a session under another name, fsync, rename: it is whole or not there.
 
     Parameters
     ----------
-    file
+    folder
+        Of the session.
+    name
+        Of the file in it.
     content
-        Text, bytes, or arrays by name.
-    within
-        The session's folder.
+        Bytes, or arrays by name.
     """
-    draft = files.checked(file, within).with_name(file.name + ".draft")
+    file = files.checked(folder / name, folder)
+    draft = file.with_name(file.name + ".draft")
     draft.unlink(missing_ok=True)
-    with files.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
+    with files.opened(draft, folder, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
         if isinstance(content, dict):
             np.savez_compressed(stream, **content)
         else:
-            stream.write(content.encode() if isinstance(content, str) else content)
+            stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
     draft.replace(file)
@@ -454,10 +452,10 @@ def append_file(file, content, within):
     """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk
     all or nothing.
     """
-    left = memoryview(content.encode() if isinstance(content, str) else content)
+    left = memoryview(content)
     with files.opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
         handle = stream.fileno()
-        begin = os.fstat(stream.fileno()).st_size
+        begin = os.fstat(handle).st_size
         try:
             while left:
                 left = left[os.write(handle, left) :]

@@ -185,7 +185,6 @@ def observe(
         "corners": np.asarray(bench.board.corners, float),
         "cameras": tuple(bench.cameras),
         "mounts": (bench.mount,) * len(bench.cameras),
-        "T_head_lrf": None,
     }
 
 
@@ -247,7 +246,6 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
         "beam_hit": hit[row, b],
         "beam_edge": edge[row, b],
         "beam_radius": radius[row, b],
-        "beam_background": np.zeros(len(row)),
         "beam_step": step * r[row, b],
     }
 

@@ -22,7 +22,7 @@ from lrfcal_lib.session.lms2xx_codec import (
 from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.session.workers import spread
-from lrfcal_lib.session.write import SessionWriter, write_file
+from lrfcal_lib.session.write import SessionWriter, as_lines, write_file
 from lrfcal_lib.simulate.beam import scan
 from lrfcal_lib.simulate.lengths import room_lengths
 from lrfcal_lib.simulate.rig import Placement, Setup, held_close, placements_of, random
@@ -242,9 +242,8 @@ def _record(folder, name, setup):
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}",
     ) as writer:
         log = _add_placements(writer, setup, placements, truth)
-    lines = [",".join(PLATFORM_COLUMNS), *log]
-    write_file(folder / "platform.csv", "\n".join(lines) + "\n", folder)
-    write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
+    write_file(folder, "platform.csv", as_lines([PLATFORM_COLUMNS, *log]))
+    write_file(folder, "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
 
 
 def _truth(setup, placements):
@@ -303,7 +302,7 @@ def _add_placements(writer, setup, placements, truth):
         writer.add_telegrams(placement.number, telegrams, lines.measured, arrived)
         for stops, times in ((images, shot_at), (lines, began)):
             rows = [times, np.degrees(stops.commanded), np.degrees(stops.measured)]
-            log += [",".join(f"{value:.4f}" for value in row) for row in np.transpose(rows)]
+            log += [[f"{value:.4f}" for value in row] for row in np.transpose(rows)]
         truth["sweeps"][placement.number] = {"pitch_rad": lines.true.tolist()}
         clock = float(began[-1] + took + pause)
     return log

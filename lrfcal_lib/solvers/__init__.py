@@ -123,8 +123,6 @@ CANDIDATES = (
     "zhang_pless",
     "line",
 )  # the better one is handed over where no joint estimate is
-# of each kind: crossings, placements with planes, scene points
-FEWEST = {"crossing": 6, "plane": 3, "scene": 3}
 
 
 def starting_transform(obs: CameraObservations) -> RigidTransform:
@@ -203,7 +201,7 @@ def solve_camera(
     """
     row = row_of(method)
     obs = observations.along() if row.along else observations
-    obs.require(row.uses, FEWEST[row.uses])
+    obs.require(row.uses)
     options = {"method": method, "uses": row.uses} | row.options | options
     points = getattr(obs, f"{row.uses}_points")
     starts = [] if T0 is None else [pose_array(T0)]

@@ -11,9 +11,9 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import pseudo_inverse
 from lrfcal_lib.fit.result import Solution
-from lrfcal_lib.model.camera import CameraModel, project_jacobians
+from lrfcal_lib.model.camera import LENS, CameraModel, project_jacobians
 from lrfcal_lib.model.geometry import gradient_by_pose
-from lrfcal_lib.model.observations import LENS, JointObservations
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint_model import JointData, Unknowns
 from lrfcal_lib.solvers.joint_residuals import among_cameras, view_block
 

@@ -143,7 +143,7 @@ def start_from_lines(obs: CameraObservations) -> RigidTransform:
 
     Many rotations at once, each with its best translation, refined on planes of sight; robust vote.
     """
-    obs.require("crossing", 6)
+    obs.require("crossing")
     points = obs.crossing_points
     normals, _ = sight_normals(obs.crossing_lines, obs.model)
     rotations = start_rotations()

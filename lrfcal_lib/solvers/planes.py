@@ -13,7 +13,7 @@ from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m, read_pose
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.fit.robust import rms
-from lrfcal_lib.model.camera import INTRINSIC_NAMES, project, project_jacobians
+from lrfcal_lib.model.camera import INTRINSIC_NAMES, LENS, project, project_jacobians
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
     DegenerateGeometry,
@@ -33,7 +33,6 @@ ROUNDS = 5  # of new weights; the last change is far below the noise
 LEAST_SPREAD = 0.02  # of the boards' normals some way, about radians
 # metres, about half a board: turns an offset into the tilt that bends as much
 TILT_LEVER = 0.3
-LENS = len(INTRINSIC_NAMES)
 LENS_SCALES = (1e3, 1e3, 1e3, 1e3, 10.0, 10.0, 10.0, 10.0, 100.0)
 FEWEST_CORNERS = 4  # of the pattern, for intrinsics
 
@@ -136,7 +135,7 @@ def plane_sets(obs: CameraObservations) -> PlaneSets:
     """Group the face points of the placements (three at least) whose board pose the camera
     knows.
     """
-    obs.require("plane", 3)
+    obs.require("plane")
     placements, rows, _ = np.intersect1d(
         obs.placements, obs.plane_placement, return_indices=True
     )
