@@ -130,7 +130,8 @@ def test_half_of_the_scans_without_ranges_is_a_verdict(tmp_path):
     told = " ".join(judged.sentences())
     assert (
         judged.answer == "no"
-        and "placements with a board pose and points on the board, at least 3 needed"
-        in told
+        and "1 of the 3 placements with a board pose and points on the board" in told
     )
-    assert "placement 3 has" in told and "Record next: 6 or more placements" in told
+    assert "placement 3: no range in any scan line" in told
+    assert told.count("camera 'left': camera 'left'") == 0
+    assert "Record next: 6 or more placements" in told

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from shared import QUICK
 
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel
@@ -113,6 +114,10 @@ def test_what_is_written_is_read(path):
     )
     assert session.placements == (1, 2) and session.problems == () and session.picks == ()
     assert validate(path) == []
+    written, shipped = (
+        list(json.loads((folder / "session.json").read_text())) for folder in (path, QUICK)
+    )
+    assert written == shipped, "what comes first, as in the session that is shipped"
     assert session.lrf.field_of_view == pytest.approx(LRF.field_of_view, abs=1e-12)
     assert (
         session.lrf.bearing_step == pytest.approx(LRF.bearing_step, abs=1e-12)

@@ -108,11 +108,11 @@ def test_every_method_refuses_one_placement_only(name):
                 name,
                 "crossing_",
                 n,
-                f"{n} crossings of scan lines with edges, at least {n + 1} needed",
+                f"{n} of the {n + 1} crossings of scan lines with edges",
             )
             for name, n in (("line", 5), ("wasielewski_strauss", 5))
         ),
-        ("bauermann", "scene_", 2, "2 scene points, at least 3 needed"),
+        ("bauermann", "scene_", 2, "2 of the 3 scene points"),
         (
             "lines",
             "scene_",

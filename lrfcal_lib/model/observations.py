@@ -213,8 +213,8 @@ class CameraObservations(_Grouped):
             placements = np.intersect1d(self.placements, placements)
         if len(placements) < least:
             raise DegenerateGeometry(
-                f"camera '{self.camera}': {len(placements)} {what}, at least {least} needed: "
-                "the rest of the pose stays unobservable"
+                f"camera '{self.camera}': {len(placements)} of the {least} {what} that are needed "
+                "at least: the rest of the pose stays unobservable"
             )
 
     def along(self):

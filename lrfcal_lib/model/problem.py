@@ -65,8 +65,9 @@ class Problem:
         if self.placement is not None:
             return f"placement {self.placement}: {self.words}"
         about = []
-        if self.camera is not None:
-            about.append(f"camera '{self.camera}'")
+        name = f"camera '{self.camera}'"
+        if self.camera is not None and name not in self.words:
+            about.append(name)
         if self.method is not None:
             about.append(f"method '{self.method}'")
         return ": ".join([*about, self.words])

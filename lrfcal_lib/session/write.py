@@ -91,12 +91,11 @@ class SessionWriter:
             "rig": {
                 "lrf": stated.lrf_to_json(lrf),
                 "platform": stated.platform_to_json(T_head_lrf, platform_sigma, continuous),
-                "cameras": {
-                    n: stated.camera_to_json(info) for n, info in self.cameras.items()
-                },
+                "cameras": {n: stated.camera_to_json(c) for n, c in self.cameras.items()},
             },
             "placements": [],
         }
+        self.data["reference"] = self.data.pop("reference")  # last: it may be long
         with naming(self.path):
             stated.parse_session(json.loads(json.dumps(self.data)))
         try:
