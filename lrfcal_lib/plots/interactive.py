@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.plots.colors import AXES_RGB, COLORS, closed, color_of
+from lrfcal_lib.plots.colors import AXES_RGB, FIT, PLATFORM, closed, color_of
 
 MOST_POINTS = 150_000  # that browsers turn smoothly
 PAGE = {"xref": "paper", "yref": "paper", "xanchor": "left", "yanchor": "bottom"}
@@ -127,18 +127,14 @@ def _packed(measuring, shown, first_trace):
     data["covariances"] = [_text(C) for C in measuring["covariances"]]
     for name in ("plane_of_point", "station_of_point"):
         data[name] = [_text(measuring[name][rows]) for rows in shown]
-    data["edges_trace"] = first_trace
-    data["lengths_trace"] = first_trace + 1
-    return data
+    return data | {"edges_trace": first_trace, "lengths_trace": first_trace + 1}
 
 
 def _measured_traces(lines):
     """Edges (n, 2, 3) that can be picked, and the lengths that were."""
     broken = np.full((len(lines), 3, 3), np.nan)
     broken[:, :2] = lines
-    edges = _trace(
-        "edges", broken.reshape(-1, 3), "lines", line={"color": COLORS["fit"], "width": 3}
-    )
+    edges = _trace("edges", broken.reshape(-1, 3), "lines", line={"color": FIT, "width": 3})
     edges |= {"visible": "legendonly", "hoverinfo": "skip"}
     red = "#d00"
     lengths = _trace(
@@ -183,32 +179,26 @@ def rig_lines(
     size
         Of a frame's axes, metres.
     """
-    lines = {
-        "tilt axis": (COLORS["platform"], np.outer([-4 * size, 4 * size], [1.0, 0.0, 0.0]))
-    }
-    frames = {"lrf": T_head_lrf} | {name: T.inv() for name, (T, _) in cameras.items()}
-    for letter, axis, color in zip("xyz", np.eye(3), AXES_RGB, strict=True):
-        arrows = [
-            np.vstack([T.apply([0 * axis, size * axis]), GAP]) for T in frames.values()
-        ]
+    lines = {"tilt axis": (PLATFORM, np.outer([-4 * size, 4 * size], [1.0, 0.0, 0.0]))}
+    frames = {"lrf": T_head_lrf}
+    for name, (T, _) in cameras.items():
+        frames[name] = T.inv()
+    for letter, axis, color in zip("xyz", size * np.eye(3), AXES_RGB, strict=True):
+        arrows = [np.vstack([T.apply([0 * axis, axis]), GAP]) for T in frames.values()]
         lines[f"{letter} of {', '.join(frames)}"] = (color, np.vstack(arrows))
-    for name, (T, model) in cameras.items():
-        lines[f"view of {name}"] = (
-            color_of(name),
-            T.inv().apply(_frustum(model, 3 * size)),
-        )
+    for name, (_, model) in cameras.items():
+        frustum = frames[name].apply(_frustum(model, 3 * size))
+        lines[f"view of {name}"] = (color_of(name), frustum)
     if boards:
         outlines = [np.vstack([closed(corners), GAP]) for corners in boards.values()]
-        lines["boards"] = (COLORS["fit"], np.vstack(outlines))
+        lines["boards"] = (FIT, np.vstack(outlines))
     return lines
 
 
 def _frustum(model, depth):
     """The edges of what a camera sees up to a depth, metres, in its own frame."""
-    u = np.array([0, model.width, model.width, 0])
-    v = np.array([0, 0, model.height, model.height])
-    rim = depth * np.stack(
-        [(u - model.cx) / model.fx, (v - model.cy) / model.fy, np.ones(4)], axis=1
-    )
+    corners = model.size * [[0, 0], [1, 0], [1, 1], [0, 1]]
+    flat = (corners - [model.cx, model.cy]) / [model.fx, model.fy]
+    rim = depth * np.insert(flat, 2, 1.0, axis=1)
     legs = [np.vstack([np.zeros(3), corner, GAP]) for corner in rim]
     return np.vstack([closed(rim), GAP, *legs])
