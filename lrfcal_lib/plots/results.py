@@ -9,7 +9,7 @@ from matplotlib.collections import PathCollection
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.plots.colors import COLORS, color_of, series
+from lrfcal_lib.plots.colors import LRF, OUTLIER, RAW, TRUTH, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
 ROOM = 1.4  # of an axis of bars, times the longest: the legend stands beside them
@@ -22,7 +22,7 @@ def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
         xlabel="placement", ylabel=label, xticks=np.arange(len(names)), xticklabels=names
     )
     ax.grid(False, axis="x")
-    _zero(ax.axhline)
+    ax.axhline(0, color=TRUTH, linewidth=0.8)
 
 
 def rows_of(ax: Axes, names: Sequence | Mapping) -> None:
@@ -31,14 +31,9 @@ def rows_of(ax: Axes, names: Sequence | Mapping) -> None:
     ax.set(yticks=np.arange(count), yticklabels=list(names), ylim=(count - 0.5, -0.5))
 
 
-def _zero(line):
-    """Draw the zero by one of the methods axhline and axvline."""
-    line(0, color=COLORS["truth"], linewidth=0.8)
-
-
 def _side_by_side(count):
     """Places of so many dots in a strip from -0.5 to 0.5."""
-    return (np.arange(count) + 0.5) / np.maximum(count, 1) - 0.5
+    return (np.arange(count) + 0.5) / count - 0.5
 
 
 def residual_strips(
@@ -97,7 +92,7 @@ def pitch_offsets(
             color=series(index),
             label=label,
             capsize=2,
-            error_kw={"linewidth": 0.9, "ecolor": COLORS["truth"]},
+            error_kw={"linewidth": 0.9, "ecolor": TRUTH},
         )
     by_placement(ax, placement, "pitch offset [deg]")
     ax.legend(title="head moved", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
@@ -122,7 +117,7 @@ def parameter_comparison(
         The true value where it is known: a vertical line.
     """
     if true is not None:
-        ax.axvline(true, color=COLORS["truth"], linestyle="--", linewidth=1, zorder=0)
+        ax.axvline(true, color=TRUTH, linestyle="--", linewidth=1, zorder=0)
     for row, (method, value) in enumerate(values.items()):
         sigma = sigmas[method] if np.isfinite(sigmas[method]) else None
         color = series(row)
@@ -148,7 +143,7 @@ def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
         ax.plot(values, height, "o", color=color, markersize=3.5, alpha=0.8)
         mean = np.mean(values)
         ax.plot([mean, mean], [row - 0.36, row + 0.36], color=color, linewidth=2.5)
-    _zero(ax.axvline)
+    ax.axvline(0, color=TRUTH, linewidth=0.8)
     ax.grid(False, axis="y")
     rows_of(ax, errors)
     ax.set_xlabel("measured - true length [mm]")
@@ -192,9 +187,9 @@ def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     """
     values = pd.Series(misfit)
     bad = values > WORST * max(values.median(), 1.0)
-    colors = np.where(bad, COLORS["outlier"], COLORS["lrf"])
+    colors = np.where(bad, OUTLIER, LRF)
     values.plot.bar(ax=ax, width=0.75, color=colors, rot=0)
-    ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
+    ax.axhline(1.0, color=TRUTH, linewidth=1, linestyle="--")
     ax.set(xlabel="placement", ylabel="chi-square per degree of freedom")
     ax.grid(False, axis="x")
     if len(misfit) > 15:
@@ -218,7 +213,7 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> N
         Metres, shape (n,).
     """
     points = pd.DataFrame({"distance": distance, "residual": 1000 * np.asarray(residual)})
-    ax.plot(points.distance, points.residual, ",", color=COLORS["raw"], zorder=0)
+    ax.plot(points.distance, points.residual, ",", color=RAW, zorder=0)
     bins = points.groupby(pd.qcut(points.distance, BINS, duplicates="drop"), observed=True)
     means = bins.mean()
     ax.errorbar(
@@ -226,11 +221,11 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> N
         means.residual,
         bins.residual.sem(),
         fmt="o-",
-        color=COLORS["lrf"],
+        color=LRF,
         capsize=2.5,
         label="mean and its standard error",
     )
-    _zero(ax.axhline)
+    ax.axhline(0, color=TRUTH, linewidth=0.8)
     limit = 1.05 * points.residual.abs().quantile(0.995)
     ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit))
     ax.set_title(f"Ranges: {np.sqrt(points.residual.pow(2).mean()):.2g} mm rms")
