@@ -18,8 +18,7 @@ MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way 
 
 def main_verdict(verdicts):
     """The verdict that stands first: one with a record, else any; None without."""
-    with_record = [entry for entry in verdicts if entry["record"] is not None]
-    return next(iter(with_record or verdicts), None)
+    return max(verdicts, key=lambda entry: entry["record"] is not None, default=None)
 
 
 def sentences_below(verdict):
@@ -48,9 +47,7 @@ def headline(out, verdict):
         numbers["image"] = dict(errors.drop("cloud_mm").max())
         numbers["known"] = _known_share(out / "tables" / "placements.csv")
     if (out / "tables" / "edge_lengths.csv").is_file():
-        edges = _edge_numbers(pd.read_csv(out / "tables" / "edge_lengths.csv"))
-        if edges:
-            numbers["edges"] = edges
+        numbers["edges"] = _edge_numbers(pd.read_csv(out / "tables" / "edge_lengths.csv"))
     return numbers
 
 

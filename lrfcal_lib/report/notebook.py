@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from numbers import Number
 from pathlib import Path
@@ -47,7 +48,7 @@ OTHER_LABELS = {  # of what is no row of METHODS
 }
 # read by Open3D when it is imported, perhaps in the same cell as this module
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
-_found: dict[str, list] = {"figures": [], "tables": [], "findings": [], "verdicts": []}
+_found: dict[str, list] = defaultdict(list)  # figures, tables, findings and verdicts
 NEEDS = "notebook.needs("
 _lacking: set[str] = (
     set()
@@ -68,8 +69,7 @@ def set_up() -> None:
         )
         get_ipython().ast_transformers[:] = [Sections()]
     _lacking.clear()
-    for kind in _found.values():
-        kind.clear()
+    _found.clear()
 
 
 def start() -> Session:
@@ -227,11 +227,11 @@ def finding(
     """
     known: float | str | None = value.item() if hasattr(value, "item") else value
     shown = str(known)
-    if isinstance(known, float) and not math.isfinite(known):
-        shown = "unknown"
-        known = None
-    elif isinstance(known, float):
+    if isinstance(known, float):
         shown = f"{known:z.{digits}f}"
+        if not math.isfinite(known):
+            shown = "unknown"
+            known = None
     shown = f"{shown} {unit}".strip()
     entry = {
         "key": key,
