@@ -9,12 +9,12 @@ from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.board import UNIT_SQUARE, Board
 from lrfcal_lib.model.camera import CameraModel, pinhole
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.plots.colors import AXES_RGB, LEFT, LRF, RIGHT, TRUTH, closed
 from lrfcal_lib.plots.recording import CENTRED, to_scale
-from lrfcal_lib.plots.rig import SQUARE, Vector, look_at
+from lrfcal_lib.plots.rig import Vector, look_at
 
 DIMENSION = {
     "arrowstyle": "<|-|>",
@@ -95,7 +95,7 @@ class View:
         """A solid box between two corners (3,) of its own frame, metres, the far faces first."""
         faces = []
         for axis, end in product(range(3), (0, 1)):
-            at_high = np.insert((SQUARE + 1) // 2, axis, end, axis=1)
+            at_high = np.insert(UNIT_SQUARE, axis, end, axis=1)
             faces.append(T.apply(np.where(at_high, high, low)))
         for face in sorted(faces, key=lambda face: -self.T_view.apply(face)[:, 2].mean()):
             self.face(face, "white", 1.0, edge=color)
@@ -137,8 +137,8 @@ def edge_in_image(
     view.face(corners, TRUTH, 0.15)
     view.face(1.25 * np.array([0 * E, E, F]), LRF, 0.12)
     view.line([E, F], color=LRF, linewidth=2)
-    half = model.size / 2
-    rim = np.column_stack([SQUARE * half / model.fx, np.ones(4)])
+    flat = model.size * (UNIT_SQUARE - 0.5) / model.fx
+    rim = np.insert(flat, 2, 1.0, axis=1)
     view.face(T_lrf_camera.apply(depth * rim), LEFT, 0.12)
     view.line([E, centre, F], ":", color=LEFT, linewidth=1)
     points = np.array([A, B, C, E, F])

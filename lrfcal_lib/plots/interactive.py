@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.model.board import UNIT_SQUARE
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots.colors import AXES_RGB, FIT, PLATFORM, closed, color_of
 
@@ -197,8 +198,7 @@ def rig_lines(
 
 def _frustum(model, depth):
     """The edges of what a camera sees up to a depth, metres, in its own frame."""
-    corners = model.size * [[0, 0], [1, 0], [1, 1], [0, 1]]
-    flat = (corners - [model.cx, model.cy]) / [model.fx, model.fy]
+    flat = (model.size * UNIT_SQUARE - [model.cx, model.cy]) / [model.fx, model.fy]
     rim = depth * np.insert(flat, 2, 1.0, axis=1)
     legs = [np.vstack([np.zeros(3), corner, GAP]) for corner in rim]
     return np.vstack([closed(rim), GAP, *legs])

@@ -15,7 +15,6 @@ PARALLEL = 1e-9  # sine of an angle below which two directions are one
 FAR = 4.0  # widths of a part from which it is looked at, so that it is hardly distorted
 COVER = 0.75  # half the width of a drawn point, of the usual spacing: scattered points leave gaps
 Vector = Sequence[float] | np.ndarray
-SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
 def render(
