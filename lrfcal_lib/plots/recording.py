@@ -143,7 +143,7 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
         If no beam of the line is on the board.
     """
     on = np.flatnonzero(scan.mask[line])
-    if on.size == 0:
+    if not on.size:
         raise ValueError(
             f"no beam of scan line {line} is on the board of placement {scan.placement}"
         )
@@ -151,18 +151,16 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
     near = slice(max(last - BESIDE, 0), last + BESIDE + 1)
     bearing = np.degrees(scan.sweep.bearings[near])
     raw = scan.sweep.ranges[line, near]
-    board = scan.mask[line, near]
-    fitted = scan.fitted[line, near][board]
-    top = fitted.max() + HEADROOM
+    fitted = scan.fitted[line, near]
+    top = np.nanmax(fitted) + HEADROOM
     far = raw >= top
     ax.plot(bearing[~far], raw[~far], "o", color=RAW, markersize=6, label="raw")
     if far.any():
         words = f"raw, farther: {raw[far].min():.2f} to {raw[far].max():.2f} m"
         edge = np.full(far.sum(), top)
         ax.plot(bearing[far], edge, "^", color=RAW, clip_on=False, label=words)
-    filtered = scan.filtered[line, near][board]
-    ax.plot(bearing[board], filtered, "x", color=TRUTH, label="filtered")
-    ax.plot(bearing[board], fitted, color=FIT, label="line fitted to the board")
+    ax.plot(bearing, scan.filtered[line, near], "x", color=TRUTH, label="filtered")
+    ax.plot(bearing, fitted, color=FIT, label="line fitted to the board")
     for crossed, style in zip(edges, ("--", "-"), strict=False):
         here = (crossed.line == line) & (crossed.end == end)
         for x, y, _ in crossed.points[here]:
