@@ -58,8 +58,9 @@ def measure(args):
     """Measure lengths between picked places."""
     from lrfcal_lib.report.measure import measure_session
 
-    options = (args.out, args.station, args.untrusted)
-    return measure_session(args.session, args.calibration, args.picks, *options)
+    return measure_session(
+        args.session, args.calibration, args.picks, args.out, args.station, args.untrusted
+    )
 
 
 def print_board(args):

@@ -79,10 +79,10 @@ def poses_in_words(calibration: Calibration) -> list[str]:
     lines = []
     scale = np.repeat([np.rad2deg(1.0), 1000.0], 3)
     for (camera, method), solution in calibration.solutions.items():
-        values = (scale * solution.parameters[:6]).round(2)
-        sigma = (scale * solution.trusted_sigma[:6]).round(2)
+        both = [solution.parameters[:6], solution.trusted_sigma[:6]]
+        values, sigma = (scale * both).round(2)
         turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
         shift = f"translation {values[3:]} +- {sigma[3:]} mm"
         lines.append(f"{camera:>8} {method:<20} {turn}, {shift}")
     problems = (*calibration.prepared.problems, *calibration.problems)
-    return lines + [str(problem) for problem in problems]
+    return [*lines, *map(str, problems)]

@@ -68,8 +68,9 @@ def merge_session(
     for table in (stations_table(joined), pairs_table(joined)):
         print(table.to_string(index=False))
     print(*sentences(joined), sep="\n", flush=True)
-    asked = (scene.folder, scene.session, scene.rig)
-    files = write_scene(*asked, joined, scene.about, clouds=clouds)
+    files = write_scene(
+        scene.folder, scene.session, scene.rig, joined, scene.about, clouds=clouds
+    )
     page = scene.folder / "stations.html"
     with whole(page) as draft:
         draft.write_text(stations_page(joined, joined_cloud(clouds, joined), scene.about))

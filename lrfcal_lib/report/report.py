@@ -237,10 +237,12 @@ def report_session(session: str | Path, out: str | Path | None, jobs: int = 2) -
     session = Path(session)
     out = Path(out or ROOT / "reports" / session.resolve().name).resolve()
     runs = make_report(session, out, jobs)
-    failed = [run for run in runs if run.error]
-    for run in failed:
-        print(f"{run.name} failed: {run.error.strip().splitlines()[-1]}", file=sys.stderr)
-    good = len(runs) - len(failed)
+    good = len(runs)
+    for run in runs:
+        if run.error:
+            good -= 1
+            last = run.error.strip().splitlines()[-1]
+            print(f"{run.name} failed: {last}", file=sys.stderr)
     seconds = time.monotonic() - begin
     print(f"{good} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
     return int(good < len(runs))
