@@ -53,8 +53,15 @@ def plane_constraint(
     sides = ("right", "left")[:: int(np.sign(beside))]
     ax.text(-beside, 0, "camera", va="center", ha=sides[0], color=LEFT)
     ax.text(lrf[0] + beside, lrf[1], "LRF", va="center", ha=sides[1], color=LRF)
-    ax.set(xlabel="along the board [m]", ylabel="along its normal [m]", aspect="equal")
-    ax.set_xlim(min(0.0, first, lrf[0]) - ROOM * height, max(last, lrf[0] + ROOM * height))
+    ax.set(
+        xlabel="along the board [m]",
+        ylabel="along its normal [m]",
+        aspect="equal",
+        xlim=(
+            min(0.0, first, lrf[0]) - ROOM * height,
+            max(last, lrf[0] + ROOM * height),
+        ),
+    )
 
 
 def spot_over_edge(ax: Axes, radius: float, bias: float) -> None:
@@ -86,8 +93,13 @@ def spot_over_edge(ax: Axes, radius: float, bias: float) -> None:
     ax.text(0.97 * reach, top, "beyond", va="center", ha="right")
     ax.plot([0, b], [0.9 * r, 0.9 * r], color=FIT, linewidth=2)
     ax.text(b / 2, 1.15 * r, "b", ha="center", va="center", color=FIT)
-    ax.set(xlim=(-reach, 2.6 * reach), ylim=(-1.4 * r, 6.8 * r), aspect="equal")
-    ax.set(xlabel="distance u of the beam from the edge [mm]", yticks=[])
+    ax.set(
+        xlabel="distance u of the beam from the edge [mm]",
+        xlim=(-reach, 2.6 * reach),
+        ylim=(-1.4 * r, 6.8 * r),
+        yticks=[],
+        aspect="equal",
+    )
     ax.grid(False)
 
 
@@ -114,6 +126,10 @@ def reading_by_distance(
     ax.axvline(0, color=TRUTH)
     ax.axvline(b, color=FIT, linestyle=":")
     ax.text(b, 0.5, f" b = {b:.1f} mm", color=FIT)
-    ax.set(xlabel="distance u of the beam from the edge [mm]", ylim=(-0.08, 1.35))
-    ax.set(ylabel="reads the board [1]", yticks=[0, 0.5, 1])
+    ax.set(
+        xlabel="distance u of the beam from the edge [mm]",
+        ylabel="reads the board [1]",
+        yticks=[0, 0.5, 1],
+        ylim=(-0.08, 1.35),
+    )
     ax.legend(loc="upper right")

@@ -52,8 +52,7 @@ def surfaces_and_edges(
     for edge in ends:
         u, v = pixels(T_view.apply(edge), size, None).T
         ax.plot(u, v, color=FIT, linewidth=1.0)
-    ax.set_xlim(0, size[1])
-    ax.set_ylim(size[0], 0)
+    ax.set(xlim=(0, size[1]), ylim=(size[0], 0))
     ax.set_axis_off()
 
 
@@ -69,12 +68,10 @@ def sigma_by_points(
     noise, together
         Parts of single points and of what all points share, metres, shape as `counts`.
     """
-    number = np.asarray(counts)
-    ax.loglog(number, 1000 * noise, "--", color=PLATFORM, label="noise of points")
+    ax.loglog(counts, 1000 * noise, "--", color=PLATFORM, label="noise of points")
     ax.loglog(counts, 1000 * together, ":", color=RIGHT, label="shared by all points")
     ax.loglog(counts, 1000 * np.hypot(noise, together), "o-", color=LEFT, label="both")
-    ax.set_xlabel("points / end")
-    ax.set_ylabel("standard deviation [mm]")
+    ax.set(xlabel="points / end", ylabel="standard deviation [mm]")
     ax.legend()
 
 

@@ -168,8 +168,8 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
             words = crossed.variant.replace("_", " ")
             ax.axvline(at, color=LRF, linestyle=style, label=words)
     ax.invert_xaxis()
-    ax.set(xlabel="bearing [deg]", ylabel="range [m]")
-    ax.set_ylim(np.nanmin(raw) - HEADROOM / 4, top)
+    lowest = np.nanmin(raw) - HEADROOM / 4
+    ax.set(xlabel="bearing [deg]", ylabel="range [m]", ylim=(lowest, top))
     ax.legend()
 
 

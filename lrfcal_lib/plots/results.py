@@ -25,10 +25,10 @@ def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
     ax.axhline(0, color=TRUTH, linewidth=0.8)
 
 
-def rows_of(ax: Axes, names: Sequence | Mapping) -> None:
-    """Ticks of rows from above to below."""
-    count = len(names)
-    ax.set(yticks=np.arange(count), yticklabels=list(names), ylim=(count - 0.5, -0.5))
+def rows_of(ax: Axes, names: Sequence | Mapping, label: str) -> None:
+    """Ticks of rows from above to below, and what they are drawn over."""
+    ax.set_yticks(range(len(names)), names)
+    ax.set(xlabel=label, ylim=(len(names) - 0.5, -0.5))
 
 
 def _side_by_side(count):
@@ -124,8 +124,7 @@ def parameter_comparison(
         ax.errorbar(
             value, row, xerr=sigma, fmt="o", color=color, capsize=2.5, markersize=4.5
         )
-    rows_of(ax, values)
-    ax.set_xlabel(label)
+    rows_of(ax, values, label)
 
 
 def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
@@ -145,8 +144,7 @@ def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
         ax.plot([mean, mean], [row - 0.36, row + 0.36], color=color, linewidth=2.5)
     ax.axvline(0, color=TRUTH, linewidth=0.8)
     ax.grid(False, axis="y")
-    rows_of(ax, errors)
-    ax.set_xlabel("measured - true length [mm]")
+    rows_of(ax, errors, "measured - true length [mm]")
 
 
 def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
@@ -190,15 +188,13 @@ def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     colors = np.where(bad, OUTLIER, LRF)
     values.plot.bar(ax=ax, width=0.75, color=colors, rot=0)
     ax.axhline(1.0, color=TRUTH, linewidth=1, linestyle="--")
-    ax.set(xlabel="placement", ylabel="chi-square per degree of freedom")
     ax.grid(False, axis="x")
     if len(misfit) > 15:
         ax.set_xticks(ax.get_xticks()[::2])
-    ax.set_title(f"All placements fit alike, the worst {values.max():.1f}")
+    title = f"All placements fit alike, the worst {values.max():.1f}"
     if bad.any():
-        ax.set_title(
-            f"{bad.sum()} of {len(values)} placements fit much worse than the others"
-        )
+        title = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
+    ax.set(xlabel="placement", ylabel="chi-square per degree of freedom", title=title)
 
 
 def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> None:
@@ -227,8 +223,12 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> N
     )
     ax.axhline(0, color=TRUTH, linewidth=0.8)
     limit = 1.05 * points.residual.abs().quantile(0.995)
-    ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit))
-    ax.set_title(f"Ranges: {np.sqrt(points.residual.pow(2).mean()):.2g} mm rms")
+    ax.set(
+        xlabel="range [m]",
+        ylabel="predicted - measured [mm]",
+        ylim=(-limit, limit),
+        title=f"Ranges: {np.sqrt(points.residual.pow(2).mean()):.2g} mm rms",
+    )
     ax.legend()
 
 
@@ -252,12 +252,12 @@ def residuals_by_region(
     title = f"{name}: no board in any image"
     if len(uv):
         length = np.linalg.norm(shift, axis=1)
-        unit = float(f"{length.max() / 2:.1g}")
-        scale = length.max() / (model.width / 8)
+        longest = length.max()
+        unit = float(f"{longest / 2:.1g}")
         drawn = ax.quiver(
             *uv.T,
             *shift.T,
-            scale=scale,
+            scale=longest / (model.width / 8),
             color=color_of(name),
             angles="xy",
             scale_units="xy",
@@ -265,8 +265,14 @@ def residuals_by_region(
         )
         ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S")
         title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
-    ax.set(xlim=(0, model.width), ylim=(model.height, 0), aspect="equal")
-    ax.set(xlabel="u [px]", ylabel="v [px]", title=title)
+    ax.set(
+        xlim=(0, model.width),
+        ylim=(model.height, 0),
+        aspect="equal",
+        xlabel="u [px]",
+        ylabel="v [px]",
+        title=title,
+    )
 
 
 def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollection:
@@ -301,6 +307,11 @@ def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollecti
         vmin=low,
         vmax=limit,
     )
-    ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
-    ax.set(xlim=(bearing.max(), bearing.min()), ylim=(pitch.min(), pitch.max()))
+    ax.set(
+        xlabel="bearing [deg]",
+        ylabel="pitch [deg]",
+        aspect="equal",
+        xlim=(bearing.max(), bearing.min()),
+        ylim=(pitch.min(), pitch.max()),
+    )
     return drawn

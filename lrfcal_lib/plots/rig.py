@@ -145,9 +145,9 @@ def face_on(
     wide = 2 * np.linalg.norm(points - middle, axis=1).max()
     T_view = look_at(middle - FAR * wide * normal, middle)
     spread = np.ptp(pixels(T_view.apply(points), size, 1.0), axis=0)
-    focal = fill * min(size[1] / spread[0], size[0] / spread[1])
+    focal = fill * (size[::-1] / spread).min()
     # half of a rectangle about points of a triangle is empty
-    spacing = focal * np.sqrt(spread[0] * spread[1] / 2 / len(points))
+    spacing = focal * np.sqrt(spread.prod() / 2 / len(points))
     return T_view, float(focal), int(np.ceil(COVER * spacing))
 
 
