@@ -65,8 +65,9 @@ def scene_page(
         _cloud_trace(name, points[rows], colors[rows]) for name, rows in shown.items()
     ]
     for name, (color, line) in lines.items():
-        traces.append(_trace(name, line, "lines", line={"color": color, "width": 4}))
-        traces[-1]["visible"] = "legendonly" if name == "boards" else True
+        looks = {"color": color, "width": 4}
+        visible = "legendonly" if name == "boards" else True
+        traces.append(_trace(name, line, "lines", line=looks, visible=visible))
     data = "null"
     if measuring is not None:
         data = _in_script(_packed(measuring, list(shown.values()), len(traces)))
@@ -75,13 +76,13 @@ def scene_page(
     plot = _in_script([traces, _layout(title, note), options])
     script = f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});"
     page = (
-        '<html><head><meta charset="utf-8"></head><body>',
-        f"<script>{_plotly_js()}</script>",
-        '<div id="scene" style="height:100vh"></div>',
-        f"<script>Plotly.newPlot({PLOT}, ...{plot}).then(() => {{\n{script}\n}});</script>",
-        "</body></html>\n",
+        '<html><head><meta charset="utf-8"></head><body>\n'
+        f"<script>{_plotly_js()}</script>\n"
+        '<div id="scene" style="height:100vh"></div>\n'
+        f"<script>Plotly.newPlot({PLOT}, ...{plot}).then(() => {{\n{script}\n}});</script>\n"
+        "</body></html>\n"
     )
-    Path(path).write_text("\n".join(page), encoding="utf-8")
+    Path(path).write_text(page, encoding="utf-8")
 
 
 def _in_script(data):
@@ -92,13 +93,13 @@ def _in_script(data):
 def _plotly_js():
     """The script that draws; to import its package takes a fifth of a second."""
     package = Path(find_spec("plotly").origin).parent
-    return (package / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
+    return (package / "package_data/plotly.min.js").read_text(encoding="utf-8")
 
 
 def _cloud_trace(name, points, colors):
     """Points (n, 3) of a cloud in their colours (n, 3)."""
     rgb = colors.astype(int)
-    shades = [f"#{value:06x}" for value in (rgb @ [1 << 16, 1 << 8, 1]).tolist()]
+    shades = [f"#{value:06x}" for value in (rgb @ [0x10000, 0x100, 1]).tolist()]
     marker = {"size": 1.6, "color": shades}
     return _trace(name, points, "markers", marker=marker, hoverinfo="none")
 
@@ -133,20 +134,26 @@ def _packed(measuring, shown, first_trace):
 
 def _measured_traces(lines):
     """Edges (n, 2, 3) that can be picked, and the lengths that were."""
-    broken = np.full((len(lines), 3, 3), np.nan)
-    broken[:, :2] = lines
-    edges = _trace("edges", broken.reshape(-1, 3), "lines", line={"color": FIT, "width": 3})
-    edges |= {"visible": "legendonly", "hoverinfo": "skip"}
     red = "#d00"
-    lengths = _trace(
-        "lengths",
-        np.zeros((0, 3)),
-        "lines+markers",
-        line={"color": red, "width": 6},
-        marker={"color": red, "size": 4},
-        hoverinfo="skip",
-    )
-    return [edges, lengths]
+    broken = np.insert(lines, 2, np.nan, axis=1)
+    return [
+        _trace(
+            "edges",
+            broken.reshape(-1, 3),
+            "lines",
+            line={"color": FIT, "width": 3},
+            visible="legendonly",
+            hoverinfo="skip",
+        ),
+        _trace(
+            "lengths",
+            np.zeros((0, 3)),
+            "lines+markers",
+            line={"color": red, "width": 6},
+            marker={"color": red, "size": 4},
+            hoverinfo="skip",
+        ),
+    ]
 
 
 def _trace(name, points, mode, **style):
