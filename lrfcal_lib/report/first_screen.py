@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pandas as pd
 
+from lrfcal_lib.model.geometry import POSE_UNITS
+
 PICTURES = (
     "scene",
     "cloud",
@@ -58,12 +60,8 @@ def handed_over(file):
     record = json.loads(file.read_text())
     poses = {}
     for name, camera in record["cameras"].items():
-        values = [
-            *np.degrees(camera["rotvec_rad"]),
-            *1000 * np.array(camera["translation_m"]),
-        ]
-        sigmas = np.array(list(camera["sigma"].values()), float)
-        sigmas *= np.repeat([np.degrees(1.0), 1000.0], 3)
+        values = POSE_UNITS * [*camera["rotvec_rad"], *camera["translation_m"]]
+        sigmas = POSE_UNITS * np.array(list(camera["sigma"].values()), float)
         shown = zip(values, sigmas, POSE_DIGITS, strict=True)
         poses[name] = [f"{value:z.{n}f} ± {sigma:.{n}f}" for value, sigma, n in shown]
     sources = {camera["maps"].split(" to ")[0] for camera in record["cameras"].values()}
