@@ -116,13 +116,8 @@ def save(fig: Figure, name: str, caption: str, *, main: bool = True) -> None:
         if path := report_file(f"figures/{name}.png"):
             fig.savefig(path, metadata={"Software": None})
         if get_ipython() is not None:
-            display(fig)
-    if get_ipython() is not None:
-        display(
-            HTML(
-                f'<p id="figure-{name}" style="color:#555;max-width:48em">{escape(caption)}</p>'
-            )
-        )
+            words = f'<p id="figure-{name}" style="color:#555;max-width:48em">{escape(caption)}</p>'
+            display(fig, HTML(words))
     plt.close(fig)
 
 
@@ -151,7 +146,8 @@ def table(
     places = digits if isinstance(digits, dict) else dict.fromkeys(df.columns, digits)
     # none shows a minus before a zero
     shapes = {c: f"{{:z.{places.get(c, 3)}f}}" for c in df.select_dtypes("floating")}
-    shapes |= {c: "{:.2g}" for c in shapes if c == "p_value"}  # a small chance is not none
+    if "p_value" in shapes:
+        shapes["p_value"] = "{:.2g}"  # a small chance is not none
     if path := report_file(f"tables/{name}.csv"):
         df.to_csv(path, index=False, float_format="%.9g")
     shown = df.reset_index(drop=True)

@@ -168,11 +168,9 @@ def store(path, session_path, cache=""):
     dropped (its pictures may carry no licence), execution counts are kept. `cache` is the folder of
     stages that other notebooks have worked out.
     """
-    environment = {} if session_path is None else {"LRFCAL_SESSION": str(session_path)}
+    environment = {"LRFCAL_SESSION": str(session_path or ""), CACHE: cache}
     with TemporaryDirectory(prefix="lrfcal-") as recordings:
-        notebook, error = execute(
-            path, environment | {CACHE: cache, RECORDINGS: recordings}
-        )
+        notebook, error = execute(path, environment | {RECORDINGS: recordings})
     if error:
         return error
     codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -351,19 +349,14 @@ def _run(path, environment):
     """Execute one notebook."""
     begin = time.monotonic()
     notebook, error = execute(path, environment | {"LRFCAL_NOTEBOOK": path.stem})
-    title, thesis = _beginning(notebook)
-    seconds = time.monotonic() - begin
-    return Run(path.stem, title or path.stem, thesis, seconds, error, notebook)
-
-
-def _beginning(notebook):
-    """Title and thesis of a notebook, the lines after '# ' and '> '; '' where there is none."""
     text = "\n".join(
         cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown"
     )
-    found = [re.search(f"^{mark} (.*)$", text, re.MULTILINE) for mark in "#>"]
-    title, thesis = (match[1] if match else "" for match in found)
-    return title, re.sub(r"[*`]", "", thesis)
+    # by their marks the first lines of each kind: title and thesis
+    first = dict(reversed(re.findall("^([#>]) (.*)$", text, re.MULTILINE)))
+    thesis = re.sub(r"[*`]", "", first.get(">", ""))
+    seconds = time.monotonic() - begin
+    return Run(path.stem, first.get("#") or path.stem, thesis, seconds, error, notebook)
 
 
 def write_pages(out, session, runs, found, seconds):
