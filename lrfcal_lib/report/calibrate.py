@@ -51,7 +51,7 @@ def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
     if method is None:
         print(*judge(calibration).sentences(), sep="\n")
         return UNTRUSTED
-    folder = Path(out or Path("reports") / Path(path).resolve().name)
+    folder = Path(out or Path("reports", Path(path).resolve().name))
     tasks = [
         *cloud_tasks(folder, calibration, method),
         partial(_judged, calibration, method),

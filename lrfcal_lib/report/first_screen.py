@@ -37,7 +37,7 @@ def first_picture(drawn):
     figures = {}
     for of_notebook, _ in drawn.values():
         figures |= of_notebook
-    return next((figures[name] for name in PICTURES if figures.get(name)), "")
+    return next(filter(None, map(figures.get, PICTURES)), "")
 
 
 def headline(out, verdict):
