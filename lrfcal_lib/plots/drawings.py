@@ -133,14 +133,12 @@ def edge_in_image(
     A, B, C = corners
     E = _crossing(A, B)
     F = _crossing(A, C)
-    centre = T_lrf_camera.translation
     view.face(corners, TRUTH, 0.15)
     view.face(1.25 * np.array([0 * E, E, F]), LRF, 0.12)
     view.line([E, F], color=LRF, linewidth=2)
-    flat = model.size * (UNIT_SQUARE - 0.5) / model.fx
-    rim = np.insert(flat, 2, 1.0, axis=1)
+    rim = np.insert(model.size * (UNIT_SQUARE - 0.5) / model.fx, 2, 1.0, axis=1)
     view.face(T_lrf_camera.apply(depth * rim), LEFT, 0.12)
-    view.line([E, centre, F], ":", color=LEFT, linewidth=1)
+    view.line([E, T_lrf_camera.translation, F], ":", color=LEFT, linewidth=1)
     points = np.array([A, B, C, E, F])
     rays = T_lrf_camera.inv().apply(points)
     seen = T_lrf_camera.apply(depth * rays / rays[:, 2:])

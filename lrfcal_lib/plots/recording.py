@@ -106,8 +106,7 @@ def scan_line(
     """
     points = polar_to_points(sweep.ranges[line], sweep.bearings)[:, :2]
     on = mask[line]
-    rest = "scene" if on.any() else "returns"
-    ax.plot(*points[~on].T, ".", color=RAW, label=rest)
+    ax.plot(*points[~on].T, ".", color=RAW, label="scene" if on.any() else "returns")
     ax.plot(*points[on].T, ".", color=LRF, label="board")
     if fitted is not None:
         on_line = polar_to_points(fitted[line], sweep.bearings)[on, :2]
@@ -119,8 +118,7 @@ def scan_line(
 
 def to_scale(ax: Axes, x: str, y: str) -> None:
     """Equal scales, and the labels `x` and `y`."""
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.set(xlabel=x, ylabel=y)
+    ax.set(xlabel=x, ylabel=y, aspect="equal", adjustable="datalim")
 
 
 def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) -> None:
@@ -185,8 +183,8 @@ def crossings(ax: Axes, edges) -> None:
     points = np.degrees([np.arctan2(y, x), edges.pitch])
     unused = edges.side < 0
     for index, side in enumerate(np.unique(edges.side[~unused])):
-        of_side = points[:, edges.side == side]
-        ax.plot(*of_side, ".", color=series(index), label=f"side {side}")
+        at = edges.side == side
+        ax.plot(*points[:, at], ".", color=series(index), label=f"side {side}")
     if unused.any():
         ax.plot(*points[:, unused], "x", color=OUTLIER, label="not used")
     ax.legend()
@@ -275,9 +273,9 @@ def board_view(
     for edge in view.edges:
         stretch = stretch_in_image(edge, model)
         ax.plot(*stretch.T, color=color, linewidth=1.6)
-        u, v = stretch.mean(axis=0)
+        middle = stretch.mean(axis=0)
         ax.text(
-            u, v, edge.name, color="white", fontsize=8, bbox=box, clip_on=True, **CENTRED
+            *middle, edge.name, color="white", fontsize=8, bbox=box, clip_on=True, **CENTRED
         )
     unused = ""
     if view.rejected:
@@ -399,8 +397,7 @@ def outline(ax: Axes, measured) -> None:
         ax.fill(*band.T, color=FIT, alpha=0.25, linewidth=0)
     _lengths(ax, board, outwards, -0.09)
     if board.pattern is not None:
-        points = board.pattern.points()[:, :2]
-        ax.plot(*points.T, "+", color=RAW, markersize=4)
+        ax.plot(*board.pattern.points()[:, :2].T, "+", color=RAW, markersize=4)
     ax.invert_yaxis()
     to_scale(ax, "x [m]", "y [m]")
     ax.set_title(f"bands: spread over the images, {EXAGGERATED} times")

@@ -120,9 +120,8 @@ def parameter_comparison(
         ax.axvline(true, color=TRUTH, linestyle="--", linewidth=1, zorder=0)
     for row, (method, value) in enumerate(values.items()):
         sigma = sigmas[method] if np.isfinite(sigmas[method]) else None
-        color = series(row)
         ax.errorbar(
-            value, row, xerr=sigma, fmt="o", color=color, capsize=2.5, markersize=4.5
+            value, row, xerr=sigma, fmt="o", color=series(row), capsize=2.5, markersize=4.5
         )
     rows_of(ax, values, label)
 
@@ -185,8 +184,7 @@ def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     """
     values = pd.Series(misfit)
     bad = values > WORST * max(values.median(), 1.0)
-    colors = np.where(bad, OUTLIER, LRF)
-    values.plot.bar(ax=ax, width=0.75, color=colors, rot=0)
+    values.plot.bar(ax=ax, width=0.75, color=np.where(bad, OUTLIER, LRF), rot=0)
     ax.axhline(1.0, color=TRUTH, linewidth=1, linestyle="--")
     ax.grid(False, axis="x")
     if len(misfit) > 15:

@@ -25,8 +25,7 @@ def sheet(columns: int, rows: int, square: float) -> Board:
         Metres.
     """
     start = (1 + BORDER) * square
-    size = (np.array([columns, rows]) + 1 + 2 * BORDER) * square
-    corners = size * UNIT_SQUARE
+    corners = (np.array([columns, rows]) + 1 + 2 * BORDER) * square * UNIT_SQUARE
     pattern = Chessboard(columns, rows, square, (start, start))
     edges = ("bottom", "right", "top", "left")
     return Board("printed", edges, corners, pattern, ("bottom", "left"))
