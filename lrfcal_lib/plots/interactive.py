@@ -74,12 +74,12 @@ def scene_page(
         traces += _measured_traces(measuring["lines"])
     options = {"scrollZoom": False, "responsive": True}
     plot = _in_script([traces, _layout(title, note), options])
-    script = f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});"
     page = (
         '<html><head><meta charset="utf-8"></head><body>\n'
         f"<script>{_plotly_js()}</script>\n"
         '<div id="scene" style="height:100vh"></div>\n'
-        f"<script>Plotly.newPlot({PLOT}, ...{plot}).then(() => {{\n{script}\n}});</script>\n"
+        f"<script>Plotly.newPlot({PLOT}, ...{plot}).then(() => {{\n"
+        f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});\n}});</script>\n"
         "</body></html>\n"
     )
     Path(path).write_text(page, encoding="utf-8")
@@ -98,8 +98,8 @@ def _plotly_js():
 
 def _cloud_trace(name, points, colors):
     """Points (n, 3) of a cloud in their colours (n, 3)."""
-    rgb = colors.astype(int)
-    shades = [f"#{value:06x}" for value in (rgb @ [0x10000, 0x100, 1]).tolist()]
+    numbers = colors.astype(int) @ [0x10000, 0x100, 1]
+    shades = [f"#{value:06x}" for value in numbers]
     marker = {"size": 1.6, "color": shades}
     return _trace(name, points, "markers", marker=marker, hoverinfo="none")
 
