@@ -86,8 +86,14 @@ def comparison_figure(comparisons: Sequence[Comparison]) -> Figure:
             )
             axes[0].invert_xaxis()  # as the rig sees it
             for ax, (name, shifts) in zip(axes[1:], compared.images.items(), strict=False):
-                title = f"'{name}' {shifts.amount('px')}"
-                labels = {"title": title, "xlabel": "u [px]", "ylabel": "v [px]"}
-                shift_map(ax, shifts.at, shifts.off, "px", **labels)
+                shift_map(
+                    ax,
+                    shifts.at,
+                    shifts.off,
+                    "px",
+                    title=f"'{name}' {shifts.amount('px')}",
+                    xlabel="u [px]",
+                    ylabel="v [px]",
+                )
                 ax.invert_yaxis()
     return figure
