@@ -123,13 +123,16 @@ def _layout(title, note):
 
 def _packed(measuring, shown, first_trace):
     """What scene.js needs, as JSON holds it: arrays of numbers as text."""
-    data = dict(measuring)
+    data = dict(measuring) | {
+        "features": _text(measuring["features"]),
+        "covariances": [_text(C) for C in measuring["covariances"]],
+        "edges_trace": first_trace,
+        "lengths_trace": first_trace + 1,
+    }
     del data["lines"]
-    data["features"] = _text(measuring["features"])
-    data["covariances"] = [_text(C) for C in measuring["covariances"]]
     for name in ("plane_of_point", "station_of_point"):
         data[name] = [_text(measuring[name][rows]) for rows in shown]
-    return data | {"edges_trace": first_trace, "lengths_trace": first_trace + 1}
+    return data
 
 
 def _measured_traces(lines):
