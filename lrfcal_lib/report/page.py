@@ -51,10 +51,6 @@ class Renderer(IPythonRenderer):
         beside = f"<span>({number[1]})</span>" if number else ""
         return f'<div class="formula"><div>{drawn}</div>{beside}</div>'
 
-    def multiline_math(self, text: str) -> str:
-        """A displayed formula over several lines."""
-        return self.block_math(text.strip("$"))
-
 
 def render(
     notebook: nbformat.NotebookNode, found: dict, number: str, folder: Path
