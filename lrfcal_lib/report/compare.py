@@ -1,6 +1,7 @@
 """The command ``compare``: calibrations of one rig, each beside the one before."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -38,7 +39,7 @@ def compare_files(paths: Sequence[str | Path], figure: str | Path | None = None)
     if len(paths) < 2:
         raise ValueError(f"{len(paths)} calibration to compare: two or more are needed")
     comparisons = history([rig_at(path) for path in paths])
-    for before, after, compared in zip(paths[:-1], paths[1:], comparisons, strict=True):
+    for (before, after), compared in zip(pairwise(paths), comparisons, strict=True):
         print(
             f"{before} ({_dated(compared.first)}) and {after} ({_dated(compared.second)}):"
         )

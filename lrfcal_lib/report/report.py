@@ -168,9 +168,13 @@ def store(path, session_path, cache=""):
     dropped (its pictures may carry no licence), execution counts are kept. `cache` is the folder of
     stages that other notebooks have worked out.
     """
-    environment = {"LRFCAL_SESSION": str(session_path or ""), CACHE: cache}
     with TemporaryDirectory(prefix="lrfcal-") as recordings:
-        notebook, error = execute(path, environment | {RECORDINGS: recordings})
+        environment = {
+            "LRFCAL_SESSION": str(session_path or ""),
+            CACHE: cache,
+            RECORDINGS: recordings,
+        }
+        notebook, error = execute(path, environment)
     if error:
         return error
     codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
