@@ -58,8 +58,9 @@ def measure(args):
     """Measure lengths between picked places."""
     from lrfcal_lib.report.measure import measure_session
 
-    options = (args.out, args.station, args.untrusted)
-    return measure_session(args.session, args.calibration, args.picks, *options)
+    return measure_session(
+        args.session, args.calibration, args.picks, args.out, args.station, args.untrusted
+    )
 
 
 def print_board(args):
@@ -202,8 +203,11 @@ def _add_sessions(verbs):
     """Verbs that make or use a session without devices."""
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
-    holds = "a calibration.json: does it still hold for the rig that recorded the session?"
-    check.add_argument("--calibration", metavar="JSON", help=holds)
+    check.add_argument(
+        "--calibration",
+        metavar="JSON",
+        help="a calibration.json: does it still hold for the rig that recorded the session?",
+    )
 
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221, sim_quick or room_lms221, as in data/")
@@ -255,8 +259,9 @@ def _add_calibration(verb):
 
 def _add_measure(verbs):
     """The verb that measures in a scene."""
-    words = "measure lengths between places picked in scene.html"
-    measure = verbs.add_parser("measure", help=words)
+    measure = verbs.add_parser(
+        "measure", help="measure lengths between places picked in scene.html"
+    )
     measure.add_argument("session", help=SCENE)
     measure.add_argument(
         "--out", help="CSV with the lengths (default reports/<session>/lengths.csv)"

@@ -26,14 +26,13 @@ from lrfcal_lib.drivers.rig_file import Placement, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.judge.verdict import YES, judge, verdict
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import POSE_UNITS, DegenerateGeometry
 from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.solvers import CANDIDATES
 
 PRACTICE_RIGS = ("practice", "sim_quick", "sim_lms221")
 ADVICE_FROM = 3  # placements, below which every other one helps
 WAIT_S = 3.0  # for a look at the rig to end
-POSE_UNITS = np.repeat([np.degrees(1.0), 1000.0], 3)  # degrees and mm
 AGAIN_S = 0.1  # between stops, until whoever moves the head has noticed
 RECONNECT_S = 2.0
 GUIDE = (

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from lrfcal_lib.plots.colors import COLORS
+from lrfcal_lib.plots.colors import LRF
 from lrfcal_lib.plots.recording import range_image
 from lrfcal_lib.session.read import Sweep
 
@@ -34,7 +34,7 @@ def scan_picture(
     """
     figure = Figure(**PLAIN)
     ax = figure.add_axes((0.1, 0.1, 0.8, 0.85), projection="polar")
-    ax.plot(bearings, ranges, ".", color=COLORS["lrf"], markersize=3)
+    ax.plot(bearings, ranges, ".", color=LRF, markersize=3)
     known = np.ravel(ranges)[np.isfinite(ranges)]
     far = np.percentile(known, 90) if len(known) else 0.0
     ax.set_rlim(0, REACHES[min(np.searchsorted(REACHES, far), len(REACHES) - 1)])

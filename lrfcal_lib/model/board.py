@@ -7,6 +7,8 @@ from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.geometry import cross
 
+UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # its corners in order
+
 
 @dataclass(frozen=True)
 class Chessboard:
@@ -38,7 +40,7 @@ class Chessboard:
         """Corners of the printed squares together, shape (4, 2), metres."""
         first = np.asarray(self.origin) - self.square
         size = self.square * np.array([self.columns + 1, self.rows + 1])
-        return first + size * [[0, 0], [1, 0], [1, 1], [0, 1]]
+        return first + size * UNIT_SQUARE
 
 
 @dataclass(frozen=True)

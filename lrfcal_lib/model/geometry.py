@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 # axes of a camera that looks ahead of the LRF, and of an upright board with its print towards it
 AHEAD = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-
+POSE_UNITS = np.repeat([np.degrees(1.0), 1000.0], 3)  # of rotation vector and translation
 NEXT = np.array([1, 2, 0])  # the axis after one, and the one before it
 PREVIOUS = np.array([2, 0, 1])
 

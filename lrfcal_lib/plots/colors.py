@@ -2,27 +2,27 @@
 
 import numpy as np
 
+LRF = "#d55e00"
+LEFT = "#0072b2"
+RIGHT = "#009e73"
+FIT = "#b5378a"
+TRUTH = "#222222"
+RAW = "#a3a3a3"
+FILTERED = "#e69f00"
+OUTLIER = "#cc2222"
+PLATFORM = "#666666"
 COLORS = {
-    "lrf": "#d55e00",
-    "left": "#0072b2",
-    "right": "#009e73",
-    "fit": "#b5378a",
-    "truth": "#222222",
-    "raw": "#a3a3a3",
-    "filtered": "#e69f00",
-    "outlier": "#cc2222",
-    "platform": "#666666",
+    "lrf": LRF,
+    "left": LEFT,
+    "right": RIGHT,
+    "fit": FIT,
+    "truth": TRUTH,
+    "raw": RAW,
+    "filtered": FILTERED,
+    "outlier": OUTLIER,
+    "platform": PLATFORM,
 }
-SERIES = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#b5378a",
-    "#e69f00",
-    "#56b4e9",
-    "#7a5c3e",
-    "#222222",
-)
+SERIES = (LEFT, LRF, RIGHT, FIT, FILTERED, "#56b4e9", "#7a5c3e", TRUTH)
 AXES_RGB = ("#d62728", "#2ca02c", "#1f5fd6")  # x, y, z of every frame
 
 

@@ -2,11 +2,10 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import QuadMesh
 
 
-def shift_map(ax: Axes, at: np.ndarray, off: np.ndarray) -> QuadMesh:
-    """By how much things move over an image or a field of view, as colours.
+def shift_map(ax: Axes, at: np.ndarray, off: np.ndarray, unit: str, **looks: str) -> None:
+    """By how much things move over an image or a field of view, as colours with a bar.
 
     Parameters
     ----------
@@ -15,11 +14,12 @@ def shift_map(ax: Axes, at: np.ndarray, off: np.ndarray) -> QuadMesh:
         Where, shape (r, c, 2).
     off
         Shifts, shape (r, c, k); NaN where there is none.
-
-    Returns
-    -------
-    QuadMesh
-        For a colour bar in the unit of `off`.
+    unit
+        Of `off`.
+    looks
+        Title and labels.
     """
     u, v = np.moveaxis(at, -1, 0)
-    return ax.pcolormesh(u, v, np.linalg.norm(off, axis=-1), vmin=0)
+    drawn = ax.pcolormesh(u, v, np.linalg.norm(off, axis=-1), vmin=0)
+    ax.figure.colorbar(drawn, ax=ax, label=f"[{unit}]")
+    ax.set(**looks)

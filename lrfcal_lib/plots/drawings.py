@@ -9,18 +9,15 @@ from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.board import UNIT_SQUARE, Board
 from lrfcal_lib.model.camera import CameraModel, pinhole
 from lrfcal_lib.model.geometry import unit_vector
-from lrfcal_lib.plots.colors import AXES_RGB, COLORS, closed
+from lrfcal_lib.plots.colors import AXES_RGB, LEFT, LRF, RIGHT, TRUTH, closed
 from lrfcal_lib.plots.recording import CENTRED, to_scale
-from lrfcal_lib.plots.rig import SQUARE, Vector, look_at
+from lrfcal_lib.plots.rig import Vector, look_at
 
-# of a box: the axis along which a face lies at the low or at the high end
-SIDES = tuple(product(range(3), (0, 1)))
 DIMENSION = {
     "arrowstyle": "<|-|>",
-    "color": COLORS["truth"],
     "linewidth": 0.9,
     "shrinkA": 0,
     "shrinkB": 0,
@@ -69,7 +66,7 @@ class View:
         point: ArrayLike,
         text: str,
         away: Place = (8, 8),
-        color: str = COLORS["truth"],
+        color: str = TRUTH,
     ) -> None:
         """A text beside a point (3,), so many printer's points to the right and up."""
         place = self.flat(point)
@@ -77,36 +74,32 @@ class View:
             text, place, away, textcoords="offset points", color=color, **CENTRED
         )
 
-    def arrow(self, ends: ArrayLike, color: str) -> None:
+    def arrow(self, ends: ArrayLike, color: str, looks: dict = ARROW) -> None:
         """From one to the other of two points (2, 3)."""
         start, end = self.flat(ends)
-        self.ax.annotate("", end, start, arrowprops=ARROW | {"color": color})
+        self.ax.annotate("", end, start, arrowprops=looks | {"color": color})
         self.ax.update_datalim([start, end])
 
     def frame(self, T: RigidTransform, length: float, names: str = "xyz") -> None:
         """Axes x red, y green, z blue of a frame, by the transform out of it."""
-        for axis, name, color in zip(np.eye(3), names, AXES_RGB, strict=True):
-            ends = T.apply([0 * axis, length * axis])
-            self.arrow(ends, color)
-            self.name(ends[1] + 0.15 * (ends[1] - ends[0]), name, (0, 0), color)
+        for axis, name, color in zip(length * np.eye(3), names, AXES_RGB, strict=True):
+            self.arrow(T.apply([0 * axis, axis]), color)
+            self.name(T.apply(1.15 * axis), name, (0, 0), color)
 
     def dimension(self, ends: ArrayLike, text: str, away: Place = (0, 8)) -> None:
         """The distance of two points (2, 3) as in a drawing of a machine."""
-        start, end = self.flat(ends)
-        self.ax.annotate("", end, start, arrowprops=DIMENSION)
+        self.arrow(ends, TRUTH, DIMENSION)
         self.name(np.asarray(ends).mean(axis=0), text, away)
 
     def box(self, T: RigidTransform, low: ArrayLike, high: ArrayLike, color: str) -> None:
         """A solid box between two corners (3,) of its own frame, metres, the far faces first."""
-        corners = np.array([low, high])
         faces = []
-        for axis, side in SIDES:
-            rows = np.insert((SQUARE + 1) // 2, axis, side, axis=1)
-            faces.append(T.apply(corners[rows, np.arange(3)]))
-        depth = [self.T_view.apply(face)[:, 2].mean() for face in faces]
-        for index in np.argsort(depth)[::-1]:
-            self.face(faces[index], "white", 1.0, edge=color)
-            self.face(faces[index], color, 0.35)
+        for axis, end in product(range(3), (0, 1)):
+            at_high = np.insert(UNIT_SQUARE, axis, end, axis=1)
+            faces.append(T.apply(np.where(at_high, high, low)))
+        for face in sorted(faces, key=lambda face: -self.T_view.apply(face)[:, 2].mean()):
+            self.face(face, "white", 1.0, edge=color)
+            self.face(face, color, 0.35)
 
 
 def edge_in_image(
@@ -136,28 +129,24 @@ def edge_in_image(
     dict of str to ndarray, shape (3,)
         Corners A, B, C and the crossings E on AB and F on CA, metres, in the frame of the LRF.
     """
-    corners = T_lrf_board.apply(np.pad(board.known_corners(), ((0, 0), (0, 1))))
-    centre = T_lrf_camera.translation
-    view.face(corners, COLORS["truth"], 0.15)
-    points = dict(zip("ABC", corners, strict=True))
-    points["E"] = _crossing(points["A"], points["B"])
-    points["F"] = _crossing(points["A"], points["C"])
-    fan = np.array([np.zeros(3), *(1.25 * points[name] for name in "EF")])
-    view.face(fan, COLORS["lrf"], 0.12)
-    view.line([points["E"], points["F"]], color=COLORS["lrf"], linewidth=2)
-    half = model.size / 2
-    rim = np.insert(SQUARE * half / model.fx, 2, 1.0, axis=1)
-    view.face(T_lrf_camera.apply(depth * rim), COLORS["left"], 0.12)
-    view.line([points["E"], centre, points["F"]], ":", color=COLORS["left"], linewidth=1)
-    for name, point in list(points.items()):
-        towards = T_lrf_camera.inv().apply(point)
-        seen = T_lrf_camera.apply(depth * towards / towards[2])
-        if name in "EF":
-            view.line([seen], "o", color=COLORS["lrf"], markersize=4)
-        points[name.lower()] = seen
-    for name in "bc":
-        view.line([points["a"], points[name]], color=COLORS["left"], linewidth=1.8)
-    return points
+    corners = T_lrf_board.apply(board.points())
+    A, B, C = corners
+    E = _crossing(A, B)
+    F = _crossing(A, C)
+    view.face(corners, TRUTH, 0.15)
+    view.face(1.25 * np.array([0 * E, E, F]), LRF, 0.12)
+    view.line([E, F], color=LRF, linewidth=2)
+    rim = np.insert(model.size * (UNIT_SQUARE - 0.5) / model.fx, 2, 1.0, axis=1)
+    view.face(T_lrf_camera.apply(depth * rim), LEFT, 0.12)
+    view.line([E, T_lrf_camera.translation, F], ":", color=LEFT, linewidth=1)
+    points = np.array([A, B, C, E, F])
+    rays = T_lrf_camera.inv().apply(points)
+    seen = T_lrf_camera.apply(depth * rays / rays[:, 2:])
+    a, b, c, e, f = seen
+    view.line([e, f], "o", color=LRF, markersize=4)
+    for end in (b, c):
+        view.line([a, end], color=LEFT, linewidth=1.8)
+    return dict(zip("ABCEFabcef", [*points, *seen], strict=True))
 
 
 def _crossing(a, b):
@@ -189,18 +178,20 @@ def image_of_edges(
         Pixels a, b, c; e and f by the guess; and their feet 'e on ab' and 'f on ac'.
     """
     uv = {n.lower(): pinhole(T_camera_lrf.apply(points[n]), model) for n in "ABC"}
-    for name, other, color in (("e", "b", COLORS["left"]), ("f", "c", COLORS["right"])):
-        uv[name] = pinhole(T_guess.apply(points[name.upper()]), model)
-        ends = np.array([uv["a"], uv[other]])
-        along = unit_vector(ends[1] - ends[0])
-        foot = ends[0] + (uv[name] - ends[0]) @ along * along
+    a = uv["a"]
+    for name, other, color in (("e", "b", LEFT), ("f", "c", RIGHT)):
+        ends = np.array([a, uv[other]])
+        along = unit_vector(ends[1] - a)
+        place = pinhole(T_guess.apply(points[name.upper()]), model)
+        foot = a + (place - a) @ along * along
+        uv[name] = place
         uv[f"{name} on a{other}"] = foot
         ax.plot(*ends.T, color=color, label=f"image line a{other}")
-        ax.plot(*uv[name], "o", color=COLORS["lrf"], markersize=6)
-        ax.annotate("", foot, uv[name], arrowprops=DIMENSION)
-        beside = np.sign(uv[name] - foot) * [30, -16]  # v runs downwards
+        ax.plot(*place, "o", color=LRF, markersize=6)
+        ax.annotate("", foot, place, arrowprops=DIMENSION | {"color": TRUTH})
+        beside = np.sign(place - foot) * [30, -16]  # v runs downwards
         words = f"{name}, off by\nd({name}, a{other})"
-        ax.annotate(words, uv[name], beside, textcoords="offset points", **CENTRED)
+        ax.annotate(words, place, beside, textcoords="offset points", **CENTRED)
     for name in "abc":
         ax.annotate(name, uv[name], xytext=(10, 6), textcoords="offset points", **CENTRED)
     to_scale(ax, "u [px]", "v [px]")

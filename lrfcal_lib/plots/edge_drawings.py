@@ -6,7 +6,7 @@ from matplotlib.patches import Circle
 from scipy.special import ndtr
 
 from lrfcal_lib.model.geometry import unit_vector
-from lrfcal_lib.plots.colors import COLORS
+from lrfcal_lib.plots.colors import FIT, LEFT, LRF, PLATFORM, TRUTH
 
 BEAMS = 12  # drawn of a scan
 ROOM = 0.45  # for labels at the sides, of the height of a drawing
@@ -32,30 +32,36 @@ def plane_constraint(
     """
     up = np.sign(distance) * np.asarray(normal)
     height = abs(distance)
-    across = points.mean(axis=0) - origin
-    across = across - up * (up @ across)
-    section = np.stack([unit_vector(across), up])
+    away = points.mean(axis=0) - origin
+    section = np.stack([unit_vector(away - up * (up @ away)), up])
     flat = points @ section.T
     lrf = section @ origin
     first = flat[:, 0].min() - 0.15
     last = flat[:, 0].max() + 0.15
-    ax.plot([first, last], [height, height], color=COLORS["truth"], linewidth=2)
-    ax.hlines(height, 0, first, COLORS["truth"], linewidth=0.6, linestyle=":")
+    ax.plot([first, last], [height, height], color=TRUTH, linewidth=2)
+    ax.hlines(height, 0, first, TRUTH, linewidth=0.6, linestyle=":")
     beams = np.array([[lrf, point] for point in flat[:: max(1, len(flat) // BEAMS)]])
-    ax.plot(*beams.T, color=COLORS["lrf"], linewidth=0.5, alpha=0.6)
-    ax.plot(*flat.T, ".", color=COLORS["lrf"], markersize=3)
-    ax.plot(*lrf, "o", color=COLORS["lrf"], markersize=8)
-    ax.plot(0, 0, "s", color=COLORS["left"], markersize=8)
+    ax.plot(*beams.T, color=LRF, linewidth=0.5, alpha=0.6)
+    ax.plot(*flat.T, ".", color=LRF, markersize=3)
+    ax.plot(*lrf, "o", color=LRF, markersize=8)
+    ax.plot(0, 0, "s", color=LEFT, markersize=8)
     ax.annotate("", (0, height), (0, 0), arrowprops={"arrowstyle": "->"})
     ax.text(last, height + ABOVE, "plane of the board", ha="right")
     ax.text(-ABOVE, height / 2, f"n, d = {height:.2f} m", ha="right")
     # each name on the side where the other sensor is not
     beside = np.copysign(ABOVE, lrf[0])
     sides = ("right", "left")[:: int(np.sign(beside))]
-    ax.text(-beside, 0, "camera", va="center", ha=sides[0], color=COLORS["left"])
-    ax.text(lrf[0] + beside, lrf[1], "LRF", va="center", ha=sides[1], color=COLORS["lrf"])
-    ax.set(xlabel="along the board [m]", ylabel="along its normal [m]", aspect="equal")
-    ax.set_xlim(min(0.0, first, lrf[0]) - ROOM * height, max(last, lrf[0] + ROOM * height))
+    ax.text(-beside, 0, "camera", va="center", ha=sides[0], color=LEFT)
+    ax.text(lrf[0] + beside, lrf[1], "LRF", va="center", ha=sides[1], color=LRF)
+    ax.set(
+        xlabel="along the board [m]",
+        ylabel="along its normal [m]",
+        aspect="equal",
+        xlim=(
+            min(0.0, first, lrf[0]) - ROOM * height,
+            max(last, lrf[0] + ROOM * height),
+        ),
+    )
 
 
 def spot_over_edge(ax: Axes, radius: float, bias: float) -> None:
@@ -71,21 +77,29 @@ def spot_over_edge(ax: Axes, radius: float, bias: float) -> None:
     b = 1000 * bias
     reach = ABOUT * r
     ax.axvspan(-reach, 0, color="#d9dee3")
-    ax.axvline(0, color=COLORS["truth"])
-    spots = (("reads beyond", 0.9 * r, "platform"), ("flips", b, "fit"))
-    for row, (words, u, role) in enumerate((*spots, ("reads the board", -0.9 * r, "lrf"))):
+    ax.axvline(0, color=TRUTH)
+    spots = (
+        ("reads beyond", 0.9 * r, PLATFORM),
+        ("flips", b, FIT),
+        ("reads the board", -0.9 * r, LRF),
+    )
+    for row, (words, u, color) in enumerate(spots):
         at = 2.3 * row * r
-        color = COLORS[role]
         ax.add_patch(Circle((u, at), r, color=color, alpha=0.3, linewidth=0))
         ax.plot(u, at, "+", color=color, markersize=9, markeredgewidth=1.6)
         ax.text(1.1 * reach, at, words, va="center", color=color)
     top = 6.2 * r
     ax.text(-0.97 * reach, top, "board", va="center")
     ax.text(0.97 * reach, top, "beyond", va="center", ha="right")
-    ax.plot([0, b], [0.9 * r, 0.9 * r], color=COLORS["fit"], linewidth=2)
-    ax.text(b / 2, 1.15 * r, "b", ha="center", va="center", color=COLORS["fit"])
-    ax.set(xlim=(-reach, 2.6 * reach), ylim=(-1.4 * r, 6.8 * r), aspect="equal")
-    ax.set(xlabel="distance u of the beam from the edge [mm]", yticks=[])
+    ax.plot([0, b], [0.9 * r, 0.9 * r], color=FIT, linewidth=2)
+    ax.text(b / 2, 1.15 * r, "b", ha="center", va="center", color=FIT)
+    ax.set(
+        xlabel="distance u of the beam from the edge [mm]",
+        xlim=(-reach, 2.6 * reach),
+        ylim=(-1.4 * r, 6.8 * r),
+        yticks=[],
+        aspect="equal",
+    )
     ax.grid(False)
 
 
@@ -106,14 +120,16 @@ def reading_by_distance(
     b = 1000 * bias
     x = np.linspace(u.min(), u.max(), 400)
     expected = ndtr((b - x) / (1000 * sigma))
-    ax.plot(x, expected, color=COLORS["fit"], label="expected, Φ((b - u) / σ)")
-    label = "beams that read the board"
-    ax.plot(u[hit], 0 * u[hit] + 1, "|", color=COLORS["lrf"], label=label)
-    label = "beams that read beyond"
-    ax.plot(u[~hit], 0 * u[~hit], "|", color=COLORS["platform"], label=label)
-    ax.axvline(0, color=COLORS["truth"])
-    ax.axvline(b, color=COLORS["fit"], linestyle=":")
-    ax.text(b, 0.5, f" b = {b:.1f} mm", color=COLORS["fit"])
-    ax.set(xlabel="distance u of the beam from the edge [mm]", ylim=(-0.08, 1.35))
-    ax.set(ylabel="reads the board [1]", yticks=[0, 0.5, 1])
+    ax.plot(x, expected, color=FIT, label="expected, Φ((b - u) / σ)")
+    ax.plot(u[hit], hit[hit], "|", color=LRF, label="beams that read the board")
+    ax.plot(u[~hit], hit[~hit], "|", color=PLATFORM, label="beams that read beyond")
+    ax.axvline(0, color=TRUTH)
+    ax.axvline(b, color=FIT, linestyle=":")
+    ax.text(b, 0.5, f" b = {b:.1f} mm", color=FIT)
+    ax.set(
+        xlabel="distance u of the beam from the edge [mm]",
+        ylabel="reads the board [1]",
+        yticks=[0, 0.5, 1],
+        ylim=(-0.08, 1.35),
+    )
     ax.legend(loc="upper right")

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.model.board import UNIT_SQUARE
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.plots.colors import AXES_RGB, COLORS, closed, color_of
+from lrfcal_lib.plots.colors import AXES_RGB, FIT, PLATFORM, closed, color_of
 
 MOST_POINTS = 150_000  # that browsers turn smoothly
 PAGE = {"xref": "paper", "yref": "paper", "xanchor": "left", "yanchor": "bottom"}
@@ -64,23 +65,24 @@ def scene_page(
         _cloud_trace(name, points[rows], colors[rows]) for name, rows in shown.items()
     ]
     for name, (color, line) in lines.items():
-        traces.append(_trace(name, line, "lines", line={"color": color, "width": 4}))
-        traces[-1]["visible"] = "legendonly" if name == "boards" else True
+        looks = {"color": color, "width": 4}
+        visible = "legendonly" if name == "boards" else True
+        traces.append(_trace(name, line, "lines", line=looks, visible=visible))
     data = "null"
     if measuring is not None:
         data = _in_script(_packed(measuring, list(shown.values()), len(traces)))
         traces += _measured_traces(measuring["lines"])
     options = {"scrollZoom": False, "responsive": True}
     plot = _in_script([traces, _layout(title, note), options])
-    script = f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});"
     page = (
-        '<html><head><meta charset="utf-8"></head><body>',
-        f"<script>{_plotly_js()}</script>",
-        '<div id="scene" style="height:100vh"></div>',
-        f"<script>Plotly.newPlot({PLOT}, ...{plot}).then(() => {{\n{script}\n}});</script>",
-        "</body></html>\n",
+        '<html><head><meta charset="utf-8"></head><body>\n'
+        f"<script>{_plotly_js()}</script>\n"
+        '<div id="scene" style="height:100vh"></div>\n'
+        f"<script>Plotly.newPlot({PLOT}, ...{plot}).then(() => {{\n"
+        f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});\n}});</script>\n"
+        "</body></html>\n"
     )
-    Path(path).write_text("\n".join(page), encoding="utf-8")
+    Path(path).write_text(page, encoding="utf-8")
 
 
 def _in_script(data):
@@ -91,13 +93,13 @@ def _in_script(data):
 def _plotly_js():
     """The script that draws; to import its package takes a fifth of a second."""
     package = Path(find_spec("plotly").origin).parent
-    return (package / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
+    return (package / "package_data/plotly.min.js").read_text(encoding="utf-8")
 
 
 def _cloud_trace(name, points, colors):
     """Points (n, 3) of a cloud in their colours (n, 3)."""
-    rgb = colors.astype(int)
-    shades = [f"#{value:06x}" for value in (rgb @ [1 << 16, 1 << 8, 1]).tolist()]
+    numbers = colors.astype(int) @ [0x10000, 0x100, 1]
+    shades = [f"#{value:06x}" for value in numbers]
     marker = {"size": 1.6, "color": shades}
     return _trace(name, points, "markers", marker=marker, hoverinfo="none")
 
@@ -121,35 +123,40 @@ def _layout(title, note):
 
 def _packed(measuring, shown, first_trace):
     """What scene.js needs, as JSON holds it: arrays of numbers as text."""
-    data = dict(measuring)
+    data = dict(measuring) | {
+        "features": _text(measuring["features"]),
+        "covariances": [_text(C) for C in measuring["covariances"]],
+        "edges_trace": first_trace,
+        "lengths_trace": first_trace + 1,
+    }
     del data["lines"]
-    data["features"] = _text(measuring["features"])
-    data["covariances"] = [_text(C) for C in measuring["covariances"]]
     for name in ("plane_of_point", "station_of_point"):
         data[name] = [_text(measuring[name][rows]) for rows in shown]
-    data["edges_trace"] = first_trace
-    data["lengths_trace"] = first_trace + 1
     return data
 
 
 def _measured_traces(lines):
     """Edges (n, 2, 3) that can be picked, and the lengths that were."""
-    broken = np.full((len(lines), 3, 3), np.nan)
-    broken[:, :2] = lines
-    edges = _trace(
-        "edges", broken.reshape(-1, 3), "lines", line={"color": COLORS["fit"], "width": 3}
-    )
-    edges |= {"visible": "legendonly", "hoverinfo": "skip"}
     red = "#d00"
-    lengths = _trace(
-        "lengths",
-        np.zeros((0, 3)),
-        "lines+markers",
-        line={"color": red, "width": 6},
-        marker={"color": red, "size": 4},
-        hoverinfo="skip",
-    )
-    return [edges, lengths]
+    broken = np.insert(lines, 2, np.nan, axis=1)
+    return [
+        _trace(
+            "edges",
+            broken.reshape(-1, 3),
+            "lines",
+            line={"color": FIT, "width": 3},
+            visible="legendonly",
+            hoverinfo="skip",
+        ),
+        _trace(
+            "lengths",
+            np.zeros((0, 3)),
+            "lines+markers",
+            line={"color": red, "width": 6},
+            marker={"color": red, "size": 4},
+            hoverinfo="skip",
+        ),
+    ]
 
 
 def _trace(name, points, mode, **style):
@@ -183,30 +190,24 @@ def rig_lines(
     size
         Of a frame's axes, metres.
     """
-    lines = {
-        "tilt axis": (COLORS["platform"], np.outer([-4 * size, 4 * size], [1.0, 0.0, 0.0]))
-    }
-    frames = {"lrf": T_head_lrf} | {name: T.inv() for name, (T, _) in cameras.items()}
-    for letter, axis, color in zip("xyz", np.eye(3), AXES_RGB, strict=True):
-        arrows = [
-            np.vstack([T.apply([0 * axis, size * axis]), GAP]) for T in frames.values()
-        ]
+    lines = {"tilt axis": (PLATFORM, np.outer([-4 * size, 4 * size], [1.0, 0.0, 0.0]))}
+    frames = {"lrf": T_head_lrf}
+    for name, (T, _) in cameras.items():
+        frames[name] = T.inv()
+    for letter, axis, color in zip("xyz", size * np.eye(3), AXES_RGB, strict=True):
+        arrows = [np.vstack([T.apply([0 * axis, axis]), GAP]) for T in frames.values()]
         lines[f"{letter} of {', '.join(frames)}"] = (color, np.vstack(arrows))
-    for name, (T, model) in cameras.items():
-        lines[f"view of {name}"] = (
-            color_of(name),
-            T.inv().apply(_frustum(model, 3 * size)),
-        )
+    for name, (_, model) in cameras.items():
+        frustum = frames[name].apply(_frustum(model, 3 * size))
+        lines[f"view of {name}"] = (color_of(name), frustum)
     if boards:
         outlines = [np.vstack([closed(corners), GAP]) for corners in boards.values()]
-        lines["boards"] = (COLORS["fit"], np.vstack(outlines))
+        lines["boards"] = (FIT, np.vstack(outlines))
     return lines
 
 
 def _frustum(model, depth):
     """The edges of what a camera sees up to a depth, metres, in its own frame."""
-    u = np.array([0, model.width, model.width, 0])
-    v = np.array([0, 0, model.height, model.height])
-    rim = depth * model.sights(np.stack([u, v], axis=1))
+    rim = depth * model.sights(model.size * UNIT_SQUARE)
     legs = [np.vstack([np.zeros(3), corner, GAP]) for corner in rim]
     return np.vstack([closed(rim), GAP, *legs])

@@ -4,26 +4,24 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba_array
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.plots.colors import COLORS
+from lrfcal_lib.plots.colors import FIT, LEFT, PLATFORM, RIGHT
 from lrfcal_lib.plots.rig import pixels, render
 
-PALETTE = np.array(  # of surfaces side by side, light enough for the edges upon them
-    [
-        [166, 206, 227],
-        [178, 223, 138],
-        [253, 191, 111],
-        [202, 178, 214],
-        [255, 255, 153],
-        [251, 180, 174],
-        [204, 235, 197],
-        [222, 203, 228],
-    ],
-    np.uint8,
+PALETTE = (  # of surfaces side by side, light enough for the edges upon them
+    "#a6cee3",
+    "#b2df8a",
+    "#fdbf6f",
+    "#cab2d6",
+    "#ffff99",
+    "#fbb4ae",
+    "#ccebc5",
+    "#decbe4",
 )
-NO_SURFACE = np.array([70, 70, 70], np.uint8)
-KIND_COLORS = {"plane": COLORS["left"], "edge": COLORS["fit"], "point": COLORS["platform"]}
+NO_SURFACE = "#464646"
+KIND_COLORS = {"plane": LEFT, "edge": FIT, "point": PLATFORM}
 
 
 def surfaces_and_edges(
@@ -48,14 +46,13 @@ def surfaces_and_edges(
     T_view, size
         See :func:`lrfcal_lib.plots.rig.render`.
     """
-    shades = PALETTE[of_point % len(PALETTE)]
-    shades[of_point < 0] = NO_SURFACE
+    colors = np.rint(255 * to_rgba_array([*PALETTE, NO_SURFACE])[:, :3]).astype(np.uint8)
+    shades = colors[np.where(of_point < 0, -1, of_point % len(PALETTE))]
     ax.imshow(render(points, shades, T_view, size, splat=3))
     for edge in ends:
         u, v = pixels(T_view.apply(edge), size, None).T
-        ax.plot(u, v, color=COLORS["fit"], linewidth=1.0)
-    ax.set_xlim(0, size[1])
-    ax.set_ylim(size[0], 0)
+        ax.plot(u, v, color=FIT, linewidth=1.0)
+    ax.set(xlim=(0, size[1]), ylim=(size[0], 0))
     ax.set_axis_off()
 
 
@@ -71,16 +68,10 @@ def sigma_by_points(
     noise, together
         Parts of single points and of what all points share, metres, shape as `counts`.
     """
-    number = np.asarray(counts)
-    ax.loglog(number, 1000 * noise, "--", color=COLORS["platform"], label="noise of points")
-    ax.loglog(
-        counts, 1000 * together, ":", color=COLORS["right"], label="shared by all points"
-    )
-    ax.loglog(
-        counts, 1000 * np.hypot(noise, together), "o-", color=COLORS["left"], label="both"
-    )
-    ax.set_xlabel("points / end")
-    ax.set_ylabel("standard deviation [mm]")
+    ax.loglog(counts, 1000 * noise, "--", color=PLATFORM, label="noise of points")
+    ax.loglog(counts, 1000 * together, ":", color=RIGHT, label="shared by all points")
+    ax.loglog(counts, 1000 * np.hypot(noise, together), "o-", color=LEFT, label="both")
+    ax.set(xlabel="points / end", ylabel="standard deviation [mm]")
     ax.legend()
 
 
@@ -103,11 +94,11 @@ def length_errors(
     """
     rows = np.arange(len(names))[::-1]
     for kind in dict.fromkeys(kinds):
-        own = np.array([each == kind for each in kinds])
+        own = np.equal(kinds, kind)
         ax.errorbar(
-            np.asarray(errors)[own],
+            errors[own],
             rows[own],
-            xerr=np.asarray(half)[own],
+            xerr=half[own],
             fmt="o",
             color=KIND_COLORS[kind],
             capsize=3,

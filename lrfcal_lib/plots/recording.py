@@ -11,11 +11,21 @@ from matplotlib.colors import ListedColormap
 from lrfcal_lib.model.board import Board, outline_lines
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import polar_to_points
-from lrfcal_lib.plots.colors import AXES_RGB as AXES_RGB
-from lrfcal_lib.plots.colors import COLORS, closed, color_of, series
+from lrfcal_lib.plots.colors import COLORS as COLORS
+from lrfcal_lib.plots.colors import (
+    FILTERED,
+    FIT,
+    LRF,
+    OUTLIER,
+    RAW,
+    TRUTH,
+    closed,
+    color_of,
+    series,
+)
 from lrfcal_lib.plots.colors import SERIES as SERIES
 
-PLANES = {"xz": (0, 2), "yz": (1, 2), "xy": (0, 1)}
+PLANES = ("xz", "yz", "xy")
 BESIDE = 14  # beams shown on either side of the end of a board
 HEADROOM = 0.12  # metres shown behind the end of a board
 ABOUT = 3.0  # degrees shown around a board
@@ -67,16 +77,13 @@ def range_image(
     if mask is not None and mask.any():
         shown = mask[order]
         about = ABOUT
-    lines, beams = np.nonzero(shown)
-    if len(beams):
-        ax.set_xlim(bearing[beams].max() + about, bearing[beams].min() - about)
-    if about == ABOUT and len(height) > 1:
-        on_board = shown.astype(float)
-        ax.contour(
-            bearing, height, on_board, [0.5], colors=COLORS["outlier"], linewidths=1.5
-        )
-        rim = [height[lines].min() - about, height[lines].max() + about]
-        ax.set_ylim(np.clip(rim, height[0], height[-1]))
+        if len(height) > 1:
+            ax.contour(bearing, height, shown, [0.5], colors=OUTLIER, linewidths=1.5)
+            rim = height[shown.any(axis=1)][[0, -1]] + [-about, about]
+            ax.set_ylim(np.clip(rim, height[0], height[-1]))
+    seen = bearing[shown.any(axis=0)]
+    if len(seen):
+        ax.set_xlim(seen[-1] + about, seen[0] - about)
     ax.grid(False)
     return drawn
 
@@ -99,21 +106,19 @@ def scan_line(
     """
     points = polar_to_points(sweep.ranges[line], sweep.bearings)[:, :2]
     on = mask[line]
-    rest = "scene" if on.any() else "returns"
-    ax.plot(*points[~on].T, ".", color=COLORS["raw"], label=rest)
-    ax.plot(*points[on].T, ".", color=COLORS["lrf"], label="board")
+    ax.plot(*points[~on].T, ".", color=RAW, label="scene" if on.any() else "returns")
+    ax.plot(*points[on].T, ".", color=LRF, label="board")
     if fitted is not None:
         on_line = polar_to_points(fitted[line], sweep.bearings)[on, :2]
-        ax.plot(*on_line.T, color=COLORS["fit"], label="fitted line")
-    ax.plot(0, 0, "^", color=COLORS["lrf"], markersize=8, label="LRF")
+        ax.plot(*on_line.T, color=FIT, label="fitted line")
+    ax.plot(0, 0, "^", color=LRF, markersize=8, label="LRF")
     to_scale(ax, "x [m]", "y [m]")
     ax.legend()
 
 
 def to_scale(ax: Axes, x: str, y: str) -> None:
     """Equal scales, and the labels `x` and `y`."""
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.set(xlabel=x, ylabel=y)
+    ax.set(xlabel=x, ylabel=y, aspect="equal", adjustable="datalim")
 
 
 def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) -> None:
@@ -136,37 +141,33 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
         If no beam of the line is on the board.
     """
     on = np.flatnonzero(scan.mask[line])
-    if on.size == 0:
-        where = f"scan line {line} is on the board of placement {scan.placement}"
-        raise ValueError(f"no beam of {where}")
+    if not on.size:
+        raise ValueError(
+            f"no beam of scan line {line} is on the board of placement {scan.placement}"
+        )
     last = on[-1] if end > 0 else on[0]
     near = slice(max(last - BESIDE, 0), last + BESIDE + 1)
     bearing = np.degrees(scan.sweep.bearings[near])
     raw = scan.sweep.ranges[line, near]
-    board = scan.mask[line, near]
-    filtered = scan.filtered[line, near][board]
-    fitted = scan.fitted[line, near][board]
-    top = fitted.max() + HEADROOM
-    shown = raw < top
-    ax.plot(bearing[shown], raw[shown], "o", color=COLORS["raw"], markersize=6, label="raw")
-    farther = raw[raw >= top]
-    if farther.size:
-        words = f"raw, farther: {farther.min():.2f} to {farther.max():.2f} m"
-        edge = np.full(farther.shape, top)
-        ax.plot(
-            bearing[raw >= top], edge, "^", color=COLORS["raw"], clip_on=False, label=words
-        )
-    ax.plot(bearing[board], filtered, "x", color=COLORS["truth"], label="filtered")
-    ax.plot(bearing[board], fitted, color=COLORS["fit"], label="line fitted to the board")
+    fitted = scan.fitted[line, near]
+    top = np.nanmax(fitted) + HEADROOM
+    far = raw >= top
+    ax.plot(bearing[~far], raw[~far], "o", color=RAW, markersize=6, label="raw")
+    if far.any():
+        words = f"raw, farther: {raw[far].min():.2f} to {raw[far].max():.2f} m"
+        edge = np.full(far.sum(), top)
+        ax.plot(bearing[far], edge, "^", color=RAW, clip_on=False, label=words)
+    ax.plot(bearing, scan.filtered[line, near], "x", color=TRUTH, label="filtered")
+    ax.plot(bearing, fitted, color=FIT, label="line fitted to the board")
     for crossed, style in zip(edges, ("--", "-"), strict=False):
-        label = crossed.variant.replace("_", " ")
         here = (crossed.line == line) & (crossed.end == end)
         for x, y, _ in crossed.points[here]:
             at = np.degrees(np.arctan2(y, x))
-            ax.axvline(at, color=COLORS["lrf"], linestyle=style, label=label)
+            words = crossed.variant.replace("_", " ")
+            ax.axvline(at, color=LRF, linestyle=style, label=words)
     ax.invert_xaxis()
-    ax.set(xlabel="bearing [deg]", ylabel="range [m]")
-    ax.set_ylim(np.nanmin(raw) - HEADROOM / 4, top)
+    lowest = np.nanmin(raw) - HEADROOM / 4
+    ax.set(xlabel="bearing [deg]", ylabel="range [m]", ylim=(lowest, top))
     ax.legend()
 
 
@@ -182,10 +183,10 @@ def crossings(ax: Axes, edges) -> None:
     points = np.degrees([np.arctan2(y, x), edges.pitch])
     unused = edges.side < 0
     for index, side in enumerate(np.unique(edges.side[~unused])):
-        of_side = points[:, edges.side == side]
-        ax.plot(*of_side, ".", color=series(index), label=f"side {side}")
+        at = edges.side == side
+        ax.plot(*points[:, at], ".", color=series(index), label=f"side {side}")
     if unused.any():
-        ax.plot(*points[:, unused], "x", color=COLORS["outlier"], label="not used")
+        ax.plot(*points[:, unused], "x", color=OUTLIER, label="not used")
     ax.legend()
     ax.invert_xaxis()
     to_scale(ax, "bearing [deg]", "pitch [deg]")
@@ -211,12 +212,11 @@ def projection(ax: Axes, edges: dict, plane: str, lines: dict | None = None) -> 
     """
     if plane not in PLANES:
         raise ValueError(f"plane must be one of {', '.join(PLANES)}, got '{plane}'")
-    pick = list(PLANES[plane])
-    lines = lines or {}
+    pick = ["xyz".index(axis) for axis in plane]
     for index, (name, points) in enumerate(edges.items()):
         color = color_of(name, index)
         ax.plot(*points[:, pick].T, ".", color=color, label=name)
-        if name in lines:
+        if name in (lines or {}):
             point, direction = lines[name]
             along = (points - point) @ direction
             ends = point + np.outer([along.min(), along.max()], direction)
@@ -234,8 +234,8 @@ def picture(ax: Axes, image: np.ndarray) -> None:
     image
         Shape (h, w, 3), blue first, or (h, w).
     """
-    brightest = max(np.quantile(image[::4, ::4], 0.99), 1.0)
-    gain = np.clip(BRIGHT / brightest, 1.0, GAIN)
+    brightest = np.quantile(image[::4, ::4], 0.99)
+    gain = BRIGHT / np.clip(brightest, BRIGHT / GAIN, BRIGHT)
     shown = np.clip(gain * image, 0, 255).astype(np.uint8)
     if image.ndim == 3:
         shown = shown[..., ::-1]
@@ -267,25 +267,20 @@ def board_view(
     """
     picture(ax, image)
     color = color_of(view.camera)
-    drawn = []
     if view.pixels is not None:
-        ax.plot(*view.pixels.T, "+", color=COLORS["filtered"], markersize=4, mew=0.8)
-        drawn.append(view.pixels)
+        ax.plot(*view.pixels.T, "+", color=FILTERED, markersize=4, mew=0.8)
     box = {"facecolor": color, "edgecolor": "none", "boxstyle": "round,pad=0.2"}
     for edge in view.edges:
         stretch = stretch_in_image(edge, model)
         ax.plot(*stretch.T, color=color, linewidth=1.6)
-        u, v = stretch.mean(axis=0)
+        middle = stretch.mean(axis=0)
         ax.text(
-            u, v, edge.name, color="white", fontsize=8, bbox=box, clip_on=True, **CENTRED
+            *middle, edge.name, color="white", fontsize=8, bbox=box, clip_on=True, **CENTRED
         )
-        drawn.append(stretch)
-    title = f"{view.camera}, placement {view.placement}"
+    unused = ""
     if view.rejected:
-        unused = ", ".join(name for name, _ in view.rejected)
-        title = f"{title}; not used: {unused}"
-    ax.set_title(title)
-    _cut(ax, drawn, image, margin)
+        unused = f"; not used: {', '.join(name for name, _ in view.rejected)}"
+    _about_lines(ax, view, image, margin, unused)
 
 
 def seen_points(
@@ -315,24 +310,21 @@ def seen_points(
         Markers or line styles, one a method.
     """
     picture(ax, image)
-    edges = [stretch_in_image(edge, model) for edge in view.edges]
-    for stretch in edges:
-        ax.plot(*stretch.T, color="white", linewidth=1.0)
-    if edges:
+    for edge in view.edges:
+        ax.plot(*stretch_in_image(edge, model).T, color="white", linewidth=1.0)
+    if view.edges:
         ax.lines[-1].set_label("edge in the image")
     for index, (method, uv) in enumerate(points.items()):
-        color = series(index + 1)
         ax.plot(
             *uv.T,
             styles[index],
-            color=color,
+            color=series(index + 1),
             label=method,
             markersize=4.5,
             markerfacecolor="none",
         )
     ax.legend(frameon=True, framealpha=0.8, labelcolor="white", **DARK)
-    _cut(ax, [*points.values(), *edges], image, margin)
-    ax.set_title(f"{view.camera}, placement {view.placement}")
+    _about_lines(ax, view, image, margin)
 
 
 def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
@@ -342,14 +334,14 @@ def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
     return project(model.sights(uv), model)
 
 
-def _cut(ax, drawn, image, margin):
-    """Limit the axes to what is drawn in them, and to the image."""
-    points = np.concatenate([*drawn, np.zeros((0, 2))])
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points):
+def _about_lines(ax, view, image, margin, more=""):
+    """Cut an image of the board to the lines drawn in it, and say in the title which it is."""
+    ax.set_title(f"{view.camera}, placement {view.placement}{more}")
+    points = np.vstack([np.zeros((0, 2)), *(line.get_xydata() for line in ax.lines)])
+    if np.isfinite(points).any():
         last = np.array(image.shape[1::-1]) - 0.5
-        left, top = np.clip(points.min(axis=0) - margin, -0.5, last)
-        right, bottom = np.clip(points.max(axis=0) + margin, -0.5, last)
+        left, top = np.clip(np.nanmin(points, axis=0) - margin, -0.5, last)
+        right, bottom = np.clip(np.nanmax(points, axis=0) + margin, -0.5, last)
         ax.set(xlim=(left, right), ylim=(bottom, top))
 
 
@@ -374,9 +366,7 @@ def board_plan(ax: Axes, board: Board) -> None:
     ax.fill(*corners.T, color=PRINT.colors[0], linewidth=0)
     pattern = board.pattern
     if pattern is not None:
-        rows = np.arange(-1, pattern.rows + 1)
-        columns = np.arange(-1, pattern.columns + 1)
-        x, y = np.meshgrid(columns, rows)
+        y, x = np.mgrid[-1 : pattern.rows + 1, -1 : pattern.columns + 1]
         left, low = pattern.origin
         white = (x + y)[:-1, :-1] % 2
         ax.pcolormesh(
@@ -397,17 +387,16 @@ def outline(ax: Axes, measured) -> None:
     """
     board = measured.board
     around = closed(board.known_corners())
-    ax.plot(*around.T, color=COLORS["truth"])
+    ax.plot(*around.T, color=TRUTH)
     outwards = measured.lines[:, :2]
     for index, spread in enumerate(measured.line_sd):
         ends = around[index : index + 2]
         away = EXAGGERATED * np.nan_to_num(spread) * outwards[index]
         band = np.vstack([ends - away, ends[::-1] + away])
-        ax.fill(*band.T, color=COLORS["fit"], alpha=0.25, linewidth=0)
+        ax.fill(*band.T, color=FIT, alpha=0.25, linewidth=0)
     _lengths(ax, board, outwards, -0.09)
     if board.pattern is not None:
-        points = board.pattern.points()[:, :2]
-        ax.plot(*points.T, "+", color=COLORS["raw"], markersize=4)
+        ax.plot(*board.pattern.points()[:, :2].T, "+", color=RAW, markersize=4)
     ax.invert_yaxis()
     to_scale(ax, "x [m]", "y [m]")
     ax.set_title(f"bands: spread over the images, {EXAGGERATED} times")

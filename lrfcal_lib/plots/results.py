@@ -9,7 +9,7 @@ from matplotlib.collections import PathCollection
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.plots.colors import COLORS, color_of, series
+from lrfcal_lib.plots.colors import LRF, OUTLIER, RAW, TRUTH, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
 ROOM = 1.4  # of an axis of bars, times the longest: the legend stands beside them
@@ -22,23 +22,18 @@ def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
         xlabel="placement", ylabel=label, xticks=np.arange(len(names)), xticklabels=names
     )
     ax.grid(False, axis="x")
-    _zero(ax.axhline)
+    ax.axhline(0, color=TRUTH, linewidth=0.8)
 
 
-def rows_of(ax: Axes, names: Sequence | Mapping) -> None:
-    """Ticks of rows from above to below."""
-    count = len(names)
-    ax.set(yticks=np.arange(count), yticklabels=list(names), ylim=(count - 0.5, -0.5))
-
-
-def _zero(line):
-    """Draw the zero by one of the methods axhline and axvline."""
-    line(0, color=COLORS["truth"], linewidth=0.8)
+def rows_of(ax: Axes, names: Sequence | Mapping, label: str) -> None:
+    """Ticks of rows from above to below, and what they are drawn over."""
+    ax.set_yticks(range(len(names)), names)
+    ax.set(xlabel=label, ylim=(len(names) - 0.5, -0.5))
 
 
 def _side_by_side(count):
     """Places of so many dots in a strip from -0.5 to 0.5."""
-    return (np.arange(count) + 0.5) / np.maximum(count, 1) - 0.5
+    return (np.arange(count) + 0.5) / count - 0.5
 
 
 def residual_strips(
@@ -97,7 +92,7 @@ def pitch_offsets(
             color=series(index),
             label=label,
             capsize=2,
-            error_kw={"linewidth": 0.9, "ecolor": COLORS["truth"]},
+            error_kw={"linewidth": 0.9, "ecolor": TRUTH},
         )
     by_placement(ax, placement, "pitch offset [deg]")
     ax.legend(title="head moved", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
@@ -122,15 +117,13 @@ def parameter_comparison(
         The true value where it is known: a vertical line.
     """
     if true is not None:
-        ax.axvline(true, color=COLORS["truth"], linestyle="--", linewidth=1, zorder=0)
+        ax.axvline(true, color=TRUTH, linestyle="--", linewidth=1, zorder=0)
     for row, (method, value) in enumerate(values.items()):
         sigma = sigmas[method] if np.isfinite(sigmas[method]) else None
-        color = series(row)
         ax.errorbar(
-            value, row, xerr=sigma, fmt="o", color=color, capsize=2.5, markersize=4.5
+            value, row, xerr=sigma, fmt="o", color=series(row), capsize=2.5, markersize=4.5
         )
-    rows_of(ax, values)
-    ax.set_xlabel(label)
+    rows_of(ax, values, label)
 
 
 def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
@@ -148,10 +141,9 @@ def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
         ax.plot(values, height, "o", color=color, markersize=3.5, alpha=0.8)
         mean = np.mean(values)
         ax.plot([mean, mean], [row - 0.36, row + 0.36], color=color, linewidth=2.5)
-    _zero(ax.axvline)
+    ax.axvline(0, color=TRUTH, linewidth=0.8)
     ax.grid(False, axis="y")
-    rows_of(ax, errors)
-    ax.set_xlabel("measured - true length [mm]")
+    rows_of(ax, errors, "measured - true length [mm]")
 
 
 def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
@@ -192,18 +184,15 @@ def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     """
     values = pd.Series(misfit)
     bad = values > WORST * max(values.median(), 1.0)
-    colors = np.where(bad, COLORS["outlier"], COLORS["lrf"])
-    values.plot.bar(ax=ax, width=0.75, color=colors, rot=0)
-    ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
-    ax.set(xlabel="placement", ylabel="chi-square per degree of freedom")
+    values.plot.bar(ax=ax, width=0.75, color=np.where(bad, OUTLIER, LRF), rot=0)
+    ax.axhline(1.0, color=TRUTH, linewidth=1, linestyle="--")
     ax.grid(False, axis="x")
     if len(misfit) > 15:
         ax.set_xticks(ax.get_xticks()[::2])
-    ax.set_title(f"All placements fit alike, the worst {values.max():.1f}")
+    title = f"All placements fit alike, the worst {values.max():.1f}"
     if bad.any():
-        ax.set_title(
-            f"{bad.sum()} of {len(values)} placements fit much worse than the others"
-        )
+        title = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
+    ax.set(xlabel="placement", ylabel="chi-square per degree of freedom", title=title)
 
 
 def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> None:
@@ -218,7 +207,7 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> N
         Metres, shape (n,).
     """
     points = pd.DataFrame({"distance": distance, "residual": 1000 * np.asarray(residual)})
-    ax.plot(points.distance, points.residual, ",", color=COLORS["raw"], zorder=0)
+    ax.plot(points.distance, points.residual, ",", color=RAW, zorder=0)
     bins = points.groupby(pd.qcut(points.distance, BINS, duplicates="drop"), observed=True)
     means = bins.mean()
     ax.errorbar(
@@ -226,14 +215,18 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> N
         means.residual,
         bins.residual.sem(),
         fmt="o-",
-        color=COLORS["lrf"],
+        color=LRF,
         capsize=2.5,
         label="mean and its standard error",
     )
-    _zero(ax.axhline)
+    ax.axhline(0, color=TRUTH, linewidth=0.8)
     limit = 1.05 * points.residual.abs().quantile(0.995)
-    ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit))
-    ax.set_title(f"Ranges: {np.sqrt(points.residual.pow(2).mean()):.2g} mm rms")
+    ax.set(
+        xlabel="range [m]",
+        ylabel="predicted - measured [mm]",
+        ylim=(-limit, limit),
+        title=f"Ranges: {np.sqrt(points.residual.pow(2).mean()):.2g} mm rms",
+    )
     ax.legend()
 
 
@@ -257,12 +250,12 @@ def residuals_by_region(
     title = f"{name}: no board in any image"
     if len(uv):
         length = np.linalg.norm(shift, axis=1)
-        unit = float(f"{length.max() / 2:.1g}")
-        scale = length.max() / (model.width / 8)
+        longest = length.max()
+        unit = float(f"{longest / 2:.1g}")
         drawn = ax.quiver(
             *uv.T,
             *shift.T,
-            scale=scale,
+            scale=longest / (model.width / 8),
             color=color_of(name),
             angles="xy",
             scale_units="xy",
@@ -270,8 +263,14 @@ def residuals_by_region(
         )
         ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S")
         title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
-    ax.set(xlim=(0, model.width), ylim=(model.height, 0), aspect="equal")
-    ax.set(xlabel="u [px]", ylabel="v [px]", title=title)
+    ax.set(
+        xlim=(0, model.width),
+        ylim=(model.height, 0),
+        aspect="equal",
+        xlabel="u [px]",
+        ylabel="v [px]",
+        title=title,
+    )
 
 
 def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollection:
@@ -306,6 +305,11 @@ def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollecti
         vmin=low,
         vmax=limit,
     )
-    ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
-    ax.set(xlim=(bearing.max(), bearing.min()), ylim=(pitch.min(), pitch.max()))
+    ax.set(
+        xlabel="bearing [deg]",
+        ylabel="pitch [deg]",
+        aspect="equal",
+        xlim=(bearing.max(), bearing.min()),
+        ylim=(pitch.min(), pitch.max()),
+    )
     return drawn

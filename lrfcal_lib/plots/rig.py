@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.geometry import fit_plane, unit_vector
-from lrfcal_lib.plots.colors import COLORS
+from lrfcal_lib.plots.colors import FIT
 from lrfcal_lib.plots.recording import CENTRED
 
 NEAREST = 1e-6  # metres: what is nearer, or behind a camera, is not seen
@@ -14,7 +15,6 @@ PARALLEL = 1e-9  # sine of an angle below which two directions are one
 FAR = 4.0  # widths of a part from which it is looked at, so that it is hardly distorted
 COVER = 0.75  # half the width of a drawn point, of the usual spacing: scattered points leave gaps
 Vector = Sequence[float] | np.ndarray
-SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
 def render(
@@ -47,20 +47,20 @@ def render(
     ndarray of uint8, shape (height, width, 3)
     """
     seen = T_view.apply(points)
-    ahead = np.isfinite(seen).all(axis=1) & (seen[:, 2] > NEAREST)
-    far_to_near = np.argsort(-seen[:, 2], kind="stable")
-    order = far_to_near[ahead[far_to_near]]
-    uv = np.rint(pixels(seen[order], size, focal)).astype(int)
-    winner = np.full(size, -1)
-    for dv, du in np.ndindex(2 * splat + 1, 2 * splat + 1):
-        v, u = (uv + [du - splat, dv - splat]).T[::-1]
-        inside = np.flatnonzero((u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0]))
-        layer = np.full(size, -1)
-        # of equal pixels the last one, the nearest, stays
-        layer[v[inside], u[inside]] = inside
-        winner = np.maximum(winner, layer)
+    ahead = np.flatnonzero(seen[:, 2] > NEAREST)
+    order = ahead[np.argsort(-seen[ahead, 2], kind="stable")]  # far to near
+    # with what is too far out to be seen, but for a part of its square
+    height, width = np.add(size, 2 * splat)
+    uv = np.rint(pixels(seen[order], size, focal)).astype(int) + splat
+    inside = np.flatnonzero(np.all((uv >= 0) & (uv < [width, height]), axis=1))
+    nearest = np.full((height, width), -1)
+    u, v = uv[inside].T
+    # of equal pixels the last one, the nearest, stays
+    nearest[v, u] = inside
+    covering = maximum_filter(nearest, 2 * splat + 1)
+    shown = covering[splat : height - splat, splat : width - splat]
     white = np.full((1, 3), 255, np.uint8)
-    return np.vstack([colors[order], white])[winner]  # the last row where no point is
+    return np.vstack([colors[order], white])[shown]  # the last row where no point is
 
 
 def pixels(
@@ -108,14 +108,12 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
     target = np.asarray(target, float)
     ahead = target - eye
     right = np.cross(ahead, up)
-    distance = np.linalg.norm(ahead)
-    if np.linalg.norm(right) <= PARALLEL * distance:
+    if np.linalg.norm(right) <= PARALLEL * np.linalg.norm(ahead):
         raise ValueError(
             f"no view from {eye} to {target} with {up} upwards: choose another eye or another up"
         )
-    right = unit_vector(right)
-    ahead = ahead / distance
-    rotation = Rotation.from_matrix(np.stack([right, np.cross(ahead, right), ahead]))
+    axes = unit_vector(np.stack([right, np.cross(ahead, right), ahead]))
+    rotation = Rotation.from_matrix(axes)
     return RigidTransform.from_components(-rotation.apply(eye), rotation)
 
 
@@ -147,9 +145,9 @@ def face_on(
     wide = 2 * np.linalg.norm(points - middle, axis=1).max()
     T_view = look_at(middle - FAR * wide * normal, middle)
     spread = np.ptp(pixels(T_view.apply(points), size, 1.0), axis=0)
-    focal = fill * min(size[1] / spread[0], size[0] / spread[1])
+    focal = fill * (size[::-1] / spread).min()
     # half of a rectangle about points of a triangle is empty
-    spacing = focal * np.sqrt(spread[0] * spread[1] / 2 / len(points))
+    spacing = focal * np.sqrt(spread.prod() / 2 / len(points))
     return T_view, float(focal), int(np.ceil(COVER * spacing))
 
 
@@ -172,15 +170,15 @@ def measured_edges(
     T_view, size, focal
         Of the picture.
     """
-    names = list(known)
-    after = dict(zip(names, names[1:] + names[:1], strict=True))
+    names = [*known, *known]  # around the outline, so that one comes after the last
     centre = measured.T_platform_plane[None, :3, 3]
-    middle = pixels(T_view.apply(centre), size, focal)[0]
+    middle = pixels(T_view.apply(centre), size, focal)
     for name, length in measured.lengths.items():
-        ends = [measured.corner_point(name), measured.corner_point(after[name])]
+        after = names[names.index(name) + 1]
+        ends = [measured.corner_point(corner) for corner in (name, after)]
         uv = pixels(T_view.apply(ends), size, focal)
-        ax.plot(*uv.T, "o-", color=COLORS["fit"])
-        away = uv.mean(axis=0) - middle
-        at = uv.mean(axis=0) + 0.07 * size[1] * unit_vector(away)
+        ax.plot(*uv.T, "o-", color=FIT)
+        at = uv.mean(axis=0)
+        at = at + 0.07 * size[1] * unit_vector(at - middle[0])
         words = f"{1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
-        ax.text(*at, f"{name.upper()} {words}", color=COLORS["fit"], **CENTRED)
+        ax.text(*at, f"{name.upper()} {words}", color=FIT, **CENTRED)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
-from lrfcal_lib.model.board import Board, Chessboard
+from lrfcal_lib.model.board import UNIT_SQUARE, Board, Chessboard
 
 BORDER = 0.5  # squares between the chessboard and the cut
 PAPER = 0.02  # metres around the cut
@@ -25,9 +25,7 @@ def sheet(columns: int, rows: int, square: float) -> Board:
         Metres.
     """
     start = (1 + BORDER) * square
-    width = (columns + 1 + 2 * BORDER) * square
-    height = (rows + 1 + 2 * BORDER) * square
-    corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+    corners = (np.array([columns, rows]) + 1 + 2 * BORDER) * square * UNIT_SQUARE
     pattern = Chessboard(columns, rows, square, (start, start))
     edges = ("bottom", "right", "top", "left")
     return Board("printed", edges, corners, pattern, ("bottom", "left"))
@@ -52,15 +50,15 @@ def print_sheet(path: str | PathLike, board: Board, dpi: float = 300) -> None:
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_axis_off()
     pattern = board.pattern
-    first = np.subtract(pattern.origin, pattern.square)
+    first = pattern.outline()[0]
+    side = pattern.square
     for row, column in np.ndindex(pattern.rows + 1, pattern.columns + 1):
         if (row + column) % 2 == 0:
-            at = first + pattern.square * np.array([column, row])
-            side = pattern.square
-            ax.add_patch(Rectangle(tuple(at), side, side, color="black", linewidth=0))
+            at = first + side * np.array([column, row])
+            ax.add_patch(Rectangle(at, side, side, color="black", linewidth=0))
     ax.add_patch(Polygon(corners, fill=False, edgecolor="black", linewidth=0.5))
-    ruler = low + [PAPER, PAPER / 3]
-    ax.plot(ruler[0] + np.array([0, RULER]), [ruler[1], ruler[1]], "|-", color="black")
-    words = f"{1000 * RULER:.0f} mm at 100 %; squares of {1000 * pattern.square:g} mm"
-    ax.text(ruler[0] + 1.1 * RULER, ruler[1], words, fontsize=7, va="center")
+    x, y = low + [PAPER, PAPER / 3]
+    ax.plot([x, x + RULER], [y, y], "|-", color="black")
+    words = f"{1000 * RULER:.0f} mm at 100 %; squares of {1000 * side:g} mm"
+    ax.text(x + 1.1 * RULER, y, words, fontsize=7, va="center")
     page.savefig(path, dpi=dpi)

@@ -4,12 +4,11 @@ import operator
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from lrfcal_lib.calibrate.pipeline import Calibration, calibrate, handed_over
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.judge.verdict import NO, judge
 from lrfcal_lib.measure.cloud_files import cloud_tasks
+from lrfcal_lib.model.geometry import POSE_UNITS
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.workers import spread
 
@@ -52,7 +51,7 @@ def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
     if method is None:
         print(*judge(calibration).sentences(), sep="\n")
         return UNTRUSTED
-    folder = Path(out or Path("reports") / Path(path).resolve().name)
+    folder = Path(out or Path("reports", Path(path).resolve().name))
     tasks = [
         *cloud_tasks(folder, calibration, method),
         partial(_judged, calibration, method),
@@ -77,12 +76,11 @@ def _judged(calibration, method):
 def poses_in_words(calibration: Calibration) -> list[str]:
     """The pose of every camera by every method, and what could not be used, a line each."""
     lines = []
-    scale = np.repeat([np.rad2deg(1.0), 1000.0], 3)
     for (camera, method), solution in calibration.solutions.items():
-        values = (scale * solution.parameters[:6]).round(2)
-        sigma = (scale * solution.trusted_sigma[:6]).round(2)
+        both = [solution.parameters[:6], solution.trusted_sigma[:6]]
+        values, sigma = (POSE_UNITS * both).round(2)
         turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
         shift = f"translation {values[3:]} +- {sigma[3:]} mm"
         lines.append(f"{camera:>8} {method:<20} {turn}, {shift}")
     problems = (*calibration.prepared.problems, *calibration.problems)
-    return lines + [str(problem) for problem in problems]
+    return [*lines, *map(str, problems)]

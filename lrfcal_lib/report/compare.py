@@ -74,20 +74,27 @@ def comparison_figure(comparisons: Sequence[Comparison]) -> Figure:
             len(comparisons), columns, figsize=size, layout="constrained", squeeze=False
         )
         for axes, compared in zip(grid, comparisons, strict=True):
+            field = compared.cloud
             names = f"{compared.first.session}, {compared.second.session}"
+            shift_map(
+                axes[0],
+                np.degrees(field.at),
+                1000 * field.off,
+                "mm",
+                title=f"{names}: {field.amount('mm', 1000)}",
+                xlabel="bearing [deg]",
+                ylabel="pitch [deg]",
+            )
+            axes[0].invert_xaxis()  # as the rig sees it
             for ax, (name, shifts) in zip(axes[1:], compared.images.items(), strict=False):
-                drawn = shift_map(ax, shifts.at, shifts.off)
-                figure.colorbar(drawn, ax=ax, label="[px]")
-                ax.set(
+                shift_map(
+                    ax,
+                    shifts.at,
+                    shifts.off,
+                    "px",
+                    title=f"'{name}' {shifts.amount('px')}",
                     xlabel="u [px]",
                     ylabel="v [px]",
-                    title=f"'{name}' {shifts.amount('px')}",
                 )
                 ax.invert_yaxis()
-            field = compared.cloud
-            drawn = shift_map(axes[0], np.degrees(field.at), 1000 * field.off)
-            figure.colorbar(drawn, ax=axes[0], label="[mm]")
-            title = f"{names}: {field.amount('mm', 1000)}"
-            axes[0].set(xlabel="bearing [deg]", ylabel="pitch [deg]", title=title)
-            axes[0].invert_xaxis()  # as the rig sees it
     return figure

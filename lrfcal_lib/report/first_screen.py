@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pandas as pd
 
+from lrfcal_lib.model.geometry import POSE_UNITS
+
 PICTURES = (
     "scene",
     "cloud",
@@ -18,8 +20,7 @@ MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way 
 
 def main_verdict(verdicts):
     """The verdict that stands first: one with a record, else any; None without."""
-    with_record = [entry for entry in verdicts if entry["record"] is not None]
-    return next(iter(with_record or verdicts), None)
+    return max(verdicts, key=lambda entry: entry["record"] is not None, default=None)
 
 
 def sentences_below(verdict):
@@ -36,7 +37,7 @@ def first_picture(drawn):
     figures = {}
     for of_notebook, _ in drawn.values():
         figures |= of_notebook
-    return next((figures[name] for name in PICTURES if figures.get(name)), "")
+    return next(filter(None, map(figures.get, PICTURES)), "")
 
 
 def headline(out, verdict):
@@ -48,9 +49,7 @@ def headline(out, verdict):
         numbers["image"] = dict(errors.drop("cloud_mm").max())
         numbers["known"] = _known_share(out / "tables" / "placements.csv")
     if (out / "tables" / "edge_lengths.csv").is_file():
-        edges = _edge_numbers(pd.read_csv(out / "tables" / "edge_lengths.csv"))
-        if edges:
-            numbers["edges"] = edges
+        numbers["edges"] = _edge_numbers(pd.read_csv(out / "tables" / "edge_lengths.csv"))
     return numbers
 
 
@@ -61,12 +60,8 @@ def handed_over(file):
     record = json.loads(file.read_text())
     poses = {}
     for name, camera in record["cameras"].items():
-        values = [
-            *np.degrees(camera["rotvec_rad"]),
-            *1000 * np.array(camera["translation_m"]),
-        ]
-        sigmas = np.array(list(camera["sigma"].values()), float)
-        sigmas *= np.repeat([np.degrees(1.0), 1000.0], 3)
+        values = POSE_UNITS * [*camera["rotvec_rad"], *camera["translation_m"]]
+        sigmas = POSE_UNITS * np.array(list(camera["sigma"].values()), float)
         shown = zip(values, sigmas, POSE_DIGITS, strict=True)
         poses[name] = [f"{value:z.{n}f} ± {sigma:.{n}f}" for value, sigma, n in shown]
     sources = {camera["maps"].split(" to ")[0] for camera in record["cameras"].values()}

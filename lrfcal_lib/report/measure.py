@@ -69,6 +69,6 @@ def measure_session(
                 f"{1000 * row.high_m:.1f}, from station {row.stations}"
             )
         print(f"{row.name}: {words}")
-    measured = int((lengths.problem == "").sum())
+    measured = (lengths.problem == "").sum()
     print(f"{file}: {measured} of {len(lengths)} lengths")
     return 0 if measured == len(lengths) else NOT_ALL

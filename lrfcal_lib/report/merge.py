@@ -68,8 +68,9 @@ def merge_session(
     for table in (stations_table(joined), pairs_table(joined)):
         print(table.to_string(index=False))
     print(*sentences(joined), sep="\n", flush=True)
-    asked = (scene.folder, scene.session, scene.rig)
-    files = write_scene(*asked, joined, scene.about, clouds=clouds)
+    files = write_scene(
+        scene.folder, scene.session, scene.rig, joined, scene.about, clouds=clouds
+    )
     page = scene.folder / "stations.html"
     with whole(page) as draft:
         draft.write_text(stations_page(joined, joined_cloud(clouds, joined), scene.about))
@@ -92,10 +93,10 @@ def stations_table(joined: Joined) -> pd.DataFrame:
     """Where the stations stood in the joined frame, and how well that is known."""
     rows = []
     for number, T in joined.T_world_station.items():
-        variance = np.diag(joined.covariance_of(number))
+        variances = np.diag(joined.covariance_of(number)).reshape(2, 3)
+        turn, shift = np.sqrt(variances.sum(axis=1))
         yaw = T.rotation.as_euler("ZYX", degrees=True)[0]
-        sigma = np.sqrt([variance[3:].sum(), variance[:3].sum()]) * [1000, np.degrees(1)]
-        rows.append([number, *T.translation, yaw, *sigma])
+        rows.append([number, *T.translation, yaw, 1000 * shift, np.degrees(turn)])
     names = ["station", "x_m", "y_m", "z_m", "yaw_deg", "sigma_mm", "sigma_deg"]
     return pd.DataFrame(rows, columns=names).round(3)
 
@@ -106,9 +107,8 @@ def pairs_table(joined: Joined) -> pd.DataFrame:
     for pair in joined.pairs:
         turn, shift = joined.miss(pair)
         both = f"{pair.first} and {pair.second}"
-        millimetres = 1000 * np.array([pair.rms, shift])
         overlap = round(100 * pair.overlap)
-        rows.append([both, overlap, *millimetres, np.degrees(turn)])
+        rows.append([both, overlap, 1000 * pair.rms, 1000 * shift, np.degrees(turn)])
     names = ["stations", "overlap_percent", "surfaces_apart_mm", "miss_mm", "miss_deg"]
     return pd.DataFrame(rows, columns=names).round(3)
 

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from numbers import Number
 from pathlib import Path
@@ -47,7 +48,7 @@ OTHER_LABELS = {  # of what is no row of METHODS
 }
 # read by Open3D when it is imported, perhaps in the same cell as this module
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
-_found: dict[str, list] = {"figures": [], "tables": [], "findings": [], "verdicts": []}
+_found: dict[str, list] = defaultdict(list)  # figures, tables, findings and verdicts
 NEEDS = "notebook.needs("
 _lacking: set[str] = (
     set()
@@ -68,8 +69,7 @@ def set_up() -> None:
         )
         get_ipython().ast_transformers[:] = [Sections()]
     _lacking.clear()
-    for kind in _found.values():
-        kind.clear()
+    _found.clear()
 
 
 def start() -> Session:
@@ -116,13 +116,8 @@ def save(fig: Figure, name: str, caption: str, *, main: bool = True) -> None:
         if path := report_file(f"figures/{name}.png"):
             fig.savefig(path, metadata={"Software": None})
         if get_ipython() is not None:
-            display(fig)
-    if get_ipython() is not None:
-        display(
-            HTML(
-                f'<p id="figure-{name}" style="color:#555;max-width:48em">{escape(caption)}</p>'
-            )
-        )
+            words = f'<p id="figure-{name}" style="color:#555;max-width:48em">{escape(caption)}</p>'
+            display(fig, HTML(words))
     plt.close(fig)
 
 
@@ -151,7 +146,8 @@ def table(
     places = digits if isinstance(digits, dict) else dict.fromkeys(df.columns, digits)
     # none shows a minus before a zero
     shapes = {c: f"{{:z.{places.get(c, 3)}f}}" for c in df.select_dtypes("floating")}
-    shapes |= {c: "{:.2g}" for c in shapes if c == "p_value"}  # a small chance is not none
+    if "p_value" in shapes:
+        shapes["p_value"] = "{:.2g}"  # a small chance is not none
     if path := report_file(f"tables/{name}.csv"):
         df.to_csv(path, index=False, float_format="%.9g")
     shown = df.reset_index(drop=True)
@@ -227,11 +223,11 @@ def finding(
     """
     known: float | str | None = value.item() if hasattr(value, "item") else value
     shown = str(known)
-    if isinstance(known, float) and not math.isfinite(known):
-        shown = "unknown"
-        known = None
-    elif isinstance(known, float):
+    if isinstance(known, float):
         shown = f"{known:z.{digits}f}"
+        if not math.isfinite(known):
+            shown = "unknown"
+            known = None
     shown = f"{shown} {unit}".strip()
     entry = {
         "key": key,

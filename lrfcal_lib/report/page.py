@@ -13,18 +13,25 @@ import pandas as pd
 from bs4 import BeautifulSoup
 from jinja2 import Environment, FileSystemLoader
 from latex2mathml.converter import convert
-from nbconvert.filters.highlight import Highlight2HTML
+from nbconvert.filters import Highlight2HTML, strip_ansi
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
-from lrfcal_lib.report.notebook import in_words
+from lrfcal_lib.report.notebook import in_words, label_of
 
 SHORT = 15  # rows of a table that is shown unfolded
 PIXELS_PER_INCH = 96 / 150  # of a page, by those of a figure's file
 # columns from which a table is turned on screens as narrow
 WIDTHS = ((9, "wide"), (3, "medium"), (0, "narrow"))
-FOLDER = Path(__file__).parent
+METHOD = re.compile(r"(?<=')\w+(?=')")  # named in a sentence
 TEMPLATES = Environment(
-    autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=FileSystemLoader(FOLDER)
+    autoescape=True,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    loader=FileSystemLoader(Path(__file__).parent),
+)
+# methods are called by their labels
+TEMPLATES.filters["words"] = lambda text: METHOD.sub(
+    lambda name: label_of(name[0]), label_of(text)
 )
 PIECES: Any = TEMPLATES.get_template("pieces.html.jinja").module
 FITTING = 42  # characters of a row that a screen of 400 pixels shows beside each other
@@ -43,10 +50,6 @@ class Renderer(IPythonRenderer):
         drawn = convert(re.sub(r"\\tag\{.*?\}", "", body), display="block")
         beside = f"<span>({number[1]})</span>" if number else ""
         return f'<div class="formula"><div>{drawn}</div>{beside}</div>'
-
-    def multiline_math(self, text: str) -> str:
-        """A displayed formula over several lines."""
-        return self.block_math(text.strip("$"))
 
 
 def render(
@@ -104,7 +107,7 @@ def render(
 def _output(output):
     """One output of a cell: HTML, picture or text."""
     if output.output_type == "error":
-        plain = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(output.traceback))
+        plain = strip_ansi("\n".join(output.traceback))
         return f'<pre class="error">{html.escape(plain)}</pre>'
     data = output.get("data", {})
     if "text/html" in data:

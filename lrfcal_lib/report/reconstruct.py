@@ -70,7 +70,7 @@ def open_scene(
     refuse_untrusted(rig, untrusted)
     session = open_session(path)
     require_same_rig(rig, session)
-    folder = Path(out or Path("reports") / Path(path).resolve().name)
+    folder = Path(out or Path("reports", Path(path).resolve().name))
     return SceneAsked(session, rig, stations_of(session), folder)
 
 
@@ -99,17 +99,18 @@ def reconstruct_session(
     """
     scene = open_scene(path, calibration, out, untrusted)
     session = scene.session
-    counts = [np.isfinite(session.sweep(n).ranges).sum() for n in scene.stations]
-    total = int(sum(counts))
+    total = sum(np.isfinite(session.sweep(n).ranges).sum() for n in scene.stations)
+    several = len(scene.stations) > 1
     with tqdm(total=total, unit=" points", unit_scale=True, disable=None) as bar:
         for number in scene.stations:
             place = scene.folder
-            if len(scene.stations) > 1:
+            if several:
                 place = scene.folder / f"station_{number}"
-            still = alone(number)
-            files = write_scene(place, session, scene.rig, still, scene.about, bar.update)
+            files = write_scene(
+                place, session, scene.rig, alone(number), scene.about, bar.update
+            )
             bar.clear()
             print(f"station {number}: {', '.join(map(str, files))}", flush=True)
-    if len(scene.stations) > 1:
+    if several:
         print(f"{len(scene.stations)} stations, each in its own frame; 'merge' joins them")
     return 0

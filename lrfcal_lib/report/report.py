@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -21,18 +22,19 @@ from tempfile import TemporaryDirectory
 
 import nbformat
 from nbclient import NotebookClient
-from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
+from nbclient.exceptions import CellControlSignal, DeadKernelError
+from nbconvert.filters import strip_ansi
 from tqdm import tqdm
 
 from lrfcal_lib.report import first_screen, page
-from lrfcal_lib.report.notebook import ROOT, SHIPPED, label_of
+from lrfcal_lib.report.notebook import ROOT, SHIPPED
 from lrfcal_lib.session.cache import VARIABLE as CACHE
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.write import RECORDINGS
 
 NOTEBOOKS = ROOT / "notebooks"
-NUMBERED = "[0-9][0-9]_*.ipynb"
+NUMBERED = "[0-9][0-9]_*"
 PACKAGES = (
     "lrfcal",
     "numpy",
@@ -60,7 +62,6 @@ EXCHANGE = 2  # RENAME_EXCHANGE of Linux
 PART = ".report-"  # begins the names of folders in which a report is being written
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
-METHOD = re.compile(r"(?<=')\w+(?=')")  # named in a sentence
 _CLIENTS: set[NotebookClient] = set()  # of the notebooks that are being executed
 
 
@@ -104,7 +105,9 @@ def make_report(session_path, out, jobs=2, notebooks=None):
     session_path = Path(session_path).resolve()
     session = open_session(session_path)
     out = Path(out).resolve()
-    paths = sorted(NOTEBOOKS.glob(NUMBERED) if notebooks is None else map(Path, notebooks))
+    paths = sorted(
+        NOTEBOOKS.glob(f"{NUMBERED}.ipynb") if notebooks is None else map(Path, notebooks)
+    )
     # a fresh cache: a report stands for its session
     with in_place_of(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:
         environment = {
@@ -115,21 +118,10 @@ def make_report(session_path, out, jobs=2, notebooks=None):
             RECORDINGS: cache,
         }
         runs = _execute_all(paths, environment, jobs)
-        found = {
-            run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []}
-            for run in runs
-        }
-        found |= {
-            part.stem: json.loads(part.read_text())
-            for part in (new / "parts").glob("*.json")
-        }
-        shutil.rmtree(new / "parts")
-        findings = [
-            {"notebook": run.name, **entry}
-            for run in runs
-            for entry in found[run.name]["findings"]
-        ]
-        (new / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
+        found = {run.name: defaultdict(list) for run in runs}
+        for part in (new / "parts").glob("*.json"):
+            found[part.stem] = defaultdict(list, json.loads(part.read_text()))
+        shutil.rmtree(new / "parts", ignore_errors=True)
         write_pages(new, session, runs, found, time.monotonic() - begin)
     return runs
 
@@ -155,15 +147,16 @@ def execute(path, environment):
         client.execute(
             env={**os.environ, "MPLBACKEND": "", **environment}
         )  # that of notebooks
-    except (CellExecutionError, CellTimeoutError, DeadKernelError) as problem:
+    except (CellControlSignal, DeadKernelError) as problem:
         # no colours of a terminal
-        error = re.sub(r"\x1b\[[0-9;]*m", "", str(problem)) or type(problem).__name__
+        error = strip_ansi(str(problem)) or type(problem).__name__
     finally:
         _CLIENTS.discard(client)
     # without their kernel live widgets show an error, and pages would load them from elsewhere
     notebook.metadata.pop("widgets", None)
-    for output in (output for cell in notebook.cells for output in cell.get("outputs", [])):
-        output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
     return notebook, error
 
 
@@ -175,11 +168,13 @@ def store(path, session_path, cache=""):
     dropped (its pictures may carry no licence), execution counts are kept. `cache` is the folder of
     stages that other notebooks have worked out.
     """
-    environment = {} if session_path is None else {"LRFCAL_SESSION": str(session_path)}
     with TemporaryDirectory(prefix="lrfcal-") as recordings:
-        notebook, error = execute(
-            path, environment | {CACHE: cache, RECORDINGS: recordings}
-        )
+        environment = {
+            "LRFCAL_SESSION": str(session_path or ""),
+            CACHE: cache,
+            RECORDINGS: recordings,
+        }
+        notebook, error = execute(path, environment)
     if error:
         return error
     codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -194,9 +189,7 @@ def store(path, session_path, cache=""):
         "language": "python",
         "name": "python3",
     }
-    notebook.metadata = nbformat.from_dict(
-        {"kernelspec": kernel, "language_info": {"name": "python"}}
-    )
+    notebook.metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
     nbformat.write(notebook, path)
     return ""
 
@@ -214,16 +207,15 @@ def main(sessions=(), out=None, jobs=2, stored=False):
         if signal.getsignal(n) != signal.SIG_IGN
     ]
     try:
-        sessions = [Path(path) for path in sessions] or [SHIPPED]
         return max(
             _store_all(session) if stored else report_session(session, out, jobs)
-            for session in sessions
+            for session in sessions or [SHIPPED]
         )
     except SessionError as problem:
         print(f"lrfcal: {problem}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stopped:
-        number = signal.Signals((*stopped.args, signal.SIGINT)[0])
+        number = signal.Signals(*stopped.args)
         print(
             f"\nlrfcal: stopped by {number.name}; an earlier report stays as it was",
             file=sys.stderr,
@@ -241,34 +233,33 @@ def _stop(number, frame):
     raise KeyboardInterrupt(number)
 
 
-def report_session(session: str | Path, out: str | Path | None, jobs: int) -> int:
+def report_session(session: str | Path, out: str | Path | None, jobs: int = 2) -> int:
     """Write the report of a session and say so: 0, or 1 if a notebook failed."""
     begin = time.monotonic()
     session = Path(session)
     out = Path(out or ROOT / "reports" / session.resolve().name).resolve()
     runs = make_report(session, out, jobs)
-    failed = [run for run in runs if run.error]
-    for run in failed:
-        print(f"{run.name} failed: {run.error.strip().splitlines()[-1]}", file=sys.stderr)
-    good = len(runs) - len(failed)
+    good = len(runs)
+    for run in runs:
+        if run.error:
+            good -= 1
+            last = run.error.strip().splitlines()[-1]
+            print(f"{run.name} failed: {last}", file=sys.stderr)
     seconds = time.monotonic() - begin
     print(f"{good} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
-    return int(bool(failed))
+    return int(good < len(runs))
 
 
 def _store_all(session):
     open_session(session)
+    failed = 0
     with TemporaryDirectory(prefix="lrfcal-") as cache:
-        failed = False
-        for path in sorted(NOTEBOOKS.glob(NUMBERED)):
-            error = store(path, session.resolve(), cache)
-            failed = failed or bool(error)
-            print(
-                f"{path.name}: {error or 'stored'}",
-                file=sys.stderr if error else sys.stdout,
-                flush=True,
-            )
-    return int(failed)
+        for path in sorted(NOTEBOOKS.glob(f"{NUMBERED}.ipynb")):
+            error = store(path, Path(session).resolve(), cache)
+            failed |= bool(error)
+            stream = sys.stderr if error else sys.stdout
+            print(f"{path.name}: {error or 'stored'}", file=stream, flush=True)
+    return failed
 
 
 @contextmanager
@@ -281,8 +272,8 @@ def in_place_of(out):
         with TemporaryDirectory(
             prefix=PART, dir=out.parent, ignore_cleanup_errors=True
         ) as box:
-            (new := Path(box) / "report").mkdir()
-            (new / "parts").mkdir()
+            new = Path(box) / "report"
+            new.mkdir()
             yield new
             _take_place(new, out)
     except OSError as error:
@@ -299,8 +290,10 @@ def _take_place(new, out):
     moment between two renames, and a kill in that moment leaves the old one beside it.
     """
 
+    of_a_report = shutil.ignore_patterns(*OWN_FILES, f"{NUMBERED}.html")
+
     def ours(folder, names):
-        return filter(_is_ours, names) if folder == str(out) else ()
+        return of_a_report(folder, names) if folder == str(out) else ()
 
     out.mkdir(exist_ok=True)
     shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
@@ -312,11 +305,6 @@ def _take_place(new, out):
         finally:
             if not out.exists():  # interrupted in between
                 old.replace(out)
-
-
-def _is_ours(name):
-    """Whether a file or folder of a report was written by one."""
-    return name in OWN_FILES or re.fullmatch("[0-9]{2}_.*[.]html", name)
 
 
 def _exchanged(one, other):
@@ -365,23 +353,18 @@ def _run(path, environment):
     """Execute one notebook."""
     begin = time.monotonic()
     notebook, error = execute(path, environment | {"LRFCAL_NOTEBOOK": path.stem})
-    title, thesis = _beginning(notebook)
-    seconds = time.monotonic() - begin
-    return Run(path.stem, title or path.stem, thesis, seconds, error, notebook)
-
-
-def _beginning(notebook):
-    """Title and thesis of a notebook, the lines after '# ' and '> '; '' where there is none."""
     text = "\n".join(
         cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown"
     )
-    found = [re.search(f"^{mark} (.*)$", text, re.MULTILINE) for mark in "#>"]
-    title, thesis = (match[1] if match else "" for match in found)
-    return title, re.sub(r"[*`]", "", thesis)
+    # by their marks the first lines of each kind: title and thesis
+    first = dict(reversed(re.findall("^([#>]) (.*)$", text, re.MULTILINE)))
+    thesis = re.sub(r"[*`]", "", first.get(">", ""))
+    seconds = time.monotonic() - begin
+    return Run(path.stem, first.get("#") or path.stem, thesis, seconds, error, notebook)
 
 
 def write_pages(out, session, runs, found, seconds):
-    """The pages of the notebooks and the first one, of what is in the report's folder.
+    """The pages and the findings of notebooks, of what is in the report's folder.
 
     Parameters
     ----------
@@ -410,6 +393,12 @@ def write_pages(out, session, runs, found, seconds):
             after=after,
         )
 
+    findings = [
+        {"notebook": run.name, **entry}
+        for run in runs
+        for entry in found[run.name]["findings"]
+    ]
+    (out / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
     main = first_screen.main_verdict(verdicts)
     _write_page(
@@ -423,7 +412,7 @@ def write_pages(out, session, runs, found, seconds):
         numbers=numbers,
         drawn=drawn,
         verdicts=verdicts,
-        told={entry["key"]: entry for run in runs for entry in found[run.name]["findings"]},
+        told={entry["key"]: entry for entry in findings},
         main=main,
         headline=first_screen.headline(out, main),
         handed=first_screen.handed_over(out / "calibration.json"),
@@ -435,12 +424,9 @@ def write_pages(out, session, runs, found, seconds):
 
 
 def _write_page(file, template, **values):
-    """Write a page made by a template, in which methods are called by their labels."""
-    jinja = page.TEMPLATES
-    jinja.filters["words"] = lambda text: METHOD.sub(
-        lambda m: label_of(m[0]), label_of(text)
-    )
-    file.write_text(jinja.get_template(template).render(**values), encoding="utf-8")
+    """Write a page made by a template."""
+    text = page.TEMPLATES.get_template(template).render(**values)
+    file.write_text(text, encoding="utf-8")
 
 
 def _provenance(session):
@@ -450,8 +436,6 @@ def _provenance(session):
     digest = hashlib.sha256((Path(session.path) / "session.json").read_bytes()).hexdigest()
     describe = [
         "git",
-        "-C",
-        str(ROOT),
         "describe",
         "--always",
         "--dirty",
@@ -459,15 +443,15 @@ def _provenance(session):
         "--exclude=*",
     ]
     try:
-        commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip()
+        git = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True)
+        commit = git.stdout.strip()
     except FileNotFoundError:
         commit = ""
     pairs = {
         "session.json (SHA-256)": digest,
         "date": date.today().isoformat(),
         "commit": commit,
-    }
-    pairs |= {"Python": platform.python_version()} | {
-        name: version(name) for name in PACKAGES
+        "Python": platform.python_version(),
+        **{name: version(name) for name in PACKAGES},
     }
     return [(name, value) for name, value in pairs.items() if value]

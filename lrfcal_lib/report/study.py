@@ -9,9 +9,13 @@ from lrfcal_lib.session.cluster import workers_at
 
 def study(args):
     """Compare methods on scenarios and write the table."""
-    scenarios = variations(args.scenarios, args.vary)
-    methods = args.methods or STUDIED
-    tasks = tasks_of(scenarios, methods, args.poses or COUNTS, args.trials, args.seed)
+    tasks = tasks_of(
+        variations(args.scenarios, args.vary),
+        args.methods or STUDIED,
+        args.poses or COUNTS,
+        args.trials,
+        args.seed,
+    )
     with (
         workers_at(args.scheduler) as executor,
         tqdm(total=len(tasks), desc="tasks", disable=None) as bar,
