@@ -68,7 +68,7 @@ ASSUMED_SPOT_RADIUS = 0.005
 
 def in_words(error):
     """The first mistake that pydantic found: where, value, what is needed."""
-    first = error.errors(include_url=False)[0]
+    first = error.errors()[0]
     where = ".".join(map(str, first["loc"])) or "it"
     kind = first["type"]
     if kind == "missing":
@@ -189,28 +189,18 @@ class LensStated(BaseModel):
     fy: Positive
     cx: FiniteFloat
     cy: FiniteFloat
-    distortion: Lens
-    covariance: tuple[(Row,) * 9] | None = None
+    distortion: Annotated[Lens, AfterValidator(np.array)]
+    covariance: Annotated[tuple[(Row,) * 9], AfterValidator(np.array)] | None = None
     rms_px: FiniteFloat | None = None
 
-    def made(self, width, height):
-        """As a CameraModel."""
-        pinhole = self.fx, self.fy, self.cx, self.cy
-        covariance = self.covariance and np.array(self.covariance)
-        return CameraModel(
-            width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px
-        )
 
-
-def model_to_json(model: CameraModel | None) -> dict | None:
+def model_to_json(model: CameraModel) -> dict:
     """Intrinsics as they stand in session.json.
 
     Parameters
     ----------
     model
     """
-    if model is None:
-        return None
     return plain({name: getattr(model, name) for name in LensStated.model_fields})
 
 
@@ -238,12 +228,14 @@ class BoardStated(BaseModel):
         tuple[EdgeName, ...], Field(fail_fast=True, min_length=3, max_length=MOST_CORNERS)
     ]
     features: tuple[str, str]
-    corners_m: Annotated[tuple[Pair, ...], Field(fail_fast=True)] | None
+    corners: Annotated[
+        Annotated[tuple[Pair, ...], Field(fail_fast=True), AfterValidator(np.array)] | None,
+        Field(alias="corners_m"),
+    ]
     pattern: Annotated[PatternStated, AfterValidator(PatternStated.made)] | None
 
     def made(self):
         """As a Board."""
-        corners = None
         if len(set(self.edges)) < len(self.edges):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
@@ -251,24 +243,22 @@ class BoardStated(BaseModel):
                 f"features must be two different edges of {short(self.edges)}, at a right angle; "
                 f"got {short(map(repr, filter(None, self.features)))}"
             )
-        if self.corners_m is not None:
-            corners = np.array(self.corners_m)
-            size = np.ptp(corners, axis=0).max()
-            if len(corners) != len(self.edges):
+        if self.corners is not None:
+            if len(self.corners) != len(self.edges):
                 raise ValueError(
                     f"corners_m must be one corner for each of {len(self.edges)} edges, got "
-                    f"{len(corners)}"
+                    f"{len(self.corners)}"
                 )
+            size = np.ptp(self.corners, axis=0).max()
             if size > LONGEST_BOARD:
                 raise ValueError(f"the board is {size:g} m large: {MILLIMETRES}")
-            self._hold_pattern(corners)
-        return Board(self.name, self.edges, corners, self.pattern, self.features)
+            if self.pattern is not None:
+                self._hold_pattern()
+        return Board(**dict(self))
 
-    def _hold_pattern(self, corners):
+    def _hold_pattern(self):
         """Refuse a pattern that does not fit on the board, farther than outlines are wrong."""
-        if self.pattern is None:
-            return
-        outline = corners.astype(np.float32)
+        outline = self.corners.astype(np.float32)
         for x, y, _ in self.pattern.points():
             beyond = -cv2.pointPolygonTest(outline, (x, y), True)
             if beyond > self.pattern.square / 4:
@@ -400,9 +390,9 @@ class LrfInfo:
         """
         if self.step_error is not None:
             return self.step_error
-        ratio = np.degrees(self.bearing_step) / SICK_STEPS
-        same = np.abs(ratio - 1).min() < SAME_STEP
-        if same and re.search("LMS|TiM", self.model):
+        step = np.degrees(self.bearing_step)
+        same = np.isclose(step, SICK_STEPS, rtol=SAME_STEP, atol=0)
+        if same.any() and re.search("LMS|TiM", self.model):
             return 0.0
         return ASSUMED_STEP_ERROR
 
@@ -438,18 +428,16 @@ def _few_pixels(height, info):
 
 
 def _lens(lens, info):
-    return lens and lens.made(info.data.get("width"), info.data.get("height"))
+    size = info.data.get("width"), info.data.get("height")
+    return CameraModel(*size, **dict(lens))
 
 
 if TYPE_CHECKING:
     Lens = CameraModel | None
 else:  # stated without the size of the image, which stands beside it
-    Lens = Annotated[
-        LensStated | None,
-        AfterValidator(_lens),
-        PlainSerializer(model_to_json),
-        Field(alias="intrinsics"),
-    ]
+    Lens = (
+        Annotated[LensStated, AfterValidator(_lens), PlainSerializer(model_to_json)] | None
+    )
 
 
 @plainly_typed
@@ -475,7 +463,7 @@ class CameraInfo:
     mount: Literal["head", "platform"]
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1), AfterValidator(_few_pixels)]
-    model: Lens = None
+    model: Annotated[Lens, Field(alias="intrinsics")] = None
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
 
@@ -568,15 +556,11 @@ def parse_session(data: dict, kind: type = SessionStated) -> dict:
     ValueError
         For a wrong one.
     """
-    found = dict(from_json(kind, data))
-    rig = dict(found.pop("rig"))
-    platform = rig.pop("platform")
-    return (
-        found
-        | rig
-        | {
-            "T_head_lrf": platform.T_head_lrf,
-            "platform_sigma": (platform.sigma_direction, platform.sigma_offset),
-            "continuous": platform.continuous,
-        }
-    )
+    facts = dict(from_json(kind, data))
+    facts.update(facts.pop("rig"))
+    platform = facts.pop("platform")
+    return facts | {
+        "T_head_lrf": platform.T_head_lrf,
+        "platform_sigma": (platform.sigma_direction, platform.sigma_offset),
+        "continuous": platform.continuous,
+    }
