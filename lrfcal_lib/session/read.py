@@ -183,11 +183,7 @@ def read_edges(path, facts, records):
 
 # radians from the first to the last quarter of a sweep; 0.006 deg, below the step of any head
 SMALLEST_MOVE = 1e-4
-# tables with times: columns, and those whose values rows share that follow each other in time
-TIMED = {
-    "lrf/index.csv": (INDEX_COLUMNS, ("placement",)),
-    "images.csv": (IMAGE_COLUMNS, ("camera", "placement", "purpose")),
-}
+TIMED = {"lrf/index.csv": INDEX_COLUMNS, "images.csv": IMAGE_COLUMNS}  # tables with times
 
 
 @dataclass(frozen=True)
@@ -285,23 +281,14 @@ class Session:
                 f"{self.path}: no placement {placement}; the session has {short(self.placements)}"
             )
         rows = self.scans["placement"] == placement
-        ranges = self.scans["ranges"][rows]
-        if not np.isfinite(ranges).any():
+        of_lines = self.scans.keys() - {"placement", "bearings"}
+        lines = {key: self.scans[key][rows] for key in of_lines}
+        if not np.isfinite(lines["ranges"]).any():
             raise SessionError(
                 f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in "
                 "them"
             )
-        intensities = self.scans.get("intensities")
-        if intensities is not None:
-            intensities = intensities[rows]
-        return Sweep(
-            placement=int(placement),
-            ranges=ranges,
-            bearings=self.scans["bearings"],
-            pitch=self.scans["pitch"][rows],
-            time_s=self.scans["time_s"][rows],
-            intensities=intensities,
-        )
+        return Sweep(int(placement), bearings=self.scans["bearings"], **lines)
 
     def images(
         self,
@@ -318,10 +305,12 @@ class Session:
         purpose
             'board', 'intrinsics' or 'scene'.
         """
-        asked = {"camera": camera, "placement": placement, "purpose": purpose}
-        asked = {key: value for key, value in asked.items() if value is not None}
         return tuple(
-            record for record in self.image_records if asked.items() <= vars(record).items()
+            record
+            for record in self.image_records
+            if camera in (None, record.camera)
+            and placement in (None, record.placement)
+            and purpose in (None, record.purpose)
         )
 
     def read_image(self, record: ImageRecord) -> np.ndarray:
@@ -461,7 +450,7 @@ def validate(path: str | os.PathLike) -> list[str]:
 
 def _times_back(session):
     """Sentences about times that run back between rows, as where two write at once."""
-    for name, (columns, group) in TIMED.items():
+    for name, columns in TIMED.items():
         file = session.path / name
         if not os.path.lexists(file):
             continue
@@ -477,10 +466,11 @@ def _times_back(session):
             ):  # of a placement that was not finished: nobody else looks at it
                 yield f"{file} line {line}: t_s is {row['t_s']!r}: a number of seconds is needed"
                 continue
-            values = tuple(map(row.get, group))
-            if time < last.get(values, -math.inf):
+            # rows that share these follow each other in time
+            group = tuple(map(row.get, ("camera", "placement", "purpose")))
+            if time < last.get(group, -math.inf):
                 yield (
-                    f"{file} line {line}: t_s runs back from {last[values]:.9g} to {time:.9g}: two "
+                    f"{file} line {line}: t_s runs back from {last[group]:.9g} to {time:.9g}: two "
                     "writers at once? Record the placement again"
                 )
-            last[values] = time
+            last[group] = time

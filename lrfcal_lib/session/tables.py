@@ -48,16 +48,17 @@ def read_table(
                 "in pandas)"
             )
         raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
+    table = []
     for number, row in enumerate(rows[1:], start=2):
         if len(row) != len(columns):
             raise SessionError(
                 f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?"
             )
-    table = [dict(zip(columns, row, strict=True)) for row in rows[1:]]
-    for cells in table:
+        cells = dict(zip(columns, row, strict=True))
         for key in WHOLE_COLUMNS & cells.keys():
             # programs write whole numbers beside empty cells as 1.0
             cells[key] = cells[key].removesuffix(".0")
+        table.append(cells)
     return table, cut
 
 
