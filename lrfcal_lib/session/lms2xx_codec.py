@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lrfcal_lib.session.files import short
 from lrfcal_lib.session.lms2xx_frame import (
     DEVICE,
     TelegramError,
@@ -284,9 +285,9 @@ def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
             f"partial scan {partial} has {181 - (partial > 0)} values, got {values}"
         )
     if partial < 0 and values not in GRIDS:
-        known = ", ".join(map(str, sorted(GRIDS)))
         raise TelegramError(
-            f"a whole scan has {known} values, got {values}: only a sub-range was asked for?"
+            f"a whole scan has {short(sorted(GRIDS))} values, got {values}: only a sub-range was "
+            "asked for?"
         )
     first, step = GRIDS[values] if partial < 0 else (partial, 4)
     return first + step * np.arange(values)

@@ -15,9 +15,10 @@ from lrfcal_lib.session.files import (
     short,
 )
 from lrfcal_lib.session.lms2xx_frame import OVERHEAD, TelegramError, are_sound
-from lrfcal_lib.session.tables import read_table, whole_number
+from lrfcal_lib.session.tables import WHOLE_COLUMNS, read_table, whole_number
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
+INDEX = [(name, int if name in WHOLE_COLUMNS else float) for name in INDEX_COLUMNS]
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
 SCANNED, OTHER, WRONG, TRUNCATED = range(4)
 LONGEST = OVERHEAD + 0xFFFF  # bytes of a telegram
@@ -44,19 +45,6 @@ class TelegramLog:
     outcome: np.ndarray
     values: np.ndarray
     problems: tuple[str, ...]
-
-
-# where telegrams are in their file, and what is known of each: time NaN where unknown, placement -1
-# for none, pitch in radians
-INDEX = np.dtype(
-    [
-        ("time_s", float),
-        ("offset", int),
-        ("length", int),
-        ("placement", int),
-        ("pitch", float),
-    ]
-)
 
 
 def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], TelegramLog]:
@@ -127,13 +115,14 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
 
 
 def _index(rows):
-    """The rows of index.csv as an array of INDEX."""
+    """The rows of index.csv as an array of INDEX: NaN for no time or pitch, -1 for no placement."""
     index = np.recarray(len(rows), INDEX)
     for at, row in enumerate(rows):
-        for key in ("offset", "length", "placement"):
-            index[key][at] = whole_number(row[key], f"line {at + 2}: {key}")
-        index.time_s[at] = row["t_s"] or "nan"
-        index.pitch[at] = np.radians(float(row["pitch_deg"] or "nan"))
+        for key, cell in row.items():
+            if key in WHOLE_COLUMNS:
+                index[key][at] = whole_number(cell, f"line {at + 2}: {key}")
+            else:
+                index[key][at] = cell or np.nan
     return index
 
 
@@ -156,7 +145,7 @@ def _check_index(index, size, file):
     ends = (index.offset + index.length)[:-1]
     absurd = (index.length < 7) | (index.length > LONGEST) | (index.offset > LARGEST_FILE)
     absurd |= index.offset < np.r_[0, ends]
-    blind = (index.placement >= 0) & ~np.isfinite(index.pitch)
+    blind = (index.placement >= 0) & ~np.isfinite(index.pitch_deg)
     for wrong, words in (
         (
             absurd,
@@ -214,20 +203,21 @@ def _lines(groups, index):
             f"scans of {short(counts)} values are mixed: a session holds one variant, "
             "split the recording"
         )
-    # which quarter of a degree the scan is turned by; -1 a whole scan, -2 no scan
+    # the quarter of a degree that a scan is turned by, -1 for a whole one, -2 for no scan
     partial = np.full(len(index), -2)
-    # of the scan, as the device counts; -1 where it does not
-    number = np.full(len(index), -2)
+    number = np.full(
+        len(index), -1
+    )  # of the scan, as the device counts; -1 where it does not
     for group in groups:
         partial[group.rows] = group.partial
         number[group.rows] = group.telegram_index
     rows = np.flatnonzero((partial > -2) & placed)
     begins = np.r_[True, ~_goes_on(partial[rows], number[rows], index[rows])]
+    first = index[rows[begins]]
     line = np.full(len(index), -1)
     line[rows] = np.cumsum(begins) - 1
 
     quarters = np.unique(np.concatenate(grids))
-    first = index[rows[begins]]
     check_amount(len(first) * len(quarters))
     # scans of no placement, line -1, go into one more that is left out
     ranges = np.full((len(first) + 1, len(quarters)), np.nan)
@@ -237,9 +227,9 @@ def _lines(groups, index):
     return {
         "ranges": ranges[:-1],
         "bearings": np.radians(quarters / 4),
-        "time_s": np.bincount(line[rows], index.time_s[rows]) / np.bincount(line[rows]),
+        "time_s": np.bincount(line[rows], index.t_s[rows]) / np.bincount(line[rows]),
         "placement": first.placement,
-        "pitch": first.pitch,
+        "pitch": np.radians(first.pitch_deg),
     }
 
 
@@ -247,16 +237,16 @@ def _goes_on(partial, number, scans):
     """Whether each scan but the first goes on with the line of the one before, shape (n - 1,)."""
     step = np.diff(partial)
     rises = (partial[:-1] >= 0) & (step > 0)
-    stays = (np.diff(scans.placement) == 0) & (np.diff(scans.pitch) == 0)
+    stays = (np.diff(scans.placement) == 0) & (np.diff(scans.pitch_deg) == 0)
     return rises & stays & ((number[1:] < 0) | (np.diff(number) % 256 == step))
 
 
 def _damage(index, outcome, size):
     """Sentences about telegrams that could not be used."""
-    wrong = index.offset[outcome == WRONG].tolist()
-    last = int(index.offset[-1])
-    tail = size - last - int(index.length[-1])
-    if wrong:
+    wrong = index.offset[outcome == WRONG]
+    last = index.offset[-1]
+    tail = size - last - index.length[-1]
+    if len(wrong):
         yield (
             f"{len(wrong)} of {len(outcome)} telegrams have a wrong CRC, left out, at "
             f"{short(wrong)}"
