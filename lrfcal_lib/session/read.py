@@ -114,9 +114,8 @@ def once(lines, number, *values):
     """ValueError for values that stand in an earlier line of a table already."""
     first = lines.setdefault(values, number)
     if first < number:
-        text = ", ".join(map(str, values))
         raise ValueError(
-            f"{text} stands in line {first} already; remove one of the two rows"
+            f"{short(values)} stands in line {first} already; remove one of the two rows"
         )
 
 
@@ -128,12 +127,11 @@ def read_images(path, facts, unfinished):
     """
     file = path / "images.csv"
     cameras = facts["cameras"]
-    if not cameras and not os.path.lexists(file):
-        return ()
     out = []
     lines = {}  # in which each file stands
     skipped = {str(placement) for placement in unfinished or ()}
-    rows = read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
+    torn = unfinished is not None
+    rows = read_table(file, IMAGE_COLUMNS, path, torn, needed=bool(cameras))[0]
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
             continue
@@ -157,12 +155,11 @@ def read_images(path, facts, unfinished):
 def read_edges(path, facts, records):
     """The picks of edges.csv, if there is one, for images and edges that the session knows."""
     file = path / "edges.csv"
-    if not os.path.lexists(file):
-        return ()
     out = []
     lines = {}  # in which each edge of an image stands
     images = {(record.camera, record.file) for record in records}
-    for number, row in enumerate(read_table(file, EDGE_COLUMNS, path)[0], start=2):
+    rows = read_table(file, EDGE_COLUMNS, path, needed=False)[0]
+    for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
             if (row["camera"], target) not in images:
@@ -172,7 +169,7 @@ def read_edges(path, facts, records):
             edge = known(row["edge"], facts["board"].edges, "edge")
             once(lines, number, row["camera"], target, edge)
             ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
-            if not np.linalg.norm(ends[1] - ends[0]) >= CLOSEST or np.isinf(ends).any():
+            if not CLOSEST <= np.linalg.norm(ends[1] - ends[0]) < math.inf:
                 raise ValueError(
                     f"the two pixels {ends.tolist()} give no direction: pick two that are "
                     f"{CLOSEST} or more pixels apart"
@@ -260,9 +257,10 @@ class Session:
     continuous: bool = False
 
     def __repr__(self):
-        cameras = ", ".join(self.cameras) or "none"
-        boards = f"{len(self.board_placements)} placements of {self.board.name}"
-        return f"Session({self.name}: {boards}, LRF {self.lrf.model}, cameras {cameras})"
+        return (
+            f"Session({self.name}: {len(self.board_placements)} placements of {self.board.name}, "
+            f"LRF {self.lrf.model}, cameras {short(self.cameras)})"
+        )
 
     def sweep(self, placement: int) -> Sweep:
         """The scan lines of a placement.
@@ -281,14 +279,23 @@ class Session:
                 f"{self.path}: no placement {placement}; the session has {short(self.placements)}"
             )
         rows = self.scans["placement"] == placement
-        of_lines = self.scans.keys() - {"placement", "bearings"}
-        lines = {key: self.scans[key][rows] for key in of_lines}
-        if not np.isfinite(lines["ranges"]).any():
+        ranges = self.scans["ranges"][rows]
+        if not np.isfinite(ranges).any():
             raise SessionError(
                 f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in "
                 "them"
             )
-        return Sweep(int(placement), bearings=self.scans["bearings"], **lines)
+        intensities = self.scans.get("intensities")
+        if intensities is not None:
+            intensities = intensities[rows]
+        return Sweep(
+            placement=int(placement),
+            ranges=ranges,
+            bearings=self.scans["bearings"],
+            pitch=self.scans["pitch"][rows],
+            time_s=self.scans["time_s"][rows],
+            intensities=intensities,
+        )
 
     def images(
         self,
@@ -452,10 +459,8 @@ def _times_back(session):
     """Sentences about times that run back between rows, as where two write at once."""
     for name, columns in TIMED.items():
         file = session.path / name
-        if not os.path.lexists(file):
-            continue
         last = {}
-        rows = read_table(file, columns, session.path, torn=True)[0]
+        rows = read_table(file, columns, session.path, torn=True, needed=False)[0]
         for line, row in enumerate(rows, start=2):
             if not row["t_s"] or not row["placement"] or row.get("purpose") == DROPPED:
                 continue

@@ -1,6 +1,7 @@
 """Tables of a session: CSV files with given columns."""
 
 import csv
+import os
 from os import PathLike
 from pathlib import Path
 
@@ -11,7 +12,11 @@ WHOLE_COLUMNS = {"placement", "offset", "length"}  # of tables, which hold whole
 
 
 def read_table(
-    file: Path, columns: tuple[str, ...], within: str | PathLike, torn: bool = False
+    file: Path,
+    columns: tuple[str, ...],
+    within: str | PathLike,
+    torn: bool = False,
+    needed: bool = True,
 ) -> tuple[list[dict[str, str]], bool]:
     """Rows of a CSV file with exactly these columns, and whether one was left out.
 
@@ -23,12 +28,16 @@ def read_table(
         The session's folder.
     torn
         A last row without its line end (cut off by a crash) is left out.
+    needed
+        Otherwise a file that is not there has no rows.
 
     Raises
     ------
     SessionError
         For other columns, rows of other lengths, or too many.
     """
+    if not needed and not os.path.lexists(file):
+        return [], False
     data = read_bytes(file, within, LARGEST_TEXT)
     with reading(file, "not a CSV file in UTF-8 ({})"):
         text = data.decode()
