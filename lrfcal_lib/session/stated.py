@@ -124,7 +124,6 @@ def refused(wrong, words):
 
 
 NOT_PLAIN = "this becomes a file name: letters, digits, '_', '-' and '.' only"
-TWICE = "placements are different numbers"
 NOT_SHOWN = "names of edges stand in figures: no line ends, no '$' (a formula)"
 Name = Annotated[
     str,
@@ -283,8 +282,15 @@ def board_to_json(board: Board) -> dict:
         "square_m": board.pattern.square,
         "origin_m": board.pattern.origin,
     }
-    stated = {"name": board.name, "edges": board.edges, "features": board.features}
-    return plain(stated | {"corners_m": board.corners, "pattern": pattern})
+    return plain(
+        {
+            "name": board.name,
+            "edges": board.edges,
+            "features": board.features,
+            "corners_m": board.corners,
+            "pattern": pattern,
+        }
+    )
 
 
 def board_from_json(data: dict) -> Board:
@@ -322,8 +328,7 @@ Endless = Annotated[
 
 def plainly_typed(kind: type) -> type:
     """A record whose help shows plain types, without the limits that pydantic reads."""
-    plain_types = get_type_hints(kind)
-    kind.__init__.__annotations__ = plain_types | {"return": None}
+    kind.__init__.__annotations__ = get_type_hints(kind) | {"return": None}
     return kind
 
 
@@ -428,8 +433,7 @@ def _few_pixels(height, info):
 
 
 def _lens(lens, info):
-    size = info.data.get("width"), info.data.get("height")
-    return CameraModel(*size, **dict(lens))
+    return CameraModel(info.data.get("width"), info.data.get("height"), **dict(lens))
 
 
 if TYPE_CHECKING:
@@ -467,24 +471,18 @@ class CameraInfo:
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
 
-def camera_to_json(camera: CameraInfo) -> dict:
-    """A camera as it stands in session.json.
-
-    Parameters
-    ----------
-    camera
-    """
-    return adapter(CameraInfo).dump_python(camera, by_alias=True)
-
-
-def platform_to_json(
-    T_head_lrf: RigidTransform | None, sigma: tuple[float, float] | None, continuous: bool
+def rig_to_json(
+    lrf: LrfInfo,
+    T_head_lrf: RigidTransform | None,
+    cameras: dict[str, CameraInfo],
+    sigma: tuple[float, float] | None = None,
+    continuous: bool = False,
 ) -> dict:
-    """A platform as it stands in session.json.
+    """A rig as it stands in session.json.
 
     Parameters
     ----------
-    T_head_lrf, sigma, continuous
+    lrf, T_head_lrf, cameras, sigma, continuous
         Fields of a Session; sigma is `platform_sigma`, radians and metres.
     """
     platform: dict[str, Any] = {"T_head_lrf": transform_to_json(T_head_lrf)}
@@ -494,7 +492,11 @@ def platform_to_json(
         platform["sigma_offset_m"] = offset
     if continuous:
         platform["continuous"] = True
-    return platform
+    return {
+        "lrf": lrf_to_json(lrf),
+        "platform": platform,
+        "cameras": adapter(dict[str, CameraInfo]).dump_python(cameras, by_alias=True),
+    }
 
 
 def _with_names(cameras):
@@ -535,7 +537,7 @@ class SessionStated(BaseModel):
     placements: Annotated[
         tuple[Whole, ...],
         Field(fail_fast=True),
-        refused(lambda p: len(set(p)) < len(p), TWICE),
+        refused(lambda p: len(set(p)) < len(p), "placements are different numbers"),
     ]
     reference: dict = {}
     unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None
