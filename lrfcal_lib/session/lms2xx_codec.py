@@ -32,8 +32,8 @@ REASONS = (
     "reserved",
 )
 BEYOND = REASONS.index("larger than maximum")
-# by how far a value is below the largest one its bits can hold
-REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND])
+# by how far a value is below the largest one its bits can hold; nine and more are ranges
+REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND, 0], np.uint8)
 # Largest number that the range bits of a value hold, by measuring mode. The bits above are flags:
 # in modes 0, 2, 4 and 6 hits of the fields A, B and C (0: A, B, dazzled), in the others the level
 # of a reflector.
@@ -48,18 +48,17 @@ def largest(mode: int) -> int:
     mode
         Key of `TOP`.
     """
-    return TOP[mode] - len(REASON_BELOW_TOP)
+    return TOP[mode] - len(REASON_BELOW_TOP) + 1
 
 
 @lru_cache
 def meanings(mode, unit):
     """What each of the 65536 values means: ranges (metres) and reasons why there is none."""
     counts = np.arange(1 << 16) & TOP[mode]
-    special = counts > largest(mode)
-    reasons = np.zeros(len(counts), np.uint8)
-    reasons[special] = REASON_BELOW_TOP[TOP[mode] - counts[special]]
+    reasons = REASON_BELOW_TOP.take(TOP[mode] - counts, mode="clip")
     ranges = counts * METRES[unit]
-    ranges[special] = np.where(reasons[special] == BEYOND, np.inf, np.nan)
+    ranges[reasons > 0] = np.nan
+    ranges[reasons == BEYOND] = np.inf
     return ranges, reasons
 
 
@@ -280,17 +279,20 @@ def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
     TelegramError
         If no variant sends that many.
     """
-    if partial >= 0 and values != 181 - (partial > 0):
+    if partial < 0:
+        if values not in GRIDS:
+            raise TelegramError(
+                f"a whole scan has {short(sorted(GRIDS))} values, got {values}: only a sub-range "
+                "was asked for?"
+            )
+        first, step = GRIDS[values]
+        return first + step * np.arange(values)
+    quarters = np.arange(partial, 721, 4)
+    if len(quarters) != values:
         raise TelegramError(
-            f"partial scan {partial} has {181 - (partial > 0)} values, got {values}"
+            f"partial scan {partial} has {len(quarters)} values, got {values}"
         )
-    if partial < 0 and values not in GRIDS:
-        raise TelegramError(
-            f"a whole scan has {short(sorted(GRIDS))} values, got {values}: only a sub-range was "
-            "asked for?"
-        )
-    first, step = GRIDS[values] if partial < 0 else (partial, 4)
-    return first + step * np.arange(values)
+    return quarters
 
 
 STATUS = 0xB1

@@ -157,7 +157,7 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
     plausible = (length > OVERHEAD) & (length <= LONGEST)
     offset = offset[plausible]
     length = length[plausible]
-    whole = offset + length <= len(raw)
+    complete = offset + length <= len(raw)
     good = are_sound(raw, offset, length)
 
     sound = []
@@ -171,7 +171,7 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
             sound.append(row)
             free = begin + int(length[row])
             begun = []
-        elif whole[row]:
+        elif complete[row]:
             rejected.append(begin)
         else:
             begun.append(begin)
