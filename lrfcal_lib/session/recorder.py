@@ -171,13 +171,12 @@ class SessionRecorder(SessionWriter):
     def _mark_dropped(self, placement):
         """Mark the rows of a placement in the tables that there are."""
         for name, columns in read.TIMED.items():
-            if not os.path.lexists(self.path / name):
-                continue
-            rows = read_table(self.path / name, columns, self.path)[0]
+            rows = read_table(self.path / name, columns, self.path, needed=False)[0]
             for row in rows:
                 if row["placement"] == str(placement):
                     row.update(MARKS[name])
-            self._write(name, as_lines([columns, *(row.values() for row in rows)]))
+            if rows:
+                self._write(name, as_lines([columns, *(row.values() for row in rows)]))
 
 
 def _first_difference(old, new, where):
