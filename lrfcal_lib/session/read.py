@@ -129,7 +129,7 @@ def read_images(path, facts, unfinished):
     cameras = facts["cameras"]
     out = []
     lines = {}  # in which each file stands
-    skipped = {str(placement) for placement in unfinished or ()}
+    skipped = set(map(str, unfinished or ()))
     torn = unfinished is not None
     rows = read_table(file, IMAGE_COLUMNS, path, torn, needed=bool(cameras))[0]
     for number, row in enumerate(rows, start=2):

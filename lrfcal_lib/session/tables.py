@@ -47,18 +47,17 @@ def read_table(
             raise SessionError(
                 f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}"
             )
-        rows = list(csv.reader(lines))
-    header = tuple(rows[0]) if rows else ("an empty file",)
-    if header != columns:
+        header, *rows = list(csv.reader(lines)) or [["an empty file"]]
+    if header != [*columns]:
         got = ", ".join(header)
-        if header == ("", *columns):
+        if header == ["", *columns]:
             got = (
                 "a first column without a name: write the table without row numbers (index=False "
                 "in pandas)"
             )
         raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
     table = []
-    for number, row in enumerate(rows[1:], start=2):
+    for number, row in enumerate(rows, start=2):
         if len(row) != len(columns):
             raise SessionError(
                 f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?"
