@@ -214,9 +214,8 @@ def decode_scans(
     -------
     list of Scans
         One for each number of values, mode, unit, and kind (whole or a part, with indices or
-        without).
-        Telegrams with another code, or with a length that does not fit the number of values, are in
-        none of them.
+        without). Telegrams with another code, or with a length that does not fit the number of
+        values, are in none of them.
     """
     modes = np.broadcast_to(mode, len(offset))
     for other in set(modes.tolist()) - TOP.keys():  # sends no range with special values

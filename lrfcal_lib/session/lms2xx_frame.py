@@ -169,7 +169,7 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
             continue
         if good[row]:
             sound.append(row)
-            free = begin + int(length[row])
+            free = begin + length[row]
             begun = []
         elif complete[row]:
             rejected.append(begin)
