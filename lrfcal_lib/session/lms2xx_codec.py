@@ -243,7 +243,7 @@ def decode_scans(
         indices = np.full((len(chosen), 2), -1)
         if extra:
             indices[:] = cut(data, begin + size, 2)
-        number = int(modes[chosen[0]])
+        number = modes[chosen[0]]
         ranges = meanings(number, unit)[0][words]
         scans.append(Scans(chosen, words, ranges, unit, number, partial, *indices.T))
     return scans

@@ -215,4 +215,4 @@ def alike(*keys):
 
 def cut(data, offset, length):
     """Pieces of the same length, shape (n, length)."""
-    return np.lib.stride_tricks.sliding_window_view(data, int(length))[offset]
+    return np.lib.stride_tricks.sliding_window_view(data, length)[offset]
