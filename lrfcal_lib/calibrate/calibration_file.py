@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, FiniteFloat, PlainValidator
+from pydantic import BaseModel, Field, FiniteFloat, PlainValidator
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
@@ -15,7 +15,7 @@ from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import LrfInfo, from_json, plain
+from lrfcal_lib.session.stated import Endless, LensStated, LrfInfo, from_json, plain
 
 SCHEMA = 3
 KIND = "lrfcal calibration"
@@ -74,9 +74,6 @@ def _pose(matrix):
 
 
 Pose = Annotated[RigidTransform, PlainValidator(_pose)]
-Endless = Annotated[
-    float, BeforeValidator(lambda value: np.inf if value is None else value)
-]
 
 
 class PlatformWritten(BaseModel):
@@ -86,18 +83,11 @@ class PlatformWritten(BaseModel):
     axis_covariance: Annotated[np.ndarray, rows(4, 4)]
 
 
-class LensWritten(BaseModel):
+class LensWritten(LensStated):
     """What ``CameraModel(**lens)`` takes."""
 
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
-    fx: Annotated[FiniteFloat, Field(gt=0)]
-    fy: Annotated[FiniteFloat, Field(gt=0)]
-    cx: FiniteFloat
-    cy: FiniteFloat
-    distortion: Annotated[np.ndarray, rows(5)]
-    covariance: Annotated[np.ndarray, rows(9, 9)] | None
-    rms_px: FiniteFloat | None
 
 
 class CameraWritten(BaseModel):

@@ -146,11 +146,9 @@ class EmulatedRig:
             "simulated": True,
             "source": f"emulated rig of the setup '{setup.name}', seed {setup.seed}",
             "board": stated.board_to_json(rig.board),
-            "rig": {
-                "lrf": stated.lrf_to_json(rig.beam.info("emulated")),
-                "platform": {"T_head_lrf": stated.transform_to_json(rig.T_head_lrf_stated)},
-                "cameras": {name: stated.camera_to_json(c) for name, c in cameras.items()},
-            },
+            "rig": stated.rig_to_json(
+                rig.beam.info("emulated"), rig.T_head_lrf_stated, cameras
+            ),
             "devices": self._devices(cameras),
             "plan": self.plan(),
         }

@@ -12,7 +12,6 @@ import fcntl
 import hashlib
 import os
 import pickle
-import stat
 from functools import wraps
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -85,20 +84,22 @@ def _refuse_shared(folder):
     _refuse_others(folder, folder.stat())
     for above in folder.resolve().parents:
         mode = above.stat().st_mode
-        if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
-            may = f"others may rename what is in '{above}' (mode {mode & 0o7777:o})"
-            raise ValueError(f"{VARIABLE}: {may}, {REMEDY}")
+        if mode & 0o1002 == 0o0002:  # all may write, and not only to what is theirs
+            raise ValueError(
+                f"{VARIABLE}: others may rename what is in '{above}' (mode {mode & 0o7777:o}), "
+                f"{REMEDY}"
+            )
 
 
 def _refuse_others(place, status):
     """Refuse what is somebody else's, but for root's, or what somebody else may write to."""
     if status.st_uid not in (os.geteuid(), 0) or status.st_mode & 0o022:
-        mode = f"{status.st_mode & 0o7777:o}"
-        may = f"others may write to '{place}' (owner {status.st_uid}, mode {mode})"
-        raise ValueError(f"{VARIABLE}: {may}, {REMEDY}")
+        raise ValueError(
+            f"{VARIABLE}: others may write to '{place}' (owner {status.st_uid}, mode "
+            f"{status.st_mode & 0o7777:o}), {REMEDY}"
+        )
 
 
 def library():
     """What stands for this library and those it works out its results with."""
-    versions = (module.__version__ for module in (np, scipy, cv2))
-    return "".join((source_digest(), *versions)).encode()
+    return f"{source_digest()}{np.__version__}{scipy.__version__}{cv2.__version__}".encode()

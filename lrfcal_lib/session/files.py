@@ -76,7 +76,7 @@ def opened(
             raise SessionError(
                 f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}"
             )
-    inner = os.open(file, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    inner = os.open(file, flags | os.O_NONBLOCK, 0o666)
     mode = "rb"
     if writes:
         mode = "r+b" if flags & os.O_RDWR else "wb"
@@ -209,7 +209,7 @@ def check_amount(values: int) -> None:
 
 def short(values: Iterable) -> str:
     """Values as text for a message, the middle of long lists left out."""
-    words = [str(value) for value in values]
+    words = list(map(str, values))
     if len(words) > 12:
         words[6:-3] = ["..."]
     return ", ".join(words) or "none"

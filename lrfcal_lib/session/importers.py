@@ -1,7 +1,6 @@
 """Other people's recordings as sessions."""
 
 import re
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
@@ -37,10 +36,11 @@ LASERSETERO_PLATFORM_SIGMA = (np.radians(0.1), 0.005)
 STEP_DEG = 0.1
 FIRST = 550
 LAST = 1250
+BEARINGS = np.radians(STEP_DEG * np.arange(FIRST, LAST + 1))
 COUNT = 0.001  # metres, one count of the LMS400
 LRF = LrfInfo(
     model="SICK LMS400",
-    field_of_view=tuple(np.radians([FIRST * STEP_DEG, LAST * STEP_DEG])),
+    field_of_view=(BEARINGS[0], BEARINGS[-1]),
     bearing_step=np.radians(STEP_DEG),
     sigma_range=0.005,
     range_resolution=COUNT,
@@ -77,28 +77,6 @@ LARGEST_MISS = 1e-5
 KEYS = {"fc": 2, "cc": 2, "kc": 5}
 
 
-@dataclass(frozen=True)
-class Recovered:
-    """What the published points of a cloud were made of.
-
-    Attributes
-    ----------
-    ranges : ndarray, shape (L, B)
-        Metres on the sensor's grid of 1 mm, NaN outside the published part.
-    bearings : ndarray, shape (B,)
-        Ours, radians, in steps of 0.1 deg.
-    pitch : ndarray, shape (L,)
-        Radians.
-    miss : float
-        Largest distance between published and rebuilt points, metres.
-    """
-
-    ranges: np.ndarray
-    bearings: np.ndarray
-    pitch: np.ndarray
-    miss: float
-
-
 def import_lasersetero(src: str | PathLike, dst: str | PathLike) -> float:
     """Make a session of the public LMS400 + ZED recording.
 
@@ -133,8 +111,8 @@ def import_lasersetero(src: str | PathLike, dst: str | PathLike) -> float:
         published[name] = read_bouguet(Path(src) / f"Calib_Results_{name}.m")
         images[name] = numbered(src, f"{name}_*.png")
         first = next(iter(images[name].values()))
-        width, height = image_size(first, read_bytes(first))
-        cameras.append(CameraInfo(name, "platform", width, height))
+        size = image_size(first, read_bytes(first))
+        cameras.append(CameraInfo(name, "platform", *size))
     reference = {
         "note": NOTE,
         "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
@@ -155,12 +133,12 @@ def import_lasersetero(src: str | PathLike, dst: str | PathLike) -> float:
         platform_sigma=LASERSETERO_PLATFORM_SIGMA,
     ) as writer:
         for placement, file in clouds.items():
-            sweep = recover_polar(read_pcd(file), file)
-            values += sweep.ranges.size
+            ranges, pitch, miss = recover_polar(read_pcd(file), file)
+            values += ranges.size
             with naming(file):
                 check_amount(values)
-            writer.add_sweep(placement, sweep.ranges, sweep.bearings, sweep.pitch)
-            misses.append(sweep.miss)
+            writer.add_sweep(placement, ranges, BEARINGS, pitch)
+            misses.append(miss)
         for name, files in images.items():
             for placement, file in files.items():
                 writer.add_image(name, file, placement)
@@ -181,8 +159,10 @@ def numbered(folder, pattern):
     return files
 
 
-def recover_polar(points: np.ndarray, name: str | PathLike = "points") -> Recovered:
-    """Range, bearing and pitch that the published points of a LaserSetero cloud were made of.
+def recover_polar(
+    points: np.ndarray, name: str | PathLike
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Ranges and pitch that the published points of a LaserSetero cloud were made of.
 
     Parameters
     ----------
@@ -190,6 +170,16 @@ def recover_polar(points: np.ndarray, name: str | PathLike = "points") -> Recove
         Authors' cloud frame, metres, in the order of acquisition, shape (n, 3).
     name
         For messages.
+
+    Returns
+    -------
+    ranges : ndarray, shape (L, B)
+        Metres on the sensor's grid of 1 mm at the bearings `BEARINGS`, NaN outside the published
+        part.
+    pitch : ndarray, shape (L,)
+        Radians.
+    miss : float
+        Largest distance between published and rebuilt points, metres.
 
     Raises
     ------
@@ -202,22 +192,24 @@ def recover_polar(points: np.ndarray, name: str | PathLike = "points") -> Recove
     authors' angle, ``y + i z = (n - i S) exp(i p)``: the modulus gives S, the argument p. A new
     scan line starts where the bearing restarts or the pitch jumps.
     """
-    x, ahead, offset = LASERSETERO_HEAD.translation
+    side, ahead, offset = LASERSETERO_HEAD.translation
     p_platform = LASERSETERO_CLOUD.inv().apply(points)
-    S = np.sqrt(np.maximum(np.sum(p_platform[:, 1:] ** 2, axis=1) - offset**2, 0.0))
-    across = p_platform[:, 0] - x
-    along = S - ahead
+    x, y, z = p_platform.T
+    across = x - side
+    along = np.sqrt(np.maximum(y**2 + z**2 - offset**2, 0.0)) - ahead
     ranges = np.round(np.hypot(across, along) / COUNT) * COUNT
-    steps = np.round(
-        np.degrees(np.arctan2(along, across)) / STEP_DEG
-    )  # 0.1 deg, so no .5 to round
-    bearing = np.radians(steps * STEP_DEG)
+    # 0.1 deg, so no .5 to round
+    steps = np.round(np.degrees(np.arctan2(along, across)) / STEP_DEG).astype(int)
+    if steps.min() < FIRST or steps.max() > LAST:
+        raise SessionError(
+            f"{name}: bearings reach {STEP_DEG * steps.min():.1f} .. "
+            f"{STEP_DEG * steps.max():.1f} deg, the LMS400 sees 55 .. 125 deg"
+        )
+    bearing = BEARINGS[steps - FIRST]
     # Once more with the exact range and bearing: now the pitch carries the rounding of the
     # published points only.
     S = ranges * np.sin(bearing) + ahead
-    pitch = (
-        np.arctan2(p_platform[:, 2], p_platform[:, 1]) + np.arctan2(S, offset) - np.pi / 2
-    )
+    pitch = np.arctan2(z, y) + np.arctan2(S, offset) - np.pi / 2
     restarts = np.diff(steps) >= 0
     jumps = np.abs(np.diff(pitch)) > LINE_JUMP
     line = np.cumsum(np.r_[True, restarts | jumps]) - 1
@@ -232,17 +224,12 @@ def recover_polar(points: np.ndarray, name: str | PathLike = "points") -> Recove
             f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, more than "
             f"{1000 * LARGEST_MISS:g} mm; not points of this rig?"
         )
-    if steps.min() < FIRST or steps.max() > LAST:
-        raise SessionError(
-            f"{name}: bearings reach {STEP_DEG * steps.min():.1f} .. "
-            f"{STEP_DEG * steps.max():.1f} deg, the LMS400 sees 55 .. 125 deg"
-        )
-    grid = np.arange(FIRST, LAST + 1)
     with naming(name):
-        check_amount(len(pitch) * len(grid))  # scan lines of few points are long as well
-    on_grid = np.full((len(pitch), len(grid)), np.nan)
-    on_grid[line, steps.astype(int) - FIRST] = ranges
-    return Recovered(on_grid, np.radians(grid * STEP_DEG), pitch, miss)
+        # scan lines of few points are long as well
+        check_amount(len(pitch) * len(BEARINGS))
+    on_grid = np.full((len(pitch), len(BEARINGS)), np.nan)
+    on_grid[line, steps - FIRST] = ranges
+    return on_grid, pitch, miss
 
 
 def source_text(file):
@@ -276,8 +263,7 @@ def read_bouguet(file: str | PathLike) -> dict:
     """Intrinsics of a ``Calib_Results.m`` of Bouguet's toolbox, as JSON has them; SessionError if
     something is missing.
     """
-    lists = re.findall(r"^(\w+)\s*=\s*\[([-+.\deE;\s]+)\]", source_text(file), re.M)
-    listed = dict(lists)
+    listed = dict(re.findall(r"^(\w+)\s*=\s*\[([-+.\deE;\s]+)\]", source_text(file), re.M))
     with naming(file):
         values = {
             key: np.array(listed.get(key, "").replace(";", " ").split(), float)

@@ -1,11 +1,13 @@
 """Telegrams of the SICK LMS2xx: bytes to values and back, without a port."""
 
+import struct
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lrfcal_lib.session.files import short
 from lrfcal_lib.session.lms2xx_frame import (
     DEVICE,
     TelegramError,
@@ -13,7 +15,6 @@ from lrfcal_lib.session.lms2xx_frame import (
     cut,
     encode_telegram,
     parse_telegram,
-    whole,
     word,
 )
 
@@ -31,12 +32,12 @@ REASONS = (
     "reserved",
 )
 BEYOND = REASONS.index("larger than maximum")
-# by how far a value is below the largest one its bits can hold
-REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND])
+# by how far a value is below the largest one its bits can hold; nine and more are ranges
+REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND, 0], np.uint8)
 # Largest number that the range bits of a value hold, by measuring mode. The bits above are flags:
 # in modes 0, 2, 4 and 6 hits of the fields A, B and C (0: A, B, dazzled), in the others the level
 # of a reflector.
-TOP = {mode: (1 << bits) - 1 for mode, bits in enumerate((13, 13, 13, 14, 14, 15, 15))}
+TOP = dict(enumerate((0x1FFF, 0x1FFF, 0x1FFF, 0x3FFF, 0x3FFF, 0x7FFF, 0x7FFF)))
 
 
 def largest(mode: int) -> int:
@@ -47,18 +48,17 @@ def largest(mode: int) -> int:
     mode
         Key of `TOP`.
     """
-    return TOP[mode] - len(REASON_BELOW_TOP)
+    return TOP[mode] - len(REASON_BELOW_TOP) + 1
 
 
 @lru_cache
 def meanings(mode, unit):
     """What each of the 65536 values means: ranges (metres) and reasons why there is none."""
     counts = np.arange(1 << 16) & TOP[mode]
-    special = counts > largest(mode)
-    reasons = np.zeros(len(counts), np.uint8)
-    reasons[special] = REASON_BELOW_TOP[TOP[mode] - counts[special]]
+    reasons = REASON_BELOW_TOP.take(TOP[mode] - counts, mode="clip")
     ranges = counts * METRES[unit]
-    ranges[special] = np.where(reasons[special] == BEYOND, np.inf, np.nan)
+    ranges[reasons > 0] = np.nan
+    ranges[reasons == BEYOND] = np.inf
     return ranges, reasons
 
 
@@ -92,11 +92,11 @@ class Scans:
     @property
     def reasons(self):
         """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
-        return np.take(meanings(self.mode, self.unit)[1], self.words, mode="clip")
+        return meanings(self.mode, self.unit)[1][self.words]
 
 
 def encode_values(
-    ranges: ArrayLike, *, unit: str = "mm", mode: int = 0, reasons: ArrayLike | None = None
+    ranges: ArrayLike, *, unit: str = "mm", mode: int = 0, reasons: ArrayLike = 0
 ) -> np.ndarray:
     """Values of a scan as a device sends them, without flags.
 
@@ -117,12 +117,10 @@ def encode_values(
     ndarray of uint16
         Of the shape of the ranges.
     """
-    ranges = np.asarray(ranges, float)
-    counts = np.rint(np.nan_to_num(ranges, nan=0, posinf=1e9) / METRES[unit])
+    counts = np.rint(np.asarray(ranges, float) / METRES[unit])
     why = np.where(counts > largest(mode), BEYOND, 0)
-    why[np.isnan(ranges)] = REASONS.index("not valid")
-    if reasons is not None:
-        why = np.where(reasons, reasons, why)
+    why[np.isnan(counts)] = REASONS.index("not valid")
+    why = np.where(reasons, reasons, why)
     # of reasons that have several values the first
     below = np.argmax(REASON_BELOW_TOP == why[..., None], axis=-1)
     return np.where(why, TOP[mode] - below, counts).astype(np.uint16)
@@ -200,8 +198,7 @@ def decode_scans(
     data: bytes | np.ndarray,
     offset: np.ndarray,
     length: np.ndarray,
-    mode: int = 0,
-    rows: np.ndarray | None = None,
+    mode: ArrayLike = 0,
 ) -> list[Scans]:
     """The scans among the telegrams of a stream, many at once. CRCs are not looked at again.
 
@@ -211,47 +208,44 @@ def decode_scans(
     offset, length
         As of :func:`split_stream`.
     mode
-        Measuring mode.
-    rows
-        Of the telegrams to look at; all by default.
+        Measuring mode, of all or of each.
 
     Returns
     -------
     list of Scans
-        One for each number of values, unit, and kind (whole or a part, with indices or without).
-        Telegrams with another code, or with a length that does not fit the number of values, are in
-        none of them.
+        One for each number of values, mode, unit, and kind (whole or a part, with indices or
+        without). Telegrams with another code, or with a length that does not fit the number of
+        values, are in none of them.
     """
-    if mode not in TOP:  # others send no range with special values
+    modes = np.broadcast_to(mode, len(offset))
+    for other in set(modes.tolist()) - TOP.keys():  # sends no range with special values
         raise ValueError(
-            f"measuring mode {mode:#04x} is none of 0x00 to 0x06: set one of those (command 77)"
+            f"measuring mode {other:#04x} is none of 0x00 to 0x06: set one of those (command 77)"
         )
     data = np.frombuffer(data, np.uint8)
-    rows = np.arange(len(offset)) if rows is None else rows
-    rows = rows[length[rows] >= 10]
+    rows = np.flatnonzero(length >= 10)
     rows = rows[data[offset[rows] + 4] == SCAN]
-    head = word(data, offset[rows] + 5)
-    extra = length[rows] - 10 - 2 * (head & 0x3FF)
-    sound = np.isin(extra, (0, 2)) & (head < 1 << 15)
-    rows = rows[sound]
-    head = head[sound]
-    extra = extra[sound]  # bytes of indices
+    heads = word(data, offset[rows] + 5)
     scans = []
-    for group in alike(head, extra):
+    for group in alike(modes[rows], length[rows], heads):
         chosen = rows[group]
         begin = offset[chosen] + 7
-        first = head[group[0]]
-        size = 2 * (first & 0x3FF)  # bytes of the values
+        head = int(heads[group[0]])
+        size = 2 * (head & 0x3FF)  # bytes of the values
+        extra = length[chosen[0]] - 10 - size  # bytes of indices
+        if extra not in (0, 2) or head >= 1 << 15:
+            continue
         words = cut(data, begin, size).view("<u2")
-        unit = UNITS[first >> 14]
+        unit = UNITS[head >> 14]
         partial = -1
-        if first >> 13 & 1:
-            partial = int(first >> 11 & 3)
+        if head >> 13 & 1:
+            partial = head >> 11 & 3
         indices = np.full((len(chosen), 2), -1)
-        if extra[group[0]]:
+        if extra:
             indices[:] = cut(data, begin + size, 2)
-        ranges = np.take(meanings(mode, unit)[0], words, mode="clip")
-        scans.append(Scans(chosen, words, ranges, unit, mode, partial, *indices.T))
+        number = modes[chosen[0]]
+        ranges = meanings(number, unit)[0][words]
+        scans.append(Scans(chosen, words, ranges, unit, number, partial, *indices.T))
     return scans
 
 
@@ -284,17 +278,20 @@ def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
     TelegramError
         If no variant sends that many.
     """
-    if partial >= 0 and values != 181 - (partial > 0):
+    if partial < 0:
+        if values not in GRIDS:
+            raise TelegramError(
+                f"a whole scan has {short(sorted(GRIDS))} values, got {values}: only a sub-range "
+                "was asked for?"
+            )
+        first, step = GRIDS[values]
+        return first + step * np.arange(values)
+    quarters = np.arange(partial, 721, 4)
+    if len(quarters) != values:
         raise TelegramError(
-            f"partial scan {partial} has {181 - (partial > 0)} values, got {values}"
+            f"partial scan {partial} has {len(quarters)} values, got {values}"
         )
-    if partial < 0 and values not in GRIDS:
-        known = ", ".join(map(str, sorted(GRIDS)))
-        raise TelegramError(
-            f"a whole scan has {known} values, got {values}: only a sub-range was asked for?"
-        )
-    first, step = GRIDS[values] if partial < 0 else (partial, 4)
-    return first + step * np.arange(values)
+    return quarters
 
 
 STATUS = 0xB1
@@ -303,20 +300,6 @@ VARIANT = 0xBB
 CONFIGURATION = 0xF4
 CONFIGURED = 0xF7
 CONFIGURATION_BYTES = 34
-
-
-def text(raw):
-    """Bytes as text."""
-    return raw.decode("ascii", "replace").strip(" \0")
-
-
-def unit_of(raw):
-    """'cm' or 'mm'."""
-    if raw[0] >= len(UNITS):
-        raise TelegramError(
-            f"unit {raw[0]} is neither 0 (cm) nor 1 (mm): set one of those (block E, command 77)"
-        )
-    return UNITS[raw[0]]
 
 
 @dataclass(frozen=True)
@@ -331,9 +314,19 @@ class DeviceStatus:
 
 @dataclass(frozen=True)
 class Configuration:
-    """The 34 bytes of configuration part 1 (0xF4, 0xF7, 0x77); older firmware sends fewer."""
+    """The 34 bytes of configuration part 1 (0xF4, 0xF7, 0x77); older firmware sends fewer.
+
+    TelegramError for a unit that no manual lists.
+    """
 
     block: bytes = bytes(9) + b"\x02\x02" + bytes(21) + b"\x02\x00"
+
+    def __post_init__(self):
+        unit = self.block[6]
+        if unit >= len(UNITS):
+            raise TelegramError(
+                f"unit {unit} is neither 0 (cm) nor 1 (mm): set one of those (block E, command 77)"
+            )
 
     @property
     def realtime_indices(self):
@@ -348,7 +341,7 @@ class Configuration:
     @property
     def unit(self):
         """'cm' or 'mm'."""
-        return unit_of(self.block[6:])
+        return UNITS[self.block[6]]
 
     def changed(
         self,
@@ -415,10 +408,11 @@ def parse_status(raw: bytes) -> DeviceStatus:
     """
     # counted as in the manual, which calls the code 0
     data = bytes([STATUS]) + reply_data(raw, STATUS, 123)
+    view, step = struct.unpack_from("<HH", data, 107)
     return DeviceStatus(
         measuring_mode=data[102],
-        scan_angle_deg=float(whole(data[107:109])),
-        resolution_deg=whole(data[109:111]) / 100,
+        scan_angle_deg=float(view),
+        resolution_deg=step / 100,
         address=data[120],
     )
 
@@ -435,7 +429,8 @@ def parse_type(raw: bytes) -> tuple[str, ...]:
     tuple of str
         Such as ('LMS200', '301063', 'V02.10').
     """
-    return tuple(part.strip() for part in text(reply_data(raw, TYPE, 1)).split(";"))
+    text = reply_data(raw, TYPE, 1).decode("ascii", "replace").strip(" \0")
+    return tuple(map(str.strip, text.split(";")))
 
 
 def parse_configuration(raw: bytes) -> Configuration:
@@ -452,11 +447,8 @@ def parse_configuration(raw: bytes) -> Configuration:
         of a unit that there is not.
     """
     if raw[4:5] == bytes([CONFIGURED]):
-        configuration = Configuration(reply_data(raw, CONFIGURED, 8)[1:])
-    else:
-        configuration = Configuration(reply_data(raw, CONFIGURATION, 7))
-    unit_of(configuration.block[6:])  # raises for one that no manual lists
-    return configuration
+        return Configuration(reply_data(raw, CONFIGURED, 8)[1:])
+    return Configuration(reply_data(raw, CONFIGURATION, 7))
 
 
 STATE_MODE = (CONFIGURATION, CONFIGURED, STATUS)  # codes of the replies that do

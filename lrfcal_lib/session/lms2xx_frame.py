@@ -163,8 +163,7 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
     offset = offset[plausible]
     length = length[plausible]
     complete = offset + length <= len(raw)
-    good = np.zeros(len(offset), bool)
-    good[complete] = check_crc(raw, offset[complete], length[complete])
+    good = are_sound(raw, offset, length)
 
     sound = []
     rejected = []
@@ -175,7 +174,7 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
             continue
         if good[row]:
             sound.append(row)
-            free = begin + int(length[row])
+            free = begin + length[row]
             begun = []
         elif complete[row]:
             rejected.append(begin)
@@ -193,27 +192,32 @@ def word(data, at):
     return data[at] | (data[at + 1].astype(int) << 8)
 
 
-def check_crc(data, offset, length):
-    """Which of the whole telegrams in an array of uint8 have the right CRC, shape (m,)."""
-    good = np.zeros(len(offset), bool)
-    for rows in alike(length):
-        raw = cut(data, offset[rows], length[rows[0]])
+def are_sound(data, offset, length):
+    """Which telegrams in an array of uint8 are whole, as long as they state, and have the right
+    CRC, shape (m,).
+    """
+    sound = np.zeros(len(offset), bool)
+    whole = np.flatnonzero(offset + length <= len(data))
+    for group in alike(length[whole]):
+        rows = whole[group]
+        size = length[rows[0]]
+        raw = cut(data, offset[rows], size)
         if len(rows) < MANY:
             sums = [crc16(bytes(one)) for one in raw[:, :-2]]
         else:
             sums = crc16(raw[:, :-2].T.astype(np.uint16, order="C"))
-        good[rows] = sums == word(raw.T, -2)
-    return good
+        framed = (raw[:, 0] == STX) & (word(raw.T, 2) + OVERHEAD == size)
+        sound[rows] = framed & (sums == word(raw.T, -2))
+    return sound
 
 
 def alike(*keys):
     """Rows with the same keys, each group in order."""
-    _, group = np.unique(np.stack(keys), axis=1, return_inverse=True)
-    order = np.argsort(group.ravel(), kind="stable")
-    ends = np.cumsum(np.bincount(group.ravel()))
-    return np.split(order, ends[:-1])[: len(ends)]
+    order = np.lexsort(keys)
+    differs = np.any(np.diff(np.stack(keys)[:, order]), axis=0)
+    return np.split(order, np.flatnonzero(differs) + 1)[: len(order)]  # no group of no rows
 
 
 def cut(data, offset, length):
     """Pieces of the same length, shape (n, length)."""
-    return np.lib.stride_tricks.sliding_window_view(data, int(length))[offset]
+    return np.lib.stride_tricks.sliding_window_view(data, length)[offset]

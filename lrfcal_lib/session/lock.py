@@ -4,7 +4,7 @@ import fcntl
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -28,13 +28,7 @@ def alone(path: str | os.PathLike) -> Iterator[None]:
         Where another process writes it.
     """
     file = Path(path) / LOCK
-    with ExitStack() as stack:
-        stream = stack.enter_context(_locked(file, path))
-        while not _still_there(
-            file, stream
-        ):  # its holder removed the file after we had opened it
-            stack.close()
-            stream = stack.enter_context(_locked(file, path))
+    with _locked(file, path) as stream:
         stream.truncate()
         stream.write(
             f"process {os.getpid()} on {socket.gethostname()} since "
@@ -59,7 +53,10 @@ def _locked(file, path):
         raise SessionError(
             f"{path}: {holder} writes this session: end that first, or choose another one"
         ) from None
-    return stream
+    if _still_there(file, stream):
+        return stream
+    stream.close()  # its holder removed the file after we had opened it
+    return _locked(file, path)
 
 
 def _still_there(file, stream):

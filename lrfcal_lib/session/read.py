@@ -114,9 +114,8 @@ def once(lines, number, *values):
     """ValueError for values that stand in an earlier line of a table already."""
     first = lines.setdefault(values, number)
     if first < number:
-        text = ", ".join(map(str, values))
         raise ValueError(
-            f"{text} stands in line {first} already; remove one of the two rows"
+            f"{short(values)} stands in line {first} already; remove one of the two rows"
         )
 
 
@@ -128,12 +127,11 @@ def read_images(path, facts, unfinished):
     """
     file = path / "images.csv"
     cameras = facts["cameras"]
-    if not cameras and not os.path.lexists(file):
-        return ()
     out = []
     lines = {}  # in which each file stands
-    skipped = {str(placement) for placement in unfinished or ()}
-    rows = read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
+    skipped = set(map(str, unfinished or ()))
+    torn = unfinished is not None
+    rows = read_table(file, IMAGE_COLUMNS, path, torn, needed=bool(cameras))[0]
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
             continue
@@ -157,12 +155,11 @@ def read_images(path, facts, unfinished):
 def read_edges(path, facts, records):
     """The picks of edges.csv, if there is one, for images and edges that the session knows."""
     file = path / "edges.csv"
-    if not os.path.lexists(file):
-        return ()
     out = []
     lines = {}  # in which each edge of an image stands
     images = {(record.camera, record.file) for record in records}
-    for number, row in enumerate(read_table(file, EDGE_COLUMNS, path)[0], start=2):
+    rows = read_table(file, EDGE_COLUMNS, path, needed=False)[0]
+    for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
             if (row["camera"], target) not in images:
@@ -172,7 +169,7 @@ def read_edges(path, facts, records):
             edge = known(row["edge"], facts["board"].edges, "edge")
             once(lines, number, row["camera"], target, edge)
             ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
-            if not np.linalg.norm(ends[1] - ends[0]) >= CLOSEST or np.isinf(ends).any():
+            if not CLOSEST <= np.linalg.norm(ends[1] - ends[0]) < math.inf:
                 raise ValueError(
                     f"the two pixels {ends.tolist()} give no direction: pick two that are "
                     f"{CLOSEST} or more pixels apart"
@@ -183,11 +180,7 @@ def read_edges(path, facts, records):
 
 # radians from the first to the last quarter of a sweep; 0.006 deg, below the step of any head
 SMALLEST_MOVE = 1e-4
-# tables with times: columns, and those whose values rows share that follow each other in time
-TIMED = {
-    "lrf/index.csv": (INDEX_COLUMNS, ("placement",)),
-    "images.csv": (IMAGE_COLUMNS, ("camera", "placement", "purpose")),
-}
+TIMED = {"lrf/index.csv": INDEX_COLUMNS, "images.csv": IMAGE_COLUMNS}  # tables with times
 
 
 @dataclass(frozen=True)
@@ -283,9 +276,10 @@ class Session:
     continuous: bool = False
 
     def __repr__(self):
-        cameras = ", ".join(self.cameras) or "none"
-        boards = f"{len(self.board_placements)} placements of {self.board.name}"
-        return f"Session({self.name}: {boards}, LRF {self.lrf.model}, cameras {cameras})"
+        return (
+            f"Session({self.name}: {len(self.board_placements)} placements of {self.board.name}, "
+            f"LRF {self.lrf.model}, cameras {short(self.cameras)})"
+        )
 
     def sweep(self, placement: int) -> Sweep:
         """The scan lines of a placement.
@@ -328,10 +322,12 @@ class Session:
         purpose
             'board', 'intrinsics' or 'scene'.
         """
-        asked = {"camera": camera, "placement": placement, "purpose": purpose}
-        asked = {key: value for key, value in asked.items() if value is not None}
         return tuple(
-            record for record in self.image_records if asked.items() <= vars(record).items()
+            record
+            for record in self.image_records
+            if camera in (None, record.camera)
+            and placement in (None, record.placement)
+            and purpose in (None, record.purpose)
         )
 
     def read_image(self, record: ImageRecord) -> np.ndarray:
@@ -471,12 +467,10 @@ def validate(path: str | os.PathLike) -> list[str]:
 
 def _times_back(session):
     """Sentences about times that run back between rows, as where two write at once."""
-    for name, (columns, group) in TIMED.items():
+    for name, columns in TIMED.items():
         file = session.path / name
-        if not os.path.lexists(file):
-            continue
         last = {}
-        rows = read_table(file, columns, session.path, torn=True)[0]
+        rows = read_table(file, columns, session.path, torn=True, needed=False)[0]
         for line, row in enumerate(rows, start=2):
             if not row["t_s"] or not row["placement"] or row.get("purpose") == DROPPED:
                 continue
@@ -487,10 +481,11 @@ def _times_back(session):
             ):  # of a placement that was not finished: nobody else looks at it
                 yield f"{file} line {line}: t_s is {row['t_s']!r}: a number of seconds is needed"
                 continue
-            values = tuple(map(row.get, group))
-            if time < last.get(values, -math.inf):
+            # rows that share these follow each other in time
+            group = tuple(map(row.get, ("camera", "placement", "purpose")))
+            if time < last.get(group, -math.inf):
                 yield (
-                    f"{file} line {line}: t_s runs back from {last[values]:.9g} to {time:.9g}: two "
+                    f"{file} line {line}: t_s runs back from {last[group]:.9g} to {time:.9g}: two "
                     "writers at once? Record the placement again"
                 )
-            last[values] = time
+            last[group] = time

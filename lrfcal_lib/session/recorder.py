@@ -1,6 +1,5 @@
 """Sessions whose recording may be interrupted and go on later."""
 
-import json
 import math
 import os
 from collections.abc import Iterable
@@ -9,8 +8,10 @@ from lrfcal_lib.session import files, read, stated
 from lrfcal_lib.session.files import SessionError, naming, short
 from lrfcal_lib.session.lock import LOCK
 from lrfcal_lib.session.tables import read_table
-from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 from lrfcal_lib.session.write import SessionWriter, as_lines, cell, mend_tables, write_file
+
+# of rows of a dropped placement, by table
+MARKS = {"lrf/index.csv": {"placement": ""}, "images.csv": {"purpose": read.DROPPED}}
 
 
 class SessionRecorder(SessionWriter):
@@ -50,7 +51,7 @@ class SessionRecorder(SessionWriter):
         """Take over what an earlier recording wrote, without the placement that it did
         not finish.
         """
-        mine = json.loads(json.dumps(self.data))
+        mine = stated.plain(self.data)
         data = files.read_json(self.path / "session.json", self.path)
         with naming(self.path / "session.json"):
             known = stated.parse_session(data)
@@ -60,20 +61,16 @@ class SessionRecorder(SessionWriter):
                         f"{_first_difference(data[key], mine[key], key)}, unlike the rig now: go "
                         "on with the same rig file, or begin another one"
                     )
-        self.data = dict(data)
-        self.data["placements"] = list(known["placements"])
-        self.data["unfinished"] = list(known["unfinished"] or ())
+        unfinished = known["unfinished"] or ()
+        self.data = data | {"placements": list(known["placements"])}
         self._make_folders()
         mend_tables(self.path)
-        for placement in self.data["unfinished"]:
+        for placement in unfinished:
             self._mark_dropped(placement)
         self._state(unfinished=[])
         for camera in self.cameras:
-            numbers = [0]
-            for file in (self.path / "images" / camera).iterdir():
-                if file.suffix != ".draft" and file.stem.isdecimal():
-                    numbers.append(int(file.stem))
-            self.shots[camera] = max(numbers)
+            names = [file.stem for file in (self.path / "images" / camera).iterdir()]
+            self.shots[camera] = max(map(int, filter(str.isdecimal, names)), default=0)
 
     def begin_placement(self, placement: int) -> None:
         """State that a placement is being recorded from now on; one that was broken off is dropped.
@@ -172,20 +169,16 @@ class SessionRecorder(SessionWriter):
             raise SessionError(f"{self.path}: placement {placement} was not begun")
 
     def _mark_dropped(self, placement):
-        self._mark_rows("lrf/index.csv", INDEX_COLUMNS, placement, {"placement": ""})
-        self._mark_rows(
-            "images.csv", read.IMAGE_COLUMNS, placement, {"purpose": read.DROPPED}
-        )
-
-    def _mark_rows(self, name, columns, placement, mark):
-        """Write other values into the rows of a placement in a table, if there is one."""
-        if not os.path.lexists(self.path / name):
-            return
-        rows = read_table(self.path / name, columns, self.path)[0]
-        for row in rows:
-            if row["placement"] == str(placement):
-                row.update(mark)
-        write_file(self.path, name, as_lines([columns, *(row.values() for row in rows)]))
+        """Mark the rows of a placement in the tables that there are."""
+        for name, columns in read.TIMED.items():
+            rows = read_table(self.path / name, columns, self.path, needed=False)[0]
+            for row in rows:
+                if row["placement"] == str(placement):
+                    row.update(MARKS[name])
+            if rows:
+                write_file(
+                    self.path, name, as_lines([columns, *(row.values() for row in rows)])
+                )
 
 
 def _first_difference(old, new, where):

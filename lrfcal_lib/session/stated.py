@@ -68,7 +68,7 @@ ASSUMED_SPOT_RADIUS = 0.005
 
 def in_words(error):
     """The first mistake that pydantic found: where, value, what is needed."""
-    first = error.errors(include_url=False)[0]
+    first = error.errors()[0]
     where = ".".join(map(str, first["loc"])) or "it"
     kind = first["type"]
     if kind == "missing":
@@ -124,7 +124,6 @@ def refused(wrong, words):
 
 
 NOT_PLAIN = "this becomes a file name: letters, digits, '_', '-' and '.' only"
-TWICE = "placements are different numbers"
 NOT_SHOWN = "names of edges stand in figures: no line ends, no '$' (a formula)"
 Name = Annotated[
     str,
@@ -189,28 +188,18 @@ class LensStated(BaseModel):
     fy: Positive
     cx: FiniteFloat
     cy: FiniteFloat
-    distortion: Lens
-    covariance: tuple[(Row,) * 9] | None = None
+    distortion: Annotated[Lens, AfterValidator(np.array)]
+    covariance: Annotated[tuple[(Row,) * 9], AfterValidator(np.array)] | None = None
     rms_px: FiniteFloat | None = None
 
-    def made(self, width, height):
-        """As a CameraModel."""
-        pinhole = self.fx, self.fy, self.cx, self.cy
-        covariance = self.covariance and np.array(self.covariance)
-        return CameraModel(
-            width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px
-        )
 
-
-def model_to_json(model: CameraModel | None) -> dict | None:
+def model_to_json(model: CameraModel) -> dict:
     """Intrinsics as they stand in session.json.
 
     Parameters
     ----------
     model
     """
-    if model is None:
-        return None
     return plain({name: getattr(model, name) for name in LensStated.model_fields})
 
 
@@ -238,12 +227,14 @@ class BoardStated(BaseModel):
         tuple[EdgeName, ...], Field(fail_fast=True, min_length=3, max_length=MOST_CORNERS)
     ]
     features: tuple[str, str]
-    corners_m: Annotated[tuple[Pair, ...], Field(fail_fast=True)] | None
+    corners: Annotated[
+        Annotated[tuple[Pair, ...], Field(fail_fast=True), AfterValidator(np.array)] | None,
+        Field(alias="corners_m"),
+    ]
     pattern: Annotated[PatternStated, AfterValidator(PatternStated.made)] | None
 
     def made(self):
         """As a Board."""
-        corners = None
         if len(set(self.edges)) < len(self.edges):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
@@ -251,24 +242,22 @@ class BoardStated(BaseModel):
                 f"features must be two different edges of {short(self.edges)}, at a right angle; "
                 f"got {short(map(repr, filter(None, self.features)))}"
             )
-        if self.corners_m is not None:
-            corners = np.array(self.corners_m)
-            size = np.ptp(corners, axis=0).max()
-            if len(corners) != len(self.edges):
+        if self.corners is not None:
+            if len(self.corners) != len(self.edges):
                 raise ValueError(
                     f"corners_m must be one corner for each of {len(self.edges)} edges, got "
-                    f"{len(corners)}"
+                    f"{len(self.corners)}"
                 )
+            size = np.ptp(self.corners, axis=0).max()
             if size > LONGEST_BOARD:
                 raise ValueError(f"the board is {size:g} m large: {MILLIMETRES}")
-            self._hold_pattern(corners)
-        return Board(self.name, self.edges, corners, self.pattern, self.features)
+            if self.pattern is not None:
+                self._hold_pattern()
+        return Board(**dict(self))
 
-    def _hold_pattern(self, corners):
+    def _hold_pattern(self):
         """Refuse a pattern that does not fit on the board, farther than outlines are wrong."""
-        if self.pattern is None:
-            return
-        outline = corners.astype(np.float32)
+        outline = self.corners.astype(np.float32)
         for x, y, _ in self.pattern.points():
             beyond = -cv2.pointPolygonTest(outline, (x, y), True)
             if beyond > self.pattern.square / 4:
@@ -293,8 +282,15 @@ def board_to_json(board: Board) -> dict:
         "square_m": board.pattern.square,
         "origin_m": board.pattern.origin,
     }
-    stated = {"name": board.name, "edges": board.edges, "features": board.features}
-    return plain(stated | {"corners_m": board.corners, "pattern": pattern})
+    return plain(
+        {
+            "name": board.name,
+            "edges": board.edges,
+            "features": board.features,
+            "corners_m": board.corners,
+            "pattern": pattern,
+        }
+    )
 
 
 def board_from_json(data: dict) -> Board:
@@ -332,8 +328,7 @@ Endless = Annotated[
 
 def plainly_typed(kind: type) -> type:
     """A record whose help shows plain types, without the limits that pydantic reads."""
-    plain_types = get_type_hints(kind)
-    kind.__init__.__annotations__ = plain_types | {"return": None}
+    kind.__init__.__annotations__ = get_type_hints(kind) | {"return": None}
     return kind
 
 
@@ -400,9 +395,9 @@ class LrfInfo:
         """
         if self.step_error is not None:
             return self.step_error
-        ratio = np.degrees(self.bearing_step) / SICK_STEPS
-        same = np.abs(ratio - 1).min() < SAME_STEP
-        if same and re.search("LMS|TiM", self.model):
+        step = np.degrees(self.bearing_step)
+        same = np.isclose(step, SICK_STEPS, rtol=SAME_STEP, atol=0)
+        if same.any() and re.search("LMS|TiM", self.model):
             return 0.0
         return ASSUMED_STEP_ERROR
 
@@ -438,18 +433,15 @@ def _few_pixels(height, info):
 
 
 def _lens(lens, info):
-    return lens and lens.made(info.data.get("width"), info.data.get("height"))
+    return CameraModel(info.data.get("width"), info.data.get("height"), **dict(lens))
 
 
 if TYPE_CHECKING:
     Lens = CameraModel | None
 else:  # stated without the size of the image, which stands beside it
-    Lens = Annotated[
-        LensStated | None,
-        AfterValidator(_lens),
-        PlainSerializer(model_to_json),
-        Field(alias="intrinsics"),
-    ]
+    Lens = (
+        Annotated[LensStated, AfterValidator(_lens), PlainSerializer(model_to_json)] | None
+    )
 
 
 @plainly_typed
@@ -475,28 +467,22 @@ class CameraInfo:
     mount: Literal["head", "platform"]
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1), AfterValidator(_few_pixels)]
-    model: Lens = None
+    model: Annotated[Lens, Field(alias="intrinsics")] = None
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
 
-def camera_to_json(camera: CameraInfo) -> dict:
-    """A camera as it stands in session.json.
-
-    Parameters
-    ----------
-    camera
-    """
-    return adapter(CameraInfo).dump_python(camera, by_alias=True)
-
-
-def platform_to_json(
-    T_head_lrf: RigidTransform | None, sigma: tuple[float, float] | None, continuous: bool
+def rig_to_json(
+    lrf: LrfInfo,
+    T_head_lrf: RigidTransform | None,
+    cameras: dict[str, CameraInfo],
+    sigma: tuple[float, float] | None = None,
+    continuous: bool = False,
 ) -> dict:
-    """A platform as it stands in session.json.
+    """A rig as it stands in session.json.
 
     Parameters
     ----------
-    T_head_lrf, sigma, continuous
+    lrf, T_head_lrf, cameras, sigma, continuous
         Fields of a Session; sigma is `platform_sigma`, radians and metres.
     """
     platform: dict[str, Any] = {"T_head_lrf": transform_to_json(T_head_lrf)}
@@ -506,7 +492,11 @@ def platform_to_json(
         platform["sigma_offset_m"] = offset
     if continuous:
         platform["continuous"] = True
-    return platform
+    return {
+        "lrf": lrf_to_json(lrf),
+        "platform": platform,
+        "cameras": adapter(dict[str, CameraInfo]).dump_python(cameras, by_alias=True),
+    }
 
 
 def _with_names(cameras):
@@ -547,7 +537,7 @@ class SessionStated(BaseModel):
     placements: Annotated[
         tuple[Whole, ...],
         Field(fail_fast=True),
-        refused(lambda p: len(set(p)) < len(p), TWICE),
+        refused(lambda p: len(set(p)) < len(p), "placements are different numbers"),
     ]
     reference: dict = {}
     unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None
@@ -568,15 +558,11 @@ def parse_session(data: dict, kind: type = SessionStated) -> dict:
     ValueError
         For a wrong one.
     """
-    found = dict(from_json(kind, data))
-    rig = dict(found.pop("rig"))
-    platform = rig.pop("platform")
-    return (
-        found
-        | rig
-        | {
-            "T_head_lrf": platform.T_head_lrf,
-            "platform_sigma": (platform.sigma_direction, platform.sigma_offset),
-            "continuous": platform.continuous,
-        }
-    )
+    facts = dict(from_json(kind, data))
+    facts.update(facts.pop("rig"))
+    platform = facts.pop("platform")
+    return facts | {
+        "T_head_lrf": platform.T_head_lrf,
+        "platform_sigma": (platform.sigma_direction, platform.sigma_offset),
+        "continuous": platform.continuous,
+    }

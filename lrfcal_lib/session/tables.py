@@ -1,6 +1,7 @@
 """Tables of a session: CSV files with given columns."""
 
 import csv
+import os
 from os import PathLike
 from pathlib import Path
 
@@ -11,7 +12,11 @@ WHOLE_COLUMNS = {"placement", "offset", "length"}  # of tables, which hold whole
 
 
 def read_table(
-    file: Path, columns: tuple[str, ...], within: str | PathLike, torn: bool = False
+    file: Path,
+    columns: tuple[str, ...],
+    within: str | PathLike,
+    torn: bool = False,
+    needed: bool = True,
 ) -> tuple[list[dict[str, str]], bool]:
     """Rows of a CSV file with exactly these columns, and whether one was left out.
 
@@ -23,12 +28,16 @@ def read_table(
         The session's folder.
     torn
         A last row without its line end (cut off by a crash) is left out.
+    needed
+        Otherwise a file that is not there has no rows.
 
     Raises
     ------
     SessionError
         For other columns, rows of other lengths, or too many.
     """
+    if not needed and not os.path.lexists(file):
+        return [], False
     data = read_bytes(file, within, LARGEST_TEXT)
     with reading(file, "not a CSV file in UTF-8 ({})"):
         text = data.decode()
@@ -38,26 +47,26 @@ def read_table(
             raise SessionError(
                 f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}"
             )
-        rows = list(csv.reader(lines))
-    header = tuple(rows[0]) if rows else ("an empty file",)
-    if header != columns:
+        header, *rows = list(csv.reader(lines)) or [["an empty file"]]
+    if header != [*columns]:
         got = ", ".join(header)
-        if header == ("", *columns):
+        if header == ["", *columns]:
             got = (
                 "a first column without a name: write the table without row numbers (index=False "
                 "in pandas)"
             )
         raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
-    for number, row in enumerate(rows[1:], start=2):
+    table = []
+    for number, row in enumerate(rows, start=2):
         if len(row) != len(columns):
             raise SessionError(
                 f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?"
             )
-    table = [dict(zip(columns, row, strict=True)) for row in rows[1:]]
-    for cells in table:
+        cells = dict(zip(columns, row, strict=True))
         for key in WHOLE_COLUMNS & cells.keys():
             # programs write whole numbers beside empty cells as 1.0
             cells[key] = cells[key].removesuffix(".0")
+        table.append(cells)
     return table, cut
 
 

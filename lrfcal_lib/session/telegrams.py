@@ -1,7 +1,6 @@
 """Scan lines out of lrf/telegrams.bin (bytes as the device sent them) and lrf/index.csv."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,11 @@ from lrfcal_lib.session.files import (
     read_bytes,
     short,
 )
-from lrfcal_lib.session.lms2xx_frame import OVERHEAD, STX, TelegramError, check_crc, word
-from lrfcal_lib.session.tables import read_table, whole_number
+from lrfcal_lib.session.lms2xx_frame import OVERHEAD, TelegramError, are_sound
+from lrfcal_lib.session.tables import WHOLE_COLUMNS, read_table, whole_number
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
+INDEX = [(name, int if name in WHOLE_COLUMNS else float) for name in INDEX_COLUMNS]
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
 SCANNED, OTHER, WRONG, TRUNCATED = range(4)
 LONGEST = OVERHEAD + 0xFFFF  # bytes of a telegram
@@ -31,7 +31,6 @@ class TelegramLog:
 
     Attributes
     ----------
-    file : Path
     offset, placement : ndarray of int, shape (n,)
         In the file; -1 for no placement.
     outcome : ndarray of uint8, shape (n,)
@@ -41,38 +40,11 @@ class TelegramLog:
     problems : tuple of str
     """
 
-    file: Path
     offset: np.ndarray
     placement: np.ndarray
     outcome: np.ndarray
     values: np.ndarray
     problems: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Index:
-    """Where telegrams are in their file, and what is known of each; all of shape (n,).
-
-    `time_s` is NaN where unknown, `placement` -1 for none, `pitch` in radians.
-    """
-
-    time_s: np.ndarray
-    offset: np.ndarray
-    length: np.ndarray
-    placement: np.ndarray
-    pitch: np.ndarray
-
-    @cached_property
-    def end(self) -> np.ndarray:
-        """Behind the last byte of each telegram."""
-        return self.offset + self.length
-
-    def place(self, row: int | np.intp) -> str:
-        """Where a telegram is, as text."""
-        return (
-            f"line {row + 2}, offset {self.offset[row]}, length {self.length[row]}, placement "
-            f"{self.placement[row]}"
-        )
 
 
 def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], TelegramLog]:
@@ -112,75 +84,75 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
         _check_index(index, len(data), file)
         check_amount(len(data) // 2)
 
-    outcome = np.where(index.end > len(data), TRUNCATED, WRONG).astype(np.uint8)
-    whole = np.flatnonzero(outcome == WRONG)
-    offset = index.offset[whole]
-    length = index.length[whole]
-    good = (data[offset] == STX) & (word(data, offset + 2) + OVERHEAD == length)
-    sound = whole[good & check_crc(data, offset, length)]
-    outcome[sound] = OTHER
-    if len(sound) < len(whole) / 2:
+    sound = are_sound(data, index.offset, index.length)
+    whole = index.offset + index.length <= len(data)
+    outcome = np.select([sound, whole], [OTHER, WRONG], TRUNCATED).astype(np.uint8)
+    wrong = np.sum(outcome == WRONG)
+    if wrong > whole.sum() / 2:
         raise SessionError(
-            f"{path}: {len(whole) - len(sound)} of {len(whole)} telegrams have a wrong CRC in "
-            f"{file.name}; the two files are not of one recording, restore both"
+            f"{path}: {wrong} of {whole.sum()} telegrams have a wrong CRC in {file.name}; the two "
+            "files are not of one recording, restore both"
         )
 
     with naming(file):
-        mode, notes = _modes(data, index, sound)
-        groups = []
-        for number in np.unique(mode).tolist():
-            rows = sound[mode == number]
-            groups += codec.decode_scans(data, index.offset, index.length, number, rows)
+        modes, notes = _modes(data, index, np.flatnonzero(sound))
+        sizes = np.where(sound, index.length, 0)  # what is damaged holds no scan
+        groups = codec.decode_scans(data, index.offset, sizes, modes)
         scans = _lines(groups, index)
 
     values = np.zeros((len(outcome), len(codec.REASONS)), int)
     for group in groups:
         outcome[group.rows] = SCANNED
-        reasons = group.reasons
-        row, column = np.nonzero(reasons)  # nearly all values are valid
-        np.add.at(values, (group.rows[row], reasons[row, column]), 1)
-        values[group.rows, 0] = reasons.shape[1] - values[group.rows].sum(axis=1)
+        values[group.rows] = [
+            np.bincount(reasons, minlength=len(codec.REASONS)) for reasons in group.reasons
+        ]
     problems = [f"{file}: {note}" for note in (*notes, *_damage(index, outcome, len(data)))]
     if torn:
         problems.append(f"{path}: the last row is cut off, its telegram is left out")
-    log = TelegramLog(file, index.offset, index.placement, outcome, values, tuple(problems))
-    return scans, log
+    return scans, TelegramLog(
+        index.offset, index.placement, outcome, values, tuple(problems)
+    )
 
 
 def _index(rows):
-    """The Index in rows of index.csv."""
-    numbers = {}
-    for key in ("offset", "length", "placement"):
-        cells = [
-            whole_number(row[key], f"line {line}: {key}")
-            for line, row in enumerate(rows, start=2)
-        ]
-        numbers[key] = np.array(cells, int)
-    time_s = np.array([float(row["t_s"] or "nan") for row in rows])
-    pitch_deg = np.array([float(row["pitch_deg"] or "nan") for row in rows])
-    return Index(time_s=time_s, pitch=np.radians(pitch_deg), **numbers)
+    """The rows of index.csv as an array of INDEX: NaN for no time or pitch, -1 for no placement."""
+    index = np.recarray(len(rows), INDEX)
+    for at, row in enumerate(rows):
+        for key, cell in row.items():
+            if key in WHOLE_COLUMNS:
+                index[key][at] = whole_number(cell, f"line {at + 2}: {key}")
+            else:
+                index[key][at] = cell or np.nan
+    return index
+
+
+def _place(index, row):
+    """Where a telegram is, as text."""
+    return (
+        f"line {row + 2}, offset {index.offset[row]}, length {index.length[row]}, placement "
+        f"{index.placement[row]}"
+    )
 
 
 def _check_index(index, size, file):
     """Telegrams lie one after the other in the file, but for a last one that is cut off, and every
     scan has a pitch.
     """
-    if len(index.offset) == 0:
+    if len(index) == 0:
         raise ValueError(
             f"no telegram in the index, {size} bytes in {file.name}: nothing was recorded"
         )
+    ends = (index.offset + index.length)[:-1]
     absurd = (index.length < 7) | (index.length > LONGEST) | (index.offset > LARGEST_FILE)
-    absurd |= index.offset < np.r_[0, index.end[:-1]]
-    missing = index.end > size
-    missing[-1] = False
-    blind = (index.placement >= 0) & ~np.isfinite(index.pitch)
+    absurd |= index.offset < np.r_[0, ends]
+    blind = (index.placement >= 0) & ~np.isfinite(index.pitch_deg)
     for wrong, words in (
         (
             absurd,
             f"telegrams of 7 to {LONGEST} bytes lie one after the other; restore the file",
         ),
         (
-            missing,
+            ends > size,
             f"{file.name} has {size} bytes: restore it, or remove the rows from this one on",
         ),
         (
@@ -189,23 +161,21 @@ def _check_index(index, size, file):
         ),
     ):
         if wrong.any():
-            raise ValueError(f"{index.place(wrong.argmax())}: {words}")
+            raise ValueError(f"{_place(index, wrong.argmax())}: {words}")
 
 
-def _modes(data, index, rows):
-    """Measuring mode at each row: that of the last telegram that states it, before it the first.
-    Also notes.
+def _modes(data, index, sound):
+    """Measuring mode at each telegram: that of the last sound one that states it, before it the
+    first. Also notes.
     """
-    modes = np.full(len(rows), -1)
+    modes = np.full(len(index), -1)
     notes = []
-    stating = np.isin(data[index.offset[rows] + 4], codec.STATE_MODE)
-    for at in np.flatnonzero(stating):
-        row = rows[at]
+    for row in sound[np.isin(data[index.offset[sound] + 4], codec.STATE_MODE)]:
+        raw = data[index.offset[row] :][: index.length[row]]
         try:
-            raw = data[index.offset[row] : index.end[row]].tobytes()
-            modes[at:] = codec.parse_mode(raw)
+            modes[row:] = codec.parse_mode(raw.tobytes())
         except TelegramError as error:
-            notes.append(f"{index.place(row)}: {error}; ignored")
+            notes.append(f"{_place(index, row)}: {error}; ignored")
     stated = modes[modes >= 0]
     if len(stated) == 0:
         notes.append(
@@ -226,58 +196,57 @@ def _lines(groups, index):
             "no telegram with a scan belongs to a placement: was the device streaming?"
         )
     grids = [codec.scan_quarters(group.words.shape[1], group.partial) for group in groups]
-    counts = {len(grid) for grid in grids}
     kinds = {(len(grid), group.partial) for grid, group in zip(grids, groups, strict=True)}
     if len(kinds) > 1 and min(group.partial for group in groups) < 0:
+        counts = sorted({len(grid) for grid in grids})
         raise ValueError(
-            f"scans of {short(sorted(counts))} values are mixed: a session holds one variant, "
+            f"scans of {short(counts)} values are mixed: a session holds one variant, "
             "split the recording"
         )
-    # which quarter of a degree the scan is turned by; -1 a whole scan, -2 no scan
-    partial = np.full(len(placed), -2)
+    # the quarter of a degree that a scan is turned by, -1 for a whole one, -2 for no scan
+    partial = np.full(len(index), -2)
     number = np.full(
-        len(placed), -2
+        len(index), -1
     )  # of the scan, as the device counts; -1 where it does not
     for group in groups:
         partial[group.rows] = group.partial
         number[group.rows] = group.telegram_index
     rows = np.flatnonzero((partial > -2) & placed)
-    begins = np.r_[True, ~_goes_on(partial[rows], number[rows], index, rows)]
-    line = np.full(len(placed), -1)
+    begins = np.r_[True, ~_goes_on(partial[rows], number[rows], index[rows])]
+    first = index[rows[begins]]
+    line = np.full(len(index), -1)
     line[rows] = np.cumsum(begins) - 1
 
     quarters = np.unique(np.concatenate(grids))
-    first = rows[begins]
     check_amount(len(first) * len(quarters))
-    ranges = np.full((len(first), len(quarters)), np.nan)
+    # scans of no placement, line -1, go into one more that is left out
+    ranges = np.full((len(first) + 1, len(quarters)), np.nan)
     for grid, group in zip(grids, groups, strict=True):
-        kept = placed[group.rows]
         columns = np.searchsorted(quarters, grid)
-        ranges[line[group.rows[kept]][:, None], columns] = group.ranges[kept]
+        ranges[line[group.rows][:, None], columns] = group.ranges
     return {
-        "ranges": ranges,
+        "ranges": ranges[:-1],
         "bearings": np.radians(quarters / 4),
-        "time_s": np.bincount(line[rows], index.time_s[rows]) / np.bincount(line[rows]),
-        "placement": index.placement[first],
-        "pitch": index.pitch[first],
+        "time_s": np.bincount(line[rows], index.t_s[rows]) / np.bincount(line[rows]),
+        "placement": first.placement,
+        "pitch": np.radians(first.pitch_deg),
     }
 
 
-def _goes_on(partial, number, index, rows):
+def _goes_on(partial, number, scans):
     """Whether each scan but the first goes on with the line of the one before, shape (n - 1,)."""
     step = np.diff(partial)
     rises = (partial[:-1] >= 0) & (step > 0)
-    stays = (np.diff(index.placement[rows]) == 0) & (np.diff(index.pitch[rows]) == 0)
-    uncounted = (number[1:] < 0) | (number[:-1] < 0)
-    return rises & stays & (uncounted | (np.diff(number) % 256 == step))
+    stays = (np.diff(scans.placement) == 0) & (np.diff(scans.pitch_deg) == 0)
+    return rises & stays & ((number[1:] < 0) | (np.diff(number) % 256 == step))
 
 
 def _damage(index, outcome, size):
     """Sentences about telegrams that could not be used."""
-    wrong = index.offset[outcome == WRONG].tolist()
-    last = int(index.offset[-1])
-    tail = size - int(index.end[-1])
-    if wrong:
+    wrong = index.offset[outcome == WRONG]
+    last = index.offset[-1]
+    tail = size - last - index.length[-1]
+    if len(wrong):
         yield (
             f"{len(wrong)} of {len(outcome)} telegrams have a wrong CRC, left out, at "
             f"{short(wrong)}"

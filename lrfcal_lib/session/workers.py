@@ -39,14 +39,10 @@ def side_by_side(executor: Executor | None = None) -> Iterator[None]:
         cores, forked for every loop, so that they have what was read before it; none where this
         process has threads, which must not be forked.
     """
-    if executor is not None:
-        with _setting(_executor, executor):
-            yield
-        return
     cores = 1
-    if hasattr(os, "sched_getaffinity") and threading.active_count() == 1:
+    if executor is None and threading.active_count() == 1:
         cores = len(os.sched_getaffinity(0))
-    with _setting(_cores, cores):
+    with _setting(_executor, executor), _setting(_cores, cores):
         yield
 
 
@@ -73,8 +69,7 @@ def spread(work: Callable, items: Iterable) -> list:
     results = {}
     if executor is not None and len(items) > 1 and _can_travel(work):
         with suppress(BrokenExecutor):
-            for number, result in enumerate(executor.map(partial(_packed, work), items)):
-                results[number] = result
+            results.update(enumerate(executor.map(partial(_packed, work), items)))
     elif cores > 1:
         results = _forked(work, items, cores)
     for number, item in enumerate(items):

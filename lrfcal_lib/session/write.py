@@ -88,16 +88,14 @@ class SessionWriter:
             "name": self.path.resolve().name,
             **about,
             "board": stated.board_to_json(board),
-            "rig": {
-                "lrf": stated.lrf_to_json(lrf),
-                "platform": stated.platform_to_json(T_head_lrf, platform_sigma, continuous),
-                "cameras": {n: stated.camera_to_json(c) for n, c in self.cameras.items()},
-            },
+            "rig": stated.rig_to_json(
+                lrf, T_head_lrf, self.cameras, platform_sigma, continuous
+            ),
             "placements": [],
         }
         self.data["reference"] = self.data.pop("reference")  # last: it may be long
         with naming(self.path):
-            stated.parse_session(json.loads(json.dumps(self.data)))
+            stated.parse_session(stated.plain(self.data))
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
