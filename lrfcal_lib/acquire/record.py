@@ -182,8 +182,7 @@ class Recording(Closed):
         Light
             'bad' where the image shows no pattern and was not kept.
         """
-        with contextlib.closing(self.rig.acquire_close(camera)) as events:
-            (photo,) = (event for event in events if isinstance(event, Photographed))
+        (photo,) = self.rig.acquire_close(camera)
         stated = self.rig.stated
         model = stated.cameras[camera].model
         light = check_image(photo.frame.image, stated.board, model, f"camera {camera}")
@@ -226,7 +225,7 @@ class Recording(Closed):
         """
         with self._safely():
             self.writer.finish()
-        if self._readable() != set(self.finished):
+        if self._lost():
             raise RecordingError(f"{self.path}: {self.safe()}")
 
     def safe(self, resume: bool = False) -> str:
@@ -237,8 +236,7 @@ class Recording(Closed):
         resume
             Say how to go on, too.
         """
-        readable = self._readable()
-        if readable is None or set(self.finished) - readable:
+        if self._lost():
             lost = "the session was removed or damaged while it was recorded"
             return f"{lost}: record again, to another folder"
         safe = "no placement was finished"
@@ -248,15 +246,13 @@ class Recording(Closed):
             safe = f"{safe}; --resume goes on from there"
         return safe
 
-    def _readable(self):
-        """Finished placements that a reader finds with their scans; None without a session."""
+    def _lost(self):
+        """Whether a reader does not find all that was finished, with its scans."""
         try:
-            recorded = open_session(self.path).scans["placement"].tolist()
+            recorded = open_session(self.path).scans["placement"]
         except (SessionError, OSError):
-            if self.finished or not self.path.exists():
-                return None
-            return set()
-        return set(recorded) & set(self.finished)
+            return bool(self.finished) or not self.path.exists()
+        return not set(self.finished) <= set(recorded.tolist())
 
     def write(self, event: Event) -> None:
         """Put an event on the disk; the parts of an interlaced scan share its pitch.
@@ -273,31 +269,34 @@ class Recording(Closed):
         """
         writer = self.writer
         with self._safely():
-            if isinstance(event, Moved):
-                measured = math.nan
-                if event.measured:
-                    measured = event.pitch
-                writer.add_platform([(event.time_s, event.commanded, measured)])
-            elif isinstance(event, Scanned):
-                scans = zip(event.readings, event.pitch, strict=True)
-                rows = [(raw, p, one.time_s) for one, p in scans for raw in one.telegrams]
-                writer.add_telegrams(event.placement, *zip(*rows, strict=True))
-            elif isinstance(event, Photographed):
-                writer.add_image(
-                    event.camera,
-                    event.frame.image,
-                    event.placement,
-                    pitch=event.pitch,
-                    time_s=event.frame.time_s,
-                    purpose=event.purpose,
-                )
-            elif isinstance(event, Tracked):
-                track = [
-                    (t, event.commanded, pitch)
-                    for t, pitch, measured in event.track
-                    if measured
-                ]
-                writer.add_platform(track)
+            match event:
+                case Moved():
+                    measured = math.nan
+                    if event.measured:
+                        measured = event.pitch
+                    writer.add_platform([(event.time_s, event.commanded, measured)])
+                case Scanned():
+                    scans = zip(event.readings, event.pitch, strict=True)
+                    rows = [
+                        (raw, p, one.time_s) for one, p in scans for raw in one.telegrams
+                    ]
+                    writer.add_telegrams(event.placement, *zip(*rows, strict=True))
+                case Photographed():
+                    writer.add_image(
+                        event.camera,
+                        event.frame.image,
+                        event.placement,
+                        pitch=event.pitch,
+                        time_s=event.frame.time_s,
+                        purpose=event.purpose,
+                    )
+                case Tracked():
+                    track = [
+                        (t, event.commanded, pitch)
+                        for t, pitch, measured in event.track
+                        if measured
+                    ]
+                    writer.add_platform(track)
 
     @contextlib.contextmanager
     def _safely(self):
@@ -349,17 +348,18 @@ class Sweeping:
         event
             Of the placement.
         """
-        if isinstance(event, Moved):
-            self.stop = f"stop {event.number} of {event.of}, "
-            self.pitch = event.pitch
-            self.share = (event.number - 1) / event.of
-        elif isinstance(event, Scanned):
-            self.scans += len(event.readings)
-            self.pitch = event.pitch[-1]
-            if math.isfinite(event.share):
-                self.share = event.share
-        elif isinstance(event, Photographed):
-            self.images += 1
+        match event:
+            case Moved():
+                self.stop = f"stop {event.number} of {event.of}, "
+                self.pitch = event.pitch
+                self.share = (event.number - 1) / event.of
+            case Scanned():
+                self.scans += len(event.readings)
+                self.pitch = event.pitch[-1]
+                if math.isfinite(event.share):
+                    self.share = event.share
+            case Photographed():
+                self.images += 1
 
     def counts(self):
         """What was recorded, as text."""
@@ -433,13 +433,16 @@ class Boards:
         )
 
 
+BOARDS = Boards()
+
+
 def record_session(
     rig: Rig,
     path: str | os.PathLike,
     *,
     resume: bool = False,
     count: int | None = None,
-    guide: Boards | None = None,
+    guide: Boards = BOARDS,
 ) -> Recording:
     """Record a session with an open rig, from the first placement that is missing to the last.
 
@@ -465,7 +468,7 @@ def record_session(
             print(f"{path}: going on, {recording.safe()}", flush=True)
         try:
             _close_views(recording)
-            _placements(recording, guide or Boards())
+            _placements(recording, guide)
             recording.finish()
         except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:
             error.add_note(recording.safe(resume=True))
@@ -528,7 +531,7 @@ def main(
     *,
     resume: bool = False,
     count: int | None = None,
-    guide: Boards | None = None,
+    guide: Boards = BOARDS,
 ) -> int:
     """Record from the command line.
 
@@ -548,7 +551,6 @@ def main(
         after a signal. The head is stopped in any case.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    guide = guide or Boards()
     try:
         stated = guide.planned(read_rig_file(rig_file))
         print(f"{rig_file}: opening the devices", flush=True)
@@ -563,12 +565,12 @@ def main(
     ) as error:
         text = f"error: {error}"
         code = FAILED
-        if isinstance(error, KeyboardInterrupt):
-            text = "\nstopped by Ctrl-C"
-            code = INTERRUPTED
-        elif isinstance(error, SystemExit) and isinstance(error.code, int):
-            text = f"\nstopped by {signal.Signals(error.code - 128).name}"
-            code = error.code
+        match error:
+            case KeyboardInterrupt():
+                text = "\nstopped by Ctrl-C"
+                code = INTERRUPTED
+            case SystemExit(code=int(code)):
+                text = f"\nstopped by {signal.Signals(code - 128).name}"
         with contextlib.suppress(OSError):  # after SIGHUP the terminal may be gone
             print("; ".join([text, *getattr(error, "__notes__", [])]), file=sys.stderr)
         return code
