@@ -5,13 +5,13 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lrfcal_lib.acquire.checks import Light
+from lrfcal_lib.acquire.checks import Light, check_placement
 from lrfcal_lib.acquire.record import Recording, RecordingError, Sweeping
 from lrfcal_lib.calibrate.pipeline import (
     Calibration,
@@ -21,7 +21,7 @@ from lrfcal_lib.calibrate.pipeline import (
     prepare,
 )
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
-from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
+from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned
 from lrfcal_lib.drivers.rig_file import Placement, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
@@ -83,16 +83,14 @@ def next_task(recording: Recording, advice: str = "") -> Task | None:
         guidance = f"hold the board close, {how}"
         return Task(title, guidance, close=(camera, view))
 
-    left = recording.to_do()
-    if not left and not plan.placements:  # nothing is listed: one more can always be had
-        more = plan.to_do(max(recording.finished) + 1)
-        left = [
-            placement for placement in more if placement.number not in recording.finished
-        ]
+    planned = recording.plan
+    if not plan.placements:  # nothing is listed: one more can always be had
+        planned = plan.to_do(max([plan.count, *recording.finished]) + 1)
+    left = [one for one in planned if one.number not in recording.finished]
     if not left:
         return None
     placement = left[0]
-    done = len(recording.plan) - len(recording.to_do())
+    done = len(planned) - len(left)
     guidance = advice or f"put the board {GUIDE[done % len(GUIDE)]}"
     if placement.purpose == "scene":
         guidance = "take the board away: this sweep shows the room"
@@ -184,17 +182,36 @@ class Interrupted(RuntimeError):
 
 
 @dataclass
-class View:
-    """What the rig sees."""
+class View(Sweeping):
+    """What the rig sees, and how far the placement recorded last is."""
 
     ranges: np.ndarray | None = None  # (B,), of the newest scan, metres
     bearings: np.ndarray | None = None  # (B,), radians
-    pitch: float = 0.0  # of the head, radians
     measured: bool = False  # the head tells its pitch
     frames: dict[str, Frame] = field(default_factory=dict)  # the newest by camera
     # ranges by pitch, of the placement recorded last
     rows: dict[float, np.ndarray] = field(default_factory=dict)
     trouble: str = ""  # what cannot be seen, and why
+
+    def note(self, event: Event) -> None:
+        """Take an event of the placement into account.
+
+        Parameters
+        ----------
+        event
+            Of the placement.
+        """
+        super().note(event)
+        match event:
+            case Moved():
+                self.measured = event.measured
+            case Scanned():
+                for reading, pitch in zip(event.readings, event.pitch, strict=True):
+                    self.rows[pitch] = reading.ranges
+                self.ranges = reading.ranges
+                self.bearings = reading.bearings
+            case Photographed():
+                self.frames[event.camera] = event.frame
 
 
 class Collector(Closed):
@@ -212,7 +229,6 @@ class Collector(Closed):
     """
 
     def __init__(self):
-        self.rig: Rig | None = None
         self.recording: Recording | None = None
         self.view = View()
         self.lights: dict[int, list[Light]] = {}
@@ -224,18 +240,22 @@ class Collector(Closed):
     @property
     def connected(self) -> bool:
         """Whether a rig is open."""
-        return self.rig is not None
+        return self.recording is not None
+
+    @property
+    def rig(self) -> Rig:
+        """The rig that is open."""
+        return self._needed().rig
 
     @property
     def emulated(self) -> bool:
         """Whether the board moves by itself."""
-        return self.rig is not None and self.rig.stated.devices.control is not None
+        return self.connected and self.rig.stated.devices.control is not None
 
     @property
     def limits_deg(self) -> Any:
         """Lowest and highest pitch of the head."""
-        rig, _ = self._needed()
-        return rig.stated.devices.head.pitch_limits_deg
+        return self.rig.stated.devices.head.pitch_limits_deg
 
     @property
     def finished(self) -> tuple[int, ...]:
@@ -267,7 +287,6 @@ class Collector(Closed):
         with self._exclusively(), contextlib.ExitStack() as stack:
             opened = stack.enter_context(Rig.open(_stated(rig, stack)))
             recording = stack.enter_context(Recording(opened, Path(session), resume=True))
-            self.rig = opened
             self.recording = recording
             self._closing = stack.pop_all()
             self.view = View()
@@ -283,16 +302,14 @@ class Collector(Closed):
         RecordingError
             If the session cannot be finished; the devices are closed all the same.
         """
-        rig = self.rig
         recording = self.recording
-        if rig is None or recording is None:
+        if recording is None:
             return
         self.stop()
         with self._exclusively():
-            self.rig = None
             self.recording = None
             with self._closing:
-                rig.halt()
+                recording.rig.halt()
                 if recording.finished:
                     recording.finish()
 
@@ -307,10 +324,11 @@ class Collector(Closed):
             self._devices.release()
 
     def _needed(self):
-        if self.rig is None:
+        """The recording."""
+        if self.recording is None:
             remedy = "name a rig file or an emulated rig, and press connect"
             raise DeviceError(f"no rig is connected: {remedy}")
-        return self.rig, self.recording
+        return self.recording
 
     def move_to(self, pitch: float) -> float:
         """Move the head.
@@ -332,20 +350,21 @@ class Collector(Closed):
         Busy
             If something else is under way.
         """
-        rig, _ = self._needed()
+        head = self.rig.head
         with self._exclusively():
             self.stopped.clear()
-            self.view.pitch = rig.head.move_to(pitch)
-            self.view.measured = rig.head.has_feedback
+            self.view.pitch = head.move_to(pitch)
+            self.view.measured = head.has_feedback
         return self.view.pitch
 
     def stop(self) -> None:
         """Stop the head at once, and whatever was under way; returns when it has ended."""
-        rig = self.rig
+        recording = self.recording
         end = time.monotonic() + WAIT_S
         self.stopped.set()
-        while rig is not None and time.monotonic() < end:
-            rig.head.emergency_stop()  # again: the next move of a sweep may have begun in between
+        while recording is not None and time.monotonic() < end:
+            # again: the next move of a sweep may have begun in between
+            recording.rig.head.emergency_stop()
             if self._devices.acquire(timeout=AGAIN_S):
                 self._devices.release()
                 return
@@ -355,10 +374,10 @@ class Collector(Closed):
 
         What could not be read is said in `trouble`; nothing is raised for it.
         """
-        rig = self.rig
         view = self.view
-        if rig is None:
+        if not self.connected:
             return view
+        rig = self.rig
         troubles = []
         for name, camera in rig.cameras.items():
             try:
@@ -407,7 +426,8 @@ class Collector(Closed):
         DeviceError, RecordingError, Interrupted
             Or if it was stopped: the placement does not count.
         """
-        rig, recording = self._needed()
+        recording = self._needed()
+        rig = recording.rig
         task = self.task()
         if task is None:
             remedy = "calibrate, or connect with another session"
@@ -420,28 +440,25 @@ class Collector(Closed):
                 rig.hold_close(camera, view)
                 return [recording.run_close(camera)]
             number = placement.number
-            self.view.rows = {}
+            self.view = replace(self.view, rows={}, scans=0, images=0, stop="", share=0.0)
             rig.move_board(number)
             self._record(placement, progress)
         progress(1.0, "checking what was recorded")
-        scenes = {
-            placement.number for placement in recording.plan if placement.purpose == "scene"
-        }
+        session = open_session(recording.path)
         adviser = None  # while every other placement helps
-        if len({*self.finished} - scenes) >= ADVICE_FROM:
+        if len(session.board_placements) >= ADVICE_FROM:
             adviser = self._advise
-        self.lights[number] = recording.check(number, adviser)
+        self.lights[number] = check_placement(session, number, adviser)
         return self.lights[number]
 
     def _record(self, placement, progress):
         """Record a placement; Interrupted if the user stops it."""
-        sweeping = Sweeping()
+        view = self.view
         with contextlib.closing(self.recording.run(placement)) as events:
             try:
                 for event in events:
-                    self._note(event)
-                    sweeping.note(event)
-                    progress(sweeping.share, f"{sweeping.stop}{sweeping.counts()}")
+                    view.note(event)
+                    progress(view.share, f"{view.stop}{view.counts()}")
                     if self.stopped.is_set():
                         raise DeviceError("stopped")
             except DeviceError as error:
@@ -449,21 +466,6 @@ class Collector(Closed):
                     raise
                 words = f"placement {placement.number} does not count, record it again"
                 raise Interrupted(f"stopped: {words}") from error
-
-    def _note(self, event):
-        """Put an event into the view."""
-        view = self.view
-        if isinstance(event, Moved):
-            view.pitch = event.pitch
-            view.measured = event.measured
-        elif isinstance(event, Scanned):
-            for reading, pitch in zip(event.readings, event.pitch.tolist(), strict=True):
-                view.rows[pitch] = reading.ranges
-            view.ranges = reading.ranges
-            view.bearings = reading.bearings
-            view.pitch = pitch
-        elif isinstance(event, Photographed):
-            view.frames[event.camera] = event.frame
 
     def _advise(self, session):
         self._advice = advise(session)
@@ -477,7 +479,7 @@ class Collector(Closed):
         RecordingError
             If there is none.
         """
-        _, recording = self._needed()
+        recording = self._needed()
         if not self.finished:
             remedy = "press capture to record one"
             raise RecordingError(f"there is no placement to record again: {remedy}")
@@ -497,7 +499,7 @@ class Collector(Closed):
         ValueError
             If it determines no calibration.
         """
-        _, recording = self._needed()
+        recording = self._needed()
         if not self.finished:
             remedy = "capture at least three placements of the board"
             raise RecordingError(f"nothing was recorded yet: {remedy}")

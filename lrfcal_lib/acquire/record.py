@@ -6,7 +6,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,7 +70,7 @@ class Recording(Closed):
     ...         input("move the board, press Enter")
     ...         for event in recording.run(placement):
     ...             print(event)
-    ...         print(recording.check(placement.number))
+    ...         print(check_placement(open_session("session"), placement.number))
     ...     recording.finish()
     """
 
@@ -189,20 +189,6 @@ class Recording(Closed):
         if light.state != "bad":
             self.write(photo)
         return light
-
-    def check(
-        self, number: int, advice: Callable[[Session], str] | None = None
-    ) -> list[Light]:
-        """Lights of a finished placement.
-
-        Parameters
-        ----------
-        number
-            Of the placement.
-        advice
-            As of :func:`~lrfcal_lib.acquire.checks.check_placement`.
-        """
-        return check_placement(open_session(self.path), number, advice)
 
     def drop(self, number: int) -> None:
         """Take a placement out of the session, to record it again; its bytes stay on the disk.
