@@ -208,6 +208,8 @@ class EmulatedHead(SerialDevice):
         Of :class:`Habits`.
     """
 
+    gap_s = FRAGMENT_S
+
     def __init__(
         self,
         head: Head | None = None,
@@ -221,7 +223,6 @@ class EmulatedHead(SerialDevice):
         self.head = head or Head(seed=seed)
         self.habits = Habits(**habits)
         self.absolute_until = -math.inf  # an absolute move is under way
-        self._buffer = b""  # bytes of a frame that is not whole
 
     @property
     def baudrate(self) -> int:
@@ -232,28 +233,26 @@ class EmulatedHead(SerialDevice):
         """True pitch now, radians."""
         return float(self.head.pitch(self.host.now()))
 
-    def receive(self, data: bytes, at: float) -> None:
-        """Bytes of the host.
+    def take(self, raw: bytes, at: float) -> int:
+        """Obey what frames of the host say.
 
         Parameters
         ----------
-        data
+        raw
             Of any number of frames, whole or not.
         at
-            Instant of the last of them, s.
+            Instant of the last of its bytes, s.
+
+        Returns
+        -------
+        int
+            From where on bytes must be kept.
         """
-        self.cancel("fragment")
-        data = self._buffer + data
-        frames, pending = pelco_d.split_frames(data)
-        self._buffer = data[pending:]
+        frames, pending = pelco_d.split_frames(raw)
         for frame in frames:
             if frame.address == self.habits.address:
                 self.obey(frame, at)
-        if self._buffer:
-            self.at(at + FRAGMENT_S, self._forget, "fragment")
-
-    def _forget(self, _):
-        self._buffer = b""
+        return pending
 
     def obey(self, frame: pelco_d.Frame, at: float) -> None:
         """Do what a frame says.

@@ -29,13 +29,14 @@ LOOK_S = 0.02  # how often to see whether somebody opened the port
 END_S = 5  # longest wait for the end of the thread
 SOON = 1e-9  # s; so far ahead counts as now, whatever the rounding
 NONE = -1  # file of a terminal that is not plugged in
-SENDING = "sending"  # tag of what is planned for the bytes on their way out
+SENDING = "sending"  # tag of what is planned until the last byte is out
 
 
 class SerialDevice(ABC):
     """What all devices on a line have in common; a context manager, or `start` and `close`.
 
-    Instants are ``now()`` of the host that it lives on, s.
+    Instants are ``now()`` of the host that it lives on, s. A telegram that was begun is forgotten
+    when nothing more of it comes for `gap_s`.
 
     Parameters
     ----------
@@ -52,6 +53,8 @@ class SerialDevice(ABC):
         What ended the device by itself.
     """
 
+    gap_s: float
+
     def __init__(self, path: str | os.PathLike, host: Host, seed: int = 0):
         self.path = str(path)
         self.host = host
@@ -60,6 +63,7 @@ class SerialDevice(ABC):
         self.busy_until = 0.0  # of the line to the host
         self._heard = 0.0  # the last byte from the host
         self._noise = np.random.default_rng([seed, 4])
+        self._buffer = b""  # bytes of a telegram that is not whole
         self._agenda: list = []  # heap of instant, order, action, tag
         self._order = itertools.count()
 
@@ -69,15 +73,20 @@ class SerialDevice(ABC):
         """Of the device."""
 
     @abstractmethod
-    def receive(self, data: bytes, at: float) -> None:
-        """Take bytes of the host.
+    def take(self, raw: bytes, at: float) -> int:
+        """Do what bytes of the host say.
 
         Parameters
         ----------
-        data
-            As they arrived.
+        raw
+            Of any number of telegrams, whole or not.
         at
             Instant of the last of them, s.
+
+        Returns
+        -------
+        int
+            From where on they must be kept: a telegram may begin there whose end has not come yet.
         """
 
     @property
@@ -114,15 +123,15 @@ class SerialDevice(ABC):
         """
         heapq.heappush(self._agenda, (instant, next(self._order), action, tag))
 
-    def cancel(self, *tags: str) -> None:
+    def cancel(self, tag: str) -> None:
         """Forget what was planned.
 
         Parameters
         ----------
-        *tags
+        tag
             Of the plans.
         """
-        self._agenda = [item for item in self._agenda if item[3] not in tags]
+        self._agenda = [item for item in self._agenda if item[3] != tag]
         heapq.heapify(self._agenda)
 
     def abort(self) -> None:
@@ -187,6 +196,25 @@ class SerialDevice(ABC):
         self._heard = max(self._heard, self.host.now()) + len(data) * self.byte_s
         if data:
             self.receive(data, self._heard)
+
+    def receive(self, data: bytes, at: float) -> None:
+        """Take bytes of the host.
+
+        Parameters
+        ----------
+        data
+            As they arrived.
+        at
+            Instant of the last of them, s.
+        """
+        self.cancel("gap")
+        raw = self._buffer + data
+        self._buffer = raw[self.take(raw, at) :]
+        if self._buffer:
+            self.at(at + self.gap_s, self._forget, "gap")
+
+    def _forget(self, _):
+        self._buffer = b""
 
     def _through(self, data, sent, read):
         """Bytes at the other end of the line; where its ends are set to different rates as much

@@ -58,6 +58,7 @@ class Memory:
     variant: tuple[int, int] = (180, 50)  # degrees and 1/100 degree
     configuration: Configuration = field(default_factory=Configuration)
     baudrate: int = 9600
+    baudrates: tuple[int, ...] = (*BAUD_WORD,)  # that the line allows; RS-232 ends at 38400
     mode: int = REQUEST  # operating mode, the sub-command of 0x20
     address: int = 0
     password: bytes = b"SICK_LMS"
