@@ -38,8 +38,6 @@ class EmulatedRig:
     ----------
     setup
         What to emulate.
-    seed
-        Of noise; the world follows from the setup's own seed.
     placements
         Where the board can be put, see :class:`EmulatedWorld`.
     head_options
@@ -61,7 +59,6 @@ class EmulatedRig:
         self,
         setup: Setup,
         *,
-        seed: int = 0,
         placements: Sequence[Placement] | None = None,
         head_options: dict | None = None,
         quick: bool = False,
@@ -74,15 +71,14 @@ class EmulatedRig:
         self._closing = contextlib.ExitStack()
         folder = tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
         self.folder = Path(self._closing.enter_context(folder))
-        self.world = EmulatedWorld(setup, host, seed, placements)
-        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host, seed=seed)
-        head = self.world.head
+        self.world = EmulatedWorld(setup, host, placements)
+        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host)
         options = dict(head_options or {})
         if quick:
             options |= QUICK_HEAD
         path = self.folder / "head"
-        self.pan_tilt = EmulatedHead(head, path=path, host=host, seed=seed, **options)
-        self.camera_server = CameraServer(self.world, seed=seed, rest_s=rest_s)
+        self.pan_tilt = EmulatedHead(self.world.head, path=path, host=host, **options)
+        self.camera_server = CameraServer(self.world, rest_s=rest_s)
         self.camera_urls = {
             name: f"{self.camera_server.url}/{name}.mjpg"
             for name in self.camera_server.cameras
@@ -138,7 +134,7 @@ class EmulatedRig:
         for info, camera in zip(rig.camera_infos(), rig.cameras, strict=True):
             if setup.intrinsics_views == 0:
                 info = replace(info, model=camera.model)
-            cameras[info.name] = info
+            cameras[info.name] = stated.camera_to_json(info)
         return {
             "schema": stated.SCHEMA,
             "name": f"{setup.name}_emulated",
@@ -149,13 +145,13 @@ class EmulatedRig:
             "rig": {
                 "lrf": stated.lrf_to_json(rig.beam.info("emulated")),
                 "platform": {"T_head_lrf": stated.transform_to_json(rig.T_head_lrf_stated)},
-                "cameras": {name: stated.camera_to_json(c) for name, c in cameras.items()},
+                "cameras": cameras,
             },
-            "devices": self._devices(cameras),
+            "devices": self._devices(),
             "plan": self.plan(),
         }
 
-    def _devices(self, cameras):
+    def _devices(self):
         """Where the devices are, and how they are to be set."""
         rig = self.setup.rig
         head = self.pan_tilt
@@ -178,12 +174,12 @@ class EmulatedRig:
             },
             "head": stated_head,
             "cameras": {
-                name: {
-                    "source": self.camera_urls[name],
+                camera.name: {
+                    "source": self.camera_urls[camera.name],
                     "silence_s": SILENCE_S,
-                    "size": [camera.width, camera.height],
+                    "size": [camera.model.width, camera.model.height],
                 }
-                for name, camera in cameras.items()
+                for camera in rig.cameras
             },
             "control": self.camera_server.control,
         }
