@@ -62,11 +62,8 @@ def sweep_picture(
     ax = figure.add_axes((0.17, 0.17, 0.81, 0.79))
     if len(rows) > 1:
         known = np.array(list(rows))
-        sweep = Sweep(
-            0, np.array(list(rows.values())), bearings, known, np.zeros(len(known))
-        )
-        range_image(ax, sweep, limits=(None, None))
-        ax.collections[0].set_cmap(NEAR_IS_BRIGHT)
+        sweep = Sweep(0, np.array(list(rows.values())), bearings, known, np.nan * known)
+        range_image(ax, sweep, limits=(None, None)).set_cmap(NEAR_IS_BRIGHT)
     ax.set(ylim=np.degrees(np.sort(pitch)), aspect="auto")
     return _png(figure)
 

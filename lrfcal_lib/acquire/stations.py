@@ -106,9 +106,8 @@ class Stations(Boards):
     def _colors(self, session, number):
         """The Light of the share of points that get a colour."""
         station = station_of(session, self.rig, number)
-        clouds = list(colored_blocks(session, self.rig, station))
-        share = sum(cloud.seen.sum() for cloud in clouds)
-        share = float(share / max(1, sum(len(cloud.seen) for cloud in clouds)))
+        seen = [cloud.seen for cloud in colored_blocks(session, self.rig, station)]
+        share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
         text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
         state = "ok" if share > EXPECTED * self.share else "warn"
         return Light("colour", state, text)
