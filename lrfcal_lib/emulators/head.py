@@ -37,7 +37,6 @@ class Head:
 
     def __init__(self, platform: Platform | None = None, seed: int = 0, pitch: float = 0.0):
         self.platform = platform or Platform()
-        self.limits = self.platform.limits
         self._rng = np.random.default_rng([seed, 2])
         # rows: instant, motor, and where its play leaves the head. One thread writes them, any may
         # look: a look sees the table of before or of after.
@@ -55,17 +54,15 @@ class Head:
         speed
             Radians a second.
         """
-        self._run(instant + REACT_S, goal, speed)
-
-    def _run(self, instant, goal, speed):
-        now = float(self.motor(instant))
-        goal = float(np.clip(goal, *self.limits))
-        dragged = float(self.pitch(instant))
-        knots = [(instant, now, dragged)]
+        reacts = instant + REACT_S
+        now = self.motor(reacts)
+        goal = np.clip(goal, *self.platform.limits)
+        dragged = self.pitch(reacts)
+        knots: list = [(reacts, now, dragged)]
         if speed and goal != now:
-            arrives = instant + abs((goal - now) / speed)
+            arrives = reacts + abs((goal - now) / speed)
             knots.append((arrives, goal, self._with_play(dragged, goal)))
-        before = self._knots[self._knots[:, 0] < instant]
+        before = self._knots[self._knots[:, 0] < reacts]
         self._knots = np.vstack([before[-KEPT:], *knots])
 
     def go(self, instant: float, goal: float, speed: float) -> None:
@@ -88,7 +85,7 @@ class Head:
         """
         reacts = instant + REACT_S
         if self.moving(reacts):
-            self._run(reacts, self.motor(reacts), 0.0)
+            self.move(instant, float(self.motor(reacts)), 0.0)
 
     def motor(self, instant: float | np.ndarray) -> np.ndarray:
         """Angle of the motor.
@@ -291,8 +288,8 @@ class EmulatedHead(SerialDevice):
             return
         head = self.head
         speed = math.radians(self.habits.go_speed)
-        goal = float(np.clip(pelco_d.decode_tilt(value), *head.limits))
-        self.absolute_until = at + abs(goal - float(head.motor(at))) / speed
+        goal = np.clip(pelco_d.decode_tilt(value), *head.platform.limits)
+        self.absolute_until = at + abs(goal - head.motor(at)) / speed
         head.go(at, goal, speed)
 
     def stop(self, at: float) -> None:
