@@ -153,14 +153,12 @@ class SerialDevice(ABC):
         then
             ``then(instant)`` is called when the last is out.
         """
-        byte_s = self.byte_s
-        begin = max(at, self.busy_until)
-        self.busy_until = begin + len(data) * byte_s
-        at_once = max(1, int(CHUNK_S / byte_s))
+        self.busy_until = max(at, self.busy_until)
+        at_once = max(1, int(CHUNK_S / self.byte_s))
         for first in range(0, len(data), at_once):
             chunk = data[first : first + at_once]
-            out = begin + (first + len(chunk)) * byte_s
-            self.at(out, partial(self._put, chunk), SENDING)
+            self.busy_until += len(chunk) * self.byte_s
+            self.at(self.busy_until, partial(self._put, chunk), SENDING)
         if then is not None:
             self.at(self.busy_until, then, SENDING)
 
@@ -176,7 +174,7 @@ class SerialDevice(ABC):
         """When something is to be done, s."""
         if not self._agenda:
             return math.inf
-        return max(self.host.now(), self._agenda[0][0])
+        return self._agenda[0][0]
 
     def advance(self) -> None:
         """Do all that is due by now."""
@@ -309,10 +307,8 @@ class Terminal(threading.Thread):
         tty.setraw(slave)
         os.set_blocking(self._master, False)
         path = Path(self._device.path)
-        beside = path.with_name(f".{path.name}.{os.getpid()}")
-        beside.unlink(missing_ok=True)
-        beside.symlink_to(os.ttyname(slave))
-        beside.replace(path)
+        path.unlink(missing_ok=True)
+        path.symlink_to(os.ttyname(slave))
         os.close(slave)
         self.open = False
 

@@ -22,10 +22,10 @@ from lrfcal_lib.emulators.lms2xx_memory import (
     REFLECTIVITY,
     REQUEST,
     STREAMED,
+    WRITTEN,
     Memory,
     Selection,
     selection_of,
-    words_of,
 )
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
@@ -194,25 +194,9 @@ class EmulatedLms(SerialDevice):
                 begun = at + ACK_S + 2 * self.byte_s
                 turn = self._turn_of(begun, memory.turns, math.floor)
                 self._measure(turn, -1, partial(self.emit, then=self._finish))
-            case 0x31, _:
-                self.answer(at, 0xB1, memory.status_data())
-            case 0x32, _:
-                self.answer(at, 0xB2)
-            case 0x3A, _:
-                self.answer(at, 0xBA, memory.model.encode())
-            case 0x3B, data if (
-                len(data) == 4
-            ):  # nothing is streamed while the variant changes
-                taken = memory.set_variant(tuple(np.frombuffer(data, "<u2").tolist()))
-                self.answer(
-                    at, 0xBB, bytes([taken]) + words_of(memory.variant), delay=WRITE_S
-                )
-            case 0x74, _:
-                self.answer(at, 0xF4, memory.configuration.block)
-            case 0x77, data if 32 <= len(data) <= 34 and memory.mode == INSTALLATION:
-                taken = memory.write_configuration(data)
-                block = memory.configuration.block
-                self.answer(at, 0xF7, bytes([taken]) + block, delay=WRITE_S)
+            case code, data if (reply := memory.reply(code, data)) is not None:
+                delay = WRITE_S if code in WRITTEN else REPLY_S
+                self.answer(at, 0x80 | code, reply, delay=delay)
             case _:
                 self.answer(at, 0x92)
 
