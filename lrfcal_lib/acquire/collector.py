@@ -132,14 +132,11 @@ def calibrate_recording(path: Path) -> Result:
     if not judged.errors:
         sentences += ("Nothing is written.",)
         return Result(judged.answer, sentences, "", {}, None, calibration)
-    method = handed_over(calibration) or ""
+    method = handed_over(calibration)
     poses = {}
     for camera, solution in calibration.cameras(method).items():
-        values = POSE_UNITS * solution.parameters[:6]
-        sigma = POSE_UNITS * solution.trusted_sigma[:6]
-        poses[camera] = tuple(
-            f"{v:.2f} ± {s:.2f}" for v, s in zip(values, sigma, strict=True)
-        )
+        told = POSE_UNITS * [solution.parameters[:6], solution.trusted_sigma[:6]]
+        poses[camera] = tuple(f"{value:.2f} ± {sigma:.2f}" for value, sigma in told.T)
     file = path.with_name(f"{path.name}_calibration") / "calibration.json"
     write_calibration(file, calibration_record(calibration, method, judged))
     return Result(judged.answer, sentences, method, poses, file, calibration)

@@ -266,14 +266,12 @@ class Panel(Closed):
         self._live: threading.Thread | None = None  # keeps looking
         self._quit = threading.Event()
         self._sweep: np.ndarray | None = None  # ends of the pitch, radians
-        # cameras that the calibration may have elsewhere
-        self._moved: set[str | None] = set()
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         for name in ("rig", "session"):
             getattr(self.parts, name).observe(self._show_places, "value")
-        self._calibrated: CalibratedRig | None = None  # shows the scan in the images
         self.parts.calibration.observe(self._choose_calibration, "value")
+        self._choose_calibration()
         self._show_places()
         self._refresh()
 
@@ -288,7 +286,7 @@ class Panel(Closed):
 
     def _choose_calibration(self, _=None):
         """Read the calibration that the field names, and say what is wrong with it."""
-        self._calibrated = None
+        self._calibrated: CalibratedRig | None = None  # shows the scan in the images
         name = self.parts.calibration.value.strip()
         words = ""
         if name:
@@ -304,7 +302,7 @@ class Panel(Closed):
 
     def _check_calibration(self):
         """Say whether the chosen calibration still holds for the scenes recorded last."""
-        self._moved = set()
+        self._moved = set()  # cameras that the calibration may have elsewhere
         self.parts.held.value = ""
         if self._calibrated is None or not self.collector.finished:
             return
@@ -372,8 +370,7 @@ class Panel(Closed):
         with self._doing("recording"):
             self._begin_sweep(task)
             lights = self.collector.capture(self._show_progress)
-            title = task.title.lower() if task else ""
-            self.parts.show_lights(f"Quality of {title}", lights)
+            self.parts.show_lights(f"Quality of {task.title.lower()}", lights)
             self._check_calibration()
         return lights
 
