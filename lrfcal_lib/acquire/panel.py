@@ -22,7 +22,7 @@ from markupsafe import Markup
 from lrfcal_lib.acquire.checks import Light
 from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted, Result
 from lrfcal_lib.acquire.pictures import WIDTH, jpeg, scan_picture, sweep_picture, with_scan
-from lrfcal_lib.acquire.record import RecordingError
+from lrfcal_lib.acquire.record import PITCH, RecordingError
 from lrfcal_lib.calibrate.calibration_file import load_calibration
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.drivers.port import Closed, DeviceError
@@ -177,14 +177,14 @@ class Parts(SimpleNamespace):
         """Show what the checks of a placement say."""
         self.lights.value = HTML.lights(heading, lights)
 
-    def enable(self, connected, busy, recorded):
-        """Let be pressed what can be done now; STOP always can."""
+    def enable(self, collector, busy):
+        """Let be pressed what a Collector can do now; STOP always can."""
         for part in (self.rig, self.session, self.connect):
-            part.disabled = busy or connected
+            part.disabled = busy or collector.connected
         for part in (self.close, self.capture, self.go, self.slider):
-            part.disabled = busy or not connected
+            part.disabled = busy or not collector.connected
         for part in (self.again, self.calibrate):
-            part.disabled = busy or not (connected and recorded)
+            part.disabled = busy or not collector.finished
 
 
 def _fields(rig, session):
@@ -265,7 +265,6 @@ class Panel(Closed):
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="panel")
         self._live: threading.Thread | None = None  # keeps looking
         self._quit = threading.Event()
-        self._sweep: np.ndarray | None = None  # ends of the pitch, radians
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         for name in ("rig", "session"):
@@ -414,7 +413,7 @@ class Panel(Closed):
         parts.error.value = ""
         parts.state.value = HTML.state("busy", text)
         self._show_progress(0.0, text)
-        parts.enable(self.collector.connected, True, False)
+        parts.enable(self.collector, busy=True)
         try:
             yield
         except Exception as error:
@@ -443,7 +442,7 @@ class Panel(Closed):
             parts.task.value = HTML.task(
                 collector.task(), collector.emulated, collector.finished
             )
-        parts.enable(collector.connected, False, bool(collector.finished))
+        parts.enable(collector, busy=False)
 
     def _show_progress(self, share, text):
         self.parts.progress.value = share
@@ -451,8 +450,8 @@ class Panel(Closed):
 
     def _begin_sweep(self, task):
         """An empty picture of the sweep to come."""
-        self._sweep = None
-        if task is not None and task.placement is not None:
+        self._sweep = None  # ends of the pitch, radians
+        if task and task.placement:
             self._sweep = task.placement.pitch[[0, -1]]
 
     def _keep_looking(self):
@@ -467,10 +466,8 @@ class Panel(Closed):
     def _show_view(self, view, field_of_view):
         """Show a View of the rig."""
         pictures = self.parts.pictures
-        how = "dead reckoning: the head does not tell it"
-        if view.measured:
-            how = "told by the head"
-        self.parts.pitch.value = f"<b>{np.degrees(view.pitch):+.2f}°</b> {HTML.soft(how)}"
+        how = HTML.soft(PITCH[view.measured])
+        self.parts.pitch.value = f"<b>{np.degrees(view.pitch):+.2f}°</b> {how}"
 
         if view.ranges is not None:
             known = np.isfinite(view.ranges).sum()

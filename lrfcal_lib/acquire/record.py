@@ -35,6 +35,7 @@ HOW = {  # a session was recorded, by the mode of the plan
         "continuous: scans are taken while the head moves, each with the pitch at its middle beam"
     ),
 }
+PITCH = {True: "told by the head", False: "dead reckoning: the head does not tell it"}
 
 
 class RecordingError(RuntimeError):
@@ -86,28 +87,23 @@ class Recording(Closed):
         self.path = Path(path)
         self.plan = rig.stated.plan.to_do(count)
         with self._safely(), contextlib.ExitStack() as stack:
-            writer = self._open(resume)
-            stack.callback(writer.close)
+            self.writer = self._open(resume)
+            stack.callback(self.close)
             # a scan does not tell its measuring mode, this does
             begin = encode_configuration(rig.lrf.configuration)
-            writer.add_telegrams(-1, [begin], time_s=rig.clock())
-            self.writer = writer
+            self.writer.add_telegrams(-1, [begin], time_s=rig.clock())
             stack.pop_all()
 
     def _open(self, resume):
         """The session, to write to."""
         rig = self.rig
         stated = rig.stated
-        pitch = "dead reckoning: the head does not tell it"
-        if rig.head.has_feedback:
-            pitch = "told by the head"
         reference = {
             "recording": HOW[stated.plan.mode],
-            "pitch": pitch,
+            "pitch": PITCH[rig.head.has_feedback],
             "scene_placements": [p.number for p in self.plan if p.purpose == "scene"],
         }
-        about = dict(stated.about)
-        about["source"] = about["source"] or f"recorded with {stated.path.name}"
+        source = stated.about["source"] or f"recorded with {stated.path.name}"
         return SessionRecorder(
             self.path,
             stated.board,
@@ -118,7 +114,7 @@ class Recording(Closed):
             reference=reference,
             continuous=stated.plan.mode == "continuous",
             resume=resume,
-            **about,
+            **stated.about | {"source": source},
         )
 
     @property
@@ -366,7 +362,7 @@ def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) 
     events
         Of its recording.
     """
-    first, last = (math.degrees(pitch) for pitch in placement.pitch[[0, -1]])
+    first, last = map(math.degrees, placement.pitch[[0, -1]])
     title = f"placement {placement.number} ({number} of {of}): {placement.purpose}"
     print(f"{title}, pitch {first:.2f} to {last:.2f} deg", flush=True)
     sweeping = Sweeping()
