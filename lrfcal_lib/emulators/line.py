@@ -4,7 +4,6 @@ The port is a pseudo-terminal served by a thread, whose rate is read at the mast
 one garbles bytes as on a real line.
 """
 
-import contextlib
 import heapq
 import itertools
 import math
@@ -19,11 +18,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from serial import Serial
 
 from lrfcal_lib.drivers.port import REAL, Host
 
-NAMES = [name for name in dir(termios) if name[0] == "B" and name[1:].isdigit()]
-RATES = {getattr(termios, name): int(name[1:]) for name in NAMES}  # code in termios -> baud
+# code in termios -> baud
+RATES = {getattr(termios, f"B{rate}", None): rate for rate in Serial.BAUDRATES}
 CHUNK_S = 0.005  # bytes that leave within this time are written at once
 LOOK_S = 0.02  # how often to see whether somebody opened the port
 END_S = 5  # longest wait for the end of the thread
@@ -178,7 +178,7 @@ class SerialDevice(ABC):
 
     def advance(self) -> None:
         """Do all that is due by now."""
-        while self._agenda and self._agenda[0][0] <= self.host.now() + SOON:
+        while self.due() <= self.host.now() + SOON:
             instant, _, action, _ = heapq.heappop(self._agenda)
             action(instant)
 
@@ -278,13 +278,15 @@ class Terminal(threading.Thread):
 
     def _listen(self):
         """Take the bytes of the host; see whether it holds the port open."""
-        state = select.poll()
-        state.register(self._master, select.POLLIN)
-        event = dict(state.poll(0)).get(self._master, 0)
-        if event & select.POLLIN:
-            with contextlib.suppress(OSError):
-                self._device.hear(os.read(self._master, 4096))
-        self.open = not event & select.POLLHUP
+        try:
+            data = os.read(self._master, 4096)
+        except BlockingIOError:  # it says nothing
+            self.open = True
+        except OSError:
+            self.open = False
+        else:
+            self.open = True
+            self._device.hear(data)
 
     def put(self, data: bytes) -> None:
         """Send bytes; what the buffer cannot hold is lost.
