@@ -82,10 +82,9 @@ def check_placement(
     if scene:
         return lights
     for name, camera in session.cameras.items():
-        records = session.images(name, placement)
         images = [
             check_image(session.read_image(record), session.board, camera.model)
-            for record in records
+            for record in session.images(name, placement)
         ]
         lights.append(_together(f"camera {name}", images))
     if advice is not None:
@@ -159,8 +158,9 @@ def check_scan(
     try:
         scan = find_board(sweep, board, T_head_lrf, lrf)
     except BoardNotFound as error:
-        text = f"no board: {error}; sweep over all of it, free of walls"
-        return [Light("scan", "bad", text)]
+        return [
+            Light("scan", "bad", f"no board: {error}; sweep over all of it, free of walls")
+        ]
     rows = np.flatnonzero(scan.mask.any(axis=1))
     text = (
         f"board on {len(rows)} scan lines at {abs(scan.distance):.2f} m, "
@@ -172,8 +172,8 @@ def check_scan(
     if len(rows) < FEWEST_LINES:
         light = Light("scan", "warn", f"{text}: take a smaller step, or go nearer")
     elif cut and np.ptp(sweep.pitch) > 0:
-        hit = f"the {' and '.join(cut)} line hits it: sweep farther"
-        light = Light("scan", "warn", f"{text}; {hit}")
+        words = f"{text}; the {' and '.join(cut)} line hits it: sweep farther"
+        light = Light("scan", "warn", words)
     return [light, _check_sides(scan)]
 
 

@@ -36,6 +36,9 @@ WAIT_S = 3.0  # for a look at the rig to end
 POSE_UNITS = np.repeat([np.degrees(1.0), 1000.0], 3)  # degrees and mm
 AGAIN_S = 0.1  # between stops, until whoever moves the head has noticed
 RECONNECT_S = 2.0
+GUIDE_CLOSE = (
+    "hold the board close, tilted otherwise than before, all of its pattern in the image"
+)
 GUIDE = (
     "about 1.5 m ahead, turned in its plane so that no edge is upright or level",
     "about 1.2 m ahead, a little to the left, turned by a third of a turn, "
@@ -79,9 +82,7 @@ def next_task(recording: Recording, advice: str = "") -> Task | None:
     plan = recording.rig.stated.plan
     for camera, view in recording.close_views_to_do():
         title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"
-        how = "tilted otherwise than before, all of its pattern in the image"
-        guidance = f"hold the board close, {how}"
-        return Task(title, guidance, close=(camera, view))
+        return Task(title, GUIDE_CLOSE, close=(camera, view))
 
     planned = recording.plan
     if not plan.placements:  # nothing is listed: one more can always be had
@@ -323,8 +324,9 @@ class Collector(Closed):
     def _needed(self):
         """The recording."""
         if self.recording is None:
-            remedy = "name a rig file or an emulated rig, and press connect"
-            raise DeviceError(f"no rig is connected: {remedy}")
+            raise DeviceError(
+                "no rig is connected: name a rig file or an emulated rig, and press connect"
+            )
         return self.recording
 
     def move_to(self, pitch: float) -> float:
@@ -427,8 +429,9 @@ class Collector(Closed):
         rig = recording.rig
         task = self.task()
         if task is None:
-            remedy = "calibrate, or connect with another session"
-            raise RecordingError(f"the plan of this rig is done: {remedy}")
+            raise RecordingError(
+                "the plan of this rig is done: calibrate, or connect with another session"
+            )
         with self._exclusively():
             self.stopped.clear()
             placement = task.placement
@@ -461,8 +464,9 @@ class Collector(Closed):
             except DeviceError as error:
                 if not self.stopped.is_set():
                     raise
-                words = f"placement {placement.number} does not count, record it again"
-                raise Interrupted(f"stopped: {words}") from error
+                raise Interrupted(
+                    f"stopped: placement {placement.number} does not count, record it again"
+                ) from error
 
     def _advise(self, session):
         self._advice = advise(session)
@@ -478,8 +482,9 @@ class Collector(Closed):
         """
         recording = self._needed()
         if not self.finished:
-            remedy = "press capture to record one"
-            raise RecordingError(f"there is no placement to record again: {remedy}")
+            raise RecordingError(
+                "there is no placement to record again: press capture to record one"
+            )
         with self._exclusively():
             number = next(reversed(self.lights), self.finished[-1])
             recording.drop(number)
@@ -498,8 +503,9 @@ class Collector(Closed):
         """
         recording = self._needed()
         if not self.finished:
-            remedy = "capture at least three placements of the board"
-            raise RecordingError(f"nothing was recorded yet: {remedy}")
+            raise RecordingError(
+                "nothing was recorded yet: capture at least three placements of the board"
+            )
         return calibrate_recording(recording.path)
 
 

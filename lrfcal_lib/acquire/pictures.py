@@ -37,7 +37,7 @@ def scan_picture(
     ax.plot(bearings, ranges, ".", color=COLORS["lrf"], markersize=3)
     known = np.ravel(ranges)[np.isfinite(ranges)]
     far = np.percentile(known, 90) if len(known) else 0.0
-    ax.set_rlim(0, REACHES[min(np.searchsorted(REACHES, far), len(REACHES) - 1)])
+    ax.set_rlim(0, REACHES[np.searchsorted(REACHES[:-1], far)])
     ax.set_thetalim(*field_of_view)
     ax.set_rorigin(0)
     figure.text(0.5, 0.03, "range [m]", ha="center")

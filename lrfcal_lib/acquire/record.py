@@ -219,8 +219,10 @@ class Recording(Closed):
             Say how to go on, too.
         """
         if self._lost():
-            lost = "the session was removed or damaged while it was recorded"
-            return f"{lost}: record again, to another folder"
+            return (
+                "the session was removed or damaged while it was recorded: record again, to "
+                "another folder"
+            )
         safe = "no placement was finished"
         if self.finished:
             safe = f"placements {', '.join(map(str, self.finished))} are safe"
@@ -308,8 +310,9 @@ def ask(text: str) -> str:
     try:
         return input(text).strip().lower()
     except EOFError:
-        hint = "run record in a terminal, or with an emulated rig"
-        raise RecordingError(f"nobody is there to move the board: {hint}") from None
+        raise RecordingError(
+            "nobody is there to move the board: run record in a terminal, or with an emulated rig"
+        ) from None
 
 
 @dataclass

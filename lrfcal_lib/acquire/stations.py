@@ -116,8 +116,7 @@ def _still(sweep):
     """The Light of whether a station stood still."""
     closing = closing_of(sweep)
     if closing is None:
-        text = "not known: too little came back to compare"
-        return Light("stood still", "warn", text)
+        return Light("stood still", "warn", "not known: too little came back to compare")
     text = (
         f"back at a pitch that it had, ranges differ by {1000 * closing.apart:.0f} mm, "
         f"by {1000 * closing.expected:.0f} mm between neighbouring scan lines"

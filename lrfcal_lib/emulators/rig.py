@@ -40,14 +40,14 @@ class EmulatedRig:
         What to emulate.
     placements
         Where the board can be put, see :class:`EmulatedWorld`.
-    head_options
-        Of :class:`EmulatedHead`.
     quick
         Its head is quick, and the rig file says so.
     rest_s
         Of :class:`CameraServer`.
     host
         Whose time the devices live in, and whose ``terminal(device)`` their ports are.
+    **habits
+        Of :class:`EmulatedHead`.
 
     Examples
     --------
@@ -60,10 +60,10 @@ class EmulatedRig:
         setup: Setup,
         *,
         placements: Sequence[Placement] | None = None,
-        head_options: dict | None = None,
         quick: bool = False,
         rest_s: float = 0.5,
         host: Host = REAL,
+        **habits,
     ):
         self.setup = setup
         self.host = host
@@ -73,11 +73,10 @@ class EmulatedRig:
         self.folder = Path(self._closing.enter_context(folder))
         self.world = EmulatedWorld(setup, host, placements)
         self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host)
-        options = dict(head_options or {})
         if quick:
-            options |= QUICK_HEAD
+            habits |= QUICK_HEAD
         path = self.folder / "head"
-        self.pan_tilt = EmulatedHead(self.world.head, path=path, host=host, **options)
+        self.pan_tilt = EmulatedHead(self.world.head, path=path, host=host, **habits)
         self.camera_server = CameraServer(self.world, rest_s=rest_s)
         self.camera_urls = {
             name: f"{self.camera_server.url}/{name}.mjpg"
@@ -223,7 +222,7 @@ def emulated(name: str, feedback: str = "full") -> EmulatedRig:
     return EmulatedRig(
         setup,
         placements=placements,
-        head_options={"feedback": feedback},
+        feedback=feedback,
         quick=name == PRACTICE,
     )
 
