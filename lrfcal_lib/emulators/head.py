@@ -320,5 +320,7 @@ class EmulatedHead(SerialDevice):
         value = 0
         if opcode == QUERY_TILT:
             value = pelco_d.encode_tilt(self.head.measured(at))
-        reply = encode_extended(self.habits.address, ANSWERS[opcode], value)
-        self.reply(reply, at + TURN_AROUND_S)
+        self.reply(
+            encode_extended(self.habits.address, ANSWERS[opcode], value),
+            at + TURN_AROUND_S,
+        )

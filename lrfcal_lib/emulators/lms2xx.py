@@ -263,8 +263,8 @@ class EmulatedLms(SerialDevice):
         """
         if effect is not None:  # else that of the command whose reply this one interrupted
             self._effect = effect
-        raw = self._encode(code, data)
-        self.at(at + delay, partial(self.reply, raw, then=self._finish), SENDING)
+        reply = partial(self.reply, self._encode(code, data), then=self._finish)
+        self.at(at + delay, reply, SENDING)
 
     def _finish(self, at):
         """A reply is out: do what is left of the command, and stream from the next scan on."""
@@ -361,16 +361,14 @@ class EmulatedLms(SerialDevice):
                 for later in range(0, turns * scans, turns)
             ]
             ranges, reasons = map(np.array, zip(*cast, strict=True))
-            configuration = memory.configuration
             words = codec.encode_values(
                 ranges.mean(axis=0),
-                unit=configuration.unit,
-                mode=ENCODED[configuration.measuring_mode],
+                unit=memory.configuration.unit,
+                mode=ENCODED[memory.configuration.measuring_mode],
                 # of a mean, too: one scan without a range leaves none
                 reasons=reasons.max(axis=0),
             )
-            scan = Scan(turn, part, words, times)
-            self.at(end, partial(send, scan), SENDING)
+            self.at(end, partial(send, Scan(turn, part, words, times)), SENDING)
 
         self.at(end - AHEAD_S, ahead, SENDING)
 
@@ -387,9 +385,8 @@ class EmulatedLms(SerialDevice):
         then
             ``then(instant)`` is called when the last byte is out.
         """
-        raw = self.telegram(scan)
+        self.reply(self.telegram(scan), at, then)
         self.telegrams += 1
-        self.reply(raw, at, then)
 
     def telegram(self, scan: Scan) -> bytes:
         """What the mode tells of a scan.

@@ -148,15 +148,14 @@ class Memory:
 
     def status_data(self) -> bytes:
         """Data of the status reply 0xB1; offsets count from its code. What no driver reads is 0."""
-        configuration = self.configuration
         parts = {
             1: self.model[14:21].encode(),
             8: bytes([self.mode]),
-            102: bytes([configuration.measuring_mode]),
+            102: bytes([self.configuration.measuring_mode]),
             107: words_of(self.variant),
             116: words_of([BAUD_WORD[self.baudrate]]),
             120: bytes([self.address, 1]),
-            122: bytes([UNITS.index(configuration.unit), 1]),
+            122: bytes([UNITS.index(self.configuration.unit), 1]),
         }
         data = bytearray(153)
         for at, part in parts.items():

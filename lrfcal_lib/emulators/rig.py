@@ -75,8 +75,9 @@ class EmulatedRig:
         self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host)
         if quick:
             habits |= QUICK_HEAD
-        path = self.folder / "head"
-        self.pan_tilt = EmulatedHead(self.world.head, path=path, host=host, **habits)
+        self.pan_tilt = EmulatedHead(
+            self.world.head, path=self.folder / "head", host=host, **habits
+        )
         self.camera_server = CameraServer(self.world, rest_s=rest_s)
         self.camera_urls = {
             name: f"{self.camera_server.url}/{name}.mjpg"
@@ -331,14 +332,14 @@ def summary(rig: EmulatedRig, file: str | os.PathLike | None) -> str:
         Its rig file.
     """
     head = rig.pan_tilt
-    control = rig.camera_server.control
     places = ", ".join(map(str, rig.world.placements))
     lines = [
         f"emulated rig '{rig.setup.name}' ({rig.setup.rig.beam.name}); Ctrl-C ends it",
         f"  lrf      {rig.lrf.path}   {rig.lrf.baudrate} Bd, SICK LMS2xx",
         f"  head     {head.path}   {head.baudrate} Bd, Pelco-D, address {head.habits.address}",
         *(f"  {name:8s} {url}" for name, url in rig.camera_urls.items()),
-        f"  board    curl -X POST {control}/place/NUMBER puts it at {places}, or none",
+        f"  board    curl -X POST {rig.camera_server.control}/place/NUMBER puts it at {places}, or "
+        "none",
     ]
     if file is not None:
         lines.append(f"  rig file {file}   python -m lrfcal_lib record --help")

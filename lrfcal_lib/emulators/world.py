@@ -184,8 +184,9 @@ class CameraServer(ThreadingHTTPServer):
         self.url = f"http://{self.host}"
         self.token = secrets.token_urlsafe()
         self.control = f"{self.url}/{self.token}"
-        serve = self.serve_forever
-        self._thread = threading.Thread(target=serve, args=(SERVE_S,), daemon=True)
+        self._thread = threading.Thread(
+            target=self.serve_forever, args=(SERVE_S,), daemon=True
+        )
         self.start = self._thread.start
 
     def close(self) -> None:
