@@ -104,8 +104,10 @@ def check_scene(sweep: Sweep) -> Light:
     """
     share = np.isfinite(sweep.ranges).mean()
     state = "ok" if share > LEAST_SCENE else "warn"
-    text = f"{len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
-    return Light("scan", state, f"scene: {text}")
+    text = (
+        f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
+    )
+    return Light("scan", state, text)
 
 
 def _together(name, lights):
@@ -130,10 +132,9 @@ def check_repetition(session: Session, placement: int) -> list[Light]:
     placement
         Its number.
     """
-    faults = repeated_images(session) + repeated_scans(session)
     return [
         Light("recording", "bad", fault.words)
-        for fault in faults
+        for fault in repeated_images(session) + repeated_scans(session)
         if placement in fault.placements
     ]
 
@@ -229,8 +230,9 @@ def check_image(
         grey(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR
     )
     enlarged = (scale * corners + (scale - 1) / 2).astype(np.float32)
-    size = (pattern.columns, pattern.rows)
-    (rise, dark, white, _), _ = cv2.estimateChessboardSharpness(large, size, enlarged)
+    (rise, dark, white, _), _ = cv2.estimateChessboardSharpness(
+        large, (pattern.columns, pattern.rows), enlarged
+    )
     rise /= scale
     faults = []
     if rise > BLURRED_PX:

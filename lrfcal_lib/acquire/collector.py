@@ -284,8 +284,9 @@ class Collector(Closed):
         self.close()
         with self._exclusively(), contextlib.ExitStack() as stack:
             opened = stack.enter_context(Rig.open(_stated(rig, stack)))
-            recording = stack.enter_context(Recording(opened, Path(session), resume=True))
-            self.recording = recording
+            self.recording = stack.enter_context(
+                Recording(opened, Path(session), resume=True)
+            )
             self._closing = stack.pop_all()
             self.view = View()
             self.lights = {}
@@ -426,7 +427,6 @@ class Collector(Closed):
             Or if it was stopped: the placement does not count.
         """
         recording = self._needed()
-        rig = recording.rig
         task = self.task()
         if task is None:
             raise RecordingError(
@@ -437,11 +437,11 @@ class Collector(Closed):
             placement = task.placement
             if placement is None:
                 camera, view = task.close
-                rig.hold_close(camera, view)
+                recording.rig.hold_close(camera, view)
                 return [recording.run_close(camera)]
             number = placement.number
             self.view = replace(self.view, rows={}, scans=0, images=0, stop="", share=0.0)
-            rig.move_board(number)
+            recording.rig.move_board(number)
             self._record(placement, progress)
         progress(1.0, "checking what was recorded")
         session = open_session(recording.path)

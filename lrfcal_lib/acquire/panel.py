@@ -144,8 +144,6 @@ class Parts(SimpleNamespace):
         title = w.HTML("<b style='font-size:16px'>Data collection</b>")
         pressed = row(self.capture, self.again, self.stop)
         self.top = named("top", row(title, self.state, pressed))
-        head = card(w.HTML(HTML.title("Head")), self.pitch, self.slider, row(self.go))
-        task = card(self.task, self.progress, self.doing)
         shown = [
             w.HTML(STYLE),
             self.top,
@@ -157,7 +155,11 @@ class Parts(SimpleNamespace):
             self.error,
             self.trouble,
             self.views,
-            row(head, task, named("checks", card(self.lights))),
+            row(
+                card(w.HTML(HTML.title("Head")), self.pitch, self.slider, row(self.go)),
+                card(self.task, self.progress, self.doing),
+                named("checks", card(self.lights)),
+            ),
             card(w.HTML(HTML.title("Result")), row(self.calibrate), self.result),
             self.notes,
         ]

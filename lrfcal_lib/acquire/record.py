@@ -90,8 +90,9 @@ class Recording(Closed):
             self.writer = self._open(resume)
             stack.callback(self.close)
             # a scan does not tell its measuring mode, this does
-            begin = encode_configuration(rig.lrf.configuration)
-            self.writer.add_telegrams(-1, [begin], time_s=rig.clock())
+            self.writer.add_telegrams(
+                -1, [encode_configuration(rig.lrf.configuration)], time_s=rig.clock()
+            )
             stack.pop_all()
 
     def _open(self, resume):
@@ -134,9 +135,11 @@ class Recording(Closed):
 
     def close_views_to_do(self) -> list[tuple[str, int]]:
         """Images of the board held close still to be taken: camera, number of the view from 0."""
-        wanted = self.rig.stated.plan.intrinsics_images
-        taken = self.writer.shots_of("intrinsics")
-        return [(camera, view) for camera in taken for view in range(taken[camera], wanted)]
+        return [
+            (camera, view)
+            for camera, taken in self.writer.shots_of("intrinsics").items()
+            for view in range(taken, self.rig.stated.plan.intrinsics_images)
+        ]
 
     def run(self, placement: Placement) -> Generator[Event, None, None]:
         """Record a placement, and yield every event once it is on the disk.
@@ -180,8 +183,12 @@ class Recording(Closed):
         """
         (photo,) = self.rig.acquire_close(camera)
         stated = self.rig.stated
-        model = stated.cameras[camera].model
-        light = check_image(photo.frame.image, stated.board, model, f"camera {camera}")
+        light = check_image(
+            photo.frame.image,
+            stated.board,
+            stated.cameras[camera].model,
+            f"camera {camera}",
+        )
         if light.state != "bad":
             self.write(photo)
         return light
@@ -275,12 +282,11 @@ class Recording(Closed):
                         purpose=event.purpose,
                     )
                 case Tracked():
-                    track = [
+                    writer.add_platform(
                         (t, event.commanded, pitch)
                         for t, pitch, measured in event.track
                         if measured
-                    ]
-                    writer.add_platform(track)
+                    )
 
     @contextlib.contextmanager
     def _safely(self):
@@ -366,12 +372,18 @@ def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) 
         Of its recording.
     """
     first, last = map(math.degrees, placement.pitch[[0, -1]])
-    title = f"placement {placement.number} ({number} of {of}): {placement.purpose}"
-    print(f"{title}, pitch {first:.2f} to {last:.2f} deg", flush=True)
+    print(
+        f"placement {placement.number} ({number} of {of}): {placement.purpose}, pitch "
+        f"{first:.2f} to {last:.2f} deg",
+        flush=True,
+    )
     sweeping = Sweeping()
-    pause = LINE_S[sys.stdout.isatty()]
     with tqdm(
-        total=1, bar_format=LINE, file=sys.stdout, leave=False, mininterval=pause
+        total=1,
+        bar_format=LINE,
+        file=sys.stdout,
+        leave=False,
+        mininterval=LINE_S[sys.stdout.isatty()],
     ) as line:
         for event in events:
             sweeping.note(event)

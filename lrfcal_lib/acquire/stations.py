@@ -69,8 +69,8 @@ class Stations(Boards):
             )
             for number in numbers
         )
-        changed = {"placements": placements, "intrinsics_images": 0}
-        return replace(stated, plan=plan.model_copy(update=changed))
+        plan = plan.model_copy(update={"placements": placements, "intrinsics_images": 0})
+        return replace(stated, plan=plan)
 
     def _images(self, sweep, limits):
         """Pitch angles of the images, degrees; prints them."""
@@ -90,8 +90,12 @@ class Stations(Boards):
             place = placement.number
         if rig.move_board(place):
             return ""
-        what = "set the rig up, so that nobody moves it or walks by"
-        return ask_before("station", placement.number, what, before)
+        return ask_before(
+            "station",
+            placement.number,
+            "set the rig up, so that nobody moves it or walks by",
+            before,
+        )
 
     def check(self, session: Session, number: int) -> list[Light]:
         """How good a station is: share of returns, share with a colour, whether it moved."""
