@@ -113,12 +113,11 @@ class EmulatedRig:
             step = setup.step
             if not board and setup.room_sweep:
                 step = setup.room_sweep[2]
-            sweep = (*placement.sweep, step)
             placements.append(
                 {
                     "number": placement.number,
                     "board": board,
-                    "pitch_deg": np.degrees(sweep).round(4).tolist(),
+                    "pitch_deg": np.degrees([*placement.sweep, step]).round(4).tolist(),
                     "image_pitch_deg": np.degrees(placement.image_pitch).round(4).tolist(),
                 }
             )

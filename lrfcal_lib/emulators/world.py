@@ -116,8 +116,10 @@ class EmulatedWorld:
         names = [camera.name for camera in self.setup.rig.cameras]
         count = self.setup.intrinsics_views
         if camera not in names or not 0 <= view < count:
-            known = f"0 to {count - 1} of {', '.join(names)}"
-            raise ValueError(f"no view {view} of camera '{camera}'; there are {known}")
+            raise ValueError(
+                f"no view {view} of camera '{camera}'; there are 0 to {count - 1} of "
+                f"{', '.join(names)}"
+            )
         pose = close_views(self.setup, names.index(camera))[view]
         self.current = ("close", camera, view), world_of(self.setup, pose, stand=False)
 
@@ -302,13 +304,14 @@ class _Handler(BaseHTTPRequestHandler):
             while not server.quit.is_set():
                 _, data = server.image(name)
                 if data is None:
-                    self.wfile.write(
-                        b"\r\n"
-                    )  # a blank line: the camera lives, its head moves
+                    # a blank line: the camera lives, its head moves
+                    self.wfile.write(b"\r\n")
                 else:
-                    length = f"Content-Length: {len(data)}\r\n\r\n".encode()
-                    head = b"--frame\r\nContent-Type: image/jpeg\r\n" + length
-                    self.wfile.write(head + data + b"\r\n")
+                    head = (
+                        "--frame\r\nContent-Type: image/jpeg\r\n"
+                        f"Content-Length: {len(data)}\r\n\r\n"
+                    )
+                    self.wfile.write(head.encode() + data + b"\r\n")
                     server.quit.wait(1 / FPS)
 
     def log_message(self, *_):
