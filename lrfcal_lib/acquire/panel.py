@@ -21,7 +21,7 @@ from markupsafe import Markup
 
 from lrfcal_lib.acquire.checks import Light
 from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted, Result
-from lrfcal_lib.acquire.pictures import WIDTH, jpeg, scan_picture, sweep_picture, with_scan
+from lrfcal_lib.acquire.pictures import jpeg, scan_picture, sweep_picture, with_scan
 from lrfcal_lib.acquire.record import PITCH, RecordingError
 from lrfcal_lib.calibrate.calibration_file import load_calibration
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -482,7 +482,7 @@ class Panel(Closed):
             pictures["sweep"].show(picture, words)
         for name, frame in dict(view.frames).items():
             image, words = self._overlaid(name, frame.image, view)
-            pictures[name].show(jpeg(image, WIDTH), words)
+            pictures[name].show(jpeg(image), words)
 
         self.parts.trouble.value = HTML.error("view", view.trouble)
 

@@ -105,17 +105,15 @@ def _png(figure):
     return content.getvalue()
 
 
-def jpeg(image: np.ndarray, width: int) -> bytes:
-    """Content of a JPEG file.
+def jpeg(image: np.ndarray) -> bytes:
+    """Content of a JPEG file, at most `WIDTH` pixels wide.
 
     Parameters
     ----------
     image
         (height, width, 3), BGR.
-    width
-        Of the file at most, pixels.
     """
-    scale = width / image.shape[1]
+    scale = WIDTH / image.shape[1]
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
