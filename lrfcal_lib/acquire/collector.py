@@ -375,9 +375,10 @@ class Collector(Closed):
         What could not be read is said in `trouble`; nothing is raised for it.
         """
         view = self.view
-        if not self.connected:
+        recording = self.recording
+        if recording is None:
             return view
-        rig = self.rig
+        rig = recording.rig
         troubles = []
         for name, camera in rig.cameras.items():
             try:
