@@ -215,16 +215,10 @@ def emulated(name: str, feedback: str = "full") -> EmulatedRig:
     ValueError
         For another name.
     """
-    setup = load_setup(name)
-    placements = None
     if name == PRACTICE:
         setup, placements = practice_setup()
-    return EmulatedRig(
-        setup,
-        placements=placements,
-        feedback=feedback,
-        quick=name == PRACTICE,
-    )
+        return EmulatedRig(setup, placements=placements, feedback=feedback, quick=True)
+    return EmulatedRig(load_setup(name), feedback=feedback)
 
 
 def main(
