@@ -186,7 +186,8 @@ def test_buttons_record_and_calibrate(page, count, tmp_path):
     before = file.read_bytes()
     saved = file.stat().st_mtime_ns
     page.keyboard.press("Control+S")
-    until(lambda: file.stat().st_mtime_ns != saved)
+    # it is emptied first, and written then
+    until(lambda: file.stat().st_mtime_ns != saved and file.stat().st_size)
     assert file.read_bytes() == before, "the notebook was run, and is as it was"
     assert sorted(path.name for path in folder.parent.iterdir())[0] == "monday", (
         "the recording stays"

@@ -79,7 +79,7 @@ def emulated_rig(setup, file):
     host = VirtualHost()
     with EmulatedRig(
         setup[0], placements=setup[1], host=host, rest_s=0.0,
-        head_options={"baudrate": 9600, "go_speed": 20.0},
+        baudrate=9600, go_speed=20.0,
     ) as emulated:  # fmt: skip
         data = emulated.rig_file()
         data["devices"]["head"] |= {

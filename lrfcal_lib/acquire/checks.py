@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import unit_vector
-from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_image import view_board
+from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
 from lrfcal_lib.session.faults import DARK, brightness, repeated_images, repeated_scans
@@ -31,6 +31,9 @@ BLURRED_PX = 3.5  # rise of a chessboard's edges from 10 to 90 %; 2 to 3 in a sh
 LEAST_SQUARE_PX = 24  # with fewer OpenCV finds no edges; smaller ones are enlarged
 CLIPPED = 250  # grey levels of a white square
 LOW_CONTRAST = 25  # grey levels between white and dark squares
+NO_RANGE = "no scan line with a range: is something close before the window?"
+NO_SIDE = "no straight side: turn the board so that scan lines cross its edges"
+NOT_CHECKED = "not checked: the board has no pattern, and the camera no intrinsics yet"
 DARKNESS = "too dark: use more light or a longer exposure"
 
 
@@ -79,18 +82,16 @@ def check_placement(
     if scene:
         return lights
     for name, camera in session.cameras.items():
-        records = session.images(name, placement)
         images = [
             check_image(session.read_image(record), session.board, camera.model)
-            for record in records
+            for record in session.images(name, placement)
         ]
         lights.append(_together(f"camera {name}", images))
     if advice is not None:
-        text = advice(session)
-        if text:
-            lights.append(Light("information", "warn", text))
-        else:
-            lights.append(Light("information", "ok", "every direction is well determined"))
+        light = Light("information", "ok", "every direction is well determined")
+        if text := advice(session):
+            light = Light("information", "warn", text)
+        lights.append(light)
     return lights
 
 
@@ -103,8 +104,10 @@ def check_scene(sweep: Sweep) -> Light:
     """
     share = np.isfinite(sweep.ranges).mean()
     state = "ok" if share > LEAST_SCENE else "warn"
-    text = f"{len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
-    return Light("scan", state, f"scene: {text}")
+    text = (
+        f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
+    )
+    return Light("scan", state, text)
 
 
 def _together(name, lights):
@@ -114,7 +117,7 @@ def _together(name, lights):
     good = [light for light in lights if light.state != "bad"]
     worst = max(good or lights, key=lambda light: STATES.index(light.state))
     state = worst.state
-    if 0 < len(good) < len(lights):
+    if good and good != lights:
         state = "warn"
     return Light(name, state, f"{len(good)} of {len(lights)} images: {worst.text}")
 
@@ -152,43 +155,40 @@ def check_scan(
         As the session states them.
     """
     if sweep is None:
-        text = "no scan line with a range: is something close before the window?"
-        return [Light("scan", "bad", text)]
+        return [Light("scan", "bad", NO_RANGE)]
     try:
-        scan = board_in_scan.find_board(sweep, board, T_head_lrf, lrf)
-    except board_in_scan.BoardNotFound as error:
-        text = f"no board: {error}; sweep over all of it, free of walls"
-        return [Light("scan", "bad", text)]
+        scan = find_board(sweep, board, T_head_lrf, lrf)
+    except BoardNotFound as error:
+        return [
+            Light("scan", "bad", f"no board: {error}; sweep over all of it, free of walls")
+        ]
     rows = np.flatnonzero(scan.mask.any(axis=1))
     text = (
         f"board on {len(rows)} scan lines at {abs(scan.distance):.2f} m, "
         f"{1000 * scan.sigma_range:.1f} mm rms"
     )
-    cut = []
-    if 0 in rows:
-        cut.append("first")
-    if len(sweep.pitch) - 1 in rows:
-        cut.append("last")
+    ends = {"first": 0, "last": len(sweep.pitch) - 1}
+    cut = [name for name, row in ends.items() if row in rows]
     light = Light("scan", "ok", text)
     if len(rows) < FEWEST_LINES:
         light = Light("scan", "warn", f"{text}: take a smaller step, or go nearer")
     elif cut and np.ptp(sweep.pitch) > 0:
-        hit = f"the {' and '.join(cut)} line hits it: sweep farther"
-        light = Light("scan", "warn", f"{text}; {hit}")
+        words = f"{text}; the {' and '.join(cut)} line hits it: sweep farther"
+        light = Light("scan", "warn", words)
     return [light, _check_sides(scan)]
 
 
 def _check_sides(scan):
     """How many straight sides of the board the scans cross, and how."""
     along, known = crossings(scan)
-    sides = {side.side: side for side in along["half_step"].sides}
+    sides = along["half_step"].sides
     if np.ptp(scan.sweep.pitch) > 0:
         columns, _ = crossings(scan, True, known)
-        sides = {side.side: side for side in columns["half_step"].sides} | sides
-    good = [side for side in sides.values() if side.n_points >= FEWEST_CROSSINGS]
+        sides = columns["half_step"].sides + sides
+    by_number = {side.side: side for side in sides}
+    good = [side for side in by_number.values() if side.n_points >= FEWEST_CROSSINGS]
     if not good:
-        text = "no straight side: turn the board so that scan lines cross its edges"
-        return Light("edges", "bad", text)
+        return Light("edges", "bad", NO_SIDE)
     each = [
         f"{side.n_points} crossings at {np.degrees(side.angle):.0f} deg" for side in good
     ]
@@ -230,8 +230,9 @@ def check_image(
         grey(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR
     )
     enlarged = (scale * corners + (scale - 1) / 2).astype(np.float32)
-    size = (pattern.columns, pattern.rows)
-    (rise, dark, white, _), _ = cv2.estimateChessboardSharpness(large, size, enlarged)
+    (rise, dark, white, _), _ = cv2.estimateChessboardSharpness(
+        large, (pattern.columns, pattern.rows), enlarged
+    )
     rise /= scale
     faults = []
     if rise > BLURRED_PX:
@@ -251,8 +252,7 @@ def check_image(
 def _check_plain(image, board, model, name):
     """The Light of an image of a board without a pattern."""
     if model is None:
-        text = "not checked: the board has no pattern, and the camera no intrinsics yet"
-        return Light(name, "warn", text)
+        return Light(name, "warn", NOT_CHECKED)
     view = view_board(image, board, model)
     if view.reason:
         return Light(name, "bad", view.reason)

@@ -5,13 +5,13 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lrfcal_lib.acquire.checks import Light
+from lrfcal_lib.acquire.checks import Light, check_placement
 from lrfcal_lib.acquire.record import Recording, RecordingError, Sweeping
 from lrfcal_lib.calibrate.pipeline import (
     Calibration,
@@ -21,7 +21,7 @@ from lrfcal_lib.calibrate.pipeline import (
     prepare,
 )
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
-from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
+from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned
 from lrfcal_lib.drivers.rig_file import Placement, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
@@ -35,6 +35,9 @@ ADVICE_FROM = 3  # placements, below which every other one helps
 WAIT_S = 3.0  # for a look at the rig to end
 AGAIN_S = 0.1  # between stops, until whoever moves the head has noticed
 RECONNECT_S = 2.0
+GUIDE_CLOSE = (
+    "hold the board close, tilted otherwise than before, all of its pattern in the image"
+)
 GUIDE = (
     "about 1.5 m ahead, turned in its plane so that no edge is upright or level",
     "about 1.2 m ahead, a little to the left, turned by a third of a turn, "
@@ -78,20 +81,16 @@ def next_task(recording: Recording, advice: str = "") -> Task | None:
     plan = recording.rig.stated.plan
     for camera, view in recording.close_views_to_do():
         title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"
-        how = "tilted otherwise than before, all of its pattern in the image"
-        guidance = f"hold the board close, {how}"
-        return Task(title, guidance, close=(camera, view))
+        return Task(title, GUIDE_CLOSE, close=(camera, view))
 
-    left = recording.to_do()
-    if not left and not plan.placements:  # nothing is listed: one more can always be had
-        more = plan.to_do(max(recording.finished) + 1)
-        left = [
-            placement for placement in more if placement.number not in recording.finished
-        ]
+    planned = recording.plan
+    if not plan.placements:  # nothing is listed: one more can always be had
+        planned = plan.to_do(max([plan.count, *recording.finished]) + 1)
+    left = [one for one in planned if one.number not in recording.finished]
     if not left:
         return None
     placement = left[0]
-    done = len(recording.plan) - len(recording.to_do())
+    done = len(planned) - len(left)
     guidance = advice or f"put the board {GUIDE[done % len(GUIDE)]}"
     if placement.purpose == "scene":
         guidance = "take the board away: this sweep shows the room"
@@ -133,14 +132,11 @@ def calibrate_recording(path: Path) -> Result:
     if not judged.errors:
         sentences += ("Nothing is written.",)
         return Result(judged.answer, sentences, "", {}, None, calibration)
-    method = handed_over(calibration) or ""
+    method = handed_over(calibration)
     poses = {}
     for camera, solution in calibration.cameras(method).items():
-        values = POSE_UNITS * solution.parameters[:6]
-        sigma = POSE_UNITS * solution.trusted_sigma[:6]
-        poses[camera] = tuple(
-            f"{v:.2f} ± {s:.2f}" for v, s in zip(values, sigma, strict=True)
-        )
+        told = POSE_UNITS * [solution.parameters[:6], solution.trusted_sigma[:6]]
+        poses[camera] = tuple(f"{value:.2f} ± {sigma:.2f}" for value, sigma in told.T)
     file = path.with_name(f"{path.name}_calibration") / "calibration.json"
     write_calibration(file, calibration_record(calibration, method, judged))
     return Result(judged.answer, sentences, method, poses, file, calibration)
@@ -183,17 +179,36 @@ class Interrupted(RuntimeError):
 
 
 @dataclass
-class View:
-    """What the rig sees."""
+class View(Sweeping):
+    """What the rig sees, and how far the placement recorded last is."""
 
     ranges: np.ndarray | None = None  # (B,), of the newest scan, metres
     bearings: np.ndarray | None = None  # (B,), radians
-    pitch: float = 0.0  # of the head, radians
     measured: bool = False  # the head tells its pitch
     frames: dict[str, Frame] = field(default_factory=dict)  # the newest by camera
     # ranges by pitch, of the placement recorded last
     rows: dict[float, np.ndarray] = field(default_factory=dict)
     trouble: str = ""  # what cannot be seen, and why
+
+    def note(self, event: Event) -> None:
+        """Take an event of the placement into account.
+
+        Parameters
+        ----------
+        event
+            Of the placement.
+        """
+        super().note(event)
+        match event:
+            case Moved():
+                self.measured = event.measured
+            case Scanned():
+                for reading, pitch in zip(event.readings, event.pitch, strict=True):
+                    self.rows[pitch] = reading.ranges
+                self.ranges = reading.ranges
+                self.bearings = reading.bearings
+            case Photographed():
+                self.frames[event.camera] = event.frame
 
 
 class Collector(Closed):
@@ -211,7 +226,6 @@ class Collector(Closed):
     """
 
     def __init__(self):
-        self.rig: Rig | None = None
         self.recording: Recording | None = None
         self.view = View()
         self.lights: dict[int, list[Light]] = {}
@@ -223,18 +237,22 @@ class Collector(Closed):
     @property
     def connected(self) -> bool:
         """Whether a rig is open."""
-        return self.rig is not None
+        return self.recording is not None
+
+    @property
+    def rig(self) -> Rig:
+        """The rig that is open."""
+        return self._needed().rig
 
     @property
     def emulated(self) -> bool:
         """Whether the board moves by itself."""
-        return self.rig is not None and self.rig.stated.devices.control is not None
+        return self.connected and self.rig.stated.devices.control is not None
 
     @property
     def limits_deg(self) -> Any:
         """Lowest and highest pitch of the head."""
-        rig, _ = self._needed()
-        return rig.stated.devices.head.pitch_limits_deg
+        return self.rig.stated.devices.head.pitch_limits_deg
 
     @property
     def finished(self) -> tuple[int, ...]:
@@ -265,9 +283,9 @@ class Collector(Closed):
         self.close()
         with self._exclusively(), contextlib.ExitStack() as stack:
             opened = stack.enter_context(Rig.open(_stated(rig, stack)))
-            recording = stack.enter_context(Recording(opened, Path(session), resume=True))
-            self.rig = opened
-            self.recording = recording
+            self.recording = stack.enter_context(
+                Recording(opened, Path(session), resume=True)
+            )
             self._closing = stack.pop_all()
             self.view = View()
             self.lights = {}
@@ -282,16 +300,14 @@ class Collector(Closed):
         RecordingError
             If the session cannot be finished; the devices are closed all the same.
         """
-        rig = self.rig
         recording = self.recording
-        if rig is None or recording is None:
+        if recording is None:
             return
         self.stop()
         with self._exclusively():
-            self.rig = None
             self.recording = None
             with self._closing:
-                rig.halt()
+                recording.rig.halt()
                 if recording.finished:
                     recording.finish()
 
@@ -306,10 +322,12 @@ class Collector(Closed):
             self._devices.release()
 
     def _needed(self):
-        if self.rig is None:
-            remedy = "name a rig file or an emulated rig, and press connect"
-            raise DeviceError(f"no rig is connected: {remedy}")
-        return self.rig, self.recording
+        """The recording."""
+        if self.recording is None:
+            raise DeviceError(
+                "no rig is connected: name a rig file or an emulated rig, and press connect"
+            )
+        return self.recording
 
     def move_to(self, pitch: float) -> float:
         """Move the head.
@@ -331,20 +349,21 @@ class Collector(Closed):
         Busy
             If something else is under way.
         """
-        rig, _ = self._needed()
+        head = self.rig.head
         with self._exclusively():
             self.stopped.clear()
-            self.view.pitch = rig.head.move_to(pitch)
-            self.view.measured = rig.head.has_feedback
+            self.view.pitch = head.move_to(pitch)
+            self.view.measured = head.has_feedback
         return self.view.pitch
 
     def stop(self) -> None:
         """Stop the head at once, and whatever was under way; returns when it has ended."""
-        rig = self.rig
+        recording = self.recording
         end = time.monotonic() + WAIT_S
         self.stopped.set()
-        while rig is not None and time.monotonic() < end:
-            rig.head.emergency_stop()  # again: the next move of a sweep may have begun in between
+        while recording is not None and time.monotonic() < end:
+            # again: the next move of a sweep may have begun in between
+            recording.rig.head.emergency_stop()
             if self._devices.acquire(timeout=AGAIN_S):
                 self._devices.release()
                 return
@@ -354,10 +373,11 @@ class Collector(Closed):
 
         What could not be read is said in `trouble`; nothing is raised for it.
         """
-        rig = self.rig
         view = self.view
-        if rig is None:
+        recording = self.recording
+        if recording is None:
             return view
+        rig = recording.rig
         troubles = []
         for name, camera in rig.cameras.items():
             try:
@@ -406,63 +426,47 @@ class Collector(Closed):
         DeviceError, RecordingError, Interrupted
             Or if it was stopped: the placement does not count.
         """
-        rig, recording = self._needed()
+        recording = self._needed()
         task = self.task()
         if task is None:
-            remedy = "calibrate, or connect with another session"
-            raise RecordingError(f"the plan of this rig is done: {remedy}")
+            raise RecordingError(
+                "the plan of this rig is done: calibrate, or connect with another session"
+            )
         with self._exclusively():
             self.stopped.clear()
             placement = task.placement
             if placement is None:
                 camera, view = task.close
-                rig.hold_close(camera, view)
+                recording.rig.hold_close(camera, view)
                 return [recording.run_close(camera)]
             number = placement.number
-            self.view.rows = {}
-            rig.move_board(number)
+            self.view = replace(self.view, rows={}, scans=0, images=0, stop="", share=0.0)
+            recording.rig.move_board(number)
             self._record(placement, progress)
         progress(1.0, "checking what was recorded")
-        scenes = {
-            placement.number for placement in recording.plan if placement.purpose == "scene"
-        }
+        session = open_session(recording.path)
         adviser = None  # while every other placement helps
-        if len({*self.finished} - scenes) >= ADVICE_FROM:
+        if len(session.board_placements) >= ADVICE_FROM:
             adviser = self._advise
-        self.lights[number] = recording.check(number, adviser)
+        self.lights[number] = check_placement(session, number, adviser)
         return self.lights[number]
 
     def _record(self, placement, progress):
         """Record a placement; Interrupted if the user stops it."""
-        sweeping = Sweeping()
+        view = self.view
         with contextlib.closing(self.recording.run(placement)) as events:
             try:
                 for event in events:
-                    self._note(event)
-                    sweeping.note(event)
-                    progress(sweeping.share, f"{sweeping.stop}{sweeping.counts()}")
+                    view.note(event)
+                    progress(view.share, f"{view.stop}{view.counts()}")
                     if self.stopped.is_set():
                         raise DeviceError("stopped")
             except DeviceError as error:
                 if not self.stopped.is_set():
                     raise
-                words = f"placement {placement.number} does not count, record it again"
-                raise Interrupted(f"stopped: {words}") from error
-
-    def _note(self, event):
-        """Put an event into the view."""
-        view = self.view
-        if isinstance(event, Moved):
-            view.pitch = event.pitch
-            view.measured = event.measured
-        elif isinstance(event, Scanned):
-            for reading, pitch in zip(event.readings, event.pitch.tolist(), strict=True):
-                view.rows[pitch] = reading.ranges
-            view.ranges = reading.ranges
-            view.bearings = reading.bearings
-            view.pitch = pitch
-        elif isinstance(event, Photographed):
-            view.frames[event.camera] = event.frame
+                raise Interrupted(
+                    f"stopped: placement {placement.number} does not count, record it again"
+                ) from error
 
     def _advise(self, session):
         self._advice = advise(session)
@@ -476,10 +480,11 @@ class Collector(Closed):
         RecordingError
             If there is none.
         """
-        _, recording = self._needed()
+        recording = self._needed()
         if not self.finished:
-            remedy = "press capture to record one"
-            raise RecordingError(f"there is no placement to record again: {remedy}")
+            raise RecordingError(
+                "there is no placement to record again: press capture to record one"
+            )
         with self._exclusively():
             number = next(reversed(self.lights), self.finished[-1])
             recording.drop(number)
@@ -496,10 +501,11 @@ class Collector(Closed):
         ValueError
             If it determines no calibration.
         """
-        _, recording = self._needed()
+        recording = self._needed()
         if not self.finished:
-            remedy = "capture at least three placements of the board"
-            raise RecordingError(f"nothing was recorded yet: {remedy}")
+            raise RecordingError(
+                "nothing was recorded yet: capture at least three placements of the board"
+            )
         return calibrate_recording(recording.path)
 
 

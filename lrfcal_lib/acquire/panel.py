@@ -5,6 +5,7 @@ import logging
 import os
 import threading
 import time
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -20,8 +21,8 @@ from markupsafe import Markup
 
 from lrfcal_lib.acquire.checks import Light
 from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted, Result
-from lrfcal_lib.acquire.pictures import WIDTH, jpeg, scan_picture, sweep_picture, with_scan
-from lrfcal_lib.acquire.record import RecordingError
+from lrfcal_lib.acquire.pictures import jpeg, scan_picture, sweep_picture, with_scan
+from lrfcal_lib.acquire.record import PITCH, RecordingError
 from lrfcal_lib.calibrate.calibration_file import load_calibration
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.drivers.port import Closed, DeviceError
@@ -77,52 +78,45 @@ HTML: Any = (  # macros that make parts of the panel
     .get_template("panel.html.jinja")
     .module
 )
-TEXTS = {  # what they say at first
-    "state": HTML.state("off"),
-    "lights": HTML.lights("Quality", ()),
-    "result": HTML.soft(FOLLOWS),
-    **dict.fromkeys(
-        (
-            "places",
-            "error",
-            "overlay",
-            "held",
-            "trouble",
-            "notes",
-            "pitch",
-            "task",
-            "doing",
-        ),
-        "",
-    ),
-}
+TEXTS = (
+    "state",
+    "lights",
+    "result",
+    "places",
+    "error",
+    "overlay",
+    "held",
+    "trouble",
+    "notes",
+    "pitch",
+    "task",
+    "doing",
+)
 
 
 def named(name: str, widget: Any) -> Any:
-    """A widget that is found in the page by the class ``lrfcal-<name>``."""
+    """A widget that the page and its style find by the class ``lrfcal-<name>``."""
     widget.add_class(f"lrfcal-{name}")
     return widget
 
 
-def card(*children, grow=1, basis="300px"):
+def card(*children):
     """A framed part."""
-    framed = w.VBox(children, layout={"flex": f"{grow} 1 {basis}", "min_width": "0"})
-    return named("card", framed)
+    return named("card", w.VBox(children))
 
 
-def row(*children, **layout):
+def row(*children):
     """Widgets side by side, wrapped where the window is narrow."""
-    return w.HBox(children, layout={"grid_gap": "10px", "flex_flow": "row wrap", **layout})
+    return named("row", w.HBox(children))
 
 
 class Picture:
     """A picture with a heading and a remark under it."""
 
     def __init__(self, name, heading, kind="png"):
-        layout = {"width": "100%", "max_width": f"{WIDTH}px"}
-        self.image = named(f"picture-{name}", w.Image(format=kind, layout=layout))
+        self.image = named(f"picture-{name}", w.Image(format=kind))
         self.remark = w.HTML()
-        self.box = card(w.HTML(HTML.title(heading)), self.image, self.remark, basis="220px")
+        self.box = card(w.HTML(HTML.title(heading)), self.image, self.remark)
 
     def show(self, data, remark):
         """Show the bytes of an image; what did not change is not sent again."""
@@ -134,29 +128,23 @@ class Parts(SimpleNamespace):
     """All widgets by their names; `root` is shown."""
 
     def __init__(self, rig, session):
-        fields = _fields(rig, session)
-        texts = {name: w.HTML(content) for name, content in TEXTS.items()}
-        buttons = {}
+        parts = _fields(rig, session)
+        for name in TEXTS:
+            parts[name] = w.HTML()
         for name, (label, tip, style, icon) in BUTTONS.items():
-            buttons[name] = w.Button(
+            parts[name] = w.Button(
                 description=label, tooltip=tip, button_style=style, icon=icon
             )
-        everything = {**fields, **texts, **buttons}
-        super().__init__(
-            **{name: named(name, widget) for name, widget in everything.items()},
-            pictures={},
-            views=row(),
-        )
+        for name, part in parts.items():
+            named(name, part)
+        super().__init__(**parts, pictures={}, views=named("views", row()))
+        self.show_lights()
+        self.result.value = HTML.soft(FOLLOWS)
         # what starts and what stops a recording stand side by side, on screen together at any size
         title = w.HTML("<b style='font-size:16px'>Data collection</b>")
         pressed = row(self.capture, self.again, self.stop)
-        spread = {"justify_content": "space-between", "align_items": "center"}
-        self.top = named("top", row(title, self.state, pressed, **spread))
-        head = card(w.HTML(HTML.title("Head")), self.pitch, self.slider, row(self.go))
-        task = card(self.task, self.progress, self.doing)
-        lights = card(self.lights, grow=2, basis="420px")
-        title = w.HTML(HTML.title("Result"))
-        parts = [
+        self.top = named("top", row(title, self.state, pressed))
+        shown = [
             w.HTML(STYLE),
             self.top,
             row(self.rig, self.session, self.connect, self.close),
@@ -167,11 +155,15 @@ class Parts(SimpleNamespace):
             self.error,
             self.trouble,
             self.views,
-            row(head, task, lights),
-            card(title, row(self.calibrate), self.result, basis="auto"),
+            row(
+                card(w.HTML(HTML.title("Head")), self.pitch, self.slider, row(self.go)),
+                card(self.task, self.progress, self.doing),
+                named("checks", card(self.lights)),
+            ),
+            card(w.HTML(HTML.title("Result")), row(self.calibrate), self.result),
             self.notes,
         ]
-        self.root = named("panel", w.VBox(parts, layout={"grid_gap": "10px"}))
+        self.root = named("panel", w.VBox(shown))
 
     def show_pictures(self, cameras):
         """Make room for the pictures of a rig."""
@@ -183,52 +175,39 @@ class Parts(SimpleNamespace):
             self.pictures[name] = Picture(name, f"Camera {name}", "jpeg")
         self.views.children = [picture.box for picture in self.pictures.values()]
 
-    def enable(self, connected, busy, recorded):
-        """Let be pressed what can be done now; STOP always can."""
+    def show_lights(self, heading="Quality", lights=()):
+        """Show what the checks of a placement say."""
+        self.lights.value = HTML.lights(heading, lights)
+
+    def enable(self, collector, busy):
+        """Let be pressed what a Collector can do now; STOP always can."""
         for part in (self.rig, self.session, self.connect):
-            part.disabled = busy or connected
+            part.disabled = busy or collector.connected
         for part in (self.close, self.capture, self.go, self.slider):
-            part.disabled = busy or not connected
+            part.disabled = busy or not collector.connected
         for part in (self.again, self.calibrate):
-            part.disabled = busy or not (connected and recorded)
+            part.disabled = busy or not collector.finished
 
 
 def _fields(rig, session):
     """Widgets of what can be entered, by name."""
-    wide = {"width": "100%"}
-    narrow = {"description_width": "62px"}
     return {
         "rig": w.Combobox(
             value=rig,
             options=PRACTICE_RIGS,
             placeholder="rig file or emulated rig",
             description="rig",
-            style=narrow,
-            layout={"flex": "1 1 260px"},
         ),
-        "session": w.Text(
-            value=session,
-            description="session",
-            style=narrow,
-            layout={"flex": "2 1 320px"},
-        ),
+        "session": w.Text(value=session, description="session"),
         "calibration": w.Text(
             placeholder="calibration.json: shows the scan in the images",
             description="calibration",
             continuous_update=False,
-            style={"description_width": "80px"},
-            layout=wide,
         ),
         "slider": w.FloatSlider(
-            min=-60,
-            max=60,
-            step=0.5,
-            readout_format="+.1f",
-            description="target",
-            style=narrow,
-            layout=wide,
+            min=-60, max=60, step=0.5, readout_format="+.1f", description="target"
         ),
-        "progress": w.FloatProgress(min=0, max=1, layout=wide),
+        "progress": w.FloatProgress(max=1),
     }
 
 
@@ -238,13 +217,11 @@ class Notes(logging.Handler):
     def __init__(self, part):
         super().__init__(logging.WARNING)
         self.part = part
-        self.lines = []
+        self.lines = deque(maxlen=NOTES)
 
     def emit(self, record):
         """Show the newest lines."""
-        self.lines = [*self.lines, f"{time.strftime('%H:%M:%S')} {record.getMessage()}"][
-            -NOTES:
-        ]
+        self.lines.append(f"{time.strftime('%H:%M:%S')} {record.getMessage()}")
         self.part.value = HTML.notes(self.lines)
 
 
@@ -290,15 +267,12 @@ class Panel(Closed):
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="panel")
         self._live: threading.Thread | None = None  # keeps looking
         self._quit = threading.Event()
-        self._sweep: tuple[float, float] | None = None  # ends of the pitch, radians
-        # cameras that the calibration may have elsewhere
-        self._moved: set[str | None] = set()
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         for name in ("rig", "session"):
             getattr(self.parts, name).observe(self._show_places, "value")
-        self._calibrated: CalibratedRig | None = None  # shows the scan in the images
         self.parts.calibration.observe(self._choose_calibration, "value")
+        self._choose_calibration()
         self._show_places()
         self._refresh()
 
@@ -313,7 +287,7 @@ class Panel(Closed):
 
     def _choose_calibration(self, _=None):
         """Read the calibration that the field names, and say what is wrong with it."""
-        self._calibrated = None
+        self._calibrated: CalibratedRig | None = None  # shows the scan in the images
         name = self.parts.calibration.value.strip()
         words = ""
         if name:
@@ -329,7 +303,7 @@ class Panel(Closed):
 
     def _check_calibration(self):
         """Say whether the chosen calibration still holds for the scenes recorded last."""
-        self._moved = set()
+        self._moved = set()  # cameras that the calibration may have elsewhere
         self.parts.held.value = ""
         if self._calibrated is None or not self.collector.finished:
             return
@@ -397,8 +371,7 @@ class Panel(Closed):
         with self._doing("recording"):
             self._begin_sweep(task)
             lights = self.collector.capture(self._show_progress)
-            title = task.title.lower() if task else ""
-            self.parts.lights.value = HTML.lights(f"Quality of {title}", lights)
+            self.parts.show_lights(f"Quality of {task.title.lower()}", lights)
             self._check_calibration()
         return lights
 
@@ -406,7 +379,7 @@ class Panel(Closed):
         """Take the placement recorded last back; returns its number."""
         with self._doing("taking it back"):
             number = self.collector.again()
-            self.parts.lights.value = HTML.lights("Quality", ())
+            self.parts.show_lights()
         return number
 
     def calibrate(self) -> Result:
@@ -427,17 +400,12 @@ class Panel(Closed):
     def _pressed(self, method, _):
         """Do what a button is for in the one thread that works, STOP at once.
 
-        What goes wrong is shown, not raised.
+        What goes wrong is shown, and raised to nobody: the job keeps it.
         """
-
-        def work():
-            with contextlib.suppress(*EXPECTED):
-                method()
-
         if method == self.stop:
             method()
         elif self.job is None or self.job.done():
-            self.job = self._worker.submit(work)
+            self.job = self._worker.submit(method)
 
     @contextlib.contextmanager
     def _doing(self, text):
@@ -447,7 +415,7 @@ class Panel(Closed):
         parts.error.value = ""
         parts.state.value = HTML.state("busy", text)
         self._show_progress(0.0, text)
-        parts.enable(self.collector.connected, True, False)
+        parts.enable(self.collector, busy=True)
         try:
             yield
         except Exception as error:
@@ -476,7 +444,7 @@ class Panel(Closed):
             parts.task.value = HTML.task(
                 collector.task(), collector.emulated, collector.finished
             )
-        parts.enable(collector.connected, False, bool(collector.finished))
+        parts.enable(collector, busy=False)
 
     def _show_progress(self, share, text):
         self.parts.progress.value = share
@@ -484,10 +452,9 @@ class Panel(Closed):
 
     def _begin_sweep(self, task):
         """An empty picture of the sweep to come."""
-        self._sweep = None
-        if task is not None and task.placement is not None:
-            pitch = task.placement.pitch
-            self._sweep = pitch.min(), pitch.max()
+        self._sweep = None  # ends of the pitch, radians
+        if task and task.placement:
+            self._sweep = task.placement.pitch[[0, -1]]
 
     def _keep_looking(self):
         field_of_view = self.collector.rig.lrf_info.field_of_view
@@ -501,10 +468,8 @@ class Panel(Closed):
     def _show_view(self, view, field_of_view):
         """Show a View of the rig."""
         pictures = self.parts.pictures
-        how = "dead reckoning: the head does not tell it"
-        if view.measured:
-            how = "told by the head"
-        self.parts.pitch.value = f"<b>{np.degrees(view.pitch):+.2f}°</b> {HTML.soft(how)}"
+        how = HTML.soft(PITCH[view.measured])
+        self.parts.pitch.value = f"<b>{np.degrees(view.pitch):+.2f}°</b> {how}"
 
         if view.ranges is not None:
             known = np.isfinite(view.ranges).sum()
@@ -517,7 +482,7 @@ class Panel(Closed):
             pictures["sweep"].show(picture, words)
         for name, frame in dict(view.frames).items():
             image, words = self._overlaid(name, frame.image, view)
-            pictures[name].show(jpeg(image, WIDTH), words)
+            pictures[name].show(jpeg(image), words)
 
         self.parts.trouble.value = HTML.error("view", view.trouble)
 

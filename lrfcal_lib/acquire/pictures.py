@@ -37,7 +37,7 @@ def scan_picture(
     ax.plot(bearings, ranges, ".", color=LRF, markersize=3)
     known = np.ravel(ranges)[np.isfinite(ranges)]
     far = np.percentile(known, 90) if len(known) else 0.0
-    ax.set_rlim(0, REACHES[min(np.searchsorted(REACHES, far), len(REACHES) - 1)])
+    ax.set_rlim(0, REACHES[np.searchsorted(REACHES[:-1], far)])
     ax.set_thetalim(*field_of_view)
     ax.set_rorigin(0)
     figure.text(0.5, 0.03, "range [m]", ha="center")
@@ -62,11 +62,8 @@ def sweep_picture(
     ax = figure.add_axes((0.17, 0.17, 0.81, 0.79))
     if len(rows) > 1:
         known = np.array(list(rows))
-        sweep = Sweep(
-            0, np.array(list(rows.values())), bearings, known, np.zeros(len(known))
-        )
-        range_image(ax, sweep, limits=(None, None))
-        ax.collections[0].set_cmap(NEAR_IS_BRIGHT)
+        sweep = Sweep(0, np.array(list(rows.values())), bearings, known, np.nan * known)
+        range_image(ax, sweep, limits=(None, None)).set_cmap(NEAR_IS_BRIGHT)
     ax.set(ylim=np.degrees(np.sort(pitch)), aspect="auto")
     return _png(figure)
 
@@ -108,17 +105,15 @@ def _png(figure):
     return content.getvalue()
 
 
-def jpeg(image: np.ndarray, width: int) -> bytes:
-    """Content of a JPEG file.
+def jpeg(image: np.ndarray) -> bytes:
+    """Content of a JPEG file, at most `WIDTH` pixels wide.
 
     Parameters
     ----------
     image
         (height, width, 3), BGR.
-    width
-        Of the file at most, pixels.
     """
-    scale = width / image.shape[1]
+    scale = WIDTH / image.shape[1]
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()

@@ -6,7 +6,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +35,7 @@ HOW = {  # a session was recorded, by the mode of the plan
         "continuous: scans are taken while the head moves, each with the pitch at its middle beam"
     ),
 }
+PITCH = {True: "told by the head", False: "dead reckoning: the head does not tell it"}
 
 
 class RecordingError(RuntimeError):
@@ -70,7 +71,7 @@ class Recording(Closed):
     ...         input("move the board, press Enter")
     ...         for event in recording.run(placement):
     ...             print(event)
-    ...         print(recording.check(placement.number))
+    ...         print(check_placement(open_session("session"), placement.number))
     ...     recording.finish()
     """
 
@@ -86,28 +87,24 @@ class Recording(Closed):
         self.path = Path(path)
         self.plan = rig.stated.plan.to_do(count)
         with self._safely(), contextlib.ExitStack() as stack:
-            writer = self._open(resume)
-            stack.callback(writer.close)
+            self.writer = self._open(resume)
+            stack.callback(self.close)
             # a scan does not tell its measuring mode, this does
-            begin = encode_configuration(rig.lrf.configuration)
-            writer.add_telegrams(-1, [begin], time_s=rig.clock())
-            self.writer = writer
+            self.writer.add_telegrams(
+                -1, [encode_configuration(rig.lrf.configuration)], time_s=rig.clock()
+            )
             stack.pop_all()
 
     def _open(self, resume):
         """The session, to write to."""
         rig = self.rig
         stated = rig.stated
-        pitch = "dead reckoning: the head does not tell it"
-        if rig.head.has_feedback:
-            pitch = "told by the head"
         reference = {
             "recording": HOW[stated.plan.mode],
-            "pitch": pitch,
+            "pitch": PITCH[rig.head.has_feedback],
             "scene_placements": [p.number for p in self.plan if p.purpose == "scene"],
         }
-        about = dict(stated.about)
-        about["source"] = about["source"] or f"recorded with {stated.path.name}"
+        source = stated.about["source"] or f"recorded with {stated.path.name}"
         return SessionRecorder(
             self.path,
             stated.board,
@@ -118,7 +115,7 @@ class Recording(Closed):
             reference=reference,
             continuous=stated.plan.mode == "continuous",
             resume=resume,
-            **about,
+            **stated.about | {"source": source},
         )
 
     @property
@@ -138,9 +135,11 @@ class Recording(Closed):
 
     def close_views_to_do(self) -> list[tuple[str, int]]:
         """Images of the board held close still to be taken: camera, number of the view from 0."""
-        wanted = self.rig.stated.plan.intrinsics_images
-        taken = self.writer.shots_of("intrinsics")
-        return [(camera, view) for camera in taken for view in range(taken[camera], wanted)]
+        return [
+            (camera, view)
+            for camera, taken in self.writer.shots_of("intrinsics").items()
+            for view in range(taken, self.rig.stated.plan.intrinsics_images)
+        ]
 
     def run(self, placement: Placement) -> Generator[Event, None, None]:
         """Record a placement, and yield every event once it is on the disk.
@@ -182,28 +181,17 @@ class Recording(Closed):
         Light
             'bad' where the image shows no pattern and was not kept.
         """
-        with contextlib.closing(self.rig.acquire_close(camera)) as events:
-            (photo,) = (event for event in events if isinstance(event, Photographed))
+        (photo,) = self.rig.acquire_close(camera)
         stated = self.rig.stated
-        model = stated.cameras[camera].model
-        light = check_image(photo.frame.image, stated.board, model, f"camera {camera}")
+        light = check_image(
+            photo.frame.image,
+            stated.board,
+            stated.cameras[camera].model,
+            f"camera {camera}",
+        )
         if light.state != "bad":
             self.write(photo)
         return light
-
-    def check(
-        self, number: int, advice: Callable[[Session], str] | None = None
-    ) -> list[Light]:
-        """Lights of a finished placement.
-
-        Parameters
-        ----------
-        number
-            Of the placement.
-        advice
-            As of :func:`~lrfcal_lib.acquire.checks.check_placement`.
-        """
-        return check_placement(open_session(self.path), number, advice)
 
     def drop(self, number: int) -> None:
         """Take a placement out of the session, to record it again; its bytes stay on the disk.
@@ -226,7 +214,7 @@ class Recording(Closed):
         """
         with self._safely():
             self.writer.finish()
-        if self._readable() != set(self.finished):
+        if self._lost():
             raise RecordingError(f"{self.path}: {self.safe()}")
 
     def safe(self, resume: bool = False) -> str:
@@ -237,10 +225,11 @@ class Recording(Closed):
         resume
             Say how to go on, too.
         """
-        readable = self._readable()
-        if readable is None or set(self.finished) - readable:
-            lost = "the session was removed or damaged while it was recorded"
-            return f"{lost}: record again, to another folder"
+        if self._lost():
+            return (
+                "the session was removed or damaged while it was recorded: record again, to "
+                "another folder"
+            )
         safe = "no placement was finished"
         if self.finished:
             safe = f"placements {', '.join(map(str, self.finished))} are safe"
@@ -248,15 +237,13 @@ class Recording(Closed):
             safe = f"{safe}; --resume goes on from there"
         return safe
 
-    def _readable(self):
-        """Finished placements that a reader finds with their scans; None without a session."""
+    def _lost(self):
+        """Whether a reader does not find all that was finished, with its scans."""
         try:
-            recorded = open_session(self.path).scans["placement"].tolist()
+            recorded = open_session(self.path).scans["placement"]
         except (SessionError, OSError):
-            if self.finished or not self.path.exists():
-                return None
-            return set()
-        return set(recorded) & set(self.finished)
+            return bool(self.finished) or not self.path.exists()
+        return not set(self.finished) <= set(recorded.tolist())
 
     def write(self, event: Event) -> None:
         """Put an event on the disk; the parts of an interlaced scan share its pitch.
@@ -273,31 +260,33 @@ class Recording(Closed):
         """
         writer = self.writer
         with self._safely():
-            if isinstance(event, Moved):
-                measured = math.nan
-                if event.measured:
-                    measured = event.pitch
-                writer.add_platform([(event.time_s, event.commanded, measured)])
-            elif isinstance(event, Scanned):
-                scans = zip(event.readings, event.pitch, strict=True)
-                rows = [(raw, p, one.time_s) for one, p in scans for raw in one.telegrams]
-                writer.add_telegrams(event.placement, *zip(*rows, strict=True))
-            elif isinstance(event, Photographed):
-                writer.add_image(
-                    event.camera,
-                    event.frame.image,
-                    event.placement,
-                    pitch=event.pitch,
-                    time_s=event.frame.time_s,
-                    purpose=event.purpose,
-                )
-            elif isinstance(event, Tracked):
-                track = [
-                    (t, event.commanded, pitch)
-                    for t, pitch, measured in event.track
-                    if measured
-                ]
-                writer.add_platform(track)
+            match event:
+                case Moved():
+                    measured = math.nan
+                    if event.measured:
+                        measured = event.pitch
+                    writer.add_platform([(event.time_s, event.commanded, measured)])
+                case Scanned():
+                    scans = zip(event.readings, event.pitch, strict=True)
+                    rows = [
+                        (raw, p, one.time_s) for one, p in scans for raw in one.telegrams
+                    ]
+                    writer.add_telegrams(event.placement, *zip(*rows, strict=True))
+                case Photographed():
+                    writer.add_image(
+                        event.camera,
+                        event.frame.image,
+                        event.placement,
+                        pitch=event.pitch,
+                        time_s=event.frame.time_s,
+                        purpose=event.purpose,
+                    )
+                case Tracked():
+                    writer.add_platform(
+                        (t, event.commanded, pitch)
+                        for t, pitch, measured in event.track
+                        if measured
+                    )
 
     @contextlib.contextmanager
     def _safely(self):
@@ -327,8 +316,9 @@ def ask(text: str) -> str:
     try:
         return input(text).strip().lower()
     except EOFError:
-        hint = "run record in a terminal, or with an emulated rig"
-        raise RecordingError(f"nobody is there to move the board: {hint}") from None
+        raise RecordingError(
+            "nobody is there to move the board: run record in a terminal, or with an emulated rig"
+        ) from None
 
 
 @dataclass
@@ -349,17 +339,18 @@ class Sweeping:
         event
             Of the placement.
         """
-        if isinstance(event, Moved):
-            self.stop = f"stop {event.number} of {event.of}, "
-            self.pitch = event.pitch
-            self.share = (event.number - 1) / event.of
-        elif isinstance(event, Scanned):
-            self.scans += len(event.readings)
-            self.pitch = event.pitch[-1]
-            if math.isfinite(event.share):
-                self.share = event.share
-        elif isinstance(event, Photographed):
-            self.images += 1
+        match event:
+            case Moved():
+                self.stop = f"stop {event.number} of {event.of}, "
+                self.pitch = event.pitch
+                self.share = (event.number - 1) / event.of
+            case Scanned():
+                self.scans += len(event.readings)
+                self.pitch = event.pitch[-1]
+                if math.isfinite(event.share):
+                    self.share = event.share
+            case Photographed():
+                self.images += 1
 
     def counts(self):
         """What was recorded, as text."""
@@ -380,13 +371,19 @@ def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) 
     events
         Of its recording.
     """
-    first, last = (math.degrees(pitch) for pitch in placement.pitch[[0, -1]])
-    title = f"placement {placement.number} ({number} of {of}): {placement.purpose}"
-    print(f"{title}, pitch {first:.2f} to {last:.2f} deg", flush=True)
+    first, last = map(math.degrees, placement.pitch[[0, -1]])
+    print(
+        f"placement {placement.number} ({number} of {of}): {placement.purpose}, pitch "
+        f"{first:.2f} to {last:.2f} deg",
+        flush=True,
+    )
     sweeping = Sweeping()
-    pause = LINE_S[sys.stdout.isatty()]
     with tqdm(
-        total=1, bar_format=LINE, file=sys.stdout, leave=False, mininterval=pause
+        total=1,
+        bar_format=LINE,
+        file=sys.stdout,
+        leave=False,
+        mininterval=LINE_S[sys.stdout.isatty()],
     ) as line:
         for event in events:
             sweeping.note(event)
@@ -433,13 +430,16 @@ class Boards:
         )
 
 
+BOARDS = Boards()
+
+
 def record_session(
     rig: Rig,
     path: str | os.PathLike,
     *,
     resume: bool = False,
     count: int | None = None,
-    guide: Boards | None = None,
+    guide: Boards = BOARDS,
 ) -> Recording:
     """Record a session with an open rig, from the first placement that is missing to the last.
 
@@ -465,7 +465,7 @@ def record_session(
             print(f"{path}: going on, {recording.safe()}", flush=True)
         try:
             _close_views(recording)
-            _placements(recording, guide or Boards())
+            _placements(recording, guide)
             recording.finish()
         except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:
             error.add_note(recording.safe(resume=True))
@@ -528,7 +528,7 @@ def main(
     *,
     resume: bool = False,
     count: int | None = None,
-    guide: Boards | None = None,
+    guide: Boards = BOARDS,
 ) -> int:
     """Record from the command line.
 
@@ -548,7 +548,6 @@ def main(
         after a signal. The head is stopped in any case.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    guide = guide or Boards()
     try:
         stated = guide.planned(read_rig_file(rig_file))
         print(f"{rig_file}: opening the devices", flush=True)
@@ -563,12 +562,12 @@ def main(
     ) as error:
         text = f"error: {error}"
         code = FAILED
-        if isinstance(error, KeyboardInterrupt):
-            text = "\nstopped by Ctrl-C"
-            code = INTERRUPTED
-        elif isinstance(error, SystemExit) and isinstance(error.code, int):
-            text = f"\nstopped by {signal.Signals(error.code - 128).name}"
-            code = error.code
+        match error:
+            case KeyboardInterrupt():
+                text = "\nstopped by Ctrl-C"
+                code = INTERRUPTED
+            case SystemExit(code=int(code)):
+                text = f"\nstopped by {signal.Signals(code - 128).name}"
         with contextlib.suppress(OSError):  # after SIGHUP the terminal may be gone
             print("; ".join([text, *getattr(error, "__notes__", [])]), file=sys.stderr)
         return code

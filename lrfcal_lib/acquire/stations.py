@@ -49,17 +49,17 @@ class Stations(Boards):
             )
             require_same_rig(self.rig, known)
         plan = stated.plan
-        scenes = [entry for entry in plan.placements if not entry.board]
         numbers = [p.number for p in plan.to_do() if p.purpose == "scene"][: self.count]
         self._listed = tuple(numbers)
-        scene = [*scenes, ListedPlacement()][0]
+        scenes = (entry for entry in plan.placements if not entry.board)
+        scene = next(scenes, ListedPlacement())
         sweep = scene.pitch_deg or plan.pitch_deg
         images = scene.image_pitch_deg or plan.image_pitch_deg
         if self.rig is not None:
             images = self._images(sweep, stated.devices.head.pitch_limits_deg)
         while len(numbers) < self.count:
             numbers.append(max(numbers, default=0) + 1)
-        placements = [
+        placements = tuple(
             ListedPlacement(
                 number=number,
                 pitch_deg=sweep,
@@ -68,14 +68,13 @@ class Stations(Boards):
                 closing=True,
             )
             for number in numbers
-        ]
-        changed = {"placements": tuple(placements), "intrinsics_images": 0}
-        return replace(stated, plan=plan.model_copy(update=changed))
+        )
+        plan = plan.model_copy(update={"placements": placements, "intrinsics_images": 0})
+        return replace(stated, plan=plan)
 
     def _images(self, sweep, limits):
         """Pitch angles of the images, degrees; prints them."""
-        first, last, low, high = np.radians([*sweep[:2], *limits])
-        best = plan_images(self.rig, (first, last), (low, high))
+        best = plan_images(self.rig, np.radians(sweep[:2]), np.radians(limits))
         self.share = best.share
         images = tuple(np.degrees(best.pitch).round(2).tolist())
         where = ", ".join(f"{pitch:g}" for pitch in images)
@@ -91,24 +90,27 @@ class Stations(Boards):
             place = placement.number
         if rig.move_board(place):
             return ""
-        what = "set the rig up, so that nobody moves it or walks by"
-        return ask_before("station", placement.number, what, before)
+        return ask_before(
+            "station",
+            placement.number,
+            "set the rig up, so that nobody moves it or walks by",
+            before,
+        )
 
     def check(self, session: Session, number: int) -> list[Light]:
         """How good a station is: share of returns, share with a colour, whether it moved."""
+        sweep = session.sweep(number)
+        lights = [check_scene(sweep)]
         if self.rig is not None:
             require_same_rig(self.rig, session)
-        lights = [check_scene(session.sweep(number))]
-        if self.rig is not None:
             lights.append(self._colors(session, number))
-        return [*lights, _still(session.sweep(number))]
+        return [*lights, _still(sweep)]
 
     def _colors(self, session, number):
         """The Light of the share of points that get a colour."""
         station = station_of(session, self.rig, number)
-        clouds = list(colored_blocks(session, self.rig, station))
-        share = sum(cloud.seen.sum() for cloud in clouds)
-        share = float(share / max(1, sum(len(cloud.seen) for cloud in clouds)))
+        seen = [cloud.seen for cloud in colored_blocks(session, self.rig, station)]
+        share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
         text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
         state = "ok" if share > EXPECTED * self.share else "warn"
         return Light("colour", state, text)
@@ -118,8 +120,7 @@ def _still(sweep):
     """The Light of whether a station stood still."""
     closing = closing_of(sweep)
     if closing is None:
-        text = "not known: too little came back to compare"
-        return Light("stood still", "warn", text)
+        return Light("stood still", "warn", "not known: too little came back to compare")
     text = (
         f"back at a pitch that it had, ranges differ by {1000 * closing.apart:.0f} mm, "
         f"by {1000 * closing.expected:.0f} mm between neighbouring scan lines"

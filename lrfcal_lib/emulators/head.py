@@ -37,7 +37,6 @@ class Head:
 
     def __init__(self, platform: Platform | None = None, seed: int = 0, pitch: float = 0.0):
         self.platform = platform or Platform()
-        self.limits = self.platform.limits
         self._rng = np.random.default_rng([seed, 2])
         # rows: instant, motor, and where its play leaves the head. One thread writes them, any may
         # look: a look sees the table of before or of after.
@@ -55,17 +54,15 @@ class Head:
         speed
             Radians a second.
         """
-        self._run(instant + REACT_S, goal, speed)
-
-    def _run(self, instant, goal, speed):
-        now = float(self.motor(instant))
-        goal = float(np.clip(goal, *self.limits))
-        dragged = float(self.pitch(instant))
-        knots = [(instant, now, dragged)]
+        reacts = instant + REACT_S
+        now = self.motor(reacts)
+        goal = np.clip(goal, *self.platform.limits)
+        dragged = self.pitch(reacts)
+        knots: list = [(reacts, now, dragged)]
         if speed and goal != now:
-            arrives = instant + abs((goal - now) / speed)
+            arrives = reacts + abs((goal - now) / speed)
             knots.append((arrives, goal, self._with_play(dragged, goal)))
-        before = self._knots[self._knots[:, 0] < instant]
+        before = self._knots[self._knots[:, 0] < reacts]
         self._knots = np.vstack([before[-KEPT:], *knots])
 
     def go(self, instant: float, goal: float, speed: float) -> None:
@@ -88,7 +85,7 @@ class Head:
         """
         reacts = instant + REACT_S
         if self.moving(reacts):
-            self._run(reacts, self.motor(reacts), 0.0)
+            self.move(instant, float(self.motor(reacts)), 0.0)
 
     def motor(self, instant: float | np.ndarray) -> np.ndarray:
         """Angle of the motor.
@@ -208,6 +205,8 @@ class EmulatedHead(SerialDevice):
         Of :class:`Habits`.
     """
 
+    gap_s = FRAGMENT_S
+
     def __init__(
         self,
         head: Head | None = None,
@@ -221,7 +220,6 @@ class EmulatedHead(SerialDevice):
         self.head = head or Head(seed=seed)
         self.habits = Habits(**habits)
         self.absolute_until = -math.inf  # an absolute move is under way
-        self._buffer = b""  # bytes of a frame that is not whole
 
     @property
     def baudrate(self) -> int:
@@ -232,28 +230,26 @@ class EmulatedHead(SerialDevice):
         """True pitch now, radians."""
         return float(self.head.pitch(self.host.now()))
 
-    def receive(self, data: bytes, at: float) -> None:
-        """Bytes of the host.
+    def take(self, raw: bytes, at: float) -> int:
+        """Obey what frames of the host say.
 
         Parameters
         ----------
-        data
+        raw
             Of any number of frames, whole or not.
         at
-            Instant of the last of them, s.
+            Instant of the last of its bytes, s.
+
+        Returns
+        -------
+        int
+            From where on bytes must be kept.
         """
-        self.cancel("fragment")
-        data = self._buffer + data
-        frames, pending = pelco_d.split_frames(data)
-        self._buffer = data[pending:]
+        frames, pending = pelco_d.split_frames(raw)
         for frame in frames:
             if frame.address == self.habits.address:
                 self.obey(frame, at)
-        if self._buffer:
-            self.at(at + FRAGMENT_S, self._forget, "fragment")
-
-    def _forget(self, _):
-        self._buffer = b""
+        return pending
 
     def obey(self, frame: pelco_d.Frame, at: float) -> None:
         """Do what a frame says.
@@ -292,8 +288,8 @@ class EmulatedHead(SerialDevice):
             return
         head = self.head
         speed = math.radians(self.habits.go_speed)
-        goal = float(np.clip(pelco_d.decode_tilt(value), *head.limits))
-        self.absolute_until = at + abs(goal - float(head.motor(at))) / speed
+        goal = np.clip(pelco_d.decode_tilt(value), *head.platform.limits)
+        self.absolute_until = at + abs(goal - head.motor(at)) / speed
         head.go(at, goal, speed)
 
     def stop(self, at: float) -> None:
@@ -324,5 +320,7 @@ class EmulatedHead(SerialDevice):
         value = 0
         if opcode == QUERY_TILT:
             value = pelco_d.encode_tilt(self.head.measured(at))
-        reply = encode_extended(self.habits.address, ANSWERS[opcode], value)
-        self.reply(reply, at + TURN_AROUND_S)
+        self.reply(
+            encode_extended(self.habits.address, ANSWERS[opcode], value),
+            at + TURN_AROUND_S,
+        )

@@ -4,7 +4,6 @@ The port is a pseudo-terminal served by a thread, whose rate is read at the mast
 one garbles bytes as on a real line.
 """
 
-import contextlib
 import heapq
 import itertools
 import math
@@ -19,23 +18,25 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from serial import Serial
 
 from lrfcal_lib.drivers.port import REAL, Host
 
-NAMES = [name for name in dir(termios) if name[0] == "B" and name[1:].isdigit()]
-RATES = {getattr(termios, name): int(name[1:]) for name in NAMES}  # code in termios -> baud
+# code in termios -> baud
+RATES = {getattr(termios, f"B{rate}", None): rate for rate in Serial.BAUDRATES}
 CHUNK_S = 0.005  # bytes that leave within this time are written at once
 LOOK_S = 0.02  # how often to see whether somebody opened the port
 END_S = 5  # longest wait for the end of the thread
 SOON = 1e-9  # s; so far ahead counts as now, whatever the rounding
 NONE = -1  # file of a terminal that is not plugged in
-SENDING = "sending"  # tag of what is planned for the bytes on their way out
+SENDING = "sending"  # tag of what is planned until the last byte is out
 
 
 class SerialDevice(ABC):
     """What all devices on a line have in common; a context manager, or `start` and `close`.
 
-    Instants are ``now()`` of the host that it lives on, s.
+    Instants are ``now()`` of the host that it lives on, s. A telegram that was begun is forgotten
+    when nothing more of it comes for `gap_s`.
 
     Parameters
     ----------
@@ -52,6 +53,8 @@ class SerialDevice(ABC):
         What ended the device by itself.
     """
 
+    gap_s: float
+
     def __init__(self, path: str | os.PathLike, host: Host, seed: int = 0):
         self.path = str(path)
         self.host = host
@@ -60,6 +63,7 @@ class SerialDevice(ABC):
         self.busy_until = 0.0  # of the line to the host
         self._heard = 0.0  # the last byte from the host
         self._noise = np.random.default_rng([seed, 4])
+        self._buffer = b""  # bytes of a telegram that is not whole
         self._agenda: list = []  # heap of instant, order, action, tag
         self._order = itertools.count()
 
@@ -69,15 +73,20 @@ class SerialDevice(ABC):
         """Of the device."""
 
     @abstractmethod
-    def receive(self, data: bytes, at: float) -> None:
-        """Take bytes of the host.
+    def take(self, raw: bytes, at: float) -> int:
+        """Do what bytes of the host say.
 
         Parameters
         ----------
-        data
-            As they arrived.
+        raw
+            Of any number of telegrams, whole or not.
         at
             Instant of the last of them, s.
+
+        Returns
+        -------
+        int
+            From where on they must be kept: a telegram may begin there whose end has not come yet.
         """
 
     @property
@@ -114,15 +123,15 @@ class SerialDevice(ABC):
         """
         heapq.heappush(self._agenda, (instant, next(self._order), action, tag))
 
-    def cancel(self, *tags: str) -> None:
+    def cancel(self, tag: str) -> None:
         """Forget what was planned.
 
         Parameters
         ----------
-        *tags
+        tag
             Of the plans.
         """
-        self._agenda = [item for item in self._agenda if item[3] not in tags]
+        self._agenda = [item for item in self._agenda if item[3] != tag]
         heapq.heapify(self._agenda)
 
     def abort(self) -> None:
@@ -144,14 +153,12 @@ class SerialDevice(ABC):
         then
             ``then(instant)`` is called when the last is out.
         """
-        byte_s = self.byte_s
-        begin = max(at, self.busy_until)
-        self.busy_until = begin + len(data) * byte_s
-        at_once = max(1, int(CHUNK_S / byte_s))
+        self.busy_until = max(at, self.busy_until)
+        at_once = max(1, int(CHUNK_S / self.byte_s))
         for first in range(0, len(data), at_once):
             chunk = data[first : first + at_once]
-            out = begin + (first + len(chunk)) * byte_s
-            self.at(out, partial(self._put, chunk), SENDING)
+            self.busy_until += len(chunk) * self.byte_s
+            self.at(self.busy_until, partial(self._put, chunk), SENDING)
         if then is not None:
             self.at(self.busy_until, then, SENDING)
 
@@ -167,11 +174,11 @@ class SerialDevice(ABC):
         """When something is to be done, s."""
         if not self._agenda:
             return math.inf
-        return max(self.host.now(), self._agenda[0][0])
+        return self._agenda[0][0]
 
     def advance(self) -> None:
         """Do all that is due by now."""
-        while self._agenda and self._agenda[0][0] <= self.host.now() + SOON:
+        while self.due() <= self.host.now() + SOON:
             instant, _, action, _ = heapq.heappop(self._agenda)
             action(instant)
 
@@ -187,6 +194,25 @@ class SerialDevice(ABC):
         self._heard = max(self._heard, self.host.now()) + len(data) * self.byte_s
         if data:
             self.receive(data, self._heard)
+
+    def receive(self, data: bytes, at: float) -> None:
+        """Take bytes of the host.
+
+        Parameters
+        ----------
+        data
+            As they arrived.
+        at
+            Instant of the last of them, s.
+        """
+        self.cancel("gap")
+        raw = self._buffer + data
+        self._buffer = raw[self.take(raw, at) :]
+        if self._buffer:
+            self.at(at + self.gap_s, self._forget, "gap")
+
+    def _forget(self, _):
+        self._buffer = b""
 
     def _through(self, data, sent, read):
         """Bytes at the other end of the line; where its ends are set to different rates as much
@@ -252,13 +278,15 @@ class Terminal(threading.Thread):
 
     def _listen(self):
         """Take the bytes of the host; see whether it holds the port open."""
-        state = select.poll()
-        state.register(self._master, select.POLLIN)
-        event = dict(state.poll(0)).get(self._master, 0)
-        if event & select.POLLIN:
-            with contextlib.suppress(OSError):
-                self._device.hear(os.read(self._master, 4096))
-        self.open = not event & select.POLLHUP
+        try:
+            data = os.read(self._master, 4096)
+        except BlockingIOError:  # it says nothing
+            self.open = True
+        except OSError:
+            self.open = False
+        else:
+            self.open = True
+            self._device.hear(data)
 
     def put(self, data: bytes) -> None:
         """Send bytes; what the buffer cannot hold is lost.
@@ -281,10 +309,8 @@ class Terminal(threading.Thread):
         tty.setraw(slave)
         os.set_blocking(self._master, False)
         path = Path(self._device.path)
-        beside = path.with_name(f".{path.name}.{os.getpid()}")
-        beside.unlink(missing_ok=True)
-        beside.symlink_to(os.ttyname(slave))
-        beside.replace(path)
+        path.unlink(missing_ok=True)
+        path.symlink_to(os.ttyname(slave))
         os.close(slave)
         self.open = False
 

@@ -6,27 +6,26 @@ The orders of commands of those two programs are in ``tests/test_lms2xx_clients.
 import math
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.drivers.lms2xx_link import FASTEST
 from lrfcal_lib.drivers.lms2xx_scans import BURST, PARTIAL
 from lrfcal_lib.drivers.port import REAL, Host
-from lrfcal_lib.emulators.line import SerialDevice
+from lrfcal_lib.emulators.line import SENDING, SerialDevice
 from lrfcal_lib.emulators.lms2xx_memory import (
     BAUD_COMMAND,
-    BAUD_WORD,
     ENCODED,
     INSTALLATION,
     INTERLACED,
     REFLECTIVITY,
     REQUEST,
     STREAMED,
+    WRITTEN,
     Memory,
     Selection,
     selection_of,
-    words_of,
 )
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
@@ -82,8 +81,6 @@ class EmulatedLms(SerialDevice):
         Whose time the device lives in.
     boot_s
         From a restart to the power-on string; a real device takes up to 60 s.
-    baudrates
-        That the line allows; RS-232 ends at 38400.
     **settings
         Of its `memory`, :class:`Memory`: model, variant, configuration, baudrate, address, ...
 
@@ -93,6 +90,8 @@ class EmulatedLms(SerialDevice):
         Scans counted since power-on.
     """
 
+    gap_s = GAP_S
+
     def __init__(
         self,
         source,
@@ -101,17 +100,14 @@ class EmulatedLms(SerialDevice):
         seed: int = 0,
         host: Host = REAL,
         boot_s: float = 2.0,
-        baudrates: tuple[int, ...] = (*BAUD_WORD,),
         **settings,
     ):
         super().__init__(path, host, seed)
         self.memory = Memory(**settings)
         self.source = source
         self.boot_s = boot_s
-        self.baudrates = baudrates
         self.telegrams = 0
         self._rng = np.random.default_rng([seed, 1])
-        self._buffer = b""  # bytes of a request that is not whole
         self._booting = False
         self._effect: Callable | None = None  # of the command whose reply is on its way
         self._zero = host.now() - POWERED_S  # when turns of the mirror are counted from
@@ -132,29 +128,27 @@ class EmulatedLms(SerialDevice):
 
     # --------------------------------------------------------------------- bytes from the host
 
-    def receive(self, data: bytes, at: float) -> None:
-        """Bytes of the host.
+    def take(self, raw: bytes, at: float) -> int:
+        """Hear the telegrams of the host.
 
         Parameters
         ----------
-        data
+        raw
             Of any number of telegrams, whole or not.
         at
-            Instant of the last of them, s.
+            Instant of the last of its bytes, s.
+
+        Returns
+        -------
+        int
+            From where on bytes must be kept.
         """
-        self.cancel("gap")
-        raw = self._buffer + data
         stream = split_stream(raw, replies=False)
-        self._buffer = raw[stream.pending :]
         for offset, length in zip(stream.offset, stream.length, strict=True):
             self.heard(raw[offset : offset + length], at)
         if len(stream.rejected) and not len(stream.offset):
             self.heard(raw[stream.rejected[0] :], at, sound=False)
-        if self._buffer:
-            self.at(at + GAP_S, self._forget, "gap")
-
-    def _forget(self, _):
-        self._buffer = b""
+        return stream.pending
 
     def heard(self, raw: bytes, at: float, sound: bool = True) -> None:
         """Acknowledge a telegram and do what it says.
@@ -172,7 +166,6 @@ class EmulatedLms(SerialDevice):
         """
         if raw[1] not in (0, self.memory.address) or self._booting:
             return
-        self.cancel("reply", "stream")
         self.abort()
         if not sound:
             self.write(NAK, at + ACK_S, self._finish)
@@ -200,26 +193,10 @@ class EmulatedLms(SerialDevice):
                 # the scan that is being measured when the request is whole
                 begun = at + ACK_S + 2 * self.byte_s
                 turn = self._turn_of(begun, memory.turns, math.floor)
-                self._measure(turn, -1, self._send_requested, "reply")
-            case 0x31, _:
-                self.answer(at, 0xB1, memory.status_data())
-            case 0x32, _:
-                self.answer(at, 0xB2)
-            case 0x3A, _:
-                self.answer(at, 0xBA, memory.model.encode())
-            case 0x3B, data if (
-                len(data) == 4
-            ):  # nothing is streamed while the variant changes
-                taken = memory.set_variant(tuple(np.frombuffer(data, "<u2").tolist()))
-                self.answer(
-                    at, 0xBB, bytes([taken]) + words_of(memory.variant), delay=WRITE_S
-                )
-            case 0x74, _:
-                self.answer(at, 0xF4, memory.configuration.block)
-            case 0x77, data if 32 <= len(data) <= 34 and memory.mode == INSTALLATION:
-                taken = memory.write_configuration(data)
-                block = memory.configuration.block
-                self.answer(at, 0xF7, bytes([taken]) + block, delay=WRITE_S)
+                self._measure(turn, -1, partial(self.emit, then=self._finish))
+            case code, data if (reply := memory.reply(code, data)) is not None:
+                delay = WRITE_S if code in WRITTEN else REPLY_S
+                self.answer(at, 0x80 | code, reply, delay=delay)
             case _:
                 self.answer(at, 0x92)
 
@@ -236,14 +213,20 @@ class EmulatedLms(SerialDevice):
         memory = self.memory
         mode = int.from_bytes(data[:1])
         parameters = data[1:]
-        if mode in BAUD_COMMAND and not parameters:
-            self._set_rate(BAUD_COMMAND[mode], at)
-        elif (
-            mode == INSTALLATION and len(parameters) == 8 and parameters != memory.password
-        ):
-            self.answer(at, 0xA0, WRONG)
-        elif (selection := selection_of(mode, parameters)) is None:
+        selection = selection_of(mode, parameters)
+        rate = BAUD_COMMAND.get(mode)
+
+        def set_rate(_):
+            memory.baudrate = rate
+
+        if rate in memory.baudrates and not parameters:
+            self.answer(at, 0xA0, DONE, set_rate)
+        elif rate and not parameters:
+            self.answer(at, 0xA0, FAULT)
+        elif selection is None:
             self.answer(at, 0x92)
+        elif mode == INSTALLATION and parameters != memory.password:
+            self.answer(at, 0xA0, WRONG)
         else:
             delay = REPLY_S + self._rng.uniform(0, 0.02)
             if self.streaming:
@@ -251,15 +234,6 @@ class EmulatedLms(SerialDevice):
             memory.mode = mode
             self._selection = selection
             self.answer(at, 0xA0, DONE, delay=delay)
-
-    def _set_rate(self, rate, at):
-        def take_effect(_):
-            self.memory.baudrate = rate
-
-        if rate in self.baudrates:
-            self.answer(at, 0xA0, DONE, take_effect)
-        else:
-            self.answer(at, 0xA0, FAULT)
 
     # ---------------------------------------------------------------------------------- replies
 
@@ -289,16 +263,14 @@ class EmulatedLms(SerialDevice):
         """
         if effect is not None:  # else that of the command whose reply this one interrupted
             self._effect = effect
-        raw = self._encode(code, data)
-        self.at(at + delay, lambda instant: self.reply(raw, instant, self._finish), "reply")
+        reply = partial(self.reply, self._encode(code, data), then=self._finish)
+        self.at(at + delay, reply, SENDING)
 
     def _finish(self, at):
         """A reply is out: do what is left of the command, and stream from the next scan on."""
-        effect = self._effect
-        self._effect = None
-        if effect is not None:
-            effect(at)
-        self.cancel("stream")
+        if self._effect is not None:
+            self._effect(at)
+            self._effect = None
         if self.streaming:
             self._partial = 0
             self._turn = self._turn_of(at, self._turns, math.ceil)
@@ -307,7 +279,7 @@ class EmulatedLms(SerialDevice):
     def reply(
         self, raw: bytes, at: float, then: Callable[[float], None] | None = None
     ) -> None:
-        """Send a reply; at 500000 Bd at most 508 bytes leave in one turn of the mirror.
+        """Send a reply; at most 508 bytes leave in one turn of the mirror, as shows at 500000 Bd.
 
         Parameters
         ----------
@@ -318,11 +290,8 @@ class EmulatedLms(SerialDevice):
         then
             ``then(instant)`` is called when the last byte is out.
         """
-        step = len(raw) or 1
-        if self.baudrate == FASTEST:
-            step = BURST
-        for burst, first in enumerate(range(0, len(raw), step)):
-            self.write(raw[first : first + step], at + burst * MIRROR_TURN)
+        for burst, first in enumerate(range(0, len(raw), BURST)):
+            self.write(raw[first : first + BURST], at + burst * MIRROR_TURN)
         self.write(b"", at, then)
 
     def _begin_restart(self, at):
@@ -337,7 +306,6 @@ class EmulatedLms(SerialDevice):
             The present instant, s.
         """
         memory = self.memory
-        self.cancel("reply", "stream")
         self.abort()
         self._booting = True
         self._effect = None
@@ -367,7 +335,7 @@ class EmulatedLms(SerialDevice):
             return 1
         return self._selection.scans * self.memory.turns
 
-    def _measure(self, turn, partial, send, tag):
+    def _measure(self, turn, part, send):
         """Send the scan that begins at a turn at its end.
 
         It is cast a little ahead, which may take a while.
@@ -376,41 +344,33 @@ class EmulatedLms(SerialDevice):
         angle, step = memory.variant
         turns = memory.turns
         values = angle * 100 // step + 1
-        if partial >= 0:
+        if part >= 0:
             turns = 1
-            values = PARTIAL - (partial > 0)
+            values = PARTIAL - (part > 0)
         scans = self._selection.scans
         end = self._zero + (turn + turns * scans) * MIRROR_TURN
 
         def ahead(_):
             """Cast the scan, or those of a mean, and send it at its end."""
-            quarters = codec.scan_quarters(values, partial)
-            after = (
-                np.arange(values) % turns + quarters / 1440
-            )  # turns since the first began
+            quarters = codec.scan_quarters(values, part)
+            # turns since the first began
+            after = np.arange(values) % turns + quarters / 1440
             times = self._zero + (turn + after) * MIRROR_TURN
-            cast = []
-            for later in range(0, turns * scans, turns):
-                cast.append(
-                    self.source.scan(turn + later, quarters, times + later * MIRROR_TURN)
-                )
+            cast = [
+                self.source.scan(turn + later, quarters, times + later * MIRROR_TURN)
+                for later in range(0, turns * scans, turns)
+            ]
             ranges, reasons = map(np.array, zip(*cast, strict=True))
-            configuration = memory.configuration
             words = codec.encode_values(
                 ranges.mean(axis=0),
-                unit=configuration.unit,
-                mode=ENCODED[configuration.measuring_mode],
-                reasons=reasons.max(
-                    axis=0
-                ),  # of a mean, too: one scan without a range leaves none
+                unit=memory.configuration.unit,
+                mode=ENCODED[memory.configuration.measuring_mode],
+                # of a mean, too: one scan without a range leaves none
+                reasons=reasons.max(axis=0),
             )
-            scan = Scan(turn, partial, words, times)
-            self.at(end, lambda instant: send(scan, instant), tag)
+            self.at(end, partial(send, Scan(turn, part, words, times)), SENDING)
 
-        self.at(end - AHEAD_S, ahead, tag)
-
-    def _send_requested(self, scan, at):
-        self.emit(scan, at, self._finish)
+        self.at(end - AHEAD_S, ahead, SENDING)
 
     def emit(
         self, scan: Scan, at: float, then: Callable[[float], None] | None = None
@@ -425,9 +385,8 @@ class EmulatedLms(SerialDevice):
         then
             ``then(instant)`` is called when the last byte is out.
         """
-        raw = self.telegram(scan)
+        self.reply(self.telegram(scan), at, then)
         self.telegrams += 1
-        self.reply(raw, at, then)
 
     def telegram(self, scan: Scan) -> bytes:
         """What the mode tells of a scan.
@@ -466,12 +425,12 @@ class EmulatedLms(SerialDevice):
             self.telegrams += 1
             self._partial = 0
             self._turn = self._turn_of(self.host.now(), turns, math.ceil)
-        partial = -1
+        part = -1
         if self.memory.mode == INTERLACED:
             # which there are depends on the resolution that is set
-            partial = self._partial * self.memory.variant[1] % 100 // 25
+            part = self._partial * self.memory.variant[1] % 100 // 25
             self._partial += 1
-        self._measure(self._turn, partial, self._next, "stream")
+        self._measure(self._turn, part, self._next)
 
     def _next(self, scan, at):
         """A scan of the stream is complete: send it unless the line is busy, and plan the next.

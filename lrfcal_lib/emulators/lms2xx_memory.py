@@ -34,6 +34,7 @@ PARAMETERS = {
 }
 # code of the telegrams that they send
 STREAMED = {STREAM: SCAN, MEAN: 0xB6, PART: 0xB7, INTERLACED: SCAN, REFLECTIVITY: 0xF5}
+WRITTEN = (0x3B, 0x77)  # commands that write to flash
 SCANS = range(2, 251)  # of a mean
 LAST = 401  # value that can be asked for; there may be fewer
 # as which mode a measuring mode encodes ranges; 13 and 14, remission, are those that CARMEN sets
@@ -58,6 +59,7 @@ class Memory:
     variant: tuple[int, int] = (180, 50)  # degrees and 1/100 degree
     configuration: Configuration = field(default_factory=Configuration)
     baudrate: int = 9600
+    baudrates: tuple[int, ...] = (*BAUD_WORD,)  # that the line allows; RS-232 ends at 38400
     mode: int = REQUEST  # operating mode, the sub-command of 0x20
     address: int = 0
     password: bytes = b"SICK_LMS"
@@ -72,6 +74,37 @@ class Memory:
     def turns(self) -> int:
         """Of the mirror for a scan."""
         return 100 // self.variant[1]
+
+    def reply(self, code: int, data: bytes) -> bytes | None:
+        """Data of the reply to a command that asks for settings, or changes them.
+
+        Parameters
+        ----------
+        code, data
+            Of the command.
+
+        Returns
+        -------
+        bytes or None
+            None for a command that is not understood now. Nothing is streamed while the variant
+            changes.
+        """
+        match code:
+            case 0x31:
+                return self.status_data()
+            case 0x32:
+                return b""
+            case 0x3A:
+                return self.model.encode()
+            case 0x3B if len(data) == 4:
+                taken = self.set_variant(tuple(np.frombuffer(data, "<u2").tolist()))
+                return bytes([taken]) + words_of(self.variant)
+            case 0x74:
+                return self.configuration.block
+            case 0x77 if 32 <= len(data) <= 34 and self.mode == INSTALLATION:
+                taken = self.write_configuration(data)
+                return bytes([taken]) + self.configuration.block
+        return None
 
     def set_variant(self, variant: tuple[int, int]) -> bool:
         """Take a variant.
@@ -115,15 +148,14 @@ class Memory:
 
     def status_data(self) -> bytes:
         """Data of the status reply 0xB1; offsets count from its code. What no driver reads is 0."""
-        configuration = self.configuration
         parts = {
             1: self.model[14:21].encode(),
             8: bytes([self.mode]),
-            102: bytes([configuration.measuring_mode]),
+            102: bytes([self.configuration.measuring_mode]),
             107: words_of(self.variant),
             116: words_of([BAUD_WORD[self.baudrate]]),
             120: bytes([self.address, 1]),
-            122: bytes([UNITS.index(configuration.unit), 1]),
+            122: bytes([UNITS.index(self.configuration.unit), 1]),
         }
         data = bytearray(153)
         for at, part in parts.items():

@@ -38,18 +38,16 @@ class EmulatedRig:
     ----------
     setup
         What to emulate.
-    seed
-        Of noise; the world follows from the setup's own seed.
     placements
         Where the board can be put, see :class:`EmulatedWorld`.
-    head_options
-        Of :class:`EmulatedHead`.
     quick
         Its head is quick, and the rig file says so.
     rest_s
         Of :class:`CameraServer`.
     host
         Whose time the devices live in, and whose ``terminal(device)`` their ports are.
+    **habits
+        Of :class:`EmulatedHead`.
 
     Examples
     --------
@@ -61,12 +59,11 @@ class EmulatedRig:
         self,
         setup: Setup,
         *,
-        seed: int = 0,
         placements: Sequence[Placement] | None = None,
-        head_options: dict | None = None,
         quick: bool = False,
         rest_s: float = 0.5,
         host: Host = REAL,
+        **habits,
     ):
         self.setup = setup
         self.host = host
@@ -74,15 +71,14 @@ class EmulatedRig:
         self._closing = contextlib.ExitStack()
         folder = tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
         self.folder = Path(self._closing.enter_context(folder))
-        self.world = EmulatedWorld(setup, host, seed, placements)
-        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host, seed=seed)
-        head = self.world.head
-        options = dict(head_options or {})
+        self.world = EmulatedWorld(setup, host, placements)
+        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host)
         if quick:
-            options |= QUICK_HEAD
-        path = self.folder / "head"
-        self.pan_tilt = EmulatedHead(head, path=path, host=host, seed=seed, **options)
-        self.camera_server = CameraServer(self.world, seed=seed, rest_s=rest_s)
+            habits |= QUICK_HEAD
+        self.pan_tilt = EmulatedHead(
+            self.world.head, path=self.folder / "head", host=host, **habits
+        )
+        self.camera_server = CameraServer(self.world, rest_s=rest_s)
         self.camera_urls = {
             name: f"{self.camera_server.url}/{name}.mjpg"
             for name in self.camera_server.cameras
@@ -117,12 +113,11 @@ class EmulatedRig:
             step = setup.step
             if not board and setup.room_sweep:
                 step = setup.room_sweep[2]
-            sweep = (*placement.sweep, step)
             placements.append(
                 {
                     "number": placement.number,
                     "board": board,
-                    "pitch_deg": np.degrees(sweep).round(4).tolist(),
+                    "pitch_deg": np.degrees([*placement.sweep, step]).round(4).tolist(),
                     "image_pitch_deg": np.degrees(placement.image_pitch).round(4).tolist(),
                 }
             )
@@ -149,11 +144,11 @@ class EmulatedRig:
             "rig": stated.rig_to_json(
                 rig.beam.info("emulated"), rig.T_head_lrf_stated, cameras
             ),
-            "devices": self._devices(cameras),
+            "devices": self._devices(),
             "plan": self.plan(),
         }
 
-    def _devices(self, cameras):
+    def _devices(self):
         """Where the devices are, and how they are to be set."""
         rig = self.setup.rig
         head = self.pan_tilt
@@ -176,12 +171,12 @@ class EmulatedRig:
             },
             "head": stated_head,
             "cameras": {
-                name: {
-                    "source": self.camera_urls[name],
+                camera.name: {
+                    "source": self.camera_urls[camera.name],
                     "silence_s": SILENCE_S,
-                    "size": [camera.width, camera.height],
+                    "size": [camera.model.width, camera.model.height],
                 }
-                for name, camera in cameras.items()
+                for camera in rig.cameras
             },
             "control": self.camera_server.control,
         }
@@ -218,16 +213,10 @@ def emulated(name: str, feedback: str = "full") -> EmulatedRig:
     ValueError
         For another name.
     """
-    setup = load_setup(name)
-    placements = None
     if name == PRACTICE:
         setup, placements = practice_setup()
-    return EmulatedRig(
-        setup,
-        placements=placements,
-        head_options={"feedback": feedback},
-        quick=name == PRACTICE,
-    )
+        return EmulatedRig(setup, placements=placements, feedback=feedback, quick=True)
+    return EmulatedRig(load_setup(name), feedback=feedback)
 
 
 def main(
@@ -334,14 +323,14 @@ def summary(rig: EmulatedRig, file: str | os.PathLike | None) -> str:
         Its rig file.
     """
     head = rig.pan_tilt
-    control = rig.camera_server.control
     places = ", ".join(map(str, rig.world.placements))
     lines = [
         f"emulated rig '{rig.setup.name}' ({rig.setup.rig.beam.name}); Ctrl-C ends it",
         f"  lrf      {rig.lrf.path}   {rig.lrf.baudrate} Bd, SICK LMS2xx",
         f"  head     {head.path}   {head.baudrate} Bd, Pelco-D, address {head.habits.address}",
         *(f"  {name:8s} {url}" for name, url in rig.camera_urls.items()),
-        f"  board    curl -X POST {control}/place/NUMBER puts it at {places}, or none",
+        f"  board    curl -X POST {rig.camera_server.control}/place/NUMBER puts it at {places}, or "
+        "none",
     ]
     if file is not None:
         lines.append(f"  rig file {file}   python -m lrfcal_lib record --help")

@@ -38,8 +38,6 @@ class EmulatedWorld:
         What to emulate.
     host
         Whose time the world lives in.
-    seed
-        Of noise.
     placements
         Where the board can be put; by default those of the setup.
 
@@ -50,21 +48,21 @@ class EmulatedWorld:
         with it.
     """
 
+    current: tuple
+
     def __init__(
         self,
         setup: Setup,
         host: Host = REAL,
-        seed: int = 0,
         placements: Sequence[Placement] | None = None,
     ):
         self.setup = setup
         self.host = host
-        self.head = Head(setup.rig.platform, seed)
+        self.head = Head(setup.rig.platform)
         self.placements = {p.number: p for p in placements or placements_of(setup)}
-        self._rng = np.random.default_rng([seed, 3])
-        # what a head at rest saw last, and without noise
-        self._still_key: tuple | None = None
-        self._still: lrf.Readings | None = None
+        self._rng = np.random.default_rng([0, 3])
+        # what was looked at last, and what was seen without noise
+        self._seen: tuple = (None, None)
         self.put(None)
 
     @property
@@ -86,17 +84,19 @@ class EmulatedWorld:
             For a placement that the setup does not have.
         """
         if number is None:
-            self._show(("placement", None))
+            self.current = ("placement", None), world_of(self.setup, None)
             return
         if number not in self.placements:
             known = ", ".join(map(str, self.placements))
             raise ValueError(f"no placement {number}; there are {known}, and none")
         placement = self.placements[number]
-        self._show(
-            ("placement", number),
+        world = world_of(
+            self.setup,
             placement.T_platform_board,
             T_room_platform=placement.T_room_platform,
         )
+        # in one go, as a scan may be cast meanwhile
+        self.current = ("placement", number), world
 
     def hold_close(self, camera: str, view: int) -> None:
         """Hold the board close to a camera, in one of the views for its intrinsics.
@@ -116,16 +116,12 @@ class EmulatedWorld:
         names = [camera.name for camera in self.setup.rig.cameras]
         count = self.setup.intrinsics_views
         if camera not in names or not 0 <= view < count:
-            known = f"0 to {count - 1} of {', '.join(names)}"
-            raise ValueError(f"no view {view} of camera '{camera}'; there are {known}")
+            raise ValueError(
+                f"no view {view} of camera '{camera}'; there are 0 to {count - 1} of "
+                f"{', '.join(names)}"
+            )
         pose = close_views(self.setup, names.index(camera))[view]
-        self._show(("close", camera, view), pose, stand=False)
-
-    def _show(self, place, T_platform_board=None, stand=True, T_room_platform=None):
-        """Put the board somewhere, on its stand or held by nothing; None: a table with things."""
-        # in one go, as a scan may be cast meanwhile
-        world = world_of(self.setup, T_platform_board, stand, T_room_platform)
-        self.current = (place, world)
+        self.current = ("close", camera, view), world_of(self.setup, pose, stand=False)
 
     def scan(
         self, turn: int, quarters: np.ndarray, times: np.ndarray
@@ -150,20 +146,17 @@ class EmulatedWorld:
         """
         place, world = self.current
         rig = self.setup.rig
-        pitch = np.broadcast_to(self.head.pitch(times), times.shape)
-        key = None
-        if np.ptp(pitch) < STILL:  # a head at rest sees the same again and again
-            key = place, len(quarters), quarters[0], round(float(pitch[0]) / STILL)
-        if self._still is None or key is None or self._still_key != key:
-            self._still_key = key
+        pitch = self.head.pitch(times)
+        # a head at rest sees the same again and again
+        key = place, quarters.tobytes(), np.rint(pitch / STILL).tobytes()
+        if self._seen[0] != key:
             bearings = np.radians(quarters / 4)
-            self._still = lrf.ideal_readings(
-                rig.beam, world, bearings, pitch, rig.T_head_lrf
-            )
-        return lrf.measured(rig.beam, self._still, self._rng)
+            seen = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
+            self._seen = key, seen
+        return lrf.measured(rig.beam, self._seen[1], self._rng)
 
 
-class CameraServer:
+class CameraServer(ThreadingHTTPServer):
     """The cameras of a world, and who puts its board elsewhere, over HTTP.
 
     `url` has ``NAME.mjpg`` of all `cameras`; `control` obeys POST of ``place/NUMBER`` (or none) and
@@ -173,39 +166,37 @@ class CameraServer:
     ----------
     world
         That the cameras show.
-    seed
-        Of noise.
     rest_s
         Seconds that the head must rest before an image is drawn. Nobody tells a camera whether its
         image is wanted; most stops of a sweep need none and are shorter.
     """
 
-    def __init__(self, world: EmulatedWorld, *, seed: int = 0, rest_s: float = 0.5):
+    def __init__(self, world: EmulatedWorld, *, rest_s: float = 0.5):
+        super().__init__(("127.0.0.1", 0), _Handler)
         self.world = world
-        self.seed = seed
         self.rest_s = rest_s
         self.quit = threading.Event()
         self.cameras = {camera.name: camera for camera in world.setup.rig.cameras}
         self._imagers: dict[str, Imager] = {}
-        self._images: dict = {}  # what is shown, and a JPEG file, by camera
+        # what is shown, and a JPEG file, by camera
+        self._images: dict = dict.fromkeys(self.cameras, (None, None))
         self._count = itertools.count()
         self._lock = threading.Lock()
-        handler = type("Handler", (_Handler,), {"server_of": self})
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-        self.host = f"127.0.0.1:{self._server.server_port}"
+        self.host = f"127.0.0.1:{self.server_port}"
         self.url = f"http://{self.host}"
         self.token = secrets.token_urlsafe()
         self.control = f"{self.url}/{self.token}"
-        serve = self._server.serve_forever
-        self._thread = threading.Thread(target=serve, args=(SERVE_S,), daemon=True)
+        self._thread = threading.Thread(
+            target=self.serve_forever, args=(SERVE_S,), daemon=True
+        )
         self.start = self._thread.start
 
     def close(self) -> None:
         """End the server, started or not, and wait for the end of a drawing."""
         self.quit.set()
         if self._thread.is_alive():
-            self._server.shutdown()
-        self._server.server_close()
+            self.shutdown()
+        self.server_close()
         with self._lock:
             self._images.clear()
 
@@ -234,7 +225,7 @@ class CameraServer:
                 place, scene = self.world.current
                 key = self._key(name, place)
                 if key is not None:
-                    if self._images.get(name, (None,))[0] != key:
+                    if self._images[name][0] != key:
                         self._images[name] = key, self._draw(name, scene, key[2])
                     if self._key(name, self.world.place) == key:
                         return self._images[name]
@@ -254,7 +245,7 @@ class CameraServer:
         camera = self.cameras[name]
         if name not in self._imagers:
             self._imagers[name] = Imager(camera.model, camera.exposure)
-        rng = np.random.default_rng([self.seed, next(self._count)])
+        rng = np.random.default_rng([0, next(self._count)])
         pose = self.world.setup.rig.camera_pose(camera, pitch)
         image = self._imagers[name].render(scene, pose, rng)
         _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
@@ -268,25 +259,25 @@ class _Handler(BaseHTTPRequestHandler):
         """Refuse what was sent to another name, as by a web page whose name leads here."""
         if not super().parse_request():
             return False
-        known = self.headers["Host"] == self.server_of.host
+        known = self.headers["Host"] == self.server.host
         if not known:
-            self.send_error(403, f"this is {self.server_of.url} only")
+            self.send_error(403, f"this is {self.server.url} only")
         return known
 
     def do_GET(self):
         """Send the images of a camera."""
         name = self.path.strip("/").removesuffix(".mjpg")
-        if name in self.server_of.cameras:
+        if name in self.server.cameras:
             return self._stream(name)
-        known = ", ".join(f"{name}.mjpg" for name in self.server_of.cameras)
+        known = ", ".join(f"{name}.mjpg" for name in self.server.cameras)
         return self.send_error(404, f"there are {known}")
 
     def do_POST(self):
         """Move the board."""
-        world = self.server_of.world
+        world = self.server.world
         try:
             match self.path.strip("/").split("/"):
-                case [token, *_] if token != self.server_of.token:
+                case [token, *_] if token != self.server.token:
                     return self.send_error(
                         403, "the address of devices.control in the rig file is needed"
                     )
@@ -304,7 +295,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self.end_headers()
 
     def _stream(self, name):
-        server = self.server_of
+        server = self.server
         with contextlib.suppress(ConnectionError, TimeoutError):
             self.send_response(200)
             self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
@@ -313,13 +304,14 @@ class _Handler(BaseHTTPRequestHandler):
             while not server.quit.is_set():
                 _, data = server.image(name)
                 if data is None:
-                    self.wfile.write(
-                        b"\r\n"
-                    )  # a blank line: the camera lives, its head moves
+                    # a blank line: the camera lives, its head moves
+                    self.wfile.write(b"\r\n")
                 else:
-                    length = f"Content-Length: {len(data)}\r\n\r\n".encode()
-                    head = b"--frame\r\nContent-Type: image/jpeg\r\n" + length
-                    self.wfile.write(head + data + b"\r\n")
+                    head = (
+                        "--frame\r\nContent-Type: image/jpeg\r\n"
+                        f"Content-Length: {len(data)}\r\n\r\n"
+                    )
+                    self.wfile.write(head.encode() + data + b"\r\n")
                     server.quit.wait(1 / FPS)
 
     def log_message(self, *_):
