@@ -1,7 +1,6 @@
 """Record a session with a simulated rig: telegrams, platform log, images and the truth."""
 
 import json
-import math
 import os
 import shutil
 from dataclasses import asdict
@@ -11,6 +10,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.kinematics import MIRROR_TURN
@@ -57,13 +57,12 @@ class Stops(NamedTuple):
 class Shots(NamedTuple):
     """Images of one camera, by its number in the rig, at one placement.
 
-    `poses` are ``T_camera_platform``, `key` that of the random numbers. The board held close to a
-    camera is placement -1.
+    `key` is that of the random numbers. The board held close to a camera is placement -1.
     """
 
     camera: int
     placement: Placement
-    poses: list
+    stops: Stops
     key: tuple
 
     @property
@@ -99,15 +98,10 @@ def world_of(
     return furnished_room(*(things if stand else things[:1]))
 
 
-def step_angles(first, last, step):
-    """Pitch commands of a stop-and-go sweep: multiples of `step` about from `first` to `last`."""
-    low, high = sorted((first, last))
-    angles = np.arange(math.floor(low / step), math.ceil(high / step) + 1) * step
-    return angles if last >= first else angles[::-1]
-
-
 def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     """Where the head stands for the images and for the scan lines of a placement.
+
+    Scan lines are at multiples of the step, about from the first to the last pitch of the sweep.
 
     Parameters
     ----------
@@ -118,10 +112,12 @@ def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     if placement.T_platform_board is None:
         _, _, step = setup.room_sweep  # type: ignore[misc]
     rng = random(setup, STOPS, placement.number)
-    images = np.asarray(placement.image_pitch)
-    lines = step_angles(*placement.sweep, step)
+    way = placement.direction
+    images = np.array(placement.image_pitch)
+    low, high = sorted(placement.sweep)
+    lines = np.arange(np.floor(low / step), np.ceil(high / step) + 1)[::way] * step
     stop = setup.rig.platform.stop
-    return [Stops(c, *stop(c, placement.direction, rng)) for c in (images, lines)]
+    return [Stops(commanded, *stop(commanded, way, rng)) for commanded in (images, lines)]
 
 
 def sweep_of(setup, placement):
@@ -152,24 +148,24 @@ def close_views(setup: Setup, number: int) -> list[RigidTransform]:
 def shots_of(setup, placements):
     """All images of a setup in the order in which they are written, a list of Shots."""
     out = []
-    rig = setup.rig
-    for number, camera in enumerate(rig.cameras):
-        still = [rig.camera_pose(camera, 0.0)]
+    cameras = range(len(setup.rig.cameras))
+    still = Stops(*np.zeros((3, 1)))
+    for number in cameras:
         for i, pose in enumerate(close_views(setup, number)):
             close = Placement(-1, pose, sweep=(0.0, 0.0), image_pitch=(0.0,))
             out.append(Shots(number, close, still, (PHOTO, number, 0, i)))
     for placement in placements:
         stops, _ = stops_of(setup, placement)
-        for number, camera in enumerate(rig.cameras):
-            poses = [rig.camera_pose(camera, pitch) for pitch in stops.true]
+        for number in cameras:
             key = (PHOTO, number, placement.number)
-            out.append(Shots(number, placement, poses, key))
+            out.append(Shots(number, placement, stops, key))
     return out
 
 
 def photograph(setup, shots):
     """Take pictures, a list of JPEG files as bytes."""
-    camera = setup.rig.cameras[shots.camera]
+    rig = setup.rig
+    camera = rig.cameras[shots.camera]
     imager = Imager(camera.model, camera.exposure)
     placement = shots.placement
     world = world_of(
@@ -179,10 +175,11 @@ def photograph(setup, shots):
         T_room_platform=placement.T_room_platform,
     )
     rng = random(setup, *shots.key)
+    poses = rig.camera_pose(camera, shots.stops.true)
     quality = [cv2.IMWRITE_JPEG_QUALITY, setup.quality]
     return [
         cv2.imencode(".jpg", imager.render(world, pose, rng), quality)[1].tobytes()
-        for pose in shots.poses
+        for pose in poses
     ]
 
 
@@ -242,8 +239,9 @@ def _record(folder, name, setup):
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}",
     ) as writer:
         log = _add_placements(writer, setup, placements, truth)
-    lines = [",".join(PLATFORM_COLUMNS), *log]
-    write_file(folder / "platform.csv", "\n".join(lines) + "\n", folder)
+    table = pd.DataFrame(log, columns=PLATFORM_COLUMNS)
+    rows = table.to_csv(index=False, float_format="%.4f")
+    write_file(folder / "platform.csv", rows, folder)
     write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
 
 
@@ -284,48 +282,49 @@ def _add_placements(writer, setup, placements, truth):
     log = []
     took = beam.turns * MIRROR_TURN
     unit = beam.unit_name
-    configuration = Configuration().changed(measuring_mode=0, unit=unit)
+    configuration = Configuration().changed(unit=unit)
     writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
     shots = shots_of(setup, placements)
     files = iter(spread(partial(photograph, setup), shots))
     close = [s for s in shots if s.purpose == "intrinsics"]
-    still = np.zeros(1)
-    _add_images(writer, setup, close, files, truth, Stops(still, still, still), [np.nan])
+    _add_images(writer, setup, close, files, truth, [np.nan])
     for placement in placements:
         images, lines = stops_of(setup, placement)
         shot_at = clock + pause * np.arange(1, len(images.true) + 1)
         own = [s for s in shots if s.placement == placement]
-        _add_images(writer, setup, own, files, truth, images, shot_at)
+        _add_images(writer, setup, own, files, truth, shot_at)
         first = shot_at[-1] + pause
         began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
         arrived = np.round(began + took + REPLY_TIME, 4)
         writer.add_telegrams(placement.number, telegrams, lines.measured, arrived)
         for stops, times in ((images, shot_at), (lines, began)):
-            rows = [times, np.degrees(stops.commanded), np.degrees(stops.measured)]
-            log += [",".join(f"{value:.4f}" for value in row) for row in np.transpose(rows)]
+            angles = np.degrees([stops.commanded, stops.measured])
+            log += zip(times, *angles, strict=True)
         truth["sweeps"][placement.number] = {"pitch_rad": lines.true.tolist()}
         clock = float(began[-1] + took + pause)
     return log
 
 
-def _add_images(writer, setup, shots, files, truth, stops, times):
+def _add_images(writer, setup, shots, files, truth, times):
     """Write the next images, with where the head then stood."""
+    rig = setup.rig
     for shot, images in zip(shots, files, strict=False):
-        name = setup.rig.cameras[shot.camera].name
-        placement = shot.placement
-        for i, data in enumerate(images):
+        camera = rig.cameras[shot.camera]
+        name = camera.name
+        board = shot.placement.T_platform_board
+        stops = zip(images, times, shot.stops.true, shot.stops.measured, strict=True)
+        for data, time_s, true, measured in stops:
             writer.add_image(
                 name,
                 data,
-                placement.number,
-                pitch=float(stops.measured[i]),
-                time_s=float(np.round(times[i], 4)),
+                shot.placement.number,
+                pitch=measured,
+                time_s=np.round(time_s, 4),
                 purpose=shot.purpose,
             )
-            known = {"pitch_rad": float(stops.true[i])}
-            if placement.T_platform_board is not None:
-                known["T_camera_board"] = transform_to_json(
-                    shot.poses[i] * placement.T_platform_board
-                )
+            known = {"pitch_rad": float(true)}
+            if board is not None:
+                T_camera_board = rig.camera_pose(camera, true) * board
+                known["T_camera_board"] = transform_to_json(T_camera_board)
             truth["images"][f"images/{name}/{writer.shots[name]:04d}.jpg"] = known
