@@ -13,6 +13,7 @@ from lrfcal_lib.simulate.corner import corner_shots
 from lrfcal_lib.simulate.draw import (
     Devices,
     beside,
+    end_to_end,
     posed,
     seen_poses,
     upright_camera,
@@ -38,11 +39,10 @@ class Scenario(Devices):
     """
 
     name: str = "own"
-    varied: dict[str, float] = field(
-        default_factory=dict
-    )  # settings that differ from its file
+    # settings that differ from its file
+    varied: dict[str, float] = field(default_factory=dict)
     about: str = ""
-    board: Board = field(default_factory=lambda: triangle_board(pattern=PATTERN))
+    board: Board = triangle_board(pattern=PATTERN)
     field_of_view: tuple[float, float] = (np.radians(40.0), np.radians(140.0))
     uniform: bool = False  # the errors of ranges; normal otherwise
     floor: float = LEAST_STEP
@@ -179,9 +179,10 @@ def draw_shots(
         conditions, shots = draw(setup, rng, T_camera_lrf[trial])
         usable = np.logical_and.reduce(list(conditions.values()))
         failing.append([100 * np.mean(~good) for good in conditions.values()])
-        parts.append({name: value[usable] for name, value in shots.items()})
-        parts[-1]["trial"] = trial[usable]
-        missing = np.maximum(missing - np.bincount(trial[usable], minlength=trials), 0)
+        shots["trial"] = trial
+        part = {name: value[usable] for name, value in shots.items()}
+        parts.append(part)
+        missing = np.maximum(missing - np.bincount(part["trial"], minlength=trials), 0)
     if missing.any():
         means = zip(np.mean(failing, axis=0), conditions, strict=True)
         shares = [f"{share:.0f} % {words}" for share, words in means]
@@ -190,7 +191,7 @@ def draw_shots(
             f"the camera: {', '.join(shares)}"
         )
 
-    drawn = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    drawn = end_to_end(parts)
     trial = drawn.pop("trial")
     order = np.argsort(trial, kind="stable")
     first = np.searchsorted(trial[order], np.arange(trials))
