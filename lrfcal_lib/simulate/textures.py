@@ -44,16 +44,15 @@ def plain(
     ndarray, shape (n, 3)
     """
     if not rough:
-        return np.broadcast_to(np.asarray(color, float), points.shape)
-    return (
-        np.asarray(color, float) * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
-    )
+        return np.broadcast_to(color, points.shape)
+    tone = 1 + rough * (value_noise(points, cell) - 0.5)
+    return tone[:, None] * color
 
 
 def wood(points, color, cell=(0.5, 0.03, 0.03)):
     """Grain along x."""
-    tone = 0.8 + 0.4 * value_noise(points, np.asarray(cell))
-    return np.asarray(color, float) * tone[:, None]
+    tone = 0.8 + 0.4 * value_noise(points, cell)
+    return tone[:, None] * color
 
 
 def planks(points, color, width=0.18, length=1.4):
@@ -62,9 +61,13 @@ def planks(points, color, width=0.18, length=1.4):
     row = np.floor(across)
     board = np.floor(points[:, 1] / length + 0.37 * row)
     tone = LATTICE[row.astype(int) & 63, board.astype(int) & 63, 7]
-    joint = np.abs(across - np.round(across)) * width
-    dark = np.where(joint < 0.002, 0.55, 1.0)
+    dark = np.where(from_whole(across) * width < 0.002, 0.55, 1.0)
     return wood(points, color, (0.03, 0.6, 1.0)) * ((0.85 + 0.3 * tone) * dark)[:, None]
+
+
+def from_whole(values):
+    """How far values are from the nearest whole number."""
+    return np.abs(values - np.round(values))
 
 
 def stripes(points, first, second, period, axis=0):
@@ -76,9 +79,9 @@ def stripes(points, first, second, period, axis=0):
 def tiles(points, color, joint, size):
     """Square tiles in x and z with joints of 4 mm."""
     at = points[:, [0, 2]] / size
-    near = np.abs(at - np.round(at)).min(axis=1) * size < 0.002
-    tile = np.asarray(color, float) * (0.94 + 0.12 * value_noise(points, size))[:, None]
-    return np.where(near[:, None], np.asarray(joint, float), tile)
+    near = from_whole(at).min(axis=1) * size < 0.002
+    tone = 0.94 + 0.12 * value_noise(points, size)
+    return np.where(near[:, None], joint, tone[:, None] * color)
 
 
 def printed_page(points, width, height, heading=0.1, line=0.0055):
@@ -99,7 +102,7 @@ def printed_page(points, width, height, heading=0.1, line=0.0055):
 
 def _grey(levels):
     """Levels (n,) as colours (n, 3)."""
-    return np.repeat(levels[:, None], 3, axis=1)
+    return np.tile(levels[:, None], 3)
 
 
 def between(values, low, high):
@@ -109,10 +112,10 @@ def between(values, low, high):
 
 def poster(points, width, height, colors):
     """A picture: hills under a sky with a sun, in the plane z = 0 about the origin."""
-    sky, sun, far, near = np.asarray(colors, float)
+    sky, sun, far, near = colors
     x = points[:, 0] / width + 0.5
     y = points[:, 1] / height + 0.5
-    out = sky * (0.7 + 0.4 * y)[:, None]
+    out = (0.7 + 0.4 * y)[:, None] * sky
     from_sun = np.hypot(points[:, 0] - 0.2 * width, points[:, 1] - 0.2 * height)
     far_hills = 0.45 + 0.12 * np.sin(7 * x + 1)
     near_hills = 0.25 + 0.08 * np.sin(11 * x)
@@ -132,9 +135,8 @@ def book_spines(points, seed, pitch=0.035):
     at = points[:, 0] / pitch
     color = palette[np.floor(at).astype(int) & 63]
     label = between(np.mod(points[:, 2], 0.3), 0.19, 0.225)
-    gap = np.abs(at - np.round(at)) < 0.05
     color[label] = 0.75
-    color[gap] = 0.04
+    color[from_whole(at) < 0.05] = 0.04  # the gaps between books
     return color
 
 
@@ -147,9 +149,9 @@ def chessboard(points, board, dark, light, ring=0.5):
     grey = np.full(len(points), float(dark))
     pattern = board.pattern
     if pattern is not None:
-        at = (points[:, :2] - np.asarray(pattern.origin)) / pattern.square
-        last = np.array([pattern.columns, pattern.rows]) - 1
-        inside = np.all((at > -ring) & (at < last + ring), axis=1)
+        at = (points[:, :2] - pattern.origin) / pattern.square
+        end = [pattern.columns - 1 + ring, pattern.rows - 1 + ring]
+        inside = between(at, -ring, end).all(axis=1)
         even = np.floor(at).astype(int).sum(axis=1) % 2 == 0
         grey[inside & even] = light
     return _grey(grey)
