@@ -21,6 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import AHEAD, apply_pose, pose_array, tilt
+from lrfcal_lib.model.kinematics import camera_at
 from lrfcal_lib.session.stated import (
     CameraInfo,
     board_to_json,
@@ -28,6 +29,7 @@ from lrfcal_lib.session.stated import (
     transform_to_json,
 )
 from lrfcal_lib.simulate.beam import LMS221, Beam
+from lrfcal_lib.simulate.scenarios import in_radians
 from lrfcal_lib.simulate.scene import Exposure, need
 
 MOST_TRIES = 4000
@@ -64,7 +66,7 @@ class Platform:
     limits: tuple[float, float] = (-math.radians(60), math.radians(60))
 
     def stop(
-        self, commanded: ArrayLike, direction: float, rng: np.random.Generator
+        self, commanded: np.ndarray, direction: float, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Where the head comes to rest.
 
@@ -82,32 +84,25 @@ class Platform:
         -------
         true, measured : ndarray, shape (n,)
             Pitch, radians.
-        """
-        commanded = np.asarray(commanded, float)
-        step = self.encoder_step
-        self.check(commanded)
-        motor = commanded + self.noise * rng.standard_normal(commanded.shape)
-        head = (1 + self.stretch) * motor - direction * self.backlash / 2
-        return head, np.rint(motor / step) * step if step else motor
-
-    def check(self, pitch: np.ndarray) -> None:
-        """Refuse angles beyond the limits.
-
-        Parameters
-        ----------
-        pitch
-            Radians, shape (n,).
 
         Raises
         ------
         ValueError
+            For angles beyond the limits.
         """
-        low, high = self.limits
-        first = np.degrees(np.min(pitch, initial=0.0))
-        last = np.degrees(np.max(pitch, initial=0.0))
-        asked = f"platform: pitch {first:.2f} to {last:.2f} deg is asked for"
-        turns = f"it turns {np.degrees(low):.2f} to {np.degrees(high):.2f} deg"
-        need(np.all((low <= pitch) & (pitch <= high)), f"{asked}, {turns}")
+        angles = np.degrees(commanded)
+        low, high = np.degrees(self.limits)
+        first = angles.min(initial=0.0)
+        last = angles.max(initial=0.0)
+        need(
+            low <= first and last <= high,
+            f"platform: pitch {first:.2f} to {last:.2f} deg is asked for, it turns {low:.2f} to "
+            f"{high:.2f} deg",
+        )
+        step = self.encoder_step
+        motor = commanded + self.noise * rng.standard_normal(commanded.shape)
+        head = (1 + self.stretch) * motor - direction * self.backlash / 2
+        return head, np.rint(motor / step) * step if step else motor
 
 
 @dataclass(frozen=True)
@@ -146,10 +141,7 @@ class Rig:
         pitch
             True one of the head, or many, radians.
         """
-        back = RigidTransform.from_rotation(
-            Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0]))
-        )
-        return camera.mounting * self.T_head_lrf.inv() * back
+        return camera_at(camera.mounting, "head", self.T_head_lrf, pitch)
 
     def camera_infos(self) -> list[CameraInfo]:
         """What a session states of the cameras."""
@@ -168,9 +160,11 @@ class Rig:
             }
             for c in self.cameras
         }
-        head = transform_to_json(self.T_head_lrf)
-        board = board_to_json(self.board)
-        return {"T_head_lrf": head, "cameras": cameras, "board": board}
+        return {
+            "T_head_lrf": transform_to_json(self.T_head_lrf),
+            "cameras": cameras,
+            "board": board_to_json(self.board),
+        }
 
     def sweep_pitch(self, p_platform):
         """Pitch (n,) at which the scan plane meets points (n, 3), and their bearing there, radians.
@@ -184,18 +178,16 @@ class Rig:
             pitch = pitch + np.arctan2(z, y)
         return pitch, np.arctan2(y, x)
 
-    def shows(self, camera, T_camera_board, points=None, margin=12.0):
-        """Whether a camera sees points of the board (corners by default) well inside the image.
 
-        For a pose, or each of a stack of poses; the margin is in pixels.
-        """
-        if points is None:
-            points = self.board.points()
-        p = apply_pose(pose_array(T_camera_board), points)
-        uv = project(p, camera.model)
-        within_45_deg = np.abs(p[..., :2]) <= p[..., 2:]
-        ahead = (p[..., 2] >= 0.1) & within_45_deg.all(axis=-1)
-        return np.all(ahead & camera.model.shows(uv, margin), axis=-1)
+def shows(model, T_camera_board, points, margin):
+    """Whether a camera sees points of a board well inside the image: by a margin, pixels.
+
+    For a pose, or each of a stack of poses.
+    """
+    p = apply_pose(pose_array(T_camera_board), points)
+    within_45_deg = np.abs(p[..., :2]) <= p[..., 2:]
+    ahead = (p[..., 2] >= 0.1) & within_45_deg.all(axis=-1)
+    return np.all(ahead & model.shows(project(p, model), margin), axis=-1)
 
 
 @pydantic.dataclasses.dataclass(frozen=True)
@@ -240,20 +232,20 @@ def load_setup(name: str) -> Setup:
         For a name that is not there.
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
-    row = _radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
+    row = in_radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
     width = row["image_width"]
     cameras = [_camera(key, camera, width) for key, camera in row["cameras"].items()]
     rig = Rig(
         beam=replace(LMS221, **row["beam"]),
-        platform=Platform(**_radians(row["platform"])),
+        platform=Platform(**in_radians(row["platform"])),
         T_head_lrf=_placed(row["head"]),
         T_head_lrf_stated=_placed(row["head_stated"]),
         cameras=tuple(cameras),
         board=printed_triangle(),
     )
     stations = tuple(_placed(station) for station in row.get("stations", ()))
-    settings = {key: row[key] for key in Setup.__dataclass_fields__.keys() & row.keys()}
-    return Setup(**settings | {"name": name, "rig": rig, "stations": stations})
+    # what else is in the row the Setup ignores
+    return Setup(**row | {"name": name, "rig": rig, "stations": stations})
 
 
 def _camera(name, row, width):
@@ -274,18 +266,6 @@ def _placed(row):
     """The transform of a shift and a turn."""
     turn = Rotation.from_rotvec(row["turn"], degrees=True)
     return RigidTransform.from_components(row["shift"], turn)
-
-
-def _radians(row):
-    """A row with what ends in _deg in radians, and no lists."""
-    turned = {}
-    for key, value in row.items():
-        if key.endswith("_deg"):
-            value = np.radians(value).tolist()
-        if isinstance(value, list):
-            value = tuple(value)
-        turned[key.removesuffix("_deg")] = value
-    return turned
 
 
 @dataclass(frozen=True)
@@ -422,13 +402,15 @@ def _spans(rig, pose, margin):
 
     None where that is too little.
     """
+    points = rig.board.points()
     shown = np.ones(len(PITCH_GRID), bool)
     for camera in rig.cameras:
-        shown &= rig.shows(camera, rig.camera_pose(camera, PITCH_GRID) * pose)
+        poses = rig.camera_pose(camera, PITCH_GRID) * pose
+        shown &= shows(camera.model, poses, points, margin=12.0)
     seen = PITCH_GRID[shown]
     if not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
         return None
-    pitch, bearing = rig.sweep_pitch(pose.apply(rig.board.points()))
+    pitch, bearing = rig.sweep_pitch(pose.apply(points))
     half_field = np.radians(rig.beam.field_of_view / 2)
     if np.abs(bearing - np.pi / 2).max() >= half_field - 2 * margin:
         return None
@@ -479,7 +461,7 @@ def held_close(
             place = z * np.array([(u - m.cx) / m.fx, (v - m.cy) / m.fy, 1.0])
             shift = place - turn.apply(points.mean(axis=0))
             pose = RigidTransform.from_components(shift, turn)
-            if rig.shows(camera, pose, points, margin=18.0):
+            if shows(m, pose, points, margin=18.0):
                 out.append(pose)
                 break
     need(len(out) == count, f"the pattern does not fit into the image of '{camera.name}'")
