@@ -12,6 +12,7 @@ from pydantic import (
     BeforeValidator,
     Field,
     StrictBool,
+    StrictInt,
     StrictStr,
     model_validator,
 )
@@ -96,9 +97,7 @@ Text = Annotated[StrictStr, refused(no_text, "a text is needed")]
 Source = Annotated[
     Any, refused(no_source, "a text, or a whole number from 0 to 255 is needed")
 ]
-Rate = Annotated[
-    Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)
-]
+Rate = Annotated[StrictInt, refused(lambda rate: rate not in RATES, OTHER_RATE)]
 Perhaps = Literal["auto", True, False]
 Angle = number(-180, 180)
 Seconds = number(0, 60)
