@@ -221,10 +221,9 @@ class Camera(Closed):
                 self._lose()
                 continue
             now = REAL.time()
-            if getattr(self._capture, "waited", True):
-                self._keep(now)
-            else:  # it may have come at any time since the frame before
-                self._keep(self._before)
+            waited = getattr(self._capture, "waited", True)
+            # else it may have come at any time since the frame before
+            self._keep(now if waited else self._before)
             self._before = now
         self._release()
 
