@@ -285,14 +285,14 @@ def _add_placements(writer, setup, placements, truth):
     configuration = Configuration().changed(unit=unit)
     writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
     shots = shots_of(setup, placements)
-    files = iter(spread(partial(photograph, setup), shots))
-    close = [s for s in shots if s.purpose == "intrinsics"]
-    _add_images(writer, setup, close, files, truth, [np.nan])
+    taken = list(zip(shots, spread(partial(photograph, setup), shots), strict=True))
+    close = [pair for pair in taken if pair[0].purpose == "intrinsics"]
+    _add_images(writer, setup, close, truth, [np.nan])
     for placement in placements:
         images, lines = stops_of(setup, placement)
         shot_at = clock + pause * np.arange(1, len(images.true) + 1)
-        own = [s for s in shots if s.placement == placement]
-        _add_images(writer, setup, own, files, truth, shot_at)
+        own = [pair for pair in taken if pair[0].placement == placement]
+        _add_images(writer, setup, own, truth, shot_at)
         first = shot_at[-1] + pause
         began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
@@ -306,10 +306,10 @@ def _add_placements(writer, setup, placements, truth):
     return log
 
 
-def _add_images(writer, setup, shots, files, truth, times):
-    """Write the next images, with where the head then stood."""
+def _add_images(writer, setup, taken, truth, times):
+    """Write images as JPEG files, each with its shot: where the head then stood."""
     rig = setup.rig
-    for shot, images in zip(shots, files, strict=False):
+    for shot, images in taken:
         camera = rig.cameras[shot.camera]
         name = camera.name
         board = shot.placement.T_platform_board

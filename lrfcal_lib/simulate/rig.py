@@ -464,5 +464,6 @@ def held_close(
             if shows(m, pose, points, margin=18.0):
                 out.append(pose)
                 break
-    need(len(out) == count, f"the pattern does not fit into the image of '{camera.name}'")
+        else:
+            raise ValueError(f"the pattern does not fit into the image of '{camera.name}'")
     return out
