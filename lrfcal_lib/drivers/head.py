@@ -19,7 +19,6 @@ from lrfcal_lib.drivers.port import (
 
 LOG = logging.getLogger(__name__)
 ROUNDING_DEG = 1e-6  # by which a pitch may exceed the limits
-EXTRA_S = 10  # that a move may take beside twice the time of its way
 
 
 class PanTilt(port.Closed):
@@ -232,16 +231,10 @@ class PanTilt(port.Closed):
             If it was stopped meanwhile.
         """
         self._begin(pitch)
-        motion = self.motion
         try:
-            if self.has_feedback and motion.read(self.settings.retries) is None:
+            if self.has_feedback and self.motion.read(self.settings.retries) is None:
                 raise self._silence()
-            way = pitch - motion.estimate()
-            seconds = abs(way) / motion.speed(way, self.settings.tilt_speed)
-            if not self.has_feedback:
-                return motion.timed(pitch, seconds)
-            deadline = self._host.now() + 2 * seconds + EXTRA_S
-            return motion.move(pitch, deadline)
+            return self.motion.move(pitch)
         except BaseException:
             self.emergency_stop()
             raise

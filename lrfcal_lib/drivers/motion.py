@@ -19,6 +19,7 @@ from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, Refused
 
 LOG = logging.getLogger(__name__)
 ASSUMED = 4.0, 4.0  # deg/s up and down, as of heads of constant speed
+EXTRA_S = 10  # that a move may take beside twice the time of its way
 ARRIVAL = math.radians(
     0.5
 )  # a move that ends this near has arrived; its settled pitch counts
@@ -339,29 +340,36 @@ class Motion:
     # ---------------------------------------------------------------------------------------------
     # moves
 
-    def move(self, target: float, deadline: float) -> float:
-        """Reach a pitch by set-tilt where the head obeys, else by up and down.
+    def move(self, target: float) -> float:
+        """Reach a pitch by set-tilt where the head obeys, else by up and down; without feedback by
+        time, unless the shortest motion would lead further away.
 
         Parameters
         ----------
         target
             Pitch, rad.
-        deadline
-            Instant of the host.
 
         Returns
         -------
         float
-            Settled pitch, rad.
+            Settled pitch, rad; without feedback by dead reckoning.
 
         Raises
         ------
         Refused
             If the head does not get there, or does not obey where that is stated.
         """
+        settings = self.settings
+        way = target - self.estimate()
+        seconds = abs(way) / self.speed(way, settings.tilt_speed)
+        if not self.feedback:
+            if seconds >= self._shortest_s / 2:
+                self.run(target, settings.tilt_speed)
+                self.pause(settings.settle_s)
+            return self.estimate()
+        deadline = self._now() + 2 * seconds + EXTRA_S
         if self._obeys is False:
             return self.steer(target, deadline)
-        settings = self.settings
         value = pelco_d.encode_tilt(settings.elevation(target))
         for _ in range(2):  # the first may be lost, or come while the head was still busy
             self._send(encode_extended(settings.address, SET_TILT, value))
@@ -412,26 +420,6 @@ class Motion:
                 continue
             self._longest = max(self._longest, took)
         raise _short_of(pitch, target)
-
-    def timed(self, target: float, seconds: float) -> float:
-        """Move by time, unless the shortest motion would lead further away.
-
-        Parameters
-        ----------
-        target
-            Pitch, rad.
-        seconds
-            That the way takes.
-
-        Returns
-        -------
-        float
-            The pitch that results by dead reckoning, rad.
-        """
-        if seconds >= self._shortest_s / 2:
-            self.run(target, self.settings.tilt_speed)
-            self.pause(self.settings.settle_s)
-        return self.estimate()
 
     def sweep(self, goal, step):
         """Move to a pitch at a speed byte; note where the head is on the way and where it rests."""
