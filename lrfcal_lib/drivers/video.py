@@ -169,7 +169,7 @@ class Camera(Closed):
             return {}
         wanted = {cv2.CAP_PROP_BUFFERSIZE: 1}
         if size is not None:
-            wanted |= dict(zip((WIDTH, HEIGHT), size, strict=True))
+            wanted[WIDTH], wanted[HEIGHT] = size
         if exposure is not None:
             wanted[cv2.CAP_PROP_AUTO_EXPOSURE] = MANUAL
             wanted[cv2.CAP_PROP_EXPOSURE] = round(exposure / EXPOSURE_UNIT_S)
@@ -417,21 +417,19 @@ class MjpegStream:
         to its end; b'' where there is none any more.
         """
         while True:
-            begin = self._buffer.find(BEGIN)
-            end = self._buffer.find(END, begin) + len(END)
-            if stated := LENGTH.findall(self._buffer[: max(begin, 0)]):
-                end = begin + int(stated[-1])
-            if begin >= 0 and len(END) <= end <= len(self._buffer):
-                image = self._buffer[begin:end]
-                self._buffer = self._buffer[end:]
-                return image
-            if self._answer.closed or len(self._buffer) > LONGEST:
-                return b""
-            try:
-                self.waited |= not select.select([self._answer], [], [], 0)[0]
-                more = self._answer.read1(CHUNK)
-            except (OSError, ValueError, HTTPError):  # ValueError: the answer was closed
-                return b""
+            before, begin, rest = self._buffer.partition(BEGIN)
+            size = rest.find(END) + len(END)
+            if stated := LENGTH.findall(before):
+                size = int(stated[-1]) - len(BEGIN)
+            if len(END) <= size <= len(rest):
+                self._buffer = rest[size:]
+                return begin + rest[:size]
+            more = b""
+            if len(self._buffer) <= LONGEST:
+                # ValueError: the answer was closed
+                with contextlib.suppress(OSError, ValueError, HTTPError):
+                    self.waited |= not select.select([self._answer], [], [], 0)[0]
+                    more = self._answer.read1(CHUNK)
             if not more:
                 return b""
             self._buffer += more
