@@ -224,7 +224,20 @@ def _record(folder, name, setup):
         "recording": RECORDING,
         "scene_placements": [p.number for p in placements if p.T_platform_board is None],
     }
-    truth = _truth(setup, placements)
+    # what only the simulator knows
+    truth = {
+        "simulated": True,
+        "setup": setup.name,
+        "seed": setup.seed,
+        **rig.truth(),
+        "boards": {},
+        "lrf": asdict(rig.beam),
+        "platform": asdict(rig.platform),
+        "sweeps": {},
+        "images": {},
+    }
+    if setup.stations:
+        truth |= {"stations": {}, "lengths": room_lengths()}
     with SessionWriter(
         folder,
         rig.board,
@@ -245,34 +258,9 @@ def _record(folder, name, setup):
     write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
 
 
-def _truth(setup, placements):
-    """What only the simulator knows, as truth.json has it; sweeps and images come later."""
-    rig = setup.rig
-    boards = {}
-    stations = {}
-    for p in placements:
-        if p.T_platform_board is not None:
-            boards[p.number] = {"T_platform_board": transform_to_json(p.T_platform_board)}
-        if p.T_room_platform is not None:
-            stations[p.number] = {"T_room_platform": transform_to_json(p.T_room_platform)}
-    truth = {
-        "simulated": True,
-        "setup": setup.name,
-        "seed": setup.seed,
-        **rig.truth(),
-        "boards": boards,
-        "lrf": asdict(rig.beam),
-        "platform": asdict(rig.platform),
-        "sweeps": {},
-        "images": {},
-    }
-    if stations:
-        truth |= {"stations": stations, "lengths": room_lengths()}
-    return truth
-
-
 def _add_placements(writer, setup, placements, truth):
-    """Write the images for the intrinsics, then images and sweep of each placement.
+    """Write the images for the intrinsics, then images and sweep of each placement, and note where
+    all was.
 
     Returns the rows of the platform's log.
     """
@@ -289,6 +277,13 @@ def _add_placements(writer, setup, placements, truth):
     close = [pair for pair in taken if pair[0].purpose == "intrinsics"]
     _add_images(writer, setup, close, truth, [np.nan])
     for placement in placements:
+        number = placement.number
+        board = placement.T_platform_board
+        if board is not None:
+            truth["boards"][number] = {"T_platform_board": transform_to_json(board)}
+        station = placement.T_room_platform
+        if station is not None:
+            truth["stations"][number] = {"T_room_platform": transform_to_json(station)}
         images, lines = stops_of(setup, placement)
         shot_at = clock + pause * np.arange(1, len(images.true) + 1)
         own = [pair for pair in taken if pair[0].placement == placement]
@@ -297,11 +292,11 @@ def _add_placements(writer, setup, placements, truth):
         began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
         arrived = np.round(began + took + REPLY_TIME, 4)
-        writer.add_telegrams(placement.number, telegrams, lines.measured, arrived)
+        writer.add_telegrams(number, telegrams, lines.measured, arrived)
         for stops, times in ((images, shot_at), (lines, began)):
             angles = np.degrees([stops.commanded, stops.measured])
             log += zip(times, *angles, strict=True)
-        truth["sweeps"][placement.number] = {"pitch_rad": lines.true.tolist()}
+        truth["sweeps"][number] = {"pitch_rad": lines.true.tolist()}
         clock = float(began[-1] + took + pause)
     return log
 

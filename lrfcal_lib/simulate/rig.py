@@ -18,7 +18,7 @@ from pydantic import (
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.board import Board, Chessboard, triangle_board
+from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import AHEAD, apply_pose, pose_array, tilt
 from lrfcal_lib.model.kinematics import camera_at
@@ -31,6 +31,7 @@ from lrfcal_lib.session.stated import (
 from lrfcal_lib.simulate.beam import LMS221, Beam
 from lrfcal_lib.simulate.scenarios import in_radians
 from lrfcal_lib.simulate.scene import Exposure, need
+from lrfcal_lib.simulate.shots import PATTERN
 
 MOST_TRIES = 4000
 SCAN_ROUNDS = 20  # of the pitch at which the scan plane meets a point; each gains a digit
@@ -211,9 +212,7 @@ class Setup:
 
 def printed_triangle() -> Board:
     """The paper's triangle (315 and 380 mm, a right angle) with 4 x 5 inner corners beside it."""
-    return triangle_board(
-        name="triangle_315_380", pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))
-    )
+    return triangle_board(name="triangle_315_380", pattern=PATTERN)
 
 
 SETUPS = json.loads(Path(__file__).with_name("setups.json").read_text())
