@@ -7,10 +7,15 @@ from numpy.typing import ArrayLike
 LATTICE = np.random.default_rng(20091001).random((64,) * 3)
 
 
+def whole_below(values):
+    """The largest whole numbers that are not above values."""
+    return np.floor(values).astype(int)
+
+
 def value_noise(points, cell):
     """Smooth noise (n,) between 0 and 1, from random values on a lattice of cells, metres."""
     at = points / cell
-    low = np.floor(at).astype(np.int64)
+    low = whole_below(at)
     f = at - low
     f = f * f * (3 - 2 * f)
     cells = np.stack([low & 63, (low + 1) & 63])  # (2, n, 3)
@@ -58,9 +63,9 @@ def wood(points, color, cell=(0.5, 0.03, 0.03)):
 def planks(points, color, width=0.18, length=1.4):
     """A wooden floor: boards along y with dark joints."""
     across = points[:, 0] / width
-    row = np.floor(across)
-    board = np.floor(points[:, 1] / length + 0.37 * row)
-    tone = LATTICE[row.astype(int) & 63, board.astype(int) & 63, 7]
+    row = whole_below(across)
+    board = whole_below(points[:, 1] / length + 0.37 * row)
+    tone = LATTICE[row & 63, board & 63, 7]
     dark = np.where(from_whole(across) * width < 0.002, 0.55, 1.0)
     return wood(points, color, (0.03, 0.6, 1.0)) * ((0.85 + 0.3 * tone) * dark)[:, None]
 
@@ -72,7 +77,7 @@ def from_whole(values):
 
 def stripes(points, first, second, period, axis=0):
     """Two colours in turn along an axis."""
-    stripe = np.floor(2 * points[:, axis] / period).astype(int)
+    stripe = whole_below(2 * points[:, axis] / period)
     return np.array([first, second], float)[stripe & 1]
 
 
@@ -88,10 +93,11 @@ def printed_page(points, width, height, heading=0.1, line=0.0055):
     """White paper in the plane z = 0 about the origin: words as dark bars, heading, picture."""
     x = points[:, 0] / width + 0.5
     y = 0.5 - points[:, 1] / height
-    row = np.floor(points[:, 1] / line).astype(int)
-    word = np.floor((points[:, 0] + 0.31 * row * line) / (2.1 * line)).astype(int)
+    lines = points[:, 1] / line
+    row = whole_below(lines)
+    word = whole_below((points[:, 0] + 0.31 * row * line) / (2.1 * line))
     ink = LATTICE[row & 63, word & 63, 3] > 0.22
-    ink &= np.mod(points[:, 1] / line, 1.0) < 0.5
+    ink &= np.mod(lines, 1.0) < 0.5
     ink &= between(x, 0.1, 0.9) & between(y, 0.18, 0.93)
     ink |= (np.abs(y - heading) < 0.025) & between(x, 0.2, 0.8)
     grey = np.where(ink, 0.12, 0.86)
@@ -133,7 +139,7 @@ def book_spines(points, seed, pitch=0.035):
     tones = rng.uniform(0.1, 0.6, (64, 1))
     palette = tones * (0.55 + rng.uniform(0.0, 0.6, (64, 3)))
     at = points[:, 0] / pitch
-    color = palette[np.floor(at).astype(int) & 63]
+    color = palette[whole_below(at) & 63]
     label = between(np.mod(points[:, 2], 0.3), 0.19, 0.225)
     color[label] = 0.75
     color[from_whole(at) < 0.05] = 0.04  # the gaps between books
@@ -152,6 +158,6 @@ def chessboard(points, board, dark, light, ring=0.5):
         at = (points[:, :2] - pattern.origin) / pattern.square
         end = [pattern.columns - 1 + ring, pattern.rows - 1 + ring]
         inside = between(at, -ring, end).all(axis=1)
-        even = np.floor(at).astype(int).sum(axis=1) % 2 == 0
+        even = whole_below(at).sum(axis=1) % 2 == 0
         grey[inside & even] = light
     return _grey(grey)
