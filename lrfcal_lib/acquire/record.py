@@ -182,8 +182,7 @@ class Recording(Closed):
         Light
             'bad' where the image shows no pattern and was not kept.
         """
-        with contextlib.closing(self.rig.acquire_close(camera)) as events:
-            (photo,) = (event for event in events if isinstance(event, Photographed))
+        photo = self.rig.acquire_close(camera)
         stated = self.rig.stated
         model = stated.cameras[camera].model
         light = check_image(photo.frame.image, stated.board, model, f"camera {camera}")

@@ -63,7 +63,7 @@ class Scanned:
     placement: int
     readings: tuple[Reading, ...]
     pitch: np.ndarray  # radians
-    share: float = math.nan  # what is done of a continuous sweep; NaN at a stop
+    share: float  # what is done of a continuous sweep; NaN at a stop
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,7 +319,7 @@ class Rig(Closed):
             self.halt()
             raise
 
-    def acquire_close(self, camera: str) -> Generator[Photographed, None, None]:
+    def acquire_close(self, camera: str) -> Photographed:
         """Take one image of the board held close to a camera, the head at pitch 0.
 
         Parameters
@@ -333,8 +333,8 @@ class Rig(Closed):
             As :meth:`acquire`.
         """
         try:
-            rest = self._move(CLOSE, 0.0, 1, 1)
-            yield from self._photograph([camera], rest, "intrinsics")
+            rest = self._move(CLOSE, 0.0)
+            return next(self._photograph([camera], rest, "intrinsics"))
         except BaseException:
             self.halt()
             raise
@@ -364,22 +364,22 @@ class Rig(Closed):
         """Scan again in the first half of a sweep, as level as it was there: walls show most."""
         half = placement.pitch[: len(placement.pitch) // 2 + 1]
         level = float(half[np.argmin(np.abs(half))])
-        moved = self._move(placement.number, level, 1, 1)
-        self._begin_scans()
-        scanned = self._scanned(moved)
-        self.lrf.stop()
+        moved = self._move(placement.number, level)
         yield moved
-        yield replace(scanned, share=1.0)
+        self._begin_scans()
+        yield self._scanned(moved, share=1.0)
+        self.lrf.stop()
 
     def _begin_scans(self):
         """Interlaced scans come in a stream, others one by one."""
         if self.stated.devices.lrf.interlaced:
             self.lrf.start(interlaced=True)
 
-    def _scanned(self, moved):
+    def _scanned(self, moved, share=math.nan):
         """What is scanned at a stop."""
         readings = tuple(self._scans(moved.time_s))
-        return Scanned(moved.placement, readings, np.full(len(readings), moved.pitch))
+        pitch = np.full(len(readings), moved.pitch)
+        return Scanned(moved.placement, readings, pitch, share)
 
     def _scans(self, after):
         """Scans of a stream, or one by one, later than an instant.
@@ -412,7 +412,7 @@ class Rig(Closed):
                 )
         return readings
 
-    def _move(self, placement, pitch, number, of):
+    def _move(self, placement, pitch, number=1, of=1):
         reached = self.head.move_to(pitch)
         return Moved(
             placement, self.clock(), pitch, reached, self.head.has_feedback, number, of
@@ -491,7 +491,7 @@ def placed(
     later : list of Reading
         Those after the track.
     """
-    if len(track) < 2:
+    if not track:
         return (), np.empty(0), list(readings)
     times, pitch = np.array([point[:2] for point in track]).T
     middle = np.array([np.mean(reading.beam_times_s[[0, -1]]) for reading in readings])
