@@ -169,6 +169,20 @@ def lrf_to_platform(
     return tilt(T_head_lrf.apply(p_lrf), pitch)
 
 
+def carry(rotation: Rotation, point: ArrayLike, to: ArrayLike = 0.0) -> RigidTransform:
+    """The transform, or a stack, with a rotation, that takes a point to a place.
+
+    Parameters
+    ----------
+    rotation : Rotation
+    point : array_like, shape (3,) or (n, 3)
+        Such as the centre of a camera, metres.
+    to : array_like, broadcastable to `point`
+        By default the origin.
+    """
+    return RigidTransform.from_components(to - rotation.apply(point), rotation)
+
+
 @dataclass(frozen=True)
 class TiltAxis:
     """The tilt axis as a line in the LRF frame: all that the platform calibration can know (4
@@ -224,7 +238,7 @@ def head_from_axis(axis: TiltAxis) -> RigidTransform:
     rotation = Rotation.identity()
     if sine > 0:
         rotation = Rotation.from_rotvec(turn / sine * np.arctan2(sine, direction[0]))
-    return RigidTransform.from_components(-rotation.apply(axis.foot), rotation)
+    return carry(rotation, axis.foot)
 
 
 def paper_parameters(T_head_lrf: RigidTransform) -> tuple[np.ndarray, float]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import fit_plane, unit_vector
+from lrfcal_lib.model.geometry import carry, fit_plane, unit_vector
 from lrfcal_lib.plots.colors import COLORS
 from lrfcal_lib.plots.recording import CENTRED
 
@@ -116,7 +116,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
     right = unit_vector(right)
     ahead = ahead / distance
     rotation = Rotation.from_matrix(np.stack([right, np.cross(ahead, right), ahead]))
-    return RigidTransform.from_components(-rotation.apply(eye), rotation)
+    return carry(rotation, eye)
 
 
 def face_on(

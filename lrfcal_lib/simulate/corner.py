@@ -83,8 +83,8 @@ def _image_lines(setup, rng, T_camera_target):
     first = inside.argmax(axis=-1)
     last = SAMPLES - 1 - inside[..., ::-1].argmax(axis=-1)
     ends = np.take_along_axis(uv, np.stack([first, last], axis=-1)[..., None], axis=2)
-    length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
-    whole = (inside.any(axis=-1) & (length > LEAST_LENGTH)).all(axis=1)
+    long = np.linalg.norm(np.diff(ends, axis=2), axis=-1) > LEAST_LENGTH
+    whole = (inside.any(axis=-1, keepdims=True) & long).all(axis=(1, 2))
 
     noisy = ends[:, 0] + setup.sigma_px * rng.standard_normal(ends[:, 0].shape)
     start, end = np.moveaxis(np.insert(noisy, 2, 1.0, axis=-1), 1, 0)

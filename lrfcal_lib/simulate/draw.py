@@ -18,12 +18,14 @@ from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import (
     AHEAD,
+    carry,
     gradient_by_pose,
     move_pose,
     polar_to_points,
     rotate_points,
     tilt,
 )
+from lrfcal_lib.model.kinematics import camera_at
 
 # corners of a pattern that fills the triangle, metres, where the board has none
 PLACES = [(i, j, 0) for i in range(5) for j in range(6) if i + j < 7]
@@ -96,7 +98,7 @@ def upright_camera(rng, side, *shape):
     """Poses ``T_camera_lrf`` of cameras beside the LRF, left (-1) or right, mounted wrongly."""
     rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (*shape, 3))) * AHEAD
     centre = np.array([0.12 * side, 0.03, 0.12]) + rng.normal(0, 0.01, (*shape, 3))
-    return RigidTransform.from_components(-rotation.apply(centre), rotation)
+    return carry(rotation, centre)
 
 
 def board_poses(
@@ -259,11 +261,8 @@ def _views(bench, pose, at, rng, noise):
     pitch = at * (1 + bench.stretch)  # of the head
     if bench.sigma_stop:  # one error for all cameras
         pitch = pitch + noise * bench.sigma_stop * rng.standard_normal(len(at))
-    T_source_platform = RigidTransform.identity(len(at))
-    if bench.mount == "head":
-        turn = np.outer(-pitch, [1.0, 0.0, 0.0])
-        T_head_platform = RigidTransform.from_rotation(Rotation.from_rotvec(turn))
-        T_source_platform = bench.T_head_lrf.inv() * T_head_platform
+    still = RigidTransform.identity(len(at))
+    T_source_platform = camera_at(still, bench.mount, bench.T_head_lrf, pitch)
     cameras = bench.cameras.values()
     true = [(camera * T_source_platform * pose).as_matrix() for camera in cameras]
     poses = np.concatenate(true)
@@ -283,7 +282,7 @@ def posed(spin, lean, centre, middle):
     leant = np.pad(lean, ((0, 0), (0, 1)))
     turned = np.outer(spin, [0.0, 0.0, 1.0])
     facing = AHEAD * Rotation.from_rotvec(leant) * Rotation.from_rotvec(turned)
-    return RigidTransform.from_components(centre - facing.apply(middle), facing)
+    return carry(facing, middle, centre)
 
 
 def beside(board, origin, rays):

@@ -20,8 +20,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.model.geometry import AHEAD, apply_pose, pose_array, tilt
-from lrfcal_lib.model.kinematics import camera_at
+from lrfcal_lib.model.geometry import AHEAD, apply_pose, carry, pose_array
+from lrfcal_lib.model.kinematics import beams_to, camera_at
 from lrfcal_lib.session.stated import (
     CameraInfo,
     board_to_json,
@@ -34,7 +34,6 @@ from lrfcal_lib.simulate.scene import Exposure, need
 from lrfcal_lib.simulate.shots import PATTERN
 
 MOST_TRIES = 4000
-SCAN_ROUNDS = 20  # of the pitch at which the scan plane meets a point; each gains a digit
 PITCH_GRID = np.radians(
     np.arange(-30.0, 30.1, 0.5)
 )  # pitch angles at which an image may be taken
@@ -167,18 +166,6 @@ class Rig:
             "board": board_to_json(self.board),
         }
 
-    def sweep_pitch(self, p_platform):
-        """Pitch (n,) at which the scan plane meets points (n, 3), and their bearing there, radians.
-
-        The head turns by what the point lies off the scan plane until it lies in it.
-        """
-        back = self.T_head_lrf.inv()
-        pitch = np.zeros(len(p_platform))
-        for _ in range(SCAN_ROUNDS):
-            x, y, z = back.apply(tilt(p_platform, -pitch)).T
-            pitch = pitch + np.arctan2(z, y)
-        return pitch, np.arctan2(y, x)
-
 
 def shows(model, T_camera_board, points, margin):
     """Whether a camera sees points of a board well inside the image: by a margin, pixels.
@@ -251,7 +238,7 @@ def _camera(name, row, width):
     """A camera with images so many pixels wide."""
     scale = width / row["size"][0]
     turn = Rotation.from_rotvec(row["turn"], degrees=True) * AHEAD
-    mounting = RigidTransform.from_components(-turn.apply(row["centre"]), turn)
+    mounting = carry(turn, row["centre"])
     off = Rotation.from_rotvec(row["guess"]["turn"], degrees=True)
     shift = mounting.translation + row["guess"]["shift"]
     guess = RigidTransform.from_components(shift, off * mounting.rotation)
@@ -305,14 +292,9 @@ def placements_of(setup: Setup) -> list[Placement]:
     if setup.room_sweep:
         first, last, _ = setup.room_sweep
         for T_room_platform in setup.stations or (None,):
-            room = Placement(
-                number=len(out) + 1,
-                T_platform_board=None,
-                sweep=(first, last),
-                image_pitch=setup.room_images,
-                T_room_platform=T_room_platform,
-            )
-            out.append(room)
+            number = len(out) + 1
+            sweep = (first, last)
+            out.append(Placement(number, None, sweep, setup.room_images, T_room_platform))
     return out
 
 
@@ -392,7 +374,7 @@ def _pair(rig, distance, turn, rng):
         angles = [*lean, turn + more + rng.uniform(-12, 12)]
         leant = Rotation.from_euler("YXZ", angles, degrees=True)
         turned = Rotation.from_euler("z", -azimuth) * AHEAD * leant
-        out.append(RigidTransform.from_components(middle - turned.apply(centre), turned))
+        out.append(carry(turned, centre, middle))
     return out
 
 
@@ -409,7 +391,7 @@ def _spans(rig, pose, margin):
     seen = PITCH_GRID[shown]
     if not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
         return None
-    pitch, bearing = rig.sweep_pitch(pose.apply(points))
+    bearing, pitch, _ = beams_to(pose.apply(points), rig.T_head_lrf)
     half_field = np.radians(rig.beam.field_of_view / 2)
     if np.abs(bearing - np.pi / 2).max() >= half_field - 2 * margin:
         return None
@@ -458,8 +440,7 @@ def held_close(
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])
             turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
             place = z * np.array([(u - m.cx) / m.fx, (v - m.cy) / m.fy, 1.0])
-            shift = place - turn.apply(points.mean(axis=0))
-            pose = RigidTransform.from_components(shift, turn)
+            pose = carry(turn, points.mean(axis=0), place)
             if shows(m, pose, points, margin=18.0):
                 out.append(pose)
                 break

@@ -8,7 +8,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array, unit_vector
+from lrfcal_lib.model.geometry import (
+    apply_pose,
+    carry,
+    polar_to_points,
+    pose_array,
+    unit_vector,
+)
 from lrfcal_lib.simulate.corner import corner_shots
 from lrfcal_lib.simulate.draw import (
     Devices,
@@ -119,7 +125,7 @@ class Scenario(Devices):
         pixels = rng.uniform(0, self.model.size, (count, 2))
         ray = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(self.model.matrix).T
         centre = away[:, None] * ray
-        return RigidTransform.from_components(centre - rotation.apply(middle), rotation)
+        return carry(rotation, middle, centre)
 
     def _around(self, rng, count):
         """Poses ``T_world_lrf`` of an LRF that looks at the origin but for turns."""
