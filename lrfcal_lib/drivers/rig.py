@@ -438,6 +438,8 @@ class Rig(Closed):
         moving = True
         while moving:
             moving = self.head.moving()
+            if not moving:
+                self.head.finish_sweep()
             fresh = self._since(newest)
             if fresh:
                 newest = fresh[-1].time_s
@@ -446,7 +448,7 @@ class Rig(Closed):
                     f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range "
                     "finder"
                 )
-            track = self.head.track if moving else self.head.finish_sweep()
+            track = self.head.track
             if moving and self.head.has_feedback:
                 # what is not measured may change until the next reading
                 track = [point for point in track if point[2]]
