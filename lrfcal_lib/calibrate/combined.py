@@ -239,7 +239,7 @@ def edges_in_cloud(solution, prepared, placement, face):
         for edge in view.edges:
             a = edge.line[:2]
             uv = edge.ends - np.outer(edge.ends @ a + edge.line[2], a)
-            rays = np.insert(uv, 2, 1.0, axis=1) @ np.linalg.inv(lens.matrix).T
+            rays = lens.rays(uv)
             sight = T_platform_camera.rotation.apply(rays)
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)

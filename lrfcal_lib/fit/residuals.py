@@ -150,15 +150,11 @@ def edge_residuals_px(
     """
     if model is not None and len(obs.crossing_points):
         lines = obs.crossing_lines
-        to_rays = np.linalg.inv(obs.model.matrix).T
         q = transform.apply(obs.crossing_points) @ obs.model.matrix.T
         uv = q[:, :2] / q[:, 2:]
         foot = uv - line_distance(uv, lines)[:, None] * lines[:, :2]
         along = lines[:, [1, 0]] * [10.0, -10.0]
-        rays = (
-            np.column_stack([foot + side * along, np.ones(len(foot))]) @ to_rays
-            for side in (-1, 1)
-        )
+        rays = (obs.model.rays(foot + side * along) for side in (-1, 1))
         moved = line_through(*(undistort(project(ray, obs.model), model) for ray in rays))
         moved *= np.sign(np.sum(moved[:, :2] * lines[:, :2], axis=1))[:, None]
         obs = replace(obs, crossing_lines=moved, model=model)

@@ -309,9 +309,7 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
 
 def beams_of_pixels(chain, model, uv, distance, image_pitch):
     """Bearing and pitch of beams of a given length that end on the rays of pixels (..., 2)."""
-    ray = unit_vector(
-        np.insert(undistort(uv, model), 2, 1.0, axis=-1) @ np.linalg.inv(model.matrix).T
-    )
+    ray = unit_vector(model.rays(undistort(uv, model)))
     depth = distance * np.ones(ray.shape[:-1])
     for _ in range(ROUNDS):
         x = (depth[..., None] * ray - chain.camera[:, 3]) @ chain.camera[:, :3]

@@ -228,7 +228,7 @@ def _on_planes(
 def _where_seen(view, normal, centre, pixels):
     """Where the sights through pixels (k, 2, 2) meet planes (k, 3), platform frame, (k, 2, 3)."""
     T_platform_camera = view.T_camera_platform.inv()
-    rays = np.insert(pixels, 2, 1.0, axis=-1) @ np.linalg.inv(view.model.matrix).T
+    rays = view.model.rays(pixels)
     rays = rays @ T_platform_camera.rotation.as_matrix().T
     eye = T_platform_camera.translation
     far = np.vecdot(normal, centre - eye)[:, None] / np.vecdot(rays, normal[:, None])

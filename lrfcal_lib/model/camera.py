@@ -55,6 +55,10 @@ class CameraModel:
         """The 3 x 3 matrix K."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
+        """Viewing rays (..., 3) of undistorted pixels (..., 2): ``(x, y, 1)``, camera frame."""
+        return np.insert(pixels, 2, 1.0, axis=-1) @ np.linalg.inv(self.matrix).T
+
     @property
     def parameters(self):
         """(fx, fy, cx, cy, k1..k5), shape (9,)."""

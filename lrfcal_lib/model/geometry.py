@@ -54,6 +54,21 @@ def unit_vector(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
+def unit_lines(lines: np.ndarray) -> np.ndarray:
+    """Lines ``a x + b y + c = 0`` with ``a^2 + b^2 = 1`` that are the same.
+
+    Parameters
+    ----------
+    lines : ndarray, shape (..., 3)
+        ``(a, b, c)``.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
+    return lines / np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
+
+
 def hat(v: ArrayLike) -> np.ndarray:
     """Cross-product matrices, ``hat(v) @ u == cross(v, u)``.
 

@@ -7,7 +7,7 @@ and the outer edges only to tell which shots show the whole corner.
 import numpy as np
 
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
+from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array, unit_lines
 
 EDGE = np.array(
     [-0.5, -0.5, 0.70711]
@@ -88,5 +88,4 @@ def _image_lines(setup, rng, T_camera_target):
 
     noisy = ends[:, 0] + setup.sigma_px * rng.standard_normal(ends[:, 0].shape)
     start, end = np.moveaxis(np.insert(noisy, 2, 1.0, axis=-1), 1, 0)
-    lines = np.cross(start, end)
-    return lines / np.linalg.norm(lines[:, :2], axis=-1, keepdims=True), whole
+    return unit_lines(np.cross(start, end)), whole

@@ -13,6 +13,7 @@ from lrfcal_lib.model.geometry import (
     carry,
     polar_to_points,
     pose_array,
+    unit_lines,
     unit_vector,
 )
 from lrfcal_lib.simulate.corner import corner_shots
@@ -123,8 +124,7 @@ class Scenario(Devices):
         rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
         away = rng.uniform(*self.distances, count)
         pixels = rng.uniform(0, self.model.size, (count, 2))
-        ray = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(self.model.matrix).T
-        centre = away[:, None] * ray
+        centre = away[:, None] * self.model.rays(pixels)
         return carry(rotation, middle, centre)
 
     def _around(self, rng, count):
@@ -235,8 +235,8 @@ def board_shots(setup, rng, T_camera_lrf):
     homography = (
         setup.model.matrix @ true[..., [0, 1, 3]]
     )  # from the board's plane to pixels
-    lines = board.lines()[edges] @ np.linalg.inv(homography)  # normals out of the board
-    lines /= np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
+    # normals out of the board
+    lines = unit_lines(board.lines()[edges] @ np.linalg.inv(homography))
     lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
     return conditions, {
         "ranges": np.where(hit, noisy, np.nan),
