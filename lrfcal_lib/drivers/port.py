@@ -15,6 +15,8 @@ from contextlib import AbstractContextManager, contextmanager
 import serial
 from serial.tools.list_ports import comports
 
+from lrfcal_lib.session.files import short
+
 LOG = logging.getLogger(__name__)
 WRITE_S = 1.0  # longest time that a write may block
 MOMENT_S = 1e-3  # shorter waits are spent awake
@@ -104,7 +106,7 @@ def open_port(path: str | os.PathLike, baudrate: int, *, timeout: float) -> seri
             path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True
         )
     except (OSError, ValueError, termios.error) as error:
-        present = ", ".join(sorted(port.device for port in comports())) or "none"
+        present = short(sorted(port.device for port in comports()))
         match getattr(error, "errno", None):
             case errno.ENOENT | errno.ENODEV | errno.ENXIO:
                 reason = (

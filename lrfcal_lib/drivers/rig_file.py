@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.drivers.pelco_d import FASTEST
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session.files import SessionError, read_json
+from lrfcal_lib.session.files import SessionError, read_json, short
 from lrfcal_lib.session.stated import (
     CameraInfo,
     LrfInfo,
@@ -441,8 +441,8 @@ def _check_cameras(devices, cameras):
     """Refuse cameras of the devices that are not those of the rig."""
     if set(devices) != set(cameras):
         raise ValueError(
-            f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras "
-            f"{', '.join(cameras) or 'none'}: every camera stands in both"
+            f"devices.cameras are {short(devices)}, rig.cameras "
+            f"{short(cameras)}: every camera stands in both"
         )
     for name, info in cameras.items():
         size = devices[name].size

@@ -16,6 +16,7 @@ import requests
 from urllib3.exceptions import HTTPError
 
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, PortError
+from lrfcal_lib.session.files import short
 
 LOG = logging.getLogger(__name__)
 # of a JPEG file; inside of its image data they cannot occur
@@ -314,7 +315,7 @@ def _opened(message, *arguments):
 
 def _open_device(path):
     if not os.path.exists(path):
-        present = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
+        present = short(sorted(glob.glob("/dev/video*")))
         raise PortError(f"there is no camera {path}: check its plug; present are {present}")
     if not os.access(path, os.R_OK | os.W_OK):
         raise PortError(
