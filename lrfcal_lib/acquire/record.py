@@ -181,7 +181,7 @@ class Recording(Closed):
         Light
             'bad' where the image shows no pattern and was not kept.
         """
-        (photo,) = self.rig.acquire_close(camera)
+        photo = self.rig.acquire_close(camera)
         stated = self.rig.stated
         light = check_image(
             photo.frame.image,

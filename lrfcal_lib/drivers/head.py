@@ -6,7 +6,7 @@ import os
 import threading
 
 from lrfcal_lib.drivers import port
-from lrfcal_lib.drivers.motion import ASSUMED, Motion, Stopped, drawn_to_readings
+from lrfcal_lib.drivers.motion import ASSUMED, Motion, Stopped
 from lrfcal_lib.drivers.pelco_d import FRAME, HeadLine
 from lrfcal_lib.drivers.port import (
     REAL,
@@ -19,7 +19,6 @@ from lrfcal_lib.drivers.port import (
 
 LOG = logging.getLogger(__name__)
 ROUNDING_DEG = 1e-6  # by which a pitch may exceed the limits
-EXTRA_S = 10  # that a move may take beside twice the time of its way
 
 
 class PanTilt(port.Closed):
@@ -57,29 +56,30 @@ class PanTilt(port.Closed):
         self._error: DeviceError | None = None
         self.motion = Motion(self._line, settings)
         try:
-            self._probe(self._line)
+            self._probe()
         except BaseException:
             self._line.close()
             raise
         port.guard(self)
 
-    def _probe(self, line):
+    def _probe(self):
         """Stop the head, ask whether it tells its tilt, and see who answers."""
         settings = self.settings
+        line = self.motion.line
         line.stop()
         reading = None
         if settings.feedback is not False:
             reading = self.motion.read(settings.retries)
         self.has_feedback = self.motion.feedback = reading is not None
-        if not self.has_feedback and line.skipped > FRAME * line.frames:
+        if self.has_feedback:
+            return
+        if line.skipped > FRAME * line.frames:
             raise WrongDevice(
                 f"{line.path} sends {line.skipped} bytes that are no Pelco-D at "
                 f"{settings.baudrate} Bd: another device, another rate, or Pelco-P"
             )
-        if self.has_feedback:
-            return
         if settings.feedback is True:
-            raise NoReply(self._silence(line))
+            raise self._silence()
         self.set_pitch(math.radians(settings.start_pitch_deg))
         LOG.warning(
             "the head does not tell its tilt: timed moves at %g/%g deg/s (state "
@@ -88,12 +88,13 @@ class PanTilt(port.Closed):
             settings.start_pitch_deg,
         )
 
-    def _silence(self, line):
+    def _silence(self):
         settings = self.settings
+        line = self.motion.line
         echo = ""
         if line.echoed:
             echo = "what was sent came back, so the adapter works: "
-        return (
+        return NoReply(
             f"the head at {line.path} does not tell its tilt: {echo}check its power, the wires A "
             f"and B, address {settings.address} and {settings.baudrate} Bd; state a longer reply_s "
             f'than {settings.reply_s:g} s if it answers late, or feedback "auto" to go on without '
@@ -106,11 +107,8 @@ class PanTilt(port.Closed):
         if line is None:
             return
         try:
-            self.stop()
-        except DeviceError as error:
-            LOG.error(
-                "the head could not be stopped (%s): cut its power if it moves", error
-            )
+            with port.stopping("head"):
+                self.stop()
         finally:
             port.release(self)
             self._line = None
@@ -122,10 +120,9 @@ class PanTilt(port.Closed):
         if self._line is not None:
             self._line.blurt_stop()
 
-    def _open_line(self):
+    def _need_open(self):
         if self._line is None:
             raise DeviceError("the head is closed: open it again")
-        return self._line
 
     # ---------------------------------------------------------------------------------------------
     # pitch
@@ -150,14 +147,14 @@ class PanTilt(port.Closed):
             If the head was closed, or the pitch of one without feedback is unknown after its line
             was lost.
         """
-        line = self._open_line()
+        self._need_open()
         if self.has_feedback:
             moving = self.moving()
             reading = self.motion.read(0 if moving else self.settings.retries)
             if reading is not None:
                 return reading.pitch, True
             if not moving:
-                raise NoReply(self._silence(line))
+                raise self._silence()
         return self.motion.estimate(), False
 
     def set_pitch(self, pitch: float) -> None:
@@ -185,7 +182,7 @@ class PanTilt(port.Closed):
         LineLost
             If the port stays away.
         """
-        self._open_line()
+        self._need_open()
         self.motion.abort.set()
         self.motion.stop()
         if self._thread is not None:
@@ -193,7 +190,7 @@ class PanTilt(port.Closed):
 
     def _begin(self, pitch):
         """Begin a motion to a pitch, one at a time."""
-        self._open_line()
+        self._need_open()
         low, high = self.settings.pitch_limits_deg
         degrees = math.degrees(pitch)
         if not low - ROUNDING_DEG <= degrees <= high + ROUNDING_DEG:
@@ -234,17 +231,10 @@ class PanTilt(port.Closed):
             If it was stopped meanwhile.
         """
         self._begin(pitch)
-        line = self._open_line()
-        motion = self.motion
         try:
-            if self.has_feedback and motion.read(self.settings.retries) is None:
-                raise NoReply(self._silence(line))
-            way = pitch - motion.estimate()
-            seconds = abs(way) / motion.speed(way, self.settings.tilt_speed)
-            if not self.has_feedback:
-                return motion.timed(pitch, seconds)
-            deadline = self._host.now() + 2 * seconds + EXTRA_S
-            return motion.move(pitch, deadline)
+            if self.has_feedback and self.motion.read(self.settings.retries) is None:
+                raise self._silence()
+            return self.motion.move(pitch)
         except BaseException:
             self.emergency_stop()
             raise
@@ -304,4 +294,4 @@ class PanTilt(port.Closed):
 
         Between readings the pitch is dead reckoning, which is drawn to the readings.
         """
-        return drawn_to_readings(list(self.motion.rows))
+        return self.motion.track()

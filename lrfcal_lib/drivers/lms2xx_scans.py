@@ -100,12 +100,11 @@ class ScanClock:
                 self._arrivals.clear()
             else:
                 last, _ = self._arrivals[-1]
-                step = (index - last) % 256
-                step += 256 * round((elapsed_s / MIRROR_TURN - step) / 256)
-                if step <= 0 or abs(elapsed_s - step * MIRROR_TURN) >= OFF_S:
+                expected = last + elapsed_s / MIRROR_TURN
+                turn += 256 * round((expected - turn) / 256)
+                if turn <= last or abs(expected - turn) * MIRROR_TURN >= OFF_S:
                     self._refused += 1
                     return None
-                turn = last + step
         self._refused = 0
         self._arrivals.append((turn, time_s))
         while self._arrivals[0][1] < time_s - WINDOW_S:  # never the one that came just now

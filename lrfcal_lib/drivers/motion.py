@@ -3,7 +3,7 @@
 import itertools
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 from lrfcal_lib.drivers import pelco_d
@@ -19,6 +19,7 @@ from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, Refused
 
 LOG = logging.getLogger(__name__)
 ASSUMED = 4.0, 4.0  # deg/s up and down, as of heads of constant speed
+EXTRA_S = 10  # that a move may take beside twice the time of its way
 ARRIVAL = math.radians(
     0.5
 )  # a move that ends this near has arrived; its settled pitch counts
@@ -45,21 +46,13 @@ class Stopped(DeviceError):
     """The motion was ended by a stop."""
 
 
-class PitchReading(NamedTuple):
-    """What the head told of its pitch."""
+class TrackPoint(NamedTuple):
+    """Where the head was."""
 
     instant: float  # of the host
     pitch: float  # radians
     reckoned: float  # dead reckoning before that was known, radians
-
-
-class TrackPoint(NamedTuple):
-    """Where the head was in a sweep."""
-
-    time_s: float  # date of the host
-    pitch: float  # radians
-    measured: bool  # the head told it
-    reckoned: float  # dead reckoning before that was known, radians
+    measured: bool = True  # the head told it
 
 
 class Motion:
@@ -92,8 +85,10 @@ class Motion:
         self.rows: list[TrackPoint] = []
         self.calibrated = settings.degrees_per_second is not None
         self._now = line.host.now
+        self._zero = line.host.time() - line.host.now()  # date of the instant 0
         up, down = map(math.radians, settings.degrees_per_second or ASSUMED)
-        self._speeds = {(settings.tilt_speed, 1): up, (settings.tilt_speed, -1): down}
+        # by way, 1 up and -1 down, and speed byte
+        self._speeds = {1: {settings.tilt_speed: up}, -1: {settings.tilt_speed: down}}
         self._longest = FIRST_BURST_S / GROWTH
         if self.calibrated:
             self._longest = math.inf
@@ -104,10 +99,11 @@ class Motion:
         # way (1 up, -1 down), speed byte and instant of the motion
         self._going: tuple | None = None
         self._frame = b""
-        self._repeated = 0.0
+        self._repeated = math.inf  # when it was last sent, if the head goes
         self._pitch: float | None = None
         self._known_at = 0.0
         self._misses = 0
+        self._repeat_s = settings.repeat_s or math.inf
         self._tolerance = math.radians(settings.tolerance_deg)
         self._shortest_s = 2 * line.wire_s() + settings.gap_s  # of a motion and its stop
 
@@ -118,16 +114,15 @@ class Motion:
         """Speed upwards (`way` > 0) or downwards; of other speed bytes in proportion, until they
         were used.
         """
-        way = math.copysign(1, way)
-        known = [other for other, direction in self._speeds if direction == way]
-        nearest = min(known, key=lambda other: abs(other - step))
-        return self._speeds[nearest, way] * max(step, 1) / max(nearest, 1)
+        speeds = self._speeds[math.copysign(1, way)]
+        nearest = min(speeds, key=lambda other: abs(other - step))
+        return speeds[nearest] * max(step, 1) / max(nearest, 1)
 
     def learn(self, way, step, speed):
         """Remember a speed that was measured."""
         way = math.copysign(1, way)
-        self._speeds[step, way] = speed
-        self._speeds.setdefault((step, -way), speed)
+        self._speeds[way][step] = speed
+        self._speeds[-way].setdefault(step, speed)
         self.calibrated = True
 
     def know(self, pitch, instant):
@@ -146,40 +141,59 @@ class Motion:
         return self._pitch + way * self.speed(way, step) * seconds
 
     def read(self, retries=0):
-        """What the head tells, as PitchReading; None without a reply.
+        """What the head tells, as TrackPoint; None without a reply.
 
         A reading far from dead reckoning is asked for twice more, and the one in the middle counts.
         """
         answer = self.line.pitch(retries)
         if answer is None:
             return None
-        instant, pitch = answer
-        if self._pitch is not None and abs(pitch - self.estimate(instant)) > SURPRISE:
-            answers = [answer, self.line.pitch(retries), self.line.pitch(retries)]
-            if None in answers:
-                return None
-            instant, pitch = sorted(answers, key=lambda answer: answer[1])[1]
+        pitch, instant = answer
         reckoned = pitch
         if self._pitch is not None:
             reckoned = self.estimate(instant)
+        if abs(pitch - reckoned) > SURPRISE:
+            answers = [answer, self.line.pitch(retries), self.line.pitch(retries)]
+            if None in answers:
+                return None
+            pitch, instant = sorted(answers)[1]
+            reckoned = self.estimate(instant)
         self.know(pitch, instant)
-        return PitchReading(instant, pitch, reckoned)
+        return TrackPoint(instant, pitch, reckoned)
 
     def note(self, retries=0):
         """Append where the head is now to the rows."""
-        reading = None
+        point = None
         if self.feedback and self._misses < MISSES:
-            reading = self.read(retries)
             self._misses += 1
-        now = self._now()
-        date = self.line.host.time()
-        if reading is None:
+            point = self.read(retries)
+        if point is None:
+            now = self._now()
             pitch = self.estimate(now)
-            self.rows.append(TrackPoint(date, pitch, False, pitch))
-            return
-        self._misses = 0
-        date -= now - reading.instant
-        self.rows.append(TrackPoint(date, reading.pitch, True, reading.reckoned))
+            point = TrackPoint(now, pitch, pitch, measured=False)
+        else:
+            self._misses = 0
+        self.rows.append(point)
+
+    def track(self):
+        """Of the sweep: date of the host (s), pitch (rad), and whether it was measured.
+
+        What lies between two readings is stretched to both.
+        """
+        rows = list(self.rows)
+        pitches = [row.pitch for row in rows]
+        measured = [i for i, row in enumerate(rows) if row.measured]
+        for first, last in itertools.pairwise(measured):
+            start = pitches[first]
+            reckoned = rows[last].reckoned - start
+            if reckoned:
+                stretch = (pitches[last] - start) / reckoned
+                for i in range(first + 1, last):
+                    pitches[i] = start + stretch * (pitches[i] - start)
+        return [
+            (self._zero + row.instant, pitch, row.measured)
+            for row, pitch in zip(rows, pitches, strict=True)
+        ]
 
     # ------------------------------------------------------------------------------------------
     # start and stop
@@ -197,6 +211,7 @@ class Motion:
         if self._going is not None and self._pitch is not None:
             self.know(self.estimate(ended), ended)
         self._going = None
+        self._repeated = math.inf
         return ended
 
     def pause(self, seconds):
@@ -206,9 +221,7 @@ class Motion:
         """
         end = self._now() + seconds
         while True:
-            due = math.inf
-            if self.settings.repeat_s is not None and self._going is not None:
-                due = self._repeated + self.settings.repeat_s
+            due = self._repeated + self._repeat_s
             if self._now() >= due:
                 self._repeated = self._send(self._frame)
             elif self.abort.wait(max(0.0, min(end, due) - self._now())):
@@ -296,25 +309,22 @@ class Motion:
         Refused
             If it does not come to rest.
         """
-        resting = None  # pitch since an instant
-        since = 0.0
+        resting = None  # the first of readings that are the same
         while True:
             reading = self.read()
-            now = self._now()
             if reading is None:
                 resting = None
-            elif resting is None or abs(reading.pitch - resting) > self._tolerance:
+            elif resting is None or abs(reading.pitch - resting.pitch) > self._tolerance:
                 if resting is not None and target is None:
                     self.stop()  # the one before was lost
-                resting = reading.pitch
-                since = now
+                resting = reading
             else:
                 enough_s = self.settings.settle_s
-                if target is not None and abs(resting - target) > ARRIVAL:
+                if target is not None and abs(resting.pitch - target) > ARRIVAL:
                     enough_s *= STALLED
-                if now - since >= enough_s:
+                if reading.instant - resting.instant >= enough_s:
                     return reading.pitch
-            if now >= deadline:
+            if self._now() >= deadline:
                 break
             self.pause(self.settings.poll_s)
         if resting is None:
@@ -323,36 +333,43 @@ class Motion:
                 "wires"
             )
         raise Refused(
-            f"the head does not come to rest, {math.degrees(resting):.2f} deg by now: give it more "
-            "time, a higher tolerance_deg, or look whether it can get there"
+            f"the head does not come to rest, {math.degrees(resting.pitch):.2f} deg by now: give "
+            "it more time, a higher tolerance_deg, or look whether it can get there"
         )
 
     # ---------------------------------------------------------------------------------------------
     # moves
 
-    def move(self, target: float, deadline: float) -> float:
-        """Reach a pitch by set-tilt where the head obeys, else by up and down.
+    def move(self, target: float) -> float:
+        """Reach a pitch by set-tilt where the head obeys, else by up and down; without feedback by
+        time, unless the shortest motion would lead further away.
 
         Parameters
         ----------
         target
             Pitch, rad.
-        deadline
-            Instant of the host.
 
         Returns
         -------
         float
-            Settled pitch, rad.
+            Settled pitch, rad; without feedback by dead reckoning.
 
         Raises
         ------
         Refused
             If the head does not get there, or does not obey where that is stated.
         """
+        settings = self.settings
+        way = target - self.estimate()
+        seconds = abs(way) / self.speed(way, settings.tilt_speed)
+        if not self.feedback:
+            if seconds >= self._shortest_s / 2:
+                self.run(target, settings.tilt_speed)
+                self.pause(settings.settle_s)
+            return self.estimate()
+        deadline = self._now() + 2 * seconds + EXTRA_S
         if self._obeys is False:
             return self.steer(target, deadline)
-        settings = self.settings
         value = pelco_d.encode_tilt(settings.elevation(target))
         for _ in range(2):  # the first may be lost, or come while the head was still busy
             self._send(encode_extended(settings.address, SET_TILT, value))
@@ -377,14 +394,13 @@ class Motion:
         full = self.settings.tilt_speed
         for _ in range(BURSTS):
             error = target - pitch
-            steps = sorted({full, full // 4, full // 16} - self._dead, reverse=True)
+            steps = {full, full // 4, full // 16} - self._dead
             shortest = {step: self._shortest_s * self.speed(error, step) for step in steps}
-            slowest = steps[-1]
+            slowest = min(steps)
             if abs(error) <= max(ARRIVAL, shortest[slowest]):
                 return pitch
-            step = next(
-                (step for step in steps if abs(error) >= 2 * shortest[step]), slowest
-            )
+            short = [step for step in steps if abs(error) >= 2 * shortest[step]]
+            step = max(short, default=slowest)
             took = self.run(pitch + SHORT_OF * error, step, GROWTH * self._longest)
             before = pitch
             pitch = self.settle(deadline)
@@ -404,26 +420,6 @@ class Motion:
                 continue
             self._longest = max(self._longest, took)
         raise _short_of(pitch, target)
-
-    def timed(self, target: float, seconds: float) -> float:
-        """Move by time, unless the shortest motion would lead further away.
-
-        Parameters
-        ----------
-        target
-            Pitch, rad.
-        seconds
-            That the way takes.
-
-        Returns
-        -------
-        float
-            The pitch that results by dead reckoning, rad.
-        """
-        if seconds >= self._shortest_s / 2:
-            self.run(target, self.settings.tilt_speed)
-            self.pause(self.settings.settle_s)
-        return self.estimate()
 
     def sweep(self, goal, step):
         """Move to a pitch at a speed byte; note where the head is on the way and where it rests."""
@@ -451,7 +447,7 @@ class Motion:
             measured = [row for row in self.rows[1:] if row.measured] or self.rows[:1]
             swept = abs(measured[-1].pitch - measured[0].pitch)
             if swept >= 10 * self._tolerance:
-                self.learn(way, step, swept / (measured[-1].time_s - measured[0].time_s))
+                self.learn(way, step, swept / (measured[-1].instant - measured[0].instant))
 
         try:
             self.run(goal, step, look=look)
@@ -469,30 +465,3 @@ def _short_of(pitch, target):
         f"the head stays at {math.degrees(pitch):.2f} deg on its way to "
         f"{math.degrees(target):.2f}: look for an end stop, or narrow pitch_limits_deg"
     )
-
-
-def drawn_to_readings(rows: Sequence[TrackPoint]) -> list[tuple[float, float, bool]]:
-    """Track of a sweep: what lies between two readings is stretched to both.
-
-    Parameters
-    ----------
-    rows
-        Of the sweep.
-
-    Returns
-    -------
-    list of tuple
-        Date of the host, s, pitch, rad, and whether it was measured.
-    """
-    pitches = [row.pitch for row in rows]
-    measured = [i for i, row in enumerate(rows) if row.measured]
-    for first, last in itertools.pairwise(measured):
-        start = rows[first].pitch
-        reckoned = rows[last].reckoned - start
-        if reckoned:
-            stretch = (rows[last].pitch - start) / reckoned
-            for i in range(first + 1, last):
-                pitches[i] = start + stretch * (rows[i].pitch - start)
-    return [
-        (row.time_s, pitch, row.measured) for row, pitch in zip(rows, pitches, strict=True)
-    ]

@@ -6,7 +6,7 @@ import math
 import os
 from dataclasses import dataclass
 
-from lrfcal_lib.drivers.port import REAL, Host, LineLost, PortError, line_lost
+from lrfcal_lib.drivers.port import REAL, Host, LineLost, PortError, line_lost, stopping
 
 LOG = logging.getLogger(__name__)
 SYNC = 0xFF
@@ -258,7 +258,7 @@ class HeadLine:
     # ------------------------------------------------------------------------------------- frames
 
     def pitch(self, retries):
-        """Instant of the host and pitch that the head tells, rad; None if no reply came.
+        """Pitch that the head tells, rad, and instant of the host; None if no reply came.
 
         After a time-out the next reply may be the late one, so it is thrown away and the head is
         asked again. The head looks at its encoder about half-way between the beginning of the query
@@ -273,7 +273,7 @@ class HeadLine:
                 self._late = not tilts
             if tilts and not suspect:
                 halfway = (begun + self.host.now()) / 2
-                return halfway, self.settings.pitch(decode_tilt(tilts[-1]))
+                return self.settings.pitch(decode_tilt(tilts[-1])), halfway
         return None
 
     def command(self, frame):
@@ -287,29 +287,25 @@ class HeadLine:
 
         To heads that acknowledge nothing it is sent at least twice.
         """
-        first = None
+        sent = []
         for _ in range(2 + self.settings.retries * self._acknowledges):
             with self.lock:
                 acknowledged = self._exchange(self._stop).acknowledged
-                if first is None:
-                    first = self._sent
+                sent.append(self._sent)
             if acknowledged:
                 self._acknowledges = True
                 break
-        return first
+        return sent[0]
 
     def blurt_stop(self):
         """Send the stop at once, whatever another thread does on the line; errors are logged."""
         held = self.lock.acquire(timeout=0.5)
         try:
-            with line_lost(self.path):
+            # on the way out nothing else can be done
+            with stopping("head", Exception), line_lost(self.path):
                 for _ in range(2):
                     self.opened().write(self._stop)
                     self.host.sleep(self.wire_s() + self.settings.gap_s)
-        except Exception as error:  # on the way out nothing else can be done
-            LOG.error(
-                "the head could not be stopped (%s): cut its power if it moves", error
-            )
         finally:
             if held:
                 self.lock.release()
@@ -318,30 +314,26 @@ class HeadLine:
         """Send a frame, and collect what is Received until a reply.
 
         The wait (by default that of an acknowledgement) counts from the end of the transmission of
-        frame and reply.
+        frame and reply. Who calls holds the lock.
         """
-        wait_s = wait_s or self.settings.gap_s
-        with self.lock:
-            self.host.sleep(self._free - self.host.now())
-            try:
-                with line_lost(self.path):
-                    port = self.opened()
-                    port.reset_input_buffer()
-                    port.write(frame)
-                    self._sent = self.host.now()
-                    received = self._collect(
-                        port, frame, self._sent + self.wire_s(2 * FRAME) + wait_s
-                    )
-            except LineLost:
-                self.close()
-                raise
-            self._free = (
-                max(self.host.now(), self._sent + self.wire_s()) + self.settings.gap_s
-            )
-            self.frames += 1
-            self.echoed += received.echoed
-            self.skipped += received.skipped
-            return received
+        gap_s = self.settings.gap_s
+        self.host.sleep(self._free - self.host.now())
+        try:
+            with line_lost(self.path):
+                port = self.opened()
+                port.reset_input_buffer()
+                port.write(frame)
+                self._sent = self.host.now()
+                end = self._sent + self.wire_s(2 * FRAME) + (wait_s or gap_s)
+                received = self._collect(port, frame, end)
+        except LineLost:
+            self.close()
+            raise
+        self._free = max(self.host.now(), self._sent + self.wire_s()) + gap_s
+        self.frames += 1
+        self.echoed += received.echoed
+        self.skipped += received.skipped
+        return received
 
     def _collect(self, port, frame, end):
         """What is Received until a reply, or an instant."""
@@ -361,22 +353,21 @@ class HeadLine:
 
         The head, which went on with what it was told, is stopped then.
         """
-        with self.lock, line_lost(self.path):
-            deadline = self.host.now() + RECONNECT_S
-            while self._port is None:
-                try:
-                    self._port = self.host.port(
-                        self.path, self.settings.baudrate, timeout=READ_S
-                    )
-                except PortError as error:
-                    if self.host.now() >= deadline:
-                        raise LineLost(f"the head's line is lost: {error}") from error
-                    self.host.sleep(AGAIN_S)
-                    continue
-                LOG.warning("the line %s to the head is back", self.path)
-                self._port.write(self._stop * 2)
-                self.host.sleep(self.wire_s(2 * FRAME) + self.settings.gap_s)
-            return self._port
+        deadline = self.host.now() + RECONNECT_S
+        while self._port is None:
+            try:
+                self._port = self.host.port(
+                    self.path, self.settings.baudrate, timeout=READ_S
+                )
+            except PortError as error:
+                if self.host.now() >= deadline:
+                    raise LineLost(f"the head's line is lost: {error}") from error
+                self.host.sleep(AGAIN_S)
+                continue
+            LOG.warning("the line %s to the head is back", self.path)
+            self._port.write(self._stop * 2)
+            self.host.sleep(self.wire_s(2 * FRAME) + self.settings.gap_s)
+        return self._port
 
     def close(self):
         """Close the port; nothing is sent."""

@@ -2,6 +2,7 @@
 
 import atexit
 import errno
+import logging
 import os
 import signal
 import termios
@@ -14,14 +15,11 @@ from contextlib import AbstractContextManager, contextmanager
 import serial
 from serial.tools.list_ports import comports
 
+from lrfcal_lib.session.files import short
+
+LOG = logging.getLogger(__name__)
 WRITE_S = 1.0  # longest time that a write may block
 MOMENT_S = 1e-3  # shorter waits are spent awake
-SAME = {  # errors that are told alike
-    errno.ENODEV: errno.ENOENT,
-    errno.ENXIO: errno.ENOENT,
-    errno.EPERM: errno.EACCES,
-    errno.EAGAIN: errno.EBUSY,
-}
 
 
 class DeviceError(RuntimeError):
@@ -50,6 +48,25 @@ class LineLost(DeviceError):
 
 class OutOfRange(DeviceError, ValueError):
     """A device was asked for more than it can do, such as a pitch beyond the limits of its head."""
+
+
+@contextmanager
+def stopping(name: str, errors: type[Exception] = DeviceError) -> Iterator[None]:
+    """Log what keeps a device from being stopped, with what to do.
+
+    Parameters
+    ----------
+    name
+        Of the device.
+    errors
+        That are logged, and go no further.
+    """
+    try:
+        yield
+    except errors as error:
+        LOG.error(
+            "the %s could not be stopped (%s): cut its power if it moves", name, error
+        )
 
 
 class Closed(AbstractContextManager):
@@ -89,16 +106,22 @@ def open_port(path: str | os.PathLike, baudrate: int, *, timeout: float) -> seri
             path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True
         )
     except (OSError, ValueError, termios.error) as error:
-        present = ", ".join(sorted(port.device for port in comports())) or "none"
-        reasons = {
-            errno.ENOENT: f"there is no port {path}: check cable and power; present are {present}",
-            errno.EACCES: f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then "
-            "log in again",
-            errno.EBUSY: f"the port {path} is busy: close the program that 'fuser -v {path}' names",
-        }
-        number = getattr(error, "errno", None)
-        reason = f"{path} is no serial line ({error}): name the port of the device"
-        raise PortError(reasons.get(SAME.get(number, number), reason)) from error
+        present = short(sorted(port.device for port in comports()))
+        match getattr(error, "errno", None):
+            case errno.ENOENT | errno.ENODEV | errno.ENXIO:
+                reason = (
+                    f"there is no port {path}: check cable and power; present are {present}"
+                )
+            case errno.EACCES | errno.EPERM:
+                reason = (
+                    f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then log in "
+                    "again"
+                )
+            case errno.EBUSY | errno.EAGAIN:
+                reason = f"the port {path} is busy: close the program that 'fuser -v {path}' names"
+            case _:
+                reason = f"{path} is no serial line ({error}): name the port of the device"
+        raise PortError(reason) from error
     try:
         set_rate(port, baudrate)
     except BaseException:

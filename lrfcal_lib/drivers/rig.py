@@ -13,7 +13,15 @@ import urllib3
 from lrfcal_lib.drivers.head import PanTilt
 from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.lms2xx_scans import Reading
-from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, Host, LineLost, NoReply
+from lrfcal_lib.drivers.port import (
+    REAL,
+    Closed,
+    DeviceError,
+    Host,
+    LineLost,
+    NoReply,
+    stopping,
+)
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, RigFileError
 from lrfcal_lib.drivers.video import Camera, Frame
 from lrfcal_lib.session.lms2xx_codec import METRES, largest
@@ -55,7 +63,7 @@ class Scanned:
     placement: int
     readings: tuple[Reading, ...]
     pitch: np.ndarray  # radians
-    share: float = math.nan  # what is done of a continuous sweep; NaN at a stop
+    share: float  # what is done of a continuous sweep; NaN at a stop
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,26 +158,26 @@ class Rig(Closed):
         settings = devices.lrf.model_dump(exclude_none=True, exclude={"interlaced"})
         if devices.lrf.interlaced:  # it chooses its own
             settings.pop("variant", None)
-        open_camera: Callable = camera or partial(_camera, stated)
-        openers: dict[str, Callable] = {
-            "head": partial(PanTilt, devices.head.port, devices.head, host=host),
-            "lrf": partial(LMS2xx, host=host, **settings),
-        }
-        for name in stated.cameras:
-            openers[f"camera '{name}'"] = partial(open_camera, name)
+        open_camera = camera or partial(_camera, stated)
         with contextlib.ExitStack() as stack:
-            opened = []
-            for name, opener in openers.items():
+
+            def opened(name, opener, *args, **options):
+                """A device that is closed with the others; errors begin with its name."""
                 try:
-                    opened.append(opener())
+                    device = opener(*args, **options)
                 except DeviceError as error:
-                    error.args = (f"{name}: {error}", *error.args[1:])
+                    error.args = (f"{name}: {error}",)
                     raise
                 except ValueError as error:
                     raise RigFileError(f"{stated.path}: {name}: {error}") from error
-                stack.callback(opened[-1].close)
-            head, lrf, *rest = opened
-            cameras = dict(zip(stated.cameras, rest, strict=True))
+                return stack.enter_context(contextlib.closing(device))
+
+            head = opened("head", PanTilt, devices.head.port, devices.head, host=host)
+            lrf = opened("lrf", LMS2xx, host=host, **settings)
+            cameras = {
+                name: opened(f"camera '{name}'", open_camera, name)
+                for name in stated.cameras
+            }
             rig = cls(stated, lrf, head, cameras, host=host)
             rig._closing = stack.pop_all()
         return rig
@@ -311,7 +319,7 @@ class Rig(Closed):
             self.halt()
             raise
 
-    def acquire_close(self, camera: str) -> Generator[Photographed, None, None]:
+    def acquire_close(self, camera: str) -> Photographed:
         """Take one image of the board held close to a camera, the head at pitch 0.
 
         Parameters
@@ -325,8 +333,8 @@ class Rig(Closed):
             As :meth:`acquire`.
         """
         try:
-            rest = self._move(CLOSE, 0.0, 1, 1)
-            yield from self._photograph([camera], rest, "intrinsics")
+            rest = self._move(CLOSE, 0.0)
+            return next(self._photograph([camera], rest, "intrinsics"))
         except BaseException:
             self.halt()
             raise
@@ -334,14 +342,8 @@ class Rig(Closed):
     def halt(self) -> None:
         """Stop the head and the scans; what cannot be stopped is logged, with what to do."""
         for name, device in (("head", self.head), ("laser range finder", self.lrf)):
-            try:
+            with stopping(name):
                 device.stop()
-            except DeviceError as error:
-                LOG.error(
-                    "the %s could not be stopped (%s): cut its power if it moves",
-                    name,
-                    error,
-                )
 
     def _stop_and_go(self, placement):
         scans = placement.pitch
@@ -362,30 +364,30 @@ class Rig(Closed):
         """Scan again in the first half of a sweep, as level as it was there: walls show most."""
         half = placement.pitch[: len(placement.pitch) // 2 + 1]
         level = float(half[np.argmin(np.abs(half))])
-        moved = self._move(placement.number, level, 1, 1)
-        self._begin_scans()
-        scanned = self._scanned(moved)
-        self.lrf.stop()
+        moved = self._move(placement.number, level)
         yield moved
-        yield replace(scanned, share=1.0)
+        self._begin_scans()
+        yield self._scanned(moved, share=1.0)
+        self.lrf.stop()
 
     def _begin_scans(self):
         """Interlaced scans come in a stream, others one by one."""
         if self.stated.devices.lrf.interlaced:
             self.lrf.start(interlaced=True)
 
-    def _scanned(self, moved):
+    def _scanned(self, moved, share=math.nan):
         """What is scanned at a stop."""
-        readings = tuple(self._scans(moved.time_s, self.stated.devices.lrf.interlaced))
-        return Scanned(moved.placement, readings, np.full(len(readings), moved.pitch))
+        readings = tuple(self._scans(moved.time_s))
+        pitch = np.full(len(readings), moved.pitch)
+        return Scanned(moved.placement, readings, pitch, share)
 
-    def _scans(self, after, interlaced):
+    def _scans(self, after):
         """Scans of a stream, or one by one, later than an instant.
 
         A line that was lost has one chance to come back.
         """
         count = self.stated.plan.scans_per_stop
-        if interlaced:
+        if self.stated.devices.lrf.interlaced:
             return self.lrf.take(count, after=after, timeout=SCAN_S * count)
         readings = []
         mended = False
@@ -410,7 +412,7 @@ class Rig(Closed):
                 )
         return readings
 
-    def _move(self, placement, pitch, number, of):
+    def _move(self, placement, pitch, number=1, of=1):
         reached = self.head.move_to(pitch)
         return Moved(
             placement, self.clock(), pitch, reached, self.head.has_feedback, number, of
@@ -431,32 +433,32 @@ class Rig(Closed):
                 yield from self._photograph(self.cameras, moved, placement.purpose)
         self.lrf.start()
         held = self.lrf.take(1, timeout=SCAN_S)  # readings whose pitch is not known yet
-        heard = self._now()
         newest = held[-1].time_s
         self.head.start_sweep(last, self.stated.plan.sweep_speed)
-        while self.head.moving():
+        moving = True
+        while moving:
+            moving = self.head.moving()
+            if not moving:
+                self.head.finish_sweep()
             fresh = self._since(newest)
             if fresh:
-                heard = self._now()
                 newest = fresh[-1].time_s
-            elif self._now() - heard > GAP_S:
+            elif self.clock() - newest > GAP_S:
                 raise NoReply(
                     f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range "
                     "finder"
                 )
-            # what is not measured may change until the next reading
-            sure = [
-                point for point in self.head.track if point[2] or not self.head.has_feedback
-            ]
-            readings, pitch, held = placed(held + fresh, sure)
+            track = self.head.track
+            if moving and self.head.has_feedback:
+                # what is not measured may change until the next reading
+                track = [point for point in track if point[2]]
+            readings, pitch, held = placed(held + fresh, track)
             if readings:
-                share = np.clip((pitch[-1] - first) / (last - first), 0, 1)
-                yield Scanned(placement.number, readings, pitch, float(share))
-        track = self.head.finish_sweep()
-        readings, pitch, _ = placed(held + self._since(newest), track)
+                share = 1.0
+                if moving:
+                    share = float(np.clip((pitch[-1] - first) / (last - first), 0, 1))
+                yield Scanned(placement.number, readings, pitch, share)
         self.lrf.stop()
-        if readings:
-            yield Scanned(placement.number, readings, pitch, 1.0)
         yield Tracked(placement.number, last, tuple(track))
 
     def _since(self, instant):
@@ -491,7 +493,7 @@ def placed(
     later : list of Reading
         Those after the track.
     """
-    if len(track) < 2:
+    if not track:
         return (), np.empty(0), list(readings)
     times, pitch = np.array([point[:2] for point in track]).T
     middle = np.array([np.mean(reading.beam_times_s[[0, -1]]) for reading in readings])
@@ -522,7 +524,7 @@ def unchanged(scans: Iterable[np.ndarray]) -> bool:
     ranges = np.array(scans)
     ranges = ranges[:, np.isfinite(ranges).all(axis=0)]
     steps = (np.diff(ranges, axis=0) ** 2).sum(axis=0)
-    spread = ((ranges - ranges.mean(axis=0)) ** 2).sum(axis=0)
+    spread = len(ranges) * ranges.var(axis=0)
     noise = np.full(len(steps), 2.0)
     ratio = np.divide(steps, spread, out=noise, where=steps > 0)
     return ratio.size > 0 and bool(ratio.mean() > STILL)

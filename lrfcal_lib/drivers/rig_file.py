@@ -12,6 +12,7 @@ from pydantic import (
     BeforeValidator,
     Field,
     StrictBool,
+    StrictInt,
     StrictStr,
     model_validator,
 )
@@ -20,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.drivers.pelco_d import FASTEST
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session.files import SessionError, read_json
+from lrfcal_lib.session.files import SessionError, read_json, short
 from lrfcal_lib.session.stated import (
     CameraInfo,
     LrfInfo,
@@ -96,9 +97,7 @@ Text = Annotated[StrictStr, refused(no_text, "a text is needed")]
 Source = Annotated[
     Any, refused(no_source, "a text, or a whole number from 0 to 255 is needed")
 ]
-Rate = Annotated[
-    Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)
-]
+Rate = Annotated[StrictInt, refused(lambda rate: rate not in RATES, OTHER_RATE)]
 Perhaps = Literal["auto", True, False]
 Angle = number(-180, 180)
 Seconds = number(0, 60)
@@ -442,8 +441,8 @@ def _check_cameras(devices, cameras):
     """Refuse cameras of the devices that are not those of the rig."""
     if set(devices) != set(cameras):
         raise ValueError(
-            f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras "
-            f"{', '.join(cameras) or 'none'}: every camera stands in both"
+            f"devices.cameras are {short(devices)}, rig.cameras "
+            f"{short(cameras)}: every camera stands in both"
         )
     for name, info in cameras.items():
         size = devices[name].size

@@ -16,6 +16,7 @@ import requests
 from urllib3.exceptions import HTTPError
 
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, PortError
+from lrfcal_lib.session.files import short
 
 LOG = logging.getLogger(__name__)
 # of a JPEG file; inside of its image data they cannot occur
@@ -169,7 +170,7 @@ class Camera(Closed):
             return {}
         wanted = {cv2.CAP_PROP_BUFFERSIZE: 1}
         if size is not None:
-            wanted |= dict(zip((WIDTH, HEIGHT), size, strict=True))
+            wanted[WIDTH], wanted[HEIGHT] = size
         if exposure is not None:
             wanted[cv2.CAP_PROP_AUTO_EXPOSURE] = MANUAL
             wanted[cv2.CAP_PROP_EXPOSURE] = round(exposure / EXPOSURE_UNIT_S)
@@ -221,10 +222,9 @@ class Camera(Closed):
                 self._lose()
                 continue
             now = REAL.time()
-            if getattr(self._capture, "waited", True):
-                self._keep(now)
-            else:  # it may have come at any time since the frame before
-                self._keep(self._before)
+            waited = getattr(self._capture, "waited", True)
+            # else it may have come at any time since the frame before
+            self._keep(now if waited else self._before)
             self._before = now
         self._release()
 
@@ -315,7 +315,7 @@ def _opened(message, *arguments):
 
 def _open_device(path):
     if not os.path.exists(path):
-        present = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
+        present = short(sorted(glob.glob("/dev/video*")))
         raise PortError(f"there is no camera {path}: check its plug; present are {present}")
     if not os.access(path, os.R_OK | os.W_OK):
         raise PortError(
@@ -418,21 +418,19 @@ class MjpegStream:
         to its end; b'' where there is none any more.
         """
         while True:
-            begin = self._buffer.find(BEGIN)
-            end = self._buffer.find(END, begin) + len(END)
-            if stated := LENGTH.findall(self._buffer[: max(begin, 0)]):
-                end = begin + int(stated[-1])
-            if begin >= 0 and len(END) <= end <= len(self._buffer):
-                image = self._buffer[begin:end]
-                self._buffer = self._buffer[end:]
-                return image
-            if self._answer.closed or len(self._buffer) > LONGEST:
-                return b""
-            try:
-                self.waited |= not select.select([self._answer], [], [], 0)[0]
-                more = self._answer.read1(CHUNK)
-            except (OSError, ValueError, HTTPError):  # ValueError: the answer was closed
-                return b""
+            before, begin, rest = self._buffer.partition(BEGIN)
+            size = rest.find(END) + len(END)
+            if stated := LENGTH.findall(before):
+                size = int(stated[-1]) - len(BEGIN)
+            if len(END) <= size <= len(rest):
+                self._buffer = rest[size:]
+                return begin + rest[:size]
+            more = b""
+            if len(self._buffer) <= LONGEST:
+                # ValueError: the answer was closed
+                with contextlib.suppress(OSError, ValueError, HTTPError):
+                    self.waited |= not select.select([self._answer], [], [], 0)[0]
+                    more = self._answer.read1(CHUNK)
             if not more:
                 return b""
             self._buffer += more

@@ -212,8 +212,8 @@ def board_poses(solution, grid):
     spin = Rotation.from_euler("z", turn[:, None], degrees=True)
     rotation = solution.T_head_lrf.rotation * gaze * geometry.AHEAD * tip * spin
     middle = solution.T_head_lrf.apply(distance[:, None] * gaze.apply([0.0, 1.0, 0.0]))
-    origin = middle - rotation.apply(outline(solution).mean(axis=0))
-    return np.concatenate([rotation.as_matrix(), origin[..., None]], axis=-1)
+    centre = outline(solution).mean(axis=0)
+    return geometry.pose_array(geometry.carry(rotation, centre, middle))
 
 
 def pitches_of_images(boards, solution, models, field_of_view):

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, columns_of
@@ -22,6 +21,7 @@ from lrfcal_lib.model.geometry import (
     tilt,
     unit_vector,
 )
+from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.preprocess.prepared import PitchNoise
 
 # a motion that moves a point less than this, relative to all others, does not matter to it
@@ -305,38 +305,6 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
     least = SEEN * size * np.linalg.norm(chain.unseen, axis=-1)
     matters = np.linalg.norm(moved, axis=-1) > least
     return np.where(np.any(matters, axis=-1), np.inf, np.sqrt(variance))
-
-
-def beams_to(
-    points: ArrayLike, T_head_lrf: RigidTransform
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bearing, pitch (radians) and range (metres) at which scans reach points.
-
-    Parameters
-    ----------
-    points : array_like, shape (..., 3)
-        Platform frame, metres.
-    T_head_lrf
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Each of the three; NaN where the scan plane never gets there.
-    """
-    points = np.asarray(points, float)
-    R = T_head_lrf.rotation.as_matrix()
-    t = T_head_lrf.translation
-    k = R[:, 2]  # normal of the scan plane: k . (Rx(-pitch) x - t) = 0
-    y = points[..., 1]
-    z = points[..., 2]
-    a = k[1] * y + k[2] * z
-    b = k[1] * z - k[2] * y
-    c = k @ t - k[0] * points[..., 0]
-    with np.errstate(invalid="ignore"):
-        pitch = np.arctan2(b, a) + np.arccos(c / np.hypot(a, b))
-    pitch = (pitch + np.pi) % (2 * np.pi) - np.pi
-    p = (tilt(points, -pitch) - t) @ R
-    return np.arctan2(p[..., 1], p[..., 0]), pitch, np.linalg.norm(p, axis=-1)
 
 
 def beams_of_pixels(chain, model, uv, distance, image_pitch):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lrfcal_lib.model.geometry import cross
+from lrfcal_lib.model.geometry import cross, unit_lines
 
 UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # its corners in order
 
@@ -111,8 +111,7 @@ def outline_lines(corners: ArrayLike) -> np.ndarray:
     points = np.insert(corners, 2, 1.0, axis=1)
     lines = cross(points, np.roll(points, -1, axis=0))
     twice_area = lines[:, 2].sum()
-    length = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-    return -np.sign(twice_area) * lines / length
+    return -np.sign(twice_area) * unit_lines(lines)
 
 
 def corners_of_lines(lines: ArrayLike) -> np.ndarray:

@@ -54,6 +54,21 @@ def unit_vector(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
+def unit_lines(lines: np.ndarray) -> np.ndarray:
+    """Lines ``a x + b y + c = 0`` with ``a^2 + b^2 = 1`` that are the same.
+
+    Parameters
+    ----------
+    lines : ndarray, shape (..., 3)
+        ``(a, b, c)``.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
+    return lines / np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
+
+
 def hat(v: ArrayLike) -> np.ndarray:
     """Cross-product matrices, ``hat(v) @ u == cross(v, u)``.
 
@@ -169,6 +184,20 @@ def lrf_to_platform(
     return tilt(T_head_lrf.apply(p_lrf), pitch)
 
 
+def carry(rotation: Rotation, point: ArrayLike, to: ArrayLike = 0.0) -> RigidTransform:
+    """The transform, or a stack, with a rotation, that takes a point to a place.
+
+    Parameters
+    ----------
+    rotation : Rotation
+    point : array_like, shape (3,) or (n, 3)
+        Such as the centre of a camera, metres.
+    to : array_like, broadcastable to `point`
+        By default the origin.
+    """
+    return RigidTransform.from_components(to - rotation.apply(point), rotation)
+
+
 @dataclass(frozen=True)
 class TiltAxis:
     """The tilt axis as a line in the LRF frame: all that the platform calibration can know (4
@@ -226,7 +255,7 @@ def head_from_axis(axis: TiltAxis, stated: RigidTransform | None = None) -> Rigi
     rotation = Rotation.identity()
     if sine > 0:
         rotation = Rotation.from_rotvec(turn / sine * np.arctan2(sine, direction[0]))
-    head = RigidTransform.from_components(-rotation.apply(axis.foot), rotation)
+    head = carry(rotation, axis.foot)
     if stated is None:
         return head
     return stated * head_from_axis(axis_of(stated)).inv() * head

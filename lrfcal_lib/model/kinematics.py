@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import lrf_to_platform
+from lrfcal_lib.model.geometry import lrf_to_platform, tilt
 
 TILT_AXIS = np.array([1.0, 0.0, 0.0])  # of the head and of the platform
 MIRROR_TURN = (
@@ -147,3 +147,35 @@ def camera_at(
     if mount == "platform":
         return T_camera
     return T_camera * (platform_from_head(pitch) * T_head_lrf).inv()
+
+
+def beams_to(
+    points: ArrayLike, T_head_lrf: RigidTransform
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bearing, pitch (radians) and range (metres) at which scans reach points.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Platform frame, metres.
+    T_head_lrf
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Each of the three; NaN where the scan plane never gets there.
+    """
+    points = np.asarray(points, float)
+    R = T_head_lrf.rotation.as_matrix()
+    t = T_head_lrf.translation
+    k = R[:, 2]  # normal of the scan plane: k . (Rx(-pitch) x - t) = 0
+    y = points[..., 1]
+    z = points[..., 2]
+    a = k[1] * y + k[2] * z
+    b = k[1] * z - k[2] * y
+    c = k @ t - k[0] * points[..., 0]
+    with np.errstate(invalid="ignore"):
+        pitch = np.arctan2(b, a) + np.arccos(c / np.hypot(a, b))
+    pitch = (pitch + np.pi) % (2 * np.pi) - np.pi
+    p = (tilt(points, -pitch) - t) @ R
+    return np.arctan2(p[..., 1], p[..., 0]), pitch, np.linalg.norm(p, axis=-1)

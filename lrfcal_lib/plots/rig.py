@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import fit_plane, unit_vector
+from lrfcal_lib.model.geometry import carry, fit_plane, unit_vector
 from lrfcal_lib.plots.colors import FIT
 from lrfcal_lib.plots.recording import CENTRED
 
@@ -114,7 +114,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
         )
     axes = unit_vector(np.stack([right, np.cross(ahead, right), ahead]))
     rotation = Rotation.from_matrix(axes)
-    return RigidTransform.from_components(-rotation.apply(eye), rotation)
+    return carry(rotation, eye)
 
 
 def face_on(

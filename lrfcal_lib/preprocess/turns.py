@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Chessboard
+from lrfcal_lib.model.geometry import carry
 
 # weight of the turn between two cameras where few placements tell: most look the same way, head up
 UPRIGHT = 0.05
@@ -49,7 +50,7 @@ def turned_boards(pattern: Chessboard, orders: np.ndarray) -> RigidTransform:
     offsets = points - middle
     turns = [Rotation.align_vectors(offsets[order], offsets)[0] for order in orders]
     rotation = Rotation.concatenate(turns)
-    return RigidTransform.from_components(middle - rotation.apply(middle), rotation)
+    return carry(rotation, middle, middle)
 
 
 def alike(rotations, views) -> Alike:

@@ -64,11 +64,6 @@ class Beam:
         need((self.field_of_view, self.resolution) in known, f"{self.name} has {words}")
 
     @property
-    def rays(self) -> int:
-        """Sub-rays of one spot."""
-        return 1 + 3 * self.rings * (self.rings + 1)
-
-    @property
     def turns(self) -> int:
         """Mirror turns of one whole scan."""
         return 100 // self.resolution
@@ -161,7 +156,7 @@ def echo(
     left = distance
     places = []
     strengths = []
-    while np.isfinite(left).any():
+    while not places or np.isfinite(left).any():
         near = left.min(axis=1, keepdims=True)
         group = np.isfinite(left) & (left <= near + beam.pulse)
         part = np.where(group, energy, 0.0)
@@ -170,13 +165,10 @@ def echo(
         with np.errstate(invalid="ignore"):
             places.append(mean / strengths[-1])
         left = np.where(group, np.inf, left)
-    best = np.max(strengths, axis=0, initial=0.0)
+    best = np.max(strengths, axis=0)
     threshold = np.maximum(beam.least_energy, beam.least_share * best)
-    reading = np.full(len(distance), np.nan)
-    for place, strength in zip(reversed(places), reversed(strengths), strict=True):
-        # the first one that is good comes last
-        reading = np.where(strength >= threshold, place, reading)
-    return reading, sum(strengths, np.zeros(len(distance)))
+    good = [strength >= threshold for strength in strengths]
+    return np.select(good, places, np.nan), sum(strengths)
 
 
 class Readings(NamedTuple):
@@ -216,14 +208,14 @@ def ideal_readings(
     slanted plane is therefore brighter: at 45 deg the reading is 0.09 mm short.
     """
     origins, directions = _sub_rays(beam, bearings)
+    *shape, _ = directions.shape
     rotation = T_head_lrf.rotation.as_matrix().T
     origins = tilt(origins @ rotation + T_head_lrf.translation, pitch[:, None])
     origins = origins.reshape(-1, 3)
     directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
     hits = world.cast(origins, directions)
     reflected = world.infrared(hits.points, hits.thing) * hits.cosine
-    energy = reflected / hits.distance**2 / beam.rays
-    shape = len(bearings), beam.rays
+    energy = reflected / hits.distance**2 / shape[1]
     reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
     dazzled = world.dazzling[hits.thing].reshape(shape).any(axis=1)
     return Readings(reading, total, dazzled)
@@ -258,10 +250,9 @@ def measured(
     """
     noise = beam.sigma_range * rng.standard_normal(ideal.reading.shape)
     ranges = ideal.reading + beam.systematic + noise
-    reasons = np.where(ideal.total > 0, WEAK, NOT_VALID)
-    reasons[np.isfinite(ideal.reading)] = 0
-    reasons[ideal.dazzled] = DAZZLED
-    return np.clip(ranges, 0, None), reasons
+    read = np.isfinite(ideal.reading)
+    known = [ideal.dazzled, read, ideal.total > 0]
+    return np.clip(ranges, 0, None), np.select(known, [DAZZLED, 0, WEAK], NOT_VALID)
 
 
 def scan(

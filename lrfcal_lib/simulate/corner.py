@@ -6,8 +6,8 @@ and the outer edges only to tell which shots show the whole corner.
 
 import numpy as np
 
-from lrfcal_lib.model.camera import line_through, pinhole
-from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
+from lrfcal_lib.model.camera import pinhole
+from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array, unit_lines
 
 EDGE = np.array(
     [-0.5, -0.5, 0.70711]
@@ -50,29 +50,25 @@ def _scanned(setup, rng, T_lrf_target):
     )  # in the frame of the target but for its place
     rays = polar_to_points(1.0, setup.bearings())
     turned = rays @ R
-    fits = []
-    enough = True
-    for plate in PLATES:
-        normal = np.cross(plate, EDGE)
-        ranges = (origin @ normal) / (turned @ normal)
-        on_plate = ranges[..., None] * turned - origin
-        away = on_plate @ plate
-        hit = (ranges > 0) & (away > 0) & (away < SIZE) & (np.abs(on_plate @ EDGE) < SIZE)
-        enough = enough & (hit.sum(axis=1) >= FEWEST_POINTS)
-        noisy = ranges + setup.range_errors(rng, ranges.shape)
-        fits.append(_fitted(noisy[..., None] * rays[:, :2], hit))
-    meeting = np.cross(*fits)
+    plates = PLATES[:, None]  # what follows is of both plates, (2, n, B)
+    normals = np.cross(plates, EDGE)
+    ranges = np.matvec(origin, normals) / np.matvec(turned, normals)
+    on_plate = ranges[..., None] * turned - origin
+    away = np.matvec(on_plate, plates)
+    hit = (ranges > 0) & (away > 0) & (away < SIZE) & (np.abs(on_plate @ EDGE) < SIZE)
+    enough = (hit.sum(axis=-1) >= FEWEST_POINTS).all(axis=0)
+    noisy = ranges + setup.range_errors(rng, ranges.shape)
+    meeting = np.cross(*_fitted(noisy[..., None] * rays[:, :2], hit))
     return meeting / meeting[:, 2:] * [1.0, 1.0, 0.0], enough
 
 
 def _fitted(points, used):
-    """Total least-squares lines (n, 3) through the used ones of some points (n, B, 2)."""
-    weight = used / np.maximum(used.sum(axis=1, keepdims=True), 1)
-    middle = np.vecmat(weight, points)
-    away = points - middle[:, None]
-    scatter = (weight[..., None] * away).mT @ away
-    normal = np.linalg.eigh(scatter)[1][..., 0]
-    return np.column_stack([normal, -np.vecdot(normal, middle)])
+    """Total least-squares lines (..., 3) through the used ones of some points (..., B, 2)."""
+    weight = (used / np.maximum(used.sum(axis=-1, keepdims=True), 1))[..., None]
+    middle = np.sum(weight * points, axis=-2, keepdims=True)
+    away = points - middle
+    normal = np.linalg.eigh((weight * away).mT @ away)[1][..., 0]
+    return np.concatenate([normal, -np.matvec(middle, normal)], axis=-1)
 
 
 def _image_lines(setup, rng, T_camera_target):
@@ -87,8 +83,9 @@ def _image_lines(setup, rng, T_camera_target):
     first = inside.argmax(axis=-1)
     last = SAMPLES - 1 - inside[..., ::-1].argmax(axis=-1)
     ends = np.take_along_axis(uv, np.stack([first, last], axis=-1)[..., None], axis=2)
-    length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
-    whole = (inside.any(axis=-1) & (length > LEAST_LENGTH)).all(axis=1)
+    long = np.linalg.norm(np.diff(ends, axis=2), axis=-1) > LEAST_LENGTH
+    whole = (inside.any(axis=-1, keepdims=True) & long).all(axis=(1, 2))
 
     noisy = ends[:, 0] + setup.sigma_px * rng.standard_normal(ends[:, 0].shape)
-    return line_through(noisy[:, 1], noisy[:, 0]), whole
+    start, end = np.moveaxis(np.insert(noisy, 2, 1.0, axis=-1), 1, 0)
+    return unit_lines(np.cross(start, end)), whole

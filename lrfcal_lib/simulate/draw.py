@@ -5,9 +5,8 @@ Monte-Carlo trials by the hundred. It returns plain arrays and knows no solver. 
 :mod:`lrfcal_lib.simulate.shots`.
 """
 
-from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
@@ -19,6 +18,7 @@ from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import (
     AHEAD,
+    carry,
     gradient_by_pose,
     move_pose,
     polar_to_points,
@@ -38,11 +38,9 @@ REACH = 2  # beams kept on either side of an edge, along and across the scan lin
 class Devices:
     """What beam and camera are, and how noisy."""
 
-    model: CameraModel = field(
-        default_factory=lambda: CameraModel(1280, 960, 1e3, 1e3, 639.5, 479.5, np.zeros(5))
-    )
+    model: CameraModel = CameraModel(1280, 960, 1e3, 1e3, 639.5, 479.5)
     # A board without a pattern is seen as one with 23 corners
-    board: Board = field(default_factory=triangle_board)
+    board: Board = triangle_board()
     step: float = np.radians(0.5)  # between beams, radians
     # diameter at the window (metres) and its growth (radians)
     spot: tuple[float, float] = (0.016, 0.0119)
@@ -91,9 +89,8 @@ def bench(
     """
     turn = Rotation.from_rotvec([0.0, *rng.normal(0, 0.02, 2)])
     head = RigidTransform.from_components([0.0, *rng.normal(0, 0.05, 2)], turn)
-    poses = {}
-    for i, name in enumerate(cameras):
-        poses[name] = upright_camera(rng, 2 * i - 1)  # the first camera on the left
+    # the first camera on the left
+    poses = {name: upright_camera(rng, 2 * i - 1) for i, name in enumerate(cameras)}
     return Bench(head, poses, **settings)
 
 
@@ -101,7 +98,7 @@ def upright_camera(rng, side, *shape):
     """Poses ``T_camera_lrf`` of cameras beside the LRF, left (-1) or right, mounted wrongly."""
     rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (*shape, 3))) * AHEAD
     centre = np.array([0.12 * side, 0.03, 0.12]) + rng.normal(0, 0.01, (*shape, 3))
-    return RigidTransform.from_components(-rotation.apply(centre), rotation)
+    return carry(rotation, centre)
 
 
 def board_poses(
@@ -161,9 +158,7 @@ def observe(
     dict
         Keyword arguments of :class:`lrfcal_lib.model.observations.JointObservations`.
     """
-    parts = defaultdict(list)
-    middle = []
-    count = len(poses)
+    parts = []
     for number, pose in enumerate(poses):
         pitch, bearings = _grid(bench, pose, span)
         drawn = _scan_lines(bench, pose, pitch, bearings, rng, noise)
@@ -171,16 +166,12 @@ def observe(
         drawn |= _views(bench, pose, between, rng, noise)
         for kind in ("face", "beam", "view"):
             drawn[f"{kind}_placement"] = np.full(len(drawn[f"{kind}_pitch"]), number)
-        for key, values in drawn.items():
-            parts[key].append(values)
-        middle.append(float(pitch.mean()))
-    direction = np.zeros(count, int)
-    if span != 0:
-        direction = np.where(np.arange(count) % 2, -1, 1)
-    return {name: np.concatenate(values) for name, values in parts.items()} | {
+        drawn["middle"] = [pitch.mean()]
+        parts.append(drawn)
+    count = len(poses)
+    return end_to_end(parts) | {
         "placements": np.arange(1, count + 1),
-        "middle": np.array(middle),
-        "direction": direction,
+        "direction": np.resize([1, -1], count) * (span != 0),
         "edges": bench.board.edges,
         "corners": np.asarray(bench.board.corners, float),
         "cameras": tuple(bench.cameras),
@@ -188,16 +179,20 @@ def observe(
     }
 
 
+def end_to_end(parts):
+    """Parts of a table, columns by name, as one."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
 def _grid(bench, pose, span):
     """Recorded pitch of the scan lines over a board, and bearings of the beams about it."""
     p = pose.apply(bench.board.points())
     up = np.arctan2(p[:, 2], p[:, 1])
-    middle = np.arctan2(*p.mean(axis=0)[[2, 1]])
+    _, ahead, above = p.mean(axis=0)
+    middle = np.arctan2(above, ahead)
     if span is None:
-        half = max(up.max() - middle, middle - up.min()) + 6 * bench.pitch_step
-    else:
-        half = span / 2
-    steps = int(half / bench.pitch_step)
+        span = 2 * (np.abs(up - middle).max() + 6 * bench.pitch_step)
+    steps = int(span / 2 / bench.pitch_step)
     pitch = middle + bench.pitch_step * np.arange(-steps, steps + 1)
     p_head = tilt(p[:, None], -pitch * (1 + bench.stretch)).reshape(-1, 3)
     p_lrf = bench.T_head_lrf.inv().apply(p_head)
@@ -212,7 +207,7 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     true = pitch[:, None] * (1 + bench.stretch)
     R = pose.rotation.as_matrix()
     head = bench.T_head_lrf
-    p_head = head.rotation.apply(polar_to_points(np.ones(len(bearings)), bearings))
+    p_head = head.rotation.apply(polar_to_points(1.0, bearings))
     rays = tilt(p_head, true) @ R
     origin = (tilt(head.translation, true) - pose.translation) @ R
     distances, r = beside(bench.board, origin, rays)
@@ -225,11 +220,11 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     bias = _bias_of_sides(bench, rng)[edge]
     hit = (u + jitter < bias * radius) & sensible
     # near to an edge across the scan lines, and along them
-    changes = (np.diff(hit, axis=axis, append=hit.take([-1], axis)) for axis in (0, 1))
-    across, along = (
-        maximum_filter1d(c, 2 * REACH, axis, mode="constant")
-        for axis, c in enumerate(changes)
-    )
+    near = []
+    for axis in (0, 1):
+        changes = np.diff(hit, axis=axis, append=hit.take([-1], axis))
+        near.append(maximum_filter1d(changes, 2 * REACH, axis, mode="constant"))
+    across, along = near
     second = np.sort(distances, axis=-1)[..., -2]
     alone = second <= -2 * radius  # elsewhere two edges cut the spot
     row, b = np.nonzero((across | along) & alone & sensible)
@@ -261,20 +256,19 @@ def _bias_of_sides(bench, rng):
 
 def _views(bench, pose, at, rng, noise):
     """Poses of the board in the cameras at recorded pitch angles, with errors."""
-    true = []
     pitch = at * (1 + bench.stretch)  # of the head
     if bench.sigma_stop:  # one error for all cameras
         pitch = pitch + noise * bench.sigma_stop * rng.standard_normal(len(at))
     still = RigidTransform.identity(len(at))
     T_source_platform = camera_at(still, bench.mount, bench.T_head_lrf, pitch)
-    for camera in bench.cameras.values():
-        true.append((camera * T_source_platform * pose).as_matrix())
-    true = np.concatenate([*true, np.zeros((0, 4, 4))])
-    drawn, covariance, _ = seen_poses(bench, true[:, :3], rng, noise)
+    cameras = bench.cameras.values()
+    true = [(camera * T_source_platform * pose).as_matrix() for camera in cameras]
+    poses = np.concatenate(true)
+    poses[:, :3], covariance, _ = seen_poses(bench, poses[:, :3], rng, noise)
     return {
-        "view_camera": np.repeat(np.arange(len(bench.cameras)), len(at)),
-        "view_pitch": np.tile(at, len(bench.cameras)),
-        "view_pose": np.concatenate([drawn, true[:, 3:]], axis=1),
+        "view_camera": np.repeat(np.arange(len(cameras)), len(at)),
+        "view_pitch": np.tile(at, len(cameras)),
+        "view_pose": poses,
         "view_covariance": covariance,
     }
 
@@ -283,10 +277,10 @@ def posed(spin, lean, centre, middle):
     """Poses of boards with their middle (board frame) at a centre (n, 3), which face the LRF but
     for a lean (n, 2) about x and y, and are turned in their plane by a spin (n,).
     """
-    leant = np.insert(lean, 2, 0.0, axis=1)
+    leant = np.pad(lean, ((0, 0), (0, 1)))
     turned = np.outer(spin, [0.0, 0.0, 1.0])
     facing = AHEAD * Rotation.from_rotvec(leant) * Rotation.from_rotvec(turned)
-    return RigidTransform.from_components(centre - facing.apply(middle), facing)
+    return carry(facing, middle, centre)
 
 
 def beside(board, origin, rays):

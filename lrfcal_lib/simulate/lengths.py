@@ -34,13 +34,13 @@ def room_lengths() -> list[dict]:
     """
     lengths = []
     for row in LENGTHS:
-        first, second = (_corners(*end) for end in row["ends"])
+        ends = [_corners(*end) for end in row["ends"]]
         lengths.append(
             {
                 "name": row["name"],
                 "kind": row["kind"],
-                "metres": _distance(row["name"], first, second),
-                "ends": [first.tolist(), second.tolist()],
+                "metres": _distance(row["name"], *ends),
+                "ends": [corners.tolist() for corners in ends],
             }
         )
     return lengths
@@ -62,16 +62,16 @@ def _corners(part, number, sides):
 
 def _distance(name, first, second):
     """Between two parallel faces, or two parallel edges: metres."""
-    directions = []
-    for corners in (first, second):
-        spread = corners - corners.mean(axis=0)
-        axes = np.linalg.svd(spread, full_matrices=True)[2]
-        # the normal of a face, the direction of an edge
-        directions.append(axes[2] if len(corners) == 4 else axes[0])
-    tilted = np.linalg.norm(np.cross(*directions))
+    faces = len(first) == 4
+    ends = np.stack([first, second])
+    middles = ends.mean(axis=1)
+    axes = np.linalg.svd(ends - middles[:, None])[2]
+    # the normals of faces, the directions of edges
+    one, other = axes[:, 2 if faces else 0]
+    tilted = np.linalg.norm(np.cross(one, other))
     need(tilted < PARALLEL, f"'{name}': its ends are not parallel")
-    way = second.mean(axis=0) - first.mean(axis=0)
-    along = abs(way @ directions[0])
-    if len(first) == 4:
-        return float(along)
-    return float(np.linalg.norm(way - (way @ directions[0]) * directions[0]))
+    way = middles[1] - middles[0]
+    along = way @ one
+    if faces:
+        return float(abs(along))
+    return float(np.linalg.norm(way - along * one))

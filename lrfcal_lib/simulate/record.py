@@ -1,7 +1,6 @@
 """Record a session with a simulated rig: telegrams, platform log, images and the truth."""
 
 import json
-import math
 import os
 import shutil
 from dataclasses import asdict
@@ -11,6 +10,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.kinematics import MIRROR_TURN
@@ -22,7 +22,7 @@ from lrfcal_lib.session.lms2xx_codec import (
 from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.session.workers import spread
-from lrfcal_lib.session.write import SessionWriter, as_lines, write_file
+from lrfcal_lib.session.write import SessionWriter, write_file
 from lrfcal_lib.simulate.beam import scan
 from lrfcal_lib.simulate.lengths import room_lengths
 from lrfcal_lib.simulate.rig import Placement, Setup, held_close, placements_of, random
@@ -57,13 +57,12 @@ class Stops(NamedTuple):
 class Shots(NamedTuple):
     """Images of one camera, by its number in the rig, at one placement.
 
-    `poses` are ``T_camera_platform``, `key` that of the random numbers. The board held close to a
-    camera is placement -1.
+    `key` is that of the random numbers. The board held close to a camera is placement -1.
     """
 
     camera: int
     placement: Placement
-    poses: list
+    stops: Stops
     key: tuple
 
     @property
@@ -99,15 +98,10 @@ def world_of(
     return furnished_room(*(things if stand else things[:1]))
 
 
-def step_angles(first, last, step):
-    """Pitch commands of a stop-and-go sweep: multiples of `step` about from `first` to `last`."""
-    low, high = sorted((first, last))
-    angles = np.arange(math.floor(low / step), math.ceil(high / step) + 1) * step
-    return angles if last >= first else angles[::-1]
-
-
 def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     """Where the head stands for the images and for the scan lines of a placement.
+
+    Scan lines are at multiples of the step, about from the first to the last pitch of the sweep.
 
     Parameters
     ----------
@@ -118,10 +112,12 @@ def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     if placement.T_platform_board is None:
         _, _, step = setup.room_sweep  # type: ignore[misc]
     rng = random(setup, STOPS, placement.number)
-    images = np.asarray(placement.image_pitch)
-    lines = step_angles(*placement.sweep, step)
+    way = placement.direction
+    images = np.array(placement.image_pitch)
+    low, high = sorted(placement.sweep)
+    lines = np.arange(np.floor(low / step), np.ceil(high / step) + 1)[::way] * step
     stop = setup.rig.platform.stop
-    return [Stops(c, *stop(c, placement.direction, rng)) for c in (images, lines)]
+    return [Stops(commanded, *stop(commanded, way, rng)) for commanded in (images, lines)]
 
 
 def sweep_of(setup, placement):
@@ -152,24 +148,24 @@ def close_views(setup: Setup, number: int) -> list[RigidTransform]:
 def shots_of(setup, placements):
     """All images of a setup in the order in which they are written, a list of Shots."""
     out = []
-    rig = setup.rig
-    for number, camera in enumerate(rig.cameras):
-        still = [rig.camera_pose(camera, 0.0)]
+    cameras = range(len(setup.rig.cameras))
+    still = Stops(*np.zeros((3, 1)))
+    for number in cameras:
         for i, pose in enumerate(close_views(setup, number)):
             close = Placement(-1, pose, sweep=(0.0, 0.0), image_pitch=(0.0,))
             out.append(Shots(number, close, still, (PHOTO, number, 0, i)))
     for placement in placements:
         stops, _ = stops_of(setup, placement)
-        for number, camera in enumerate(rig.cameras):
-            poses = [rig.camera_pose(camera, pitch) for pitch in stops.true]
+        for number in cameras:
             key = (PHOTO, number, placement.number)
-            out.append(Shots(number, placement, poses, key))
+            out.append(Shots(number, placement, stops, key))
     return out
 
 
 def photograph(setup, shots):
     """Take pictures, a list of JPEG files as bytes."""
-    camera = setup.rig.cameras[shots.camera]
+    rig = setup.rig
+    camera = rig.cameras[shots.camera]
     imager = Imager(camera.model, camera.exposure)
     placement = shots.placement
     world = world_of(
@@ -179,10 +175,11 @@ def photograph(setup, shots):
         T_room_platform=placement.T_room_platform,
     )
     rng = random(setup, *shots.key)
+    poses = rig.camera_pose(camera, shots.stops.true)
     quality = [cv2.IMWRITE_JPEG_QUALITY, setup.quality]
     return [
         cv2.imencode(".jpg", imager.render(world, pose, rng), quality)[1].tobytes()
-        for pose in shots.poses
+        for pose in poses
     ]
 
 
@@ -227,7 +224,20 @@ def _record(folder, name, setup):
         "recording": RECORDING,
         "scene_placements": [p.number for p in placements if p.T_platform_board is None],
     }
-    truth = _truth(setup, placements)
+    # what only the simulator knows
+    truth = {
+        "simulated": True,
+        "setup": setup.name,
+        "seed": setup.seed,
+        **rig.truth(),
+        "boards": {},
+        "lrf": asdict(rig.beam),
+        "platform": asdict(rig.platform),
+        "sweeps": {},
+        "images": {},
+    }
+    if setup.stations:
+        truth |= {"stations": {}, "lengths": room_lengths()}
     with SessionWriter(
         folder,
         rig.board,
@@ -242,38 +252,15 @@ def _record(folder, name, setup):
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}",
     ) as writer:
         log = _add_placements(writer, setup, placements, truth)
-    write_file(folder, "platform.csv", as_lines([PLATFORM_COLUMNS, *log]))
+    table = pd.DataFrame(log, columns=PLATFORM_COLUMNS)
+    rows = table.to_csv(index=False, float_format="%.4f")
+    write_file(folder, "platform.csv", rows.encode())
     write_file(folder, "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
 
 
-def _truth(setup, placements):
-    """What only the simulator knows, as truth.json has it; sweeps and images come later."""
-    rig = setup.rig
-    boards = {}
-    stations = {}
-    for p in placements:
-        if p.T_platform_board is not None:
-            boards[p.number] = {"T_platform_board": transform_to_json(p.T_platform_board)}
-        if p.T_room_platform is not None:
-            stations[p.number] = {"T_room_platform": transform_to_json(p.T_room_platform)}
-    truth = {
-        "simulated": True,
-        "setup": setup.name,
-        "seed": setup.seed,
-        **rig.truth(),
-        "boards": boards,
-        "lrf": asdict(rig.beam),
-        "platform": asdict(rig.platform),
-        "sweeps": {},
-        "images": {},
-    }
-    if stations:
-        truth |= {"stations": stations, "lengths": room_lengths()}
-    return truth
-
-
 def _add_placements(writer, setup, placements, truth):
-    """Write the images for the intrinsics, then images and sweep of each placement.
+    """Write the images for the intrinsics, then images and sweep of each placement, and note where
+    all was.
 
     Returns the rows of the platform's log.
     """
@@ -283,48 +270,56 @@ def _add_placements(writer, setup, placements, truth):
     log = []
     took = beam.turns * MIRROR_TURN
     unit = beam.unit_name
-    configuration = Configuration().changed(measuring_mode=0, unit=unit)
+    configuration = Configuration().changed(unit=unit)
     writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
     shots = shots_of(setup, placements)
-    files = iter(spread(partial(photograph, setup), shots))
-    close = [s for s in shots if s.purpose == "intrinsics"]
-    still = np.zeros(1)
-    _add_images(writer, setup, close, files, truth, Stops(still, still, still), [np.nan])
+    taken = list(zip(shots, spread(partial(photograph, setup), shots), strict=True))
+    close = [pair for pair in taken if pair[0].purpose == "intrinsics"]
+    _add_images(writer, setup, close, truth, [np.nan])
     for placement in placements:
+        number = placement.number
+        board = placement.T_platform_board
+        if board is not None:
+            truth["boards"][number] = {"T_platform_board": transform_to_json(board)}
+        station = placement.T_room_platform
+        if station is not None:
+            truth["stations"][number] = {"T_room_platform": transform_to_json(station)}
         images, lines = stops_of(setup, placement)
         shot_at = clock + pause * np.arange(1, len(images.true) + 1)
-        own = [s for s in shots if s.placement == placement]
-        _add_images(writer, setup, own, files, truth, images, shot_at)
+        own = [pair for pair in taken if pair[0].placement == placement]
+        _add_images(writer, setup, own, truth, shot_at)
         first = shot_at[-1] + pause
         began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
         arrived = np.round(began + took + REPLY_TIME, 4)
-        writer.add_telegrams(placement.number, telegrams, lines.measured, arrived)
+        writer.add_telegrams(number, telegrams, lines.measured, arrived)
         for stops, times in ((images, shot_at), (lines, began)):
-            rows = [times, np.degrees(stops.commanded), np.degrees(stops.measured)]
-            log += [[f"{value:.4f}" for value in row] for row in np.transpose(rows)]
-        truth["sweeps"][placement.number] = {"pitch_rad": lines.true.tolist()}
+            angles = np.degrees([stops.commanded, stops.measured])
+            log += zip(times, *angles, strict=True)
+        truth["sweeps"][number] = {"pitch_rad": lines.true.tolist()}
         clock = float(began[-1] + took + pause)
     return log
 
 
-def _add_images(writer, setup, shots, files, truth, stops, times):
-    """Write the next images, with where the head then stood."""
-    for shot, images in zip(shots, files, strict=False):
-        name = setup.rig.cameras[shot.camera].name
-        placement = shot.placement
-        for i, data in enumerate(images):
+def _add_images(writer, setup, taken, truth, times):
+    """Write images as JPEG files, each with its shot: where the head then stood."""
+    rig = setup.rig
+    for shot, images in taken:
+        camera = rig.cameras[shot.camera]
+        name = camera.name
+        board = shot.placement.T_platform_board
+        stops = zip(images, times, shot.stops.true, shot.stops.measured, strict=True)
+        for data, time_s, true, measured in stops:
             writer.add_image(
                 name,
                 data,
-                placement.number,
-                pitch=float(stops.measured[i]),
-                time_s=float(np.round(times[i], 4)),
+                shot.placement.number,
+                pitch=measured,
+                time_s=np.round(time_s, 4),
                 purpose=shot.purpose,
             )
-            known = {"pitch_rad": float(stops.true[i])}
-            if placement.T_platform_board is not None:
-                known["T_camera_board"] = transform_to_json(
-                    shot.poses[i] * placement.T_platform_board
-                )
+            known = {"pitch_rad": float(true)}
+            if board is not None:
+                T_camera_board = rig.camera_pose(camera, true) * board
+                known["T_camera_board"] = transform_to_json(T_camera_board)
             truth["images"][f"images/{name}/{writer.shots[name]:04d}.jpg"] = known

@@ -18,10 +18,10 @@ from pydantic import (
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.board import Board, Chessboard, triangle_board
+from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.model.geometry import AHEAD, apply_pose, pose_array, tilt
-from lrfcal_lib.model.kinematics import camera_at
+from lrfcal_lib.model.geometry import AHEAD, apply_pose, carry, pose_array
+from lrfcal_lib.model.kinematics import beams_to, camera_at
 from lrfcal_lib.session.stated import (
     CameraInfo,
     board_to_json,
@@ -29,10 +29,11 @@ from lrfcal_lib.session.stated import (
     transform_to_json,
 )
 from lrfcal_lib.simulate.beam import LMS221, Beam
+from lrfcal_lib.simulate.scenarios import in_radians
 from lrfcal_lib.simulate.scene import Exposure, need
+from lrfcal_lib.simulate.shots import PATTERN
 
 MOST_TRIES = 4000
-SCAN_ROUNDS = 20  # of the pitch at which the scan plane meets a point; each gains a digit
 PITCH_GRID = np.radians(
     np.arange(-30.0, 30.1, 0.5)
 )  # pitch angles at which an image may be taken
@@ -65,7 +66,7 @@ class Platform:
     limits: tuple[float, float] = (-math.radians(60), math.radians(60))
 
     def stop(
-        self, commanded: ArrayLike, direction: float, rng: np.random.Generator
+        self, commanded: np.ndarray, direction: float, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Where the head comes to rest.
 
@@ -83,32 +84,25 @@ class Platform:
         -------
         true, measured : ndarray, shape (n,)
             Pitch, radians.
-        """
-        commanded = np.asarray(commanded, float)
-        step = self.encoder_step
-        self.check(commanded)
-        motor = commanded + self.noise * rng.standard_normal(commanded.shape)
-        head = (1 + self.stretch) * motor - direction * self.backlash / 2
-        return head, np.rint(motor / step) * step if step else motor
-
-    def check(self, pitch: np.ndarray) -> None:
-        """Refuse angles beyond the limits.
-
-        Parameters
-        ----------
-        pitch
-            Radians, shape (n,).
 
         Raises
         ------
         ValueError
+            For angles beyond the limits.
         """
-        low, high = self.limits
-        first = np.degrees(np.min(pitch, initial=0.0))
-        last = np.degrees(np.max(pitch, initial=0.0))
-        asked = f"platform: pitch {first:.2f} to {last:.2f} deg is asked for"
-        turns = f"it turns {np.degrees(low):.2f} to {np.degrees(high):.2f} deg"
-        need(np.all((low <= pitch) & (pitch <= high)), f"{asked}, {turns}")
+        angles = np.degrees(commanded)
+        low, high = np.degrees(self.limits)
+        first = angles.min(initial=0.0)
+        last = angles.max(initial=0.0)
+        need(
+            low <= first and last <= high,
+            f"platform: pitch {first:.2f} to {last:.2f} deg is asked for, it turns {low:.2f} to "
+            f"{high:.2f} deg",
+        )
+        step = self.encoder_step
+        motor = commanded + self.noise * rng.standard_normal(commanded.shape)
+        head = (1 + self.stretch) * motor - direction * self.backlash / 2
+        return head, np.rint(motor / step) * step if step else motor
 
 
 @dataclass(frozen=True)
@@ -166,34 +160,22 @@ class Rig:
             }
             for c in self.cameras
         }
-        head = transform_to_json(self.T_head_lrf)
-        board = board_to_json(self.board)
-        return {"T_head_lrf": head, "cameras": cameras, "board": board}
+        return {
+            "T_head_lrf": transform_to_json(self.T_head_lrf),
+            "cameras": cameras,
+            "board": board_to_json(self.board),
+        }
 
-    def sweep_pitch(self, p_platform):
-        """Pitch (n,) at which the scan plane meets points (n, 3), and their bearing there, radians.
 
-        The head turns by what the point lies off the scan plane until it lies in it.
-        """
-        back = self.T_head_lrf.inv()
-        pitch = np.zeros(len(p_platform))
-        for _ in range(SCAN_ROUNDS):
-            x, y, z = back.apply(tilt(p_platform, -pitch)).T
-            pitch = pitch + np.arctan2(z, y)
-        return pitch, np.arctan2(y, x)
+def shows(model, T_camera_board, points, margin):
+    """Whether a camera sees points of a board well inside the image: by a margin, pixels.
 
-    def shows(self, camera, T_camera_board, points=None, margin=12.0):
-        """Whether a camera sees points of the board (corners by default) well inside the image.
-
-        For a pose, or each of a stack of poses; the margin is in pixels.
-        """
-        if points is None:
-            points = self.board.points()
-        p = apply_pose(pose_array(T_camera_board), points)
-        uv = project(p, camera.model)
-        within_45_deg = np.abs(p[..., :2]) <= p[..., 2:]
-        ahead = (p[..., 2] >= 0.1) & within_45_deg.all(axis=-1)
-        return np.all(ahead & camera.model.shows(uv, margin), axis=-1)
+    For a pose, or each of a stack of poses.
+    """
+    p = apply_pose(pose_array(T_camera_board), points)
+    within_45_deg = np.abs(p[..., :2]) <= p[..., 2:]
+    ahead = (p[..., 2] >= 0.1) & within_45_deg.all(axis=-1)
+    return np.all(ahead & model.shows(project(p, model), margin), axis=-1)
 
 
 @pydantic.dataclasses.dataclass(frozen=True)
@@ -217,9 +199,7 @@ class Setup:
 
 def printed_triangle() -> Board:
     """The paper's triangle (315 and 380 mm, a right angle) with 4 x 5 inner corners beside it."""
-    return triangle_board(
-        name="triangle_315_380", pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))
-    )
+    return triangle_board(name="triangle_315_380", pattern=PATTERN)
 
 
 SETUPS = json.loads(Path(__file__).with_name("setups.json").read_text())
@@ -238,27 +218,27 @@ def load_setup(name: str) -> Setup:
         For a name that is not there.
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
-    row = _radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
+    row = in_radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
     width = row["image_width"]
     cameras = [_camera(key, camera, width) for key, camera in row["cameras"].items()]
     rig = Rig(
         beam=replace(LMS221, **row["beam"]),
-        platform=Platform(**_radians(row["platform"])),
+        platform=Platform(**in_radians(row["platform"])),
         T_head_lrf=_placed(row["head"]),
         T_head_lrf_stated=_placed(row["head_stated"]),
         cameras=tuple(cameras),
         board=printed_triangle(),
     )
     stations = tuple(_placed(station) for station in row.get("stations", ()))
-    settings = {key: row[key] for key in Setup.__dataclass_fields__.keys() & row.keys()}
-    return Setup(**settings | {"name": name, "rig": rig, "stations": stations})
+    # what else is in the row the Setup ignores
+    return Setup(**row | {"name": name, "rig": rig, "stations": stations})
 
 
 def _camera(name, row, width):
     """A camera with images so many pixels wide."""
     scale = width / row["size"][0]
     turn = Rotation.from_rotvec(row["turn"], degrees=True) * AHEAD
-    mounting = RigidTransform.from_components(-turn.apply(row["centre"]), turn)
+    mounting = carry(turn, row["centre"])
     off = Rotation.from_rotvec(row["guess"]["turn"], degrees=True)
     shift = mounting.translation + row["guess"]["shift"]
     guess = RigidTransform.from_components(shift, off * mounting.rotation)
@@ -272,18 +252,6 @@ def _placed(row):
     """The transform of a shift and a turn."""
     turn = Rotation.from_rotvec(row["turn"], degrees=True)
     return RigidTransform.from_components(row["shift"], turn)
-
-
-def _radians(row):
-    """A row with what ends in _deg in radians, and no lists."""
-    turned = {}
-    for key, value in row.items():
-        if key.endswith("_deg"):
-            value = np.radians(value).tolist()
-        if isinstance(value, list):
-            value = tuple(value)
-        turned[key.removesuffix("_deg")] = value
-    return turned
 
 
 @dataclass(frozen=True)
@@ -324,14 +292,9 @@ def placements_of(setup: Setup) -> list[Placement]:
     if setup.room_sweep:
         first, last, _ = setup.room_sweep
         for T_room_platform in setup.stations or (None,):
-            room = Placement(
-                number=len(out) + 1,
-                T_platform_board=None,
-                sweep=(first, last),
-                image_pitch=setup.room_images,
-                T_room_platform=T_room_platform,
-            )
-            out.append(room)
+            number = len(out) + 1
+            sweep = (first, last)
+            out.append(Placement(number, None, sweep, setup.room_images, T_room_platform))
     return out
 
 
@@ -411,7 +374,7 @@ def _pair(rig, distance, turn, rng):
         angles = [*lean, turn + more + rng.uniform(-12, 12)]
         leant = Rotation.from_euler("YXZ", angles, degrees=True)
         turned = Rotation.from_euler("z", -azimuth) * AHEAD * leant
-        out.append(RigidTransform.from_components(middle - turned.apply(centre), turned))
+        out.append(carry(turned, centre, middle))
     return out
 
 
@@ -420,13 +383,15 @@ def _spans(rig, pose, margin):
 
     None where that is too little.
     """
+    points = rig.board.points()
     shown = np.ones(len(PITCH_GRID), bool)
     for camera in rig.cameras:
-        shown &= rig.shows(camera, rig.camera_pose(camera, PITCH_GRID) * pose)
+        poses = rig.camera_pose(camera, PITCH_GRID) * pose
+        shown &= shows(camera.model, poses, points, margin=12.0)
     seen = PITCH_GRID[shown]
     if not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
         return None
-    pitch, bearing = rig.sweep_pitch(pose.apply(rig.board.points()))
+    bearing, pitch, _ = beams_to(pose.apply(points), rig.T_head_lrf)
     half_field = np.radians(rig.beam.field_of_view / 2)
     if np.abs(bearing - np.pi / 2).max() >= half_field - 2 * margin:
         return None
@@ -475,10 +440,10 @@ def held_close(
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])
             turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
             place = z * m.sights(shown)
-            shift = place - turn.apply(points.mean(axis=0))
-            pose = RigidTransform.from_components(shift, turn)
-            if rig.shows(camera, pose, points, margin=18.0):
+            pose = carry(turn, points.mean(axis=0), place)
+            if shows(m, pose, points, margin=18.0):
                 out.append(pose)
                 break
-    need(len(out) == count, f"the pattern does not fit into the image of '{camera.name}'")
+        else:
+            raise ValueError(f"the pattern does not fit into the image of '{camera.name}'")
     return out

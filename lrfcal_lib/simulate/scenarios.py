@@ -25,15 +25,26 @@ def load_scenario(name: str) -> Scenario:
     """A scenario of ``scenarios.json``; ValueError names those that there are."""
     if name not in FILE:
         raise ValueError(f"unknown scenario {name!r}: use one of {', '.join(FILE)}")
-    settings: dict[str, Any] = {}
-    for key, value in FILE[name].items():
+    settings = in_radians(FILE[name])
+    made = {key: MADE[key](settings[key]) for key in MADE.keys() & settings.keys()}
+    return Scenario(name=name, **settings | made)
+
+
+def in_radians(row: dict) -> dict[str, Any]:
+    """A row of a file with what ends in _deg in radians, and no lists.
+
+    Parameters
+    ----------
+    row
+    """
+    turned = {}
+    for key, value in row.items():
         if key.endswith("_deg"):
-            key = key.removesuffix("_deg")
             value = np.radians(value).tolist()
-        if key in MADE:
-            value = MADE[key](value)
-        settings[key] = tuple(value) if isinstance(value, list) else value
-    return Scenario(name=name, **settings)
+        if isinstance(value, list):
+            value = tuple(value)
+        turned[key.removesuffix("_deg")] = value
+    return turned
 
 
 def varied(scenario: Scenario, key: str, value: float) -> Scenario:

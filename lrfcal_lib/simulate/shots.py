@@ -8,11 +8,19 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array, unit_vector
+from lrfcal_lib.model.geometry import (
+    apply_pose,
+    carry,
+    polar_to_points,
+    pose_array,
+    unit_lines,
+    unit_vector,
+)
 from lrfcal_lib.simulate.corner import corner_shots
 from lrfcal_lib.simulate.draw import (
     Devices,
     beside,
+    end_to_end,
     posed,
     seen_poses,
     upright_camera,
@@ -38,11 +46,10 @@ class Scenario(Devices):
     """
 
     name: str = "own"
-    varied: dict[str, float] = field(
-        default_factory=dict
-    )  # settings that differ from its file
+    # settings that differ from its file
+    varied: dict[str, float] = field(default_factory=dict)
     about: str = ""
-    board: Board = field(default_factory=lambda: triangle_board(pattern=PATTERN))
+    board: Board = triangle_board(pattern=PATTERN)
     field_of_view: tuple[float, float] = (np.radians(40.0), np.radians(140.0))
     uniform: bool = False  # the errors of ranges; normal otherwise
     floor: float = LEAST_STEP
@@ -118,7 +125,7 @@ class Scenario(Devices):
         away = rng.uniform(*self.distances, count)
         pixels = rng.uniform(0, self.model.size, (count, 2))
         centre = away[:, None] * self.model.sights(pixels)
-        return RigidTransform.from_components(centre - rotation.apply(middle), rotation)
+        return carry(rotation, middle, centre)
 
     def _around(self, rng, count):
         """Poses ``T_world_lrf`` of an LRF that looks at the origin but for turns."""
@@ -178,9 +185,10 @@ def draw_shots(
         conditions, shots = draw(setup, rng, T_camera_lrf[trial])
         usable = np.logical_and.reduce(list(conditions.values()))
         failing.append([100 * np.mean(~good) for good in conditions.values()])
-        parts.append({name: value[usable] for name, value in shots.items()})
-        parts[-1]["trial"] = trial[usable]
-        missing = np.maximum(missing - np.bincount(trial[usable], minlength=trials), 0)
+        shots["trial"] = trial
+        part = {name: value[usable] for name, value in shots.items()}
+        parts.append(part)
+        missing = np.maximum(missing - np.bincount(part["trial"], minlength=trials), 0)
     if missing.any():
         means = zip(np.mean(failing, axis=0), conditions, strict=True)
         shares = [f"{share:.0f} % {words}" for share, words in means]
@@ -189,7 +197,7 @@ def draw_shots(
             f"the camera: {', '.join(shares)}"
         )
 
-    drawn = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    drawn = end_to_end(parts)
     trial = drawn.pop("trial")
     order = np.argsort(trial, kind="stable")
     first = np.searchsorted(trial[order], np.arange(trials))
@@ -227,8 +235,8 @@ def board_shots(setup, rng, T_camera_lrf):
     homography = (
         setup.model.matrix @ true[..., [0, 1, 3]]
     )  # from the board's plane to pixels
-    lines = board.lines()[edges] @ np.linalg.inv(homography)  # normals out of the board
-    lines /= np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
+    # normals out of the board
+    lines = unit_lines(board.lines()[edges] @ np.linalg.inv(homography))
     lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
     return conditions, {
         "ranges": np.where(hit, noisy, np.nan),

@@ -7,10 +7,15 @@ from numpy.typing import ArrayLike
 LATTICE = np.random.default_rng(20091001).random((64,) * 3)
 
 
+def whole_below(values):
+    """The largest whole numbers that are not above values."""
+    return np.floor(values).astype(int)
+
+
 def value_noise(points, cell):
     """Smooth noise (n,) between 0 and 1, from random values on a lattice of cells, metres."""
     at = points / cell
-    low = np.floor(at).astype(np.int64)
+    low = whole_below(at)
     f = at - low
     f = f * f * (3 - 2 * f)
     cells = np.stack([low & 63, (low + 1) & 63])  # (2, n, 3)
@@ -45,48 +50,54 @@ def plain(
     """
     if not rough:
         return np.broadcast_to(color, points.shape)
-    return color * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
+    tone = 1 + rough * (value_noise(points, cell) - 0.5)
+    return tone[:, None] * color
 
 
 def wood(points, color, cell=(0.5, 0.03, 0.03)):
     """Grain along x."""
     tone = 0.8 + 0.4 * value_noise(points, cell)
-    return color * tone[:, None]
+    return tone[:, None] * color
 
 
 def planks(points, color, width=0.18, length=1.4):
     """A wooden floor: boards along y with dark joints."""
     across = points[:, 0] / width
-    row = np.floor(across)
-    board = np.floor(points[:, 1] / length + 0.37 * row)
-    tone = LATTICE[row.astype(int) & 63, board.astype(int) & 63, 7]
-    joint = np.abs(across - np.round(across)) * width
-    dark = np.where(joint < 0.002, 0.55, 1.0)
+    row = whole_below(across)
+    board = whole_below(points[:, 1] / length + 0.37 * row)
+    tone = LATTICE[row & 63, board & 63, 7]
+    dark = np.where(from_whole(across) * width < 0.002, 0.55, 1.0)
     return wood(points, color, (0.03, 0.6, 1.0)) * ((0.85 + 0.3 * tone) * dark)[:, None]
+
+
+def from_whole(values):
+    """How far values are from the nearest whole number."""
+    return np.abs(values - np.round(values))
 
 
 def stripes(points, first, second, period, axis=0):
     """Two colours in turn along an axis."""
-    stripe = np.floor(2 * points[:, axis] / period).astype(int)
-    return np.array([first, second])[stripe & 1]
+    stripe = whole_below(2 * points[:, axis] / period)
+    return np.array([first, second], float)[stripe & 1]
 
 
 def tiles(points, color, joint, size):
     """Square tiles in x and z with joints of 4 mm."""
     at = points[:, [0, 2]] / size
-    near = np.abs(at - np.round(at)).min(axis=1) * size < 0.002
-    tile = color * (0.94 + 0.12 * value_noise(points, size))[:, None]
-    return np.where(near[:, None], joint, tile)
+    near = from_whole(at).min(axis=1) * size < 0.002
+    tone = 0.94 + 0.12 * value_noise(points, size)
+    return np.where(near[:, None], joint, tone[:, None] * color)
 
 
 def printed_page(points, width, height, heading=0.1, line=0.0055):
     """White paper in the plane z = 0 about the origin: words as dark bars, heading, picture."""
     x = points[:, 0] / width + 0.5
     y = 0.5 - points[:, 1] / height
-    row = np.floor(points[:, 1] / line).astype(int)
-    word = np.floor((points[:, 0] + 0.31 * row * line) / (2.1 * line)).astype(int)
+    lines = points[:, 1] / line
+    row = whole_below(lines)
+    word = whole_below((points[:, 0] + 0.31 * row * line) / (2.1 * line))
     ink = LATTICE[row & 63, word & 63, 3] > 0.22
-    ink &= np.mod(points[:, 1] / line, 1.0) < 0.5
+    ink &= np.mod(lines, 1.0) < 0.5
     ink &= between(x, 0.1, 0.9) & between(y, 0.18, 0.93)
     ink |= (np.abs(y - heading) < 0.025) & between(x, 0.2, 0.8)
     grey = np.where(ink, 0.12, 0.86)
@@ -97,7 +108,7 @@ def printed_page(points, width, height, heading=0.1, line=0.0055):
 
 def _grey(levels):
     """Levels (n,) as colours (n, 3)."""
-    return np.repeat(levels[:, None], 3, axis=1)
+    return np.tile(levels[:, None], 3)
 
 
 def between(values, low, high):
@@ -110,7 +121,7 @@ def poster(points, width, height, colors):
     sky, sun, far, near = colors
     x = points[:, 0] / width + 0.5
     y = points[:, 1] / height + 0.5
-    out = sky * (0.7 + 0.4 * y)[:, None]
+    out = (0.7 + 0.4 * y)[:, None] * sky
     from_sun = np.hypot(points[:, 0] - 0.2 * width, points[:, 1] - 0.2 * height)
     far_hills = 0.45 + 0.12 * np.sin(7 * x + 1)
     near_hills = 0.25 + 0.08 * np.sin(11 * x)
@@ -128,11 +139,10 @@ def book_spines(points, seed, pitch=0.035):
     tones = rng.uniform(0.1, 0.6, (64, 1))
     palette = tones * (0.55 + rng.uniform(0.0, 0.6, (64, 3)))
     at = points[:, 0] / pitch
-    color = palette[np.floor(at).astype(int) & 63]
+    color = palette[whole_below(at) & 63]
     label = between(np.mod(points[:, 2], 0.3), 0.19, 0.225)
-    gap = np.abs(at - np.round(at)) < 0.05
     color[label] = 0.75
-    color[gap] = 0.04
+    color[from_whole(at) < 0.05] = 0.04  # the gaps between books
     return color
 
 
@@ -146,8 +156,8 @@ def chessboard(points, board, dark, light, ring=0.5):
     pattern = board.pattern
     if pattern is not None:
         at = (points[:, :2] - pattern.origin) / pattern.square
-        last = np.array([pattern.columns, pattern.rows]) - 1
-        inside = np.all((at > -ring) & (at < last + ring), axis=1)
-        even = np.floor(at).astype(int).sum(axis=1) % 2 == 0
+        end = [pattern.columns - 1 + ring, pattern.rows - 1 + ring]
+        inside = between(at, -ring, end).all(axis=1)
+        even = whole_below(at).sum(axis=1) % 2 == 0
         grey[inside & even] = light
     return _grey(grey)
