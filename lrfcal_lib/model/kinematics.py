@@ -146,7 +146,7 @@ def camera_at(
     """
     if mount == "platform":
         return T_camera
-    return T_camera * (platform_from_head(pitch) * T_head_lrf).inv()
+    return T_camera * T_head_lrf.inv() * platform_from_head(pitch).inv()
 
 
 def beams_to(
