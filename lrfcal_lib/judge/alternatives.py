@@ -82,9 +82,14 @@ def _views(obs, s, origin=(0.0, 0.0)):
     return replace(obs, view_pose=pose)
 
 
+def _outline(obs, s):
+    """The board larger by s."""
+    return replace(obs, corners=obs.corners * (1 + s))
+
+
 def _views_and_outline(obs, s):
     """Squares larger by s where the outline was measured in their scale."""
-    return replace(_views(obs, s), corners=obs.corners * (1 + s))
+    return _outline(_views(obs, s), s)
 
 
 def _lag(obs, s):
@@ -103,7 +108,7 @@ ALTERNATIVES = {
         "measure a square over many of them",
     ),
     Kind.OUTLINE: Alternative(
-        lambda obs, s: replace(obs, corners=obs.corners * (1 + s)),
+        _outline,
         "the board's outline is {size} +- {sigma} % {sign} than stated",
         "measure the board's edges",
     ),
@@ -148,15 +153,14 @@ def alternatives_of(prepared):
     the pattern's first corner.
     """
     stated = dict(ALTERNATIVES)
+    squares = stated.pop(Kind.SQUARES)
     pattern = prepared.board.pattern
-    if pattern is None:
-        del stated[Kind.SQUARES]
-    elif prepared.session.board.corners is None:
-        del stated[Kind.OUTLINE]
-        stated[Kind.SQUARES] = replace(stated[Kind.SQUARES], change=_views_and_outline)
-    else:
-        about_first_corner = partial(_views, origin=pattern.origin)
-        stated[Kind.SQUARES] = replace(stated[Kind.SQUARES], change=about_first_corner)
+    if pattern is not None:
+        change = partial(_views, origin=pattern.origin)
+        if prepared.session.board.corners is None:
+            del stated[Kind.OUTLINE]
+            change = _views_and_outline
+        stated[Kind.SQUARES] = replace(squares, change=change)
     if prepared.session.lrf.spot_exit is None:
         del stated[Kind.SPOT]
     return stated
@@ -364,11 +368,8 @@ def far_cameras(joint):
     for camera, transform in joint.solution.transforms.items():
         if camera not in guesses:
             continue
-        apart = {
-            name: transform_difference(transform, guess) for name, guess in guesses.items()
-        }
-        turn, shift = apart[camera]
-        nearest = min(apart, key=lambda name: apart[name][0] * LEVER + apart[name][1])
+        turn, shift = transform_difference(transform, guesses[camera])
+        nearest = nearest_guess(transform, guesses)
         if turn > FAR_TURN or shift > FAR_SHIFT:
             words = (
                 f"camera '{camera}' stands {_apart(turn, shift)} from its guess in "
@@ -384,11 +385,27 @@ def far_cameras(joint):
     return far
 
 
+def nearest_guess(transform, guesses):
+    """Name of the camera whose guess is nearest."""
+    return min(guesses, key=lambda name: distance(transform, guesses[name]))
+
+
+def distance(a: RigidTransform, b: RigidTransform) -> float:
+    """How far two places of a camera are apart, turn and shift in one: metres.
+
+    Parameters
+    ----------
+    a, b
+    """
+    turn, shift = transform_difference(a, b)
+    return LEVER * turn + shift
+
+
 def exchanged_sides(solution):
     """Cameras that are called left and right, and stand the other way round."""
     far = []
     for left, right in permutations(solution.transforms, 2):
-        offset = _seat(solution, left)[0] - _seat(solution, right)[0]
+        offset = _right_of_lrf(solution, left) - _right_of_lrf(solution, right)
         if "left" in left.lower() and "right" in right.lower() and offset > 0:
             words = (
                 f"camera '{left}' is {1000 * offset:.0f} mm to the right of camera '{right}': were "
@@ -398,9 +415,10 @@ def exchanged_sides(solution):
     return far
 
 
-def _seat(solution, camera):
-    """Where a camera sits in the frame of the range finder, metres."""
-    return (solution.camera_at(camera, 0.0) * solution.T_head_lrf).inv().translation
+def _right_of_lrf(solution, camera):
+    """How far to the right of the range finder a camera sits, metres."""
+    T_camera_lrf = solution.camera_at(camera, 0.0) * solution.T_head_lrf
+    return T_camera_lrf.inv().translation[0]
 
 
 def _apart(angle, distance):
