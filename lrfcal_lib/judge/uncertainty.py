@@ -155,10 +155,8 @@ def projection_sigma(
 
 def pixel_grid(model: CameraModel, grid: tuple[int, int]) -> np.ndarray:
     """Middles of the cells that columns and rows cut an image into, (rows, columns, 2), pixels."""
-    columns, rows = grid
-    u = (np.arange(columns) + 0.5) * model.width / columns - 0.5
-    v = (np.arange(rows) + 0.5) * model.height / rows - 0.5
-    return np.stack(np.meshgrid(u, v), axis=-1)
+    cells = np.stack(np.meshgrid(*map(np.arange, grid)), axis=-1)
+    return (cells + 0.5) * model.size / grid - 0.5
 
 
 def point_sigma(

@@ -189,10 +189,8 @@ def judge(
     """
     prepared = calibration.prepared
     joint = calibration.joint
-    findings = []
     faults = recording_faults(calibration)
-    for fault in faults:
-        findings.append(Finding(no_if(fault.severe), fault.kind, fault.words))
+    findings = [Finding(no_if(fault.severe), fault.kind, fault.words) for fault in faults]
     findings += lens_findings(prepared)
     doubt = 0.0
     # also where the joint estimate is not handed over: a wrong size may be why
@@ -227,11 +225,13 @@ def judge(
 def _notes(calibration, method, lost):
     """What is handed over, where the cameras are, what was left out, and what is not known."""
     axis = calibration.platform.axis_with(method)
-    notes = [f"Handed over: the cameras of the method '{method}' and the axis '{axis}'."]
-    if method != "joint" or calibration.joint is None:
-        return tuple(filter(None, [*notes, lost]))
-    solution = calibration.joint.solution
-    notes += [lost, step_words(solution), _scatter_note(len(solution.boards))]
+    notes = [
+        f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.",
+        lost,
+    ]
+    if method == "joint" and calibration.joint is not None:
+        solution = calibration.joint.solution
+        notes += [step_words(solution), _scatter_note(len(solution.boards))]
     return tuple(filter(None, notes))
 
 

@@ -8,10 +8,11 @@ import numpy as np
 from lrfcal_lib.calibrate.pipeline import Calibration, largest_range
 from lrfcal_lib.fit.covariance import solve_each
 from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, no_if
 from lrfcal_lib.judge.next_placement import group_sigma, sights
 from lrfcal_lib.judge.placements import placements_table
-from lrfcal_lib.model.problem import LEAVES_OUT
+from lrfcal_lib.model.problem import LEAVES_OUT, Problem
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
@@ -49,7 +50,6 @@ def diagnose(solution: JointSolution) -> list[Finding]:
         *weak_estimate(solution),
         *weak_placements(solution),
         *weak_pitch(solution),
-        *weak_poses(solution),
         *large_residuals(solution),
     ]
 
@@ -66,13 +66,21 @@ def weak_estimate(solution) -> Iterator[Finding]:
 
 
 def weak_placements(solution) -> Iterator[Finding]:
-    """The number of placements."""
+    """The number of placements, and boards that stand alike."""
     count = len(solution.boards)
     if count < FEW:
         words = (
             f"only {count} placements, {FEW} or more are needed to see errors of the model"
         )
         yield Finding(no_if(count < FEWEST), Kind.PLACEMENTS, words)
+    distance = np.linalg.norm(sights(solution.board_poses, solution), axis=1)
+    if count > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance):
+        words = (
+            f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): "
+            "errors at other distances are extrapolated, and a range offset is hard to tell from "
+            "shifts"
+        )
+        yield Finding(CARE, Kind.DISTANCE, words)
 
 
 def weak_pitch(solution) -> Iterator[Finding]:
@@ -104,21 +112,6 @@ def weak_pitch(solution) -> Iterator[Finding]:
             "small boards"
         )
         yield Finding(CARE, Kind.IMAGE_PITCH, words)
-
-
-def weak_poses(solution) -> Iterator[Finding]:
-    """Boards that stand alike."""
-    boards = solution.board_poses
-    if len(boards) < 2:
-        return
-    distance = np.linalg.norm(sights(boards, solution), axis=1)
-    if np.ptp(distance) < SAME_DISTANCE * np.median(distance):
-        words = (
-            f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): "
-            "errors at other distances are extrapolated, and a range offset is hard to tell from "
-            "shifts"
-        )
-        yield Finding(CARE, Kind.DISTANCE, words)
 
 
 def large_residuals(solution) -> Iterator[Finding]:
@@ -187,13 +180,11 @@ def noise_of_images(solution: JointSolution) -> dict[str, float]:
     level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)
     factors = np.linalg.cholesky(obs.view_covariance)
     white = solve_each(factors, solution.residuals("view"))
-    squares = np.mean(white**2, axis=1)
-    usual = max(np.mean(squares), np.finfo(float).tiny)
-    scatter = {}
-    for number, camera in enumerate(obs.cameras):
-        mean = np.mean(squares[obs.view_camera == number])
-        scatter[f"images of '{camera}'"] = float(level * np.sqrt(mean / usual))
-    return scatter
+    usual = max(rms(white), np.finfo(float).tiny)
+    return {
+        f"images of '{camera}'": level * rms(white[obs.view_camera == number]) / usual
+        for number, camera in enumerate(obs.cameras)
+    }
 
 
 def sides_elsewhere(prepared: Prepared) -> Iterator[Finding]:
@@ -259,13 +250,13 @@ class LeftOut:
         Number of placements of the board.
     placements : dict of int to str
         Why whole placements are left out.
-    parts : list of str
-        Parts that are left out beside them, and why.
+    parts : list of Problem
+        Why parts are left out beside them.
     """
 
     recorded: int
     placements: dict[int, str]
-    parts: list[str]
+    parts: list[Problem]
 
     @property
     def many(self) -> bool:
@@ -285,7 +276,7 @@ class LeftOut:
         if not self.many:
             notes.append(f"{self.words}.")
         if self.parts:
-            parts = "; ".join(self.parts)
+            parts = "; ".join(map(str, self.parts))
             notes.append(f"Parts left out beside them: {len(self.parts)} ({parts}).")
         return " ".join(notes)
 
@@ -303,23 +294,17 @@ def left_out(calibration: Calibration, method: str) -> LeftOut:
     table = placements_table(prepared, calibration.observations).set_index("placement")
     used = set(table.index[table.used]) - set(prepared.left_out)
     excluded: dict[int, str] = {}
-    images: list[str] = []
+    parts = [problem for problem in prepared.problems if problem.kind not in LEAVES_OUT]
+    images: list[Problem] = []
     if method == "joint" and calibration.joint is not None:
         solution = calibration.joint.solution
         used = set(solution.boards)
         excluded = solution.excluded_placements
-        images = [
-            str(problem) for problem in solution.excluded if problem.camera is not None
-        ]
-    placements = {}
-    for number in table.index:
-        if number not in used:
-            stated = excluded.get(number) or prepared.left_out.get(number)
-            placements[number] = stated or table.reason[number] or "no edge"
-    parts = [
-        str(problem) for problem in prepared.problems if problem.kind not in LEAVES_OUT
-    ]
-    lost = LeftOut(len(table), placements, parts)
+        images = [problem for problem in solution.excluded if problem.camera is not None]
+    reasons = table.reason.replace("", "no edge").to_dict() | excluded
+    lost = LeftOut(
+        len(table), {p: why for p, why in reasons.items() if p not in used}, parts
+    )
     if lost.many:  # otherwise a finding says it
         return replace(lost, parts=parts + images)
     return lost
