@@ -152,9 +152,7 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
     if not rows:
         last = next(reversed(failed.values()), "no seed given")
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
-    seeds, errors, covariances, bounds = (
-        np.array(column) for column in zip(*rows, strict=True)
-    )
+    seeds, errors, covariances, bounds = map(np.array, zip(*rows, strict=True))
     return Trials(names, seeds, errors, covariances, bounds, failed)
 
 
@@ -278,23 +276,20 @@ def _judge(trials, index, factor):
     C = trials.covariances[block]
     B = trials.bounds[block]
     mean = np.mean(C, axis=0)
-    sigma = sigma_of(mean)
-    seen = max(round(len(e) * _freedom(mean / np.outer(sigma, sigma))), 1)
+    seen = max(round(len(e) * _freedom(mean / dyads(sigma_of(mean)))), 1)
     unit = np.full(e.shape, factor)
     if factor is None:
         unit = 1 / sigma_of(B)
-    B = unit[:, :, None] * B * unit[:, None]
+    B = B * dyads(unit)
     crb = np.sqrt(np.mean(np.linalg.trace(B)))
     rmse = rms(np.linalg.norm(unit * e, axis=1))
     free = len(e) * _freedom(np.mean(B, axis=0))
-    half_width = HALF_WIDTH * sigma_of(C)
-    normalised = solve_each(C, e)
     row = {
         "rmse": rmse,
         "crb": crb,
         "rmse_over_crb": rmse / crb,
-        "coverage": np.mean(np.abs(e) < half_width),
-        "nees": np.mean(np.vecdot(e, normalised)) / len(index),
+        "coverage": np.mean(np.abs(e) < HALF_WIDTH * sigma_of(C)),
+        "nees": np.mean(np.vecdot(e, solve_each(C, e))) / len(index),
     }
     row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(
         chi2.ppf(LIMITS, free) / free
