@@ -74,14 +74,14 @@ def calibration_record(
 
 def _sensor(solution):
     """What a JointSolution says about range finder and pitch, and what it left out in words."""
-    sensor = {}
     sigma = solution.sigma
-    for name, value in solution.sensor.items():
-        if name in sigma:
-            sensor[name] = {"value": value, "sigma": sigma[name]}
-    sensor["noise"] = solution.noise
-    sensor["excluded"] = [str(problem) for problem in solution.excluded]
-    return sensor
+    sensor = {
+        name: {"value": value, "sigma": sigma[name]}
+        for name, value in solution.sensor.items()
+        if name in sigma
+    }
+    excluded = [str(problem) for problem in solution.excluded]
+    return sensor | {"noise": solution.noise, "excluded": excluded}
 
 
 def _camera(calibration, camera, method, solution):
@@ -114,10 +114,10 @@ def file_hashes(session: Session) -> dict[str, str]:
 
     Of no other that lies there.
     """
-    stated = {session.path / name for name in FILES if os.path.lexists(session.path / name)}
+    stated = filter(os.path.lexists, [session.path / name for name in FILES])
     images = {record.file for record in session.image_records}
     hashes = {}
-    for file in sorted(stated | images):
+    for file in sorted(images.union(stated)):
         with opened(file, session.path) as stream:
             digest = hashlib.sha256(stream.read())
         hashes[file.relative_to(session.path).as_posix()] = digest.hexdigest()

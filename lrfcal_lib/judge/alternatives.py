@@ -2,7 +2,7 @@
 cause and remedy.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
@@ -243,12 +243,11 @@ def doubt_about(kind, alternative, solution, admitted_offset):
     score = solution.score(alternative.change(solution.observations, STEP), STEP)
     expected = np.append(names == "range_offset", 0) / (ADMITTED * admitted_offset) ** 2
     covariance, step, pulls = score.solved(expected, solution.sensor["range_offset"])
-    value = float(step[-1])
-    pulls = pulls[:, -1]
+    value = step[-1]
     freedom = max(len(pulls) - 1, 1)
     noise = covariance[-1, -1]
-    scatter = np.sum(pulls**2) * len(pulls) / freedom
-    sigma = float(np.sqrt(max(noise, scatter)))
+    scatter = np.sum(pulls[:, -1] ** 2) * len(pulls) / freedom
+    sigma = np.sqrt(max(noise, scatter))
 
     handed = np.flatnonzero(~np.isin(names, SENSOR))
     # what the accuracy of the angular step may do must not hide that it is wrong
@@ -265,7 +264,7 @@ def doubt_about(kind, alternative, solution, admitted_offset):
         sigma=sigma,
         ratio=(value / max(sigma, 1e-300)) ** 2,
         freedom=freedom if scatter > noise else np.inf,
-        moved=float(np.max(np.abs(moves), initial=0.0)),
+        moved=np.max(np.abs(moves), initial=0.0),
         words=f"{words}: {alternative.remedy}",
     )
 
@@ -285,9 +284,10 @@ def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
             harmful = (
                 False  # a step that the sensor's disc divides is off for no small reason
             )
-        certain = doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
+        size = abs(doubt.value)
+        certain = doubt.exceeds(ASKED) and size > stated[doubt.kind].worth
         asks = harmful or (certain and doubt.kind not in faint)
-        if asks and abs(doubt.value) < stated[doubt.kind].reach:
+        if asks and size < stated[doubt.kind].reach:
             asked.append(doubt)
     return [doubt for doubt in asked if doubt.ratio > AS_GOOD * asked[0].ratio]
 
@@ -329,25 +329,22 @@ def far_from_stated(joint) -> list[Far]:
     ----------
     joint : JointCalibration
     """
-    far = far_axis(joint) + far_cameras(joint)
-    return far or exchanged_sides(joint.solution)
+    far = [*far_axis(joint), *far_cameras(joint)]
+    return far or list(exchanged_sides(joint.solution))
 
 
-def far_axis(joint):
+def far_axis(joint) -> Iterator[Far]:
     """The tilt axis, if it is Far from where it is stated."""
     session = joint.prepared.session
     solution = joint.solution
     if session.T_head_lrf is None or not joint.settings["axis"]:
-        return []
+        return
     apart = axis_difference(solution.axis, axis_of(session.T_head_lrf))
     variance = np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1)
     sigma = np.hypot(session.platform_sigma, np.sqrt(variance))
-    if np.all(apart <= FAR * sigma):
-        return []
-    words = (
-        f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
-    )
-    return [Far(words, apart[0])]
+    if np.any(apart > FAR * sigma):
+        words = f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
+        yield Far(words, apart[0])
 
 
 def guesses_of(session: Session) -> dict[str, RigidTransform]:
@@ -361,10 +358,9 @@ def guesses_of(session: Session) -> dict[str, RigidTransform]:
     return {name: camera.guess for name, camera in cameras if camera.guess is not None}
 
 
-def far_cameras(joint):
+def far_cameras(joint) -> Iterator[Far]:
     """Cameras that are Far from where they are guessed, or stand where another one is guessed."""
     guesses = guesses_of(joint.prepared.session)
-    far = []
     for camera, transform in joint.solution.transforms.items():
         if camera not in guesses:
             continue
@@ -375,14 +371,13 @@ def far_cameras(joint):
                 f"camera '{camera}' stands {_apart(turn, shift)} from its guess in "
                 f"session.json: {CHECK}"
             )
-            far.append(Far(words, turn))
+            yield Far(words, turn)
         elif nearest != camera:
             words = (
                 f"camera '{camera}' stands where camera '{nearest}' is said to stand: were the "
                 "folders exchanged?"
             )
-            far.append(Far(words, turn))
-    return far
+            yield Far(words, turn)
 
 
 def nearest_guess(transform, guesses):
@@ -401,9 +396,8 @@ def distance(a: RigidTransform, b: RigidTransform) -> float:
     return LEVER * turn + shift
 
 
-def exchanged_sides(solution):
+def exchanged_sides(solution) -> Iterator[Far]:
     """Cameras that are called left and right, and stand the other way round."""
-    far = []
     for left, right in permutations(solution.transforms, 2):
         offset = _right_of_lrf(solution, left) - _right_of_lrf(solution, right)
         if "left" in left.lower() and "right" in right.lower() and offset > 0:
@@ -411,8 +405,7 @@ def exchanged_sides(solution):
                 f"camera '{left}' is {1000 * offset:.0f} mm to the right of camera '{right}': were "
                 "the folders exchanged?"
             )
-            far.append(Far(words, 0.0))
-    return far
+            yield Far(words, 0.0)
 
 
 def _right_of_lrf(solution, camera):

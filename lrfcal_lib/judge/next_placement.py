@@ -196,10 +196,19 @@ def outline(solution: JointSolution) -> np.ndarray:
     return np.insert(corners, 2, 0.0, axis=1)
 
 
+def board_middle(solution: JointSolution) -> np.ndarray:
+    """Middle of the board, metres, and a 1 that poses (..., 3, 4) shift, shape (4,).
+
+    Parameters
+    ----------
+    solution
+    """
+    return np.append(outline(solution).mean(axis=0), 1.0)
+
+
 def sights(boards: np.ndarray, solution: JointSolution) -> np.ndarray:
     """From the LRF to the middles of boards ``T_platform_board`` (n, 3, 4): metres, (n, 3)."""
-    middle = np.append(outline(solution).mean(axis=0), 1.0)
-    return boards @ middle - solution.T_head_lrf.translation
+    return boards @ board_middle(solution) - solution.T_head_lrf.translation
 
 
 def board_poses(solution, grid):
@@ -311,5 +320,5 @@ def image_sigma(solution, camera, model):
     by_pixel = (model.fx / obs.view_pose[views, 2, 3]) ** 2
     variance = solution.noise["view_scale"] ** 2 * np.median(by_pixel / by_shift)
     if obs.mounts[number] == "head":  # all points of an image share the error of its pitch
-        variance += (model.fx * solution.noise.get("sigma_pitch", 0.0)) ** 2
+        variance += (model.fx * solution.noise["sigma_pitch"]) ** 2
     return np.sqrt(variance * len(points_of_face(solution)))

@@ -1,5 +1,6 @@
 """What went wrong with a recording, as far as its files and the estimates show."""
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -87,12 +88,8 @@ class Reading:
     def view(self, view):
         """A BoardView, read this way: the mirror image of a chessboard is one."""
         mirror = np.diag([self.image_across, 1.0, 1.0, 1.0])
-        pose = mirror @ view.T_camera_board.as_matrix() @ mirror
-        return replace(
-            view,
-            pitch=self.image_turn * view.pitch,
-            T_camera_board=RigidTransform.from_matrix(pose),
-        )
+        pose = RigidTransform.from_matrix(mirror @ view.T_camera_board.as_matrix() @ mirror)
+        return replace(view, pitch=self.image_turn * view.pitch, T_camera_board=pose)
 
 
 AS_STATED = Reading("", "")
@@ -275,7 +272,7 @@ def board_misses(prepared, reading):
             residuals = pd.Series(np.abs(plane_residuals_m(obs, transform)))
             each = residuals.groupby(obs.plane_placement).median()
             square = each.median() ** 2 - (HALF * reading.length * noise) ** 2
-            size = float(np.sqrt(max(square, LEAST_MISS**2)))
+            size = np.sqrt(max(square, LEAST_MISS**2))
             misses[camera] = BoardMiss(size, transform, planes=len(each))
     return misses
 
@@ -328,9 +325,8 @@ def _far_from_guess(prepared, found):
     )
 
 
-def faults_of_changes(changes, cameras):
+def faults_of_changes(changes, cameras) -> Iterator[Fault]:
     """The Faults of CameraChanges; `cameras` are the names of all of them."""
-    found = []
     steps = [change.after for change in changes]
     for change in changes:
         kind = "camera moved"
@@ -344,15 +340,13 @@ def faults_of_changes(changes, cameras):
             "fix what is loose and record anew, or make two sessions: one of the placements before "
             f"{change.after}, one of the others"
         )
-        fault = Fault(
+        yield Fault(
             kind,
             f"{words}; {remedy}",
             severe=change.size_px > SEVERE_PX,
             camera=change.camera,
             placements=(change.after,),
         )
-        found.append(fault)
-    return found
 
 
 def _zoomed(change):
@@ -374,7 +368,7 @@ def _moved(change):
     )
 
 
-def exchanged_placements(calibration):
+def exchanged_placements(calibration) -> Iterator[Fault]:
     """Pairs of placements that are left out, and whose images fit the scans of each other."""
     prepared = calibration.prepared
     session = prepared.session
@@ -382,7 +376,6 @@ def exchanged_placements(calibration):
     lost = [p for p in session.board_placements if p in prepared.left_out | excluded]
     scans = boards_in(session, lost[:MOST_LOST], AS_STATED)
 
-    found = []
     strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
     for first, second in combinations(strange, 2):
         if _same_board(calibration, scans[first], second) and _same_board(
@@ -393,8 +386,7 @@ def exchanged_placements(calibration):
                 f"of {second} the scans of {first}: their numbers are exchanged; exchange them "
                 "back in images.csv"
             )
-            found.append(Fault("exchanged", words, placements=(first, second)))
-    return found
+            yield Fault("exchanged", words, placements=(first, second))
 
 
 def _same_board(calibration, scan, placement):

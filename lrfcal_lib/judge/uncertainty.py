@@ -41,7 +41,7 @@ class Chain:
         ``T_camera_lrf`` of a camera on the head, or ``T_camera_platform``; None for points of the
         cloud.
     on_head : bool
-    covariances : tuple of ndarray, shape (13, 13)
+    covariances : ndarray, shape (n, 13, 13)
         Of `COLUMNS` (increments ``[w, v]`` of the transforms). Where there are several, the one
         that gives more counts, quantity by quantity.
     unseen : ndarray, shape (m, 13)
@@ -53,7 +53,7 @@ class Chain:
     head: np.ndarray
     camera: np.ndarray | None
     on_head: bool
-    covariances: tuple[np.ndarray, ...]
+    covariances: np.ndarray
     unseen: np.ndarray
     sweep_sigma: tuple[float, float] = (0.0, 0.0)
 
@@ -65,7 +65,7 @@ class Chain:
         """
         taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
         unsure = np.diag(doubt**2 * taken_up)
-        return replace(self, covariances=tuple(C + unsure for C in self.covariances))
+        return replace(self, covariances=self.covariances + unsure)
 
 
 def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
@@ -85,12 +85,10 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
     known = uncertainty_of(rig)
     index = columns_of(known.names, camera)
     estimated = index >= 0
-    covariances = []
-    for whole in (known.covariance, known.trusted):
-        part = whole[np.ix_(index, index)]
-        # zero for what is known; what has no bound is among `unseen`
-        bounded = np.outer(estimated, estimated) & np.isfinite(part)
-        covariances.append(np.where(bounded, part, 0.0))
+    part = np.stack([known.covariance, known.trusted])[:, index[:, None], index]
+    # zero for what is known; what has no bound is among `unseen`
+    bounded = np.outer(estimated, estimated) & np.isfinite(part)
+    covariances = np.where(bounded, part, 0.0)
 
     on_head = True
     pose = None
@@ -100,7 +98,7 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
         pose = pose_array(rig.cameras[camera].T_camera)
         unseen = known.unseen_of_cameras[camera]
     head = pose_array(rig.T_head_lrf)
-    return Chain(head, pose, on_head, tuple(covariances), unseen, known.sweep_sigma)
+    return Chain(head, pose, on_head, covariances, unseen, known.sweep_sigma)
 
 
 def projection_sigma(
@@ -294,10 +292,8 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
     ndarray, shape (...)
         Of all m together, in their unit; inf where an undetermined motion matters.
     """
-    variance = 0.0
-    for C in chain.covariances:
-        by_this = np.einsum("...ik,kl,...il->...", jacobian, C, jacobian)
-        variance = np.maximum(variance, by_this)
+    each = np.einsum("...ik,nkl,...il->n...", jacobian, chain.covariances, jacobian)
+    variance = each.max(axis=0, initial=0.0)
     moved = np.einsum("...ik,mk->...mi", jacobian, chain.unseen)
     size = np.linalg.norm(jacobian, axis=(-2, -1))[..., None]
     least = SEEN * size * np.linalg.norm(chain.unseen, axis=-1)
@@ -325,13 +321,11 @@ def beams_to(
     R = T_head_lrf.rotation.as_matrix()
     t = T_head_lrf.translation
     k = R[:, 2]  # normal of the scan plane: k . (Rx(-pitch) x - t) = 0
-    y = points[..., 1]
-    z = points[..., 2]
-    a = k[1] * y + k[2] * z
-    b = k[1] * z - k[2] * y
+    # y and z as real and imaginary part: Re(w exp(-i pitch)) = c
+    w = (k[1] - 1j * k[2]) * (points[..., 1] + 1j * points[..., 2])
     c = k @ t - k[0] * points[..., 0]
     with np.errstate(invalid="ignore"):
-        pitch = np.arctan2(b, a) + np.arccos(c / np.hypot(a, b))
+        pitch = np.angle(w) + np.arccos(c / np.abs(w))
     pitch = (pitch + np.pi) % (2 * np.pi) - np.pi
     p = (tilt(points, -pitch) - t) @ R
     return np.arctan2(p[..., 1], p[..., 0]), pitch, np.linalg.norm(p, axis=-1)

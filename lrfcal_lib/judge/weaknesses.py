@@ -1,7 +1,6 @@
 """What is weak about a joint estimate, and about the recording behind any result."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -240,71 +239,47 @@ def blind_cameras(prepared: Prepared) -> Iterator[Finding]:
             yield Finding(CARE, Kind.LEFT_OUT, words)
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """What a result does not rest on.
-
-    Attributes
-    ----------
-    recorded : int
-        Number of placements of the board.
-    placements : dict of int to str
-        Why whole placements are left out.
-    parts : list of Problem
-        Why parts are left out beside them.
-    """
-
-    recorded: int
-    placements: dict[int, str]
-    parts: list[Problem]
-
-    @property
-    def many(self) -> bool:
-        """Whether more placements are left out than may be without a warning."""
-        return len(self.placements) > LOST * self.recorded
-
-    @property
-    def words(self) -> str:
-        """The placements that are left out, counted, with their reasons."""
-        why = [f"{placement} ({words})" for placement, words in self.placements.items()]
-        return f"{len(why)} of {self.recorded} placements are left out: {', '.join(why) or 'none'}"
-
-    @property
-    def note(self) -> str:
-        """What became of all placements, as far as it is no finding."""
-        notes = []
-        if not self.many:
-            notes.append(f"{self.words}.")
-        if self.parts:
-            parts = "; ".join(map(str, self.parts))
-            notes.append(f"Parts left out beside them: {len(self.parts)} ({parts}).")
-        return " ".join(notes)
-
-
-def left_out(calibration: Calibration, method: str) -> LeftOut:
-    """All placements that the result of a method does not rest on.
+def left_out(calibration: Calibration, method: str) -> tuple[list[Finding], str]:
+    """What the result of a method does not rest on.
 
     Parameters
     ----------
     calibration
     method
         Whose camera poses are handed over.
+
+    Returns
+    -------
+    list of Finding
+        One where more placements are left out than may be without a warning. It stands for what
+        :func:`large_residuals` says of those that the estimate excluded.
+    str
+        What became of all placements, as far as it is no finding.
     """
     prepared = calibration.prepared
     table = placements_table(prepared, calibration.observations).set_index("placement")
     used = set(table.index[table.used]) - set(prepared.left_out)
     excluded: dict[int, str] = {}
     parts = [problem for problem in prepared.problems if problem.kind not in LEAVES_OUT]
-    images: list[Problem] = []
+    images: list[Problem] = []  # and cameras
     if method == "joint" and calibration.joint is not None:
         solution = calibration.joint.solution
         used = set(solution.boards)
         excluded = solution.excluded_placements
         images = [problem for problem in solution.excluded if problem.camera is not None]
     reasons = table.reason.replace("", "no edge").to_dict() | excluded
-    lost = LeftOut(
-        len(table), {p: why for p, why in reasons.items() if p not in used}, parts
+    lost = [f"{number} ({why})" for number, why in reasons.items() if number not in used]
+    words = (
+        f"{len(lost)} of {len(table)} placements are left out: {', '.join(lost) or 'none'}"
     )
-    if lost.many:  # otherwise a finding says it
-        return replace(lost, parts=parts + images)
-    return lost
+    findings = []
+    notes = []
+    if len(lost) > LOST * len(table):
+        findings.append(Finding(CARE, Kind.LEFT_OUT, words))
+        parts += images  # otherwise a finding says it
+    else:
+        notes.append(f"{words}.")
+    if parts:
+        named = "; ".join(map(str, parts))
+        notes.append(f"Parts left out beside them: {len(parts)} ({named}).")
+    return findings, " ".join(notes)
