@@ -111,7 +111,7 @@ def edge_lengths(
             views[placement] for views in prepared.views.values() if placement in views
         ]
         for name, true in known.items():
-            if all(view.edge(name) is None for view in views):
+            if not any(view.edge(name) for view in views):
                 continue
             length = board.lengths.get(name, np.nan)
             sigma = board.sigma.get(name, np.nan)

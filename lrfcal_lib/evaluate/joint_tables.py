@@ -180,12 +180,11 @@ def edge_misses_px(joint: JointCalibration, camera: str) -> np.ndarray:
     Undistorted pixels.
     """
     solution = joint.solution
-    edges = list(joint.observations.edges)
     placements = list(joint.solution.boards)
     obs = joint.seen_by(camera, crossings=ALL, faces=0).along().select(placements)
     pose = solution.transforms[camera]
     row = pd.Index(placements).get_indexer(obs.crossing_placement)
-    side = pd.Index(edges).get_indexer(obs.crossing_edge)
+    side = pd.Index(joint.observations.edges).get_indexer(obs.crossing_edge)
     odds = obs.crossing_background + solution.side_odds[row, side]
     shift = edge_shift(solution.sensor["edge_log_odds"], obs.crossing_radius, odds)[0]
     depth = pose.apply(obs.crossing_points)[:, 2]
@@ -221,9 +220,9 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         except DegenerateGeometry:
             continue
         for camera in joint.observations.cameras:
-            one = first.transforms[camera]
-            other = second.transforms[camera]
-            turn, shift = geometry.transform_difference(one, other)
+            turn, shift = geometry.transform_difference(
+                first.transforms[camera], second.transforms[camera]
+            )
             differences = np.rad2deg(turn), 1000 * shift
             rows.append((pair, camera, *differences, *_predicted(joint.solution, camera)))
     return pd.DataFrame(rows, columns=HALVES_COLUMNS)
@@ -241,8 +240,9 @@ def _predicted(solution, camera):
     common = np.diag(solution.lens) + solution.step**2
     variances = solution.camera(camera).trusted_sigma ** 2
     variances -= common[solution.columns(f"{camera}_")]
-    turn, shift = np.split(2 * np.sqrt(np.maximum(variances, 0.0)), 2)
-    return np.rad2deg(np.linalg.norm(turn)), 1000 * np.linalg.norm(shift)
+    parts = np.split(2 * np.sqrt(np.maximum(variances, 0.0)), 2)
+    turn, shift = np.linalg.norm(parts, axis=1)
+    return np.rad2deg(turn), 1000 * shift
 
 
 def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import RigidTransform
 from scipy.special import logit
 from scipy.stats import binom, chi2
 
@@ -112,7 +113,7 @@ def joint_truth(
         [range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0]
     )
     count = len(boards)
-    boards = np.stack([pose_array(T) for T in boards])
+    boards = pose_array(RigidTransform.concatenate(boards))
     own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges) + 1))
     return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, *own), obs)
 
@@ -165,13 +166,10 @@ def state_errors(state: JointState, truth: JointState, unknowns: Unknowns) -> np
         In one gauge.
     unknowns : Unknowns
     """
-    estimated = np.concatenate([state.head[None], state.cameras])
-    true = np.concatenate([truth.head[None], truth.cameras])
-    poses = pose_step(pose_transform(true), pose_transform(estimated))
+    head = pose_step(pose_transform(truth.head), pose_transform(state.head))
+    cameras = pose_step(pose_transform(truth.cameras), pose_transform(state.cameras))
     sensor = state.sensor - truth.sensor
-    return np.concatenate([poses[0, AXIS_COLUMNS], poses[1:].ravel(), sensor])[
-        unknowns.mask
-    ]
+    return np.concatenate([head[AXIS_COLUMNS], cameras.ravel(), sensor])[unknowns.mask]
 
 
 def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.ndarray:

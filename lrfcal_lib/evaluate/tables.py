@@ -84,8 +84,7 @@ def poses_under(obs: CameraObservations, model: CameraModel | None) -> np.ndarra
                 useExtrinsicGuess=True,
                 flags=cv2.SOLVEPNP_ITERATIVE,
             )
-            pose[:3, :3] = cv2.Rodrigues(rotvec)[0]
-            pose[:3, 3:] = shift
+            pose[:3] = np.hstack([cv2.Rodrigues(rotvec)[0], shift])
     return moved
 
 
@@ -311,18 +310,19 @@ def sweeps_table(session: Session) -> pd.DataFrame:
         step = 0.0
         if len(pitch) > 1:
             step = float(np.median(np.abs(np.diff(pitch))))
-        row = {
-            "placement": placement,
-            "n_scan_lines": len(pitch),
-            "n_returns": int(valid.sum()),
-            "invalid_percent": 100 * (1 - valid.mean()),
-            "pitch_from_deg": pitch[0],
-            "pitch_to_deg": pitch[-1],
-            "pitch_step_deg": step,
-            "direction": session.sweep_direction(placement),
-            "n_images": len(session.images(placement=placement)),
-        }
-        rows.append(row)
+        rows.append(
+            {
+                "placement": placement,
+                "n_scan_lines": len(pitch),
+                "n_returns": int(valid.sum()),
+                "invalid_percent": 100 * (1 - valid.mean()),
+                "pitch_from_deg": pitch[0],
+                "pitch_to_deg": pitch[-1],
+                "pitch_step_deg": step,
+                "direction": session.sweep_direction(placement),
+                "n_images": len(session.images(placement=placement)),
+            }
+        )
     return pd.DataFrame(rows)
 
 

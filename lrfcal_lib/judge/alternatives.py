@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtr, stdtrit
 
-from lrfcal_lib.judge.findings import Kind, by_sign
+from lrfcal_lib.judge.findings import Finding, Kind, by_sign, no_if
 from lrfcal_lib.model.geometry import (
     axis_difference,
     axis_of,
@@ -77,8 +77,7 @@ class Alternative:
 def _views(obs, s, origin=(0.0, 0.0)):
     """Squares larger by s about the pattern's first corner (`origin`, metres, board frame)."""
     pose = obs.view_pose.copy()
-    corner = pose[:, :3, :2] @ np.asarray(origin)
-    pose[:, :3, 3] = (1 + s) * pose[:, :3, 3] + s * corner
+    pose[:, :3, 3] += s * pose[:, :3] @ [*origin, 0.0, 1.0]
     return replace(obs, view_pose=pose)
 
 
@@ -310,15 +309,7 @@ def step_words(solution: JointSolution) -> str:
     )
 
 
-@dataclass(frozen=True)
-class Far:
-    """Something that lies far from where it is stated: in words, and by what angle (radians)."""
-
-    words: str
-    angle: float
-
-
-def far_from_stated(joint) -> list[Far]:
+def far_from_stated(joint) -> list[Finding]:
     """What lies far from where session.json puts it.
 
     A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of
@@ -333,8 +324,13 @@ def far_from_stated(joint) -> list[Far]:
     return far or list(exchanged_sides(joint.solution))
 
 
-def far_axis(joint) -> Iterator[Far]:
-    """The tilt axis, if it is Far from where it is stated."""
+def _far(words, angle):
+    """The Finding of what lies far from where it is stated, turned by an angle (radians)."""
+    return Finding(no_if(angle > np.pi / 2), Kind.FAR_FROM_STATED, words)
+
+
+def far_axis(joint) -> Iterator[Finding]:
+    """The tilt axis, if it is far from where it is stated."""
     session = joint.prepared.session
     solution = joint.solution
     if session.T_head_lrf is None or not joint.settings["axis"]:
@@ -344,7 +340,7 @@ def far_axis(joint) -> Iterator[Far]:
     sigma = np.hypot(session.platform_sigma, np.sqrt(variance))
     if np.any(apart > FAR * sigma):
         words = f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
-        yield Far(words, apart[0])
+        yield _far(words, apart[0])
 
 
 def guesses_of(session: Session) -> dict[str, RigidTransform]:
@@ -358,8 +354,8 @@ def guesses_of(session: Session) -> dict[str, RigidTransform]:
     return {name: camera.guess for name, camera in cameras if camera.guess is not None}
 
 
-def far_cameras(joint) -> Iterator[Far]:
-    """Cameras that are Far from where they are guessed, or stand where another one is guessed."""
+def far_cameras(joint) -> Iterator[Finding]:
+    """Cameras that are far from where they are guessed, or stand where another one is guessed."""
     guesses = guesses_of(joint.prepared.session)
     for camera, transform in joint.solution.transforms.items():
         if camera not in guesses:
@@ -371,13 +367,13 @@ def far_cameras(joint) -> Iterator[Far]:
                 f"camera '{camera}' stands {_apart(turn, shift)} from its guess in "
                 f"session.json: {CHECK}"
             )
-            yield Far(words, turn)
+            yield _far(words, turn)
         elif nearest != camera:
             words = (
                 f"camera '{camera}' stands where camera '{nearest}' is said to stand: were the "
                 "folders exchanged?"
             )
-            yield Far(words, turn)
+            yield _far(words, turn)
 
 
 def nearest_guess(transform, guesses):
@@ -396,7 +392,7 @@ def distance(a: RigidTransform, b: RigidTransform) -> float:
     return LEVER * turn + shift
 
 
-def exchanged_sides(solution) -> Iterator[Far]:
+def exchanged_sides(solution) -> Iterator[Finding]:
     """Cameras that are called left and right, and stand the other way round."""
     for left, right in permutations(solution.transforms, 2):
         offset = _right_of_lrf(solution, left) - _right_of_lrf(solution, right)
@@ -405,7 +401,7 @@ def exchanged_sides(solution) -> Iterator[Far]:
                 f"camera '{left}' is {1000 * offset:.0f} mm to the right of camera '{right}': were "
                 "the folders exchanged?"
             )
-            yield Far(words, 0.0)
+            yield _far(words, 0.0)
 
 
 def _right_of_lrf(solution, camera):

@@ -15,7 +15,7 @@ from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.judge.alternatives import distance, far_axis, guesses_of
 from lrfcal_lib.judge.camera_changes import camera_changes, explains
-from lrfcal_lib.judge.findings import by_sign
+from lrfcal_lib.judge.findings import NO, by_sign
 from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.geometry import (
     POSE,
@@ -183,7 +183,7 @@ def hopeless(joint):
     """
     if joint is None or not explains(joint.solution) or joint.solution.unobservable:
         return True
-    return any(far.angle > np.pi / 2 for far in far_axis(joint))
+    return any(far.answer == NO for far in far_axis(joint))
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:

@@ -73,10 +73,7 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
     if beyond:
         range_doubt = max(range_doubt, abs(solution.sensor["range_offset"]))
     findings += [*beyond, *beyond_spot(solution), *pitch_turns_otherwise(solution)]
-    findings += [
-        Finding(no_if(far.angle > np.pi / 2), Kind.FAR_FROM_STATED, far.words)
-        for far in far_from_stated(joint)
-    ]
+    findings += far_from_stated(joint)
     return findings, range_doubt
 
 
