@@ -12,9 +12,11 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, columns_of
+from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
+    apply_pose,
     hat,
     polar_to_points,
     pose_array,
@@ -22,6 +24,7 @@ from lrfcal_lib.model.geometry import (
     tilt,
     unit_vector,
 )
+from lrfcal_lib.model.kinematics import TILT_AXIS
 from lrfcal_lib.preprocess.prepared import PitchNoise
 
 # a motion that moves a point less than this, relative to all others, does not matter to it
@@ -256,10 +259,11 @@ def carried(
     p_head = distance[..., None] * beam
     x = tilt(p_head + t, turn)
     M = tilt(np.eye(3), turn[..., None]).mT
+    by_turn = back * hat(x - t) - M @ hat(p_head)
+    by_shift = M - back * np.eye(3)
     # a turn of the head about x and a shift along it change nothing
-    by_turn_of_axis = (back * hat(x - t) - M @ hat(p_head))[..., 1:]
-    by_shift_of_axis = (M - back * np.eye(3))[..., 1:]
-    by_pitch = np.cross([1.0, 0.0, 0.0], x)
+    by_axis = np.concatenate([by_turn, by_shift], axis=-1)[..., AXIS_COLUMNS]
+    by_pitch = np.cross(TILT_AXIS, x)
     by_scale = turn[..., None] * by_pitch
     by_sensor = np.stack([-tilt(beam, turn), by_scale, (1 - back) * by_pitch], axis=-1)
 
@@ -273,8 +277,7 @@ def carried(
         by_camera[..., :3] = -hat(points)
         by_camera[..., 3:] = np.eye(3)
         points = points + chain.camera[:, 3]
-    by_axis = A @ np.concatenate([by_turn_of_axis, by_shift_of_axis], axis=-1)
-    by_link = np.concatenate([by_axis, by_camera, A @ by_sensor], axis=-1)
+    by_link = np.concatenate([A @ by_axis, by_camera, A @ by_sensor], axis=-1)
     return points, by_link, by_pitch @ A.T
 
 
@@ -338,7 +341,7 @@ def beams_of_pixels(chain, model, uv, distance, image_pitch):
     for _ in range(ROUNDS):
         x = (depth[..., None] * ray - chain.camera[:, 3]) @ chain.camera[:, :3]
         if chain.on_head:
-            x = x @ chain.head[:, :3].T + chain.head[:, 3]
+            x = apply_pose(chain.head, x)
         bearing, pitch, reached = beams_to(x, pose_transform(chain.head))
         depth = depth + distance - reached
     if chain.on_head:
