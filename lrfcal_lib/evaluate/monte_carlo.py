@@ -226,10 +226,10 @@ def spread(covariance: np.ndarray, names: Sequence[str]) -> dict[str, float]:
         Of the unknowns.
     """
     variance = np.diagonal(covariance)
-    out = {}
-    for words, (index, _, factor) in groups_of(names).items():
-        out[words] = float(factor * np.sqrt(variance[index].sum()))
-    return out
+    return {
+        words: float(factor * np.sqrt(variance[index].sum()))
+        for words, (index, _, factor) in groups_of(names).items()
+    }
 
 
 def consistency(trials: Trials) -> pd.DataFrame:
@@ -261,9 +261,10 @@ def consistency(trials: Trials) -> pd.DataFrame:
         bad = trials.seeds[~np.isfinite(trials.errors).all(axis=1)]
         raise ValueError(f"errors or covariances are not finite (seeds {bad.tolist()[:5]})")
     groups = groups_of(trials.names) | {"all": (list(range(len(trials.names))), "", None)}
-    rows = []
-    for words, (index, unit, factor) in groups.items():
-        rows.append({"group": words, "unit": unit} | _judge(trials, index, factor))
+    rows = [
+        {"group": words, "unit": unit} | _judge(trials, index, factor)
+        for words, (index, unit, factor) in groups.items()
+    ]
     return pd.DataFrame(rows).assign(trials=count, failed=len(trials.failed))
 
 

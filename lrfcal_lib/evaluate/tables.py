@@ -386,10 +386,10 @@ def outline_table(outline: Outline) -> pd.DataFrame:
         Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours),
         n_images.
     """
-    rows = []
-    for name, length in outline.board.lengths().items():
-        sd = 1000 * outline.length_sd[name]
-        rows.append((name, 1000 * length, sd, outline.n_lengths[name]))
+    rows = [
+        (name, 1000 * length, 1000 * outline.length_sd[name], outline.n_lengths[name])
+        for name, length in outline.board.lengths().items()
+    ]
     return pd.DataFrame(rows, columns=["edge", "length_mm", "sd_mm", "n_images"])
 
 
@@ -405,10 +405,10 @@ def pitch_models_table(errors: PitchErrors) -> pd.DataFrame:
     DataFrame
         Columns model, n_parameters, plane_rms_mm, F, p_value (against the model before).
     """
-    rows = []
-    for model in errors.models.values():
-        rms_mm = 1000 * model.plane_rms
-        rows.append((model.name, model.n_parameters, rms_mm, model.F, model.p_value))
+    rows = [
+        (model.name, model.n_parameters, 1000 * model.plane_rms, model.F, model.p_value)
+        for model in errors.models.values()
+    ]
     return pd.DataFrame(
         rows, columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"]
     )
