@@ -118,14 +118,13 @@ def stereo_check(solutions: dict, reference: StereoReference) -> pd.DataFrame:
     """
     rows = []
     baseline = np.linalg.norm(reference.T_second_first.translation)
-    first, second = (
-        {method: found for (name, method), found in solutions.items() if name == camera}
-        for camera in reference.cameras
-    )
     for method in (*METHODS, "joint"):
-        if method not in first or method not in second:
+        if not all((camera, method) in solutions for camera in reference.cameras):
             continue
-        between = second[method].transform * first[method].transform.inv()
+        first, second = (
+            solutions[camera, method].transform for camera in reference.cameras
+        )
+        between = second * first.inv()
         turn, shift = transform_difference(between, reference.T_second_first)
         length = np.linalg.norm(between.translation)
         millimetres = 1000 * np.array([length, length - baseline, shift])
