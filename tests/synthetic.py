@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.judge.uncertainty import beams_to
 from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel, pinhole, project
 from lrfcal_lib.model.geometry import polar_to_points
+from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.model.observations import CameraObservations
 
 CORNERS = np.array([[-0.30, -0.22], [0.32, -0.25], [0.28, 0.24], [-0.33, 0.20]])

@@ -8,7 +8,7 @@ from shared import QUICK, campaign
 
 from lrfcal_lib.calibrate import clouds, combined, pipeline
 from lrfcal_lib.calibrate.joint_observations import observe_joint
-from lrfcal_lib.evaluate import edge_tables, joint_tables
+from lrfcal_lib.evaluate import edge_tables, joint_tables, tables
 from lrfcal_lib.evaluate.export import calibration_record
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
@@ -121,6 +121,13 @@ def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_bo
     for placement, (board, _) in same.items():
         for name, length in board.lengths.items():
             assert other[placement][0].lengths[name] == pytest.approx(length, abs=1e-5)
+
+
+def test_placements_are_judged_by_estimates_that_have_not_seen_them(quick, joint):
+    own = tables.method_comparison(quick.observations, quick.solutions, joint=joint)
+    own = own[own.method == "joint"]
+    assert (own.left_out_edge_rms_px > own.edge_rms_px).all()
+    assert (own.left_out_plane_rms_mm > own.plane_rms_mm).all()
 
 
 def other_session(quick, **changes):

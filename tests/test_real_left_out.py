@@ -8,8 +8,9 @@ from shared import campaign
 
 from lrfcal_lib.calibrate.pipeline import leave_out
 from lrfcal_lib.calibrate.rig import joint_rig
-from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
+from lrfcal_lib.judge.uncertainty import carried, chain_of
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian
+from lrfcal_lib.model.kinematics import beams_to
 
 PLACEMENTS = 20
 

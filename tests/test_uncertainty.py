@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.judge import uncertainty
-from lrfcal_lib.judge.uncertainty import Chain, beams_to, point_sigma, projection_sigma
+from lrfcal_lib.judge.uncertainty import Chain, point_sigma, projection_sigma
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.kinematics import SourceFrame
+from lrfcal_lib.model.kinematics import SourceFrame, beams_to
 from lrfcal_lib.simulate.draw import Devices
 
 HEAD = RigidTransform.from_components(

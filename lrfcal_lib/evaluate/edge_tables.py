@@ -10,6 +10,7 @@ from scipy.special import ndtri
 
 from lrfcal_lib.calibrate.combined import combined_outlines
 from lrfcal_lib.calibrate.observe import outline_of
+from lrfcal_lib.calibrate.outline import MeasuredBoard
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth
 from lrfcal_lib.model import geometry
@@ -18,6 +19,7 @@ from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
 
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
+UNMEASURED = MeasuredBoard(np.eye(4), lines={}, corners={}, lengths={})
 # what decides the ends of edges (images, beams, the pitch): of most, and of those with a weak side
 ENDS = {
     "last_beam": ("scan", "pitch"),
@@ -58,9 +60,9 @@ def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
             pitch = truth.pitch[placement][scanned.line]
             p_platform = geometry.lrf_to_platform(scanned.points, pitch, truth.T_head_lrf)
             p_board = truth.boards[placement].inv().apply(p_platform)
+            p_board[:, 2] = 1.0  # x and y in its plane, as lines take them
             for side, edge in names.items():
-                p_side = p_board[scanned.side == side, :2]
-                misses[edge].append(p_side @ lines[edge][:2] + lines[edge][2])
+                misses[edge].append(p_board[scanned.side == side] @ lines[edge])
         for edge, parts in misses.items():
             miss = pd.Series(1000 * np.concatenate(parts))
             mean = miss.mean() if len(miss) > 1 else np.nan
@@ -98,26 +100,21 @@ def edge_lengths(
     known = {}
     if prepared.board.corners is not None:
         known = prepared.board.lengths()
-    measured = {}
-    for variant in VARIANTS:
-        measured[variant] = _outlines(prepared, variant, T_head_lrf)
+    measured = {variant: _outlines(prepared, variant, T_head_lrf) for variant in VARIANTS}
     if joint is not None and known:
         combined = combined_outlines(joint)
         measured["combined"] = {p: combined[p] for p in prepared.names if p in combined}
     rows = []
     for variant, placement in product(measured, prepared.session.board_placements):
-        board, weak = measured[variant].get(placement, (None, frozenset()))
+        board, weak = measured[variant].get(placement, (UNMEASURED, frozenset()))
         views = [
             views[placement] for views in prepared.views.values() if placement in views
         ]
         for name, true in known.items():
-            if all(view.edge(name) is None for view in views):
+            if not any(view.edge(name) for view in views):
                 continue
-            length = np.nan
-            sigma = np.nan
-            if board is not None and name in board.lengths:
-                length = board.lengths[name]
-                sigma = board.sigma.get(name, np.nan)
+            length = board.lengths.get(name, np.nan)
+            sigma = board.sigma.get(name, np.nan)
             ends = "not measured"
             if np.isfinite(length):
                 hangs = not neighbours(prepared.board.edges, name).isdisjoint(weak)

@@ -11,8 +11,7 @@ from lrfcal_lib import __version__
 from lrfcal_lib.calibrate.calibration_file import FORMULAS, KIND, SCHEMA, rig_record
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.evaluate.joint_tables import joint_fit
-from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
-from lrfcal_lib.fit.residuals import edge_residuals_px
+from lrfcal_lib.evaluate.tables import left_out_residuals, rms
 from lrfcal_lib.judge.verdict import Verdict, judge
 from lrfcal_lib.session.files import opened
 from lrfcal_lib.session.read import Session
@@ -75,14 +74,14 @@ def calibration_record(
 
 def _sensor(solution):
     """What a JointSolution says about range finder and pitch, and what it left out in words."""
-    sensor = {}
     sigma = solution.sigma
-    for name, value in solution.sensor.items():
-        if name in sigma:
-            sensor[name] = {"value": value, "sigma": sigma[name]}
-    sensor["noise"] = solution.noise
-    sensor["excluded"] = [str(problem) for problem in solution.excluded]
-    return sensor
+    sensor = {
+        name: {"value": value, "sigma": sigma[name]}
+        for name, value in solution.sensor.items()
+        if name in sigma
+    }
+    excluded = [str(problem) for problem in solution.excluded]
+    return sensor | {"noise": solution.noise, "excluded": excluded}
 
 
 def _camera(calibration, camera, method, solution):
@@ -92,12 +91,10 @@ def _camera(calibration, camera, method, solution):
     """
     variant = "joint" if method == "joint" else "half_step"
     obs = calibration.observations[camera, variant]
-    edge = edge_residuals_px(obs, solution.transform, solution.model)
+    edge, plane = left_out_residuals([(obs, solution)])
+    misfit = {"edge_rms_px": rms(edge), "plane_rms_mm": 1000 * rms(plane)}
     if method == "joint":
         misfit = joint_fit(calibration.joint, [camera])
-    else:
-        plane = plane_residuals_of(obs, solution)
-        misfit = {"edge_rms_px": rms(edge), "plane_rms_mm": 1000 * rms(plane)}
     return {
         "maps": f"{obs.source} to {obs.camera}",
         "sigma": dict(
@@ -117,10 +114,10 @@ def file_hashes(session: Session) -> dict[str, str]:
 
     Of no other that lies there.
     """
-    stated = {session.path / name for name in FILES if os.path.lexists(session.path / name)}
+    stated = filter(os.path.lexists, [session.path / name for name in FILES])
     images = {record.file for record in session.image_records}
     hashes = {}
-    for file in sorted(stated | images):
+    for file in sorted(images.union(stated)):
         with opened(file, session.path) as stream:
             digest = hashlib.sha256(stream.read())
         hashes[file.relative_to(session.path).as_posix()] = digest.hexdigest()

@@ -7,11 +7,11 @@ import pandas as pd
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.pipeline import JointCalibration
-from lrfcal_lib.evaluate.tables import rms, unit_of
+from lrfcal_lib.evaluate.tables import parameter_table, rms
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
 from lrfcal_lib.fit.residuals import edge_residuals_px
-from lrfcal_lib.judge.next_placement import outline
+from lrfcal_lib.judge.next_placement import board_middle
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import DegenerateGeometry
@@ -79,13 +79,11 @@ def view_residuals(
         cameras = ", ".join(solution.transforms) or "none"
         raise ValueError(f"cameras are {cameras}; got '{camera}'")
     mine = solution.observations.view_camera == list(solution.transforms).index(camera)
-    pose = solution.observations.view_pose[mine]
-    turn, shift = np.split(solution.residuals("view")[mine], 2, axis=1)
-    turned = pose[:, :3, :3] @ outline(solution).mean(axis=0)
-    at = pose[:, :3, 3]
-    seen = project(turned + at, model)
-    moved = np.matvec(geometry.exp_rotation(turn), turned)
-    return seen, project(moved + at + shift, model) - seen
+    pose = solution.observations.view_pose[mine, :3]
+    predicted = geometry.move_pose(pose, solution.residuals("view")[mine])
+    middle = board_middle(solution)
+    seen = project(pose @ middle, model)
+    return seen, project(predicted @ middle, model) - seen
 
 
 def joint_table(joint: JointCalibration) -> pd.DataFrame:
@@ -102,18 +100,10 @@ def joint_table(joint: JointCalibration) -> pd.DataFrame:
         placements, model errors included; NaN where unknown), sigma (of both, see
         `Solution.trusted`).
     """
-    solution = joint.solution.solution
-    units, factors = zip(*map(unit_of, solution.names), strict=True)
-    return pd.DataFrame(
-        {
-            "parameter": solution.names,
-            "unit": units,
-            "value": factors * solution.parameters,
-            "sigma_noise": factors * solution.sigma,
-            "sigma_placements": factors * solution.sigma_placements,
-            "sigma": factors * solution.trusted_sigma,
-        }
-    )
+    s = joint.solution.solution
+    sigmas = s.sigma, s.sigma_placements, s.trusted_sigma
+    columns = ("value", "sigma_noise", "sigma_placements", "sigma")
+    return parameter_table([], {(): (s.names, s.parameters, *sigmas)}, columns)
 
 
 def noise_table(joint: JointCalibration) -> pd.DataFrame:
@@ -128,11 +118,9 @@ def noise_table(joint: JointCalibration) -> pd.DataFrame:
     DataFrame
         Columns what, value.
     """
-    rows = []
-    for name, value in joint.solution.noise.items():
-        if name == "sigma_pitch":
-            value = np.rad2deg(value)
-        rows.append((NOISE_WORDS[name], value))
+    noise = joint.solution.noise
+    noise["sigma_pitch"] = np.rad2deg(noise["sigma_pitch"])
+    rows = [(NOISE_WORDS[name], value) for name, value in noise.items()]
     return pd.DataFrame(rows, columns=["what", "value"])
 
 
@@ -155,14 +143,13 @@ def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
     odds = obs.beam_background + solution.side_odds[obs.beam_placement, obs.beam_edge]
     columns = {
         "placement": obs.placements[obs.beam_placement],
-        "edge": np.array(obs.edges)[obs.beam_edge],
+        "edge": obs.beam_edge,
         "distance_m": distance[obs.beam_placement],
         "bias_mm": 1000 * edge_shift(sensor, obs.beam_radius, odds)[0],
         "bias_radii": disc_edge(sensor + odds)[0],
     }
-    order = np.lexsort((obs.beam_edge, obs.beam_placement))
-    sides = pd.DataFrame(columns).iloc[order].groupby(list(columns)[:3], sort=False)
-    return sides.mean().reset_index()
+    sides = pd.DataFrame(columns).groupby([*columns][:3]).mean().reset_index()
+    return sides.assign(edge=np.array(obs.edges)[sides.edge])
 
 
 def joint_fit(joint: JointCalibration, cameras: Iterable[str] = ()) -> dict[str, float]:
@@ -193,14 +180,11 @@ def edge_misses_px(joint: JointCalibration, camera: str) -> np.ndarray:
     Undistorted pixels.
     """
     solution = joint.solution
-    edges = list(joint.observations.edges)
     placements = list(joint.solution.boards)
     obs = joint.seen_by(camera, crossings=ALL, faces=0).along().select(placements)
     pose = solution.transforms[camera]
-    if len(obs.crossing_points) == 0:
-        return np.zeros(0)
-    row = [placements.index(p) for p in obs.crossing_placement]
-    side = [edges.index(e) for e in obs.crossing_edge]
+    row = pd.Index(placements).get_indexer(obs.crossing_placement)
+    side = pd.Index(joint.observations.edges).get_indexer(obs.crossing_edge)
     odds = obs.crossing_background + solution.side_odds[row, side]
     shift = edge_shift(solution.sensor["edge_log_odds"], obs.crossing_radius, odds)[0]
     depth = pose.apply(obs.crossing_points)[:, 2]
@@ -236,16 +220,11 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         except DegenerateGeometry:
             continue
         for camera in joint.observations.cameras:
-            one = first.transforms[camera]
-            other = second.transforms[camera]
-            turn, shift = geometry.transform_difference(one, other)
-            row = {
-                "pair": pair,
-                "camera": camera,
-                "rotation_deg": np.rad2deg(turn),
-                "translation_mm": 1000 * shift,
-            }
-            rows.append(row | _predicted(joint.solution, camera))
+            turn, shift = geometry.transform_difference(
+                first.transforms[camera], second.transforms[camera]
+            )
+            differences = np.rad2deg(turn), 1000 * shift
+            rows.append((pair, camera, *differences, *_predicted(joint.solution, camera)))
     return pd.DataFrame(rows, columns=HALVES_COLUMNS)
 
 
@@ -255,15 +234,15 @@ def _estimate_from(joint, placements):
 
 
 def _predicted(solution, camera):
-    """Root mean square difference of two halves of the placements as sigma predicts it."""
+    """Root mean square difference of two halves of the placements as sigma predicts it, degrees and
+    millimetres.
+    """
     common = np.diag(solution.lens) + solution.step**2
     variances = solution.camera(camera).trusted_sigma ** 2
     variances -= common[solution.columns(f"{camera}_")]
-    turn, shift = np.split(2 * np.sqrt(np.maximum(variances, 0.0)), 2)
-    return {
-        "predicted_rotation_deg": np.rad2deg(np.linalg.norm(turn)),
-        "predicted_translation_mm": 1000 * np.linalg.norm(shift),
-    }
+    parts = np.split(2 * np.sqrt(np.maximum(variances, 0.0)), 2)
+    turn, shift = np.linalg.norm(parts, axis=1)
+    return np.rad2deg(turn), 1000 * shift
 
 
 def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:

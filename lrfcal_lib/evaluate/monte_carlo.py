@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import RigidTransform
 from scipy.special import logit
 from scipy.stats import binom, chi2
 
@@ -112,7 +113,7 @@ def joint_truth(
         [range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0]
     )
     count = len(boards)
-    boards = np.stack([pose_array(T) for T in boards])
+    boards = pose_array(RigidTransform.concatenate(boards))
     own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges) + 1))
     return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, *own), obs)
 
@@ -152,9 +153,7 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
     if not rows:
         last = next(reversed(failed.values()), "no seed given")
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
-    seeds, errors, covariances, bounds = (
-        np.array(column) for column in zip(*rows, strict=True)
-    )
+    seeds, errors, covariances, bounds = map(np.array, zip(*rows, strict=True))
     return Trials(names, seeds, errors, covariances, bounds, failed)
 
 
@@ -167,13 +166,10 @@ def state_errors(state: JointState, truth: JointState, unknowns: Unknowns) -> np
         In one gauge.
     unknowns : Unknowns
     """
-    estimated = np.concatenate([state.head[None], state.cameras])
-    true = np.concatenate([truth.head[None], truth.cameras])
-    poses = pose_step(pose_transform(true), pose_transform(estimated))
+    head = pose_step(pose_transform(truth.head), pose_transform(state.head))
+    cameras = pose_step(pose_transform(truth.cameras), pose_transform(state.cameras))
     sensor = state.sensor - truth.sensor
-    return np.concatenate([poses[0, AXIS_COLUMNS], poses[1:].ravel(), sensor])[
-        unknowns.mask
-    ]
+    return np.concatenate([head[AXIS_COLUMNS], cameras.ravel(), sensor])[unknowns.mask]
 
 
 def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.ndarray:
@@ -230,10 +226,10 @@ def spread(covariance: np.ndarray, names: Sequence[str]) -> dict[str, float]:
         Of the unknowns.
     """
     variance = np.diagonal(covariance)
-    out = {}
-    for words, (index, _, factor) in groups_of(names).items():
-        out[words] = float(factor * np.sqrt(variance[index].sum()))
-    return out
+    return {
+        words: float(factor * np.sqrt(variance[index].sum()))
+        for words, (index, _, factor) in groups_of(names).items()
+    }
 
 
 def consistency(trials: Trials) -> pd.DataFrame:
@@ -265,9 +261,10 @@ def consistency(trials: Trials) -> pd.DataFrame:
         bad = trials.seeds[~np.isfinite(trials.errors).all(axis=1)]
         raise ValueError(f"errors or covariances are not finite (seeds {bad.tolist()[:5]})")
     groups = groups_of(trials.names) | {"all": (list(range(len(trials.names))), "", None)}
-    rows = []
-    for words, (index, unit, factor) in groups.items():
-        rows.append({"group": words, "unit": unit} | _judge(trials, index, factor))
+    rows = [
+        {"group": words, "unit": unit} | _judge(trials, index, factor)
+        for words, (index, unit, factor) in groups.items()
+    ]
     return pd.DataFrame(rows).assign(trials=count, failed=len(trials.failed))
 
 
@@ -278,23 +275,20 @@ def _judge(trials, index, factor):
     C = trials.covariances[block]
     B = trials.bounds[block]
     mean = np.mean(C, axis=0)
-    sigma = sigma_of(mean)
-    seen = max(round(len(e) * _freedom(mean / np.outer(sigma, sigma))), 1)
+    seen = max(round(len(e) * _freedom(mean / dyads(sigma_of(mean)))), 1)
     unit = np.full(e.shape, factor)
     if factor is None:
         unit = 1 / sigma_of(B)
-    B = unit[:, :, None] * B * unit[:, None]
+    B = B * dyads(unit)
     crb = np.sqrt(np.mean(np.linalg.trace(B)))
     rmse = rms(np.linalg.norm(unit * e, axis=1))
     free = len(e) * _freedom(np.mean(B, axis=0))
-    half_width = HALF_WIDTH * sigma_of(C)
-    normalised = solve_each(C, e)
     row = {
         "rmse": rmse,
         "crb": crb,
         "rmse_over_crb": rmse / crb,
-        "coverage": np.mean(np.abs(e) < half_width),
-        "nees": np.mean(np.vecdot(e, normalised)) / len(index),
+        "coverage": np.mean(np.abs(e) < HALF_WIDTH * sigma_of(C)),
+        "nees": np.mean(np.vecdot(e, solve_each(C, e))) / len(index),
     }
     row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(
         chi2.ppf(LIMITS, free) / free

@@ -9,7 +9,7 @@ from lrfcal_lib.calibrate.clouds import views_of
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.evaluate.truth import read_truth
-from lrfcal_lib.model.geometry import tilt
+from lrfcal_lib.model.geometry import tilt, unit_vector
 from lrfcal_lib.model.kinematics import AS_RECORDED
 
 # metres along the beam by which a reading is of another surface than the beam's centre meets
@@ -75,9 +75,9 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     order = np.argsort(recorded)
     pitch = np.interp(cloud.pitch, recorded[order], true_pitch[order])
     points = tilt(cloud.points, turn) + shift
-    origins = tilt(np.broadcast_to(truth.T_head_lrf.translation, points.shape), pitch)
+    origins = tilt(truth.T_head_lrf.translation, pitch)
     length = np.linalg.norm(points - origins, axis=1)
-    directions = (points - origins) / length[:, None]
+    directions = unit_vector(points - origins)
     hits = world.cast(origins, directions)
     depth = np.where(np.isfinite(hits.distance), length - hits.distance, np.nan)
     # else the rim of the spot read a surface beside the beam: the point is where it is
@@ -100,9 +100,8 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
 def _hidden(world, eye, points):
     """Which points (n, 3) something of a World hides from an eye (3,)."""
     way = points - eye
-    far = np.linalg.norm(way, axis=1)
-    hits = world.cast(np.broadcast_to(eye, way.shape), way / far[:, None])
-    return hits.distance < far - CLEAR
+    hits = world.cast(np.broadcast_to(eye, way.shape), unit_vector(way))
+    return hits.distance < np.linalg.norm(way, axis=1) - CLEAR
 
 
 def _color_errors(cloud, light):

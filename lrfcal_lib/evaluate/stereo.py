@@ -65,17 +65,16 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
             f"a stereo reference needs two cameras and a pattern, got {len(prepared.views)} cameras"
         )
     first, second = list(prepared.views)[:2]
-    corners = {}
-    for camera in (first, second):
-        views = prepared.views[camera].items()
-        corners[camera] = {p: view.pixels for p, view in views if view.pixels is not None}
-    common = sorted(corners[first].keys() & corners[second].keys())
+    shown = []
+    for views in (prepared.views[first], prepared.views[second]):
+        shown.append({p: v.pixels for p, v in views.items() if v.pixels is not None})
+    common = sorted(shown[0].keys() & shown[1].keys())
     if not common:
         raise ValueError(
             "no placement shows the pattern to both cameras: the stereo check needs at least one"
         )
     models = [prepared.models[first], prepared.models[second]]
-    pixels = np.array([[of_camera[p] for p in common] for of_camera in corners.values()])
+    pixels = np.array([[of_camera[p] for p in common] for of_camera in shown])
     poses = []
     for model, of_camera in zip(models, pixels, strict=True):
         boards = [board_pose(image, pattern, model)[0] for image in of_camera]
@@ -87,9 +86,7 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
     basis = None
     if np.any(prepared.relief):
         basis = waves(pattern.points())
-    fixed = []
-    if all(model.distortion[4] == 0 for model in models):
-        fixed.append(K3)
+    fixed = (K3,) if all(model.distortion[4] == 0 for model in models) else ()
     adjusted = adjust_robust(
         pixels,
         pattern.points(),
@@ -97,7 +94,7 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
         poses[0],
         RigidTransform.concatenate([RigidTransform.identity(), rough]),
         basis=basis,
-        fixed=tuple(fixed),
+        fixed=fixed,
     )
     return StereoReference(
         (first, second), adjusted.mounting[1], adjusted.mounting_covariance[0]

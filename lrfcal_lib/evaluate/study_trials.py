@@ -12,6 +12,7 @@ from lrfcal_lib.evaluate.monte_carlo import (
     bound,
     joint_truth,
 )
+from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     move_pose,
@@ -51,7 +52,6 @@ PLANES: dict[str, dict] = {
     },
 }
 STUDIED = (*BATCHED, *PLANES, "joint")
-PARTS = {"rotation": slice(3), "translation": slice(3, 6)}  # of a pose
 LEAST_RANGE = 0.05  # metres: noise may make a near one negative
 
 
@@ -157,7 +157,7 @@ def _judged(estimate, true, bounds):
     error = pose_step(pose_transform(true), pose_transform(pose))
     if not (np.isfinite(error).all() and np.isfinite(covariance).all()):
         return {"outcome": "not finite"}
-    numbers = {part: np.linalg.norm(error[of]) for part, of in PARTS.items()}
+    numbers = _sizes(error)
     outcome = "ok"
     if numbers["rotation"] > FAR:
         outcome = "more than 10 deg from the truth"
@@ -165,16 +165,22 @@ def _judged(estimate, true, bounds):
         outcome = "not converged"
     if not bounds:
         return {"outcome": outcome} | numbers
-    interval = HALF_WIDTH * np.sqrt(np.maximum(np.diagonal(covariance), 0))
-    for name, limit in bounds.items():
-        for part, of in PARTS.items():
-            numbers[f"{name}_{part}"] = np.sqrt(np.trace(limit[of, of]))
-    numbers |= {
-        "over_bound": np.mean(error**2 / np.diagonal(bounds["bound"])),
+    sigma_bound = sigma_of(bounds["bound"])
+    return {
+        "outcome": outcome,
+        **numbers,
+        **_sizes(sigma_bound, "bound_"),
+        **_sizes(sigma_of(bounds["known"]), "known_"),
+        "over_bound": np.mean((error / sigma_bound) ** 2),
         "nees": error @ np.linalg.pinv(covariance) @ error / 6,
-        "covered": np.mean(np.abs(error) < interval),
+        "covered": np.mean(np.abs(error) < HALF_WIDTH * sigma_of(covariance)),
     }
-    return {"outcome": outcome} | numbers
+
+
+def _sizes(step, what=""):
+    """Lengths of the turn and the shift of a step (6,), by column."""
+    turn, shift = np.linalg.norm(np.split(step, 2), axis=1)
+    return {f"{what}rotation": turn, f"{what}translation": shift}
 
 
 def crossing_observations(
@@ -191,22 +197,23 @@ def crossing_observations(
         Crossings are at the last beams on the board instead of half a beam step outside.
     """
     if scenario.corner:
-        lines = shots["lines"][:, :, None]
-        points = shots["points"][:, :, None]
+        lines = shots["lines"]
+        points = shots["points"]
         noise = scenario.sigma_range**2 * np.eye(3)
         covariance = np.broadcast_to(noise, (*points.shape, 3))
     else:
         lines = np.tile(shots["lines"], (1, 1, scenario.scans, 1))
         points, covariance = _ends_of_lines(shots["ranges"], scenario, last_beam)
-    sessions, placements, each = points.shape[:3]
-    shape = (sessions, placements * each)
+    sessions, placements = points.shape[:2]
+    lines = lines.reshape(sessions, -1, 3)
+    count = lines.shape[1]
     return CameraObservations(
         scenario.model,
-        crossing_points=points.reshape(*shape, 3),
-        crossing_covariance=covariance.reshape(*shape, 3, 3),
-        crossing_lines=lines.reshape(*shape, 3),
-        crossing_line_sigma=np.full(shape, scenario.sigma_px),
-        crossing_placement=np.repeat(np.arange(placements), each),
+        crossing_points=points.reshape(lines.shape),
+        crossing_covariance=covariance.reshape(*lines.shape, 3),
+        crossing_lines=lines,
+        crossing_line_sigma=np.full((sessions, count), scenario.sigma_px),
+        crossing_placement=np.arange(count) * placements // count,
     )
 
 
@@ -215,18 +222,23 @@ def _ends_of_lines(ranges, setup, last_beam):
     covariances.
     """
     bearings = setup.bearings()
-    *sessions, scans, beams = ranges.shape
+    sessions, placements, _, beams = ranges.shape
     ranges = ranges.reshape(-1, beams)
     lines, information = fit_lines(ranges, bearings)
-    _, first, last = row_ends(np.isfinite(ranges))
-    ends = bearings[np.stack([first, last], axis=1)]
+    ends = bearings[_ends(ranges)]
     if not last_beam:
         ends = ends + np.array([-0.5, 0.5]) * setup.step
     of_line = np.linalg.inv(information) * setup.sigma_range**2
     found = crossings_of(lines.repeat(2, axis=0), of_line.repeat(2, axis=0), ends.ravel())
+    points = found.points.reshape(sessions, placements, -1, 3)
     covariance = found.covariance(setup.step * UNIFORM)
-    shape = (*sessions, 2 * scans, 3)
-    return found.points.reshape(shape), covariance.reshape(*shape, 3)
+    return points, covariance.reshape(*points.shape, 3)
+
+
+def _ends(ranges):
+    """The first and the last beam on the board of scan lines (n, B), (n, 2)."""
+    _, *ends = row_ends(np.isfinite(ranges))
+    return np.stack(ends, axis=1)
 
 
 def plane_observations(
@@ -305,27 +317,25 @@ def _readings(shots, scenario, trial):
     edges = np.repeat(shots["edges"][trial], scans, axis=0)
     ranges = ranges.reshape(-1, beams)
     bearings = scenario.bearings()
-    hit = np.isfinite(ranges)
-    line, beam = np.nonzero(hit)
-    _, first, last = row_ends(hit)
-    ends = np.stack([first, last], axis=1)
+    line, beam = np.nonzero(np.isfinite(ranges))
+    ends = _ends(ranges)
     at_ends = np.maximum(np.take_along_axis(ranges, ends, axis=1), LEAST_RANGE)
-    near = np.arange(2 * REACH) - REACH  # beams about the end of a scan line
+    # beams about either end of every scan line
+    near = np.arange(2 * REACH) - REACH
     window = np.clip(ends[..., None] + [[0], [1]] + near, 0, beams - 1)
-    row, end, _ = np.indices(window.shape).reshape(3, -1)
-    window = window.ravel()
-    at_end = at_ends[row, end]
+    read = np.take_along_axis(ranges[:, None], window, axis=2)
+    at_end = np.repeat(at_ends, near.size)
     return {
         "face_range": ranges[line, beam],
         "face_bearing": bearings[beam],
         "face_sigma": np.full(len(beam), scenario.sigma_range),
         "face_placement": of_line[line],
-        "beam_bearing": bearings[window],
-        "beam_hit": hit[row, window],
-        "beam_edge": edges[row, end],
+        "beam_bearing": bearings[window.ravel()],
+        "beam_hit": np.isfinite(read.ravel()),
+        "beam_edge": np.repeat(edges, near.size),
         "beam_radius": scenario.radius(at_end),
         "beam_step": scenario.step * at_end,
-        "beam_placement": of_line[row],
+        "beam_placement": np.repeat(of_line, 2 * near.size),
     }
 
 

@@ -1,7 +1,7 @@
 """Tables of what was recorded and calibrated, and the comparison of methods."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import cv2
@@ -29,6 +29,7 @@ UNITS = {  # of parameters, and the factor from radians and metres
     r"offset_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0),
     r"pitch_scale": ("%", 100.0),
     r"[fc][xy]": ("px", 1.0),
+    r".*": ("1", 1.0),
 }
 AXIS_ERRORS = {  # of an axis, and what they are called of a camera
     "axis_direction_error_deg": "rotation_error_deg",
@@ -59,10 +60,7 @@ def unit_of(parameter: str) -> tuple[str, float]:
     factor : float
         From radians and metres.
     """
-    for names, unit in UNITS.items():
-        if re.fullmatch(names, parameter):
-            return unit
-    return "1", 1.0
+    return next(unit for names, unit in UNITS.items() if re.fullmatch(names, parameter))
 
 
 def poses_under(obs: CameraObservations, model: CameraModel | None) -> np.ndarray:
@@ -86,8 +84,7 @@ def poses_under(obs: CameraObservations, model: CameraModel | None) -> np.ndarra
                 useExtrinsicGuess=True,
                 flags=cv2.SOLVEPNP_ITERATIVE,
             )
-            pose[:3, :3] = cv2.Rodrigues(rotvec)[0]
-            pose[:3, 3:] = shift
+            pose[:3] = np.hstack([cv2.Rodrigues(rotvec)[0], shift])
     return moved
 
 
@@ -192,7 +189,7 @@ def method_comparison(
             if method.uses != "plane":
                 used = getattr(obs, f"{method.uses}_placement")
             held = left_out(obs, judge, name, solution)
-        edge = edge_residuals_px(judge, solution.transform, solution.model)
+        edge, plane = left_out_residuals([(judge, solution)])
         held_edge, held_plane = left_out_residuals(held)
         row = {
             "camera": camera,
@@ -200,7 +197,7 @@ def method_comparison(
             "n_placements": len(np.unique(used)),
             "edge_median_px": float(np.median(np.abs(edge))) if len(edge) else np.nan,
             "edge_rms_px": rms(edge),
-            "plane_rms_mm": 1000 * rms(plane_residuals_of(judge, solution)),
+            "plane_rms_mm": 1000 * rms(plane),
             "left_out_edge_rms_px": rms(held_edge),
             "left_out_plane_rms_mm": 1000 * rms(held_plane),
         }
@@ -211,14 +208,32 @@ def method_comparison(
     return pd.DataFrame(rows)
 
 
-def _parameter_table(keys, parameters):
-    """A row a parameter, in its unit, of names, values and sigmas by a tuple of keys."""
+def parameter_table(
+    keys: Sequence[str],
+    parameters: Mapping[tuple, tuple],
+    columns: Sequence[str] = ("value", "sigma"),
+) -> pd.DataFrame:
+    """Parameters in their units, a row each.
+
+    Parameters
+    ----------
+    keys : sequence of str
+        Columns that tell whose parameters they are.
+    parameters : dict of tuple to tuple
+        By what these columns hold: names, and an array for every one of `columns`.
+    columns : sequence of str
+
+    Returns
+    -------
+    DataFrame
+        Columns as `keys`, parameter, unit, and `columns`.
+    """
     rows = []
-    for key, columns in parameters.items():
-        for name, value, sigma in zip(*columns, strict=True):
+    for key, arrays in parameters.items():
+        for name, *values in zip(*arrays, strict=True):
             unit, factor = unit_of(name)
-            rows.append((*key, name, unit, factor * value, factor * sigma))
-    return pd.DataFrame(rows, columns=[*keys, "parameter", "unit", "value", "sigma"])
+            rows.append((*key, name, unit, *np.multiply(factor, values)))
+    return pd.DataFrame(rows, columns=[*keys, "parameter", "unit", *columns])
 
 
 def camera_calibration_table(solutions: dict[tuple[str, str], Solution]) -> pd.DataFrame:
@@ -237,7 +252,7 @@ def camera_calibration_table(solutions: dict[tuple[str, str], Solution]) -> pd.D
     parameters = {
         key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()
     }
-    return _parameter_table(["camera", "method"], parameters)
+    return parameter_table(["camera", "method"], parameters)
 
 
 def platform_calibration_table(
@@ -265,7 +280,7 @@ def platform_calibration_table(
         phi, ty = geometry.paper_parameters(axis.T_head_lrf)
         sigma = np.append(axis.sigma, np.full(4, np.nan))
         parameters[method,] = names, [*axis.parameters, *phi, ty], sigma
-    table = _parameter_table(["method"], parameters)
+    table = parameter_table(["method"], parameters)
     if truth is not None:
         axes = platform.axes.items()
         errors = {method: axis_errors(axis, truth) for method, axis in axes}
@@ -295,18 +310,19 @@ def sweeps_table(session: Session) -> pd.DataFrame:
         step = 0.0
         if len(pitch) > 1:
             step = float(np.median(np.abs(np.diff(pitch))))
-        row = {
-            "placement": placement,
-            "n_scan_lines": len(pitch),
-            "n_returns": int(valid.sum()),
-            "invalid_percent": 100 * (1 - valid.mean()),
-            "pitch_from_deg": pitch[0],
-            "pitch_to_deg": pitch[-1],
-            "pitch_step_deg": step,
-            "direction": session.sweep_direction(placement),
-            "n_images": len(session.images(placement=placement)),
-        }
-        rows.append(row)
+        rows.append(
+            {
+                "placement": placement,
+                "n_scan_lines": len(pitch),
+                "n_returns": int(valid.sum()),
+                "invalid_percent": 100 * (1 - valid.mean()),
+                "pitch_from_deg": pitch[0],
+                "pitch_to_deg": pitch[-1],
+                "pitch_step_deg": step,
+                "direction": session.sweep_direction(placement),
+                "n_images": len(session.images(placement=placement)),
+            }
+        )
     return pd.DataFrame(rows)
 
 
@@ -328,15 +344,10 @@ def scans_table(prepared: Prepared) -> pd.DataFrame:
         swept = prepared.swept["half_step"].get(placement)
         along = {s.side for s in prepared.edges["half_step"][placement].sides}
         across = set() if swept is None else {s.side for s in swept.sides} - along
-        row = {
-            "placement": placement,
-            "n_points": int(board.mask.sum()),
-            "sigma_range_mm": 1000 * board.sigma_range,
-            "jump_points": int(board.n_jump_points),
-            "sides_along": len(along),
-            "sides_across": len(across),
-        }
-        rows.append(row)
+        count = int(board.mask.sum())
+        sigma_mm = 1000 * board.sigma_range
+        jumps = int(board.n_jump_points)
+        rows.append((placement, count, sigma_mm, jumps, len(along), len(across)))
     return pd.DataFrame(rows, columns=SCAN_COLUMNS)
 
 
@@ -359,7 +370,7 @@ def intrinsics_table(models: dict[str, CameraModel]) -> pd.DataFrame:
         if model.covariance is not None:
             sigma = sigma_of(model.covariance)
         parameters[camera,] = INTRINSIC_NAMES, model.parameters, sigma
-    return _parameter_table(["camera"], parameters)
+    return parameter_table(["camera"], parameters)
 
 
 def outline_table(outline: Outline) -> pd.DataFrame:
@@ -375,10 +386,10 @@ def outline_table(outline: Outline) -> pd.DataFrame:
         Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours),
         n_images.
     """
-    rows = []
-    for name, length in outline.board.lengths().items():
-        sd = 1000 * outline.length_sd[name]
-        rows.append((name, 1000 * length, sd, outline.n_lengths[name]))
+    rows = [
+        (name, 1000 * length, 1000 * outline.length_sd[name], outline.n_lengths[name])
+        for name, length in outline.board.lengths().items()
+    ]
     return pd.DataFrame(rows, columns=["edge", "length_mm", "sd_mm", "n_images"])
 
 
@@ -394,10 +405,10 @@ def pitch_models_table(errors: PitchErrors) -> pd.DataFrame:
     DataFrame
         Columns model, n_parameters, plane_rms_mm, F, p_value (against the model before).
     """
-    rows = []
-    for model in errors.models.values():
-        rms_mm = 1000 * model.plane_rms
-        rows.append((model.name, model.n_parameters, rms_mm, model.F, model.p_value))
+    rows = [
+        (model.name, model.n_parameters, 1000 * model.plane_rms, model.F, model.p_value)
+        for model in errors.models.values()
+    ]
     return pd.DataFrame(
         rows, columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"]
     )
@@ -439,13 +450,7 @@ def axis_knowledge_table(platform: PlatformCalibration) -> pd.DataFrame:
     """
     data = platform.axes["line_3d"].sigma
     rough = np.repeat(platform.stated_sigma, 2)
-    units, factors = zip(*map(unit_of, AXIS_NAMES), strict=True)
-    return pd.DataFrame(
-        {
-            "parameter": AXIS_NAMES,
-            "unit": units,
-            "sigma_data": factors * data,
-            "sigma_rough": factors * rough,
-            "better": np.where(data < rough, "data", "rough measurement"),
-        }
+    table = parameter_table(
+        [], {(): (AXIS_NAMES, data, rough)}, ("sigma_data", "sigma_rough")
     )
+    return table.assign(better=np.where(data < rough, "data", "rough measurement"))

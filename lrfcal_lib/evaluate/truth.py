@@ -4,6 +4,7 @@ import os
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
@@ -89,25 +90,25 @@ def read_truth(session: Session) -> Truth | None:
         return None
     data = read_json(file, session.path)
     with naming(f"{file} (simulate the session again)"):
-        cameras = {}
-        for name, entry in data["cameras"].items():
-            cameras[name] = _pose(entry.get("T_camera_lrf") or entry["T_camera_platform"])
-        boards = {}
-        for number, entry in data["boards"].items():
-            boards[int(number)] = _pose(entry["T_platform_board"])
-        pitch = {}
-        for number, entry in data["sweeps"].items():
-            pitch[int(number)] = np.asarray(entry["pitch_rad"], float)
-        stations = {}
-        for number, entry in data.get("stations", {}).items():
-            stations[int(number)] = _pose(entry["T_room_platform"])
         return Truth(
             T_head_lrf=_pose(data["T_head_lrf"]),
-            cameras=cameras,
+            cameras={
+                name: _pose(entry.get("T_camera_lrf") or entry["T_camera_platform"])
+                for name, entry in data["cameras"].items()
+            },
             board=board_from_json(data["board"]),
-            boards=boards,
-            pitch=pitch,
-            stations=stations,
+            boards={
+                int(number): _pose(entry["T_platform_board"])
+                for number, entry in data["boards"].items()
+            },
+            pitch={
+                int(number): np.asarray(entry["pitch_rad"], float)
+                for number, entry in data["sweeps"].items()
+            },
+            stations={
+                int(number): _pose(entry["T_room_platform"])
+                for number, entry in data.get("stations", {}).items()
+            },
             lengths=tuple(data.get("lengths", ())),
             setup=data.get("setup", ""),
         )
@@ -196,18 +197,16 @@ def on_true_edges(observations: PlatformObservations, truth: Truth) -> PlatformO
     -------
     PlatformObservations
     """
-    lines = truth.board.lines()
-    points = observations.edge_points.copy()
-    sides = np.column_stack([observations.edge_placement, observations.edge_number])
-    for placement, number in np.unique(sides, axis=0):
-        rows = (sides == (placement, number)).all(axis=1)
-        pitch = observations.edge_pitch[rows]
-        board = truth.boards[placement]
-        moved = geometry.lrf_to_platform(points[rows], pitch, truth.T_head_lrf)
-        flat = board.inv().apply(moved)[:, :2]
-        away = flat @ lines[:, :2].T + lines[:, 2]
-        edge = np.median(np.abs(away), axis=0).argmin()
-        flat = flat - away[:, [edge]] * lines[edge, :2]
-        on_edge = board.apply(np.insert(flat, 2, 0.0, axis=1))
-        points[rows] = truth.T_head_lrf.inv().apply(geometry.tilt(on_edge, -pitch))
-    return replace(observations, edge_points=points)
+    pitch = observations.edge_pitch
+    placement = observations.edge_placement
+    boards = RigidTransform.concatenate([truth.boards[p] for p in placement])
+    p_platform = geometry.lrf_to_platform(observations.edge_points, pitch, truth.T_head_lrf)
+    flat = boards.inv().apply(p_platform)
+    flat[:, 2] = 1.0  # x and y in the plane of the board, as lines take them
+    away = pd.DataFrame(np.abs(flat @ truth.board.lines().T))
+    of_sides = away.groupby([placement, observations.edge_number]).transform("median")
+    line = truth.board.lines()[of_sides.to_numpy().argmin(axis=1)]
+    on_edge = flat - np.vecdot(flat, line)[:, None] * line
+    on_edge[:, 2] = 0.0
+    p_head = geometry.tilt(boards.apply(on_edge), -pitch)
+    return replace(observations, edge_points=truth.T_head_lrf.inv().apply(p_head))

@@ -2,7 +2,7 @@
 cause and remedy.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtr, stdtrit
 
-from lrfcal_lib.judge.findings import Kind, by_sign
+from lrfcal_lib.judge.findings import Finding, Kind, by_sign, no_if
 from lrfcal_lib.model.geometry import (
     axis_difference,
     axis_of,
@@ -77,14 +77,18 @@ class Alternative:
 def _views(obs, s, origin=(0.0, 0.0)):
     """Squares larger by s about the pattern's first corner (`origin`, metres, board frame)."""
     pose = obs.view_pose.copy()
-    corner = pose[:, :3, :2] @ np.asarray(origin)
-    pose[:, :3, 3] = (1 + s) * pose[:, :3, 3] + s * corner
+    pose[:, :3, 3] += s * pose[:, :3] @ [*origin, 0.0, 1.0]
     return replace(obs, view_pose=pose)
+
+
+def _outline(obs, s):
+    """The board larger by s."""
+    return replace(obs, corners=obs.corners * (1 + s))
 
 
 def _views_and_outline(obs, s):
     """Squares larger by s where the outline was measured in their scale."""
-    return replace(_views(obs, s), corners=obs.corners * (1 + s))
+    return _outline(_views(obs, s), s)
 
 
 def _lag(obs, s):
@@ -103,7 +107,7 @@ ALTERNATIVES = {
         "measure a square over many of them",
     ),
     Kind.OUTLINE: Alternative(
-        lambda obs, s: replace(obs, corners=obs.corners * (1 + s)),
+        _outline,
         "the board's outline is {size} +- {sigma} % {sign} than stated",
         "measure the board's edges",
     ),
@@ -148,15 +152,14 @@ def alternatives_of(prepared):
     the pattern's first corner.
     """
     stated = dict(ALTERNATIVES)
+    squares = stated.pop(Kind.SQUARES)
     pattern = prepared.board.pattern
-    if pattern is None:
-        del stated[Kind.SQUARES]
-    elif prepared.session.board.corners is None:
-        del stated[Kind.OUTLINE]
-        stated[Kind.SQUARES] = replace(stated[Kind.SQUARES], change=_views_and_outline)
-    else:
-        about_first_corner = partial(_views, origin=pattern.origin)
-        stated[Kind.SQUARES] = replace(stated[Kind.SQUARES], change=about_first_corner)
+    if pattern is not None:
+        change = partial(_views, origin=pattern.origin)
+        if prepared.session.board.corners is None:
+            del stated[Kind.OUTLINE]
+            change = _views_and_outline
+        stated[Kind.SQUARES] = replace(squares, change=change)
     if prepared.session.lrf.spot_exit is None:
         del stated[Kind.SPOT]
     return stated
@@ -239,12 +242,11 @@ def doubt_about(kind, alternative, solution, admitted_offset):
     score = solution.score(alternative.change(solution.observations, STEP), STEP)
     expected = np.append(names == "range_offset", 0) / (ADMITTED * admitted_offset) ** 2
     covariance, step, pulls = score.solved(expected, solution.sensor["range_offset"])
-    value = float(step[-1])
-    pulls = pulls[:, -1]
+    value = step[-1]
     freedom = max(len(pulls) - 1, 1)
     noise = covariance[-1, -1]
-    scatter = np.sum(pulls**2) * len(pulls) / freedom
-    sigma = float(np.sqrt(max(noise, scatter)))
+    scatter = np.sum(pulls[:, -1] ** 2) * len(pulls) / freedom
+    sigma = np.sqrt(max(noise, scatter))
 
     handed = np.flatnonzero(~np.isin(names, SENSOR))
     # what the accuracy of the angular step may do must not hide that it is wrong
@@ -261,7 +263,7 @@ def doubt_about(kind, alternative, solution, admitted_offset):
         sigma=sigma,
         ratio=(value / max(sigma, 1e-300)) ** 2,
         freedom=freedom if scatter > noise else np.inf,
-        moved=float(np.max(np.abs(moves), initial=0.0)),
+        moved=np.max(np.abs(moves), initial=0.0),
         words=f"{words}: {alternative.remedy}",
     )
 
@@ -281,9 +283,10 @@ def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
             harmful = (
                 False  # a step that the sensor's disc divides is off for no small reason
             )
-        certain = doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
+        size = abs(doubt.value)
+        certain = doubt.exceeds(ASKED) and size > stated[doubt.kind].worth
         asks = harmful or (certain and doubt.kind not in faint)
-        if asks and abs(doubt.value) < stated[doubt.kind].reach:
+        if asks and size < stated[doubt.kind].reach:
             asked.append(doubt)
     return [doubt for doubt in asked if doubt.ratio > AS_GOOD * asked[0].ratio]
 
@@ -306,15 +309,7 @@ def step_words(solution: JointSolution) -> str:
     )
 
 
-@dataclass(frozen=True)
-class Far:
-    """Something that lies far from where it is stated: in words, and by what angle (radians)."""
-
-    words: str
-    angle: float
-
-
-def far_from_stated(joint) -> list[Far]:
+def far_from_stated(joint) -> list[Finding]:
     """What lies far from where session.json puts it.
 
     A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of
@@ -325,25 +320,27 @@ def far_from_stated(joint) -> list[Far]:
     ----------
     joint : JointCalibration
     """
-    far = far_axis(joint) + far_cameras(joint)
-    return far or exchanged_sides(joint.solution)
+    far = [*far_axis(joint), *far_cameras(joint)]
+    return far or list(exchanged_sides(joint.solution))
 
 
-def far_axis(joint):
-    """The tilt axis, if it is Far from where it is stated."""
+def _far(words, angle):
+    """The Finding of what lies far from where it is stated, turned by an angle (radians)."""
+    return Finding(no_if(angle > np.pi / 2), Kind.FAR_FROM_STATED, words)
+
+
+def far_axis(joint) -> Iterator[Finding]:
+    """The tilt axis, if it is far from where it is stated."""
     session = joint.prepared.session
     solution = joint.solution
     if session.T_head_lrf is None or not joint.settings["axis"]:
-        return []
+        return
     apart = axis_difference(solution.axis, axis_of(session.T_head_lrf))
     variance = np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1)
     sigma = np.hypot(session.platform_sigma, np.sqrt(variance))
-    if np.all(apart <= FAR * sigma):
-        return []
-    words = (
-        f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
-    )
-    return [Far(words, apart[0])]
+    if np.any(apart > FAR * sigma):
+        words = f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
+        yield _far(words, apart[0])
 
 
 def guesses_of(session: Session) -> dict[str, RigidTransform]:
@@ -357,50 +354,60 @@ def guesses_of(session: Session) -> dict[str, RigidTransform]:
     return {name: camera.guess for name, camera in cameras if camera.guess is not None}
 
 
-def far_cameras(joint):
-    """Cameras that are Far from where they are guessed, or stand where another one is guessed."""
+def far_cameras(joint) -> Iterator[Finding]:
+    """Cameras that are far from where they are guessed, or stand where another one is guessed."""
     guesses = guesses_of(joint.prepared.session)
-    far = []
     for camera, transform in joint.solution.transforms.items():
         if camera not in guesses:
             continue
-        apart = {
-            name: transform_difference(transform, guess) for name, guess in guesses.items()
-        }
-        turn, shift = apart[camera]
-        nearest = min(apart, key=lambda name: apart[name][0] * LEVER + apart[name][1])
+        turn, shift = transform_difference(transform, guesses[camera])
+        nearest = nearest_guess(transform, guesses)
         if turn > FAR_TURN or shift > FAR_SHIFT:
             words = (
                 f"camera '{camera}' stands {_apart(turn, shift)} from its guess in "
                 f"session.json: {CHECK}"
             )
-            far.append(Far(words, turn))
+            yield _far(words, turn)
         elif nearest != camera:
             words = (
                 f"camera '{camera}' stands where camera '{nearest}' is said to stand: were the "
                 "folders exchanged?"
             )
-            far.append(Far(words, turn))
-    return far
+            yield _far(words, turn)
 
 
-def exchanged_sides(solution):
+def nearest_guess(transform, guesses):
+    """Name of the camera whose guess is nearest."""
+    return min(guesses, key=lambda name: distance(transform, guesses[name]))
+
+
+def distance(a: RigidTransform, b: RigidTransform) -> float:
+    """How far two places of a camera are apart, turn and shift in one: metres.
+
+    Parameters
+    ----------
+    a, b
+    """
+    turn, shift = transform_difference(a, b)
+    return LEVER * turn + shift
+
+
+def exchanged_sides(solution) -> Iterator[Finding]:
     """Cameras that are called left and right, and stand the other way round."""
-    far = []
     for left, right in permutations(solution.transforms, 2):
-        offset = _seat(solution, left)[0] - _seat(solution, right)[0]
+        offset = _right_of_lrf(solution, left) - _right_of_lrf(solution, right)
         if "left" in left.lower() and "right" in right.lower() and offset > 0:
             words = (
                 f"camera '{left}' is {1000 * offset:.0f} mm to the right of camera '{right}': were "
                 "the folders exchanged?"
             )
-            far.append(Far(words, 0.0))
-    return far
+            yield _far(words, 0.0)
 
 
-def _seat(solution, camera):
-    """Where a camera sits in the frame of the range finder, metres."""
-    return (solution.camera_at(camera, 0.0) * solution.T_head_lrf).inv().translation
+def _right_of_lrf(solution, camera):
+    """How far to the right of the range finder a camera sits, metres."""
+    T_camera_lrf = solution.camera_at(camera, 0.0) * solution.T_head_lrf
+    return T_camera_lrf.inv().translation[0]
 
 
 def _apart(angle, distance):

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc, fdtrc
 
-from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
-from lrfcal_lib.judge.next_placement import outline
+from lrfcal_lib.fit.covariance import dyads, pseudo_inverse, sigma_of
+from lrfcal_lib.judge.next_placement import board_middle, outline
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import POSE, DegenerateGeometry, apply_pose, pose_step
 from lrfcal_lib.preprocess.bundle import adjust_robust
@@ -189,11 +189,10 @@ def _chance_of_step(score, columns, row):
     `score` is what each placement says about the shared unknowns.
     """
     count, shared = score.gradient.shape
-    later = np.arange(count) >= row
     # the normal equations with the pose's change as more unknowns, placement by placement
     repeated = np.concatenate([np.arange(shared), columns])
     kept = np.ones((count, len(repeated)))
-    kept[~later, shared:] = 0.0
+    kept[:row, shared:] = 0.0
     both = dyads(kept)
     whole = both * score.information[:, repeated[:, None], repeated]
     parted = Score(whole, score.gradient[:, repeated] * kept)
@@ -205,7 +204,7 @@ def _chance_of_step(score, columns, row):
     pull = pulls[:, -POSE:]  # its scatter is that of the placements
     scatter = np.einsum("pi,ij,pj->", pull, information, pull) / POSE * count / (count - 1)
     p_value = fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0))
-    return float(p_value), change
+    return p_value, change
 
 
 def largest_motion(solution, step, model):
@@ -216,16 +215,15 @@ def largest_motion(solution, step, model):
     origin = solution.transforms[obs.cameras[step.camera]].translation
     turned = Rotation.from_rotvec(step.change[:3]).apply(corners - origin)
     motion = project(turned + origin + step.change[3:], model) - project(corners, model)
-    return float(np.max(np.linalg.norm(motion, axis=-1)))
+    return np.max(np.linalg.norm(motion, axis=-1))
 
 
 def with_two_poses(obs, step, name):
     """Observations in which a camera is another one, of this name, from a Step on."""
-    camera = obs.view_camera.copy()
-    camera[(camera == step.camera) & (obs.view_placement >= step.row)] = len(obs.cameras)
+    later = (obs.view_camera == step.camera) & (obs.view_placement >= step.row)
     return replace(
         obs,
-        view_camera=camera,
+        view_camera=np.where(later, len(obs.cameras), obs.view_camera),
         cameras=(*obs.cameras, name),
         mounts=(*obs.mounts, obs.mounts[step.camera]),
         lens_covariance=np.concatenate(
@@ -247,8 +245,7 @@ def change_between(solution, first, later, camera, prepared):
     square = step @ pseudo_inverse(spread) @ step
 
     views = obs.view_camera == index
-    middle = outline(solution).mean(axis=0)
-    middles = RigidTransform.from_matrix(obs.view_pose[views]).apply(middle)
+    middles = obs.view_pose[views, :3] @ board_middle(solution)
     motion = project(middles, model) - project(change.inv().apply(middles), model)
     after = int(obs.placements[obs.view_placement[views].min()])
     growths = [
@@ -259,13 +256,13 @@ def change_between(solution, first, later, camera, prepared):
     return CameraChange(
         camera=camera,
         after=after,
-        turn=float(change.rotation.magnitude()),
-        shift=float(np.linalg.norm(step[3:])),
-        p_value=float(chdtrc(POSE, square)),
-        motion_px=float(np.median(np.linalg.norm(motion, axis=1))),
+        turn=change.rotation.magnitude(),
+        shift=np.linalg.norm(step[3:]),
+        p_value=chdtrc(POSE, square),
+        motion_px=np.median(np.linalg.norm(motion, axis=1)),
         zoom=zoom,
         zoom_sigma=zoom_sigma,
-        corner_px=abs(zoom) * float(np.hypot(model.width, model.height)) / 2,
+        corner_px=abs(zoom) * np.hypot(model.width, model.height) / 2,
     )
 
 
@@ -293,7 +290,7 @@ def growth_of_focal_length(prepared, camera, placement):
         ).models[0]
         lengths.append(np.mean([lens.fx / model.fx, lens.fy / model.fy]))
         spreads.append(lens.covariance[:2, :2].mean() / model.fx**2)
-    return float(lengths[1] / lengths[0] - 1), float(np.sqrt(sum(spreads)))
+    return lengths[1] / lengths[0] - 1, np.sqrt(sum(spreads))
 
 
 def growth_by_depth(solution, camera):
@@ -306,4 +303,4 @@ def growth_by_depth(solution, camera):
     nearer[obs.view_camera == camera, 2, 3] *= 1 + STEP
     score = solution.score(replace(obs, view_pose=nearer), STEP)
     covariance, step, _ = score.solved()
-    return float(step[-1]), float(np.sqrt(max(covariance[-1, -1], 0.0)))
+    return step[-1], sigma_of(covariance)[-1]

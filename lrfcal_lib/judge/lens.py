@@ -1,5 +1,7 @@
 """Does the model of a lens fit what its images show?"""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
 
@@ -17,19 +19,18 @@ REMEDY = (
 )
 
 
-def lens_findings(prepared: Prepared) -> list[Finding]:
+def lens_findings(prepared: Prepared) -> Iterator[Finding]:
     """Cameras whose lens its model does not fit, as the corners of the chessboard show it.
 
     Parameters
     ----------
     prepared
 
-    Returns
-    -------
-    list of Finding
+    Yields
+    ------
+    Finding
         One a camera.
     """
-    findings = []
     for camera, model in prepared.models.items():
         views = list(prepared.patterned(camera).values())
         if not views:
@@ -53,8 +54,7 @@ def lens_findings(prepared: Prepared) -> list[Finding]:
                 f"the lens of camera '{camera}' is not that of its model ({'; '.join(faults)}): "
                 f"{REMEDY}"
             )
-            findings.append(Finding(no_if(other_size), Kind.LENS, words))
-    return findings
+            yield Finding(no_if(other_size), Kind.LENS, words)
 
 
 def common_miss(views, points, model):
@@ -70,4 +70,4 @@ def common_miss(views, points, model):
     parts = table.dropna().groupby(["column", "row"])
     noise = parts.var(ddof=0).div(parts.size(), axis=0)
     squares = (parts.mean() ** 2 - noise).sum(axis=1)[parts.size() >= LENS_CORNERS]
-    return np.sqrt(max(squares.mean(), 0.0)) if len(squares) else 0.0
+    return np.sqrt(np.fmax(squares.mean(), 0.0))  # 0 where no part has corners enough

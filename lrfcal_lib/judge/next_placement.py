@@ -11,13 +11,15 @@ from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import by_sign
-from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
+from lrfcal_lib.judge.uncertainty import carried, chain_of
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
+from lrfcal_lib.model.kinematics import beams_to
+from lrfcal_lib.preprocess.surfaces import row_ends
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
-# how a board leans out of the upright plane that faces the LRF: turns about its x and y, degrees
+# how a board leans out of the upright plane that faces the LRF: about its x or y, degrees
 LEANS = {
     "upright": (0, 0),
     "leaning back by 35 deg": (-35, 0),
@@ -117,16 +119,14 @@ def suggest_placement(
     """
     grid = np.array(list(product(*PLACES)))
     boards = board_poses(solution, grid)
-    pitches = pitches_of_images(boards, solution, models, field_of_view)
-    seen = np.isfinite(pitches[:, 0])
-    if not seen.any():
+    seen, pitches = pitches_of_images(boards, solution, models, field_of_view)
+    if len(seen) == 0:
         raise DegenerateGeometry(
             f"none of {len(grid)} board poses lies wholly in the view of the LRF and of all "
             f"cameras at a pitch within {np.degrees(LARGEST_PITCH):.0f} deg: check the field of "
             "view and the calibration"
         )
     boards = boards[seen]
-    pitches = pitches[seen]
     known = solution.information().sum(axis=0)
     added = candidate_information(boards, pitches, solution, models)
     before = total_sigma(known, solution)
@@ -136,7 +136,7 @@ def suggest_placement(
         pitches = pitches[:, :0]
     return Suggestion(
         T_platform_board=geometry.pose_transform(boards[best]),
-        place=tuple(grid[seen][best].tolist()),
+        place=tuple(grid[seen[best]].tolist()),
         pitches=pitches[best],
         gain=float(1 - after[best] / before),
         median_gain=float(1 - np.median(after) / before),
@@ -151,7 +151,7 @@ def total_sigma(information, solution):
     scales = scales_of(solution)
     unit = dyads(scales)
     covariance = np.linalg.inv(information * unit + np.eye(len(unit))) * unit
-    return np.sqrt(sum(sigma**2 for sigma in group_sigma(covariance, solution).values()))
+    return np.linalg.norm([*group_sigma(covariance, solution).values()], axis=0)
 
 
 def scales_of(solution: JointSolution) -> np.ndarray:
@@ -197,29 +197,37 @@ def outline(solution: JointSolution) -> np.ndarray:
     return np.insert(corners, 2, 0.0, axis=1)
 
 
+def board_middle(solution: JointSolution) -> np.ndarray:
+    """Middle of the board, metres, and a 1 that poses (..., 3, 4) shift, shape (4,).
+
+    Parameters
+    ----------
+    solution
+    """
+    return np.append(outline(solution).mean(axis=0), 1.0)
+
+
 def sights(boards: np.ndarray, solution: JointSolution) -> np.ndarray:
     """From the LRF to the middles of boards ``T_platform_board`` (n, 3, 4): metres, (n, 3)."""
-    middle = geometry.apply_pose(boards, outline(solution).mean(axis=0, keepdims=True))
-    return middle[:, 0] - solution.T_head_lrf.translation
+    return boards @ board_middle(solution) - solution.T_head_lrf.translation
 
 
 def board_poses(solution, grid):
     """``T_platform_board`` (n, 3, 4) of boards at the places (n, 5) of a grid, see `PLACES`."""
-    distance, bearing, elevation, turn, lean = grid.T
-    gaze = Rotation.from_euler("ZX", np.column_stack([bearing, elevation]), degrees=True)
-    leans = np.array([(*angles, 0) for angles in LEANS.values()])[lean.astype(int)]
-    tip = Rotation.from_rotvec(leans, degrees=True)
-    spin = Rotation.from_euler("z", turn[:, None], degrees=True)
+    distance, bearing_elevation, turn, lean = np.split(grid, [1, 3, 4], axis=1)
+    gaze = Rotation.from_euler("ZX", bearing_elevation, degrees=True)
+    leans = np.array([*LEANS.values()])[lean[:, 0].astype(int)]
+    tip = Rotation.from_euler("xy", leans, degrees=True)
+    spin = Rotation.from_euler("z", turn, degrees=True)
     rotation = solution.T_head_lrf.rotation * gaze * geometry.AHEAD * tip * spin
-    middle = solution.T_head_lrf.apply(distance[:, None] * gaze.apply([0.0, 1.0, 0.0]))
+    middle = solution.T_head_lrf.apply(distance * gaze.apply([0.0, 1.0, 0.0]))
     centre = outline(solution).mean(axis=0)
     return geometry.pose_array(geometry.carry(rotation, centre, middle))
 
 
 def pitches_of_images(boards, solution, models, field_of_view):
-    """Pitch angles (n, k) of images in which all cameras see whole boards (n, 3, 4), radians.
-
-    NaN for boards that the LRF or a camera does not see wholly.
+    """Which of some boards (n, 3, 4) LRF and cameras see wholly, (m,), and pitch angles (m, k) of
+    images of them, radians.
     """
     points = geometry.apply_pose(boards, outline(solution))
     bearing, pitch, _ = beams_to(points, solution.T_head_lrf)
@@ -227,19 +235,16 @@ def pitches_of_images(boards, solution, models, field_of_view):
     inside &= np.abs(pitch) < LARGEST_PITCH
     visible = np.tile(inside.all(axis=1), (len(LATTICE), 1))
     for name in solution.transforms:
-        size = models[name].size
-        for row, pitch in enumerate(LATTICE):
-            T_camera_platform = solution.camera_at(name, pitch)
-            p_camera = T_camera_platform.apply(points)
-            # far outside the image a lens model would fold back
-            uv = pinhole(p_camera, models[name])
-            inside = (uv > MARGIN * size) & (uv < size - MARGIN * size)
-            visible[row] &= np.all(inside & (p_camera[..., 2:] > 0), axis=(1, 2))
+        border = MARGIN * models[name].size
+        poses = geometry.pose_array(solution.camera_at(name, LATTICE))
+        p_camera = geometry.apply_pose(poses[..., None, :, :], points)
+        # far outside the image a lens model would fold back
+        uv = pinhole(p_camera, models[name])
+        inside = (uv > border) & (uv < models[name].size - border)
+        visible &= np.all(inside & (p_camera[..., 2:] > 0), axis=(-2, -1))
 
-    first = LATTICE[np.argmax(visible, axis=0)]
-    last = LATTICE[len(LATTICE) - 1 - np.argmax(visible[::-1], axis=0)]
-    pitches = np.linspace(first, last, IMAGES, axis=1)
-    return np.where(visible.any(axis=0)[:, None], pitches, np.nan)
+    seen, first, last = row_ends(visible.T)
+    return seen, np.linspace(LATTICE[first], LATTICE[last], IMAGES, axis=1)
 
 
 def candidate_information(boards, pitches, solution, models):
@@ -316,5 +321,5 @@ def image_sigma(solution, camera, model):
     by_pixel = (model.fx / obs.view_pose[views, 2, 3]) ** 2
     variance = solution.noise["view_scale"] ** 2 * np.median(by_pixel / by_shift)
     if obs.mounts[number] == "head":  # all points of an image share the error of its pitch
-        variance += (model.fx * solution.noise.get("sigma_pitch", 0.0)) ** 2
+        variance += (model.fx * solution.noise["sigma_pitch"]) ** 2
     return np.sqrt(variance * len(points_of_face(solution)))

@@ -1,5 +1,6 @@
 """What went wrong with a recording, as far as its files and the estimates show."""
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -12,14 +13,14 @@ from scipy.special import fdtri
 from lrfcal_lib.calibrate.observe import observe
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.fit.residuals import plane_residuals_m
-from lrfcal_lib.judge.alternatives import LEVER, far_axis, guesses_of
+from lrfcal_lib.judge.alternatives import distance, far_axis, guesses_of
 from lrfcal_lib.judge.camera_changes import camera_changes, explains
-from lrfcal_lib.judge.findings import by_sign
+from lrfcal_lib.judge.findings import NO, by_sign
+from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.geometry import (
     POSE,
     DegenerateGeometry,
     lrf_to_platform,
-    transform_difference,
 )
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
@@ -87,12 +88,8 @@ class Reading:
     def view(self, view):
         """A BoardView, read this way: the mirror image of a chessboard is one."""
         mirror = np.diag([self.image_across, 1.0, 1.0, 1.0])
-        pose = mirror @ view.T_camera_board.as_matrix() @ mirror
-        return replace(
-            view,
-            pitch=self.image_turn * view.pitch,
-            T_camera_board=RigidTransform.from_matrix(pose),
-        )
+        pose = RigidTransform.from_matrix(mirror @ view.T_camera_board.as_matrix() @ mirror)
+        return replace(view, pitch=self.image_turn * view.pitch, T_camera_board=pose)
 
 
 AS_STATED = Reading("", "")
@@ -186,7 +183,7 @@ def hopeless(joint):
     """
     if joint is None or not explains(joint.solution) or joint.solution.unobservable:
         return True
-    return any(far.angle > np.pi / 2 for far in far_axis(joint))
+    return any(far.answer == NO for far in far_axis(joint))
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:
@@ -210,7 +207,13 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     mirrored = []
     for camera, miss in board_misses(prepared, MIRRORED).items():
         if camera in stated and _fits({camera: miss}, {camera: stated[camera]}):
-            mirrored.append(_mirrored_camera(camera, stated[camera], miss))
+            words = (
+                f"the images of camera '{camera}' are mirrored: the mirror images of its boards "
+                f"lie {1000 * miss.size:.0f} mm from the scans, the images as recorded "
+                f"{1000 * stated[camera].size:.0f} mm; turn mirroring off in the camera, or flip "
+                "the images"
+            )
+            mirrored.append(Fault("sense", words, severe=True, camera=camera))
     if 0 < len(mirrored) < len(stated):
         return mirrored
 
@@ -269,7 +272,7 @@ def board_misses(prepared, reading):
             residuals = pd.Series(np.abs(plane_residuals_m(obs, transform)))
             each = residuals.groupby(obs.plane_placement).median()
             square = each.median() ** 2 - (HALF * reading.length * noise) ** 2
-            size = float(np.sqrt(max(square, LEAST_MISS**2)))
+            size = np.sqrt(max(square, LEAST_MISS**2))
             misses[camera] = BoardMiss(size, transform, planes=len(each))
     return misses
 
@@ -278,41 +281,36 @@ def shows_boards(session, reading):
     """Whether boards are found in most of some sweeps, read in some way."""
     numbers = session.board_placements
     looked_at = numbers[:: max(len(numbers) // LOOKED_AT, 1)][:LOOKED_AT]
-    found = 0
-    for placement in looked_at:
+    return len(boards_in(session, looked_at, reading)) > len(looked_at) / 2
+
+
+def boards_in(session, placements, reading):
+    """The BoardScan of every placement, of some, whose sweep shows the board, read in some way."""
+    scans = {}
+    for placement in placements:
         with suppress(BoardNotFound, SessionError):
             sweep = session.sweep(placement)
-            sweep = replace(
+            read = replace(
                 sweep,
                 ranges=reading.length * sweep.ranges,
                 pitch=reading.turn * sweep.pitch,
             )
-            find_board(sweep, session.board, session.T_head_lrf, session.lrf)
-            found += 1
-    return found > len(looked_at) / 2
-
-
-def _mirrored_camera(camera, stated, found):
-    """The Fault of one camera whose images are mirrored."""
-    words = (
-        f"the images of camera '{camera}' are mirrored: the mirror images of its boards lie "
-        f"{1000 * found.size:.0f} mm from the scans, the images as recorded "
-        f"{1000 * stated.size:.0f} mm; turn mirroring off in the camera, or flip the images"
-    )
-    return Fault("sense", words, severe=True, camera=camera)
+            scans[placement] = find_board(
+                read, session.board, session.T_head_lrf, session.lrf
+            )
+    return scans
 
 
 def _misread(prepared, fitting, stated):
     """The Fault of a recording that fits with some Readings (BoardMisses of each), likely first."""
-    best = min(map(_worst, fitting.values()))
-    likely = [
-        reading for reading, misses in fitting.items() if _worst(misses) < AS_GOOD * best
-    ]
+    worst = {reading: _worst(misses) for reading, misses in fitting.items()}
+    best = min(worst.values())
+    likely = [reading for reading, miss in worst.items() if miss < AS_GOOD * best]
     # a mirrored cloud fits mirrored images: only where the cameras are said to be can tell
-    likely.sort(key=lambda r: (_far_from_guess(prepared, fitting[r]), _worst(fitting[r])))
+    likely.sort(key=lambda r: (_far_from_guess(prepared, fitting[r]), worst[r]))
     causes = "; or ".join(reading.words for reading in likely)
     words = (
-        f"{causes}; once this is corrected, scans lie {1000 * _worst(fitting[likely[0]]):.0f} mm "
+        f"{causes}; once this is corrected, scans lie {1000 * worst[likely[0]]:.0f} mm "
         f"from the boards in the images, as recorded {1000 * _worst(stated):.0f} mm"
     )
     return Fault(likely[0].kind, words, severe=True)
@@ -321,33 +319,34 @@ def _misread(prepared, fitting, stated):
 def _far_from_guess(prepared, found):
     """How far cameras stand from where session.json guesses them, metres; 0 without guesses."""
     guesses = guesses_of(prepared.session)
-    total = 0.0
-    for camera in guesses.keys() & found.keys():
-        turn, shift = transform_difference(found[camera].transform, guesses[camera])
-        total += LEVER * turn + shift
-    return total
+    return sum(
+        distance(found[camera].transform, guesses[camera])
+        for camera in guesses.keys() & found.keys()
+    )
 
 
-def faults_of_changes(changes, cameras):
+def faults_of_changes(changes, cameras) -> Iterator[Fault]:
     """The Faults of CameraChanges; `cameras` are the names of all of them."""
-    found = []
+    steps = [change.after for change in changes]
     for change in changes:
-        at_once = {other.camera for other in changes if other.after == change.after}
         kind = "camera moved"
         words = _moved(change)
         if change.zoomed:
             kind = "camera zoomed"
             words = _zoomed(change)
-        elif len(at_once) == len(cameras):
+        elif steps.count(change.after) == len(cameras):
             words += " (or the range finder was: all cameras changed at once)"
         remedy = (
             "fix what is loose and record anew, or make two sessions: one of the placements before "
             f"{change.after}, one of the others"
         )
-        severe = change.size_px > SEVERE_PX
-        concerned = (change.after,)
-        found.append(Fault(kind, f"{words}; {remedy}", severe, change.camera, concerned))
-    return found
+        yield Fault(
+            kind,
+            f"{words}; {remedy}",
+            severe=change.size_px > SEVERE_PX,
+            camera=change.camera,
+            placements=(change.after,),
+        )
 
 
 def _zoomed(change):
@@ -369,43 +368,32 @@ def _moved(change):
     )
 
 
-def exchanged_placements(calibration):
+def exchanged_placements(calibration) -> Iterator[Fault]:
     """Pairs of placements that are left out, and whose images fit the scans of each other."""
     prepared = calibration.prepared
-    joint = calibration.joint
     session = prepared.session
-    lost = prepared.left_out | joint.solution.excluded_placements
-    scans = {}
-    for placement in [p for p in session.board_placements if p in lost][:MOST_LOST]:
-        with suppress(BoardNotFound, SessionError):
-            sweep = session.sweep(placement)
-            scans[placement] = find_board(
-                sweep, session.board, session.T_head_lrf, session.lrf
-            )
+    excluded = calibration.joint.solution.excluded_placements
+    lost = [p for p in session.board_placements if p in prepared.left_out | excluded]
+    scans = boards_in(session, lost[:MOST_LOST], AS_STATED)
 
-    found = []
     strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
     for first, second in combinations(strange, 2):
-        there = _same_board(calibration, scans[first], second)
-        back = _same_board(calibration, scans[second], first)
-        if there and back:
+        if _same_board(calibration, scans[first], second) and _same_board(
+            calibration, scans[second], first
+        ):
             words = (
                 f"the images of placement {first} fit the scans of placement {second}, and those "
                 f"of {second} the scans of {first}: their numbers are exchanged; exchange them "
                 "back in images.csv"
             )
-            found.append(Fault("exchanged", words, placements=(first, second)))
-    return found
+            yield Fault("exchanged", words, placements=(first, second))
 
 
 def _same_board(calibration, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
     prepared = calibration.prepared
     solution = calibration.joint.solution
-    corners = prepared.board.corners
-    if corners is None:
-        corners = prepared.board.pattern.points()
-    middle = corners.mean(axis=0)[:2]
+    middle = outline(solution).mean(axis=0)
     p_lrf, pitch, _ = face_points(scan, POINTS)
     p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
     agree = []
@@ -414,6 +402,7 @@ def _same_board(calibration, scan, placement):
         if view is not None:
             T_camera_platform = solution.camera_at(camera, view.pitch)
             on_board = (view.T_camera_board.inv() * T_camera_platform).apply(p_platform)
-            beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
-            agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
+            beside = (on_board.mean(axis=0) - middle)[:2]
+            away = np.median(np.abs(on_board[:, 2]))
+            agree.append(away < GOOD and np.linalg.norm(beside) < BESIDE)
     return bool(agree) and all(agree)

@@ -73,9 +73,7 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
     if beyond:
         range_doubt = max(range_doubt, abs(solution.sensor["range_offset"]))
     findings += [*beyond, *beyond_spot(solution), *pitch_turns_otherwise(solution)]
-    for far in far_from_stated(joint):
-        severe = far.angle > np.pi / 2
-        findings.append(Finding(no_if(severe), Kind.FAR_FROM_STATED, far.words))
+    findings += far_from_stated(joint)
     return findings, range_doubt
 
 
@@ -151,14 +149,16 @@ def falsified(joint: JointCalibration) -> pd.DataFrame:
             if kind in stated:
                 obs = stated[kind].change(obs, size)
         offset = np.nan
+        doubted = "nothing"
         try:
             solution = joint.solution
             if sizes:
                 solution = solve_joint(obs, required=False, **joint.settings)
             offset = solution.sensor["range_offset"]
             findings, _ = contradicts_stated(replace(joint, solution=solution))
-            doubted = [finding.words for finding in findings] or ["nothing"]
+            if findings:
+                doubted = findings[0].words
         except DegenerateGeometry as error:
-            doubted = [f"refused: {error}"]
-        rows.append((name, 1000 * offset, doubted[0]))
+            doubted = f"refused: {error}"
+        rows.append((name, 1000 * offset, doubted))
     return pd.DataFrame(rows, columns=["falsified", "range_offset_mm", "doubted"])

@@ -11,9 +11,11 @@ from numpy.typing import ArrayLike
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, columns_of
+from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
+    apply_pose,
     hat,
     polar_to_points,
     pose_array,
@@ -21,7 +23,7 @@ from lrfcal_lib.model.geometry import (
     tilt,
     unit_vector,
 )
-from lrfcal_lib.model.kinematics import beams_to
+from lrfcal_lib.model.kinematics import TILT_AXIS, beams_to
 from lrfcal_lib.preprocess.prepared import PitchNoise
 
 # a motion that moves a point less than this, relative to all others, does not matter to it
@@ -41,7 +43,7 @@ class Chain:
         ``T_camera_lrf`` of a camera on the head, or ``T_camera_platform``; None for points of the
         cloud.
     on_head : bool
-    covariances : tuple of ndarray, shape (13, 13)
+    covariances : ndarray, shape (n, 13, 13)
         Of `COLUMNS` (increments ``[w, v]`` of the transforms). Where there are several, the one
         that gives more counts, quantity by quantity.
     unseen : ndarray, shape (m, 13)
@@ -53,7 +55,7 @@ class Chain:
     head: np.ndarray
     camera: np.ndarray | None
     on_head: bool
-    covariances: tuple[np.ndarray, ...]
+    covariances: np.ndarray
     unseen: np.ndarray
     sweep_sigma: tuple[float, float] = (0.0, 0.0)
 
@@ -65,7 +67,7 @@ class Chain:
         """
         taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
         unsure = np.diag(doubt**2 * taken_up)
-        return replace(self, covariances=tuple(C + unsure for C in self.covariances))
+        return replace(self, covariances=self.covariances + unsure)
 
 
 def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
@@ -85,12 +87,10 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
     known = uncertainty_of(rig)
     index = columns_of(known.names, camera)
     estimated = index >= 0
-    covariances = []
-    for whole in (known.covariance, known.trusted):
-        part = whole[np.ix_(index, index)]
-        # zero for what is known; what has no bound is among `unseen`
-        bounded = np.outer(estimated, estimated) & np.isfinite(part)
-        covariances.append(np.where(bounded, part, 0.0))
+    part = np.stack([known.covariance, known.trusted])[:, index[:, None], index]
+    # zero for what is known; what has no bound is among `unseen`
+    bounded = np.outer(estimated, estimated) & np.isfinite(part)
+    covariances = np.where(bounded, part, 0.0)
 
     on_head = True
     pose = None
@@ -100,7 +100,7 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
         pose = pose_array(rig.cameras[camera].T_camera)
         unseen = known.unseen_of_cameras[camera]
     head = pose_array(rig.T_head_lrf)
-    return Chain(head, pose, on_head, tuple(covariances), unseen, known.sweep_sigma)
+    return Chain(head, pose, on_head, covariances, unseen, known.sweep_sigma)
 
 
 def projection_sigma(
@@ -155,10 +155,8 @@ def projection_sigma(
 
 def pixel_grid(model: CameraModel, grid: tuple[int, int]) -> np.ndarray:
     """Middles of the cells that columns and rows cut an image into, (rows, columns, 2), pixels."""
-    columns, rows = grid
-    u = (np.arange(columns) + 0.5) * model.width / columns - 0.5
-    v = (np.arange(rows) + 0.5) * model.height / rows - 0.5
-    return np.stack(np.meshgrid(u, v), axis=-1)
+    cells = np.stack(np.meshgrid(*map(np.arange, grid)), axis=-1)
+    return (cells + 0.5) * model.size / grid - 0.5
 
 
 def point_sigma(
@@ -260,10 +258,11 @@ def carried(
     p_head = distance[..., None] * beam
     x = tilt(p_head + t, turn)
     M = tilt(np.eye(3), turn[..., None]).mT
+    by_turn = back * hat(x - t) - M @ hat(p_head)
+    by_shift = M - back * np.eye(3)
     # a turn of the head about x and a shift along it change nothing
-    by_turn_of_axis = (back * hat(x - t) - M @ hat(p_head))[..., 1:]
-    by_shift_of_axis = (M - back * np.eye(3))[..., 1:]
-    by_pitch = np.cross([1.0, 0.0, 0.0], x)
+    by_axis = np.concatenate([by_turn, by_shift], axis=-1)[..., AXIS_COLUMNS]
+    by_pitch = np.cross(TILT_AXIS, x)
     by_scale = turn[..., None] * by_pitch
     by_sensor = np.stack([-tilt(beam, turn), by_scale, (1 - back) * by_pitch], axis=-1)
 
@@ -277,8 +276,7 @@ def carried(
         by_camera[..., :3] = -hat(points)
         by_camera[..., 3:] = np.eye(3)
         points = points + chain.camera[:, 3]
-    by_axis = A @ np.concatenate([by_turn_of_axis, by_shift_of_axis], axis=-1)
-    by_link = np.concatenate([by_axis, by_camera, A @ by_sensor], axis=-1)
+    by_link = np.concatenate([A @ by_axis, by_camera, A @ by_sensor], axis=-1)
     return points, by_link, by_pitch @ A.T
 
 
@@ -296,10 +294,8 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
     ndarray, shape (...)
         Of all m together, in their unit; inf where an undetermined motion matters.
     """
-    variance = 0.0
-    for C in chain.covariances:
-        by_this = np.einsum("...ik,kl,...il->...", jacobian, C, jacobian)
-        variance = np.maximum(variance, by_this)
+    each = np.einsum("...ik,nkl,...il->n...", jacobian, chain.covariances, jacobian)
+    variance = each.max(axis=0, initial=0.0)
     moved = np.einsum("...ik,mk->...mi", jacobian, chain.unseen)
     size = np.linalg.norm(jacobian, axis=(-2, -1))[..., None]
     least = SEEN * size * np.linalg.norm(chain.unseen, axis=-1)
@@ -314,7 +310,7 @@ def beams_of_pixels(chain, model, uv, distance, image_pitch):
     for _ in range(ROUNDS):
         x = (depth[..., None] * ray - chain.camera[:, 3]) @ chain.camera[:, :3]
         if chain.on_head:
-            x = x @ chain.head[:, :3].T + chain.head[:, 3]
+            x = apply_pose(chain.head, x)
         bearing, pitch, reached = beams_to(x, pose_transform(chain.head))
         depth = depth + distance - reached
     if chain.on_head:

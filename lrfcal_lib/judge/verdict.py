@@ -2,6 +2,7 @@
 report.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -189,10 +190,8 @@ def judge(
     """
     prepared = calibration.prepared
     joint = calibration.joint
-    findings = []
     faults = recording_faults(calibration)
-    for fault in faults:
-        findings.append(Finding(no_if(fault.severe), fault.kind, fault.words))
+    findings = [Finding(no_if(fault.severe), fault.kind, fault.words) for fault in faults]
     findings += lens_findings(prepared)
     doubt = 0.0
     # also where the joint estimate is not handed over: a wrong size may be why
@@ -213,25 +212,26 @@ def judge(
         )
     else:
         judged = _without_joint(calibration, method, doubt)
-    lost = left_out(calibration, method)
-    findings += blind_cameras(prepared)
-    if lost.many:  # which says what was excluded, too
-        findings.append(Finding(CARE, Kind.LEFT_OUT, lost.words))
+    many_lost, note = left_out(calibration, method)
+    findings += [*blind_cameras(prepared), *many_lost]
+    if many_lost:  # which says what was excluded, too
         kept = [reason for reason in judged.reasons if reason.kind != Kind.EXCLUDED]
         judged = replace(judged, reasons=tuple(kept))
     findings += sides_elsewhere(prepared)
-    notes = _notes(calibration, method, lost.note)
+    notes = _notes(calibration, method, note)
     return replace(judged.because(findings), notes=notes)
 
 
 def _notes(calibration, method, lost):
     """What is handed over, where the cameras are, what was left out, and what is not known."""
     axis = calibration.platform.axis_with(method)
-    notes = [f"Handed over: the cameras of the method '{method}' and the axis '{axis}'."]
-    if method != "joint" or calibration.joint is None:
-        return tuple(filter(None, [*notes, lost]))
-    solution = calibration.joint.solution
-    notes += [lost, step_words(solution), _scatter_note(len(solution.boards))]
+    notes = [
+        f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.",
+        lost,
+    ]
+    if method == "joint" and calibration.joint is not None:
+        solution = calibration.joint.solution
+        notes += [step_words(solution), _scatter_note(len(solution.boards))]
     return tuple(filter(None, notes))
 
 
@@ -285,12 +285,17 @@ def _expected(rig, pitch, doubt):
     pitches = np.linspace(*field, PITCHES)
     chain = chain_of(rig).doubted(doubt)
     cloud = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
-    images = {}
-    for name, camera in rig.cameras.items():
-        chain = chain_of(rig, name).doubted(doubt)
-        images[name] = projection_sigma(
-            chain, camera.model, DISTANCES, PIXELS, image_pitch=middle, pitches=field
+    images = {
+        name: projection_sigma(
+            chain_of(rig, name).doubted(doubt),
+            camera.model,
+            DISTANCES,
+            PIXELS,
+            image_pitch=middle,
+            pitches=field,
         )
+        for name, camera in rig.cameras.items()
+    }
     errors = {}
     for i, distance in enumerate(DISTANCES):
         pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
@@ -343,24 +348,28 @@ def _scatter_note(placements):
 
 def _without_joint(calibration, method, doubt):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
+    pitch = [scan.sweep.pitch for scan in calibration.prepared.scans.values()]
+    judged = _expected(calibration.rig(method), np.concatenate(pitch), doubt)
+    return judged.because([_not_joint(calibration), *_weak_cameras(calibration, method)])
+
+
+def _weak_cameras(calibration, method) -> Iterator[Finding]:
+    """What is weak about cameras that were calibrated one by one."""
     prepared = calibration.prepared
     solved = calibration.cameras(method)
-    pitch = np.concatenate([scan.sweep.pitch for scan in prepared.scans.values()])
-    judged = _expected(calibration.rig(method), pitch, doubt)
-    findings = [_not_joint(calibration)]
     fewest = min(
         len(calibration.observations[camera, "half_step"].all_placements)
         for camera in solved
     )
     if fewest < FEW:
         words = f"only {fewest} placements, {FEW} or more are needed"
-        findings.append(Finding(NO, Kind.PLACEMENTS, words))
+        yield Finding(NO, Kind.PLACEMENTS, words)
     for camera in prepared.views:
         if camera not in solved:
             problem = calibration.problem(method, camera)
             why = problem.words if problem else "no result"
             words = f"camera '{camera}' is not handed over ({why})"
-            findings.append(Finding(CARE, Kind.CAMERAS, words))
+            yield Finding(CARE, Kind.CAMERAS, words)
     for camera, solution in solved.items():
         if solution.rival is not None:
             turn, shift = transform_difference(solution.transform, solution.rival)
@@ -369,12 +378,11 @@ def _without_joint(calibration, method, doubt):
                 f"{np.degrees(turn):.0f} deg and {1000 * shift:.0f} mm from where it is handed "
                 "over; record more placements that lean other ways"
             )
-            findings.append(Finding(NO, Kind.SECOND_MINIMUM, words))
+            yield Finding(NO, Kind.SECOND_MINIMUM, words)
     sweeps = any(np.ptp(scan.sweep.pitch) > LEAST_SWEEP for scan in prepared.scans.values())
     unknown = calibration.platform.problem("combined")
     if unknown and sweeps:
-        findings.append(Finding(NO, Kind.FAR_FROM_STATED, unknown.words))
-    return judged.because(findings)
+        yield Finding(NO, Kind.FAR_FROM_STATED, unknown.words)
 
 
 def _not_joint(calibration):

@@ -1,17 +1,17 @@
 """What is weak about a joint estimate, and about the recording behind any result."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lrfcal_lib.calibrate.pipeline import Calibration, largest_range
 from lrfcal_lib.fit.covariance import solve_each
 from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, no_if
 from lrfcal_lib.judge.next_placement import group_sigma, sights
 from lrfcal_lib.judge.placements import placements_table
-from lrfcal_lib.model.problem import LEAVES_OUT
+from lrfcal_lib.model.problem import LEAVES_OUT, Problem
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
@@ -49,7 +49,6 @@ def diagnose(solution: JointSolution) -> list[Finding]:
         *weak_estimate(solution),
         *weak_placements(solution),
         *weak_pitch(solution),
-        *weak_poses(solution),
         *large_residuals(solution),
     ]
 
@@ -66,13 +65,21 @@ def weak_estimate(solution) -> Iterator[Finding]:
 
 
 def weak_placements(solution) -> Iterator[Finding]:
-    """The number of placements."""
+    """The number of placements, and boards that stand alike."""
     count = len(solution.boards)
     if count < FEW:
         words = (
             f"only {count} placements, {FEW} or more are needed to see errors of the model"
         )
         yield Finding(no_if(count < FEWEST), Kind.PLACEMENTS, words)
+    distance = np.linalg.norm(sights(solution.board_poses, solution), axis=1)
+    if count > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance):
+        words = (
+            f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): "
+            "errors at other distances are extrapolated, and a range offset is hard to tell from "
+            "shifts"
+        )
+        yield Finding(CARE, Kind.DISTANCE, words)
 
 
 def weak_pitch(solution) -> Iterator[Finding]:
@@ -104,21 +111,6 @@ def weak_pitch(solution) -> Iterator[Finding]:
             "small boards"
         )
         yield Finding(CARE, Kind.IMAGE_PITCH, words)
-
-
-def weak_poses(solution) -> Iterator[Finding]:
-    """Boards that stand alike."""
-    boards = solution.board_poses
-    if len(boards) < 2:
-        return
-    distance = np.linalg.norm(sights(boards, solution), axis=1)
-    if np.ptp(distance) < SAME_DISTANCE * np.median(distance):
-        words = (
-            f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): "
-            "errors at other distances are extrapolated, and a range offset is hard to tell from "
-            "shifts"
-        )
-        yield Finding(CARE, Kind.DISTANCE, words)
 
 
 def large_residuals(solution) -> Iterator[Finding]:
@@ -187,13 +179,11 @@ def noise_of_images(solution: JointSolution) -> dict[str, float]:
     level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)
     factors = np.linalg.cholesky(obs.view_covariance)
     white = solve_each(factors, solution.residuals("view"))
-    squares = np.mean(white**2, axis=1)
-    usual = max(np.mean(squares), np.finfo(float).tiny)
-    scatter = {}
-    for number, camera in enumerate(obs.cameras):
-        mean = np.mean(squares[obs.view_camera == number])
-        scatter[f"images of '{camera}'"] = float(level * np.sqrt(mean / usual))
-    return scatter
+    usual = max(rms(white), np.finfo(float).tiny)
+    return {
+        f"images of '{camera}'": level * rms(white[obs.view_camera == number]) / usual
+        for number, camera in enumerate(obs.cameras)
+    }
 
 
 def sides_elsewhere(prepared: Prepared) -> Iterator[Finding]:
@@ -249,77 +239,47 @@ def blind_cameras(prepared: Prepared) -> Iterator[Finding]:
             yield Finding(CARE, Kind.LEFT_OUT, words)
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """What a result does not rest on.
-
-    Attributes
-    ----------
-    recorded : int
-        Number of placements of the board.
-    placements : dict of int to str
-        Why whole placements are left out.
-    parts : list of str
-        Parts that are left out beside them, and why.
-    """
-
-    recorded: int
-    placements: dict[int, str]
-    parts: list[str]
-
-    @property
-    def many(self) -> bool:
-        """Whether more placements are left out than may be without a warning."""
-        return len(self.placements) > LOST * self.recorded
-
-    @property
-    def words(self) -> str:
-        """The placements that are left out, counted, with their reasons."""
-        why = [f"{placement} ({words})" for placement, words in self.placements.items()]
-        return f"{len(why)} of {self.recorded} placements are left out: {', '.join(why) or 'none'}"
-
-    @property
-    def note(self) -> str:
-        """What became of all placements, as far as it is no finding."""
-        notes = []
-        if not self.many:
-            notes.append(f"{self.words}.")
-        if self.parts:
-            parts = "; ".join(self.parts)
-            notes.append(f"Parts left out beside them: {len(self.parts)} ({parts}).")
-        return " ".join(notes)
-
-
-def left_out(calibration: Calibration, method: str) -> LeftOut:
-    """All placements that the result of a method does not rest on.
+def left_out(calibration: Calibration, method: str) -> tuple[list[Finding], str]:
+    """What the result of a method does not rest on.
 
     Parameters
     ----------
     calibration
     method
         Whose camera poses are handed over.
+
+    Returns
+    -------
+    list of Finding
+        One where more placements are left out than may be without a warning. It stands for what
+        :func:`large_residuals` says of those that the estimate excluded.
+    str
+        What became of all placements, as far as it is no finding.
     """
     prepared = calibration.prepared
     table = placements_table(prepared, calibration.observations).set_index("placement")
     used = set(table.index[table.used]) - set(prepared.left_out)
     excluded: dict[int, str] = {}
-    images: list[str] = []
+    parts = [problem for problem in prepared.problems if problem.kind not in LEAVES_OUT]
+    images: list[Problem] = []  # and cameras
     if method == "joint" and calibration.joint is not None:
         solution = calibration.joint.solution
         used = set(solution.boards)
         excluded = solution.excluded_placements
-        images = [
-            str(problem) for problem in solution.excluded if problem.camera is not None
-        ]
-    placements = {}
-    for number in table.index:
-        if number not in used:
-            stated = excluded.get(number) or prepared.left_out.get(number)
-            placements[number] = stated or table.reason[number] or "no edge"
-    parts = [
-        str(problem) for problem in prepared.problems if problem.kind not in LEAVES_OUT
-    ]
-    lost = LeftOut(len(table), placements, parts)
-    if lost.many:  # otherwise a finding says it
-        return replace(lost, parts=parts + images)
-    return lost
+        images = [problem for problem in solution.excluded if problem.camera is not None]
+    reasons = table.reason.replace("", "no edge").to_dict() | excluded
+    lost = [f"{number} ({why})" for number, why in reasons.items() if number not in used]
+    words = (
+        f"{len(lost)} of {len(table)} placements are left out: {', '.join(lost) or 'none'}"
+    )
+    findings = []
+    notes = []
+    if len(lost) > LOST * len(table):
+        findings.append(Finding(CARE, Kind.LEFT_OUT, words))
+        parts += images  # otherwise a finding says it
+    else:
+        notes.append(f"{words}.")
+    if parts:
+        named = "; ".join(map(str, parts))
+        notes.append(f"Parts left out beside them: {len(parts)} ({named}).")
+    return findings, " ".join(notes)

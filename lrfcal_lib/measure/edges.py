@@ -16,10 +16,10 @@ from scipy.spatial import KDTree
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
-from lrfcal_lib.judge.uncertainty import beams_to
 from lrfcal_lib.measure.features import Feature, Kind, beams_moved
 from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge, refine_edge
 from lrfcal_lib.session.workers import spread
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
-from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
+from lrfcal_lib.judge.uncertainty import carried, chain_of
+from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.session.read import Session
 
 # a camera's likely changes, radians and metres of its pose
