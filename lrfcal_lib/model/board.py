@@ -34,6 +34,10 @@ class Chessboard:
             -1, 3
         )
 
+    def grid(self, corners: ArrayLike) -> np.ndarray:
+        """What belongs to the inner corners, (rows * columns, 2), as (rows, columns, 2)."""
+        return np.reshape(corners, (self.rows, self.columns, 2))
+
     def outline(self) -> np.ndarray:
         """Corners of the printed squares together, shape (4, 2), metres."""
         first = np.asarray(self.origin) - self.square

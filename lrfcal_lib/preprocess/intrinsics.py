@@ -191,7 +191,7 @@ def board_pose(
     residuals = result.residuals[0, 0]
     pose = result.poses[0]
     factor = max(1.0, SIGMA_FLOOR_PX / result.sigma_px) ** 2
-    factor *= _alike_factor(residuals.reshape(pattern.rows, pattern.columns, 2))
+    factor *= _alike_factor(pattern.grid(residuals))
     covariance = result.pose_covariance[0] * factor + scale_covariance(
         pose, pixels, pattern
     )
@@ -218,7 +218,7 @@ def scale_covariance(pose: RigidTransform, pixels, pattern: Chessboard) -> np.nd
     ndarray, shape (6, 6)
         Of ``[w, v]``.
     """
-    side = square_px(pixels, (pattern.columns, pattern.rows))
+    side = square_px(pattern.grid(pixels))
     away = np.zeros(6)
     away[3:] = scale_error(side) * pose.apply(pattern.points().mean(axis=0))
     return np.outer(away, away)

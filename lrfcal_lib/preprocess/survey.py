@@ -248,10 +248,9 @@ def small_squares(views, pattern) -> dict[str, str]:
     words: dict[str, str] = {}
     if pattern is None:
         return words
-    size = (pattern.columns, pattern.rows)
     for camera, of_camera in views.items():
         seen = {p: view.pixels for p, view in of_camera.items() if view.pixels is not None}
-        sides = {p: square_px(pixels, size) for p, pixels in seen.items()}
+        sides = {p: square_px(pattern.grid(pixels)) for p, pixels in seen.items()}
         small = [p for p, side in sides.items() if side < SMALL_SQUARE_PX]
         if small:
             least = min(sides.values())
