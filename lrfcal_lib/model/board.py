@@ -134,6 +134,23 @@ def corners_of_lines(lines: ArrayLike) -> np.ndarray:
     return points[..., :2] / points[..., 2:]
 
 
+def side_ends(corners: np.ndarray, inset: float = 0.0) -> np.ndarray:
+    """Both ends of every side of a polygon, side i from corner i to i + 1.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (n, k)
+    inset : float
+        Share of a side left out at either end.
+
+    Returns
+    -------
+    ndarray, shape (n, 2, k)
+    """
+    ends = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+    return ends + inset * (ends[:, ::-1] - ends)
+
+
 def triangle_board(
     ab: float = 0.315,
     ac: float = 0.380,

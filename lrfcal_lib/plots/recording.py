@@ -9,7 +9,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap
 
 from lrfcal_lib.model.board import Board, outline_lines
-from lrfcal_lib.model.camera import CameraModel, distort
+from lrfcal_lib.model.camera import CameraModel, redistort
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.colors import AXES_RGB as AXES_RGB
 from lrfcal_lib.plots.colors import COLORS, closed, color_of, series
@@ -338,10 +338,7 @@ def seen_points(
 def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
     """Recorded pixels (STRETCH, 2) of an ImageEdge, which is a straight line without the lens."""
     first, last = edge.ends
-    uv = np.linspace(first, last, STRETCH)
-    focal = np.array([model.fx, model.fy])
-    centre = np.array([model.cx, model.cy])
-    return distort((uv - centre) / focal, model.distortion) * focal + centre
+    return redistort(np.linspace(first, last, STRETCH), model)
 
 
 def _cut(ax, drawn, image, margin):

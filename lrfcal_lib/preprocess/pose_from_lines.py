@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.board import Board, side_ends
 from lrfcal_lib.model.camera import CameraModel, pinhole, pinhole_jacobian
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
@@ -72,10 +72,8 @@ def pose_from_edges(
 
 def line_residuals(edges, board: Board, model: CameraModel, pose):
     """Those of :func:`line_misses` for every edge's two corners."""
-    flat = board.points()
-    first = np.array([board.edges.index(edge.name) for edge in edges])
-    corners = np.stack([first, (first + 1) % len(flat)], axis=1)
-    return line_misses(edges, flat[corners], model, pose)
+    sides = [board.edges.index(edge.name) for edge in edges]
+    return line_misses(edges, side_ends(board.points())[sides], model, pose)
 
 
 def line_misses(edges, points, model: CameraModel, pose):
