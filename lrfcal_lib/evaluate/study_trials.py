@@ -218,8 +218,7 @@ def _ends_of_lines(ranges, setup, last_beam):
     *sessions, scans, beams = ranges.shape
     ranges = ranges.reshape(-1, beams)
     lines, information = fit_lines(ranges, bearings)
-    _, first, last = row_ends(np.isfinite(ranges))
-    ends = bearings[np.stack([first, last], axis=1)]
+    ends = bearings[row_ends(np.isfinite(ranges))[1]]
     if not last_beam:
         ends = ends + np.array([-0.5, 0.5]) * setup.step
     of_line = np.linalg.inv(information) * setup.sigma_range**2
@@ -310,8 +309,7 @@ def _readings(shots, scenario, trial):
     bearings = scenario.bearings()
     hit = np.isfinite(ranges)
     line, beam = np.nonzero(hit)
-    _, first, last = row_ends(hit)
-    ends = np.stack([first, last], axis=1)
+    _, ends = row_ends(hit)
     at_ends = np.maximum(np.take_along_axis(ranges, ends, axis=1), LEAST_RANGE)
     near = np.arange(2 * REACH) - REACH  # beams about the end of a scan line
     window = np.clip(ends[..., None] + [[0], [1]] + near, 0, beams - 1)

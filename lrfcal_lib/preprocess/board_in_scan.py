@@ -9,6 +9,7 @@ from lrfcal_lib.fit.covariance import solve_each
 from lrfcal_lib.fit.robust import NORMAL, biweight, rms
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import polar_covariance, polar_to_points
+from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.surfaces import (
     PLANE_NOISE,
     BoardNotFound,
@@ -123,13 +124,13 @@ def find_board(
     fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
     residuals = np.where(mask, sweep.ranges - fitted, np.nan)
     residuals = residuals[np.abs(residuals) <= PLANE_NOISE * 2]
-    if not len(residuals):
+    if not residuals.size:
         raise BoardNotFound(f"no scan line has {FEWEST_BEAMS} beams on the board")
     sigma = rms(residuals)
     spot = 0.0
     if lrf is not None and lrf.spot_exit is not None:
-        reach = float(np.nanmedian(fitted))
-        spot = float(lrf.spot_radius(reach)) / reach
+        reach = np.nanmedian(fitted)
+        spot = lrf.spot_radius(reach) / reach
     return BoardScan(
         placement=sweep.placement,
         sweep=sweep,
@@ -142,7 +143,7 @@ def find_board(
         normal=surface.normal,
         distance=surface.distance,
         sigma_range=sigma,
-        n_jump_points=int(jump_points(sweep.ranges, fitted, sigma).sum()),
+        n_jump_points=jump_points(sweep.ranges, fitted, sigma).sum(),
         spot=spot,
     )
 
@@ -173,11 +174,10 @@ def median_filter(
             f"the width of a median filter must be odd and positive, got {width}"
         )
     half = width // 2
-    taken = np.where(mask, ranges, np.nan)
-    padded = np.pad(taken, ((0, 0), (half, half)), constant_values=np.nan)
+    filtered = np.where(mask, ranges, np.nan)
+    padded = np.pad(filtered, ((0, 0), (half, half)), constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, width, axis=1)
-    valid = np.isfinite(taken)
-    filtered = np.full(taken.shape, np.nan)
+    valid = np.isfinite(filtered)
     filtered[valid] = np.nanmedian(windows[valid], axis=1)
     return filtered
 
@@ -283,10 +283,7 @@ def face_points(
     down = CLEAR * scan.spot / max(median_step(sweep.pitch), 1e-6)
     good &= _interior(scan.mask, along)
     good &= _interior(scan.mask.T, down).T
-    line, beam = np.nonzero(good)
-    if len(line) > count:
-        keep = np.linspace(0, len(line) - 1, count).round().astype(int)
-        line, beam = np.stack([line, beam])[:, keep]
+    line, beam = thin(np.argwhere(good), count).T
     ranges = sweep.ranges[line, beam]
     bearings = sweep.bearings[beam]
     # keeps the covariance regular; bearings are all but exact
@@ -312,12 +309,11 @@ def _span(mask, trim=0):
 
     A number, or one a row.
     """
-    rows, first, last = row_ends(mask)
+    rows, ends = row_ends(mask)
+    inside = ends + np.multiply.outer(trim, [1, -1])
     beam = np.arange(mask.shape[1])
     span = np.zeros(mask.shape, bool)
-    after = beam >= (first + trim)[:, None]
-    before = beam <= (last - trim)[:, None]
-    span[rows] = after & before
+    span[rows] = (beam >= inside[:, :1]) & (beam <= inside[:, 1:])
     return span
 
 
@@ -327,8 +323,7 @@ def _interior(mask, spot):
     The latter where that leaves half of the row. A row too short for that (a sweep of one line,
     seen by columns) stays.
     """
-    _, first, last = row_ends(mask)
-    size = last - first
+    size = np.ptp(row_ends(mask)[1], axis=1)
     least = np.maximum(2, np.minimum(spot, MOST_MARGIN * size))
     trim = np.maximum(least, MARGIN * size).astype(int)
     return _span(mask, np.where(size < SHORTEST_ROW, 0, trim))

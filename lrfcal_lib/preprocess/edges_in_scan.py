@@ -315,9 +315,9 @@ def _ends(scan, across):
     sweep = scan.sweep
     mask = scan.mask.T if across else scan.mask
     angles = sweep.pitch if across else sweep.bearings
-    rows, first, last = row_ends(mask)
+    rows, ends = row_ends(mask)
     row = np.tile(rows, 2)
-    place = np.concatenate([first, last])
+    place = ends.T.ravel()
     cell = np.column_stack([place, row] if across else [row, place])
     end = np.repeat([-1, 1], len(rows))
     step = np.outer(end, [across, not across])
@@ -463,9 +463,9 @@ def _group(scan, crossing, order, end, mixed, known):
 
 def _spacing(scan):
     """Median distance of neighbouring beams at the ends of the board's scan lines, metres."""
-    row, first, last = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
-    bearing = scan.sweep.bearings[np.r_[first, last]]
-    line = np.tile(row, 2)
+    row, ends = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
+    line = np.repeat(row, 2)
+    bearing = scan.sweep.bearings[ends.ravel()]
     ends = crossings_of(scan.lines[line], scan.lines_covariance[line], bearing)
     apart = np.median(np.linalg.norm(ends.by_angle, axis=1))
     return apart * median_step(scan.sweep.bearings)
