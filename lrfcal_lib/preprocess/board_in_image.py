@@ -245,8 +245,13 @@ def _view_plain(view, image, board, model, picks):
         if np.abs(off).max(initial=0.0) >= SAME_NAMES_PX:
             continue
         edges |= {name: picked_edge(name, uv, inner) for name, uv in ends.items()}
-        pose = {"T_camera_board": found.T_camera_board, "covariance": found.covariance}
-        views.append(replace(view, edges=tuple(edges.values()), **pose))
+        explained = replace(
+            view,
+            edges=tuple(edges.values()),
+            T_camera_board=found.T_camera_board,
+            covariance=found.covariance,
+        )
+        views.append(explained)
     if not views:
         reason = f"no pose of board '{board.name}' explains the outline in the image"
         return replace(view, reason=reason)

@@ -2,10 +2,11 @@
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import opencv_poses
 from lrfcal_lib.preprocess.bundle import (
     SIGMA_FLOOR_PX,
     UP,
@@ -133,7 +134,7 @@ def first_pose(
         raise ValueError(f"{why} (OpenCV: {error.err})") from error
     if not solved or not np.isfinite(shift).all() or shift[2, 0] <= 0:
         raise ValueError(why)
-    return RigidTransform.from_components(shift.ravel(), Rotation.from_rotvec(turn.ravel()))
+    return opencv_poses(turn, shift)[0]
 
 
 def board_pose(
@@ -259,8 +260,7 @@ def _rough(views, points, size):
     fx, cx = matrix[0, [0, 2]]
     fy, cy = matrix[1, [1, 2]]
     model = CameraModel(*size, float(fx), float(fy), float(cx), float(cy), lens.ravel())
-    rotation = Rotation.from_rotvec(np.reshape(turns, (-1, 3)))
-    return model, RigidTransform.from_components(np.reshape(shifts, (-1, 3)), rotation)
+    return model, opencv_poses(turns, shifts)
 
 
 def _alike_factor(grid):

@@ -1,14 +1,15 @@
 """The pose of a board from image lines of its edges."""
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board, side_ends
-from lrfcal_lib.model.camera import CameraModel, pinhole, pinhole_jacobian
+from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, pinhole_jacobian
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
     move_pose,
     pose_array,
+    pose_step,
     pose_transform,
     rotate_points,
 )
@@ -43,21 +44,19 @@ def pose_from_edges(
     numpy.linalg.LinAlgError
         If the lines lead to a pose behind the camera.
     """
-    first = pose_array(start)
     white = np.zeros((0, 6))
     if covariance is not None:
         white = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def system(pose):
         misses, by_pose = line_residuals(edges, board, model, pose)
-        turn = Rotation.from_matrix(pose[:, :3] @ first[:, :3].T)
-        moved = np.r_[turn.as_rotvec(), pose[:, 3] - first[:, 3]]
+        moved = pose_step(start, pose_transform(pose))
         residuals = np.r_[misses.ravel(), white @ moved]
         return residuals, np.concatenate([by_pose.reshape(-1, 6), white])
 
     # plain Gauss-Newton: the weights of the lines move along with the pose, so that no sum of
     # squares falls steadily, which the minimiser asks for
-    pose = first
+    pose = pose_array(start)
     residuals, jacobian = system(pose)
     for _ in range(ROUNDS):
         step = np.linalg.lstsq(jacobian, -residuals, rcond=1e-12)[0]
@@ -65,9 +64,8 @@ def pose_from_edges(
         residuals, jacobian = system(pose)
         if np.abs(step).max() < SETTLED:
             break
-    information = jacobian.T @ jacobian
-    chi2 = float(residuals @ residuals)
-    return pose_transform(pose), np.linalg.pinv(information, hermitian=True), chi2
+    reached = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+    return pose_transform(pose), reached, residuals @ residuals
 
 
 def line_residuals(edges, board: Board, model: CameraModel, pose):
@@ -99,7 +97,7 @@ def line_misses(edges, points, model: CameraModel, pose):
     turned = rotate_points(pose, points)
     p_camera = turned + pose[:, 3]
     uv = pinhole(p_camera, model)
-    distance = np.einsum("enk,ek->en", uv, lines[:, :2]) + lines[:, 2:]
+    distance = line_distance(uv, lines[:, None])
     by_point = np.einsum("ek,enkj->enj", lines[:, :2], pinhole_jacobian(p_camera, model))
     by_pose = gradient_by_pose(turned, by_point)
     white = _whiteners(edges, lines, uv)
