@@ -1,7 +1,6 @@
 """Coloured clouds of a session: its sweeps and images, seen by a calibrated rig."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -107,16 +106,7 @@ def _about(sweep, mask):
     for shown in np.nonzero(mask):
         window.append(slice(max(0, shown.min() - MARGIN), shown.max() + MARGIN + 1))
     lines, beams = window
-    cut = replace(
-        sweep,
-        ranges=sweep.ranges[lines, beams],
-        pitch=sweep.pitch[lines],
-        time_s=sweep.time_s[lines],
-        bearings=sweep.bearings[beams],
-    )
-    if sweep.intensities is not None:
-        cut = replace(cut, intensities=sweep.intensities[lines, beams])
-    return cut, mask[lines, beams]
+    return sweep.cut(lines, beams), mask[lines, beams]
 
 
 def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]:

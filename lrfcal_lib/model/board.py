@@ -83,7 +83,7 @@ class Board:
 
     def points(self):
         """Corners of the outline in space, board frame, metres, shape (n, 3)."""
-        return np.pad(self.known_corners(), ((0, 0), (0, 1)))
+        return np.insert(self.known_corners(), 2, 0.0, axis=1)
 
     def known_corners(self):
         """Corners of the outline, metres, shape (n, 2); ValueError where nobody has

@@ -136,7 +136,7 @@ def edge_in_image(
     dict of str to ndarray, shape (3,)
         Corners A, B, C and the crossings E on AB and F on CA, metres, in the frame of the LRF.
     """
-    corners = T_lrf_board.apply(np.pad(board.known_corners(), ((0, 0), (0, 1))))
+    corners = T_lrf_board.apply(board.points())
     centre = T_lrf_camera.translation
     view.face(corners, COLORS["truth"], 0.15)
     points = dict(zip("ABC", corners, strict=True))

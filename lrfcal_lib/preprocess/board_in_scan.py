@@ -204,22 +204,20 @@ def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.
     """
     rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
     products = np.einsum("...i,...j->...ij", rays, rays)
-    valid = np.isfinite(ranges)
-    r = np.where(valid, ranges, 1.0)
-    enough = valid.sum(axis=1) >= FEWEST_BEAMS
-    base = np.where(valid & enough[:, None], r**4, 0.0)
+    few = np.isfinite(ranges).sum(axis=1) < FEWEST_BEAMS
+    r = np.where(few[:, None], 1.0, ranges)  # something to fit all the same
+    valid = np.isfinite(r)
+    r[~valid] = 1.0
+    base = np.where(valid, r**4, 0.0)
     weights = base
     for _ in range(LINE_ROUNDS):
         information = np.einsum("lb,bij->lij", weights, products)
-        right = (weights / r) @ rays
-        information[~enough] = np.eye(2)
-        right[~enough] = np.nan
-        lines = solve_each(information, right)
+        lines = solve_each(information, (weights / r) @ rays)
         misses = np.where(valid, np.abs(r - _line_ranges(lines, bearings)), np.nan)
-        misses[~enough] = 0.0
         sigma = np.maximum(NORMAL * np.nanmedian(misses, axis=1), LEAST_SIGMA)[:, None]
         weights = np.nan_to_num(base * biweight(misses, sigma))
-    information[~enough] = np.nan
+    lines[few] = np.nan
+    information[few] = np.nan
     return lines, information
 
 

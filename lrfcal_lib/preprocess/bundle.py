@@ -241,18 +241,17 @@ def adjust_robust(pixels, points, models, poses, mounting=ALONE, **options) -> A
     -------
     Adjustment
     """
-    used = np.isfinite(pixels)
+    used = np.isfinite(pixels[..., :1])
     for _ in range(ROBUST_ROUNDS):
         kept = np.where(used, pixels, np.nan)
         result = adjust(kept, points, models, poses, mounting, **options)
         models = result.models
         poses = result.poses
         mounting = result.mounting
-        distance = np.linalg.norm(pixels - result.predicted, axis=-1)
+        distance = np.linalg.norm(pixels - result.predicted, axis=-1, keepdims=True)
         sigma = max(np.nanmedian(distance) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX)
         before = used
-        near = distance <= OUTLIER_SIGMAS * sigma
-        used = np.broadcast_to(near[..., None], pixels.shape)
+        used = distance <= OUTLIER_SIGMAS * sigma
         if np.array_equal(used, before):
             break
     return result

@@ -3,7 +3,7 @@
 It shows what changes the ranges at that pitch: a shift along a wall that fills the scan does not.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -62,21 +62,7 @@ def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
     far = np.abs(pitch[turn:] - pitch[0]) < FIRST * np.ptp(pitch)
     if not far.any() or len(far) > max(1, FEW * count):
         return sweep, None
-    return _lines(sweep, slice(0, turn)), _lines(sweep, turn + np.flatnonzero(far))
-
-
-def _lines(sweep, which):
-    """Some of the scan lines of a Sweep."""
-    intensities = sweep.intensities
-    if intensities is not None:
-        intensities = intensities[which]
-    return replace(
-        sweep,
-        ranges=sweep.ranges[which],
-        pitch=sweep.pitch[which],
-        time_s=sweep.time_s[which],
-        intensities=intensities,
-    )
+    return sweep.cut(slice(turn)), sweep.cut(turn + np.flatnonzero(far))
 
 
 def closing_of(sweep: Sweep) -> Closing | None:

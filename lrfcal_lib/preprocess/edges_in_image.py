@@ -251,8 +251,8 @@ def on_board(xy, pose, model):
 
     Far outside the image where they lie behind the camera.
     """
-    points = pose.apply(np.pad(xy.reshape(-1, 2), ((0, 0), (0, 1))))
-    return np.nan_to_num(pinhole(points, model), nan=BEHIND).reshape(xy.shape)
+    points = pose.apply(np.insert(xy, 2, 0.0, axis=-1))
+    return np.nan_to_num(pinhole(points, model), nan=BEHIND)
 
 
 def _line_in_strip(strip, visible, across, half_width, prior_px):

@@ -178,7 +178,7 @@ def crossings_of(
     fitted = 1 / np.sum(lines * flat, axis=1)
     variance = np.einsum("ni,nij,nj->n", flat, covariance, flat)
     points = fitted[:, None] * rays
-    normal = np.pad(lines, ((0, 0), (0, 1)))
+    normal = np.insert(lines, 2, 0.0, axis=1)
     return Crossings(
         points=points,
         by_angle=_slid(np.cross([0.0, 0.0, 1.0], points), normal, rays),

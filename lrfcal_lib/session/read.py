@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +211,19 @@ class Sweep:
     pitch: np.ndarray
     time_s: np.ndarray
     intensities: np.ndarray | None = None
+
+    def cut(self, lines, beams=slice(None)) -> "Sweep":
+        """Some of its scan lines and beams: an index of each."""
+        cut = replace(
+            self,
+            ranges=self.ranges[lines, beams],
+            bearings=self.bearings[beams],
+            pitch=self.pitch[lines],
+            time_s=self.time_s[lines],
+        )
+        if self.intensities is not None:
+            cut = replace(cut, intensities=self.intensities[lines, beams])
+        return cut
 
 
 @dataclass(frozen=True)
