@@ -277,10 +277,8 @@ def face_points(
     sweep = scan.sweep
     miss = np.abs(sweep.ranges - scan.fitted)
     good = scan.mask & (miss < OUTLYING * scan.sigma_range)
-    along = CLEAR * scan.spot / max(median_step(sweep.bearings), 1e-6)
-    down = CLEAR * scan.spot / max(median_step(sweep.pitch), 1e-6)
-    good &= _interior(scan.mask, along)
-    good &= _interior(scan.mask.T, down).T
+    good &= _interior(scan.mask, sweep.bearings, scan.spot)
+    good &= _interior(scan.mask.T, sweep.pitch, scan.spot).T
     line, beam = thin(np.argwhere(good), count).T
     ranges = sweep.ranges[line, beam]
     bearings = sweep.bearings[beam]
@@ -315,13 +313,14 @@ def _span(mask, trim=0):
     return span
 
 
-def _interior(mask, spot):
-    """Without the outer part of each row: a share of it, and `spot` cells.
+def _interior(mask, angles, spot):
+    """Without the outer part of each row: a share of it, and what a spot reads over the edge.
 
     The latter where that leaves half of the row. A row too short for that (a sweep of one line,
-    seen by columns) stays.
+    seen by columns) stays. `angles` of the cells of a row, and `spot`, in radians.
     """
     size = np.ptp(row_ends(mask)[1], axis=1)
-    least = np.maximum(2, np.minimum(spot, MOST_MARGIN * size))
+    clear = CLEAR * spot / max(median_step(angles), 1e-6)
+    least = np.maximum(2, np.minimum(clear, MOST_MARGIN * size))
     trim = np.maximum(least, MARGIN * size).astype(int)
     return _span(mask, np.where(size < SHORTEST_ROW, 0, trim))

@@ -74,7 +74,8 @@ def edge_cells(
 
     row, k, line, beam = _neighbours(usable, cell, step, scan.mask.shape)
     cells = line, beam
-    hit, keep = _readings(scan, cells, k, board, radius, close)
+    gaps = median_step(sweep.pitch), median_step(sweep.bearings)
+    hit, keep = _readings(scan, cells, k, board, radius, gaps, close)
     sides = [s for edges in ways for s in edges.sides]
     side = side[row, 0]
     reach = (CORNER * radius / np.abs(cosine))[cells]
@@ -91,18 +92,19 @@ def edge_cells(
         "radius": radius[cells],
         "background": odds[row],
         "across": across,
-        "step": np.where(across, median_step(sweep.pitch), median_step(sweep.bearings)),
+        "step": np.where(across, *gaps),
     }
     arrays = [column[keep] for column in columns.values()]
     names = ",".join(columns)
     return np.rec.fromarrays(arrays, names=names)  # type: ignore[call-overload]
 
 
-def _readings(scan, cells, k, board, radius, close):
+def _readings(scan, cells, k, board, radius, gaps, close):
     """Which cells, k steps from a boundary, read the board, and which can be told.
 
-    `board` and `radius` (L, B) are the range of the board's plane and of the spot there; `close`
-    where most of the outline has a background that melts into the board's echo.
+    `board` and `radius` (L, B) are the range of the board's plane and of the spot there, `gaps` the
+    angles between lines and beams; `close` where most of the outline has a background that melts
+    into the board's echo.
     """
     sweep = scan.sweep
     near = max(SURE * scan.sigma_range, DEPTH_NOISE)
@@ -119,7 +121,6 @@ def _readings(scan, cells, k, board, radius, close):
         if not close:
             mixing = (np.abs(miss) > near) & (miss < MIXING)
             size = np.nanmedian((radius / board)[scan.mask])
-            gaps = median_step(sweep.pitch), median_step(sweep.bearings)
             keep &= ~_within_a_spot(mixing, size, gaps)[cells]
     return hit, keep
 

@@ -152,9 +152,8 @@ class Crossings:
         rays = unit_vector(self.points)
         noise = rays * np.hypot(self.range_sigma, warp_sigma)[:, None]
         place = self.by_angle * np.reshape(sigma, (-1, 1))
-        by_noise = np.einsum("...i,...j->...ij", noise, noise)
-        by_place = np.einsum("...i,...j->...ij", place, place)
-        return by_noise + by_place
+        axes = np.stack([noise, place], axis=-1)
+        return axes @ axes.mT
 
 
 def crossings_of(

@@ -110,8 +110,8 @@ def edge_votes(
         strip = sample(image, model, on_board(xy, pose, model))
         height = step_contrast(strip, SMOOTH_STEPS, along=AVERAGED_PROFILES)
         column, place, _ = peaks(height, LEAST_CONTRAST)
-        weight = np.ones(len(column))
-        votes = vote(column, place, weight, height.shape, slopes).max(axis=0)
+        alike = np.ones_like(place)
+        votes = vote(column, place, alike, height.shape, slopes).max(axis=0)
         visible = np.isfinite(strip[..., 0]).sum(axis=1)
         share = votes / np.maximum(visible, 1)
         share[visible <= LEAST_SHARE * len(s)] = np.nan
@@ -171,9 +171,9 @@ def common_lines(votes: np.ndarray, board) -> np.ndarray:
         Names the first edge that they do not agree on.
     """
     wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), MOVES_BETWEEN, axis=-1)
-    wide[wide < 0] = np.nan
-    count = np.isfinite(wide).sum(axis=0)
-    mean = np.nansum(wide, axis=0) / np.maximum(count, 1)
+    visible = wide >= 0
+    count = visible.sum(axis=0)
+    mean = wide.sum(axis=0, where=visible) / np.maximum(count, 1)
     mean[count < min(3, len(votes))] = 0
     places = []
     for name, of_side in zip(SIDES, gaussian_filter1d(mean, 1.0), strict=True):

@@ -130,7 +130,7 @@ def frontal(pose: RigidTransform) -> float:
     1 seen from the front, below 0 from behind.
     """
     normal = pose.rotation.as_matrix()[:, 2]
-    return float(-normal @ unit_vector(pose.translation))
+    return -normal @ unit_vector(pose.translation)
 
 
 def _polygon(contour, n_corners):

@@ -319,13 +319,13 @@ def square_px(grid):
     Corners (rows, columns, 2) that are NaN do not count.
     """
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2) for axis in (0, 1)]
-    return float(min(np.nanmean(side) for side in sides))
+    return min(np.nanmean(side) for side in sides)
 
 
 def scale_error(side_px):
     """Standard deviation, a share, of the scale of corners whose squares have a side in pixels."""
     error = SCALE_ERROR * (SCALE_ERROR_AT_PX / side_px) ** SCALE_ERROR_POWER
-    return float(min(LARGEST_SCALE_ERROR, error))
+    return min(LARGEST_SCALE_ERROR, error)
 
 
 def _ends_in_squares(picture, grid):

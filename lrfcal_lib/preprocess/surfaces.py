@@ -317,14 +317,14 @@ def _grown(surface, points):
 
 def _size_limits(board, grown):
     """Limits of a board with its outline grown (m)."""
-    if board.corners is None and board.pattern is not None:
-        sides = np.ptp(board.pattern.outline(), axis=0)
-        area = np.prod(sides)
-        return Limits(0.3 * area, 4 * area, 2.5 * np.linalg.norm(sides))
-    corners = board.known_corners().astype(np.float32)
+    unknown = board.corners is None and board.pattern is not None
+    corners = board.pattern.outline() if unknown else board.known_corners()
+    corners = corners.astype(np.float32)
     area = cv2.contourArea(corners)
-    rim = cv2.arcLength(corners, True)
     length = pdist(corners).max()
+    if unknown:
+        return Limits(0.3 * area, 4 * area, 2.5 * length)
+    rim = cv2.arcLength(corners, True)
     return Limits(0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown)
 
 
