@@ -193,7 +193,7 @@ def pose_with_edges(view, board, model: CameraModel) -> tuple[RigidTransform, np
         return pose, covariance
     misses, by_pose = line_residuals(view.edges, board, model, pose_array(pose))
     expected = np.eye(2) + by_pose @ covariance @ by_pose.mT
-    chi2 = np.sum(misses * solve_each(expected, misses), axis=1)
+    chi2 = np.vecdot(misses, solve_each(expected, misses))
     agreeing = [view.edges[i] for i in np.flatnonzero(chi2 < AGREE_CHI2)]
     if not agreeing:
         return pose, covariance

@@ -174,7 +174,7 @@ def crossings_of(
     """
     rays = polar_to_points(1.0, bearings)
     flat = rays[:, :2]
-    fitted = 1 / np.sum(lines * flat, axis=1)
+    fitted = 1 / np.vecdot(lines, flat)
     variance = np.einsum("ni,nij,nj->n", flat, covariance, flat)
     points = fitted[:, None] * rays
     normal = np.insert(lines, 2, 0.0, axis=1)
@@ -378,7 +378,7 @@ def within(cell, step, shape):
 
 def _slid(turned, normal, rays):
     """How points on a surface with these normals move when their rays turn, all (n, 3)."""
-    slide = np.sum(normal * turned, axis=1) / np.sum(normal * rays, axis=1)
+    slide = np.vecdot(normal, turned) / np.vecdot(normal, rays)
     return turned - slide[:, None] * rays
 
 

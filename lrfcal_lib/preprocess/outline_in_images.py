@@ -201,7 +201,7 @@ def side_lines(pattern: Chessboard, distances) -> np.ndarray:
     ndarray, shape (4, 3)
     """
     corner = np.asarray(pattern.origin) + np.maximum(SIDE_NORMALS, 0) * _size(pattern)
-    offset = -np.sum(corner * SIDE_NORMALS, axis=1) - np.asarray(distances, float)
+    offset = -np.vecdot(corner, SIDE_NORMALS) - np.asarray(distances, float)
     return np.column_stack([SIDE_NORMALS, offset])
 
 

@@ -96,7 +96,7 @@ def _consensus(points, tolerance, apart, rng):
     a = a[far]
     along = b[far] - a
     normal = unit_vector(along[:, ::-1] * [-1, 1])
-    distance = normal @ points.T - np.sum(normal * a, axis=1)[:, None]
+    distance = normal @ points.T - np.vecdot(normal, a)[:, None]
     # The sum of truncated squares ranks lines through the middle of a trace above those along its
     # rim.
     best = np.minimum((distance / tolerance) ** 2, 1).sum(axis=1).argmin()

@@ -223,7 +223,7 @@ def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
     normals = np.cross(others[:, 0] - seeds, second)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals /= np.where(length > 1e-9, length, np.nan)
-    offsets = np.sum(normals * seeds, axis=1)
+    offsets = np.vecdot(normals, seeds)
     misses = np.abs(normals @ sample.T - offsets[:, None])
     best = np.sum(misses < PLANE_NOISE, axis=1).argmax()
     normal = normals[best]
