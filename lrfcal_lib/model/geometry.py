@@ -429,18 +429,6 @@ def pose_transform(pose: np.ndarray, proper: bool = False) -> RigidTransform:
     )  # much faster than from components
 
 
-def opencv_poses(turns: ArrayLike, shifts: ArrayLike) -> RigidTransform:
-    """A stack of transforms from rotation vectors and translations as OpenCV gives them.
-
-    Parameters
-    ----------
-    turns, shifts : array_like, shape (n, 3, 1) or (3, 1)
-        Radians and metres.
-    """
-    rotation = Rotation.from_rotvec(np.reshape(turns, (-1, 3)))
-    return RigidTransform.from_components(np.reshape(shifts, (-1, 3)), rotation)
-
-
 def exp_rotation(w: ArrayLike) -> np.ndarray:
     """Rotation matrices of rotation vectors.
 

@@ -2,11 +2,10 @@
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import opencv_poses
 from lrfcal_lib.preprocess.bundle import (
     SIGMA_FLOOR_PX,
     UP,
@@ -135,6 +134,18 @@ def first_pose(
     if not solved or not np.isfinite(shift).all() or shift[2, 0] <= 0:
         raise ValueError(why)
     return opencv_poses(turn, shift)[0]
+
+
+def opencv_poses(turns, shifts) -> RigidTransform:
+    """A stack of transforms from rotation vectors and translations as OpenCV gives them.
+
+    Parameters
+    ----------
+    turns, shifts : array_like, shape (n, 3, 1) or (3, 1)
+        Radians and metres.
+    """
+    rotation = Rotation.from_rotvec(np.reshape(turns, (-1, 3)))
+    return RigidTransform.from_components(np.reshape(shifts, (-1, 3)), rotation)
 
 
 def board_pose(

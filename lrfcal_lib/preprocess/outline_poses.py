@@ -8,8 +8,9 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.camera import CameraModel, pinhole
-from lrfcal_lib.model.geometry import opencv_poses, unit_vector
+from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge
+from lrfcal_lib.preprocess.intrinsics import opencv_poses
 from lrfcal_lib.preprocess.pattern_in_image import grey
 from lrfcal_lib.preprocess.pose_from_lines import pose_from_edges
 
