@@ -7,12 +7,11 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.geometry import transform_difference
-from lrfcal_lib.preprocess.bundle import adjust_robust, waves
-from lrfcal_lib.preprocess.intrinsics import board_pose
+from lrfcal_lib.preprocess.bundle import LENS, adjust_robust
+from lrfcal_lib.preprocess.intrinsics import K5, board_pose
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers import METHODS
 
-K3 = 8  # number of the sixth-power term of the lens among the intrinsics
 COLUMNS = (
     "method",
     "baseline_mm",
@@ -83,18 +82,17 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
     rough = RigidTransform.from_components(
         np.median(between.translation, axis=0), between.rotation.mean()
     )
-    basis = None
-    if np.any(prepared.relief):
-        basis = waves(pattern.points())
-    fixed = (K3,) if all(model.distortion[4] == 0 for model in models) else ()
+    lens = LENS
+    if all(model.distortion[4] == 0 for model in models):
+        lens = K5
     adjusted = adjust_robust(
         pixels,
         pattern.points(),
         models,
         poses[0],
         RigidTransform.concatenate([RigidTransform.identity(), rough]),
-        basis=basis,
-        fixed=fixed,
+        lens=lens,
+        wavy=np.any(prepared.relief),
     )
     return StereoReference(
         (first, second), adjusted.mounting[1], adjusted.mounting_covariance[0]

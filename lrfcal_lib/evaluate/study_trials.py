@@ -225,7 +225,7 @@ def _ends_of_lines(ranges, setup, last_beam):
     sessions, placements, _, beams = ranges.shape
     ranges = ranges.reshape(-1, beams)
     lines, information = fit_lines(ranges, bearings)
-    ends = bearings[_ends(ranges)]
+    ends = bearings[row_ends(np.isfinite(ranges))[1]]
     if not last_beam:
         ends = ends + np.array([-0.5, 0.5]) * setup.step
     of_line = np.linalg.inv(information) * setup.sigma_range**2
@@ -317,8 +317,9 @@ def _readings(shots, scenario, trial):
     edges = np.repeat(shots["edges"][trial], scans, axis=0)
     ranges = ranges.reshape(-1, beams)
     bearings = scenario.bearings()
-    line, beam = np.nonzero(np.isfinite(ranges))
-    ends = _ends(ranges)
+    hit = np.isfinite(ranges)
+    line, beam = np.nonzero(hit)
+    _, ends = row_ends(hit)
     at_ends = np.maximum(np.take_along_axis(ranges, ends, axis=1), LEAST_RANGE)
     # beams about either end of every scan line
     near = np.arange(2 * REACH) - REACH

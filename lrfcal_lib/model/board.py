@@ -36,6 +36,10 @@ class Chessboard:
             -1, 3
         )
 
+    def grid(self, corners: ArrayLike) -> np.ndarray:
+        """What belongs to the inner corners, (rows * columns, 2), as (rows, columns, 2)."""
+        return np.reshape(corners, (self.rows, self.columns, 2))
+
     def outline(self) -> np.ndarray:
         """Corners of the printed squares together, shape (4, 2), metres."""
         first = np.asarray(self.origin) - self.square
@@ -81,7 +85,7 @@ class Board:
 
     def points(self):
         """Corners of the outline in space, board frame, metres, shape (n, 3)."""
-        return np.pad(self.known_corners(), ((0, 0), (0, 1)))
+        return np.insert(self.known_corners(), 2, 0.0, axis=1)
 
     def known_corners(self):
         """Corners of the outline, metres, shape (n, 2); ValueError where nobody has
@@ -129,6 +133,23 @@ def corners_of_lines(lines: ArrayLike) -> np.ndarray:
     lines = np.asarray(lines, float)
     points = cross(np.roll(lines, 1, axis=-2), lines)
     return points[..., :2] / points[..., 2:]
+
+
+def side_ends(corners: np.ndarray, inset: float = 0.0) -> np.ndarray:
+    """Both ends of every side of a polygon, side i from corner i to i + 1.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (n, k)
+    inset : float
+        Share of a side left out at either end.
+
+    Returns
+    -------
+    ndarray, shape (n, 2, k)
+    """
+    ends = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+    return ends + inset * (ends[:, ::-1] - ends)
 
 
 def triangle_board(

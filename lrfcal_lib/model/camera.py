@@ -289,6 +289,28 @@ def undistort(uv: ArrayLike, model: CameraModel) -> np.ndarray:
     return out.reshape(uv.shape)
 
 
+def redistort(uv: ArrayLike, model: CameraModel) -> np.ndarray:
+    """Image points of undistorted pixels: the way back of :func:`undistort`.
+
+    Parameters
+    ----------
+    uv : array_like, shape (..., 2)
+        Undistorted pixels.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Pixels; NaN for what lies so far outside that the lens would fold it back into the image.
+    """
+    focal = np.array([model.fx, model.fy])
+    centre = np.array([model.cx, model.cy])
+    normalized = (uv - centre) / focal
+    recorded = distort(normalized, model.distortion) * focal + centre
+    recorded[np.sum(normalized**2, axis=-1) >= fold(model)] = np.nan
+    return recorded
+
+
 def line_through(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     """Pixel line ``l0 u + l1 v + l2 = 0`` with ``l0^2 + l1^2 = 1`` through two pixels.
 

@@ -9,7 +9,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap
 
 from lrfcal_lib.model.board import Board, outline_lines
-from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.model.camera import CameraModel, redistort
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.colors import COLORS as COLORS
 from lrfcal_lib.plots.colors import (
@@ -330,8 +330,7 @@ def seen_points(
 def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
     """Recorded pixels (STRETCH, 2) of an ImageEdge, which is a straight line without the lens."""
     first, last = edge.ends
-    uv = np.linspace(first, last, STRETCH)
-    return project(model.sights(uv), model)
+    return redistort(np.linspace(first, last, STRETCH), model)
 
 
 def _about_lines(ax, view, image, margin, more=""):

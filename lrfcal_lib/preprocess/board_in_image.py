@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import solve_each
-from lrfcal_lib.model.board import Board, corners_of_lines
+from lrfcal_lib.model.board import Board, corners_of_lines, side_ends
 from lrfcal_lib.model.camera import CameraModel, line_distance, undistort
 from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.preprocess.edges_in_image import (
@@ -151,11 +151,10 @@ def order_scores(
         From a few coarse profiles across the outline.
     """
     lines = board.lines()
-    start = corners_of_lines(lines)
-    end = np.roll(start, -1, axis=0)
     offset = np.linspace(-2, 2, COARSE_ACROSS) * PREDICTION_SIGMA
-    along = np.linspace(CORNER_INSET, 1 - CORNER_INSET, COARSE_PROFILES)
-    on_edges = start[:, None] + along[:, None] * (end - start)[:, None]
+    along = np.linspace(0, 1, COARSE_PROFILES)
+    ends = side_ends(board.known_corners(), CORNER_INSET)
+    on_edges = np.column_stack([1 - along, along]) @ ends
     xy = on_edges + offset[:, None, None, None] * lines[:, None, :2]
     flat = xy.reshape(COARSE_ACROSS, -1, 2)
     uv = np.concatenate([on_board(flat, pose, model) for pose in poses], axis=1)
@@ -210,18 +209,16 @@ def _view_pattern(view, image, board, model, picks, lines, relief):
         unknown = [(name, "the outline of the board is not known") for name in board.edges]
         return replace(view, rejected=tuple(unknown))
     inner = undistort(np.nanmean(pixels, axis=0), model)
-    corners = corners_of_lines(lines)
+    ends = side_ends(corners_of_lines(lines), CORNER_INSET)
     edges = []
     rejected = []
-    for i, name in enumerate(board.edges):
+    for name, line, (start, end) in zip(board.edges, lines, ends, strict=True):
         if name in picks:
             edges.append(picked_edge(name, undistort(picks[name], model), inner))
             continue
-        start, end = corners[[i, (i + 1) % len(corners)]]
-        inset = CORNER_INSET * (end - start)
         middle = (start + end) / 2
-        beside = middle + WINDOW * lines[i, :2]
-        uv = on_board(np.stack([start + inset, end - inset, middle, beside]), pose, model)
+        beside = middle + WINDOW * line[:2]
+        uv = on_board(np.stack([start, end, middle, beside]), pose, model)
         window = np.linalg.norm(uv[3] - uv[2])
         reach = np.clip(window, LEAST_REACH_PX, MOST_REACH_PX)
         prior = max(window / WINDOW * PREDICTION_SIGMA, 1.0)
@@ -245,11 +242,16 @@ def _view_plain(view, image, board, model, picks):
         inner = np.mean([edge.centre for edge in found.edges], axis=0)
         edges = {edge.name: edge for edge in found.edges}
         off = [line_distance(uv, edges[name].line) for name, uv in ends.items()]
-        if off and np.abs(off).max() >= SAME_NAMES_PX:
+        if np.abs(off).max(initial=0.0) >= SAME_NAMES_PX:
             continue
         edges |= {name: picked_edge(name, uv, inner) for name, uv in ends.items()}
-        pose = {"T_camera_board": found.T_camera_board, "covariance": found.covariance}
-        views.append(replace(view, edges=tuple(edges.values()), **pose))
+        explained = replace(
+            view,
+            edges=tuple(edges.values()),
+            T_camera_board=found.T_camera_board,
+            covariance=found.covariance,
+        )
+        views.append(explained)
     if not views:
         reason = f"no pose of board '{board.name}' explains the outline in the image"
         return replace(view, reason=reason)
@@ -267,10 +269,7 @@ def _sides(image, board, model, ends):
     corners = undistort(find_polygon(image, len(board.known_corners())), model)
     middle = corners.mean(axis=0)
     sides = []
-    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        inset = OUTLINE_INSET * (b - a)
+    for a, b in side_ends(corners, OUTLINE_INSET):
         outward = (a + b) / 2 - middle
-        sides.append(
-            refine_edge(image, model, "", a + inset, b - inset, outward, SEARCH_PX)
-        )
+        sides.append(refine_edge(image, model, "", a, b, outward, SEARCH_PX))
     return sides

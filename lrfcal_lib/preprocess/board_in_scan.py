@@ -9,6 +9,7 @@ from lrfcal_lib.fit.covariance import dyads, solve_each
 from lrfcal_lib.fit.robust import NORMAL, biweight, rms
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import polar_covariance, polar_to_points
+from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.surfaces import (
     PLANE_NOISE,
     BoardNotFound,
@@ -123,13 +124,13 @@ def find_board(
     fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
     residuals = np.where(mask, sweep.ranges - fitted, np.nan)
     residuals = residuals[np.abs(residuals) <= PLANE_NOISE * 2]
-    if not len(residuals):
+    if not residuals.size:
         raise BoardNotFound(f"no scan line has {FEWEST_BEAMS} beams on the board")
     sigma = rms(residuals)
     spot = 0.0
     if lrf is not None and lrf.spot_exit is not None:
-        reach = float(np.nanmedian(fitted))
-        spot = float(lrf.spot_radius(reach)) / reach
+        reach = np.nanmedian(fitted)
+        spot = lrf.spot_radius(reach) / reach
     return BoardScan(
         placement=sweep.placement,
         sweep=sweep,
@@ -142,7 +143,7 @@ def find_board(
         normal=surface.normal,
         distance=surface.distance,
         sigma_range=sigma,
-        n_jump_points=int(jump_points(sweep.ranges, fitted, sigma).sum()),
+        n_jump_points=jump_points(sweep.ranges, fitted, sigma).sum(),
         spot=spot,
     )
 
@@ -173,11 +174,10 @@ def median_filter(
             f"the width of a median filter must be odd and positive, got {width}"
         )
     half = width // 2
-    taken = np.where(mask, ranges, np.nan)
-    padded = np.pad(taken, ((0, 0), (half, half)), constant_values=np.nan)
+    filtered = np.where(mask, ranges, np.nan)
+    padded = np.pad(filtered, ((0, 0), (half, half)), constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, width, axis=1)
-    valid = np.isfinite(taken)
-    filtered = np.full(taken.shape, np.nan)
+    valid = np.isfinite(filtered)
     filtered[valid] = np.nanmedian(windows[valid], axis=1)
     return filtered
 
@@ -204,22 +204,20 @@ def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.
     """
     rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
     products = dyads(rays)
-    valid = np.isfinite(ranges)
-    r = np.where(valid, ranges, 1.0)
-    enough = valid.sum(axis=1) >= FEWEST_BEAMS
-    base = np.where(valid & enough[:, None], r**4, 0.0)
+    few = np.isfinite(ranges).sum(axis=1) < FEWEST_BEAMS
+    r = np.where(few[:, None], 1.0, ranges)  # something to fit all the same
+    valid = np.isfinite(r)
+    r[~valid] = 1.0
+    base = np.where(valid, r**4, 0.0)
     weights = base
     for _ in range(LINE_ROUNDS):
         information = np.einsum("lb,bij->lij", weights, products)
-        right = (weights / r) @ rays
-        information[~enough] = np.eye(2)
-        right[~enough] = np.nan
-        lines = solve_each(information, right)
+        lines = solve_each(information, (weights / r) @ rays)
         misses = np.where(valid, np.abs(r - _line_ranges(lines, bearings)), np.nan)
-        misses[~enough] = 0.0
         sigma = np.maximum(NORMAL * np.nanmedian(misses, axis=1), LEAST_SIGMA)[:, None]
         weights = np.nan_to_num(base * biweight(misses, sigma))
-    information[~enough] = np.nan
+    lines[few] = np.nan
+    information[few] = np.nan
     return lines, information
 
 
@@ -279,14 +277,9 @@ def face_points(
     sweep = scan.sweep
     miss = np.abs(sweep.ranges - scan.fitted)
     good = scan.mask & (miss < OUTLYING * scan.sigma_range)
-    along = CLEAR * scan.spot / max(median_step(sweep.bearings), 1e-6)
-    down = CLEAR * scan.spot / max(median_step(sweep.pitch), 1e-6)
-    good &= _interior(scan.mask, along)
-    good &= _interior(scan.mask.T, down).T
-    line, beam = np.nonzero(good)
-    if len(line) > count:
-        keep = np.linspace(0, len(line) - 1, count).round().astype(int)
-        line, beam = np.stack([line, beam])[:, keep]
+    good &= _interior(scan.mask, sweep.bearings, scan.spot)
+    good &= _interior(scan.mask.T, sweep.pitch, scan.spot).T
+    line, beam = thin(np.argwhere(good), count).T
     ranges = sweep.ranges[line, beam]
     bearings = sweep.bearings[beam]
     # keeps the covariance regular; bearings are all but exact
@@ -312,23 +305,22 @@ def _span(mask, trim=0):
 
     A number, or one a row.
     """
-    rows, first, last = row_ends(mask)
+    rows, ends = row_ends(mask)
+    inside = ends + np.multiply.outer(trim, [1, -1])
     beam = np.arange(mask.shape[1])
     span = np.zeros(mask.shape, bool)
-    after = beam >= (first + trim)[:, None]
-    before = beam <= (last - trim)[:, None]
-    span[rows] = after & before
+    span[rows] = (beam >= inside[:, :1]) & (beam <= inside[:, 1:])
     return span
 
 
-def _interior(mask, spot):
-    """Without the outer part of each row: a share of it, and `spot` cells.
+def _interior(mask, angles, spot):
+    """Without the outer part of each row: a share of it, and what a spot reads over the edge.
 
     The latter where that leaves half of the row. A row too short for that (a sweep of one line,
-    seen by columns) stays.
+    seen by columns) stays. `angles` of the cells of a row, and `spot`, in radians.
     """
-    _, first, last = row_ends(mask)
-    size = last - first
-    least = np.maximum(2, np.minimum(spot, MOST_MARGIN * size))
+    size = np.ptp(row_ends(mask)[1], axis=1)
+    clear = CLEAR * spot / max(median_step(angles), 1e-6)
+    least = np.maximum(2, np.minimum(clear, MOST_MARGIN * size))
     trim = np.maximum(least, MARGIN * size).astype(int)
     return _span(mask, np.where(size < SHORTEST_ROW, 0, trim))

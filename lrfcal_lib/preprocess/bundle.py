@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.fit.covariance import covariance_of
 from lrfcal_lib.fit.least_squares import Block, minimise
-from lrfcal_lib.model.camera import LENS, CameraModel, project_jacobians
+from lrfcal_lib.model.camera import LENS, CameraModel, project, project_jacobians
 from lrfcal_lib.model.geometry import (
     POSE,
     gradient_by_pose,
@@ -21,6 +22,7 @@ OUTLIER_SIGMAS = 4.5
 RAYLEIGH_MEDIAN = 1.1774  # median of the length of a vector (2,) of normal variables
 ROBUST_ROUNDS = 7
 UP = np.array([0.0, 0.0, 1.0])
+ALONE = RigidTransform.identity(1)  # the mounting of a single camera
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,7 @@ class Bundle:
             )
             rows = [part.reshape(*by_height.shape, -1) for part in parts]
             jacobian.append(np.concatenate(rows, axis=-1))
-            # the derivatives by fx and fy are the distorted normalised coordinates themselves
-            distorted = np.stack([by_lens[..., 0, 0], by_lens[..., 1, 1]], axis=-1)
-            pixels.append(lens[:2] * distorted + lens[2:4])
+            pixels.append(project(p_camera, model))
         return np.stack(pixels), np.stack(jacobian)
 
 
@@ -168,7 +168,7 @@ def waves(points: np.ndarray) -> np.ndarray:
 
 
 def adjust(
-    pixels, points, models, poses, mounting=None, *, intrinsics=True, basis=None, fixed=()
+    pixels, points, models, poses, mounting=ALONE, *, lens=LENS, wavy=False
 ) -> Adjustment:
     """Bundle adjustment of chessboard views with analytic derivatives.
 
@@ -184,12 +184,11 @@ def adjust(
         A stack of ``T_first_board``.
     mounting : RigidTransform, optional
         A stack of ``T_camera_first``; may be left out for a single camera.
-    intrinsics : bool
-        Whether they are unknown, but for the `fixed` places in fx, fy, cx, cy, k1..k5.
-    basis : ndarray, shape (k, m), optional
-        Heights that all views may have in common; those of :func:`waves` hold no plane, so that the
-        poses are those of the sheet's mean plane.
-    fixed : sequence of int
+    lens : int
+        How many of fx, fy, cx, cy, k1..k5 are unknown, from the first one on.
+    wavy : bool
+        Whether all views may have heights in common; those of :func:`waves` hold no plane, so that
+        the poses are those of the sheet's mean plane.
 
     Returns
     -------
@@ -200,41 +199,33 @@ def adjust(
     ValueError
         If there are more unknowns than coordinates.
     """
-    basis = np.zeros((len(points), 0)) if basis is None else basis
-    mounting = RigidTransform.identity(1) if mounting is None else mounting
+    basis = waves(points) if wavy else np.zeros((len(points), 0))
     start = Bundle(
         lenses=np.stack([model.parameters for model in models]),
         mounting=pose_array(mounting),
         poses=pose_array(poses),
         shape=np.zeros(basis.shape[1]),
     )
-    free = np.ones(start.ends[-1], bool)
-    free[: start.ends[0]] = intrinsics
-    for place in fixed:
-        free[place : start.ends[0] : LENS] = False
+    unknown = np.ones(start.ends[-1], bool)
+    unknown[: start.ends[0]] = np.tile(np.arange(LENS) < lens, len(models))
     visible = np.isfinite(pixels)
-    if visible.sum() < free.sum():
+    if visible.sum() < unknown.sum():
         raise ValueError(
-            f"{visible.sum()} image coordinates cannot determine {free.sum()} unknowns: use more "
-            "views"
+            f"{visible.sum()} image coordinates cannot determine {unknown.sum()} unknowns: use "
+            "more views"
         )
 
     def evaluate(bundle):
         predicted, jacobian = bundle.predict(points, basis)
         misses = (predicted - pixels)[visible]
-        return Block(misses, jacobian[visible][:, free])
+        return Block(misses, jacobian[visible] * unknown)
 
-    def retract(bundle, step):
-        whole = np.zeros(len(free))
-        whole[free] = step
-        return bundle.moved(whole)
-
-    bundle = minimise(evaluate, start, retract)[0]
-    adjusted = _adjusted(bundle, evaluate(bundle), pixels, points, basis, free, models)
-    return adjusted if intrinsics else replace(adjusted, models=tuple(models))
+    bundle = minimise(evaluate, start, Bundle.moved).state
+    adjusted = _adjusted(bundle, evaluate(bundle), pixels, points, basis, unknown, models)
+    return adjusted if lens else replace(adjusted, models=tuple(models))
 
 
-def adjust_robust(pixels, points, models, poses, mounting=None, **options) -> Adjustment:
+def adjust_robust(pixels, points, models, poses, mounting=ALONE, **options) -> Adjustment:
     """As :func:`adjust`, without corners far off the rest (glare, a shadow).
 
     Every corner is judged again in every round, so that one that its neighbour pulled out comes
@@ -249,52 +240,51 @@ def adjust_robust(pixels, points, models, poses, mounting=None, **options) -> Ad
     -------
     Adjustment
     """
-    used = np.isfinite(pixels)
+    used = np.isfinite(pixels[..., :1])
     for _ in range(ROBUST_ROUNDS):
         kept = np.where(used, pixels, np.nan)
         result = adjust(kept, points, models, poses, mounting, **options)
         models = result.models
         poses = result.poses
         mounting = result.mounting
-        distance = np.linalg.norm(pixels - result.predicted, axis=-1)
+        distance = np.linalg.norm(pixels - result.predicted, axis=-1, keepdims=True)
         sigma = max(np.nanmedian(distance) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX)
         before = used
-        near = distance <= OUTLIER_SIGMAS * sigma
-        used = np.broadcast_to(near[..., None], pixels.shape)
+        used = distance <= OUTLIER_SIGMAS * sigma
         if np.array_equal(used, before):
             break
     return result
 
 
-def better(result: Adjustment, pixels, points, **options) -> Adjustment:
+def better(result: Adjustment, points, **options) -> Adjustment:
     """The same corners adjusted otherwise, where the Bayesian information criterion prefers that.
 
     Parameters
     ----------
     result : Adjustment
-    pixels, points, **options
+    points, **options
         Those of :func:`adjust`.
 
     Returns
     -------
     Adjustment
     """
-    same = np.where(np.isfinite(result.residuals), pixels, np.nan)
-    other = adjust(same, points, result.models, result.poses, **options)
+    pixels = result.predicted + result.residuals
+    other = adjust(pixels, points, result.models, result.poses, **options)
     return other if other.bic < result.bic else result
 
 
-def _adjusted(bundle, block, pixels, points, basis, free, models):
+def _adjusted(bundle, block, pixels, points, basis, unknown, models):
     """The Adjustment that a solved bundle is."""
     predicted = bundle.predict(points, basis)[0]
     residuals = pixels - predicted
     count = len(block.residuals)
     error = block.residuals @ block.residuals
-    variance = max(error / max(count - free.sum(), 1), 1e-18)
-    lens, mount, pose = _covariances(bundle, variance, block.jacobian, free)
+    variance = max(error / max(count - unknown.sum(), 1), 1e-18)
+    lens, mount, pose = _covariances(bundle, variance, block.jacobian)
     rms = np.sqrt(2 * np.nanmean(residuals**2, axis=(1, 2, 3)))  # as OpenCV counts it
     adjusted = zip(models, bundle.lenses, lens, rms.tolist(), strict=True)
-    penalty = free.sum() * np.log(count)
+    penalty = unknown.sum() * np.log(count)
     return Adjustment(
         models=tuple(model.with_parameters(*values) for model, *values in adjusted),
         mounting=pose_transform(bundle.mounting),
@@ -304,21 +294,19 @@ def _adjusted(bundle, block, pixels, points, basis, free, models):
         relief=basis @ bundle.shape,
         predicted=predicted,
         residuals=residuals,
-        sigma_px=float(np.sqrt(variance)),
-        bic=float(count * np.log(max(error, 1e-300) / count) + penalty),
+        sigma_px=np.sqrt(variance),
+        bic=count * np.log(max(error, 1e-300) / count) + penalty,
     )
 
 
-def _covariances(bundle, variance, jacobian, free):
-    """Of every lens, mounting and pose (n, k, k); those that are `free`."""
+def _covariances(bundle, variance, jacobian):
+    """Of every lens, mounting and pose (n, k, k); zero for what is no unknown."""
     normal = jacobian.T @ jacobian
     # pixels, radians and metres mix safely
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scale = np.outer(scale, scale)
-    inverse = np.linalg.pinv(normal * scale, hermitian=True)
-    covariance = np.zeros((len(free), len(free)))
-    covariance[np.ix_(free, free)] = variance * inverse * scale
-    kinds = np.split(np.arange(len(free)), bundle.ends[:-1])
+    seen = np.diag(normal)
+    scales = 1 / np.sqrt(np.where(seen > 0, seen, np.inf))
+    covariance = variance * covariance_of(normal, scales, lost=())
+    kinds = np.split(np.arange(len(normal)), bundle.ends[:-1])
     for unknowns, size in zip(kinds, (LENS, POSE, POSE), strict=False):
         rows = unknowns.reshape(-1, size)
         yield covariance[rows[:, :, None], rows[:, None]]

@@ -58,7 +58,7 @@ def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
     count = len(pitch)
     quarter = count // 4 + 1
     way = np.sign(np.median(pitch[-quarter:]) - np.median(pitch[:quarter]))
-    turn = int(np.argmax(way * pitch)) + 1
+    turn = np.argmax(way * pitch) + 1
     far = np.abs(pitch[turn:] - pitch[0]) < FIRST * np.ptp(pitch)
     if not far.any() or len(far) > max(1, FEW * count):
         return sweep, None
@@ -89,7 +89,7 @@ def closing_of(sweep: Sweep) -> Closing | None:
     expected = [_apart(*pair) for pair in pairwise(lines)]
     if not (np.isfinite(apart).any() and np.isfinite(expected).any()):
         return None
-    return Closing(float(np.nanmin(apart)), float(np.nanmedian(expected)))
+    return Closing(np.nanmin(apart), np.nanmedian(expected))
 
 
 def _apart(first, second):

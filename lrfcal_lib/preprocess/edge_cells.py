@@ -11,12 +11,12 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
-    BORDER,
     MIXING,
     ScanEdges,
     background_odds,
     beyond,
     plane_range,
+    within,
 )
 from lrfcal_lib.preprocess.surfaces import DEPTH_NOISE
 from lrfcal_lib.session.stated import LrfInfo
@@ -58,27 +58,28 @@ def edge_cells(
     """
     ways = [edges for edges in (along, swept) if edges is not None]
     sweep = scan.sweep
-    ends = [np.column_stack([e.line, e.beam, e.step, e.side])[e.side >= 0] for e in ways]
-    line, beam, up, along_line, side = np.concatenate(ends).T
-    step = np.stack([up, along_line], axis=1)
+    ends = [np.column_stack([e.cell, e.step, e.side])[e.side >= 0] for e in ways]
+    cell, step, side = np.split(np.concatenate(ends), [2, 4], axis=1)
     rays = polar_to_points(1.0, sweep.bearings)
     board, cosine = plane_range(scan, rays, sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
     radius = lrf.spot_radius(board)
-    here = board[line, beam]
-    behind = beyond(scan, line, beam, step)
+    here = board[tuple(cell.T)]
+    behind = beyond(scan, cell, step)
     visible = np.isfinite(behind)
     mixed = behind - here < MIXING
     close = 2 * visible.sum() < len(visible) or 2 * mixed.sum() >= len(mixed)
     odds = np.where(close, 0.0, background_odds(here, behind))
     usable = np.flatnonzero(close | (visible & ~mixed))
 
-    row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape)
+    row, k, line, beam = _neighbours(usable, cell, step, scan.mask.shape)
     cells = line, beam
-    hit, keep = _readings(scan, cells, k, board, radius, close)
+    gaps = median_step(sweep.pitch), median_step(sweep.bearings)
+    hit, keep = _readings(scan, cells, k, board, radius, gaps, close)
     sides = [s for edges in ways for s in edges.sides]
+    side = side[row, 0]
     reach = (CORNER * radius / np.abs(cosine))[cells]
-    keep &= _on_one_side(scan, cells, board, reach, sides, side[row])
+    keep &= _on_one_side(scan, cells, board, reach, sides, side)
     across = step[row, 0] != 0
     columns = {
         "line": line,
@@ -86,23 +87,24 @@ def edge_cells(
         "bearing": sweep.bearings[beam],
         "pitch": sweep.pitch[line],
         "hit": hit,
-        "side": side[row],
+        "side": side,
         "range_m": board[cells],
         "radius": radius[cells],
         "background": odds[row],
         "across": across,
-        "step": np.where(across, median_step(sweep.pitch), median_step(sweep.bearings)),
+        "step": np.where(across, *gaps),
     }
     arrays = [column[keep] for column in columns.values()]
     names = ",".join(columns)
     return np.rec.fromarrays(arrays, names=names)  # type: ignore[call-overload]
 
 
-def _readings(scan, cells, k, board, radius, close):
+def _readings(scan, cells, k, board, radius, gaps, close):
     """Which cells, k steps from a boundary, read the board, and which can be told.
 
-    `board` and `radius` (L, B) are the range of the board's plane and of the spot there; `close`
-    where most of the outline has a background that melts into the board's echo.
+    `board` and `radius` (L, B) are the range of the board's plane and of the spot there, `gaps` the
+    angles between lines and beams; `close` where most of the outline has a background that melts
+    into the board's echo.
     """
     sweep = scan.sweep
     near = max(SURE * scan.sigma_range, DEPTH_NOISE)
@@ -119,7 +121,6 @@ def _readings(scan, cells, k, board, radius, close):
         if not close:
             mixing = (np.abs(miss) > near) & (miss < MIXING)
             size = np.nanmedian((radius / board)[scan.mask])
-            gaps = median_step(sweep.pitch), median_step(sweep.bearings)
             keep &= ~_within_a_spot(mixing, size, gaps)[cells]
     return hit, keep
 
@@ -135,15 +136,13 @@ def _within_a_spot(mixing, size, gaps):
     return ndimage.binary_dilation(surface, np.ones(spot))
 
 
-def _neighbours(usable, line, beam, step, shape):
+def _neighbours(usable, cell, step, shape):
     """Cells about boundaries, each once: number of the nearest, step k from it, line and beam."""
     steps = sorted(range(1 - REACH, REACH + 1), key=lambda k: abs(k - 0.5))
     k = np.repeat(steps, len(usable))
     row = np.tile(usable, len(steps))
-    cell = np.stack([line, beam], axis=1)[row] + k[:, None] * step[row]
-    margin = np.where(step[row] != 0, BORDER, 0)
-    inside = np.all((cell >= margin) & (cell < shape - margin), axis=1)
-    rows = np.column_stack([row, k, cell])[inside]
+    near = cell[row] + k[:, None] * step[row]
+    rows = np.column_stack([row, k, near])[within(near, step[row], shape)]
     _, first = np.unique(rows[:, 2:], axis=0, return_index=True)
     return rows[first].T
 

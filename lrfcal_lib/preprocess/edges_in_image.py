@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from lrfcal_lib.fit.robust import biweight, rms, robust_sigma
-from lrfcal_lib.model.camera import CameraModel, fold, line_through, pinhole, project
+from lrfcal_lib.model.camera import CameraModel, line_through, pinhole, redistort
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -70,21 +70,6 @@ class EdgeNotSeen(ValueError):
     """An edge cannot be used in this image; the message is the reason."""
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """A line ``place = offset + slope column`` in a strip, pixels from the prediction.
-
-    `covariance` (2, 2) is of the offset at the middle of the `columns` and of the slope; `columns`
-    are those of the peaks that it goes through, `rms` is their distance.
-    """
-
-    offset: float
-    slope: float
-    covariance: np.ndarray
-    columns: np.ndarray
-    rms: float
-
-
 def refine_edge(
     image: np.ndarray,
     model: CameraModel,
@@ -137,21 +122,17 @@ def refine_edge(
     if visible < max(LEAST_PROFILES, LEAST_SHARE * len(columns)):
         share = 100 * visible / len(columns)
         raise EdgeNotSeen(f"cut by the image border: {share:.0f}% of it inside the image")
-    fit = _line_in_strip(strip, visible, across, half_width, prior_px)
-    seen = np.array([fit.columns.min(), fit.columns.max(), fit.columns.mean()])[:, None]
-    off = fit.offset + fit.slope * seen
-    first, last, centre = start + seen * along + off * normal
-    line = outward_line(first, last, normal)
-    # a slope ds moves the far end outwards; the angle turns the normal from u to v
-    turn = -np.sign(along @ [-line[1], line[0]])
+    line, columns, misses = _line_in_strip(strip, visible, across, half_width, prior_px)
+    stretch = np.array([columns.min(), columns.max(), columns.mean()])[:, None]
+    first, last, centre = start + stretch * along + np.polyval(line, stretch) * normal
     return ImageEdge(
         name=name,
-        line=line,
-        covariance=fit.covariance * np.outer([1, turn], [1, turn]),
+        line=outward_line(first, last, normal),
+        covariance=_line_covariance(columns, misses),
         centre=centre,
         ends=np.stack([first, last]),
-        n_points=len(fit.columns),
-        rms_px=fit.rms,
+        n_points=len(columns),
+        rms_px=rms(misses),
     )
 
 
@@ -186,10 +167,7 @@ def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:
 
     `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid.
     """
-    sights = model.sights(uv)
-    recorded = project(sights, model)
-    # the lens would fold what is farther out back into the image
-    recorded[np.sum(sights[..., :2] ** 2, axis=-1) >= fold(model)] = BEHIND
+    recorded = np.nan_to_num(redistort(uv, model), nan=BEHIND)
     places = np.moveaxis(recorded, -1, 0)[::-1]
     channels = np.moveaxis(np.atleast_3d(image), -1, 0)
     colours = [
@@ -273,12 +251,14 @@ def on_board(xy, pose, model):
 
     Far outside the image where they lie behind the camera.
     """
-    points = pose.apply(np.pad(xy.reshape(-1, 2), ((0, 0), (0, 1))))
-    return np.nan_to_num(pinhole(points, model), nan=BEHIND).reshape(xy.shape)
+    points = pose.apply(np.insert(xy, 2, 0.0, axis=-1))
+    return np.nan_to_num(pinhole(points, model), nan=BEHIND)
 
 
 def _line_in_strip(strip, visible, across, half_width, prior_px):
-    """The line of most votes in a strip (across, along, channels)."""
+    """The line of most votes in a strip (across, along, channels): its slope and offset, pixels
+    from the prediction, the columns of the peaks that it goes through, and how far it misses them.
+    """
     height = step_contrast(strip, SMOOTH_PX / ACROSS_STEP_PX)
     count = height.shape[1]
     column, place, contrast = peaks(height)
@@ -293,44 +273,47 @@ def _line_in_strip(strip, visible, across, half_width, prior_px):
     turned, at = np.unravel_index(np.argmax(votes * allowed), votes.shape)
     slope = ACROSS_STEP_PX * slopes[turned]
     offset = across[at] - slope * (count - 1) / 2
-    fit = _fit_line(column, across[0] + ACROSS_STEP_PX * place, offset, slope)
-    support = len(np.unique(fit.columns)) / visible
+    line = np.array([slope, offset])
+    line, columns, misses = _fit_line(column, across[0] + ACROSS_STEP_PX * place, line)
+    support = len(np.unique(columns)) / visible
     if support < LEAST_SUPPORT:
         raise EdgeNotSeen(
             f"no clear edge: {100 * support:.0f}% of the profiles agree on a line"
         )
-    return fit
+    return line, columns, misses
 
 
-def _fit_line(column, place, offset, slope):
-    """Robust line through the peaks near a start line (Tukey's biweight).
-
-    Neighbouring profiles share pixels and the same dents, so errors are correlated along the edge;
-    the covariance is multiplied by the integrated autocorrelation of the residuals.
+def _fit_line(column, place, line):
+    """Robust line (slope, offset) through the peaks near a start line (Tukey's biweight), their
+    columns and residuals.
     """
-    design = np.vander(column, 2, increasing=True)
-    line = np.array([offset, slope])
     for _ in range(FIT_ROUNDS):
-        residuals = place - design @ line
+        residuals = place - np.polyval(line, column)
         near = np.abs(residuals) < TOLERANCE_PX
         if near.sum() < LEAST_PROFILES:
             raise EdgeNotSeen(f"no clear edge: {near.sum()} profiles agree on a line")
         sigma = robust_sigma(residuals[near], least=LEAST_SIGMA_PX)
         weight = np.where(near, biweight(residuals, sigma), 0)
-        normal = design.T @ (design * weight[:, None])
         before = line
-        line = np.linalg.solve(normal, design.T @ (weight * place))
+        line = np.polyfit(column, place, 1, w=np.sqrt(weight))
         if np.abs(line - before).max() <= SETTLED_PX:
             break
     kept = weight > 0
-    column = column[kept]
-    residuals = (place - design @ line)[kept]
-    variance = residuals @ residuals / (len(residuals) - 2)
-    factor = max(_correlation_factor(column, residuals), LEAST_CORRELATION)
-    about_middle = np.vander(column - column.mean(), 2, increasing=True)
-    covariance = np.linalg.inv(about_middle.T @ about_middle) * variance * factor
-    covariance += np.diag([1.0, 12 / np.ptp(column) ** 2]) * SYSTEMATIC_PX**2
-    return _Fit(*line, covariance, column, rms(residuals))
+    return line, column[kept], (place - np.polyval(line, column))[kept]
+
+
+def _line_covariance(column, residuals):
+    """Covariance (2, 2) of the offset of a line at the middle of its points, and of its slope.
+
+    Neighbouring profiles share pixels and the same dents, so errors are correlated along the edge;
+    the covariance is multiplied by the integrated autocorrelation of the residuals.
+    """
+    count = len(column)
+    variance = residuals @ residuals / (count - 2)
+    variance *= max(_correlation_factor(column, residuals), LEAST_CORRELATION)
+    noise = variance / count * np.array([1.0, 1 / np.var(column)])
+    systematic = SYSTEMATIC_PX**2 * np.array([1.0, 12 / np.ptp(column) ** 2])
+    return np.diag(noise + systematic)
 
 
 def _correlation_factor(column, residuals):

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     lrf_to_platform,
@@ -43,9 +42,6 @@ class ScanSide:
     ----------
     side : int
         Number within the placement; the same in all variants, along and across.
-    end : int
-        -1 where it ends scan lines at low bearings (right), +1 at high bearings (left); of columns:
-        -1 at low pitch, +1 at high pitch.
     n_points : int
     length : float
         Of the stretch with points, metres.
@@ -59,7 +55,6 @@ class ScanSide:
     """
 
     side: int
-    end: int
     n_points: int
     length: float
     rms: float
@@ -71,12 +66,12 @@ class ScanSide:
         """From one end to the other, shape (3,), of unit length."""
         return (self.ends[1] - self.ends[0]) / self.length
 
-    def is_same(self, other: "ScanSide") -> bool:
+    def is_same(self, other: "ScanSide") -> np.bool:
         """Whether two sides are one: the same direction, and less than two centimetres apart."""
         between = other.ends.mean(axis=0) - self.ends.mean(axis=0)
         apart = np.linalg.norm(np.cross(between, self.direction))
         cosine = abs(self.direction @ other.direction)
-        return bool(cosine > np.cos(LEAST_TURN) and apart < SAME_SIDE)
+        return cosine > np.cos(LEAST_TURN) and apart < SAME_SIDE
 
 
 @dataclass(frozen=True)
@@ -91,12 +86,13 @@ class ScanEdges:
     covariance : ndarray, shape (n, 3, 3)
     pitch : ndarray, shape (n,)
         Radians.
-    line, beam : ndarray of int, shape (n,)
-        The last cell that hit the board.
+    cell : ndarray of int, shape (n, 2)
+        Scan line and beam of the last cell that hit the board.
     step : ndarray of int, shape (n, 2)
-        From it to the first cell off the board, in scan lines and beams.
+        From it to the first cell off the board, likewise.
     end : ndarray of int, shape (n,)
-        As in `ScanSide`.
+        -1 where scan lines end at low bearings (right), +1 at high bearings (left); columns: -1 at
+        low pitch, +1 at high pitch.
     side : ndarray of int, shape (n,)
         Number of the straight side; -1 for outliers.
     sides : tuple of ScanSide
@@ -109,29 +105,17 @@ class ScanEdges:
     points: np.ndarray
     covariance: np.ndarray
     pitch: np.ndarray
-    line: np.ndarray
-    beam: np.ndarray
+    cell: np.ndarray
     step: np.ndarray
     end: np.ndarray
     side: np.ndarray
     sides: tuple[ScanSide, ...]
     background: np.ndarray
 
-
-@dataclass(frozen=True)
-class _Ends:
-    """Ends of scan lines (or columns) on the board, arrays (n,), as in ScanEdges.
-
-    `inner` and `outer` are the bearing (or the pitch) of the last cell on the board and of the
-    first one off it, radians.
-    """
-
-    line: np.ndarray
-    beam: np.ndarray
-    step: np.ndarray
-    end: np.ndarray
-    inner: np.ndarray
-    outer: np.ndarray
+    @property
+    def line(self) -> np.ndarray:
+        """Scan line of each point."""
+        return self.cell[:, 0]
 
 
 @dataclass(frozen=True)
@@ -168,9 +152,8 @@ class Crossings:
         rays = unit_vector(self.points)
         noise = rays * np.hypot(self.range_sigma, warp_sigma)[:, None]
         place = self.by_angle * np.reshape(sigma, (-1, 1))
-        by_noise = dyads(noise)
-        by_place = dyads(place)
-        return by_noise + by_place
+        axes = np.stack([noise, place], axis=-1)
+        return axes @ axes.mT
 
 
 def crossings_of(
@@ -194,7 +177,7 @@ def crossings_of(
     fitted = 1 / np.vecdot(lines, flat)
     variance = np.einsum("ni,nij,nj->n", flat, covariance, flat)
     points = fitted[:, None] * rays
-    normal = np.pad(lines, ((0, 0), (0, 1)))
+    normal = np.insert(lines, 2, 0.0, axis=1)
     return Crossings(
         points=points,
         by_angle=_slid(np.cross([0.0, 0.0, 1.0], points), normal, rays),
@@ -233,42 +216,40 @@ def crossings(
     sides : tuple of ScanSide
         All of them, with those left out.
     """
-    ends = _ends(scan, across)
+    cell, step, end = _ends(scan, across)
     shift = 0.0
     warp_sigma = 0.0
     if not across:
-        shift, warp_sigma = _warp(scan, ends)
-
-    def at(angle):
-        if across:
-            return _at(scan, ends.line, scan.sweep.bearings[ends.beam], angle, across)
-        return _at(scan, ends.line, angle, scan.sweep.pitch[ends.line], shift=shift)
-
-    last = at(ends.inner)
-    middle = at((ends.inner + ends.outer) / 2)
-    here = scan.fitted[ends.line, ends.beam]
-    behind = beyond(scan, ends.line, ends.beam, ends.step)
-    order = ends.beam if across else ends.line
-    side, every = _group(scan, middle, order, ends.end, behind - here < MIXING, known)
+        shift, warp_sigma = _warp(scan, cell, step)
+    inner = _place(scan, cell)
+    outer = _place(scan, cell + step)
+    last = _at(scan, cell[:, 0], inner, across, shift)
+    middle = _at(scan, cell[:, 0], (inner + outer) / 2, across, shift)
+    here = scan.fitted[tuple(cell.T)]
+    behind = beyond(scan, cell, step)
+    side, every = _group(
+        scan, middle, cell[:, int(across)], end, behind - here < MIXING, known
+    )
     # the pitch is read in steps, it may seem to stand still
-    step = median_step(scan.sweep.pitch if across else scan.sweep.bearings)
-    sigma = np.maximum(np.abs(ends.outer - ends.inner), step) * UNIFORM
+    least = median_step(scan.sweep.pitch if across else scan.sweep.bearings)
+    sigma = np.maximum(np.abs(outer - inner).sum(axis=0), least) * UNIFORM
     by_angle = _to_platform(scan, middle.by_angle, middle.pitch)
     sigma = sigma * _inflation(by_angle, sigma, side, every)
-    sides = tuple(s for s in every if _leans(s, across))
+    # to the scan lines: of sides along the lines (the columns), whose ends tell nothing of them
+    unseen = np.pi / 2 if across else 0.0
+    sides = tuple(s for s in every if abs(s.angle - unseen) >= LEAST_ANGLE)
     if every:  # scans at one pitch have no sides, and keep all points
         side = np.where(np.isin(side, [s.side for s in sides]), side, -1)
     edges = {}
-    for variant, crossing in (("last_beam", last), ("half_step", middle)):
+    for variant, crossing in zip(VARIANTS, (last, middle), strict=True):
         edges[variant] = ScanEdges(
             variant=variant,
             points=crossing.points,
             covariance=crossing.covariance(sigma, warp_sigma),
             pitch=crossing.pitch,
-            line=ends.line,
-            beam=ends.beam,
-            step=ends.step,
-            end=ends.end,
+            cell=cell,
+            step=step,
+            end=end,
             side=side,
             sides=sides,
             background=background_odds(here, behind),
@@ -276,26 +257,21 @@ def crossings(
     return edges, every
 
 
-def beyond(scan, line, beam, step):
+def beyond(scan, cell, step):
     """Range behind ends of the board, metres: a median of three cells, or inf.
 
     Parameters
     ----------
     scan : BoardScan
-    line, beam : ndarray of int, shape (n,)
-        The last cell on the board.
-    step : ndarray of int, shape (n, 2)
-        To the next one, in lines and beams.
+    cell, step : ndarray of int, shape (n, 2)
+        As in `ScanEdges`.
 
     Returns
     -------
     ndarray, shape (n,)
     """
-    ends = np.stack([line, beam], axis=1)
-    away = np.arange(1, CELLS_BEHIND + 1)[:, None]
-    cells = ends[:, None] + step[:, None] * away
-    cells = np.clip(cells, 0, np.array(scan.mask.shape) - 1)
-    ranges = scan.sweep.ranges[cells[..., 0], cells[..., 1]]
+    away = np.arange(1, CELLS_BEHIND + 1)
+    ranges = _read_along(scan.sweep.ranges, cell, step, away)
     return np.median(np.nan_to_num(ranges, nan=np.inf), axis=1)
 
 
@@ -333,54 +309,71 @@ def plane_range(scan, rays, pitch) -> tuple[np.ndarray, np.ndarray]:
         return height / cosine, cosine
 
 
-def _leans(side, across):
-    """Whether the place along a scan line (a column) tells more of a side than the pitch does."""
-    lean = np.pi / 2 - side.angle if across else side.angle
-    return lean >= LEAST_ANGLE
-
-
 def _ends(scan, across):
-    """Ends of lines (columns) that may be edges."""
-    mask = scan.mask.T if across else scan.mask
+    """Ends of lines (columns) that may be edges: cell, step and end, as in `ScanEdges`."""
     sweep = scan.sweep
+    mask = scan.mask.T if across else scan.mask
     angles = sweep.pitch if across else sweep.bearings
-    rows, first, last = row_ends(mask)
+    rows, ends = row_ends(mask)
     row = np.tile(rows, 2)
-    cell = np.concatenate([first, last])
-    way = np.repeat([-1, 1], len(rows))
-    line, beam = (cell, row) if across else (row, cell)
-    inside = (cell >= BORDER) & (cell < mask.shape[1] - BORDER)
-    inside &= np.isfinite(scan.lines[line, 0])
-    row, cell, way, line, beam = np.stack([row, cell, way, line, beam])[:, inside]
-    step = np.outer(way, [across, not across])
-    inner = angles[cell]
-    outer = angles[cell + way]
-    falling = across and np.polyfit(np.arange(len(angles)), angles, 1)[0] <= 0
-    here = scan.fitted[line, beam]
-    after = sweep.ranges[line + step[:, 0], beam + step[:, 1]]
+    place = ends.T.ravel()
+    cell = np.column_stack([place, row] if across else [row, place])
+    end = np.repeat([-1, 1], len(rows))
+    step = np.outer(end, [across, not across])
+    if np.polyfit(np.arange(len(angles)), angles, 1)[0] <= 0:  # a sweep downwards
+        end = -end
+    inside = within(cell, step, scan.mask.shape) & np.isfinite(scan.lines[cell[:, 0], 0])
+    cell, step, end = cell[inside], step[inside], end[inside]
+    here = scan.fitted[tuple(cell.T)]
+    after = sweep.ranges[tuple((cell + step).T)]
+    gap = np.sum(_place(scan, cell + step) - _place(scan, cell), axis=0)
     # nothing nearer hides the board
-    visible = ~(after < here - depth_jump(here, outer - inner))
-    ends = line, beam, step, -way if falling else way, inner, outer
-    return _Ends(*(part[visible] for part in ends))
+    visible = ~(after < here - depth_jump(here, gap))
+    return cell[visible], step[visible], end[visible]
 
 
-def _at(scan, line, bearing, pitch, across=False, shift=0.0):
-    """Crossings of fitted lines and rays, moved by `shift` (metres) along the ray.
+def _place(scan, cell):
+    """Pitch and bearing of cells (n, 2), radians, (2, n)."""
+    line, beam = cell.T
+    return np.stack([scan.sweep.pitch[line], scan.sweep.bearings[beam]])
+
+
+def _at(scan, line, place, across, shift):
+    """Crossings of fitted lines with the rays of places (2, n), moved by `shift` (metres) along
+    the ray.
 
     At another pitch than that of the line changed as the board's plane predicts.
     """
+    pitch, bearing = place
     found = crossings_of(scan.lines[line], scan.lines_covariance[line], bearing)
     rays = polar_to_points(1.0, bearing)
-    if not across:
-        points = found.points + np.reshape(shift, (-1, 1)) * rays
-        return replace(found, points=points, pitch=pitch)
     there, _ = plane_range(scan, rays, pitch)
     here, _ = plane_range(scan, rays, scan.sweep.pitch[line])
-    points = found.points + (there - here)[:, None] * rays
+    points = found.points + (there - here + shift)[:, None] * rays
+    found = replace(found, points=points, pitch=pitch)
+    if not across:
+        return found
     rotation = scan.T_head_lrf.rotation.as_matrix()
     turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation
     normal = tilt(scan.normal, -pitch) @ rotation
-    return replace(found, points=points, pitch=pitch, by_angle=_slid(turned, normal, rays))
+    return replace(found, by_angle=_slid(turned, normal, rays))
+
+
+def _read_along(values, cell, step, count):
+    """Values (L, B) at cells so many steps (m,) from others (n, 2); those at the border of the
+    view stand for what is beyond it, (n, m).
+    """
+    cells = cell[:, None] + step[:, None] * count[:, None]
+    line, beam = np.clip(cells, 0, np.array(values.shape) - 1).T
+    return values[line, beam].T
+
+
+def within(cell, step, shape):
+    """Which cells (n, 2) are inside the view (of so many lines and beams) by more than its border,
+    in the direction of their steps.
+    """
+    margin = np.where(step != 0, BORDER, 0)
+    return np.all((cell >= margin) & (cell < shape - margin), axis=1)
 
 
 def _slid(turned, normal, rays):
@@ -391,10 +384,10 @@ def _slid(turned, normal, rays):
 
 def _to_platform(scan, vectors, pitch):
     """Directions (not points) from the LRF at a pitch to the nominal platform frame."""
-    return tilt(vectors @ scan.T_head_lrf.rotation.as_matrix().T, pitch)
+    return tilt(scan.T_head_lrf.rotation.apply(vectors), pitch)
 
 
-def _warp(scan, ends):
+def _warp(scan, cell, step):
     """How far the board lies from the fitted lines at their ends, and the sigma of that, metres.
 
     A board bends, and cardboard reads farther than paper. The outermost eighth of a line (15 beams
@@ -403,18 +396,17 @@ def _warp(scan, ends):
     fitted lines.
     """
     inwards = np.arange(WARPED_BEAMS)
-    count = np.clip(scan.mask[ends.line].sum(axis=1) // 8, 1, WARPED_BEAMS)
-    beams = ends.beam[:, None] - ends.end[:, None] * inwards
-    # an eighth of a line never leaves the view
-    cells = ends.line[:, None], np.clip(beams, 0, scan.mask.shape[1] - 1)
-    use = (inwards < count[:, None]) & scan.mask[cells]
-    misses = (scan.sweep.ranges - scan.fitted)[cells]
-    middle = np.nanmedian(np.where(use, misses, np.nan), axis=1)
+    count = np.clip(scan.mask[cell[:, 0]].sum(axis=1) // 8, 1, WARPED_BEAMS)
+    misses = np.where(scan.mask, scan.sweep.ranges - scan.fitted, np.nan)
+    misses = _read_along(misses, cell, step, -inwards)
+    misses[inwards >= count[:, None]] = np.nan  # an eighth of a line never leaves the view
+    middle = np.nanmedian(misses, axis=1)
     # of a median: pi / 2 times that of a mean
-    noise = np.pi / 2 * scan.sigma_range**2 / use.sum(axis=1)
+    noise = np.pi / 2 * scan.sigma_range**2 / np.isfinite(misses).sum(axis=1)
     excess = np.zeros(len(noise))
-    for way in np.unique(ends.end):
-        rows = ends.end == way
+    ways = step[:, 1]
+    for way in np.unique(ways):
+        rows = ways == way
         variance = np.median(middle[rows] ** 2) / MEDIAN_CHI2
         excess[rows] = max(variance - np.median(noise[rows]), 0.0)
     share = excess / (excess + noise)
@@ -429,9 +421,8 @@ def _inflation(by_angle, sigma, side, sides):
     factor = np.ones(len(side))
     for s in sides:
         rows = side == s.side
-        along = by_angle[rows] @ s.direction
-        across = by_angle[rows] - along[:, None] * s.direction
-        expected = rms(sigma[rows] * np.linalg.norm(across, axis=1))
+        away = np.cross(by_angle[rows], s.direction)
+        expected = rms(sigma[rows] * np.linalg.norm(away, axis=1))
         if expected > 0:
             factor[rows] = max(1.0, s.rms / expected)
     return factor
@@ -461,9 +452,9 @@ def _group(scan, crossing, order, end, mixed, known):
         place = order[candidates] - np.searchsorted(left_out, order[candidates])
         for run in straight_runs(flat[candidates], place, tolerance, shortest):
             rows = candidates[run]
-            new = _side_through(scan, flat[rows], axes, np.mean(crossing.pitch[rows]), hand)
-            same = [s.side for s in known if s.is_same(new)]
-            number = same[0] if same else len(known) + len(sides)
+            new = _side_through(scan, flat[rows], axes, np.mean(crossing.pitch[rows]))
+            same = (s.side for s in known if s.is_same(new))
+            number = next(same, len(known) + len(sides))
             side[rows] = number
             sides.append(replace(new, side=number))
     return side, tuple(sides)
@@ -471,27 +462,27 @@ def _group(scan, crossing, order, end, mixed, known):
 
 def _spacing(scan):
     """Median distance of neighbouring beams at the ends of the board's scan lines, metres."""
-    row, first, last = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
-    bearing = scan.sweep.bearings[np.r_[first, last]]
-    ends = _at(scan, np.tile(row, 2), bearing, 0.0)
+    row, ends = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
+    line = np.repeat(row, 2)
+    bearing = scan.sweep.bearings[ends.ravel()]
+    ends = crossings_of(scan.lines[line], scan.lines_covariance[line], bearing)
     apart = np.median(np.linalg.norm(ends.by_angle, axis=1))
-    return float(apart) * median_step(scan.sweep.bearings)
+    return apart * median_step(scan.sweep.bearings)
 
 
-def _side_through(scan, flat, axes, pitch, end):
+def _side_through(scan, flat, axes, pitch):
     """The ScanSide, without its number, through points (n, 2) of the board's plane."""
     centre, direction, along, across = line_of(flat)
     ends = centre + np.outer([along.min(), along.max()], direction)
     scan_normal = _to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch)
     level = np.cross(scan_normal, scan.normal)  # of the scan line on the board
     cosine = abs(unit_vector(level) @ (direction @ axes))
-    variance = np.sum(across**2) / max(len(flat) - 2, 1)
+    variance = np.sum(across**2) / (len(flat) - 2)
     return ScanSide(
         side=-1,
-        end=end,
         n_points=len(flat),
-        length=float(np.ptp(along)),
-        rms=float(np.sqrt(variance)),
-        angle=float(np.arccos(min(cosine, 1.0))),
+        length=np.ptp(along),
+        rms=np.sqrt(variance),
+        angle=np.arccos(min(cosine, 1.0)),
         ends=ends @ axes + scan.distance * scan.normal,
     )

@@ -12,14 +12,13 @@ from lrfcal_lib.preprocess.bundle import (
     Adjustment,
     adjust_robust,
     better,
-    waves,
 )
 from lrfcal_lib.preprocess.pattern_in_image import scale_error, square_px
 
 FEWEST_VIEWS = 3  # of the pattern, for intrinsics
 FEWEST_CORNERS = 4  # for a pose
 LEAST_TILT = np.radians(3.0)  # between views, to observe the focal length
-K5 = 8  # place of the third radial term in the intrinsics
+K5 = 8  # place of the third radial term, the last one, in the intrinsics
 MOST_ALIKE = 0.8  # correlation of neighbouring residuals
 
 
@@ -68,13 +67,12 @@ def estimate_intrinsics(
             "more between views"
         )
     corners = views[None]
-    best = adjust_robust(corners, points, [model], poses, fixed=(K5,))
+    best = adjust_robust(corners, points, [model], poses, lens=K5)
     if relief:
         start = best.models, best.poses
-        best = adjust_robust(corners, points, *start, basis=waves(points), fixed=(K5,))
-        best = better(best, corners, points, fixed=(K5,))
-    basis = waves(points) if np.any(best.relief) else None
-    return better(best, corners, points, basis=basis)
+        best = adjust_robust(corners, points, *start, lens=K5, wavy=True)
+        best = better(best, points, lens=K5)
+    return better(best, points, wavy=np.any(best.relief))
 
 
 def estimate_relief(pixels, pattern: Chessboard, model: CameraModel) -> Adjustment:
@@ -96,10 +94,8 @@ def estimate_relief(pixels, pattern: Chessboard, model: CameraModel) -> Adjustme
     )
     corners = np.asarray(pixels, float)[None]
     points = pattern.points()
-    wavy = adjust_robust(
-        corners, points, [model], poses, basis=waves(points), intrinsics=False
-    )
-    return better(wavy, corners, points, intrinsics=False)
+    best = adjust_robust(corners, points, [model], poses, lens=0, wavy=True)
+    return better(best, points, lens=0)
 
 
 def first_pose(
@@ -137,7 +133,19 @@ def first_pose(
         raise ValueError(f"{why} (OpenCV: {error.err})") from error
     if not solved or not np.isfinite(shift).all() or shift[2, 0] <= 0:
         raise ValueError(why)
-    return RigidTransform.from_components(shift.ravel(), Rotation.from_rotvec(turn.ravel()))
+    return opencv_poses(turn, shift)[0]
+
+
+def opencv_poses(turns, shifts) -> RigidTransform:
+    """A stack of transforms from rotation vectors and translations as OpenCV gives them.
+
+    Parameters
+    ----------
+    turns, shifts : array_like, shape (n, 3, 1) or (3, 1)
+        Radians and metres.
+    """
+    rotation = Rotation.from_rotvec(np.reshape(turns, (-1, 3)))
+    return RigidTransform.from_components(np.reshape(shifts, (-1, 3)), rotation)
 
 
 def board_pose(
@@ -182,20 +190,20 @@ def board_pose(
     if count < FEWEST_CORNERS:
         raise ValueError(f"a pose needs four corners of the pattern or more, got {count}")
 
-    def settled(start):
-        poses = RigidTransform.concatenate([start])
-        return adjust_robust(pixels[None, None], points, [model], poses, intrinsics=False)
+    def settled(used):
+        rough = first_pose(points, np.where(used, pixels, np.nan), model)
+        poses = RigidTransform.concatenate([rough])
+        return adjust_robust(pixels[None, None], points, [model], poses, lens=0)
 
-    result = settled(first_pose(points, pixels, model))
+    result = settled(True)
     used = np.isfinite(result.residuals[0, 0])
     if used.sum() < np.isfinite(pixels).sum():
         # a corner far off may have led to the mirrored lean of a small board
-        again = settled(first_pose(points, np.where(used, pixels, np.nan), model))
-        result = min(result, again, key=lambda each: each.sigma_px)
+        result = min(result, settled(used), key=lambda each: each.sigma_px)
     residuals = result.residuals[0, 0]
     pose = result.poses[0]
     factor = max(1.0, SIGMA_FLOOR_PX / result.sigma_px) ** 2
-    factor *= _alike_factor(residuals.reshape(pattern.rows, pattern.columns, 2))
+    factor *= _alike_factor(pattern.grid(residuals))
     covariance = result.pose_covariance[0] * factor + scale_covariance(
         pose, pixels, pattern
     )
@@ -222,7 +230,7 @@ def scale_covariance(pose: RigidTransform, pixels, pattern: Chessboard) -> np.nd
     ndarray, shape (6, 6)
         Of ``[w, v]``.
     """
-    side = square_px(pixels, pattern)
+    side = square_px(pattern.grid(pixels))
     away = np.zeros(6)
     away[3:] = scale_error(side) * pose.apply(pattern.points().mean(axis=0))
     return np.outer(away, away)
@@ -262,9 +270,8 @@ def _rough(views, points, size):
         ) from error
     fx, cx = matrix[0, [0, 2]]
     fy, cy = matrix[1, [1, 2]]
-    model = CameraModel(*size, float(fx), float(fy), float(cx), float(cy), lens.ravel()[:5])
-    rotation = Rotation.from_rotvec(np.reshape(turns, (-1, 3)))
-    return model, RigidTransform.from_components(np.reshape(shifts, (-1, 3)), rotation)
+    model = CameraModel(*size, float(fx), float(fy), float(cx), float(cy), lens.ravel())
+    return model, opencv_poses(turns, shifts)
 
 
 def _alike_factor(grid):

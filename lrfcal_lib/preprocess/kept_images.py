@@ -55,7 +55,7 @@ def part_around(image: np.ndarray, corners: np.ndarray, board) -> Part:
         low = np.max(grid.min(axis=0) - board.corners)
         high = np.max(board.corners - grid.max(axis=0))
         beyond = max(low, high) / pattern.square
-    sides = np.linalg.norm(square_axes(corners, (pattern.columns, pattern.rows)), axis=1)
+    sides = np.linalg.norm(square_axes(pattern.grid(corners)), axis=-2)
     room = NEARER * beyond * sides.max() + ROOM_PX
     left, top = np.maximum(corners.min(axis=0) - room, 0).astype(int)
     right, bottom = (corners.max(axis=0) + room + 1).astype(int)

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.robust import robust_sigma
-from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines
+from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, side_ends
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry, unit_vector
 from lrfcal_lib.preprocess.edges_in_image import (
@@ -110,8 +110,8 @@ def edge_votes(
         strip = sample(image, model, on_board(xy, pose, model))
         height = step_contrast(strip, SMOOTH_STEPS, along=AVERAGED_PROFILES)
         column, place, _ = peaks(height, LEAST_CONTRAST)
-        weight = np.ones(len(column))
-        votes = vote(column, place, weight, height.shape, slopes).max(axis=0)
+        alike = np.ones_like(place)
+        votes = vote(column, place, alike, height.shape, slopes).max(axis=0)
         visible = np.isfinite(strip[..., 0]).sum(axis=1)
         share = votes / np.maximum(visible, 1)
         share[visible <= LEAST_SHARE * len(s)] = np.nan
@@ -171,9 +171,9 @@ def common_lines(votes: np.ndarray, board) -> np.ndarray:
         Names the first edge that they do not agree on.
     """
     wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), MOVES_BETWEEN, axis=-1)
-    wide[wide < 0] = np.nan
-    count = np.isfinite(wide).sum(axis=0)
-    mean = np.nansum(wide, axis=0) / np.maximum(count, 1)
+    visible = wide >= 0
+    count = visible.sum(axis=0)
+    mean = wide.sum(axis=0, where=visible) / np.maximum(count, 1)
     mean[count < min(3, len(votes))] = 0
     places = []
     for name, of_side in zip(SIDES, gaussian_filter1d(mean, 1.0), strict=True):
@@ -228,38 +228,29 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     DegenerateGeometry
         Names an edge that was found in no image.
     """
-    lines_of_views = [
-        {edge.name: board_line(view, edge, models[view.camera]) for edge in view.edges}
-        for view in views
-        if not view.reason
-    ]
-    lines = []
-    for name in board.edges:
-        of_edge = [of_view[name] for of_view in lines_of_views if name in of_view]
-        if not of_edge:
-            raise DegenerateGeometry(
-                f"edge '{name}' of board '{board.name}' was found in none of "
-                f"{len(lines_of_views)} images: pick it by hand in edges.csv or give the corners "
-                "of the board"
-            )
-        lines.append(np.array(of_edge))
-    rough = corners_of_lines([np.median(of_edge, axis=0) for of_edge in lines])
-    ends = np.stack([rough, np.roll(rough, -1, axis=0)], axis=1)
-    medians = [_median_line(*each) for each in zip(lines, ends, strict=True)]
-    fitted = [line for line, _ in medians]
-    lengths: dict[str, list] = {name: [] for name in board.edges}
-    for i, name in enumerate(board.edges):
-        trio = board.edges[i - 1], name, board.edges[(i + 1) % len(board.edges)]
-        for of_view in lines_of_views:
-            if of_view.keys() >= {*trio}:
-                corners = corners_of_lines([of_view[each] for each in trio])
-                lengths[name].append(np.linalg.norm(corners[2] - corners[1]))
+    visible = [view for view in views if not view.reason]
+    lines = np.full((len(visible), len(board.edges), 3), np.nan)
+    for of_view, view in zip(lines, visible, strict=True):
+        for edge in view.edges:
+            row = board.edges.index(edge.name)
+            of_view[row] = board_line(view, edge, models[view.camera])
+    unseen = np.isnan(lines).all(axis=(0, 2))
+    if unseen.any():
+        raise DegenerateGeometry(
+            f"edge '{board.edges[unseen.argmax()]}' of board '{board.name}' was found in none of "
+            f"{len(visible)} images: pick it by hand in edges.csv or give the corners of the board"
+        )
+    ends = side_ends(corners_of_lines(np.nanmedian(lines, axis=0)))
+    medians = [_median_line(lines[:, i], of_edge) for i, of_edge in enumerate(ends)]
+    fitted = np.array([line for line, _ in medians])
+    corners = corners_of_lines(lines)
+    lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).T
     return Outline(
         board=replace(board, corners=corners_of_lines(fitted)),
-        lines=np.array(fitted),
+        lines=fitted,
         line_sd=np.array([spread for _, spread in medians]),
-        length_sd={name: _spread(of_edge) for name, of_edge in lengths.items()},
-        n_lengths={name: len(of_edge) for name, of_edge in lengths.items()},
+        length_sd=dict(zip(board.edges, map(_spread, lengths), strict=True)),
+        n_lengths=dict(zip(board.edges, np.isfinite(lengths).sum(axis=1), strict=True)),
     )
 
 
@@ -292,18 +283,22 @@ def _outer_peak(votes):
 
 
 def _median_line(lines, ends):
-    """Median line (of n, 3) from its offsets at two ends, and the spread at the middle."""
-    normal = unit_vector(np.median(lines[:, :2], axis=0))
+    """Median line (of n, 3) from its offsets at two ends, and the spread at the middle.
+
+    NaN where an image does not show it.
+    """
+    normal = unit_vector(np.nanmedian(lines[:, :2], axis=0))
     # where every line crosses the normals raised at the two ends
     distance = lines[:, :2] @ ends.T + lines[:, 2:]
     cosine = lines[:, :2] @ normal
     offsets = -distance / cosine[:, None]
-    a, b = ends + np.median(offsets, axis=0)[:, None] * normal
+    a, b = ends + np.nanmedian(offsets, axis=0)[:, None] * normal
     return outward_line(a, b, normal), _spread(offsets.mean(axis=1))
 
 
 def _spread(values):
-    """Standard deviation about the median; NaN below two values."""
+    """Standard deviation about the median; NaN below two values that are known."""
+    values = values[np.isfinite(values)]
     if len(values) < 2:
         return float("nan")
     return robust_sigma(values - np.median(values))

@@ -4,12 +4,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.camera import CameraModel, pinhole
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge
+from lrfcal_lib.preprocess.intrinsics import opencv_poses
 from lrfcal_lib.preprocess.pattern_in_image import grey
 from lrfcal_lib.preprocess.pose_from_lines import pose_from_edges
 
@@ -130,7 +131,7 @@ def frontal(pose: RigidTransform) -> float:
     1 seen from the front, below 0 from behind.
     """
     normal = pose.rotation.as_matrix()[:, 2]
-    return float(-normal @ unit_vector(pose.translation))
+    return -normal @ unit_vector(pose.translation)
 
 
 def _polygon(contour, n_corners):
@@ -160,7 +161,4 @@ def _starts(flat, corners, model):
         solved = cv2.solvePnPGeneric(
             flat, corners, model.matrix, None, flags=cv2.SOLVEPNP_IPPE
         )
-    for turn, shift in zip(solved[1], solved[2], strict=True):
-        yield RigidTransform.from_components(
-            shift.ravel(), Rotation.from_rotvec(turn.ravel())
-        )
+    return opencv_poses(*solved[1:3])

@@ -115,21 +115,20 @@ class PatternFinder:
             Where no detector finds all corners.
         """
         picture = grey(image)
-        corners = self._in_reduced(picture)
-        if corners is None:
+        grid = self._in_reduced(picture)
+        if grid is None:
             columns, rows = self.size
             raise PatternNotFound(
                 f"no chessboard with {columns} x {rows} inner corners in the image: it must be "
                 "whole, and not glare"
             )
-        if np.linalg.det(square_axes(corners, self.size)).mean() > 0:
-            return corners
-        grid = corners.reshape(self.size[1], self.size[0], 2)
-        return grid[::-1].reshape(-1, 2)  # of a mirrored image
+        if np.linalg.det(square_axes(grid)).mean() <= 0:
+            grid = grid[::-1]  # of a mirrored image
+        return grid.reshape(-1, 2)
 
     def _in_reduced(self, picture):
-        """Corners of a large picture by way of a reduced one, or without it where that shows
-        none.
+        """Grid of corners of a large picture by way of a reduced one, or without it where that
+        shows none.
         """
         times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
         if times <= 1:
@@ -137,29 +136,29 @@ class PatternFinder:
         height, width = (side // times for side in picture.shape)
         whole = picture[: height * times, : width * times]
         reduced = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
-        corners = self._search(reduced)
-        if corners is None:
+        grid = self._search(reduced)
+        if grid is None:
             return self._search(picture, thorough=False)
         # pixel (0, 0) is the centre of a pixel, of the reduced one as well
-        return refine_corners(picture, (corners + 0.5) * times - 0.5, self.size)
+        return refine_corners(picture, (grid + 0.5) * times - 0.5)
 
     def _search(self, picture, thorough=True):
-        """Refined corners (n, 2) of a picture, None where there are none; `thorough` costs most."""
+        """Grid of refined corners, None where there are none; `thorough` costs most."""
         rough = self._classic(picture)
         if rough is not None:
-            corners = _smoothest(picture, self.size, rough)
+            grid = _smoothest(picture, rough)
         else:
             rough = sectors(picture, self.size, 0)
             if rough is None and thorough:
                 rough = sectors(picture, self.size)
             if rough is None:
                 return None
-            corners = refine_corners(picture, rough, self.size)
-        return corners if _ends_in_squares(picture, corners, self.size) else None
+            grid = refine_corners(picture, rough)
+        return grid if _ends_in_squares(picture, grid) else None
 
     def _classic(self, picture):
-        """Rough corners by the classic detector, the last successful of picture and negative
-        first.
+        """Grid of rough corners by the classic detector, the last successful of picture and
+        negative first.
         """
         for negative in self.negatives:
             rough = classic(picture, self.size, negative)
@@ -170,7 +169,7 @@ class PatternFinder:
 
 
 def classic(picture, size, negative):
-    """Rough corners (n, 2) by OpenCV's classic detector, also in the negative; None without any."""
+    """Grid of rough corners by OpenCV's classic detector, also in the negative, or None."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     # the quick check overlooks white squares on a dark board, and saves little time there
     if negative:
@@ -178,61 +177,63 @@ def classic(picture, size, negative):
     else:
         flags |= cv2.CALIB_CB_FAST_CHECK
     try:
-        found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
+        return _grid(*cv2.findChessboardCorners(picture, size, flags=flags), size)
     except cv2.error:  # some images a few pixels wide are too narrow for its thresholds
         return None
-    return corners.reshape(-1, 2).astype(float) if found else None
 
 
 def sectors(picture, size, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
-    """Rough corners (n, 2) by OpenCV's sector-based detector; None if there are none.
+    """Grid of rough corners by OpenCV's sector-based detector; None if there are none.
 
     The flags make it look at a picture of twice the size, for small squares, at four times the
     time.
     """
-    found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
-    return corners.reshape(-1, 2).astype(float) if found else None
+    return _grid(*cv2.findChessboardCornersSB(picture, size, flags=flags), size)
 
 
-def _smoothest(picture, size, rough):
-    """Refined corners.
+def _grid(found, corners, size):
+    """Corners of a detector as (rows, columns, 2), where it found them."""
+    return corners.reshape(*size[::-1], 2).astype(float) if found else None
+
+
+def _smoothest(picture, rough):
+    """Grid of refined corners.
 
     From sectors near by where rough corners were too far off for their windows.
     """
-    refined = refine_corners(picture, rough, size)
-    if grid_noise(refined, size) < SMOOTH_ENOUGH_PX:
+    refined = refine_corners(picture, rough)
+    if grid_noise(refined) < SMOOTH_ENOUGH_PX:
         return refined
-    margin = AROUND * np.ptp(rough, axis=0) + AROUND_PX
-    left, top = np.maximum(rough.min(axis=0) - margin, 0).astype(int)
-    right, bottom = (rough.max(axis=0) + margin).astype(int)
-    start = sectors(np.ascontiguousarray(picture[top:bottom, left:right]), size, 0)
+    margin = AROUND * np.ptp(rough, axis=(0, 1)) + AROUND_PX
+    left, top = np.maximum(rough.min(axis=(0, 1)) - margin, 0).astype(int)
+    right, bottom = (rough.max(axis=(0, 1)) + margin).astype(int)
+    part = np.ascontiguousarray(picture[top:bottom, left:right])
+    start = sectors(part, rough.shape[1::-1], 0)
     if start is None:
         return refined
-    other = refine_corners(picture, start + [left, top], size)
-    return min(refined, other, key=lambda corners: grid_noise(corners, size))
+    return min(refined, refine_corners(picture, start + [left, top]), key=grid_noise)
 
 
-def grid_noise(corners, size):
-    """Root mean square distance of a chessboard's corners (row by row) from a smooth grid, pixels.
+def grid_noise(grid):
+    """Root mean square distance of a chessboard's corners from a smooth grid, pixels.
 
     Smooth are a homography and polynomials of third order (second below 16 corners): lens
     distortion, a bent sheet.
     """
-    row, column = np.mgrid[: size[1], : size[0]].reshape(2, -1)
-    x = column / (max(size) - 1) * 2 - 1
-    y = row / (max(size) - 1) * 2 - 1
-    grid = np.column_stack([x, y])
-    order = 3 if len(grid) >= 16 else 2
-    homography = cv2.findHomography(grid, np.asarray(corners, float))[0]
-    left = corners - cv2.perspectiveTransform(grid[None], homography)[0]
-    design = polyvander2d(x, y, [order, order])
-    powers = np.add.outer(np.arange(order + 1), np.arange(order + 1)).ravel()
-    design = design[:, powers <= order]
+    rows, columns, _ = grid.shape
+    y, x = np.mgrid[:rows, :columns].reshape(2, -1) / (max(rows, columns) - 1) * 2 - 1
+    flat = np.column_stack([x, y])
+    corners = grid.reshape(-1, 2)
+    order = 3 if len(flat) >= 16 else 2
+    homography = cv2.findHomography(flat, corners)[0]
+    left = corners - cv2.perspectiveTransform(flat[None], homography)[0]
+    powers = np.indices((order + 1, order + 1)).sum(axis=0).ravel()
+    design = polyvander2d(x, y, [order, order])[:, powers <= order]
     noise = left - design @ np.linalg.lstsq(design, left, rcond=None)[0]
     return rms(np.linalg.norm(noise, axis=1))
 
 
-def refine_corners(picture, corners, size):
+def refine_corners(picture, start):
     """Corners of a chessboard: the points about which the picture is symmetric.
 
     A window turned by 180 deg about a corner looks the same, however blurred. The least squares of
@@ -243,36 +244,33 @@ def refine_corners(picture, corners, size):
     Parameters
     ----------
     picture : ndarray of uint8, shape (h, w)
-    corners : ndarray, shape (columns * rows, 2)
-        Start values row by row, pixels; good to a quarter of a square.
-    size : (int, int)
-        Columns and rows of inner corners.
+    start : ndarray, shape (rows, columns, 2)
+        Pixels; good to a quarter of a square.
 
     Returns
     -------
-    ndarray, shape (columns * rows, 2)
+    ndarray, shape (rows, columns, 2)
         A corner that would move farther stays where it started.
     """
-    start = np.asarray(corners, float)
-    side = np.linalg.norm(square_axes(start, size), axis=1)  # (n, 2), pixels
-    longest = side.max(axis=1)
-    reach = np.clip(WIDEST_WINDOW_PX / longest, LEAST_REACH, REACH)  # (n,), squares
+    side = np.linalg.norm(square_axes(start), axis=-2)  # (rows, columns, 2), pixels
+    longest = side.max(axis=-1, keepdims=True)
+    reach = np.clip(WIDEST_WINDOW_PX / longest, LEAST_REACH, REACH)  # squares
     around = int(MARGIN * np.max(reach * longest)) + 3
-    low = np.maximum(start.min(axis=0).astype(int) - around, 0)
-    high = start.max(axis=0).astype(int) + around
+    low = np.maximum(start.min(axis=(0, 1)).astype(int) - around, 0)
+    high = start.max(axis=(0, 1)).astype(int) + around
     part = picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-    half_window = np.median(reach[:, None] * side)
+    half_window = np.median(reach * side)
     kept = start - low
     for look in (ROUGHLY, FINELY):
         smooth = cv2.GaussianBlur(part, (0, 0), look.blur * half_window)
-        refined = symmetric_points(smooth, kept, size, reach, look)
-        near = np.linalg.norm(refined - kept, axis=1) < FARTHEST_MOVE * longest
-        kept = np.where(near[:, None], refined, kept)
+        refined = symmetric_points(smooth, kept, reach, look)
+        moved = np.linalg.norm(refined - kept, axis=-1, keepdims=True)
+        kept = np.where(moved < FARTHEST_MOVE * longest, refined, kept)
     return kept + low
 
 
-def symmetric_points(picture, points, size, reach, look):
-    """Points (n, 2) of a grid about which windows of `reach` squares (n,) are symmetric."""
+def symmetric_points(picture, points, reach, look):
+    """Points of a grid (rows, columns, 2) about which windows of `reach` squares are symmetric."""
     place = np.linspace(-1, 1, look.samples)
     half = place[look.samples // 2 + 1 :]  # the other half is what it is compared with
     offsets = np.stack(np.meshgrid(half, place)).reshape(2, -1)
@@ -281,20 +279,20 @@ def symmetric_points(picture, points, size, reach, look):
     slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
     slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
     for _ in range(REFINE_ROUNDS):
-        axes = square_axes(points, size) * reach[:, None, None]
-        arms = (axes @ offsets).mT  # (n, m, 2)
-        pairs = np.stack([points[:, None] + arms, points[:, None] - arms])
+        axes = square_axes(points) * reach[..., None]
+        arms = (axes @ offsets).mT  # (rows, columns, m, 2)
+        middle = points[..., None, :]
+        pairs = np.stack([middle + arms, middle - arms])
         differs = np.subtract(*interpolated(spline, pairs, look.order))
         slopes = [np.subtract(*interpolated(slope, pairs)) for slope in (slope_u, slope_v)]
-        jacobian = np.stack(slopes, axis=2)
-        weighted = weight[:, None] * jacobian
-        normal = weighted.mT @ jacobian
-        right = weighted.mT @ differs[..., None]
-        step = -(np.linalg.pinv(normal, hermitian=True) @ right)[..., 0]
-        length = np.linalg.norm(step, axis=1)
+        jacobian = np.stack(slopes, axis=-1)
+        weighted = (weight[:, None] * jacobian).mT
+        inverse = np.linalg.pinv(weighted @ jacobian, hermitian=True)
+        step = -np.matvec(inverse, np.matvec(weighted, differs))
+        length = np.linalg.norm(step, axis=-1, keepdims=True)
         # a third of the window at most: farther away other corners begin
-        most = np.linalg.norm(axes, axis=1).min(axis=1) / 3
-        points = points + step * np.minimum(1, most / np.maximum(length, most))[:, None]
+        most = np.linalg.norm(axes, axis=-2).min(axis=-1, keepdims=True) / 3
+        points = points + step * np.minimum(1, most / np.maximum(length, most))
         if length.max() < look.settled_px:
             break
     return points
@@ -308,45 +306,40 @@ def interpolated(picture, places, order=1):
     )
 
 
-def square_axes(corners, size):
-    """Sides of the squares around every corner, (n, 2, 2): along a row, along a column."""
-    grid = np.reshape(corners, (size[1], size[0], 2))
-    along = np.gradient(grid, axis=1)
-    across = np.gradient(grid, axis=0)
-    return np.stack([along, across], axis=-1).reshape(-1, 2, 2)
+def square_axes(grid):
+    """Sides of the squares around every corner of a grid (rows, columns, 2): along a row, along a
+    column, as columns (rows, columns, 2, 2).
+    """
+    return np.stack(np.gradient(grid, axis=(1, 0)), axis=-1)
 
 
-def square_px(corners, pattern):
+def square_px(grid):
     """Mean side of a chessboard's squares in an image along the shorter of its two axes, pixels.
 
-    Corners (n, 2) that are NaN do not count.
+    Corners (rows, columns, 2) that are NaN do not count.
     """
-    grid = np.reshape(corners, (pattern.rows, pattern.columns, 2))
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2) for axis in (0, 1)]
-    return float(min(np.nanmean(side) for side in sides))
+    return min(np.nanmean(side) for side in sides)
 
 
 def scale_error(side_px):
     """Standard deviation, a share, of the scale of corners whose squares have a side in pixels."""
     error = SCALE_ERROR * (SCALE_ERROR_AT_PX / side_px) ** SCALE_ERROR_POWER
-    return float(min(LARGEST_SCALE_ERROR, error))
+    return min(LARGEST_SCALE_ERROR, error)
 
 
-def _ends_in_squares(picture, corners, size):
+def _ends_in_squares(picture, grid):
     """Whether squares alternate outside the outermost corners: not where a pattern that is cut
     is taken a row off.
     """
-    grid = corners.reshape(size[1], size[0], 2)
     last = np.array(picture.shape[::-1]) - 1
     for turns in range(4):
-        edge, inner = np.rot90(grid, turns)[:2]
-        edge = (edge[1:] + edge[:-1]) / 2
-        inner = (inner[1:] + inner[:-1]) / 2
+        outermost = np.rot90(grid, turns)[:2]
+        edge, inner = (outermost[:, 1:] + outermost[:, :-1]) / 2
         away = BEYOND * (inner - edge)
         places = np.array([edge - away, edge + away])
         visible = np.all((places >= 0) & (places <= last), axis=(0, 2))
-        colours = cv2.remap(picture, places.astype(np.float32), None, cv2.INTER_LINEAR)
-        outside, inside = colours[:, visible].astype(float)
+        outside, inside = interpolated(picture.astype(float), places[:, visible])
         sign = np.resize([1.0, -1.0], len(visible))[visible]
         sign -= sign.sum() / max(len(sign), 1)
         contrast = sign @ inside

@@ -1,15 +1,16 @@
 """The pose of a board from image lines of its edges."""
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import inverse_root
-from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.board import Board, side_ends
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, pinhole_jacobian
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
     move_pose,
     pose_array,
+    pose_step,
     pose_transform,
     rotate_points,
 )
@@ -44,21 +45,19 @@ def pose_from_edges(
     numpy.linalg.LinAlgError
         If the lines lead to a pose behind the camera.
     """
-    first = pose_array(start)
     white = np.zeros((0, 6))
     if covariance is not None:
         white = inverse_root(covariance)
 
     def system(pose):
         misses, by_pose = line_residuals(edges, board, model, pose)
-        turn = Rotation.from_matrix(pose[:, :3] @ first[:, :3].T)
-        moved = np.r_[turn.as_rotvec(), pose[:, 3] - first[:, 3]]
+        moved = pose_step(start, pose_transform(pose))
         residuals = np.r_[misses.ravel(), white @ moved]
         return residuals, np.concatenate([by_pose.reshape(-1, 6), white])
 
     # plain Gauss-Newton: the weights of the lines move along with the pose, so that no sum of
     # squares falls steadily, which the minimiser asks for
-    pose = first
+    pose = pose_array(start)
     residuals, jacobian = system(pose)
     for _ in range(ROUNDS):
         step = np.linalg.lstsq(jacobian, -residuals, rcond=1e-12)[0]
@@ -66,17 +65,14 @@ def pose_from_edges(
         residuals, jacobian = system(pose)
         if np.abs(step).max() < SETTLED:
             break
-    information = jacobian.T @ jacobian
-    chi2 = float(residuals @ residuals)
-    return pose_transform(pose), np.linalg.pinv(information, hermitian=True), chi2
+    reached = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+    return pose_transform(pose), reached, residuals @ residuals
 
 
 def line_residuals(edges, board: Board, model: CameraModel, pose):
     """Those of :func:`line_misses` for every edge's two corners."""
-    flat = board.points()
-    first = np.array([board.edges.index(edge.name) for edge in edges])
-    corners = np.stack([first, (first + 1) % len(flat)], axis=1)
-    return line_misses(edges, flat[corners], model, pose)
+    sides = [board.edges.index(edge.name) for edge in edges]
+    return line_misses(edges, side_ends(board.points())[sides], model, pose)
 
 
 def line_misses(edges, points, model: CameraModel, pose):

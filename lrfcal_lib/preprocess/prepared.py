@@ -254,9 +254,9 @@ def prepare_images(prepared: Prepared) -> Prepared:
         return replace(prepared, problems=(*prepared.problems, lost))
     views = {}
     for camera, of_camera in surveyed.views.items():
-        by_placement = {view.placement: view for view in of_camera}
+        ordered = sorted(of_camera, key=lambda view: view.placement)
         # an image that belongs to no placement is left out
-        views[camera] = {p: by_placement[p] for p in sorted(by_placement) if p >= 0}
+        views[camera] = {v.placement: v for v in ordered if v.placement >= 0}
     problems = list(prepared.problems)
     if surveyed.unseen:
         words = f"faces of the board only: {surveyed.unseen}"

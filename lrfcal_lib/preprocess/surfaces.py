@@ -164,21 +164,20 @@ def planar_surface(
         if nearest > best_reach:
             break
         for part in _planes(sweep, points, mask, upright, rng):
-            reach = float(np.median(ranges[part.mask]))
-            grown = 0.0 if lrf is None else float(lrf.spot_radius(reach))
+            reach = np.median(ranges[part.mask])
+            grown = 0.0 if lrf is None else lrf.spot_radius(reach)
             limits = _size_limits(board, grown)
             if upright is None:
                 part = _trimmed(part, points, limits)
             area, length = plane_size(points[part.mask], part.normal)
-            lines = int(part.mask.any(axis=1).sum())
-            fits = limits.hold(area, length) and lines >= min(FEWEST_LINES, len(ranges))
-            if upright is not None:
-                fits = LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest
+            lines = part.mask.any(axis=1).sum()
             fault = f" on {lines} of {len(ranges)} scan lines"
-            if fits:
-                fault = _fault(part, points, sweep.pitch, T_head_lrf)
-                fits = upright is not None or not fault
-            if not fits:
+            if upright is None:
+                if limits.hold(area, length) and lines >= min(FEWEST_LINES, len(ranges)):
+                    fault = _fault(part, points, sweep.pitch, T_head_lrf)
+            elif LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest:
+                fault = ""
+            if fault:
                 size = f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m"
                 rejected.append(size + fault)
             elif reach < best_reach:
@@ -223,7 +222,7 @@ def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
     second = others[:, 1] - seeds if upright is None else upright
     normals = np.cross(others[:, 0] - seeds, second)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / np.where(length > 1e-9, length, np.nan)
+    normals /= np.where(length > 1e-9, length, np.nan)
     offsets = np.vecdot(normals, seeds)
     misses = np.abs(normals @ sample.T - offsets[:, None])
     best = np.sum(misses < PLANE_NOISE, axis=1).argmax()
@@ -247,7 +246,7 @@ def plane_size(points: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
     return cv2.contourArea(hull), float(pdist(hull).max())
 
 
-def row_ends(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def row_ends(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First and last True of each row.
 
     Parameters
@@ -256,13 +255,14 @@ def row_ends(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Returns
     -------
-    rows, first, last : ndarray of int
-        Without rows that have none.
+    rows : ndarray of int, shape (k,)
+        Without those that have none.
+    ends : ndarray of int, shape (k, 2)
     """
     rows = np.flatnonzero(mask.any(axis=1))
     first = mask[rows].argmax(axis=1)
     from_end = mask[rows, ::-1].argmax(axis=1)
-    return rows, first, mask.shape[1] - 1 - from_end
+    return rows, np.stack([first, mask.shape[1] - 1 - from_end], axis=1)
 
 
 def _by_distance(sweep):
@@ -317,14 +317,14 @@ def _grown(surface, points):
 
 def _size_limits(board, grown):
     """Limits of a board with its outline grown (m)."""
-    if board.corners is None and board.pattern is not None:
-        sides = np.ptp(board.pattern.outline(), axis=0)
-        area = np.prod(sides)
-        return Limits(0.3 * area, 4 * area, 2.5 * np.linalg.norm(sides))
-    corners = board.known_corners().astype(np.float32)
+    unknown = board.corners is None and board.pattern is not None
+    corners = board.pattern.outline() if unknown else board.known_corners()
+    corners = corners.astype(np.float32)
     area = cv2.contourArea(corners)
-    rim = cv2.arcLength(corners, True)
     length = pdist(corners).max()
+    if unknown:
+        return Limits(0.3 * area, 4 * area, 2.5 * length)
+    rim = cv2.arcLength(corners, True)
     return Limits(0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown)
 
 

@@ -227,7 +227,7 @@ def small_squares(views, pattern) -> dict[str, str]:
     words: dict[str, str] = {}
     for camera, of_camera in views.items():
         sides = {
-            placement: square_px(view.pixels, pattern)
+            placement: square_px(pattern.grid(view.pixels))
             for placement, view in of_camera.items()
             if view.pixels is not None
         }
