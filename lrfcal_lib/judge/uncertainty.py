@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, columns_of
+from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, selection
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
@@ -83,14 +83,12 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
         Where nothing says how well the rig is known.
     """
     known = uncertainty_of(rig)
-    index = columns_of(known.names, camera)
-    estimated = index >= 0
+    links = selection(known.names, camera)
     covariances = []
     for whole in (known.covariance, known.trusted):
-        part = whole[np.ix_(index, index)]
         # zero for what is known; what has no bound is among `unseen`
-        bounded = np.outer(estimated, estimated) & np.isfinite(part)
-        covariances.append(np.where(bounded, part, 0.0))
+        bounded = np.where(np.isfinite(whole), whole, 0.0)
+        covariances.append(links @ bounded @ links.T)
 
     on_head = True
     pose = None

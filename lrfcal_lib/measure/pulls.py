@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import columns_of
+from lrfcal_lib.calibrate.rig_uncertainty import columns_of, selection
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
 from lrfcal_lib.session.read import Session
 
@@ -61,13 +61,8 @@ class View:
         beams = beams_to(points, self.rig.T_head_lrf)
         chain = chain_of(self.rig, self.camera)
         p_camera, by_link, by_pitch = carried(chain, *beams, self.pitch)
-        names = self.rig.uncertainty.names
-        columns = columns_of(names, self.camera)
-        known = columns >= 0
-        J = np.zeros((*p_camera.shape, len(names) + 1))
-        J[..., columns[known]] = by_link[..., known]
-        J[..., -1] = by_pitch
-        return p_camera, J
+        by_rig = by_link @ selection(self.rig.uncertainty.names, self.camera)
+        return p_camera, np.concatenate([by_rig, by_pitch[..., None]], axis=-1)
 
 
 @dataclass(frozen=True)
