@@ -8,6 +8,7 @@ import numpy as np
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of, selection
+from lrfcal_lib.fit.robust import sums_by
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of
 from lrfcal_lib.session.read import Session
 
@@ -138,10 +139,9 @@ def pull_of_groups(
     fitted : ndarray of int, shape (f,)
         Which of them were fitted: by their slopes groups scatter.
     """
-    _, group = np.unique(group, return_inverse=True)
-    sums = np.zeros((group.max() + 1, len(fitted)))
-    np.add.at(sums, group, by_row[:, fitted])
-    load = np.bincount(group, np.linalg.norm(by_row, axis=1))
+    size = np.linalg.norm(by_row, axis=1)
+    sums = sums_by(group, by_row[:, fitted])
+    load = sums_by(group, size)
     groups = load.sum() ** 2 / max(load @ load, 1e-300)
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
     excess = np.trace(own @ sums.T @ sums) / max(len(fitted), 1)
