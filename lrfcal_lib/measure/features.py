@@ -169,9 +169,8 @@ class Feature:
         return axis is None or abs(self.axis @ axis) > np.cos(ALIKE)
 
     def foot(self, place: np.ndarray) -> np.ndarray:
-        """The place (3,) on the plane or the line of an edge that is nearest to another."""
-        away = place - self.centre
-        along = (away @ self.axis) * self.axis
+        """The places (..., 3) on the plane or the line of an edge that are nearest to others."""
+        along = np.multiply.outer((place - self.centre) @ self.axis, self.axis)
         if self.kind == Kind.PLANE:
             return place - along
         return self.centre + along

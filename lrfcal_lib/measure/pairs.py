@@ -139,7 +139,7 @@ def _moves(cloud, rig):
     # as the platform sees it, whatever stands on the head
     chain = replace(chain_of(rig), on_head=False)
     _, J, by_pitch = carried(chain, cloud.bearing, cloud.pitch, cloud.range)
-    by_rig = np.einsum("ni,nij->nj", cloud.normals, J)
+    by_rig = np.vecmat(cloud.normals, J)
     turn = np.vecdot(cloud.normals, by_pitch)
     offset, stretch = chain.sweep_sigma
     return np.column_stack([by_rig, offset * turn, stretch * cloud.pitch * turn])
@@ -391,12 +391,13 @@ def fitted(
         sigma = np.sqrt(first.sigma[here] ** 2 + second.sigma[there] ** 2 + COMMON**2)
         sigma *= robust_sigma(r / sigma, least=1.0)
         weight = biweight(r, sigma) / sigma**2
-        inverse = np.linalg.pinv(J.T @ (weight[:, None] * J), rcond=1e-12)
-        step = -inverse @ (J.T @ (weight * r))
+        weighted = J * weight[:, None]
+        inverse = np.linalg.pinv(J.T @ weighted, rcond=1e-12)
+        gain = -inverse @ weighted.T
+        step = gain @ r
         T = moved(T, step)
-    pulls = J * (weight * (r + J @ step))[:, None]
+    pulls = weighted * (r + J @ step)[:, None]
     sums = sums_by(np.floor(first.points[here] / NEIGHBOURS), pulls)
-    gain = -inverse @ (J * weight[:, None]).T
     by_first = gain @ first.moves[here]
     by_second = gain @ second.moves[there]
     by_sweeps = np.hstack([by_first[:, -2:], by_second[:, -2:]])

@@ -169,10 +169,11 @@ def _asked(seen, pairs, rig):
     of the unknowns that it moves by, and the likeliest Fit.
     """
     C = _allowed(rig)
-    ways = [SPREAD * (np.arange(6) < 3), SPREAD * (np.arange(6) >= 3), SPREAD]
+    turns = np.arange(6) < 3
+    ways = [SPREAD * turns, SPREAD * ~turns, SPREAD]
     moves = [(camera, poses_of(rig, camera), ways) for camera in rig.cameras]
     if any(camera.mount == "platform" for camera in rig.cameras.values()):
-        moves.append((None, np.array([len(C) - 1]), [SLIP]))
+        moves.append((None, np.array([-1]), [SLIP]))
     asked = []
     for camera, columns, ways in moves:
         fits = []
@@ -190,11 +191,9 @@ def _fitted(seen, pairs, C):
     """
     change = np.zeros(len(C))
     for width in WIDTHS:
-        information = np.zeros_like(C)
-        slope = np.zeros(len(C))
-        for pull in [*pairs, *(sights.pull(change, width) for sights in seen)]:
-            information += pull.information
-            slope += pull.slope
+        pulls = [*pairs, *(sights.pull(change, width) for sights in seen)]
+        information = sum((pull.information for pull in pulls), np.zeros_like(C))
+        slope = sum((pull.slope for pull in pulls), np.zeros(len(C)))
         shares = np.eye(len(C)) + C @ information
         change = np.linalg.solve(shares, C @ slope)
     evidence = sum(sights.explained(change) for sights in seen)
@@ -207,18 +206,15 @@ def _fitted(seen, pairs, C):
 def _allowed(rig):
     """Covariance (c, c) of the unknowns where nothing has moved, the pitch of sweeps last."""
     known = rig.uncertainty
-    count = len(known.names)
-    C = np.zeros((count + 1,) * 2)
-    C[:count, :count] = np.where(np.isfinite(known.trusted), known.trusted, 0.0)
+    C = np.pad(np.where(np.isfinite(known.trusted), known.trusted, 0.0), (0, 1))
     common = np.zeros((len(C), 6))
     for name, camera in rig.cameras.items():
         columns = poses_of(rig, name)
         C[columns, columns] += OWN**2
         if camera.mount == "head":
             common[columns, np.arange(6)] = COMMON
-    C += common @ common.T
-    C[count, count] = known.sweep_sigma[0] ** 2 + PITCH_NOISE**2
-    return C
+    C[-1, -1] = known.sweep_sigma[0] ** 2 + PITCH_NOISE**2
+    return C + common @ common.T
 
 
 def _shift(camera, columns, fit, evidence, rig):
