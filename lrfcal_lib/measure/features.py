@@ -373,7 +373,7 @@ def _refuse_askew(first, second):
     """DegenerateGeometry for planes or edges that are not parallel."""
     if Kind.POINT in (first.kind, second.kind):
         return
-    between = np.arccos(np.clip(abs(first.axis @ second.axis), 0, 1))
+    between = np.arccos(min(abs(first.axis @ second.axis), 1.0))
     if first.kind != second.kind:
         between = np.pi / 2 - between
     if between > ALIKE:

@@ -236,7 +236,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     of_pairs = [pairs_pull(*station, start) for station in stations]
     of_pairs = [pull for pull in of_pairs if pull is not None]
     shifts = suspects(of_creases, of_pairs, rig)
-    nothing = np.zeros(len(rig.uncertainty.names) + 1)
+    nothing = np.zeros_like(start)
     return Held(
         culprits=tuple(most_likely(shifts)),
         shifts=tuple(shifts),

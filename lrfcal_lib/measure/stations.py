@@ -72,8 +72,9 @@ class Joined:
 
         That is the error which loops through it leave there; 0 without loops.
         """
-        miss = pair.miss(self.T_world_station)
-        return float(np.linalg.norm(miss[:3])), float(np.linalg.norm(miss[3:]))
+        miss = pair.miss(self.T_world_station).reshape(2, 3)
+        turn, shift = np.linalg.norm(miss, axis=1)
+        return float(turn), float(shift)
 
     def covariance_of(self, station: int) -> np.ndarray:
         """Of turn and shift of a station, (6, 6)."""

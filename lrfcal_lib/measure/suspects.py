@@ -176,24 +176,25 @@ def _asked(seen, pairs, rig):
         moves.append((None, np.array([-1]), [SLIP]))
     asked = []
     for camera, columns, ways in moves:
-        fits = []
-        for likely in ways:
-            wide = C.copy()
-            wide[columns, columns] += likely**2
-            fits.append(_fitted(seen, pairs, wide))
+        fits = [_fitted(seen, pairs, C, columns, likely) for likely in ways]
         asked.append((camera, columns, max(fits, key=lambda fit: fit.evidence)))
-    return _fitted(seen, pairs, C), asked
+    return _fitted(seen, pairs, C, [], 0.0), asked
 
 
-def _fitted(seen, pairs, C):
-    """The Fit of changes that are likely to a covariance C (c, c): expectation and maximisation,
-    with edges that are sought nearer and nearer, and Laplace's approximation of the evidence.
+def _fitted(seen, pairs, C, columns, likely):
+    """The Fit of changes that are likely to a covariance C (c, c), and in some columns to standard
+    deviations besides: expectation and maximisation, with edges that are sought nearer and nearer,
+    and Laplace's approximation of the evidence.
     """
+    C = C.copy()
+    C[columns, columns] += likely**2
     change = np.zeros(len(C))
     for width in WIDTHS:
-        pulls = [*pairs, *(sights.pull(change, width) for sights in seen)]
-        information = sum((pull.information for pull in pulls), np.zeros_like(C))
-        slope = sum((pull.slope for pull in pulls), np.zeros(len(C)))
+        information = np.zeros_like(C)
+        slope = np.zeros(len(C))
+        for pull in [*pairs, *(sights.pull(change, width) for sights in seen)]:
+            information += pull.information
+            slope += pull.slope
         shares = np.eye(len(C)) + C @ information
         change = np.linalg.solve(shares, C @ slope)
     evidence = sum(sights.explained(change) for sights in seen)
