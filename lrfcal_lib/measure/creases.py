@@ -88,10 +88,9 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
         places = origin + by_height[:, :2] @ lifts + STEP * common[:, None] * way
         # the smaller a surface, the more of it is rim, where spots are mixed with what is beside
         rim = SYSTEMATIC / min(STEP * len(common), 1.0)
-        systematic = np.hypot(rim, np.divide(lifts, 2))
         sigma = [
-            _sigma(first, places, systematic[0]),
-            _sigma(second, places, systematic[1]),
+            _sigma(plane, places, np.hypot(rim, lift / 2))
+            for plane, lift in zip((first, second), lifts, strict=True)
         ]
         points.append(places)
         along.append(np.tile(way, (len(common), 1)))
