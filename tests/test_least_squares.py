@@ -8,13 +8,13 @@ import scipy.linalg
 import scipy.optimize
 import scipy.special
 
-from lrfcal_lib.fit.covariance import placement_covariance, pseudo_inverse
+from lrfcal_lib.fit.covariance import motion_words, placement_covariance, pseudo_inverse
 from lrfcal_lib.fit.least_squares import (
     Block,
     minimise,
     solve,
 )
-from lrfcal_lib.model.geometry import DegenerateGeometry, motion_words
+from lrfcal_lib.model.geometry import DegenerateGeometry
 
 
 def line_problem(x, y, sigma=1.0):

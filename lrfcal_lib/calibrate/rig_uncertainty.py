@@ -79,6 +79,11 @@ def columns_of(names: Sequence[str], camera: str | None = None) -> np.ndarray:
     return np.array([place.get(name, -1) for name in wanted])
 
 
+def selection(names: Sequence[str], camera: str | None = None) -> np.ndarray:
+    """Which of c shared unknowns each of `COLUMNS` is: ones, a row of zeros where none, (13, c)."""
+    return np.eye(len(names) + 1, len(names))[columns_of(names, camera)]
+
+
 def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
     """What a joint estimate says about its rig.
 

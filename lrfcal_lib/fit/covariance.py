@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import qr
 
+from lrfcal_lib.model.geometry import unit_vector
+
 # eigenvalues of scaled normal equations below this share of the largest are rounding errors
 RANK = 1e-13
 # share of a direction's largest component from which an unknown takes part in it
@@ -191,3 +193,34 @@ def placement_covariance(
     gained = np.linalg.diagonal(without) - whole
     factor = np.sqrt(whole[..., 0, :] / gained.sum(axis=-2))
     return squares * dyads(factor), shifts
+
+
+def axis_words(direction):
+    """A direction in words: the name of an axis within 8 degrees, otherwise its components."""
+    direction = unit_vector(np.asarray(direction, float))
+    largest = int(np.argmax(np.abs(direction)))
+    direction = direction * np.sign(direction[largest])
+    if direction[largest] > np.cos(np.radians(8)):
+        return "xyz"[largest]
+    return "({:.2f}, {:.2f}, {:.2f})".format(*(direction + 0.0))
+
+
+def motion_words(delta: np.ndarray, frame: str) -> str:
+    """Name a small motion by its direction, e.g. ``translation along x of the left frame``.
+
+    Parameters
+    ----------
+    delta : ndarray, shape (6,)
+        ``[w, v]``.
+    frame : str
+    """
+    w = np.asarray(delta[:3], float)
+    v = np.asarray(delta[3:6], float)
+    turn = np.linalg.norm(w)
+    shift = np.linalg.norm(v)
+    if turn < 0.02 * shift:
+        return f"translation along {axis_words(v)} of the {frame} frame"
+    words = f"rotation about {axis_words(w)} of the {frame} frame"
+    if shift < 0.02 * turn:
+        return words
+    return f"{words} with translation along {axis_words(v)}"

@@ -5,6 +5,7 @@ One rule for every fit that does not go through :func:`lrfcal_lib.fit.least_squa
 """
 
 import numpy as np
+from scipy.sparse import csr_array
 
 # standard deviation of a normal variable over the median of its absolute value
 NORMAL = 1.4826
@@ -57,3 +58,21 @@ def biweight(misses: np.ndarray, sigma: float | np.ndarray) -> np.ndarray:
     ndarray, shape (...)
     """
     return np.clip(1 - (misses / (TUKEY * sigma)) ** 2, 0, None) ** 2
+
+
+def sums_by(group: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Sums of the rows of each group.
+
+    Parameters
+    ----------
+    group : ndarray, shape (n,) or (n, k)
+        The same number, or row of numbers, for those of one group.
+    rows : ndarray, shape (n, m)
+
+    Returns
+    -------
+    ndarray, shape (g, m)
+    """
+    groups, place = np.unique(group, axis=0, return_inverse=True)
+    one_each = np.ones(len(place)), place, np.arange(len(place) + 1)
+    return csr_array(one_each, (len(place), len(groups))).T @ rows

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.rig import joint_rig
-from lrfcal_lib.calibrate.rig_uncertainty import columns_of
+from lrfcal_lib.calibrate.rig_uncertainty import selection
 from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import by_sign
@@ -268,16 +268,14 @@ def candidate_information(boards, pitches, solution, models):
         model = models[camera]
         by_image = image_sigma(solution, camera, model)
         chain = chain_of(rig, camera)
-        links = columns_of(solution.solution.names, camera)
-        unknown = links >= 0
-        index = links[unknown]
+        links = selection(solution.solution.names, camera)
         for pitch in at.T:
             p_camera, by_link, _ = carried(chain, *beams, image_pitch=pitch[:, None])
             by_point = project_jacobians(p_camera, model)[0]
             sigma = np.hypot(by_image, by_scan * model.fx / p_camera[..., 2])
-            J = (by_point @ by_link)[..., unknown] / sigma[..., None, None]
-            J = J.reshape(len(boards), -1, len(index))
-            information[:, index[:, None], index] += J.mT @ J
+            J = by_point @ by_link @ links / sigma[..., None, None]
+            J = J.reshape(len(boards), -1, unknowns)
+            information += J.mT @ J
     return information
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, columns_of
+from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, selection
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
@@ -85,12 +85,11 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
         Where nothing says how well the rig is known.
     """
     known = uncertainty_of(rig)
-    index = columns_of(known.names, camera)
-    estimated = index >= 0
-    part = np.stack([known.covariance, known.trusted])[:, index[:, None], index]
+    links = selection(known.names, camera)
+    both = np.stack([known.covariance, known.trusted])
     # zero for what is known; what has no bound is among `unseen`
-    bounded = np.outer(estimated, estimated) & np.isfinite(part)
-    covariances = np.where(bounded, part, 0.0)
+    bounded = np.where(np.isfinite(both), both, 0.0)
+    covariances = links @ bounded @ links.T
 
     on_head = True
     pose = None

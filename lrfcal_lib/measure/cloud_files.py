@@ -118,15 +118,13 @@ def write_pcd(path, ply, comments=()):
 
 def _pcd_header(count, comments):
     """The lines before the points of a PCD file."""
-    names = []
     types = []
-    for kind, columns in PCD_COLUMNS.values():
-        names += columns.split()
-        types += [np.dtype(kind)] * len(columns.split())
+    for kind, names in PCD_COLUMNS.values():
+        types += [np.dtype(kind)] * len(names.split())
     lines = (
         *(f"# {words}" for words in comments),
         "VERSION 0.7",
-        f"FIELDS {' '.join(names)}",
+        f"FIELDS {' '.join(names for _, names in PCD_COLUMNS.values())}",
         f"SIZE {' '.join(str(kind.itemsize) for kind in types)}",
         f"TYPE {' '.join(kind.kind.upper() for kind in types)}",
         f"COUNT {' '.join('1' for _ in types)}",

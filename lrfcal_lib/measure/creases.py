@@ -69,7 +69,8 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
     along = [np.zeros((0, 3))]
     off = [np.zeros((0, 2, 3))]
     surfaces = [(plane, cloud.points[of_point == k]) for k, plane in enumerate(planes)]
-    for (first, points_one), (second, points_other) in combinations(surfaces, 2):
+    for pair in combinations(surfaces, 2):
+        (first, _), (second, _) = pair
         way = np.cross(first.axis, second.axis)
         sine = np.linalg.norm(way)
         if sine < LEAST_SINE:
@@ -79,18 +80,17 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
         middle = (first.centre + second.centre) / 2
         heights = [first.axis @ first.centre, second.axis @ second.centre, way @ middle]
         origin = by_height @ heights
-        one, lift_one = _beside(points_one - origin, first, way)
-        other, lift_other = _beside(points_other - origin, second, way)
-        common = np.intersect1d(one, other)
+        beside = [_beside(readings - origin, plane, way) for plane, readings in pair]
+        numbers, lifts = zip(*beside, strict=True)
+        common = np.intersect1d(*numbers)
         if len(common) < FEWEST:
             continue
-        origin = origin + by_height @ [lift_one, lift_other, 0.0]
-        places = origin + STEP * common[:, None] * way
+        places = origin + by_height[:, :2] @ lifts + STEP * common[:, None] * way
         # the smaller a surface, the more of it is rim, where spots are mixed with what is beside
         rim = SYSTEMATIC / min(STEP * len(common), 1.0)
         sigma = [
-            _sigma(first, places, np.hypot(rim, lift_one / 2)),
-            _sigma(second, places, np.hypot(rim, lift_other / 2)),
+            _sigma(plane, places, np.hypot(rim, lift / 2))
+            for plane, lift in zip((first, second), lifts, strict=True)
         ]
         points.append(places)
         along.append(np.tile(way, (len(common), 1)))
@@ -209,7 +209,7 @@ def sights(creases: Creases, view: View) -> Sights:
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
     by_place = np.vecmat(normal, by_point) / reach
-    off = np.einsum("nj,nkj->nk", by_place, creases.off[inside] @ R.T)
+    off = np.matvec(creases.off[inside] @ R.T, by_place)
     return Sights(
         by_unknown=np.vecmat(by_place, J[inside]),
         across=across / reach,

@@ -45,21 +45,22 @@ class E57Writer:
     """
 
     def __init__(self, path: Path, about: str):
-        import pye57
+        from pye57 import E57, libe57
 
         self.about = about
-        self._file = pye57.E57(str(path), "w")
+        self._file = E57(str(path), "w")
+        self._image_file = self._file.image_file
+        self._nodes = libe57
 
     def __enter__(self):
         return self
 
     def __exit__(self, kind, error, trace):
-        libe57, image_file = self._library()
         try:
-            image_file.close()
-        except libe57.E57Exception as failed:
+            self._image_file.close()
+        except self._nodes.E57Exception as failed:
             error = error or failed
-        if isinstance(error, libe57.E57Exception):
+        if isinstance(error, self._nodes.E57Exception):
             raise OSError(errno.EIO, f"E57: {error}") from error
 
     @contextmanager
@@ -82,21 +83,18 @@ class E57Writer:
         callable
             ``write(cloud)`` appends points in the scan's own frame.
         """
-        libe57, image_file = self._library()
         arrays, prototype, buffers = self._columns(intensity)
-        scan = self._node(
-            {
-                "guid": guid,
-                "name": name,
-                "description": self.about,
-                "pose": _pose(T_file_scan),
-                "colorLimits": COLOR_LIMITS,
-            }
-        )
-        codecs = libe57.VectorNode(image_file, True)
-        points = libe57.CompressedVectorNode(image_file, prototype, codecs)
-        scan.set("points", points)
-        self._file.data3d.append(scan)
+        codecs = self._nodes.VectorNode(self._image_file, True)
+        points = self._nodes.CompressedVectorNode(self._image_file, prototype, codecs)
+        scan = {
+            "guid": guid,
+            "name": name,
+            "description": self.about,
+            "pose": _pose(T_file_scan),
+            "colorLimits": COLOR_LIMITS,
+            "points": points,
+        }
+        self._file.data3d.append(self._node(scan))
         writer = points.writer(buffers)
 
         def write(cloud):
@@ -116,13 +114,12 @@ class E57Writer:
 
     def _columns(self, intensity):
         """Arrays by field, with the library's statement of their types and its view of them."""
-        libe57, image_file = self._library()
         fields = [*POINT, *COLORS, "intensity"] if intensity else [*POINT, *COLORS]
-        prototype = libe57.StructureNode(image_file)
+        prototype = self._nodes.StructureNode(self._image_file)
         for field in fields:
-            node = libe57.FloatNode(image_file, 0.0, libe57.E57_SINGLE)
+            node = self._nodes.FloatNode(self._image_file, 0.0, self._nodes.E57_SINGLE)
             if field in COLORS:
-                node = libe57.IntegerNode(image_file, 0, 0, 255)
+                node = self._nodes.IntegerNode(self._image_file, 0, 0, 255)
             prototype.set(field, node)
         arrays, buffers = self._file.make_buffers(fields, AT_ONCE)
         return arrays, prototype, buffers
@@ -142,7 +139,6 @@ class E57Writer:
         view
             Its pixels and intrinsics.
         """
-        libe57, image_file = self._library()
         size = (view.model.width, view.model.height)
         lens = (view.model.matrix, view.model.distortion)
         # all of the image, and room for it
@@ -152,41 +148,32 @@ class E57Writer:
         flat = cv2.remap(view.image, maps, None, cv2.INTER_LINEAR)
         quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
         jpeg = cv2.imencode(".jpg", flat, quality)[1].ravel()
-        blob = libe57.BlobNode(image_file, len(jpeg))
-        representation = self._node(_pinhole(matrix, wide))
-        representation.set("jpegImage", blob)
-        node = self._node(
-            {
-                "guid": new_guid(),
-                "name": name,
-                "description": f"{self.about}; distortion removed",
-                "associatedData3DGuid": scan,
-                "pose": _pose(T_file_camera * E57_FROM_OPENCV),
-            }
-        )
-        node.set("pinholeRepresentation", representation)
-        self._file.root["images2D"].append(node)
+        blob = self._nodes.BlobNode(self._image_file, len(jpeg))
+        image = {
+            "guid": new_guid(),
+            "name": name,
+            "description": f"{self.about}; distortion removed",
+            "associatedData3DGuid": scan,
+            "pose": _pose(T_file_camera * E57_FROM_OPENCV),
+            "pinholeRepresentation": _pinhole(matrix, wide) | {"jpegImage": blob},
+        }
+        self._file.root["images2D"].append(self._node(image))
         blob.write(jpeg, 0, len(jpeg))
 
-    def _library(self):
-        """The module of nodes, and the file that they are made for."""
-        from pye57 import libe57
-
-        return libe57, self._file.image_file
-
     def _node(self, value):
-        """A value as a node; mappings become structures."""
-        libe57, image_file = self._library()
+        """A value as a node; mappings become structures, nodes stay."""
         if isinstance(value, Mapping):
-            structure = libe57.StructureNode(image_file)
+            structure = self._nodes.StructureNode(self._image_file)
             for key, child in value.items():
                 structure.set(key, self._node(child))
             return structure
         if isinstance(value, str):
-            return libe57.StringNode(image_file, value)
+            return self._nodes.StringNode(self._image_file, value)
         if isinstance(value, int):
-            return libe57.IntegerNode(image_file, value)
-        return libe57.FloatNode(image_file, float(value))
+            return self._nodes.IntegerNode(self._image_file, value)
+        if isinstance(value, float):
+            return self._nodes.FloatNode(self._image_file, value)
+        return value
 
 
 def _values(cloud):

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 
 from lrfcal_lib.calibrate.cloud import Cloud
@@ -20,7 +21,7 @@ from lrfcal_lib.measure.features import Feature, Kind, beams_moved
 from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.model.kinematics import beams_to
-from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge, refine_edge
+from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, refine_edge
 from lrfcal_lib.session.workers import spread
 
 SHORTEST_PX = 40.0  # of an edge in an image
@@ -55,44 +56,31 @@ def edges_of(
     -------
     list of Feature
     """
-    planes, _ = surfaces
-    edges = []
-    seen = spread(partial(_lines_on_planes, cloud, surfaces, views), views)
-    for view, (numbers, lines) in zip(views, seen, strict=True):
-        if lines:
-            edges += _on_planes([planes[number] for number in numbers], lines, view)
-    return edges
+    of_views = spread(partial(_edges_in, cloud, surfaces, views), views)
+    return [edge for of_view in of_views for edge in of_view]
 
 
-def _lines_on_planes(cloud, surfaces, views, view):
-    """The lines of one image at planes of a cloud, and the numbers of these planes."""
+def _edges_in(cloud, surfaces, views, view):
+    """The edges at planes of a cloud that one image shows."""
     planes, of_point = surfaces
     segments = _segments(view)
     # what one image of a camera sees, all of them see that have it in view
     of_camera = [other.number for other in views if other.camera == view.camera]
-    rows = np.flatnonzero(np.isin(cloud.image, of_camera))
-    p_camera = view.T_camera_platform.apply(cloud.points[rows])
+    p_camera = view.T_camera_platform.apply(cloud.points)
     uv = pinhole(p_camera, view.model)
     size = view.model.size
-    inside = np.flatnonzero((np.abs(uv - size / 2) < size).all(axis=1))
-    rows = rows[inside]
-    uv = uv[inside]
-    beside = _Beside(uv, p_camera[inside, 2], of_point[rows], cloud.image[rows])
-    tree = KDTree(uv)
-    depths = partial(_depth, view, planes)
-    numbers = []
-    lines = []
-    for ends in segments:
-        reach = np.linalg.norm(ends[1] - ends[0]) / 2 + BESIDE_PX[1]
-        near = tree.query_ball_point(ends.mean(axis=0), reach, return_sorted=False)
-        near = np.array(near, int)
-        points = _Beside(*(column[near] for column in beside))
-        number = _surface_at(ends, points, depths, view.number)
-        if number >= 0:
+    near = np.isin(cloud.image, of_camera) & (np.abs(uv - size / 2) < size).all(axis=1)
+    points = _Beside(uv[near], p_camera[near, 2], of_point[near], cloud.image[near])
+    reach = np.linalg.norm(np.diff(segments, axis=1), axis=-1)[:, 0] / 2 + BESIDE_PX[1]
+    about = KDTree(points.uv).query_ball_point(segments.mean(axis=1), reach)
+    edges = []
+    for ends, rows in zip(segments, about, strict=True):
+        beside = _Beside(*(column[rows] for column in points))
+        plane = _surface_at(ends, beside, planes, view)
+        if plane is not None:
             with suppress(EdgeNotSeen):
-                lines.append(_refined(view, ends, segments))
-                numbers.append(number)
-    return numbers, lines
+                edges.append(_on_plane(plane, _refined(view, ends, segments), view))
+    return edges
 
 
 class _Beside(NamedTuple):
@@ -108,9 +96,7 @@ class _Beside(NamedTuple):
 
 def _segments(view):
     """Straight segments (n, 2, 2) of an image, undistorted pixels."""
-    grey = view.image
-    if grey.ndim == 3:
-        grey = cv2.cvtColor(grey, cv2.COLOR_BGR2GRAY)
+    grey = cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY)
     flat = cv2.undistort(grey, view.model.matrix, view.model.distortion)
     lines = cv2.createLineSegmentDetector(scale=1.0).detect(flat)[0]
     if lines is None:
@@ -130,24 +116,13 @@ def _refined(view, ends, segments):
     beside = (along.min(axis=1) < 0) & (along.max(axis=1) > 0) & (away < CLOSE_PX)
     if beside.sum() < 2:
         return line
-    covariance = line.covariance + np.diag([PULLED_PX**2, 0.0])
-    return replace(line, covariance=covariance)
+    return replace(line, covariance=line.covariance + np.diag([PULLED_PX**2, 0.0]))
 
 
-def _depth(view, planes, number, pixel):
-    """How deep in an image a plane is at an undistorted pixel (2,); inf behind it."""
-    plane = planes[number]
-    T = view.T_camera_platform
-    normal = T.rotation.apply(plane.axis)
-    depth = normal @ T.apply(plane.centre) / (normal @ view.model.sights(pixel))
-    return depth if depth > 0 else np.inf
+def _surface_at(ends, points, planes, view):
+    """The surface that ends at a segment (2, 2) of an image, or that it is on; None for none.
 
-
-def _surface_at(ends, points, depths, image):
-    """The number of the surface that ends at a segment (2, 2) of an image, or that it is on; -1
-    for none.
-
-    Of `points` about it; ``depths(number, pixel)`` are those of surfaces.
+    Of `points` about it.
     """
     first, last = ends
     length = np.linalg.norm(last - first)
@@ -155,104 +130,80 @@ def _surface_at(ends, points, depths, image):
     s = (points.uv - first) @ along
     t = (points.uv - first) @ [along[1], -along[0]]
     near, far = BESIDE_PX
-    beside = (s > 0) & (s < length) & (np.abs(t) > near) & (np.abs(t) < far)
     # depth, whether it is no flat surface, less the points of it, its number, points of the image
     sides = []
-    for side in (1.0, -1.0):
-        rows = np.flatnonzero(beside & (side * t > 0))
+    for away in (t, -t):
+        rows = np.flatnonzero((s > 0) & (s < length) & (away > near) & (away < far))
         if len(rows) < FEWEST:
             continue
         counts = np.bincount(points.plane[rows] + 1)  # of none first
         number = int(np.argmax(counts)) - 1
+        depth = np.median(points.depth[rows])
         if number >= 0 and counts.max() > LEAST_SHARE * len(rows):
-            depth = depths(number, (first + last) / 2)
+            _, (depth,) = _where_seen(view, planes[number], ends.mean(axis=0)[None])
+            depth = depth if depth > 0 else np.inf  # behind the camera
         else:
             number = -1
-            depth = np.median(points.depth[rows])
-        own = np.sum(points.image[rows] == image)
+        own = np.sum(points.image[rows] == view.number)
         sides.append((depth, number < 0, -counts.max(), number, own))
     sides.sort()
     step = STEP if any(side[1] for side in sides) else PLANES_APART
     if len(sides) == 2 and sides[1][0] - sides[0][0] < step:
         sides.sort(key=lambda side: side[1:])
-    if not sides or sides[0][-1] < LEAST_OWN:
-        return -1
-    return sides[0][3]
+    if not sides or sides[0][-1] < LEAST_OWN or sides[0][3] < 0:
+        return None
+    return planes[sides[0][3]]
 
 
-def _on_planes(
-    planes: Sequence[Feature], lines: Sequence[ImageEdge], view: View
-) -> list[Feature]:
-    """The edges of a scene that k lines of an image show, each on its plane."""
-    rig = planes[0].rig
-    normal = np.array([plane.axis for plane in planes])
-    centre = np.array([plane.centre for plane in planes])
-    line = np.array([each.line for each in lines])
-    pixels = np.array([each.ends for each in lines])
+def _where_seen(view, plane, pixels):
+    """Where the sights through undistorted pixels (k, 2) meet a plane: places (k, 3), platform
+    frame, and how deep in the image these are (k,), metres.
+    """
+    T = view.T_camera_platform.inv()
+    rays = T.rotation.apply(view.model.sights(pixels))
+    depth = plane.axis @ (plane.centre - T.translation) / (rays @ plane.axis)
+    return T.translation + depth[:, None] * rays, depth
 
-    ends = _where_seen(view, normal, centre, pixels)
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)[:, None]
-    direction = (ends[:, 1] - ends[:, 0]) / length
+
+def _on_plane(plane, line, view):
+    """The edge of a scene that a line of an image shows, on its plane."""
+    rig = plane.rig
+    ends, depth = _where_seen(view, plane, line.ends)
+    way = ends[1] - ends[0]
+    direction = unit_vector(way)
 
     # the plane of sight: what it misses a point of the camera's frame by, its gradient, pixels a
     # metre
-    R = view.T_camera_platform.rotation.as_matrix()
-    depth = ends @ R[2] + view.T_camera_platform.translation[2]
-    sight = (line @ view.model.matrix)[:, None] / depth[..., None]
-    gradient = sight @ R
-    across = np.cross(normal, direction)[:, None]
-    way = across / np.vecdot(gradient, across)[..., None]  # metres a pixel
+    sight = line.line @ view.model.matrix / depth[:, None]
+    gradient = sight @ view.T_camera_platform.rotation.as_matrix()
+    across = np.cross(plane.axis, direction)
+    by_offset = across / (gradient @ across)[:, None]  # metres a pixel
 
     # ends by the plane's height and turn, and by the line's offset and turn
-    lifted = normal[:, None] - way * np.vecdot(gradient, normal[:, None])[..., None]
-    middle = np.array([each.centre for each in lines])[:, None]
-    tangent = np.stack([-line[:, 1], line[:, 0]], axis=-1)[:, None]
-    stretch = np.vecdot(pixels - middle, tangent)[..., None, None]
-    turned = -lifted[..., None] * (ends - centre[:, None])[..., None, :]
-    by = (lifted[..., None], turned, way[..., None], -way[..., None] * stretch)
-    by_noise = _of_line(np.concatenate(by, axis=-1), length)
+    by_height = plane.axis - by_offset * (gradient @ plane.axis)[:, None]
+    by_plane = -by_height[..., None] * (ends - plane.centre)[:, None]
+    stretch = (line.ends - line.centre) @ [-line.line[1], line.line[0]]
+    by_line = -by_offset * stretch[:, None]
+    by_noise = np.dstack([by_height, by_plane, by_offset, by_line])
+    height = plane.axis @ plane.noise[:3, :3] @ plane.axis
+    noise = block_diag(height, plane.noise[3:, 3:], line.covariance)
 
     beams = beams_to(ends, rig.T_head_lrf)
-    by_camera = beams_moved(rig, beams, view.camera, view.pitch)
-    by_shared = beams_moved(rig, beams)
-    by_shared -= way[..., None] * (sight[..., None, :] @ by_camera)
-    by_shared[..., -1] = lifted
-    jacobian = _of_line(by_shared, length)
-    parts = zip(planes, lines, ends, by_noise, jacobian, strict=True)
-    return [_edge(*one, view.number) for one in parts]
+    by_sight = sight[:, None] @ beams_moved(rig, beams, view.camera, view.pitch)
+    by_shared = beams_moved(rig, beams) - by_offset[..., None] * by_sight
+    by_shared[..., -1] = by_height
 
-
-def _where_seen(view, normal, centre, pixels):
-    """Where the sights through pixels (k, 2, 2) meet planes (k, 3), platform frame, (k, 2, 3)."""
-    T_platform_camera = view.T_camera_platform.inv()
-    rays = view.model.sights(pixels) @ T_platform_camera.rotation.as_matrix().T
-    eye = T_platform_camera.translation
-    far = np.vecdot(normal, centre - eye)[:, None] / np.vecdot(rays, normal[:, None])
-    return eye + far[..., None] * rays
-
-
-def _edge(plane, line, ends, by_noise, jacobian, number):
-    """An edge of a plane between two ends (2, 3), from an image by its number."""
-    noise = np.zeros(
-        (6, 6)
-    )  # of the plane's height and turn, of the line's offset and turn
-    noise[0, 0] = plane.axis @ plane.noise[:3, :3] @ plane.axis
-    noise[1:4, 1:4] = plane.noise[3:, 3:]
-    noise[4:, 4:] = line.covariance
-    way = ends[1] - ends[0]
+    # from both ends to middle and direction
+    length = np.linalg.norm(way)
+    of_line = np.kron([[0.5, 0.5], [-1 / length, 1 / length]], np.eye(3))
+    by_noise = of_line @ by_noise.reshape(6, -1)
     return replace(
         plane,
         kind=Kind.EDGE,
         centre=ends.mean(axis=0),
-        axis=unit_vector(way),
+        axis=direction,
         noise=by_noise @ noise @ by_noise.T,
-        jacobian=jacobian,
+        jacobian=of_line @ by_shared.reshape(6, -1),
         ends=ends,
-        image=number,
+        image=view.number,
     )
-
-
-def _of_line(by, length):
-    """Derivatives (k, 2, 3, m) of two ends as those of their middle and direction, (k, 6, m)."""
-    direction = (by[:, 1] - by[:, 0]) / length[..., None]
-    return np.concatenate([by.mean(axis=1), direction], axis=1)

@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import columns_of
+from lrfcal_lib.calibrate.rig_uncertainty import selection
 from lrfcal_lib.judge.uncertainty import (
     COLUMNS,
     carried,
@@ -54,16 +53,16 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
     noise = range_noise(rig)
     offset, stretch = chain.sweep_sigma
     sigma = np.zeros(len(cloud.points))
-    for part in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
-        pitch = cloud.pitch[part]
-        _, J, by_pitch = carried(chain, cloud.bearing[part], pitch, cloud.range[part])
-        normals = cloud.normals[part] @ chain.head[:, :3]
+    for rows in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
+        part = cloud.rows(rows)
+        _, J, by_pitch = carried(chain, part.bearing, part.pitch, part.range)
+        normals = part.normals @ chain.head[:, :3]
         beams = -J[..., COLUMNS.index("range_offset")]
         normals = np.where(np.isfinite(normals), normals, beams)
-        calibration = spread(chain, np.vecmat(normals, J)[:, None])
-        sweep = np.hypot(offset, stretch * pitch) * np.vecdot(normals, by_pitch)
-        reading = np.maximum(np.abs(noise * np.vecdot(normals, beams)), cloud.sigma[part])
-        sigma[part] = np.sqrt(calibration**2 + sweep**2 + reading**2)
+        calibration = spread(chain, normals[:, None] @ J)
+        sweep = np.hypot(offset, stretch * part.pitch) * np.vecdot(normals, by_pitch)
+        reading = np.maximum(np.abs(noise * np.vecdot(normals, beams)), part.sigma)
+        sigma[rows] = np.sqrt(calibration**2 + sweep**2 + reading**2)
     return replace(cloud, sigma=sigma)
 
 
@@ -170,9 +169,8 @@ class Feature:
         return axis is None or abs(self.axis @ axis) > np.cos(ALIKE)
 
     def foot(self, place: np.ndarray) -> np.ndarray:
-        """The place (3,) on the plane or the line of an edge that is nearest to another."""
-        away = place - self.centre
-        along = (away @ self.axis) * self.axis
+        """The places (..., 3) on the plane or the line of an edge that are nearest to others."""
+        along = np.multiply.outer((place - self.centre) @ self.axis, self.axis)
         if self.kind == Kind.PLANE:
             return place - along
         return self.centre + along
@@ -201,12 +199,10 @@ class Length:
     @property
     def sigma(self) -> float:
         """Standard deviation, metres."""
-        surfaces = SYSTEMATIC**2 * np.eye(2)
-        variance = []
-        for of_rig in shared_covariances(self.rig):
-            C = block_diag(of_rig, surfaces)
-            variance.append(self.shared @ C @ self.shared)
-        return float(np.sqrt(self.noise + max(variance)))
+        by_rig, by_surfaces = np.split(self.shared, [-2])
+        of_rig = max(by_rig @ C @ by_rig for C in shared_covariances(self.rig))
+        of_surfaces = SYSTEMATIC**2 * by_surfaces @ by_surfaces
+        return float(np.sqrt(self.noise + of_rig + of_surfaces))
 
 
 def mean_length(lengths: Sequence[Length]) -> Length:
@@ -236,17 +232,14 @@ def mean_length(lengths: Sequence[Length]) -> Length:
 def shared_covariances(rig: CalibratedRig) -> list[np.ndarray]:
     """Covariances (c, c) of a rig's unknowns, of which the one that gives more counts."""
     known = uncertainty_of(rig)
-    covariances = []
-    for whole in (known.covariance, known.trusted):
-        unbounded = ~np.isfinite(np.diag(whole))
-        bounded = np.nan_to_num(whole, posinf=0.0, neginf=0.0)
-        covariances.append(bounded + UNBOUNDED * np.diag(unbounded))
-    return covariances
+    unbounded = UNBOUNDED * np.eye(len(known.names))
+    both = (known.covariance, known.trusted)
+    return [np.where(np.isfinite(whole), whole, unbounded) for whole in both]
 
 
 def beams_moved(
     rig: CalibratedRig,
-    beams: Sequence[np.ndarray],
+    beams: tuple[np.ndarray, np.ndarray, np.ndarray],
     camera: str | None = None,
     image_pitch: float = 0.0,
 ) -> np.ndarray:
@@ -255,31 +248,23 @@ def beams_moved(
     Parameters
     ----------
     rig : CalibratedRig
-    beams : sequence of ndarray, shape (...)
+    beams : tuple of ndarray, shape (...)
         Bearing, pitch (radians) and range (metres).
     camera : str, optional
         In whose frame the ends are, with the head at `image_pitch`; the platform's unless given.
     image_pitch : float
         Radians.
     """
-    names = uncertainty_of(rig).names
     chain = chain_of(rig, camera)
-    bearing, turn, distance = beams
-    _, by_link, by_pitch = carried(chain, bearing, turn, distance, image_pitch)
-    by_offset = by_pitch
-    if camera is None:
-        R = chain.head[:, :3]
-        by_link = R @ by_link
-        by_pitch = by_offset = by_pitch @ R.T
-    elif chain.on_head:
-        turn = turn - image_pitch
-        by_offset = 0 * by_pitch
-    index = columns_of(names, camera)
-    moved = np.zeros((*by_pitch.shape, len(names) + 3))
-    moved[..., index[index >= 0]] = by_link[..., index >= 0]
-    moved[..., -3] = by_offset
-    moved[..., -2] = turn[..., None] * by_pitch
-    return moved
+    _, by_link, by_pitch = carried(chain, *beams, image_pitch)
+    moved = by_link @ selection(uncertainty_of(rig).names, camera)
+    turn = beams[1][..., None]
+    nothing = np.zeros_like(by_pitch)
+    sweep = [by_pitch, turn * by_pitch, nothing]
+    if camera and chain.on_head:  # the offset is that of the image, too
+        sweep = [nothing, (turn - image_pitch) * by_pitch, nothing]
+    moved = np.concatenate([moved, np.stack(sweep, axis=-1)], axis=-1)
+    return moved if camera else chain.head[:, :3] @ moved
 
 
 def fit_feature(
@@ -367,29 +352,28 @@ def length_between(first: Feature, second: Feature) -> Length:
     _refuse_askew(first, second)
     kind, weights = _axes(first, second)
     place = np.concatenate([first.centre, first.axis, second.centre, second.axis])
-    gradient = []
-    for step in STEP * np.eye(12):
-        change = _length(place + step, kind, weights) - _length(place - step, kind, weights)
-        gradient.append(change / (2 * STEP))
-    noise = 0.0
-    moved = []
-    for feature, by in zip((first, second), np.split(np.array(gradient), 2), strict=True):
-        noise += by @ feature.noise @ by
-        moved.append(by @ feature.jacobian)
-    by_sweep = np.array(moved)[:, -3:-1]
+    steps = STEP * np.eye(12)
+    change = _length(place + steps, kind, weights) - _length(place - steps, kind, weights)
+    by_first, by_second = np.split(change / (2 * STEP), 2)
+    noise = by_first @ first.noise @ by_first + by_second @ second.noise @ by_second
+    moved = np.array([by_first @ first.jacobian, by_second @ second.jacobian])
+    by_sweep = moved[:, -3:-1]
     if first.placement == second.placement:
         by_sweep = by_sweep.sum(axis=0)
     noise += np.sum((by_sweep * uncertainty_of(first.rig).sweep_sigma) ** 2)
-    by_rig = (moved[0] + moved[1])[:-3]
-    shared = np.append(by_rig, [moved[0][-1], moved[1][-1]])
-    return Length(_length(place, kind, weights), float(noise), shared, first.rig)
+    return Length(
+        metres=float(_length(place, kind, weights)),
+        noise=float(noise),
+        shared=np.append(moved[:, :-3].sum(axis=0), moved[:, -1]),
+        rig=first.rig,
+    )
 
 
 def _refuse_askew(first, second):
     """DegenerateGeometry for planes or edges that are not parallel."""
     if Kind.POINT in (first.kind, second.kind):
         return
-    between = np.arccos(np.clip(abs(first.axis @ second.axis), 0, 1))
+    between = np.arccos(min(abs(first.axis @ second.axis), 1.0))
     if first.kind != second.kind:
         between = np.pi / 2 - between
     if between > ALIKE:
@@ -401,23 +385,24 @@ def _refuse_askew(first, second):
 
 def _axes(first, second):
     """Which kind of axes a length goes by, and their weights, which turn them to one side."""
-    features = (first, second)
-    kind = max((feature.kind for feature in features), key=list(Kind).index)
+    kind = max(first.kind, second.kind, key=list(Kind).index)
     weights = np.zeros(2)
-    for number, feature in enumerate(features):
-        if feature.kind == kind != Kind.POINT:
+    for number, feature in enumerate((first, second)):
+        if feature.kind == kind:
             weights[number] = 1 / max(np.trace(feature.noise[3:, 3:]), SURE)
+    weights /= weights.sum()
     if first.axis @ second.axis < 0:
-        weights[1] = -weights[1]
-    return kind, weights / max(np.abs(weights).sum(), SURE)
+        weights[1] *= -1
+    return kind, weights
 
 
 def _length(place, kind, weights):
-    """Length between two features with these centres and axes (12,)."""
-    first, first_axis, second, second_axis = place.reshape(4, 3)
+    """Lengths (...) between two features with these centres and axes (..., 12)."""
+    first, first_axis, second, second_axis = np.split(place, 4, axis=-1)
     way = second - first
     along = weights[0] * first_axis + weights[1] * second_axis
-    along = along / max(np.linalg.norm(along), SURE)
+    along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), SURE)
+    height = np.vecdot(along, way)
     if kind == Kind.PLANE:
-        return float(abs(along @ way))
-    return float(np.linalg.norm(way - (way @ along) * along))
+        return np.abs(height)
+    return np.linalg.norm(way - height[..., None] * along, axis=-1)

@@ -222,7 +222,8 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     stations = []
     walls = []
     for placement in _stations(session, rig):
-        cloud = _cloud(session, rig, placement)
+        sweep = session.sweep(placement)
+        cloud = join_clouds(sweep_blocks(session, rig.for_scenes, sweep, []))
         planes, of_point = planes_of(cloud, rig)
         wall = cloud.rows(largest_plane(cloud))
         if len(wall.points) > FEWEST_POINTS:
@@ -235,7 +236,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     of_pairs = [pairs_pull(*station, start) for station in stations]
     of_pairs = [pull for pull in of_pairs if pull is not None]
     shifts = suspects(of_creases, of_pairs, rig)
-    nothing = np.zeros(len(rig.uncertainty.names) + 1)
+    nothing = np.zeros_like(start)
     return Held(
         culprits=tuple(most_likely(shifts)),
         shifts=tuple(shifts),
@@ -264,19 +265,12 @@ def _stations(session, rig):
     return stations
 
 
-def _cloud(session, rig, placement) -> Cloud:
-    """The points of a station."""
-    return join_clouds(sweep_blocks(session, rig.for_scenes, session.sweep(placement), []))
-
-
 def flattened(cloud, planes, of_point):
     """A cloud whose points of flat surfaces are moved onto them: single readings are noisy."""
-    flat = of_point >= 0
-    plane = of_point[flat]
-    normal = np.reshape([plane.axis for plane in planes], (-1, 3))[plane]
-    centre = np.reshape([plane.centre for plane in planes], (-1, 3))[plane]
     points = cloud.points.copy()
-    points[flat] -= np.vecdot(points[flat] - centre, normal)[:, None] * normal
+    for number, plane in enumerate(planes):
+        rows = of_point == number
+        points[rows] = plane.foot(points[rows])
     return replace(cloud, points=points)
 
 
@@ -294,7 +288,7 @@ def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
     _, J, _ = carried(
         chain, wall.bearing, rig.corrections.pitch(-1, wall.pitch), wall.range
     )
-    by_link = np.vecmat(normal @ chain.head[:, :3], J)
+    by_link = normal @ chain.head[:, :3] @ J
     # a plane turns and shifts with the errors: only what bends it shows
     plane = np.insert(wall.points - wall.points.mean(axis=0), 0, 1.0, axis=1)
     by_link -= plane @ np.linalg.lstsq(plane, by_link, rcond=None)[0]

@@ -78,7 +78,7 @@ def pairs_pull(
     for first, second in combinations(views, 2):
         turned = abs(first.pitch - second.pitch)
         same = first.camera == second.camera
-        if turned < (NEAR_PITCH if same else 1e-3) and not (same and first.fixed):
+        if turned < (NEAR_PITCH if same else 1e-3):
             both = clear[id(first)] & clear[id(second)]
             rows = cloud.rows(patches[both])
             pairs.append(_pair(rows, surfaces[both], first, second, stops))
@@ -87,7 +87,7 @@ def pairs_pull(
     cameras = dict.fromkeys(view.camera for view in views)
     poses = np.concatenate([poses_of(views[0].rig, camera) for camera in cameras])
     noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
-    x = np.concatenate([start, np.zeros(len(noise))])
+    x = np.pad(start, (0, len(noise)))
     fitted = np.r_[poses, len(start) : len(x)]
     begun = x[fitted]
     # what moves both images alike stays where creases have it

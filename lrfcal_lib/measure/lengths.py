@@ -184,22 +184,20 @@ def measure(
     rows = []
     for row in picks.to_dict("records"):
         length = sigma = np.nan
-        stations: list[int] = []
+        lengths: dict[int, Length] = {}
         problem = ""
         try:
             lengths = _lengths(scenes, poses, row)
-        except DegenerateGeometry as error:
-            problem = str(error)
-        else:
-            stations = list(lengths)
             mean = mean_length(list(lengths.values()))
             length, sigma = mean.metres, mean.sigma
+        except DegenerateGeometry as error:
+            problem = str(error)
         row |= {
             "length_m": length,
             "sigma_m": sigma,
             "low_m": max(length - NINETY * sigma, 0.0),
             "high_m": length + NINETY * sigma,
-            "stations": " ".join(map(str, stations)),
+            "stations": " ".join(map(str, lengths)),
             "problem": problem,
         }
         rows.append(row)
@@ -243,12 +241,9 @@ def _shown(scenes, poses, kind, place) -> dict[int, Feature]:
     for number, scene in scenes.items():
         T = poses[number].inv() * poses[clicked]
         there = T.apply(foot)
-        axis = T.rotation.apply(feature.axis)
-        other, away = scene.at(kind, there, axis)
-        if number == clicked or away >= REACH:
-            continue
-        if np.linalg.norm(other.foot(there) - there) < ON_IT:
-            shown[number] = other
+        other, away = scene.at(kind, there, T.rotation.apply(feature.axis))
+        if away < REACH and np.linalg.norm(other.foot(there) - there) < ON_IT:
+            shown.setdefault(number, other)
     return shown
 
 
@@ -326,14 +321,12 @@ def for_page(
         lines += [poses[number].apply(edge.ends) for edge in scene.edges]
     rows = []
     for f in features:
-        parts = (f.centre, f.axis, f.ends.ravel(), f.noise.ravel(), f.jacobian.ravel())
-        rows.append(np.concatenate(parts))
-    frames = {}
-    for number, T in poses.items():
-        frames[number] = {
-            "R": T.rotation.as_matrix().tolist(),
-            "t": T.translation.tolist(),
-        }
+        parts = (f.centre, f.axis, f.ends, f.noise, f.jacobian)
+        rows.append(np.concatenate(parts, axis=None))
+    frames = {
+        number: {"R": T.rotation.as_matrix().tolist(), "t": T.translation.tolist()}
+        for number, T in poses.items()
+    }
     rig = next(iter(scenes.values())).rig
     known = uncertainty_of(rig)
     return {

@@ -12,14 +12,14 @@ from itertools import permutations, product
 
 import numpy as np
 import small_gicp
-from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.signal import fftconvolve
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.fit.robust import biweight, robust_sigma
+from lrfcal_lib.fit.robust import biweight, robust_sigma, sums_by
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
@@ -41,12 +41,14 @@ UPRIGHT = np.cos(
     np.radians(25.0)
 )  # between the z axes of platforms that stand on their feet
 CELL = 0.2  # metres, of the grid on which shifts are looked for
+GRID = (1, 2, 3)  # its axes, after that of the components of normals
+ROOM = 4  # cells beside what is on it: four standard deviations of a blur
 PEAKS = 6  # shifts tried a turn
 STARTS = 10  # tried a pair
 WIDTHS = (0.4, 0.2)  # metres within which patches are taken for the same, one by one
 AROUND = 20  # patches that make a covariance
-SAME_PLACE = 0.15  # metres, and
-SAME_YAW = np.radians(3.0)  # within which two starts ended at the same pose
+# turn and metres: nearer together, two starts ended at the same pose
+SAME_POSE = (np.radians(3.0), 0.15)
 MATCHED = 0.1  # metres between patches of the same surface
 FACING = np.cos(np.radians(30.0))  # between normals of the same surface
 LOOK = np.radians(1.0)  # side of a cell of what a station saw
@@ -105,29 +107,24 @@ def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> S
         If no part of it is smooth.
     """
     whole = cloud.rows(np.isfinite(cloud.normals).all(axis=1))
-    cells = np.floor(whole.points / size).astype(int)
-    _, patch, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-
-    def mean(columns):
-        sums = [np.bincount(patch, column) for column in columns.T]
-        return np.stack(sums, axis=1) / count[:, None]
-
-    points = mean(whole.points)
-    normals = mean(whole.normals)
-    sigma = np.sqrt(mean(whole.sigma[:, None] ** 2)[:, 0] / count)
-    length = np.linalg.norm(normals, axis=1)
-    flat = length > FLAT
+    one = np.ones(len(whole.points))
+    columns = [whole.points, whole.normals, _moves(whole, rig), whole.sigma**2, one]
+    sums = sums_by(np.floor(whole.points / size), np.column_stack(columns))
+    count = sums[:, -1:]
+    length = np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True)
+    flat = (length > FLAT * count)[:, 0]
     if not flat.any():
         raise ValueError("no part of the cloud is a smooth surface")
-    points = points[flat]
+    means = (sums / count)[flat]
+    points, normals, moves, variance, _ = np.split(means, [3, 6, -2, -1], axis=1)
     gicp = small_gicp.PointCloud(points)
     gicp_tree = small_gicp.KdTree(gicp)
     small_gicp.estimate_normals_covariances(gicp, gicp_tree, AROUND)
     return Surface(
         points=points,
-        normals=normals[flat] / length[flat, None],
-        sigma=sigma[flat],
-        moves=mean(_moves(whole, rig))[flat],
+        normals=unit_vector(normals),
+        sigma=np.sqrt(variance / count[flat])[:, 0],
+        moves=moves,
         nearest=_look(cloud.points),
         gicp=gicp,
         gicp_tree=gicp_tree,
@@ -149,21 +146,19 @@ def _moves(cloud, rig):
 
 
 def _cells(points):
-    """Where points (n, 3) stand in the view of a platform: row, column, range (n,)."""
-    distance = np.linalg.norm(points, axis=1)
-    azimuth = np.arctan2(points[:, 0], points[:, 1])
-    height = np.arcsin(points[:, 2] / np.maximum(distance, 1e-9))
-    row = np.floor((azimuth + np.pi) / LOOK).astype(int)
-    column = np.floor((height + np.pi / 2) / LOOK).astype(int)
-    return row, column, distance
+    """Where points (n, 3) stand in the view of a platform: row and column, and range (n,)."""
+    x, y, z = points.T
+    away = np.hypot(x, y)
+    angles = np.array([np.arctan2(x, y) + np.pi, np.arctan2(z, away) + np.pi / 2])
+    return tuple((angles / LOOK).astype(int)), np.hypot(away, z)
 
 
 def _look(points):
     """Nearest range in every cell of the view of a platform and the cells about it, or 0."""
-    row, column, distance = _cells(points)
+    cell, distance = _cells(points)
     shape = (int(2 * np.pi / LOOK) + 1, int(np.pi / LOOK) + 1)
     nearest = np.full(shape, np.inf)
-    np.minimum.at(nearest, (row, column), distance)
+    np.minimum.at(nearest, cell, distance)
     nearest = minimum_filter(nearest, 3)
     return np.nan_to_num(nearest, posinf=0.0, neginf=0.0)
 
@@ -201,16 +196,11 @@ def candidates(first: Surface, second: Surface) -> list[Candidate]:
     ended: list[RigidTransform] = []
     for start in starts(first, second):
         T = refined(first, second, start)
-        if not any(_same(T, other) for other in ended):
+        apart = [np.divide(transform_difference(T, other), SAME_POSE) for other in ended]
+        if all(max(parts) >= 1 for parts in apart):
             ended.append(T)
     found = [agreement(first, second, T) for T in ended]
     return sorted(found, key=lambda c: -c.overlap * (1 - c.against))
-
-
-def _same(a, b):
-    """Whether two poses are one."""
-    angle, distance = transform_difference(a, b)
-    return distance < SAME_PLACE and angle < SAME_YAW
 
 
 def starts(first: Surface, second: Surface) -> list[RigidTransform]:
@@ -223,20 +213,20 @@ def starts(first: Surface, second: Surface) -> list[RigidTransform]:
 
 
 def _directions(surface):
-    """Directions (k, 3) in which many patches face, the most of them first."""
+    """Directions (3,) in which many patches face, the most of them first."""
     every = max(1, len(surface.normals) // 2000)
     left = surface.normals[::every]
     least = FEW * len(left)
     found = []
-    while len(found) < DIRECTIONS and len(left):
+    for _ in range(DIRECTIONS):
         near = left @ left.T > NEAR
-        best = near[np.argmax(near.sum(axis=1))]
-        if best.sum() < least:
+        count = near.sum(axis=1)
+        if count.max(initial=0) < least:
             break
-        mean = unit_vector(left[best].mean(axis=0))
+        mean = unit_vector(left[near[count.argmax()]].mean(axis=0))
         found.append(mean)
         left = left[left @ mean < NEAR]
-    return np.array(found).reshape(-1, 3)
+    return found
 
 
 def _turns(first, second):
@@ -262,34 +252,28 @@ def _shifts(first, second, turn):
 
     The correlation of normals on a grid: surfaces count that face the same way.
     """
-    moved = turn.apply(second.points)
-    low = first.points.min(axis=0)
-    low_moved = moved.min(axis=0)
-    span = np.ptp(first.points, axis=0) + np.ptp(moved, axis=0)
-    shape = [next_fast_len(int(n) + 4, real=True) for n in span / CELL]
-    score = np.zeros(shape)
-    for axis in range(3):
-        here = _on_grid(first.points - low, first.normals[:, axis], shape)
-        there = _on_grid(moved - low_moved, turn.apply(second.normals)[:, axis], shape)
-        blurred = gaussian_filter(here, 1.0, mode="wrap")
-        score += irfftn(rfftn(blurred) * np.conj(rfftn(there)), s=shape)
-    top = np.where(score == maximum_filter(score, 5, mode="wrap"), score, 0.0)
-    best = np.argsort(top, axis=None)[::-1][:PEAKS]
+    here, low = _on_grid(first.points, first.normals)
+    there, low_moved = _on_grid(turn.apply(second.points), turn.apply(second.normals))
+    blurred = gaussian_filter(here, 1.0, axes=GRID)
+    score = fftconvolve(blurred, np.flip(there, GRID), axes=GRID).sum(axis=0)
+    top = np.where(score == maximum_filter(score, 5), score, 0.0)
     found = []
-    for place in best:
-        cell = np.array(np.unravel_index(place, shape))
-        # beyond the extent of the first, a shift is one to the other side
-        back = cell * CELL > np.ptp(first.points, axis=0) + 2 * CELL
-        shift = (cell - back * np.array(shape)) * CELL + low - low_moved
+    for place in np.argsort(top, axis=None)[::-1][:PEAKS]:
+        cell = np.unravel_index(place, top.shape) - np.array(there.shape[1:]) + 1
+        shift = cell * CELL + low - low_moved
         found.append((top.flat[place], RigidTransform.from_components(shift, turn)))
     return found
 
 
-def _on_grid(points, values, shape):
-    """Sums of values (n,) on the nearest points of a grid."""
-    grid = np.zeros(shape)
-    np.add.at(grid, tuple(np.rint(points / CELL).astype(int).T), values)
-    return grid
+def _on_grid(points, values):
+    """Sums of values (n, 3) on the nearest points of a grid (3, a, b, c), with room for what is
+    blurred, and where it begins.
+    """
+    low = points.min(axis=0) - ROOM * CELL
+    cells = np.rint((points - low) / CELL).astype(int)
+    grid = np.zeros((3, *cells.max(axis=0) + ROOM + 1))
+    np.add.at(grid, (slice(None), *cells.T), values.T)
+    return grid, low
 
 
 def refined(first: Surface, second: Surface, start: RigidTransform) -> RigidTransform:
@@ -311,7 +295,7 @@ def refined(first: Surface, second: Surface, start: RigidTransform) -> RigidTran
 def agreement(first: Surface, second: Surface, T: RigidTransform) -> Candidate:
     """How two stations agree at a pose of the second."""
     here, there = matches(first, second, T)
-    both = len(np.unique(here)), len(there)
+    both = (len(np.unique(here)), len(there))
     conflicts = _before(first, T.apply(second.points))
     conflicts += _before(second, T.inv().apply(first.points))
     fewer = min(len(first.points), len(second.points))
@@ -331,8 +315,8 @@ def matches(first: Surface, second: Surface, T: RigidTransform, width: float = M
 
 def _before(surface, points):
     """How many points (n, 3) stand where a station looked through."""
-    row, column, distance = _cells(points)
-    return int(np.sum(distance < surface.nearest[row, column] - CLEAR))
+    cell, distance = _cells(points)
+    return int(np.sum(distance < surface.nearest[cell] - CLEAR))
 
 
 @dataclass(frozen=True)
@@ -407,14 +391,13 @@ def fitted(
         sigma = np.sqrt(first.sigma[here] ** 2 + second.sigma[there] ** 2 + COMMON**2)
         sigma *= robust_sigma(r / sigma, least=1.0)
         weight = biweight(r, sigma) / sigma**2
-        inverse = np.linalg.pinv(J.T @ (weight[:, None] * J), rcond=1e-12)
-        step = -inverse @ (J.T @ (weight * r))
+        weighted = J * weight[:, None]
+        inverse = np.linalg.pinv(J.T @ weighted, rcond=1e-12)
+        gain = -inverse @ weighted.T
+        step = gain @ r
         T = moved(T, step)
-    pulls = J * (weight * (r + J @ step))[:, None]
-    cells = np.floor(first.points[here] / NEIGHBOURS).astype(int)
-    _, group = np.unique(cells, axis=0, return_inverse=True)
-    sums = np.stack([np.bincount(group, column) for column in pulls.T], axis=1)
-    gain = -inverse @ (J * weight[:, None]).T
+    pulls = weighted * (r + J @ step)[:, None]
+    sums = sums_by(np.floor(first.points[here] / NEIGHBOURS), pulls)
     by_first = gain @ first.moves[here]
     by_second = gain @ second.moves[there]
     by_sweeps = np.hstack([by_first[:, -2:], by_second[:, -2:]])

@@ -78,11 +78,9 @@ def seen_at(
     """
     first, last = np.sort(sweep)
     bearings = _grid(*rig.lrf.field_of_view)
-    ranges = np.repeat(DISTANCES, len(bearings)).reshape(len(DISTANCES), -1)
-    p_lrf = polar_to_points(ranges, bearings).reshape(-1, 3)
+    p_lrf = polar_to_points(np.reshape(DISTANCES, (-1, 1)), bearings).reshape(-1, 3)
     turns = rig.corrections.pitch(NEW, _grid(first, last))
-    clouds = [lrf_to_platform(p_lrf, turn, rig.T_head_lrf) for turn in turns]
-    points = np.concatenate(clouds)
+    points = lrf_to_platform(p_lrf, turns[:, None], rig.T_head_lrf).reshape(-1, 3)
     visible = np.zeros((len(pitches), len(points)), bool)
     for row, pitch in zip(visible, rig.corrections.pitch(NEW, pitches), strict=True):
         for name, camera in rig.cameras.items():

@@ -1,6 +1,6 @@
 """Poses of stations that agree best with all pairs of them."""
 
-from collections.abc import Iterable
+from collections.abc import Collection
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -10,12 +10,12 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.measure.pairs import Pair, moved
 
 
-def connected(pairs: Iterable[Pair], station: int) -> dict[int, RigidTransform]:
+def connected(pairs: Collection[Pair], station: int) -> dict[int, RigidTransform]:
     """Rough poses of all stations that pairs lead to, in the frame of one, along the best pairs.
 
     Parameters
     ----------
-    pairs : iterable of Pair
+    pairs : collection of Pair
     station : int
 
     Returns
@@ -23,19 +23,15 @@ def connected(pairs: Iterable[Pair], station: int) -> dict[int, RigidTransform]:
     dict of int to RigidTransform
         The one itself first.
     """
-    left = sorted(pairs, key=lambda pair: np.trace(pair.covariance))
-    poses = {station: RigidTransform.identity()}
-    while True:
-        leads_on = [
-            pair for pair in left if (pair.first in poses) != (pair.second in poses)
-        ]
-        if not leads_on:
-            return {n: poses[n] for n in sorted(poses, key=lambda n: (n != station, n))}
-        pair = leads_on[0]
-        if pair.first in poses:
-            poses[pair.second] = poses[pair.first] * pair.T_first_second
+    start = {station: RigidTransform.identity()}
+    poses = dict(start)
+    while leads_on := [p for p in pairs if (p.first in poses) != (p.second in poses)]:
+        best = min(leads_on, key=lambda pair: np.trace(pair.covariance))
+        if best.first in poses:
+            poses[best.second] = poses[best.first] * best.T_first_second
         else:
-            poses[pair.first] = poses[pair.second] * pair.T_first_second.inv()
+            poses[best.first] = poses[best.second] * best.T_first_second.inv()
+    return start | dict(sorted(poses.items()))
 
 
 def solved(pairs: list[Pair], station: int) -> tuple[dict[int, RigidTransform], np.ndarray]:
@@ -44,7 +40,7 @@ def solved(pairs: list[Pair], station: int) -> tuple[dict[int, RigidTransform], 
     Parameters
     ----------
     pairs : list of Pair
-        Between stations that they connect.
+        One or more, between stations that they connect.
     station : int
         Whose frame the poses are in.
 
@@ -57,9 +53,6 @@ def solved(pairs: list[Pair], station: int) -> tuple[dict[int, RigidTransform], 
     """
     start = connected(pairs, station)
     size = 6 * len(start) - 6
-    response = np.zeros((size + 6, 6 * len(pairs)))
-    if not size:
-        return start, response
 
     def after(steps):
         """The poses after turns and shifts of all but the first."""
@@ -72,5 +65,5 @@ def solved(pairs: list[Pair], station: int) -> tuple[dict[int, RigidTransform], 
 
     best = least_squares(residuals, np.zeros(size), jac="3-point", x_scale="jac")
     whiten = block_diag(*(pair.whiten for pair in pairs))
-    response[6:] = np.linalg.pinv(best.jac) @ whiten
-    return after(best.x), response
+    response = np.linalg.pinv(best.jac) @ whiten
+    return after(best.x), np.pad(response, ((6, 0), (0, 0)))

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import columns_of
+from lrfcal_lib.calibrate.rig_uncertainty import columns_of, selection
+from lrfcal_lib.fit.robust import sums_by
 from lrfcal_lib.judge.uncertainty import carried, chain_of
 from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.session.read import Session
@@ -62,13 +63,8 @@ class View:
         beams = beams_to(points, self.rig.T_head_lrf)
         chain = chain_of(self.rig, self.camera)
         p_camera, by_link, by_pitch = carried(chain, *beams, self.pitch)
-        names = self.rig.uncertainty.names
-        columns = columns_of(names, self.camera)
-        known = columns >= 0
-        J = np.zeros((*p_camera.shape, len(names) + 1))
-        J[..., columns[known]] = by_link[..., known]
-        J[..., -1] = by_pitch
-        return p_camera, J
+        by_rig = by_link @ selection(self.rig.uncertainty.names, self.camera)
+        return p_camera, np.concatenate([by_rig, by_pitch[..., None]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -144,10 +140,9 @@ def pull_of_groups(
     fitted : ndarray of int, shape (f,)
         Which of them were fitted: by their slopes groups scatter.
     """
-    _, group = np.unique(group, return_inverse=True)
-    sums = np.zeros((group.max() + 1, len(fitted)))
-    np.add.at(sums, group, by_row[:, fitted])
-    load = np.bincount(group, np.linalg.norm(by_row, axis=1))
+    size = np.linalg.norm(by_row, axis=1)
+    sums = sums_by(group, by_row[:, fitted])
+    load = sums_by(group, size)
     groups = load.sum() ** 2 / max(load @ load, 1e-300)
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
     excess = np.trace(own @ sums.T @ sums) / max(len(fitted), 1)

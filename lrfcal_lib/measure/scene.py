@@ -136,20 +136,18 @@ def colored_blocks(
     rig : CalibratedRig
     station : Station
 
-    Yields
-    ------
-    Cloud
+    Returns
+    -------
+    iterator of Cloud
         Points that no image saw are grey, by intensity where the sensor has it.
     """
-    levels = None
+    blocks = sweep_blocks(session, rig.for_scenes, station.sweep, station.views)
     intensities = station.sweep.intensities
-    if intensities is not None:
-        some = intensities.ravel()[:: 1 + intensities.size // COMPARED]
-        levels = np.nanpercentile(some, [2, 98])
-    for cloud in sweep_blocks(session, rig.for_scenes, station.sweep, station.views):
-        if levels is not None:
-            cloud = _shaded(cloud, *levels)
-        yield cloud
+    if intensities is None:
+        return blocks
+    subset = intensities.ravel()[:: 1 + intensities.size // COMPARED]
+    levels = np.nanpercentile(subset, [2, 98])
+    return (_shaded(cloud, *levels) for cloud in blocks)
 
 
 def _shaded(cloud, weak, strong):
@@ -226,13 +224,12 @@ def write_scene(
             write_ply(ply, blocks, [about])
         write_pcd(pcd, ply, [about])
         title = f"{session.name}, station {', '.join(map(str, poses))}"
-        _measuring_page(page_draft, scenes, poses, title, about)
+        _measuring_page(page_draft, rig, scenes, poses, title, about)
     return [ply, pcd, e57, page]
 
 
-def _measuring_page(path, scenes, poses, title, note):
+def _measuring_page(path, rig, scenes, poses, title, note):
     """Write the page on which two clicks give a length: SceneFeatures and poses by station."""
-    rig = next(iter(scenes.values())).rig
     cameras = {
         name: (rig.camera_at(name, 0.0), camera.model)
         for name, camera in rig.cameras.items()

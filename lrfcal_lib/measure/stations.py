@@ -9,6 +9,7 @@ and only a level or a plumb line would tell G. Compare poses with a truth after 
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -71,8 +72,9 @@ class Joined:
 
         That is the error which loops through it leave there; 0 without loops.
         """
-        miss = pair.miss(self.T_world_station)
-        return float(np.linalg.norm(miss[:3])), float(np.linalg.norm(miss[3:]))
+        miss = pair.miss(self.T_world_station).reshape(2, 3)
+        turn, shift = np.linalg.norm(miss, axis=1)
+        return float(turn), float(shift)
 
     def covariance_of(self, station: int) -> np.ndarray:
         """Of turn and shift of a station, (6, 6)."""
@@ -115,26 +117,18 @@ def join_stations(clouds: Mapping[int, Cloud], rig: CalibratedRig | None = None)
             fine[number] = surface_of(cloud, FINE, rig)
         except ValueError as error:
             raise ValueError(f"station {number}: {error}") from error
-    pairs = []
-    problems = []
-    for first, second in combinations(sorted(clouds), 2):
-        result = join_pair(
-            (first, second),
-            (coarse[first], coarse[second]),
-            (fine[first], fine[second]),
-        )
-        if isinstance(result, Pair):
-            pairs.append(result)
-        else:
-            problems.append(result)
+    numbers = sorted(clouds)
+    results = [join_pair(names, coarse, fine) for names in combinations(numbers, 2)]
+    pairs = [result for result in results if isinstance(result, Pair)]
+    problems = [result for result in results if isinstance(result, Problem)]
     of_rig = chain_of(rig).covariances[-1] if rig else np.zeros((len(COLUMNS),) * 2)
-    return _joined(sorted(clouds), pairs, problems, of_rig)
+    return _joined(numbers, pairs, problems, of_rig)
 
 
 def join_pair(
     names: tuple[int, int],
-    coarse: tuple[Surface, Surface],
-    fine: tuple[Surface, Surface],
+    coarse: Mapping[int, Surface],
+    fine: Mapping[int, Surface],
 ) -> Pair | Problem:
     """Two stations beside each other.
 
@@ -142,15 +136,16 @@ def join_pair(
     ----------
     names : tuple of int
         Their numbers.
-    coarse, fine : tuple of Surface
-        Both in patches of `COARSE` and of `FINE`.
+    coarse, fine : dict of int to Surface
+        By station, in patches of `COARSE` and of `FINE`.
 
     Returns
     -------
     Pair or Problem
         Why they are not joined.
     """
-    tried = candidates(*coarse)
+    first, second = names
+    tried = candidates(coarse[first], coarse[second])
     good = [c for c in tried if c.overlap > LEAST_OVERLAP and c.against < MOST_AGAINST]
     if not tried:
         words = "they have no two directions of walls in common"
@@ -173,11 +168,10 @@ def join_pair(
                 names,
                 ProblemKind.AMBIGUOUS,
                 f"they fit together in two ways, {far:.2f} m and {np.degrees(angle):.0f} deg apart "
-                f"(overlap "
-                f"{100 * best.overlap:.0f} % and {100 * other.overlap:.0f} %): the scene repeats "
-                "itself or is symmetric",
+                f"(overlap {100 * best.overlap:.0f} % and {100 * other.overlap:.0f} %): the scene "
+                "repeats itself or is symmetric",
             )
-    pair = fitted(names, *fine, best.T_first_second)
+    pair = fitted(names, fine[first], fine[second], best.T_first_second)
     variance = [np.linalg.eigvalsh(pair.covariance[k, k])[-1] for k in (TURN, SHIFT)]
     if pair.held < LEAST_HELD or np.any(np.sqrt(variance) > MOST_SIGMA):
         x, y, z = pair.loose
@@ -198,44 +192,36 @@ def _problem(names, kind, words):
 
 def _joined(numbers, pairs, problems, of_rig):
     """The Joined of the largest group of stations, without pairs that loops contradict."""
-    groups = [connected(pairs, number) for number in numbers]
-    largest = max(groups, key=len)
+    largest = max((connected(pairs, number) for number in numbers), key=len)
     reference = min(largest)
     pairs = [pair for pair in pairs if pair.first in largest]
-    while True:
+    joined = alone(reference)
+    if pairs:
         poses, response = solved(pairs, reference)
-        covariance = _covariance(pairs, response, of_rig)
-        joined = Joined(poses, covariance, tuple(pairs), tuple(problems))
-        worst = max(pairs, key=lambda pair: _excess(joined, pair), default=None)
-        if worst is None or _excess(joined, worst) < 1.0:
-            break
-        pairs.remove(worst)
-        turn, shift = joined.miss(worst)
-        words = (
-            f"the loops through them miss by {np.degrees(turn):.2f} deg and {1000 * shift:.0f} mm: "
-            "they are not used together"
-        )
-        problems.append(
-            _problem((worst.first, worst.second), ProblemKind.CONTRADICTS, words)
-        )
-        if len(connected(pairs, reference)) < len(poses):
-            return _joined(numbers, pairs, problems, of_rig)
-    for number in sorted(set(numbers) - set(poses)):
-        words = (
-            f"station {number} is left out: nothing joins it to station {reference}; record one "
-            "between them that sees what both see"
-        )
-        problems.append(Problem(Stage.STATIONS, ProblemKind.LEFT_OUT, words))
+        # noise of each pair, and the calibration, common to all
+        noise = block_diag(*(pair.covariance for pair in pairs))
+        by_rig = response @ np.vstack([pair.by_rig for pair in pairs])
+        covariance = response @ noise @ response.T + by_rig @ of_rig @ by_rig.T
+        joined = Joined(poses, covariance, tuple(pairs), ())
+        worst = max(pairs, key=partial(_excess, joined))
+        if _excess(joined, worst) >= 1.0:
+            turn, shift = joined.miss(worst)
+            problem = _problem(
+                (worst.first, worst.second),
+                ProblemKind.CONTRADICTS,
+                f"the loops through them miss by {np.degrees(turn):.2f} deg and "
+                f"{1000 * shift:.0f} mm: they are not used together",
+            )
+            others = [pair for pair in pairs if pair is not worst]
+            return _joined(numbers, others, [*problems, problem], of_rig)
+    for number in numbers:
+        if number not in largest:
+            words = (
+                f"station {number} is left out: nothing joins it to station {reference}; record "
+                "one between them that sees what both see"
+            )
+            problems.append(Problem(Stage.STATIONS, ProblemKind.LEFT_OUT, words))
     return replace(joined, problems=tuple(problems))
-
-
-def _covariance(pairs, response, of_rig):
-    """Of the poses of stations: noise of each pair, and the calibration, common to all."""
-    if not pairs:
-        return np.zeros((6, 6))
-    noise = block_diag(*(pair.covariance for pair in pairs))
-    by_rig = response @ np.vstack([pair.by_rig for pair in pairs])
-    return response @ noise @ response.T + by_rig @ of_rig @ by_rig.T
 
 
 def _excess(joined, pair):

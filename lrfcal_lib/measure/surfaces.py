@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import binary_erosion, label
-from scipy.spatial import KDTree
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -43,25 +42,20 @@ def planes_of(cloud: Cloud, rig: CalibratedRig) -> tuple[list[Feature], np.ndarr
     """
     of_point = np.full(len(cloud.points), -1)
     planes: list[Feature] = []
-    smooth = np.isfinite(cloud.normals).all(axis=1)
-    free = np.flatnonzero(smooth)
-    points = cloud.points[free]
-    normals = cloud.normals[free]
-    tree = KDTree(cloud.points)
+    free = np.flatnonzero(np.isfinite(cloud.normals).all(axis=1))
+    left = cloud.rows(free)
     for seed in range(0, len(of_point), max(1, len(of_point) // SEEDS)):
-        if of_point[seed] >= 0 or not smooth[seed]:
+        if of_point[seed] >= 0:
             continue
-        near = tree.query_ball_point(cloud.points[seed], SEED, return_sorted=True)
-        near = np.array(near)[(smooth & (of_point < 0))[near]]
-        rows = np.searchsorted(free, near)
-        rows = rows[normals[rows] @ cloud.normals[seed] > np.cos(ALIKE)]
-        surface = free[_grown(points, normals, rows, cloud.points[seed])]
+        place = cloud.points[seed]
+        rows = np.flatnonzero(left.normals @ cloud.normals[seed] > np.cos(ALIKE))
+        rows = rows[np.linalg.norm(left.points[rows] - place, axis=1) <= SEED]
+        surface = free[_grown(left.points, left.normals, rows, place)]
         if len(surface) >= FEWEST:
             of_point[surface] = len(planes)
             planes.append(_fitted(cloud, surface, rig))
             free = free[of_point[free] < 0]
-            points = cloud.points[free]
-            normals = cloud.normals[free]
+            left = cloud.rows(free)
     return planes, of_point
 
 
@@ -105,9 +99,8 @@ def _fitted(cloud, surface, rig):
     plane = fit_feature(cloud, inner, rig)
     if len(inner) < len(surface):
         return plane
-    noise = plane.noise.copy()
-    noise[:3, :3] += ALL_RIM**2 * np.outer(plane.axis, plane.axis)
-    return replace(plane, noise=noise)
+    rim = ALL_RIM**2 * np.outer(plane.axis, plane.axis)
+    return replace(plane, noise=plane.noise + np.pad(rim, (0, 3)))
 
 
 def _inner(points, surface):

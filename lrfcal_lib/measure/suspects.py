@@ -169,25 +169,25 @@ def _asked(seen, pairs, rig):
     of the unknowns that it moves by, and the likeliest Fit.
     """
     C = _allowed(rig)
-    ways = [SPREAD * (np.arange(6) < 3), SPREAD * (np.arange(6) >= 3), SPREAD]
+    turns = np.arange(6) < 3
+    ways = [SPREAD * turns, SPREAD * ~turns, SPREAD]
     moves = [(camera, poses_of(rig, camera), ways) for camera in rig.cameras]
     if any(camera.mount == "platform" for camera in rig.cameras.values()):
-        moves.append((None, np.array([len(C) - 1]), [SLIP]))
+        moves.append((None, np.array([-1]), [SLIP]))
     asked = []
     for camera, columns, ways in moves:
-        fits = []
-        for likely in ways:
-            wide = C.copy()
-            wide[columns, columns] += likely**2
-            fits.append(_fitted(seen, pairs, wide))
+        fits = [_fitted(seen, pairs, C, columns, likely) for likely in ways]
         asked.append((camera, columns, max(fits, key=lambda fit: fit.evidence)))
-    return _fitted(seen, pairs, C), asked
+    return _fitted(seen, pairs, C, [], 0.0), asked
 
 
-def _fitted(seen, pairs, C):
-    """The Fit of changes that are likely to a covariance C (c, c): expectation and maximisation,
-    with edges that are sought nearer and nearer, and Laplace's approximation of the evidence.
+def _fitted(seen, pairs, C, columns, likely):
+    """The Fit of changes that are likely to a covariance C (c, c), and in some columns to standard
+    deviations besides: expectation and maximisation, with edges that are sought nearer and nearer,
+    and Laplace's approximation of the evidence.
     """
+    C = C.copy()
+    C[columns, columns] += likely**2
     change = np.zeros(len(C))
     for width in WIDTHS:
         information = np.zeros_like(C)
@@ -207,18 +207,15 @@ def _fitted(seen, pairs, C):
 def _allowed(rig):
     """Covariance (c, c) of the unknowns where nothing has moved, the pitch of sweeps last."""
     known = rig.uncertainty
-    count = len(known.names)
-    C = np.zeros((count + 1,) * 2)
-    C[:count, :count] = np.nan_to_num(known.trusted, posinf=0.0, neginf=0.0)
+    C = np.pad(np.where(np.isfinite(known.trusted), known.trusted, 0.0), (0, 1))
     common = np.zeros((len(C), 6))
     for name, camera in rig.cameras.items():
         columns = poses_of(rig, name)
         C[columns, columns] += OWN**2
         if camera.mount == "head":
             common[columns, np.arange(6)] = COMMON
-    C += common @ common.T
-    C[count, count] = known.sweep_sigma[0] ** 2 + PITCH_NOISE**2
-    return C
+    C[-1, -1] = known.sweep_sigma[0] ** 2 + PITCH_NOISE**2
+    return C + common @ common.T
 
 
 def _shift(camera, columns, fit, evidence, rig):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.covariance import pseudo_inverse
+from lrfcal_lib.fit.covariance import motion_words, pseudo_inverse
 from lrfcal_lib.fit.edge_likelihood import disc_edge
 from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
@@ -365,7 +365,7 @@ def joint_words(
     for camera in cameras:
         index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
         if large[index].any():
-            words.append(geometry.motion_words(direction[index], camera))
+            words.append(motion_words(direction[index], camera))
     words += [
         WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS
     ]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.fit.covariance import inverse_root
+from lrfcal_lib.fit.covariance import inverse_root, motion_words
 from lrfcal_lib.fit.least_squares import Block, minimise_in_rounds, solve
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m, read_pose
@@ -21,7 +21,6 @@ from lrfcal_lib.model.geometry import (
     cross,
     gradient_by_pose,
     hat,
-    motion_words,
     move_pose,
     pose_array,
     pose_transform,
