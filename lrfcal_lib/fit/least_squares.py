@@ -265,6 +265,29 @@ def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
     return eliminate(hessian, np.zeros(hessian.shape[:2]), shared)[0]
 
 
+def _by_shared(back):
+    """Derivatives (p, k, c) of the best values of all unknowns by the shared ones."""
+    own = -back[..., :-1]
+    same = np.eye(own.shape[-1])
+    return np.concatenate([np.broadcast_to(same, (len(own), *same.shape)), own], axis=1)
+
+
+def likeliest(
+    hessian: np.ndarray, gradient: np.ndarray, shared: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Steps (p, k) of all unknowns of every placement to the minimum, and their covariances (p, k,
+    k), from normal equations as of :func:`eliminate`.
+    """
+    reduced, right, back = eliminate(hessian, gradient, shared)
+    by_shared = _by_shared(back)
+    inverse = pseudo_inverse(np.sum(reduced, axis=0))
+    steps = by_shared @ (-inverse @ np.sum(right, axis=0))
+    steps[:, shared:] -= back[..., shared]
+    covariance = by_shared @ inverse @ by_shared.mT
+    covariance[:, shared:, shared:] += pseudo_inverse(hessian[:, shared:, shared:])
+    return steps, covariance
+
+
 def _step(hessian, gradient, damping, shared):
     """A damped step, its squared length in standard deviations, and the fall of the cost it
     promises.
@@ -279,10 +302,9 @@ def _step(hessian, gradient, damping, shared):
     else:
         reduced, right, back = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
-        step = common, -(back[..., shared] + back[..., :shared] @ common)
-        whole = np.concatenate(
-            [np.broadcast_to(common, (len(back), shared)), step[1]], axis=-1
-        )
+        whole = _by_shared(back) @ common
+        whole[:, shared:] -= back[..., shared]
+        step = common, whole[:, shared:]
     length = np.vecdot(whole, np.matvec(hessian, whole))
     promised = -np.vecdot(whole, gradient) - 0.5 * length
     if shared is None:
