@@ -6,12 +6,12 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 from scipy.special import log_ndtr
 
 ROOT_2PI = np.sqrt(2 * np.pi)
 # of a beam step: least softness, so that an edge between two beams is put into their middle
 LEAST_STEP = 0.15
-LEAST_SHARE = 1e-12  # of a spot, so that odds stay finite
 
 
 def disc_share(x: np.ndarray) -> np.ndarray:
@@ -46,29 +46,18 @@ def disc_edge(log_odds: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     slope : ndarray
         ``dx / dlog_odds`` (negative).
     """
-    log_odds = np.asarray(log_odds, float)
-    table, odds = _table()
-    x = np.interp(-log_odds, -odds, table)
-    slope, here = _slope(x)
-    # value and slope must agree for steps to converge
-    refined = x + slope * np.clip(log_odds - here, -1e-4, 1e-4)
-    return refined, _slope(refined)[0]
+    spline = _spline()
+    odds = np.clip(log_odds, *spline.x[[0, -1]])
+    return spline(odds), spline(odds, 1)
 
 
 @cache
-def _table():
-    """Distances of an edge in radii, dense where the share changes least, and their log odds."""
-    x = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]
-    return x, np.log(disc_share(x)) - np.log(disc_share(-x))
-
-
-def _slope(x):
-    """``dx / dlog_odds`` and the log odds of the share inside, at a distance of the edge in
-    radii.
+def _spline():
+    """Distance of an edge in radii by the log odds, from points dense where the share changes
+    least.
     """
-    inside, outside = (np.maximum(disc_share(v), LEAST_SHARE) for v in (x, -x))
-    slope = -inside * outside * np.pi / (2 * np.sqrt(np.maximum(1 - x**2, 1e-12)))
-    return slope, np.log(inside / outside)
+    x = np.sin(np.linspace(1, -1, 4001) * np.pi / 2)[1:-1]
+    return CubicSpline(np.log(disc_share(x) / disc_share(-x)), x)
 
 
 def edge_shift(
