@@ -220,12 +220,7 @@ def head_from_axis(axis: TiltAxis, stated: RigidTransform | None = None) -> Rigi
         ``T_head_lrf`` with the smallest rotation that maps the axis' direction to x, and no shift
         along the axis.
     """
-    direction = np.asarray(axis.direction, float)
-    turn = np.cross(direction, [1.0, 0.0, 0.0])
-    sine = np.linalg.norm(turn)
-    rotation = Rotation.identity()
-    if sine > 0:
-        rotation = Rotation.from_rotvec(turn / sine * np.arctan2(sine, direction[0]))
+    rotation, _ = Rotation.align_vectors([1.0, 0.0, 0.0], axis.direction)
     head = RigidTransform.from_components(-rotation.apply(axis.foot), rotation)
     if stated is None:
         return head
