@@ -217,8 +217,7 @@ def gather(cameras, placements):
         scatter[face == index] = np.outer(points @ normal - distance, normal)
     parts = []
     for number, obs in enumerate(cameras):
-        order = np.argsort(obs.placements)
-        known = order[np.searchsorted(obs.placements[order], placements)]
+        known = np.intersect1d(placements, obs.placements, return_indices=True)[2]
         board = obs.board_poses[known][face]
         on_board = _Rows(
             points=faces.plane_points,
