@@ -50,11 +50,6 @@ def line_residuals(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) ->
     return line_distance(mirrored(moved, camera), lines)
 
 
-def line_gradients(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) -> np.ndarray:
-    """Derivatives (..., n, 3) of :func:`line_residuals` by the moved points, pixels a metre."""
-    return np.vecmat(lines[..., :2], pinhole_jacobian(moved, camera))
-
-
 def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     """Distances d(e, ab) of projected crossings from their image lines: :func:`line_residuals` as a
     Block.
@@ -72,7 +67,8 @@ def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     rotated = rotate_points(pose, obs.crossing_points)
     moved = rotated + pose[..., None, :, 3]  # (16)
     residuals = line_residuals(moved, obs.crossing_lines, obs.model)
-    gradients = line_gradients(moved, obs.crossing_lines, obs.model)
+    by_point = pinhole_jacobian(moved, obs.model)
+    gradients = np.vecmat(obs.crossing_lines[..., :2], by_point)  # pixels a metre
     jacobian = gradient_by_pose(rotated, gradients)
     noise = moved_noise(pose, gradients, obs.crossing_covariance)
     variance = np.vecdot(gradients, noise) + obs.crossing_line_sigma**2
