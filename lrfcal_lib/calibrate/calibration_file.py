@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, FiniteFloat, PlainValidator
+from pydantic import BaseModel, Field, FiniteFloat, PlainValidator
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
@@ -15,7 +15,7 @@ from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import LrfInfo, from_json, plain
+from lrfcal_lib.session.stated import Endless, LrfInfo, Positive, from_json, plain
 
 SCHEMA = 3
 KIND = "lrfcal calibration"
@@ -74,9 +74,6 @@ def _pose(matrix):
 
 
 Pose = Annotated[RigidTransform, PlainValidator(_pose)]
-Endless = Annotated[
-    float, BeforeValidator(lambda value: np.inf if value is None else value)
-]
 
 
 class PlatformWritten(BaseModel):
@@ -91,8 +88,8 @@ class LensWritten(BaseModel):
 
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
-    fx: Annotated[FiniteFloat, Field(gt=0)]
-    fy: Annotated[FiniteFloat, Field(gt=0)]
+    fx: Positive
+    fy: Positive
     cx: FiniteFloat
     cy: FiniteFloat
     distortion: Annotated[np.ndarray, rows(5)]
@@ -113,7 +110,7 @@ class LrfWritten(BaseModel):
 
     model: str
     field_of_view: tuple[FiniteFloat, FiniteFloat]
-    bearing_step: Annotated[FiniteFloat, Field(gt=0)]
+    bearing_step: Positive
     sigma_range: FiniteFloat
     sigma_bearing: FiniteFloat
     range_resolution: FiniteFloat
@@ -185,7 +182,7 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
             "range_offset_m": float(rig.corrections.range_offset),
             "pitch_scale": float(rig.corrections.pitch_scale),
         },
-        "lrf": {name: getattr(rig.lrf, name) for name in LrfWritten.model_fields},
+        "lrf": dict(vars(rig.lrf)),
         "uncertainty": None if rig.uncertainty is None else plain(vars(rig.uncertainty)),
     }
 
