@@ -7,6 +7,7 @@ import pandas as pd
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
+from lrfcal_lib.model.camera import line_distance
 from lrfcal_lib.model.geometry import fit_line
 
 STEP = 1e-6  # of shifts and turns of lines, metres and radians: for derivatives of lengths
@@ -145,12 +146,7 @@ def sized(
 
 def moved_lines(lines: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Lines (s, 3) shifted outwards and turned about points (s, 2) of them by steps (..., s, 2)."""
-    shift = step[..., 0]
-    cos = np.cos(step[..., 1])
-    sin = np.sin(step[..., 1])
-    a, b, c = lines.T
-    x, y = middle.T
-    turned_a = cos * a - sin * b
-    turned_b = sin * a + cos * b
-    at = a * x + b * y + c - shift
-    return np.stack([turned_a, turned_b, at - (turned_a * x + turned_b * y)], axis=-1)
+    turned = (lines[:, 0] + 1j * lines[:, 1]) * np.exp(1j * step[..., 1])
+    normals = np.stack([turned.real, turned.imag], axis=-1)
+    at = line_distance(middle, lines) - step[..., 0] - np.vecdot(normals, middle)
+    return np.concatenate([normals, at[..., None]], axis=-1)
