@@ -109,8 +109,7 @@ def _roots(block, axes):
         return np.ones(())
     groups = block.white.reshape(*block.white.shape[:-1], -1, block.size)
     squares = np.sum(groups**2, axis=-1)
-    count = np.asarray(block.size if block.count is None else block.count, float)
-    count = np.broadcast_to(count, squares.shape)
+    count = block.size if block.count is None else block.count
     z = np.sqrt(squares / count)
     return (1 + (z / _level(z, count, block, axes) / CAUCHY) ** 2) ** -0.5
 
@@ -145,8 +144,7 @@ def _level(z, count, block, axes):
     inside = block.whitener != 0
     if block.size > 1:
         inside = inside.any(axis=(-1, -2))
-    sizes, index = np.unique(count, return_inverse=True)
-    usual = np.sqrt(chdtri(sizes, 0.5) / sizes)[index].reshape(count.shape)
+    usual = np.sqrt(chdtri(count, 0.5) / count)
     wide = (*z.shape[: z.ndim + min(np.atleast_1d(axes))], -1)
     level = medians((z / usual).reshape(wide), (inside & (z == z)).reshape(wide))
     return np.maximum(np.expand_dims(level, axes), 1e-9)
@@ -383,9 +381,7 @@ def minimise(
             blocks, roots = problem(state)
         at = linearise(blocks, axes)
         history.append(at.cost)
-    if converged.ndim == 0:
-        converged = converged[()]
-    return Minimum(state, converged, len(history) - 1, np.array(history))
+    return Minimum(state, converged[()], len(history) - 1, np.array(history))
 
 
 def _next_damping(damping, gain, accepted):
