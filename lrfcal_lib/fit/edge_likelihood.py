@@ -61,17 +61,17 @@ def _spline():
 
 
 def edge_shift(
-    log_odds: ArrayLike, radius: np.ndarray, background: ArrayLike = 0.0
+    log_odds: float | np.ndarray, radius: np.ndarray, background: float | np.ndarray = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """By how far a spot's centre may lie outside an edge and still read the board.
 
     Parameters
     ----------
-    log_odds : array_like
+    log_odds : float or ndarray
         The sensor's, for a background as far and as bright as the board.
-    radius : array_like
+    radius : ndarray
         Of the spot, metres.
-    background : array_like
+    background : float or ndarray
         What the real one adds: ``-2 ln(d_background / d_board)``, 0 where it is not known.
 
     Returns
@@ -81,8 +81,8 @@ def edge_shift(
     slope : ndarray
         Its derivative by `log_odds`.
     """
-    x, slope = disc_edge(np.add(log_odds, background))
-    return np.multiply(radius, x), np.multiply(radius, slope)
+    x, slope = disc_edge(log_odds + background)
+    return radius * x, radius * slope
 
 
 def flip_sigma(
@@ -106,8 +106,8 @@ def flip_sigma(
     share : ndarray
         ``d ln sigma / d ln softness``, 0 (all floor) to 1.
     """
-    soft = softness * np.asarray(radius, float)
-    sigma = np.hypot(soft, LEAST_STEP * np.asarray(step, float))
+    soft = softness * radius
+    sigma = np.hypot(soft, LEAST_STEP * step)
     return sigma, (soft / sigma) ** 2
 
 
@@ -140,7 +140,7 @@ def beam_terms(
         of an EM step.
     """
     sign = np.where(hit, 1.0, -1.0)
-    z = sign * np.asarray(margin, float) / sigma
+    z = sign * margin / sigma
     log_p = log_ndtr(z)
     mills = np.exp(-0.5 * z**2 - log_p) / ROOT_2PI  # phi(z) / Phi(z) without overflow
     weight = 1.0
