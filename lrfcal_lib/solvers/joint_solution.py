@@ -153,8 +153,7 @@ class JointSolution:
     @cached_property
     def boards(self) -> dict[int, RigidTransform]:
         """``T_platform_board`` by placement."""
-        poses = pose_transform(self.state.boards)
-        return dict(zip(self.observations.placements.tolist(), poses, strict=True))
+        return self._by_placement(pose_transform(self.state.boards))
 
     @property
     def board_poses(self) -> np.ndarray:
@@ -171,9 +170,10 @@ class JointSolution:
     @property
     def sweeps(self) -> dict[int, np.ndarray]:
         """Offset (rad) and stretch of the recorded pitch of each sweep, by placement."""
-        return dict(
-            zip(self.observations.placements.tolist(), self.state.sweeps, strict=True)
-        )
+        return self._by_placement(self.state.sweeps)
+
+    def _by_placement(self, values):
+        return dict(zip(self.observations.placements.tolist(), values, strict=True))
 
     @property
     def sweep_sigma(self) -> tuple[float, float]:
@@ -225,11 +225,13 @@ class JointSolution:
         sweeps of the pitch.
         """
         turn = self.sensor["pitch_by_direction"] * self.observations.direction
-        sweeps = {}
-        for row, (placement, (offset, stretch)) in enumerate(self.sweeps.items()):
-            middle = self.observations.middle[row]
-            sweeps[placement] = SweepPitch(turn[row] + offset, stretch, middle)
-        return Corrections(self.sensor["range_offset"], self.sensor["pitch_scale"], sweeps)
+        offset, stretch = self.state.sweeps.T
+        sweeps = map(SweepPitch, turn + offset, stretch, self.observations.middle)
+        return Corrections(
+            self.sensor["range_offset"],
+            self.sensor["pitch_scale"],
+            self._by_placement(sweeps),
+        )
 
     def columns(self, prefix: str) -> list[int]:
         """Indices of the shared unknowns whose names begin so."""
