@@ -182,12 +182,9 @@ def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
     along = np.linalg.svd(root[..., :2])[2][..., 0, :]
     rows = np.einsum("...i,...j->...ij", along, normal)
     null = np.linalg.svd(rows.reshape(*normal.shape[:-1], 6))[2][..., 3:, :]
-    first = null[..., :3]
-    second = null[..., 3:]
-    first_length = first @ first.mT
-    second_length = second @ second.mT
-    angle = first @ second.mT
-    quadrics = np.stack([first_length - second_length, angle + angle.mT], axis=-3)
+    both = null[..., :3] + 1j * null[..., 3:]
+    products = both @ both.mT  # real: by how much the lengths differ; imaginary: the angle
+    quadrics = np.stack([products.real, products.imag], axis=-3)
     columns = _common_points(quadrics)
     columns = columns @ null
     columns = np.concatenate([columns, -columns], axis=-2)
@@ -262,8 +259,7 @@ def _centred(triangles):
     """Scatter roots about the centroid (..., 3, 3), and the centroids (..., 3), of compressed
     points.
     """
-    rows = np.concatenate([triangles[..., 3:], triangles[..., :3]], axis=-1)
-    turned = np.linalg.qr(rows, mode="r")
+    turned = np.linalg.qr(np.roll(triangles, 1, axis=-1), mode="r")
     return turned[..., 1:, 1:], turned[..., 0, 1:] / turned[..., 0, :1]
 
 
