@@ -269,17 +269,23 @@ def sweep_levels(sweeps, data, hessian, gradient, shared):
     before = np.square(data.levels.sweep_sigma[:number])
     variance = before
     for _ in range(SWEEP_ROUNDS):
-        whole = hessian.copy()
-        right = gradient.copy()
-        change = 1 / variance - 1 / before
-        whole[:, places, places] += change
-        right[:, places] += change * sweeps
-        steps, covariance = likeliest(whole, right, shared)
-        error = sweeps + steps[:, places]
-        unknown = covariance[:, places, places]
+        more = 1 / variance - 1 / before
+        square, unknown = expecting(more, sweeps, places, hessian, gradient, shared)
         told = np.maximum(1 - unknown / variance, 0.0)
-        variance = (np.sum(error**2, axis=0) + usual) / (np.sum(told, axis=0) + 1)
+        variance = (np.sum(square, axis=0) + usual) / (np.sum(told, axis=0) + 1)
     return np.sqrt(variance)
+
+
+def expecting(more, values, places, hessian, gradient, shared):
+    """Squares and variances (p, n) of unknowns in some places, now `values`, if there were `more`
+    information that they are zero than normal equations hold.
+    """
+    whole = hessian.copy()
+    right = gradient.copy()
+    whole[:, places, places] += more
+    right[:, places] += more * values
+    steps, covariance = likeliest(whole, right, shared)
+    return (values + steps[:, places]) ** 2, covariance[:, places, places]
 
 
 def side_levels(sides, data, hessian, gradient):
@@ -304,13 +310,8 @@ def side_levels(sides, data, hessian, gradient):
     last = np.arange(hessian.shape[-1])[-edges - 1 :]
     weight = prior * sigma2
     for _ in range(SIDE_ROUNDS):
-        whole = hessian.copy()
-        right = gradient.copy()
-        whole[:, last, last] += weight / sigma2 - prior
-        right[:, last] += (weight / sigma2 - prior) * sides
-        spread = pseudo_inverse(whole)
-        step = -np.matvec(spread, right)
-        square = (sides + step[:, last]) ** 2 + spread[:, last, last]
+        more = weight / sigma2 - prior
+        square = sum(expecting(more, sides, last, hessian, gradient, 0))
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)
         total = np.sum(weight * square * shown, axis=0)
         of_side = (total[:-1].sum() + Levels.side_sigma**2) / (counted[:-1].sum() + 1)
