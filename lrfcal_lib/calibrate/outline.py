@@ -72,8 +72,8 @@ def measure_board(
     for name, points in sides.items():
         flat = (points - pose[:3, 3]) @ pose[:3, :2]
         middle, direction, rms = fit_line(flat)
-        x, y = direction
-        lines[name] = np.array([y, -x, x * middle[1] - y * middle[0]])
+        normal = direction[::-1] * [1.0, -1.0]
+        lines[name] = np.append(normal, -normal @ middle)
         middles.append(middle)
         shift = rms**2 / max(len(flat) - 1, 1)
         spread = np.mean(((flat - middle) @ direction) ** 2)
