@@ -118,8 +118,7 @@ def _times(blocks, roots):
     """Blocks with the roots of their weights in their whiteners."""
     weighted = []
     for block, root in zip(blocks, roots, strict=True):
-        whole = block.size > 1 and root.ndim > 0
-        factor = root[..., None, None] if whole else root
+        factor = root[..., None, None] if block.size > 1 else root
         weighted.append(replace(block, whitener=block.whitener * factor))
     return weighted
 
@@ -166,6 +165,11 @@ def remembered(evaluate: Callable) -> Callable:
         return last[1]
 
     return once
+
+
+def _axes(shared):
+    """What a cost is summed over: residuals of trials, or placements and residuals."""
+    return -1 if shared is None else (-2, -1)
 
 
 def _blocks(evaluate, state):
@@ -349,7 +353,7 @@ def minimise(
         A trial has converged when a step is shorter than this many standard deviations of the
         estimate.
     """
-    axes = -1 if shared is None else (-2, -1)
+    axes = _axes(shared)
     problem = _weighted(evaluate, robust, axes)
     blocks, roots = problem(state)
     at = linearise(blocks, axes)
@@ -520,42 +524,42 @@ def solve(
         tolerance=tolerance,
     )
     blocks = _blocks(evaluate, minimum.state)
-    axes = -1 if shared is None else (-2, -1)
-    weights = []
-    for block in blocks:
-        weight = np.ones_like(block.white)
-        if robust and block.cost is None:
-            weight = np.repeat(_roots(block, axes) ** 2, block.size, axis=-1)
-        weights.append(weight)
-    return _solution(question, minimum, blocks, np.concatenate(weights, axis=-1), shared)
+    weighted = blocks
+    if robust:
+        weighted = _times(blocks, [_roots(block, _axes(shared)) for block in blocks])
+    return _solution(question, minimum, blocks, weighted, shared)
 
 
-def _by_placement(r, J, weights, groups, shared):
+def _stacked(blocks):
+    """White residuals (..., n) of all blocks, and their Jacobian (..., n, k)."""
+    r = np.concatenate([block.white for block in blocks], axis=-1)
+    return r, np.concatenate([block.white_jacobian for block in blocks], axis=-2)
+
+
+def _by_placement(r, J, groups, shared):
     """Normal equations of the reported unknowns by placement (one group where they are not told
     apart).
     """
-    weighted = (weights[..., None] * J).mT
+    transposed = J.mT
     if shared is not None:
-        scores = np.matvec(weighted, r)
-        return reduced_hessian(weighted @ J, shared), scores[:, :shared]
+        scores = np.matvec(transposed, r)
+        return reduced_hessian(transposed @ J, shared), scores[:, :shared]
     index = np.unique(groups, return_inverse=True)[1]
     index = np.repeat(index, r.shape[-1] // len(index))
     member = index == np.arange(index.max() + 1)[:, None]
-    weighted = weighted[..., None, :, :] * member[:, None]
-    return weighted @ J[..., None, :, :], np.matvec(weighted, r[..., None, :])
+    transposed = transposed[..., None, :, :] * member[:, None]
+    return transposed @ J[..., None, :, :], np.matvec(transposed, r[..., None, :])
 
 
-def _solution(question, minimum, blocks, weights, shared):
-    """The Solution at a minimum, from the blocks and their robust weights (..., n) there."""
-    r = np.concatenate([block.white for block in blocks], axis=-1)
-    J = np.concatenate([block.white_jacobian for block in blocks], axis=-2)
-    hessians, scores = _by_placement(r, J, weights, question.groups, shared)
+def _solution(question, minimum, blocks, weighted, shared):
+    """The Solution at a minimum, from the blocks there without and with their robust weights."""
+    r, J = _stacked(blocks)
+    weighted_r, weighted_J = _stacked(weighted)
+    hessians, scores = _by_placement(weighted_r, weighted_J, question.groups, shared)
     hessian = np.sum(hessians, axis=-3)
     scales = np.broadcast_to(question.scales, hessian.shape[-1:])
     motions = question.open_motions(hessian, scales)
-    chi2 = (
-        np.sum(weights * r**2, axis=-1 if shared is None else (-2, -1)) + question.chi2_rest
-    )
+    chi2 = np.sum(weighted_r**2, axis=_axes(shared)) + question.chi2_rest
     freedom = question.freedom
     if freedom is None:
         own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
