@@ -5,7 +5,7 @@ Poses of equations (4) to (6) and (16); residuals are in :mod:`lrfcal_lib.solver
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import compress
+from itertools import accumulate, compress, pairwise, starmap
 
 import numpy as np
 
@@ -96,12 +96,8 @@ class Unknowns:
             "sweep": SWEEPS[self.sweep],
             "sides": (self.edges + 1) * self.sides,
         }
-        columns = {}
-        end = 0
-        for name, width in widths.items():
-            columns[name] = slice(end, end + width)
-            end += width
-        return columns
+        ends = accumulate(widths.values(), initial=0)
+        return dict(zip(widths, starmap(slice, pairwise(ends)), strict=True))
 
     @property
     def shared(self) -> int:
