@@ -136,15 +136,10 @@ def tilt(points: ArrayLike, pitch: ArrayLike) -> np.ndarray:
         ``p_platform = Rx(pitch) p_head``.
     """
     points = np.asarray(points)
-    y = points[..., 1]
-    z = points[..., 2]
-    cosine = np.cos(pitch)
-    sine = np.sin(pitch)
-    turned = np.empty((*np.broadcast_shapes(y.shape, cosine.shape), 3))
-    turned[..., 0] = points[..., 0]
-    turned[..., 1] = cosine * y - sine * z
-    turned[..., 2] = sine * y + cosine * z
-    return turned
+    # y and z as one complex number
+    turned = (points[..., 1] + 1j * points[..., 2]) * np.exp(1j * np.asarray(pitch))
+    x = np.broadcast_to(points[..., 0], turned.shape)
+    return np.stack([x, turned.real, turned.imag], axis=-1)
 
 
 def lrf_to_platform(
