@@ -126,7 +126,7 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
     points = block.points[take]
     normals = block.normals[take]
     colors, seen, source = painter.paint(points, normals)
-    colors = np.clip(np.rint(np.nan_to_num(colors)), 0, 255)
+    colors = np.rint(np.nan_to_num(colors, nan=GREY))
     intensity = np.full(n, np.nan)
     if sweep.intensities is not None:
         intensity = sweep.intensities[block.lines][take].astype(float)
@@ -134,7 +134,7 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
     return Cloud(
         points=points,
         normals=normals,
-        colors=np.where(seen[:, None], colors, GREY).astype(np.uint8),
+        colors=np.clip(colors, 0, 255).astype(np.uint8),
         seen=seen,
         placement=np.full(n, sweep.placement),
         image=source,
@@ -235,9 +235,7 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
         Standard deviation along them, metres.
     """
     valid = np.isfinite(points).all(axis=-1)
-    centre = np.zeros(3)
-    if valid.any():
-        centre = np.nanmean(points[valid], axis=0)
+    centre = np.sum(points[valid], axis=0) / max(valid.sum(), 1)
     p = np.where(valid[..., None], points - centre, 0.0)
     width = 2 * WINDOW + 1
 
