@@ -55,8 +55,9 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
         changed["view_scale"] = float(scale)
         changed["sigma_pitch"] = sigma
     if "side" in blocks and "beam" in blocks:
-        scales = side_levels(state.sides, data, own, gradient[:, c:])
-        changed["side_sigma"], changed["background_sigma"] = scales
+        changed["side_sigma"], changed["background_sigma"] = side_levels(
+            state.sides, data, own, gradient[:, c:]
+        )
     if "sweep" in blocks:
         number = SWEEPS[unknowns.sweep]
         scatter = sweep_levels(state.sweeps[:, :number], data, hessian, gradient, c)
