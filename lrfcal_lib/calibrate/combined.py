@@ -237,8 +237,8 @@ def edges_in_cloud(solution, prepared, placement, face):
         centre = T_platform_camera.translation
         height = (plane[:3, 3] - centre) @ normal
         for edge in view.edges:
-            a = edge.line[:2]
-            uv = edge.ends - np.outer(line_distance(edge.ends, edge.line), a)
+            off = line_distance(edge.ends, edge.line)
+            uv = edge.ends - np.outer(off, edge.line[:2])
             sight = T_platform_camera.rotation.apply(lens.sights(uv))
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
@@ -275,8 +275,7 @@ def fitted(case, scale):
         max_iterations=ITERATIONS,
         tolerance=TOLERANCE,
     )[0]
-    hessian = linearise(evaluate(state)).hessian
-    return state, np.linalg.inv(hessian[0])
+    return state, np.linalg.inv(linearise(evaluate(state)).hessian[0])
 
 
 def blocks_of(state, case, scale):
