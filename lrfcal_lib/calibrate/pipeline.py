@@ -473,8 +473,7 @@ def leave_out(joint: JointCalibration, groups: int = 8) -> JointCalibration:
         out = numbers[group::groups]
         rest = joint.observations.select(np.setdiff1d(numbers, out))
         with suppress(DegenerateGeometry):
-            solution = solve_again(rest, joint.solution)
-            estimates |= dict.fromkeys(out.tolist(), solution)
+            estimates |= dict.fromkeys(out.tolist(), solve_again(rest, joint.solution))
     return replace(joint, without=estimates)
 
 
