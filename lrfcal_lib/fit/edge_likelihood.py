@@ -143,10 +143,10 @@ def beam_terms(
     z = sign * margin / sigma
     log_p = log_ndtr(z)
     mills = np.exp(-0.5 * z**2 - log_p) / ROOT_2PI  # phi(z) / Phi(z) without overflow
-    weight = 1.0
-    cost = -log_p
+    likely = np.log1p(-2 * lapse) + log_p
+    cost = -likely
     if lapse:
-        cost = -np.logaddexp(np.log(lapse), np.log1p(-2 * lapse) + log_p)
-        weight = np.exp(np.log1p(-2 * lapse) + log_p + cost)
+        cost = -np.logaddexp(np.log(lapse), likely)
+    weight = np.exp(likely + cost)
     decline = np.maximum(z + mills, 0.0)  # far outside what is left of it is rounding
     return cost, -weight * sign * mills / sigma, weight * mills * decline / sigma**2
