@@ -247,8 +247,7 @@ def eliminate(
         back = pseudo_inverse(own) @ known
     taken = hessian[:, :c, c:] @ back
     reduced = hessian[:, :c, :c] - taken[..., :c]
-    reduced_gradient = gradient[:, :c] - taken[..., c]
-    return reduced, reduced_gradient, back
+    return reduced, gradient[:, :c] - taken[..., c], back
 
 
 def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
