@@ -245,6 +245,4 @@ def moved_noise(
     -------
     ndarray, shape (..., n, 3)
     """
-    in_source = gradient @ pose[..., :3]
-    pulled = (in_source[..., None, :] @ covariance)[..., 0, :]
-    return rotate_points(pose, pulled)
+    return rotate_points(pose, np.vecmat(gradient @ pose[..., :3], covariance))
