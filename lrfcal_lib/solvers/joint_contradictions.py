@@ -106,8 +106,8 @@ def refuse_contradiction(
 
 def face_miss(state: JointState, data: JointData) -> float:
     """By how much a state puts the scanned points off their boards, metres (median)."""
-    points = face_points(state, data)
-    return float(np.median(_misses(points, state.boards, data.face["used"])))
+    misses = _misses(face_points(state, data), state.boards, data.face["used"])
+    return float(np.median(misses))
 
 
 def _misses(points, boards, used):

@@ -194,8 +194,14 @@ class JointSolution:
         """Factors on the stated standard deviations, and shares of independent errors, as
         estimated.
         """
-        names = ["face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma"]
-        names.append("background_sigma")
+        names = [
+            "face_scale",
+            "face_share",
+            "beam_share",
+            "sigma_pitch",
+            "side_sigma",
+            "background_sigma",
+        ]
         if self.observations.cameras:
             names.append("view_scale")
         return {name: float(getattr(self.data.levels, name)) for name in names}
@@ -401,8 +407,7 @@ def expected_information(
         hits = read["beam"]
         misses = named_blocks(state, none_read, unknowns)["beam"]
         chance = np.exp(-np.asarray(hits.cost))
-        weights = ((hits, chance), (misses, 1 - chance))
-        for block, share in weights:
+        for block, share in ((hits, chance), (misses, 1 - chance)):
             J = np.sqrt(share)[..., None] * block.white_jacobian
             hessian = hessian + J.mT @ J
     others = [block for name, block in read.items() if name != "beam"]
