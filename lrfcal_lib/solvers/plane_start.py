@@ -184,8 +184,7 @@ def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
     null = np.linalg.svd(rows.reshape(*normal.shape[:-1], 6))[2][..., 3:, :]
     both = null[..., :3] + 1j * null[..., 3:]
     products = both @ both.mT  # real: by how much the lengths differ; imaginary: the angle
-    quadrics = np.stack([products.real, products.imag], axis=-3)
-    columns = _common_points(quadrics)
+    columns = _common_points(np.stack([products.real, products.imag], axis=-3))
     columns = columns @ null
     columns = np.concatenate([columns, -columns], axis=-2)
     x = columns[..., :3]

@@ -414,8 +414,7 @@ def _move_with_lens(state, step):
     pose, intrinsics, boards = state
     common, by_placement = step
     change = common[6:]
-    held = LENS - len(change)
-    refined = intrinsics + np.pad(change, (0, held))
+    refined = intrinsics + np.pad(change, (0, LENS - len(change)))
     return move_pose(pose, common[:6]), refined, move_pose(boards, by_placement)
 
 

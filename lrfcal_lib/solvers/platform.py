@@ -208,8 +208,9 @@ def prepare_boards(obs: PlatformObservations, T_head_lrf: RigidTransform) -> Boa
     )
     for group in (edge, face):
         group["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
-    poses = np.array(list(boards.values()))
-    return Boards(np.array(list(boards)), poses, edge, face, skipped)
+    return Boards(
+        np.array(list(boards)), np.array(list(boards.values())), edge, face, skipped
+    )
 
 
 def _edges(obs):
