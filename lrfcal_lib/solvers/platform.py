@@ -228,15 +228,13 @@ def _start_board(edges, face):
     if len(edges) == 2:
         point2, second, _ = fit_line(edges[1])
         z = np.cross(x, second)
-        cosine = x @ second
-        between = point2 - point
         if np.linalg.norm(z) < np.sin(np.radians(30)):
             raise DegenerateGeometry(
                 "the two edges are nearly parallel: edges 1 and 2 must be perpendicular"
             )
         # the origin is where edge 1 comes nearest to edge 2
-        along = between @ x - cosine * (between @ second)
-        point = point + x * along / (1 - cosine**2)
+        along, _ = np.linalg.lstsq(np.column_stack([x, -second]), point2 - point)[0]
+        point = point + x * along
     elif len(face) >= 3:
         normal = geometry.fit_plane(face)[0]
         z = normal - x * (x @ normal)
