@@ -130,7 +130,6 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
     intensity = np.full(n, np.nan)
     if sweep.intensities is not None:
         intensity = sweep.intensities[block.lines][take].astype(float)
-    scatter = block.scatter[take]
     return Cloud(
         points=points,
         normals=normals,
@@ -142,7 +141,7 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
         bearing=sweep.bearings[beam],
         range=sweep.ranges[block.lines][take],
         intensity=intensity,
-        sigma=np.where(np.isfinite(scatter), scatter, sigma_range),
+        sigma=np.nan_to_num(block.scatter[take], nan=sigma_range),
         removed=int((wanted & ~block.good).sum()),
     )
 
