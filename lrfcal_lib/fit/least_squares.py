@@ -108,9 +108,8 @@ def _roots(block, axes):
     if block.cost is not None:
         return np.ones(())
     groups = block.white.reshape(*block.white.shape[:-1], -1, block.size)
-    squares = np.sum(groups**2, axis=-1)
     count = block.size if block.count is None else block.count
-    z = np.sqrt(squares / count)
+    z = np.sqrt(np.vecdot(groups, groups) / count)
     return (1 + (z / _level(z, count, block, axes) / CAUCHY) ** 2) ** -0.5
 
 
