@@ -239,7 +239,7 @@ def _before_boards(poses, sets, centres):
 def _squares(poses, triangles, sets):
     """Mean squared distances (n, p) of each placement's points from its plane, at n poses."""
     residuals = plane_residuals(poses[:, None], triangles, sets.boards)
-    return np.sum(residuals**2, axis=2) / sets.number
+    return np.vecdot(residuals, residuals) / sets.number
 
 
 def _apart(poses, order):
