@@ -15,7 +15,7 @@ from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import Endless, LensStated, LrfInfo, from_json, plain
+from lrfcal_lib.session.stated import Endless, LrfInfo, Positive, from_json, plain
 
 SCHEMA = 3
 KIND = "lrfcal calibration"
@@ -83,11 +83,18 @@ class PlatformWritten(BaseModel):
     axis_covariance: Annotated[np.ndarray, rows(4, 4)]
 
 
-class LensWritten(LensStated):
+class LensWritten(BaseModel):
     """What ``CameraModel(**lens)`` takes."""
 
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
+    fx: Positive
+    fy: Positive
+    cx: FiniteFloat
+    cy: FiniteFloat
+    distortion: Annotated[np.ndarray, rows(5)]
+    covariance: Annotated[np.ndarray, rows(9, 9)] | None
+    rms_px: FiniteFloat | None
 
 
 class CameraWritten(BaseModel):
@@ -103,7 +110,7 @@ class LrfWritten(BaseModel):
 
     model: str
     field_of_view: tuple[FiniteFloat, FiniteFloat]
-    bearing_step: Annotated[FiniteFloat, Field(gt=0)]
+    bearing_step: Positive
     sigma_range: FiniteFloat
     sigma_bearing: FiniteFloat
     range_resolution: FiniteFloat
@@ -175,7 +182,7 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
             "range_offset_m": float(rig.corrections.range_offset),
             "pitch_scale": float(rig.corrections.pitch_scale),
         },
-        "lrf": {name: getattr(rig.lrf, name) for name in LrfWritten.model_fields},
+        "lrf": dict(vars(rig.lrf)),
         "uncertainty": None if rig.uncertainty is None else plain(vars(rig.uncertainty)),
     }
 

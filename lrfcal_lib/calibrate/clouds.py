@@ -102,10 +102,10 @@ def sweep_blocks(
 
 def _about(sweep, mask):
     """A Sweep cut down to what a mask shows and a margin about it, and the mask likewise."""
-    window = []
-    for shown in np.nonzero(mask):
-        window.append(slice(max(0, shown.min() - MARGIN), shown.max() + MARGIN + 1))
-    lines, beams = window
+    lines, beams = (
+        slice(max(0, shown.min() - MARGIN), shown.max() + MARGIN + 1)
+        for shown in np.nonzero(mask)
+    )
     return sweep.part(lines, beams), mask[lines, beams]
 
 
@@ -137,8 +137,9 @@ def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]
         number = session.image_records.index(record)
         T_camera_platform = rig.camera_at(record.camera, pitch)
         image = session.read_image(record)
-        view = View(number, record.camera, T_camera_platform, camera.model, image, pitch)
-        views.append(view)
+        views.append(
+            View(number, record.camera, T_camera_platform, camera.model, image, pitch)
+        )
     if records and not views:
         raise ValueError(
             f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; "

@@ -143,15 +143,6 @@ def paint(points, normals, eye, sums, best, source):
 
 
 @njit(**COMPILED)
-def finish(sums, colors, seen):
-    """Colours (n, 3) of `sums`, NaN where no image sees a point, and whether one does."""
-    for i in range(len(sums)):
-        seen[i] = sums[i, 3] > 0
-        for j in range(3):
-            colors[i, j] = sums[i, j] / sums[i, 3]
-
-
-@njit(**COMPILED)
 def _locate(points, eye, rows, at):
     """Fill `rows` with x, y, z of a tile of platform points, their pixels and distances, `at` with
     their cells.

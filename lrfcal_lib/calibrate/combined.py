@@ -237,8 +237,8 @@ def edges_in_cloud(solution, prepared, placement, face):
         centre = T_platform_camera.translation
         height = (plane[:3, 3] - centre) @ normal
         for edge in view.edges:
-            a = edge.line[:2]
-            uv = edge.ends - np.outer(line_distance(edge.ends, edge.line), a)
+            off = line_distance(edge.ends, edge.line)
+            uv = edge.ends - np.outer(off, edge.line[:2])
             sight = T_platform_camera.rotation.apply(lens.sights(uv))
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
@@ -275,24 +275,21 @@ def fitted(case, scale):
         max_iterations=ITERATIONS,
         tolerance=TOLERANCE,
     )[0]
-    hessian = linearise(evaluate(state)).hessian
-    return state, np.linalg.inv(hessian[0])
+    return state, np.linalg.inv(linearise(evaluate(state)).hessian[0])
 
 
 def blocks_of(state, case, scale):
     """All that is known of a placement, each a Block (1, n, width)."""
     unknowns = case.unknowns
-    of_joint = (state.joint, replace(case.data, lines=state.lines), unknowns)
-    blocks = [joint_residuals.face_block(*of_joint)]
-    if case.data.beam["used"].any():
-        beams = joint_residuals.beam_block(*of_joint)
+    data = replace(case.data, lines=state.lines)
+    named = joint_residuals.named_blocks(state.joint, data, unknowns)
+    if "beam" in named:
+        beams = named["beam"]
         by_sides = side_columns(beams.jacobian, case.data.beam["edge"], state, case)
         jacobian = np.concatenate([beams.jacobian, by_sides], axis=-1)
-        blocks.append(replace(beams, jacobian=jacobian))
-    if joint_model.SWEEPS[unknowns.sweep]:
-        blocks.append(joint_residuals.sweep_block(*of_joint))
-    if unknowns.sides:
-        blocks.append(joint_residuals.side_block(*of_joint))
+        named["beam"] = replace(beams, jacobian=jacobian)
+    # no view and nothing that is usual: image edges and the calibration say it
+    blocks = [named[name] for name in ("face", "beam", "sweep", "side") if name in named]
     if case.images:
         blocks.append(image_block(state, case, scale))
     blocks.append(_rows(case.whitener @ state.change, case.whitener))
@@ -306,8 +303,8 @@ def blocks_of(state, case, scale):
     held[3:, -count:] = np.diag(np.tile(FAR, len(case.middle)))
     blocks.append(_rows(np.zeros(len(held)), held))
     for block in blocks:
-        jacobian = np.zeros((*block.residuals.shape, width))
-        jacobian[..., : block.jacobian.shape[-1]] = block.jacobian
+        missing = width - block.jacobian.shape[-1]
+        jacobian = np.pad(block.jacobian, ((0, 0), (0, 0), (0, missing)))
         yield replace(block, jacobian=jacobian)
 
 

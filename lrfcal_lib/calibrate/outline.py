@@ -3,9 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+import pandas as pd
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
+from lrfcal_lib.model.camera import line_distance
 from lrfcal_lib.model.geometry import fit_line
 
 STEP = 1e-6  # of shifts and turns of lines, metres and radians: for derivatives of lengths
@@ -70,8 +72,8 @@ def measure_board(
     for name, points in sides.items():
         flat = (points - pose[:3, 3]) @ pose[:3, :2]
         middle, direction, rms = fit_line(flat)
-        x, y = direction
-        lines[name] = np.array([y, -x, x * middle[1] - y * middle[0]])
+        normal = direction[::-1] * [1.0, -1.0]
+        lines[name] = np.append(normal, -normal @ middle)
         middles.append(middle)
         shift = rms**2 / max(len(flat) - 1, 1)
         spread = np.mean(((flat - middle) @ direction) ** 2)
@@ -119,42 +121,32 @@ def sized(
     lengths, sigma : dict of str to float
         Of edges between two corners, and their standard deviations.
     """
-    names = list(lines)
     straight = np.array(list(lines.values()))
-    corners, lengths = _corners(straight, names, edges)
+    index = [edges.index(name) for name in lines]
+
+    def outline(known):
+        """Corners (..., E, 2) and lengths (..., E) with lines (..., s, 3); NaN where some miss."""
+        every = np.full((*known.shape[:-2], len(edges), 3), np.nan)
+        every[..., index, :] = known
+        corners = corners_of_lines(every)
+        along = np.roll(corners, -1, axis=-2) - corners
+        return corners, np.linalg.norm(along, axis=-1)
+
+    corners, lengths = outline(straight)
     steps = STEP * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
-    _, after = _corners(moved_lines(straight, middle, steps), names, edges)
-    sigma = {}
-    for name, length in lengths.items():
-        J = (after[name] - length) / STEP
-        sigma[name] = float(np.sqrt(J @ covariance @ J))
-    return corners, {name: float(length) for name, length in lengths.items()}, sigma
-
-
-def _corners(lines, names, edges):
-    """Corners (..., 2) of lines (..., s, 3) and lengths (...) between these, by edge."""
-    row = {name: number for number, name in enumerate(names)}
-    after = dict(zip(edges, [*edges[1:], edges[0]], strict=True))
-    corners = {}
-    for edge, following in after.items():
-        if edge in row and following in row:
-            both = lines[..., [row[edge], row[following]], :]
-            corners[following] = corners_of_lines(both)[..., 1, :]
-    lengths = {}
-    for edge, following in after.items():
-        if edge in corners and following in corners:
-            lengths[edge] = np.linalg.norm(corners[following] - corners[edge], axis=-1)
-    return corners, lengths
+    _, after = outline(moved_lines(straight, middle, steps))
+    J = (after - lengths).T / STEP
+    sigma = np.sqrt(np.vecdot(J @ covariance, J))
+    return (
+        pd.Series(list(corners), edges)[~np.isnan(corners).any(axis=1)].to_dict(),
+        pd.Series(lengths, edges).dropna().to_dict(),
+        pd.Series(sigma, edges).dropna().to_dict(),
+    )
 
 
 def moved_lines(lines: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Lines (s, 3) shifted outwards and turned about points (s, 2) of them by steps (..., s, 2)."""
-    shift = step[..., 0]
-    cos = np.cos(step[..., 1])
-    sin = np.sin(step[..., 1])
-    a, b, c = lines.T
-    x, y = middle.T
-    turned_a = cos * a - sin * b
-    turned_b = sin * a + cos * b
-    at = a * x + b * y + c - shift
-    return np.stack([turned_a, turned_b, at - (turned_a * x + turned_b * y)], axis=-1)
+    turned = (lines[:, 0] + 1j * lines[:, 1]) * np.exp(1j * step[..., 1])
+    normals = np.stack([turned.real, turned.imag], axis=-1)
+    at = line_distance(middle, lines) - step[..., 0] - np.vecdot(normals, middle)
+    return np.concatenate([normals, at[..., None]], axis=-1)

@@ -127,8 +127,7 @@ class Painter:
             The number of the image that counts most, -1 for none.
         """
         n = len(points)
-        colors = np.empty((n, 3), np.float32)
-        seen = np.empty(n, bool)
+        colors = np.full((n, 3), np.nan, np.float32)
         source = np.full(n, -1, np.int32)
 
         def work(rows, _):
@@ -139,10 +138,11 @@ class Painter:
             best = np.zeros(len(part), np.float32)
             for eye in self.eyes[only]:
                 colouring.paint(part, facing, eye, sums, best, source[rows])
-            colouring.finish(sums, colors[rows], seen[rows])
+            weight = sums[:, 3:]
+            np.divide(sums[:, :3], weight, out=colors[rows], where=weight > 0)
 
         _share(work, n)
-        return colors, seen, source
+        return colors, ~np.isnan(colors[:, 0]), source
 
     def compare_exposures(self, points: np.ndarray, normals: np.ndarray) -> None:
         """Estimate gain and fall-off towards the corners of every image from points that several
@@ -179,14 +179,12 @@ def _compared(logs, radii):
     shared = np.isfinite(logs).sum(axis=0) > 1
     gain = np.zeros(len(logs))
     falloff = 0.0
-    if not shared.any():
-        return gain, falloff
     logs = logs[:, shared]
     radii = np.where(np.isfinite(logs), radii[:, shared], np.nan)
     apart = np.nan_to_num(radii - np.nanmean(radii, axis=0))
     for _ in range(EXPOSURE_ROUNDS):
         light = logs - gain[:, None] - falloff * radii
-        miss = np.nan_to_num(light - np.nanmean(light, axis=0), nan=0.0)
+        miss = np.nan_to_num(light - np.nanmean(light, axis=0))
         miss = np.clip(miss, -LARGEST_MISS, LARGEST_MISS)
         gain += np.sum(miss, axis=1) / np.maximum(np.isfinite(logs).sum(axis=1), 1)
         falloff += np.sum(miss * apart) / max(np.sum(apart**2), 1e-9)

@@ -4,7 +4,7 @@ everything at once.
 
 import operator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -174,10 +174,7 @@ class Calibration:
             axis.covariance,
             solved,
             admitted_offset=session.lrf.admitted_offset,
-            sweep_sigma=(
-                self.prepared.pitch_noise.offset,
-                self.prepared.pitch_noise.stretch,
-            ),
+            sweep_sigma=astuple(self.prepared.pitch_noise),
             range_noise=float(np.median(noise)) if noise else session.lrf.sigma_range,
         )
         return CalibratedRig(
@@ -300,12 +297,10 @@ def find_pitch_errors(prepared: Prepared) -> PitchErrors | None:
 
 def pitch_noise(errors: PitchErrors | None) -> PitchNoise:
     """How far a recorded pitch is off; zero where the data do not ask for any."""
-    if errors is None or errors.wanted == "none":
+    if errors is None:
         return PitchNoise()
     model = errors.models[errors.wanted]
-    offset = rms(model.offset)
-    stretch = rms(model.stretch)
-    return PitchNoise(float(offset), float(stretch))
+    return PitchNoise(rms(model.offset), rms(model.stretch))
 
 
 def tilt_axis(prepared: Prepared) -> PlatformCalibration:
@@ -322,9 +317,9 @@ def tilt_axis(prepared: Prepared) -> PlatformCalibration:
     PlatformCalibration
     """
     session = prepared.session
-    variants = ("last_beam", "half_step")
     observations = {
-        variant: platform_observations(prepared, variant) for variant in variants
+        variant: platform_observations(prepared, variant)
+        for variant in ("last_beam", "half_step")
     }
     return calibrate_platform(
         observations,
@@ -478,8 +473,7 @@ def leave_out(joint: JointCalibration, groups: int = 8) -> JointCalibration:
         out = numbers[group::groups]
         rest = joint.observations.select(np.setdiff1d(numbers, out))
         with suppress(DegenerateGeometry):
-            solution = solve_again(rest, joint.solution)
-            estimates |= dict.fromkeys(out.tolist(), solution)
+            estimates |= dict.fromkeys(out.tolist(), solve_again(rest, joint.solution))
     return replace(joint, without=estimates)
 
 

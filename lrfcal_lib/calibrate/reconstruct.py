@@ -4,6 +4,7 @@ in bounded memory.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -74,11 +75,11 @@ def reconstruct(
         mask = np.isfinite(sweep.ranges)
     steps = (_pitch_step(sweep), lrf.bearing_step)
     painter = Painter(views, max(steps), BEHIND * lrf.sigma_range)
-    blocks: Iterable[_Block] = _Blocks(
-        sweep, steps, T_head_lrf, corrections, lrf, continuous
-    )
+    blocks_of = partial(_blocks, sweep, steps, T_head_lrf, corrections, lrf, continuous, {})
+    blocks: Iterable[_Block] = blocks_of()
     if sweep.ranges.size <= KEPT:
         blocks = list(blocks)
+        blocks_of = partial(iter, blocks)
     points = []
     normals = []
     every = max(1, sweep.ranges.size // GAIN_POINTS)
@@ -88,7 +89,7 @@ def reconstruct(
         points.append(block.points[block.good][::every].copy())
         normals.append(block.normals[block.good][::every].copy())
     painter.compare_exposures(np.concatenate(points), np.concatenate(normals))
-    for block in blocks:
+    for block in blocks_of():
         yield _coloured(block, sweep, painter, mask[block.lines], lrf.sigma_range)
 
 
@@ -125,15 +126,14 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
     points = block.points[take]
     normals = block.normals[take]
     colors, seen, source = painter.paint(points, normals)
-    colors = np.clip(np.rint(np.nan_to_num(colors)), 0, 255)
+    colors = np.rint(np.nan_to_num(colors, nan=GREY))
     intensity = np.full(n, np.nan)
     if sweep.intensities is not None:
         intensity = sweep.intensities[block.lines][take].astype(float)
-    scatter = block.scatter[take]
     return Cloud(
         points=points,
         normals=normals,
-        colors=np.where(seen[:, None], colors, GREY).astype(np.uint8),
+        colors=np.clip(colors, 0, 255).astype(np.uint8),
         seen=seen,
         placement=np.full(n, sweep.placement),
         image=source,
@@ -141,7 +141,7 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
         bearing=sweep.bearings[beam],
         range=sweep.ranges[block.lines][take],
         intensity=intensity,
-        sigma=np.where(np.isfinite(scatter), scatter, sigma_range),
+        sigma=np.nan_to_num(block.scatter[take], nan=sigma_range),
         removed=int((wanted & ~block.good).sum()),
     )
 
@@ -160,51 +160,38 @@ class _Block:
     good: np.ndarray
 
 
-class _Blocks:
-    """The blocks of a sweep, one by one; mixed pixels are looked for the first time only."""
-
-    def __init__(self, sweep, steps, T_head_lrf, corrections, lrf, continuous):
-        self.sweep = sweep
-        self.steps = steps
-        self.T_head_lrf = T_head_lrf
-        self.corrections = corrections
-        self.lrf = lrf
-        self.rate = np.zeros(len(sweep.pitch))
-        self.after = np.zeros(len(sweep.bearings))
-        if continuous and len(sweep.pitch) > 1:
-            self.rate = np.gradient(sweep.pitch, sweep.time_s)
-            self.after = after_middle(sweep.bearings, lrf)
-        self.sound = {}  # by first line
-
-    def __iter__(self):
-        lines, beams = self.sweep.ranges.shape
-        size = max(1, BLOCK // beams)
-        for start in range(0, lines, size):
-            yield self._block(start, min(start + size, lines))
-
-    def _block(self, start, stop):
-        """Scan lines from one to before another, and what is about them."""
-        sweep = self.sweep
-        low = max(0, start - MARGIN)
-        high = min(len(sweep.ranges), stop + MARGIN)
-        ranges = sweep.ranges[low:high].astype(float)
-        p_lrf = self.corrections.points(polar_to_points(ranges, sweep.bearings))
+def _blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous, sound):
+    """The blocks of a sweep, one by one; mixed pixels are looked for where `sound`, by first line,
+    does not know them yet.
+    """
+    rate = np.zeros(len(sweep.pitch))
+    after = np.zeros(len(sweep.bearings))
+    if continuous and len(sweep.pitch) > 1:
+        rate = np.gradient(sweep.pitch, sweep.time_s)
+        after = after_middle(sweep.bearings, lrf)
+    lines, beams = sweep.ranges.shape
+    size = max(1, BLOCK // beams)
+    for start in range(0, lines, size):
+        stop = min(start + size, lines)
+        about = slice(max(0, start - MARGIN), stop + MARGIN)
+        ranges = sweep.ranges[about].astype(float)
+        p_lrf = corrections.points(polar_to_points(ranges, sweep.bearings))
         # of every beam: between scan lines the mirror turns while the head moves
-        recorded = sweep.pitch[low:high, None] + self.rate[low:high, None] * self.after
-        pitch = self.corrections.pitch(sweep.placement, recorded)
-        points = lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
+        recorded = sweep.pitch[about, None] + rate[about, None] * after
+        pitch = corrections.pitch(sweep.placement, recorded)
+        points = lrf_to_platform(p_lrf, pitch, T_head_lrf)
         hiding = points
-        good = self.sound.get(start, np.isfinite(ranges))
-        if self.lrf.spot_divergence is not None and start not in self.sound:
-            nearer = mixed(ranges, self.steps, self.lrf)
-            good = self.sound[start] = good & (nearer == 0)
+        good = sound.get(start, np.isfinite(ranges))
+        if lrf.spot_divergence is not None and start not in sound:
+            nearer = mixed(ranges, steps, lrf)
+            good = sound[start] = good & (nearer == 0)
             length = np.linalg.norm(p_lrf, axis=-1, keepdims=True)
             surface = p_lrf * (1 - nearer[..., None] / length)
-            hiding = lrf_to_platform(surface, pitch, self.T_head_lrf)
-        origin = lrf_to_platform(np.zeros(3), pitch, self.T_head_lrf)
+            hiding = lrf_to_platform(surface, pitch, T_head_lrf)
+        origin = lrf_to_platform(np.zeros(3), pitch, T_head_lrf)
         normals, scatter = grid_normals(np.where(good[..., None], points, np.nan), origin)
-        inner = slice(start - low, stop - low)
-        return _Block(
+        inner = slice(start - about.start, stop - about.start)
+        yield _Block(
             lines=slice(start, stop),
             points=points[inner],
             normals=normals[inner],
@@ -247,9 +234,7 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
         Standard deviation along them, metres.
     """
     valid = np.isfinite(points).all(axis=-1)
-    centre = np.zeros(3)
-    if valid.any():
-        centre = np.nanmean(points[valid], axis=0)
+    centre = np.sum(points[valid], axis=0) / max(valid.sum(), 1)
     p = np.where(valid[..., None], points - centre, 0.0)
     width = 2 * WINDOW + 1
 

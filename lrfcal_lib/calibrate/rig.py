@@ -127,12 +127,10 @@ def joint_rig(solution: JointSolution, models: dict[str, CameraModel]) -> Calibr
     -------
     CalibratedRig
     """
-    mounts = dict(
-        zip(solution.observations.cameras, solution.observations.mounts, strict=True)
-    )
+    mounts = solution.observations.mounts
     cameras = {
-        name: CalibratedCamera(T_camera, mounts[name], models[name])
-        for name, T_camera in solution.transforms.items()
+        name: CalibratedCamera(T_camera, mount, models[name])
+        for (name, T_camera), mount in zip(solution.transforms.items(), mounts, strict=True)
     }
     return CalibratedRig(
         method="joint",

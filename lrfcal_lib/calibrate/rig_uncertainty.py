@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+import pandas as pd
 from pydantic import PlainValidator
 from scipy.linalg import block_diag
 
@@ -75,8 +76,7 @@ class RigUncertainty:
 def columns_of(names: Sequence[str], camera: str | None = None) -> np.ndarray:
     """Where each of `COLUMNS` stands among shared unknowns, -1 where it was none, (13,)."""
     wanted = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
-    place = {name: i for i, name in enumerate(names)}
-    return np.array([place.get(name, -1) for name in wanted])
+    return pd.Index(names).get_indexer(wanted)
 
 
 def selection(names: Sequence[str], camera: str | None = None) -> np.ndarray:

@@ -197,7 +197,7 @@ def placement_covariance(
 
 def axis_words(direction):
     """A direction in words: the name of an axis within 8 degrees, otherwise its components."""
-    direction = unit_vector(np.asarray(direction, float))
+    direction = unit_vector(direction)
     largest = int(np.argmax(np.abs(direction)))
     direction = direction * np.sign(direction[largest])
     if direction[largest] > np.cos(np.radians(8)):
@@ -214,8 +214,8 @@ def motion_words(delta: np.ndarray, frame: str) -> str:
         ``[w, v]``.
     frame : str
     """
-    w = np.asarray(delta[:3], float)
-    v = np.asarray(delta[3:6], float)
+    w = delta[:3]
+    v = delta[3:]
     turn = np.linalg.norm(w)
     shift = np.linalg.norm(v)
     if turn < 0.02 * shift:

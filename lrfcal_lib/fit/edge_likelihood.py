@@ -6,12 +6,12 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 from scipy.special import log_ndtr
 
 ROOT_2PI = np.sqrt(2 * np.pi)
 # of a beam step: least softness, so that an edge between two beams is put into their middle
 LEAST_STEP = 0.15
-LEAST_SHARE = 1e-12  # of a spot, so that odds stay finite
 
 
 def disc_share(x: np.ndarray) -> np.ndarray:
@@ -46,43 +46,32 @@ def disc_edge(log_odds: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     slope : ndarray
         ``dx / dlog_odds`` (negative).
     """
-    log_odds = np.asarray(log_odds, float)
-    table, odds = _table()
-    x = np.interp(-log_odds, -odds, table)
-    slope, here = _slope(x)
-    # value and slope must agree for steps to converge
-    refined = x + slope * np.clip(log_odds - here, -1e-4, 1e-4)
-    return refined, _slope(refined)[0]
+    spline = _spline()
+    odds = np.clip(log_odds, *spline.x[[0, -1]])
+    return spline(odds), spline(odds, 1)
 
 
 @cache
-def _table():
-    """Distances of an edge in radii, dense where the share changes least, and their log odds."""
-    x = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]
-    return x, np.log(disc_share(x)) - np.log(disc_share(-x))
-
-
-def _slope(x):
-    """``dx / dlog_odds`` and the log odds of the share inside, at a distance of the edge in
-    radii.
+def _spline():
+    """Distance of an edge in radii by the log odds, from points dense where the share changes
+    least.
     """
-    inside, outside = (np.maximum(disc_share(v), LEAST_SHARE) for v in (x, -x))
-    slope = -inside * outside * np.pi / (2 * np.sqrt(np.maximum(1 - x**2, 1e-12)))
-    return slope, np.log(inside / outside)
+    x = np.sin(np.linspace(1, -1, 4001) * np.pi / 2)[1:-1]
+    return CubicSpline(np.log(disc_share(x) / disc_share(-x)), x)
 
 
 def edge_shift(
-    log_odds: ArrayLike, radius: np.ndarray, background: ArrayLike = 0.0
+    log_odds: float | np.ndarray, radius: np.ndarray, background: float | np.ndarray = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """By how far a spot's centre may lie outside an edge and still read the board.
 
     Parameters
     ----------
-    log_odds : array_like
+    log_odds : float or ndarray
         The sensor's, for a background as far and as bright as the board.
-    radius : array_like
+    radius : ndarray
         Of the spot, metres.
-    background : array_like
+    background : float or ndarray
         What the real one adds: ``-2 ln(d_background / d_board)``, 0 where it is not known.
 
     Returns
@@ -92,8 +81,8 @@ def edge_shift(
     slope : ndarray
         Its derivative by `log_odds`.
     """
-    x, slope = disc_edge(np.add(log_odds, background))
-    return np.multiply(radius, x), np.multiply(radius, slope)
+    x, slope = disc_edge(log_odds + background)
+    return radius * x, radius * slope
 
 
 def flip_sigma(
@@ -117,8 +106,8 @@ def flip_sigma(
     share : ndarray
         ``d ln sigma / d ln softness``, 0 (all floor) to 1.
     """
-    soft = softness * np.asarray(radius, float)
-    sigma = np.hypot(soft, LEAST_STEP * np.asarray(step, float))
+    soft = softness * radius
+    sigma = np.hypot(soft, LEAST_STEP * step)
     return sigma, (soft / sigma) ** 2
 
 
@@ -151,13 +140,13 @@ def beam_terms(
         of an EM step.
     """
     sign = np.where(hit, 1.0, -1.0)
-    z = sign * np.asarray(margin, float) / sigma
+    z = sign * margin / sigma
     log_p = log_ndtr(z)
     mills = np.exp(-0.5 * z**2 - log_p) / ROOT_2PI  # phi(z) / Phi(z) without overflow
-    weight = 1.0
-    cost = -log_p
+    likely = np.log1p(-2 * lapse) + log_p
+    cost = -likely
     if lapse:
-        cost = -np.logaddexp(np.log(lapse), np.log1p(-2 * lapse) + log_p)
-        weight = np.exp(np.log1p(-2 * lapse) + log_p + cost)
+        cost = -np.logaddexp(np.log(lapse), likely)
+    weight = np.exp(likely + cost)
     decline = np.maximum(z + mills, 0.0)  # far outside what is left of it is rounding
     return cost, -weight * sign * mills / sigma, weight * mills * decline / sigma**2

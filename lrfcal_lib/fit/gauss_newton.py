@@ -48,12 +48,12 @@ def gauss_newton(
             [(residuals(a) - residuals(b)) / (2 * SMALL) for a, b in sides], axis=1
         )
         step = np.linalg.lstsq(J, -r)[0]
+        cost = np.sum(r**2) / 2
         while (
-            np.sum(residuals(move(x, step)) ** 2) > np.sum(r**2)
-            and np.abs(step).max() > stop
+            np.sum(residuals(move(x, step)) ** 2) / 2 > cost and np.abs(step).max() > stop
         ):
             step = step / 2
-        path.append([np.sum(r**2) / 2, *step])
+        path.append([cost, *step])
         x = move(x, step)
         if np.abs(step).max() < stop:
             break

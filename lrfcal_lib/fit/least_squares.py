@@ -108,10 +108,8 @@ def _roots(block, axes):
     if block.cost is not None:
         return np.ones(())
     groups = block.white.reshape(*block.white.shape[:-1], -1, block.size)
-    squares = np.sum(groups**2, axis=-1)
-    count = np.asarray(block.size if block.count is None else block.count, float)
-    count = np.broadcast_to(count, squares.shape)
-    z = np.sqrt(squares / count)
+    count = block.size if block.count is None else block.count
+    z = np.sqrt(np.vecdot(groups, groups) / count)
     return (1 + (z / _level(z, count, block, axes) / CAUCHY) ** 2) ** -0.5
 
 
@@ -119,8 +117,7 @@ def _times(blocks, roots):
     """Blocks with the roots of their weights in their whiteners."""
     weighted = []
     for block, root in zip(blocks, roots, strict=True):
-        whole = block.size > 1 and root.ndim > 0
-        factor = root[..., None, None] if whole else root
+        factor = root[..., None, None] if block.size > 1 else root
         weighted.append(replace(block, whitener=block.whitener * factor))
     return weighted
 
@@ -145,8 +142,7 @@ def _level(z, count, block, axes):
     inside = block.whitener != 0
     if block.size > 1:
         inside = inside.any(axis=(-1, -2))
-    sizes, index = np.unique(count, return_inverse=True)
-    usual = np.sqrt(chdtri(sizes, 0.5) / sizes)[index].reshape(count.shape)
+    usual = np.sqrt(chdtri(count, 0.5) / count)
     wide = (*z.shape[: z.ndim + min(np.atleast_1d(axes))], -1)
     level = medians((z / usual).reshape(wide), (inside & (z == z)).reshape(wide))
     return np.maximum(np.expand_dims(level, axes), 1e-9)
@@ -168,6 +164,11 @@ def remembered(evaluate: Callable) -> Callable:
         return last[1]
 
     return once
+
+
+def _axes(shared):
+    """What a cost is summed over: residuals of trials, or placements and residuals."""
+    return -1 if shared is None else (-2, -1)
 
 
 def _blocks(evaluate, state):
@@ -245,8 +246,7 @@ def eliminate(
         back = pseudo_inverse(own) @ known
     taken = hessian[:, :c, c:] @ back
     reduced = hessian[:, :c, :c] - taken[..., :c]
-    reduced_gradient = gradient[:, :c] - taken[..., c]
-    return reduced, reduced_gradient, back
+    return reduced, gradient[:, :c] - taken[..., c], back
 
 
 def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
@@ -265,6 +265,29 @@ def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
     return eliminate(hessian, np.zeros(hessian.shape[:2]), shared)[0]
 
 
+def _by_shared(back):
+    """Derivatives (p, k, c) of the best values of all unknowns by the shared ones."""
+    own = -back[..., :-1]
+    same = np.eye(own.shape[-1])
+    return np.concatenate([np.broadcast_to(same, (len(own), *same.shape)), own], axis=1)
+
+
+def likeliest(
+    hessian: np.ndarray, gradient: np.ndarray, shared: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Steps (p, k) of all unknowns of every placement to the minimum, and their covariances (p, k,
+    k), from normal equations as of :func:`eliminate`.
+    """
+    reduced, right, back = eliminate(hessian, gradient, shared)
+    by_shared = _by_shared(back)
+    inverse = pseudo_inverse(np.sum(reduced, axis=0))
+    steps = by_shared @ (-inverse @ np.sum(right, axis=0))
+    steps[:, shared:] -= back[..., shared]
+    covariance = by_shared @ inverse @ by_shared.mT
+    covariance[:, shared:, shared:] += pseudo_inverse(hessian[:, shared:, shared:])
+    return steps, covariance
+
+
 def _step(hessian, gradient, damping, shared):
     """A damped step, its squared length in standard deviations, and the fall of the cost it
     promises.
@@ -279,10 +302,9 @@ def _step(hessian, gradient, damping, shared):
     else:
         reduced, right, back = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
-        step = common, -(back[..., shared] + back[..., :shared] @ common)
-        whole = np.concatenate(
-            [np.broadcast_to(common, (len(back), shared)), step[1]], axis=-1
-        )
+        whole = _by_shared(back) @ common
+        whole[:, shared:] -= back[..., shared]
+        step = common, whole[:, shared:]
     length = np.vecdot(whole, np.matvec(hessian, whole))
     promised = -np.vecdot(whole, gradient) - 0.5 * length
     if shared is None:
@@ -329,7 +351,7 @@ def minimise(
         A trial has converged when a step is shorter than this many standard deviations of the
         estimate.
     """
-    axes = -1 if shared is None else (-2, -1)
+    axes = _axes(shared)
     problem = _weighted(evaluate, robust, axes)
     blocks, roots = problem(state)
     at = linearise(blocks, axes)
@@ -361,9 +383,7 @@ def minimise(
             blocks, roots = problem(state)
         at = linearise(blocks, axes)
         history.append(at.cost)
-    if converged.ndim == 0:
-        converged = converged[()]
-    return Minimum(state, converged, len(history) - 1, np.array(history))
+    return Minimum(state, converged[()], len(history) - 1, np.array(history))
 
 
 def _next_damping(damping, gain, accepted):
@@ -502,42 +522,42 @@ def solve(
         tolerance=tolerance,
     )
     blocks = _blocks(evaluate, minimum.state)
-    axes = -1 if shared is None else (-2, -1)
-    weights = []
-    for block in blocks:
-        weight = np.ones_like(block.white)
-        if robust and block.cost is None:
-            weight = np.repeat(_roots(block, axes) ** 2, block.size, axis=-1)
-        weights.append(weight)
-    return _solution(question, minimum, blocks, np.concatenate(weights, axis=-1), shared)
+    weighted = blocks
+    if robust:
+        weighted = _times(blocks, [_roots(block, _axes(shared)) for block in blocks])
+    return _solution(question, minimum, blocks, weighted, shared)
 
 
-def _by_placement(r, J, weights, groups, shared):
+def _stacked(blocks):
+    """White residuals (..., n) of all blocks, and their Jacobian (..., n, k)."""
+    r = np.concatenate([block.white for block in blocks], axis=-1)
+    return r, np.concatenate([block.white_jacobian for block in blocks], axis=-2)
+
+
+def _by_placement(r, J, groups, shared):
     """Normal equations of the reported unknowns by placement (one group where they are not told
     apart).
     """
-    weighted = (weights[..., None] * J).mT
+    transposed = J.mT
     if shared is not None:
-        scores = np.matvec(weighted, r)
-        return reduced_hessian(weighted @ J, shared), scores[:, :shared]
+        scores = np.matvec(transposed, r)
+        return reduced_hessian(transposed @ J, shared), scores[:, :shared]
     index = np.unique(groups, return_inverse=True)[1]
     index = np.repeat(index, r.shape[-1] // len(index))
     member = index == np.arange(index.max() + 1)[:, None]
-    weighted = weighted[..., None, :, :] * member[:, None]
-    return weighted @ J[..., None, :, :], np.matvec(weighted, r[..., None, :])
+    transposed = transposed[..., None, :, :] * member[:, None]
+    return transposed @ J[..., None, :, :], np.matvec(transposed, r[..., None, :])
 
 
-def _solution(question, minimum, blocks, weights, shared):
-    """The Solution at a minimum, from the blocks and their robust weights (..., n) there."""
-    r = np.concatenate([block.white for block in blocks], axis=-1)
-    J = np.concatenate([block.white_jacobian for block in blocks], axis=-2)
-    hessians, scores = _by_placement(r, J, weights, question.groups, shared)
+def _solution(question, minimum, blocks, weighted, shared):
+    """The Solution at a minimum, from the blocks there without and with their robust weights."""
+    r, J = _stacked(blocks)
+    weighted_r, weighted_J = _stacked(weighted)
+    hessians, scores = _by_placement(weighted_r, weighted_J, question.groups, shared)
     hessian = np.sum(hessians, axis=-3)
     scales = np.broadcast_to(question.scales, hessian.shape[-1:])
     motions = question.open_motions(hessian, scales)
-    chi2 = (
-        np.sum(weights * r**2, axis=-1 if shared is None else (-2, -1)) + question.chi2_rest
-    )
+    chi2 = np.sum(weighted_r**2, axis=_axes(shared)) + question.chi2_rest
     freedom = question.freedom
     if freedom is None:
         own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)

@@ -18,11 +18,9 @@ def medians(values: np.ndarray, used: np.ndarray) -> np.ndarray:
     """
     count = used.sum(axis=-1, keepdims=True)
     ordered = np.sort(np.where(used, values, np.inf), axis=-1)
-    low, high = (
-        np.take_along_axis(ordered, np.maximum(n // 2, 0), axis=-1)
-        for n in (count - 1, count)
-    )
-    return np.where(count > 0, 0.5 * low + 0.5 * high, 0.0)[..., 0]
+    middle = np.concatenate([count - 1, count], axis=-1) // 2
+    median = np.take_along_axis(ordered, middle, axis=-1).mean(axis=-1)
+    return np.where(count[..., 0] > 0, median, 0.0)
 
 
 def pad(

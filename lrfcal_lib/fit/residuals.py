@@ -50,11 +50,6 @@ def line_residuals(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) ->
     return line_distance(mirrored(moved, camera), lines)
 
 
-def line_gradients(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) -> np.ndarray:
-    """Derivatives (..., n, 3) of :func:`line_residuals` by the moved points, pixels a metre."""
-    return np.vecmat(lines[..., :2], pinhole_jacobian(moved, camera))
-
-
 def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     """Distances d(e, ab) of projected crossings from their image lines: :func:`line_residuals` as a
     Block.
@@ -72,11 +67,13 @@ def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     rotated = rotate_points(pose, obs.crossing_points)
     moved = rotated + pose[..., None, :, 3]  # (16)
     residuals = line_residuals(moved, obs.crossing_lines, obs.model)
-    gradients = line_gradients(moved, obs.crossing_lines, obs.model)
+    by_point = pinhole_jacobian(moved, obs.model)
+    gradients = np.vecmat(obs.crossing_lines[..., :2], by_point)  # pixels a metre
     jacobian = gradient_by_pose(rotated, gradients)
     noise = moved_noise(pose, gradients, obs.crossing_covariance)
     variance = np.vecdot(gradients, noise) + obs.crossing_line_sigma**2
-    correction = noise_correction(rotated, moved, gradients, noise, residuals / variance)
+    shift = noise * (residuals / variance)[..., None]
+    correction = noise_correction(rotated, moved, gradients, shift)
     return Block(
         residuals, jacobian, 1 / np.sqrt(variance), corrected=jacobian - correction
     )
@@ -101,7 +98,7 @@ def sight_block(
     rotated = rotate_points(pose, points)
     residuals = np.vecdot(normals, rotated + pose[..., None, :, 3])
     jacobian = gradient_by_pose(rotated, np.broadcast_to(normals, rotated.shape))
-    return Block(residuals, jacobian, np.full(residuals.shape, 1.0 / sigma))
+    return Block(residuals, jacobian, np.asarray(1 / sigma))
 
 
 def sight_normals(lines: np.ndarray, model: CameraModel) -> tuple[np.ndarray, np.ndarray]:
@@ -205,10 +202,9 @@ def noise_correction(
     point: np.ndarray,
     gradient: np.ndarray,
     shift: np.ndarray,
-    factor: np.ndarray,
 ) -> np.ndarray:
-    """What errors in the points take from Jacobian rows by the pose: ``factor`` times half the
-    change of the variance.
+    """What errors in the points take from Jacobian rows by the pose: the weighted residual times
+    half the change of the variance.
 
     Parameters
     ----------
@@ -217,9 +213,8 @@ def noise_correction(
     gradient : ndarray, shape (..., n, 3)
         Of a scalar ``l . pinhole(q)`` by the moved point q.
     shift : ndarray, shape (..., n, 3)
-        The direction in which the noise pulls the point, see :func:`moved_noise`.
-    factor : ndarray, shape (..., n)
-        The weighted residual.
+        The direction in which the noise pulls the point, see :func:`moved_noise`, times the
+        weighted residual.
 
     Returns
     -------
@@ -230,7 +225,7 @@ def noise_correction(
     by_shift = -gradient * shift[..., 2:] / depth
     by_shift[..., 2] -= np.vecdot(gradient, shift) / depth[..., 0]
     by_turn = cross(shift, gradient) + cross(rotated, by_shift)
-    return factor[..., None] * np.concatenate([by_turn, by_shift], axis=-1)
+    return np.concatenate([by_turn, by_shift], axis=-1)
 
 
 def moved_noise(
@@ -250,6 +245,4 @@ def moved_noise(
     -------
     ndarray, shape (..., n, 3)
     """
-    in_source = gradient @ pose[..., :3]
-    pulled = (in_source[..., None, :] @ covariance)[..., 0, :]
-    return rotate_points(pose, pulled)
+    return rotate_points(pose, np.vecmat(gradient @ pose[..., :3], covariance))

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 from scipy.special import polygamma
 
@@ -25,7 +24,7 @@ AXIS_WORDS = (
 )
 
 
-def beyond_chance(excess: ArrayLike, freedom: ArrayLike) -> np.ndarray:
+def beyond_chance(excess: float | np.ndarray, freedom: float | np.ndarray) -> np.ndarray:
     """How far a variance is above another one, when what chance does is taken off.
 
     Off the square of the logarithm of the ratio goes its variance by chance, trigamma of half the
@@ -33,9 +32,9 @@ def beyond_chance(excess: ArrayLike, freedom: ArrayLike) -> np.ndarray:
 
     Parameters
     ----------
-    excess : array_like
+    excess : float or ndarray
         Logarithm of the ratio of both variances, 0 or more.
-    freedom : array_like
+    freedom : float or ndarray
         Of the first.
 
     Returns
@@ -43,7 +42,7 @@ def beyond_chance(excess: ArrayLike, freedom: ArrayLike) -> np.ndarray:
     ndarray
         Logarithm of the ratio that is believed, 0 or more.
     """
-    chance = polygamma(1, np.asarray(freedom) / 2)
+    chance = polygamma(1, freedom / 2)
     return np.maximum(excess - chance / np.maximum(excess, 1e-9), 0.0)
 
 

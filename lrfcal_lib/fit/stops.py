@@ -25,9 +25,8 @@ def same_stop(pitch: np.ndarray, used: np.ndarray) -> np.ndarray:
     -------
     ndarray of bool, shape (p, v, v)
     """
-    stop = np.rint(pitch / SAME_STOP)
-    same = stop[:, :, None] == stop[:, None, :]
-    return same & used[:, :, None] & used[:, None, :]
+    stop = np.where(used, np.rint(pitch / SAME_STOP), np.nan)  # which is like no other
+    return stop[:, :, None] == stop[:, None, :]
 
 
 @dataclass(frozen=True)

@@ -102,12 +102,10 @@ def polar_to_points(ranges: ArrayLike, bearings: ArrayLike) -> np.ndarray:
     ndarray, shape (..., 3)
         ``p_lrf``, metres; NaN rows where the range is NaN.
     """
-    ranges, bearings = np.broadcast_arrays(
-        np.asarray(ranges, float), np.asarray(bearings, float)
-    )
+    ranges = np.asarray(ranges, float)
     x = ranges * np.cos(bearings)
     y = ranges * np.sin(bearings)
-    return np.stack([x, y, 0.0 * ranges], axis=-1)
+    return np.stack([x, y, 0.0 * x], axis=-1)
 
 
 def polar_covariance(
@@ -127,7 +125,6 @@ def polar_covariance(
     ndarray, shape (..., 3, 3)
         LRF frame, square metres.
     """
-    sigma_range = np.asarray(sigma_range, float)
     ranges, bearings, sigma_range = np.broadcast_arrays(ranges, bearings, sigma_range)
     along = polar_to_points(sigma_range, bearings)
     across = polar_to_points(ranges * sigma_bearing, bearings + np.pi / 2)
@@ -249,12 +246,7 @@ def head_from_axis(axis: TiltAxis, stated: RigidTransform | None = None) -> Rigi
         ``T_head_lrf`` with the smallest rotation that maps the axis' direction to x, and no shift
         along the axis.
     """
-    direction = np.asarray(axis.direction, float)
-    turn = np.cross(direction, [1.0, 0.0, 0.0])
-    sine = np.linalg.norm(turn)
-    rotation = Rotation.identity()
-    if sine > 0:
-        rotation = Rotation.from_rotvec(turn / sine * np.arctan2(sine, direction[0]))
+    rotation, _ = Rotation.align_vectors([1.0, 0.0, 0.0], axis.direction)
     head = carry(rotation, axis.foot)
     if stated is None:
         return head
@@ -492,8 +484,7 @@ def log_rotation(R: np.ndarray) -> np.ndarray:
     ndarray, shape (..., 3)
         Radians.
     """
-    flat = Rotation.from_matrix(R.reshape(-1, 3, 3), assume_valid=True)
-    return flat.as_rotvec().reshape(R.shape[:-1])
+    return Rotation.from_matrix(R, assume_valid=True).as_rotvec()
 
 
 def pose_parameters(pose: np.ndarray) -> np.ndarray:

@@ -10,11 +10,13 @@ from functools import partial
 from types import MappingProxyType
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial.transform import RigidTransform
 from scipy.special import chdtri
 
 from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m
 from lrfcal_lib.fit.result import Solution
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_difference
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers import lines, plane_start, planes
@@ -303,14 +305,13 @@ def _left_out_errors(obs, method, full):
     for held, solution in left_out(obs, obs.along(), method, full):
         edges.append(edge_residuals_px(held, solution.transform))
         faces.append(plane_residuals_m(held, solution.transform))
-    return [np.sqrt(_mean(np.concatenate(errors) ** 2)) for errors in (edges, faces)]
+    return [rms(np.concatenate(errors)) for errors in (edges, faces)]
 
 
 def _mean(values):
     """Mean of the finite values; NaN where there are none."""
-    values = np.asarray(values, float)
-    values = values[np.isfinite(values)]
-    return values.mean() if len(values) else np.nan
+    finite = [value for value in values if np.isfinite(value)]
+    return np.mean(finite) if finite else np.nan
 
 
 def best_minimum(obs, row, minima):
@@ -378,17 +379,15 @@ def find_outlying_placements(obs: CameraObservations) -> tuple[list[int], dict[i
         inliers = obs.select(placements[accepted])
         T = plain(inliers, T0=T, search=False).transform
         _, mean = _mean_squares(obs, T)
+    rest = placements[~accepted].tolist()
     errors = np.sqrt(mean[~accepted]).tolist()
-    return placements[accepted].tolist(), dict(
-        zip(placements[~accepted].tolist(), errors, strict=True)
-    )
+    return placements[accepted].tolist(), dict(zip(rest, errors, strict=True))
 
 
 def _mean_squares(obs, transform):
     """Placements, and mean squares of their points' distances from the planes."""
-    residuals = plane_residuals_m(obs, transform)
-    known = np.isfinite(residuals)
-    placements, index, count = np.unique(
-        obs.plane_placement[known], return_inverse=True, return_counts=True
-    )
-    return placements, np.bincount(index, residuals[known] ** 2) / count
+    placements = np.unique(obs.plane_placement)
+    squares = plane_residuals_m(obs, transform) ** 2
+    mean = ndimage.mean(squares, obs.plane_placement, placements)
+    known = np.isfinite(mean)
+    return placements[known], mean[known]

@@ -175,8 +175,8 @@ def solve_joint(
         state = minimum(state, data, unknowns, LAST_STEP).state
     if required:  # a cause before what follows from it: edges that fit nowhere, say
         refuse_contradiction(obs, state, LAST_MISS, left_out)
-    found = finished(obs, state, data, unknowns, required)
-    return replace(found, excluded=tuple(left_out))
+    solution = finished(obs, state, data, unknowns, required)
+    return replace(solution, excluded=tuple(left_out))
 
 
 def solve_again(obs: JointObservations, like: JointSolution) -> JointSolution:
@@ -267,8 +267,7 @@ def with_step_error(solution: JointSolution) -> JointSolution:
     free = pseudo_inverse(here.information.sum(axis=0))
     moved = -free @ pull.sum(axis=0) / STEP * sigma
     spread = dyads(moved)
-    estimate = solution.solution.widened(spread, spread)
-    return replace(solution, solution=estimate, step=moved)
+    return replace(solution, solution=solution.solution.widened(spread, spread), step=moved)
 
 
 def parameters_of(state: JointState, unknowns: Unknowns) -> np.ndarray:

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
 from lrfcal_lib.fit.least_squares import Block
-from lrfcal_lib.fit.padding import medians, pad
+from lrfcal_lib.fit.padding import medians
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
@@ -50,17 +51,18 @@ def left_out_share(obs: JointObservations, left_out: list[Problem]) -> float:
 
 def without_blind_cameras(obs, required):
     """Leave out cameras that never see a board; refuse them where everything is required."""
-    blind = [name for i, name in enumerate(obs.cameras) if not (obs.view_camera == i).any()]
-    if not blind:
-        return obs, []
+    seeing = []
     left_out = []
-    for name in blind:
+    for number, name in enumerate(obs.cameras):
+        if number in obs.view_camera:
+            seeing.append(name)
+            continue
         words = "it never sees the board, its pose stays open"
         left_out.append(Problem(Stage.JOINT, ProblemKind.NO_IMAGES, words, camera=name))
-    if required:
+    if required and left_out:
         words = "; ".join(map(str, left_out))
         raise DegenerateGeometry(f"{words}; leave it out with obs.with_cameras")
-    return obs.with_cameras([name for name in obs.cameras if name not in blind]), left_out
+    return obs.with_cameras(seeing), left_out
 
 
 def without_lost_placements(obs):
@@ -84,14 +86,16 @@ def refuse_contradiction(
     Placements that were left out for that already count with them.
     """
     place = obs.view_placement
+    if not len(place):
+        return
     boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
     misses = np.linalg.norm(boards[..., 3] - state.boards[place, :, 3], axis=1)
     stated = np.sqrt(np.linalg.trace(obs.view_covariance[:, 3:, 3:]))
     before = sum(p.kind == CONTRADICTS and p.camera is None for p in left_out)
-    of = pad(place, len(obs.placements), miss=misses, stated=stated)
-    limit = np.maximum(most, MOST_SIGMA * medians(of["stated"], of["used"]))
-    wrong = np.sum(medians(of["miss"], of["used"]) > limit)
-    every = len(np.unique(place)) + before
+    shown = np.unique(place)
+    limit = np.maximum(most, MOST_SIGMA * ndimage.median(stated, place, shown))
+    wrong = np.sum(ndimage.median(misses, place, shown) > limit)
+    every = len(shown) + before
     if wrong and 3 * (wrong + before) > every:
         raise DegenerateGeometry(
             f"images and scans contradict each other: for {wrong + before} of {every} placements "
@@ -102,9 +106,14 @@ def refuse_contradiction(
 
 def face_miss(state: JointState, data: JointData) -> float:
     """By how much a state puts the scanned points off their boards, metres (median)."""
-    boards = state.boards[:, None]
-    heights = np.abs(np.vecdot(face_points(state, data) - boards[..., 3], boards[..., 2]))
-    return float(np.median(medians(heights, data.face["used"])))
+    misses = _misses(face_points(state, data), state.boards, data.face["used"])
+    return float(np.median(misses))
+
+
+def _misses(points, boards, used):
+    """How far points (p, n, 3) are off their boards (p, 3, 4), metres (medians)."""
+    heights = np.vecdot(points - boards[:, None, :, 3], boards[:, None, :, 2])
+    return medians(np.abs(heights), used)
 
 
 def without_contradictions(obs, state, data):
@@ -113,15 +122,13 @@ def without_contradictions(obs, state, data):
     """
     place = obs.view_placement
     boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
-    away = face_points(state, data)[place] - boards[:, None, :, 3]
-    heights = np.abs(np.vecdot(away, boards[:, None, :, 2]))
-    misses = medians(heights, data.face["used"][place])  # of the faces' points
+    misses = _misses(face_points(state, data)[place], boards, data.face["used"][place])
     wrong = misses > max(LAST_MISS, FAR_MISS * np.median(misses))
     if not wrong.any():
         return obs, state, []
     good, first = np.unique(place[~wrong], return_index=True)
     out = np.setdiff1d(place, good)
-    single = np.flatnonzero(wrong & np.isin(place, good))
+    single = wrong & np.isin(place, good)
     moved = state.boards.copy()
     moved[good] = boards[~wrong][first]
     left_out = []
@@ -129,13 +136,12 @@ def without_contradictions(obs, state, data):
         miss = 1000 * misses[place == row].min()
         why = f"the scan is {miss:.0f} mm off where its image puts the board"
         left_out.append(of_placement(obs, row, CONTRADICTS, why))
-    for view in single:
+    for view in np.flatnonzero(single):
         why = f"it puts the board {1000 * misses[view]:.0f} mm off the scan"
         left_out.append(of_image(obs, view, why))
     kept = np.setdiff1d(np.arange(len(obs.placements)), out)
-    rest = obs.keep(view=~np.isin(np.arange(len(place)), single))
-    state = replace(state, boards=moved).of_placements(kept)
-    return rest.select(obs.placements[kept]), state, left_out
+    rest = obs.keep(view=~single).select(obs.placements[kept])
+    return rest, replace(state, boards=moved).of_placements(kept), left_out
 
 
 def misfits(blocks: dict[str, Block], data: JointData) -> np.ndarray:

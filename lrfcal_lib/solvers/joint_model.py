@@ -5,6 +5,7 @@ Poses of equations (4) to (6) and (16); residuals are in :mod:`lrfcal_lib.solver
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate, compress, pairwise, starmap
 
 import numpy as np
 
@@ -66,8 +67,8 @@ class Unknowns:
     """Which columns of the full Jacobian are unknown.
 
     `cameras` and `edges` are their numbers, `sensor` names some of `SENSOR`, `sweep` one of
-    `SWEEPS`; `poses` tells whether the cameras' are unknown, `sides` whether every placement, and
-    every side of it, has a deviation of its own from the sensor's edge bias.
+    `SWEEPS`; `sides` tells whether every placement, and every side of it, has a deviation of its
+    own from the sensor's edge bias.
     """
 
     cameras: int
@@ -75,33 +76,28 @@ class Unknowns:
     axis: bool = True
     sensor: tuple[str, ...] = SENSOR[:3]
     sweep: str = "none"
-    poses: bool = True
     sides: bool = False
 
     @property
     def mask(self) -> np.ndarray:
         """Of the full set of shared columns, those that are unknown."""
         sensor = [name in self.sensor for name in SENSOR]
-        return np.array([self.axis] * 4 + [self.poses] * 6 * self.cameras + sensor)
+        return np.array([self.axis] * 4 + [True] * 6 * self.cameras + sensor)
 
     @cached_property
     def columns(self) -> dict[str, slice]:
         """Where the unknowns stand in a Jacobian: first the shared ones, then the placement's
         own.
         """
-        widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras * self.poses}
+        widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras}
         widths |= {name: int(name in self.sensor) for name in SENSOR}
         widths |= {
             "board": 6,
             "sweep": SWEEPS[self.sweep],
             "sides": (self.edges + 1) * self.sides,
         }
-        columns = {}
-        end = 0
-        for name, width in widths.items():
-            columns[name] = slice(end, end + width)
-            end += width
-        return columns
+        ends = accumulate(widths.values(), initial=0)
+        return dict(zip(widths, starmap(slice, pairwise(ends)), strict=True))
 
     @property
     def shared(self) -> int:
@@ -116,8 +112,7 @@ class Unknowns:
     def names(self, cameras) -> tuple[str, ...]:
         """Names of the shared unknowns, of cameras with these names."""
         poses = [f"{camera}_{name}" for camera in cameras for name in geometry.POSE_NAMES]
-        every = np.array([*AXIS_NAMES, *poses, *SENSOR])
-        return tuple(every[self.mask].tolist())
+        return tuple(compress([*AXIS_NAMES, *poses, *SENSOR], self.mask))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from lrfcal_lib.fit.covariance import pseudo_inverse
-from lrfcal_lib.fit.least_squares import eliminate, linearise
+from lrfcal_lib.fit.least_squares import likeliest, linearise
 from lrfcal_lib.fit.result import beyond_chance
 from lrfcal_lib.solvers.joint_model import SWEEPS, JointData, JointState, Levels, Unknowns
 from lrfcal_lib.solvers.joint_residuals import (
@@ -55,8 +55,9 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
         changed["view_scale"] = float(scale)
         changed["sigma_pitch"] = sigma
     if "side" in blocks and "beam" in blocks:
-        scales = side_levels(state.sides, data, own, gradient[:, c:])
-        changed["side_sigma"], changed["background_sigma"] = scales
+        changed["side_sigma"], changed["background_sigma"] = side_levels(
+            state.sides, data, own, gradient[:, c:]
+        )
     if "sweep" in blocks:
         number = SWEEPS[unknowns.sweep]
         scatter = sweep_levels(state.sweeps[:, :number], data, hessian, gradient, c)
@@ -66,14 +67,11 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
 
 def settled(before: Levels, after: Levels) -> bool:
     """Whether noise levels have settled within a few per cent."""
-    ratios = [
-        after.face_scale / before.face_scale,
-        after.face_share / before.face_share,
-        after.beam_share / before.beam_share,
-        after.view_scale / before.view_scale,
-        *np.divide(after.sweep_sigma, before.sweep_sigma),
+    compared = [
+        [at.face_scale, at.face_share, at.beam_share, at.view_scale, *at.sweep_sigma]
+        for at in (before, after)
     ]
-    return bool(np.all(np.abs(np.log(ratios)) < SETTLED))
+    return bool(np.all(np.abs(np.diff(np.log(compared), axis=0)) < SETTLED))
 
 
 def face_points(state: JointState, data: JointData) -> np.ndarray:
@@ -114,7 +112,8 @@ def face_levels(state, data, block, shared, spread):
         common_errors(modes, z / scale, by_own, levels.face_share, spread)
         for modes in (parts, planes)
     ]
-    share = levels.face_share if np.isnan(excess).all() else np.exp(-np.nanmax(excess))
+    most = np.fmax(*excess)
+    share = levels.face_share if np.isnan(most) else np.exp(-most)
     return float(scale), float(share)
 
 
@@ -182,20 +181,16 @@ def beam_share(state, data, block, shared, spread):
     lapsed = data.levels.lapse * np.exp(np.where(used, block.cost, 0.0) / before)
     curvature = root**2 * (1 - block.residuals**2 * lapsed / (1 - lapsed))
     gain = max(np.sum(curvature) / np.sum(root**2), LEAST_CURVATURE)
-    along = np.where(used, _along_edges(state, data), 0.0)[..., None]
+    ray = rays(state, data, data.beam)
+    sides = edge_distance(state, data, data.beam, ray)
+    places = np.vecdot(meeting(state, ray).point, sides.along)  # metres
+    along = np.where(used, places, 0.0)[..., None]
     edges = np.eye(len(data.lines))[data.beam["edge"]] * root[..., None]
     information = np.maximum(np.sum(edges**2, axis=1, keepdims=True), 1e-300)
     middle = np.sum(edges**2 * along, axis=1, keepdims=True) / information
     slopes = edges * (along - middle)
     excess = common_errors(slopes, block.residuals, by_own, before, spread, gain)
     return before if np.isnan(excess) else float(gain * np.exp(-excess))
-
-
-def _along_edges(state, data):
-    """Where beams meet the boards along their edges, metres, (p, n)."""
-    ray = rays(state, data, data.beam)
-    edge = edge_distance(state, data, data.beam, ray)
-    return np.vecdot(meeting(state, ray).point, edge.along)
 
 
 def view_levels(data, block, hessian, gradient, shared):
@@ -243,28 +238,17 @@ def judged(block, factor, others, rows, shared):
     """
     c = shared
     f2 = factor**2
-    z = block.white
-    J = block.white_jacobian
     hessian, gradient, half_square = linearise([block])
     whole = others[0] + hessian / f2
     right = others[1] + gradient / f2
     size = np.linalg.trace(whole)[:, None, None]
     whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
-    reduced, score, back = eliminate(whole, right, c, regular=True)
-    total = np.sum(reduced, axis=0)
-    inverse = np.linalg.inv(total)
-    step = -inverse @ np.sum(score, axis=0)
-    own = -(back[..., c] + back[..., :c] @ step)
-    moved = np.concatenate([np.broadcast_to(step, (len(own), c)), own], axis=-1)
-    left = np.sum((z + np.matvec(J, moved)) ** 2)
+    moved, covariance = likeliest(whole, right, c)
+    left = np.sum((block.white + np.matvec(block.white_jacobian, moved)) ** 2)
     # share of the views in what is known of the unknowns: rows that these take up
-    inner = np.linalg.inv(whole[:, c:, c:])
-    every = np.broadcast_to(np.eye(c), (len(own), c, c))
-    spread = np.concatenate([every, -back[..., :c]], axis=1)
-    taken = np.sum(inner * hessian[:, c:, c:]) + np.sum(
-        (spread @ inverse) * (hessian @ spread)
-    )
-    freedom = np.linalg.slogdet(whole[:, c:, c:])[1].sum() + np.linalg.slogdet(total)[1]
+    taken = np.sum(covariance * hessian)
+    own = np.linalg.slogdet(whole[:, c:, c:])[1].sum()
+    freedom = own - np.linalg.slogdet(covariance[0, :c, :c])[1]
     cost = half_square / f2 + 0.5 * (
         np.vecdot(moved, right).sum() + rows * np.log(f2) + block.log_determinant + freedom
     )
@@ -280,29 +264,29 @@ def sweep_levels(sweeps, data, hessian, gradient, shared):
     sweep more is believed to err as `USUAL_SWEEP`. `hessian` (p, k, k) and `gradient` (p, k) are
     of all blocks, `shared` unknowns first.
     """
-    c = shared
     number = sweeps.shape[1]
-    rows = np.arange(6, 6 + number)  # of a placement's own unknowns
-    places = c + rows
+    places = shared + 6 + np.arange(number)  # behind the board's pose
     usual = USUAL_SWEEP[:number] ** 2
     before = np.square(data.levels.sweep_sigma[:number])
     variance = before
     for _ in range(SWEEP_ROUNDS):
-        whole = hessian.copy()
-        right = gradient.copy()
-        change = 1 / variance - 1 / before
-        whole[:, places, places] += change
-        right[:, places] += change * sweeps
-        reduced, score, back = eliminate(whole, right, c)
-        inverse = np.linalg.pinv(np.sum(reduced, axis=0), hermitian=True)
-        step = -inverse @ np.sum(score, axis=0)
-        by_shared = back[:, rows, :c]
-        error = sweeps - back[:, rows, c] - by_shared @ step
-        own = pseudo_inverse(whole[:, c:, c:])
-        unknown = own[:, rows, rows] + np.vecdot(by_shared @ inverse, by_shared)
+        more = 1 / variance - 1 / before
+        square, unknown = expecting(more, sweeps, places, hessian, gradient, shared)
         told = np.maximum(1 - unknown / variance, 0.0)
-        variance = (np.sum(error**2, axis=0) + usual) / (np.sum(told, axis=0) + 1)
+        variance = (np.sum(square, axis=0) + usual) / (np.sum(told, axis=0) + 1)
     return np.sqrt(variance)
+
+
+def expecting(more, values, places, hessian, gradient, shared):
+    """Squares and variances (p, n) of unknowns in some places, now `values`, if there were `more`
+    information that they are zero than normal equations hold.
+    """
+    whole = hessian.copy()
+    right = gradient.copy()
+    whole[:, places, places] += more
+    right[:, places] += more * values
+    steps, covariance = likeliest(whole, right, shared)
+    return (values + steps[:, places]) ** 2, covariance[:, places, places]
 
 
 def side_levels(sides, data, hessian, gradient):
@@ -327,13 +311,8 @@ def side_levels(sides, data, hessian, gradient):
     last = np.arange(hessian.shape[-1])[-edges - 1 :]
     weight = prior * sigma2
     for _ in range(SIDE_ROUNDS):
-        whole = hessian.copy()
-        right = gradient.copy()
-        whole[:, last, last] += weight / sigma2 - prior
-        right[:, last] += (weight / sigma2 - prior) * sides
-        spread = pseudo_inverse(whole)
-        step = -np.matvec(spread, right)
-        square = (sides + step[:, last]) ** 2 + spread[:, last, last]
+        more = weight / sigma2 - prior
+        square = sum(expecting(more, sides, last, hessian, gradient, 0))
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)
         total = np.sum(weight * square * shown, axis=0)
         of_side = (total[:-1].sum() + Levels.side_sigma**2) / (counted[:-1].sum() + 1)

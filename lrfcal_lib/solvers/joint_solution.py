@@ -153,8 +153,7 @@ class JointSolution:
     @cached_property
     def boards(self) -> dict[int, RigidTransform]:
         """``T_platform_board`` by placement."""
-        poses = pose_transform(self.state.boards)
-        return dict(zip(self.observations.placements.tolist(), poses, strict=True))
+        return self._by_placement(pose_transform(self.state.boards))
 
     @property
     def board_poses(self) -> np.ndarray:
@@ -171,9 +170,10 @@ class JointSolution:
     @property
     def sweeps(self) -> dict[int, np.ndarray]:
         """Offset (rad) and stretch of the recorded pitch of each sweep, by placement."""
-        return dict(
-            zip(self.observations.placements.tolist(), self.state.sweeps, strict=True)
-        )
+        return self._by_placement(self.state.sweeps)
+
+    def _by_placement(self, values):
+        return dict(zip(self.observations.placements.tolist(), values, strict=True))
 
     @property
     def sweep_sigma(self) -> tuple[float, float]:
@@ -194,8 +194,14 @@ class JointSolution:
         """Factors on the stated standard deviations, and shares of independent errors, as
         estimated.
         """
-        names = ["face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma"]
-        names.append("background_sigma")
+        names = [
+            "face_scale",
+            "face_share",
+            "beam_share",
+            "sigma_pitch",
+            "side_sigma",
+            "background_sigma",
+        ]
         if self.observations.cameras:
             names.append("view_scale")
         return {name: float(getattr(self.data.levels, name)) for name in names}
@@ -225,11 +231,13 @@ class JointSolution:
         sweeps of the pitch.
         """
         turn = self.sensor["pitch_by_direction"] * self.observations.direction
-        sweeps = {}
-        for row, (placement, (offset, stretch)) in enumerate(self.sweeps.items()):
-            middle = self.observations.middle[row]
-            sweeps[placement] = SweepPitch(turn[row] + offset, stretch, middle)
-        return Corrections(self.sensor["range_offset"], self.sensor["pitch_scale"], sweeps)
+        offset, stretch = self.state.sweeps.T
+        sweeps = map(SweepPitch, turn + offset, stretch, self.observations.middle)
+        return Corrections(
+            self.sensor["range_offset"],
+            self.sensor["pitch_scale"],
+            self._by_placement(sweeps),
+        )
 
     def columns(self, prefix: str) -> list[int]:
         """Indices of the shared unknowns whose names begin so."""
@@ -399,8 +407,7 @@ def expected_information(
         hits = read["beam"]
         misses = named_blocks(state, none_read, unknowns)["beam"]
         chance = np.exp(-np.asarray(hits.cost))
-        weights = ((hits, chance), (misses, 1 - chance))
-        for block, share in weights:
+        for block, share in ((hits, chance), (misses, 1 - chance)):
             J = np.sqrt(share)[..., None] * block.white_jacobian
             hessian = hessian + J.mT @ J
     others = [block for name, block in read.items() if name != "beam"]

@@ -69,7 +69,7 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     rotated = rotated[..., None, :]  # u and v, two scalars of one point
     jacobian = gradient_by_pose(rotated, by_point)
     corrected = jacobian - noise_correction(
-        rotated, moved[..., None, :], by_point, shift[..., None, :], np.ones(())
+        rotated, moved[..., None, :], by_point, shift[..., None, :]
     )
     shape = errors.shape[:-2] + (-1,)
     return Block(

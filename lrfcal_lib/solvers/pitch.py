@@ -159,14 +159,14 @@ def estimate_pitch_errors(
         When a camera is not fixed to the platform.
     """
     placements = _common_placements(cameras)
-    turn = np.array([direction[p] for p in placements.tolist()])
+    turn = np.array([direction[p] for p in placements])
     rows = gather(list(cameras.values()), placements)
     each = np.eye(len(placements))[rows.placement]
-    middles = np.array([middle[p] for p in placements.tolist()])
+    middles = np.array([middle[p] for p in placements])
     away = rows.pitch - middles[rows.placement]
     # columns: by how much the unknowns of a model change the pitch of each row
     columns = {"none": each[:, :0]}
-    if {-1, 1} <= set(turn.tolist()):
+    if {-1, 1} <= set(turn):
         columns["direction"] = turn[rows.placement, None]
     columns["sweep"] = each
     columns["sweep_stretch"] = np.concatenate([each, each * away[:, None]], axis=1)
@@ -217,8 +217,7 @@ def gather(cameras, placements):
         scatter[face == index] = np.outer(points @ normal - distance, normal)
     parts = []
     for number, obs in enumerate(cameras):
-        order = np.argsort(obs.placements)
-        known = order[np.searchsorted(obs.placements[order], placements)]
+        known = np.intersect1d(placements, obs.placements, return_indices=True)[2]
         board = obs.board_poses[known][face]
         on_board = _Rows(
             points=faces.plane_points,

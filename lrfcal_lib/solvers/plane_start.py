@@ -38,6 +38,11 @@ SEEN = 0.8  # of the placements: a few may be wrong
 ROTATIONS = 200  # random ones, beside the 24 of a cube
 FEWEST_PLANES = 5  # that judge a candidate
 FEWEST_LINES = 7  # the same, where placements are single scan lines
+# which of the ten products of three coordinates x, y, 1 each one is, (3, 3, 3, 10)
+_, PRODUCT = np.unique(
+    np.sort(np.indices((3, 3, 3)).reshape(3, -1), axis=0), axis=1, return_inverse=True
+)
+CUBES = np.eye(10)[PRODUCT].reshape(3, 3, 3, 10)
 FLAT = 1e-3  # of its extent: what leaves a common plane less is a set of single scan lines
 
 
@@ -177,12 +182,9 @@ def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
     along = np.linalg.svd(root[..., :2])[2][..., 0, :]
     rows = np.einsum("...i,...j->...ij", along, normal)
     null = np.linalg.svd(rows.reshape(*normal.shape[:-1], 6))[2][..., 3:, :]
-    first = null[..., :3]
-    second = null[..., 3:]
-    first_length = first @ first.mT
-    second_length = second @ second.mT
-    angle = first @ second.mT
-    columns = _common_points(first_length - second_length, angle + angle.mT)
+    both = null[..., :3] + 1j * null[..., 3:]
+    products = both @ both.mT  # real: by how much the lengths differ; imaginary: the angle
+    columns = _common_points(np.stack([products.real, products.imag], axis=-3))
     columns = columns @ null
     columns = np.concatenate([columns, -columns], axis=-2)
     x = columns[..., :3]
@@ -237,7 +239,7 @@ def _before_boards(poses, sets, centres):
 def _squares(poses, triangles, sets):
     """Mean squared distances (n, p) of each placement's points from its plane, at n poses."""
     residuals = plane_residuals(poses[:, None], triangles, sets.boards)
-    return np.sum(residuals**2, axis=2) / sets.number
+    return np.vecdot(residuals, residuals) / sets.number
 
 
 def _apart(poses, order):
@@ -256,8 +258,7 @@ def _centred(triangles):
     """Scatter roots about the centroid (..., 3, 3), and the centroids (..., 3), of compressed
     points.
     """
-    rows = np.concatenate([triangles[..., 3:], triangles[..., :3]], axis=-1)
-    turned = np.linalg.qr(rows, mode="r")
+    turned = np.linalg.qr(np.roll(triangles, 1, axis=-1), mode="r")
     return turned[..., 1:, 1:], turned[..., 0, 1:] / turned[..., 0, :1]
 
 
@@ -273,37 +274,18 @@ def _on_planes(rotation, normal, point, centre):
 
 
 @np.errstate(all="ignore")
-def _common_points(one, two):
-    """The four points ``[x, y, 1]`` (..., 4, 3) that two conics (..., 3, 3) share.
+def _common_points(conics):
+    """The four points ``[x, y, 1]`` (..., 4, 3) that two conics (..., 2, 3, 3) share.
 
-    Real parts of complex ones.
+    Real parts of complex ones. Both conics times x, y and 1 are six equations in the ten products
+    of three coordinates: four combinations stay open, and of those times 1 and times y the points
+    are the eigenvectors.
     """
-
-    def at(y):
-        """Numerator and denominator of x at y, and the resultant, which is zero where the
-        conics meet.
-        """
-        a, b, c = _in_x(one, y)
-        d, e, f = _in_x(two, y)
-        up = d * c - a * f
-        down = a * e - d * b
-        return up, down, up**2 - down * (b * f - e * c)
-
-    nodes = np.arange(-2.0, 3.0)
-    resultant = at(nodes)[2] @ np.linalg.inv(np.vander(nodes)).T
-    companion = np.zeros(resultant.shape[:-1] + (4, 4))
-    companion[..., 0, :] = -resultant[..., 1:] / resultant[..., :1]
-    companion[..., [1, 2, 3], [0, 1, 2]] = 1.0
+    equations = np.tensordot(conics, CUBES, 2)
+    rows = equations.reshape(*conics.shape[:-3], 6, 10)
+    left = np.tensordot(np.linalg.svd(rows)[2][..., 6:, :], CUBES, (-1, -1))
+    _, by_y, by_one = np.moveaxis(left.reshape(*left.shape[:-2], 9), -2, 0)
+    chosen = np.linalg.eig((by_y @ np.linalg.pinv(by_one)).mT)[1]
+    points = chosen.mT @ left[..., 2, 2, :]
     # parallel boards leave nothing
-    y = np.linalg.eigvals(np.nan_to_num(companion, posinf=0.0, neginf=0.0))
-    up, down, _ = at(y)
-    points = np.stack([(up / down).real, y.real, np.ones(y.shape)], axis=-1)
-    return np.nan_to_num(points, posinf=0.0, neginf=0.0)
-
-
-def _in_x(conic, y):
-    """Coefficients of x^2, x and 1 of conics (..., 3, 3) at values of y (..., n)."""
-    xx, xy, x = np.moveaxis(conic[..., 0, :, None], -2, 0)
-    _, yy, y1 = np.moveaxis(conic[..., 1, :, None], -2, 0)
-    one = conic[..., 2, 2, None]
-    return xx, 2 * (xy * y + x), yy * y**2 + 2 * y1 * y + one
+    return np.nan_to_num((points / points[..., 2:]).real, posinf=0.0, neginf=0.0)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from lrfcal_lib.fit.covariance import inverse_root, motion_words
 from lrfcal_lib.fit.least_squares import Block, minimise_in_rounds, solve
@@ -284,10 +285,8 @@ def plane_error(obs: CameraObservations, solution: Solution) -> float:
     if solution.inflation == 1.0:
         return 0.0
     distance = plane_residuals_m(obs, solution.transform)
-    known = np.isfinite(distance)
-    _, index = np.unique(obs.plane_placement[known], return_inverse=True)
-    means = np.bincount(index, distance[known]) / np.bincount(index)
-    return rms(means)
+    placements = np.unique(obs.plane_placement)
+    return rms(ndimage.mean(distance, obs.plane_placement, placements))
 
 
 def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> list[Block]:
@@ -414,8 +413,7 @@ def _move_with_lens(state, step):
     pose, intrinsics, boards = state
     common, by_placement = step
     change = common[6:]
-    held = LENS - len(change)
-    refined = intrinsics + np.pad(change, (0, held))
+    refined = intrinsics + np.pad(change, (0, LENS - len(change)))
     return move_pose(pose, common[:6]), refined, move_pose(boards, by_placement)
 
 

@@ -175,10 +175,8 @@ def prepare_boards(obs: PlatformObservations, T_head_lrf: RigidTransform) -> Boa
     second = np.zeros(len(p_edge))
     edge_row = np.full(len(p_edge), -1)
     face_row = np.full(len(p_face), -1)
-    for placement in np.unique(obs.edge_placement).tolist():
-        here = obs.edge_placement == placement
-        edges = [here & (obs.edge_number == number) for number in (1, 2)]
-        edges = [rows for rows in edges if rows.sum() >= 2]
+    for placement, both in _edges(obs):
+        edges = [rows for rows in both if len(rows) >= 2]
         on_face = obs.face_placement == placement
         try:
             pose = _start_board([p_edge[rows] for rows in edges], p_face[on_face])
@@ -210,8 +208,16 @@ def prepare_boards(obs: PlatformObservations, T_head_lrf: RigidTransform) -> Boa
     )
     for group in (edge, face):
         group["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
-    poses = np.array(list(boards.values()))
-    return Boards(np.array(list(boards)), poses, edge, face, skipped)
+    return Boards(
+        np.array(list(boards)), np.array(list(boards.values())), edge, face, skipped
+    )
+
+
+def _edges(obs):
+    """Placements, each with the rows of its edges 1 and 2."""
+    for placement in np.unique(obs.edge_placement).tolist():
+        here = obs.edge_placement == placement
+        yield placement, [np.flatnonzero(here & (obs.edge_number == n)) for n in (1, 2)]
 
 
 def _start_board(edges, face):
@@ -222,15 +228,13 @@ def _start_board(edges, face):
     if len(edges) == 2:
         point2, second, _ = fit_line(edges[1])
         z = np.cross(x, second)
-        cosine = x @ second
-        between = point2 - point
         if np.linalg.norm(z) < np.sin(np.radians(30)):
             raise DegenerateGeometry(
                 "the two edges are nearly parallel: edges 1 and 2 must be perpendicular"
             )
         # the origin is where edge 1 comes nearest to edge 2
-        along = between @ x - cosine * (between @ second)
-        point = point + x * along / (1 - cosine**2)
+        along, _ = np.linalg.lstsq(np.column_stack([x, -second]), point2 - point)[0]
+        point = point + x * along
     elif len(face) >= 3:
         normal = geometry.fit_plane(face)[0]
         z = normal - x * (x @ normal)
@@ -303,10 +307,9 @@ def platform_blocks(state, edge, face, sigma_pitch):
     # a board seen with one edge may slide along it: its origin is held at the middle of that edge's
     # points
     r, J, *_ = distances(state, edge)
-    count = np.maximum(used.sum(axis=1, keepdims=True), 1)
-    middle = np.sum(r[..., 2] * used, axis=1, keepdims=True) / count
-    by_sum = np.vecmat(used, J[..., 2, :])[:, None]
-    by_middle = by_sum / count[..., None]
+    share = used / np.maximum(used.sum(axis=1, keepdims=True), 1)
+    middle = np.vecdot(share, r[..., 2])[:, None]
+    by_middle = np.vecmat(share, J[..., 2, :])[:, None]
     stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))
     return [
         distance_block(state, edge, sigma_pitch, slice(0, 2)),
@@ -369,7 +372,7 @@ def solve_projected(
         )
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
     scatter = 1.0
-    for final in (False, True):  # the second time with the scatter of the first
+    for _ in range(2):  # the second time with the scatter of the first
         solution = solve(
             partial(
                 projected_block,
@@ -388,9 +391,8 @@ def solve_projected(
             read=_read_head,
             max_iterations=100,
         )
-        if not final:
-            freedom = max(len(solution.residuals) - 4, 1)
-            scatter = max(np.sqrt(np.sum(solution.residuals**2) / freedom), LEAST_SCATTER)
+        freedom = max(len(solution.residuals) - 4, 1)
+        scatter = max(np.sqrt(np.sum(solution.residuals**2) / freedom), LEAST_SCATTER)
         gauge = head_from_axis(axis_of(solution.transform))
     return PlatformSolution(solution, np.array(list(groups)), skipped)
 
@@ -404,9 +406,7 @@ def _slanted(obs, p_platform):
     """Rows of edges 1 and 2 of placements whose edges are slanted, and why others are left out."""
     groups = {}
     skipped = {}
-    for placement in np.unique(obs.edge_placement).tolist():
-        here = obs.edge_placement == placement
-        edges = [np.flatnonzero(here & (obs.edge_number == number)) for number in (1, 2)]
+    for placement, edges in _edges(obs):
         reasons = []
         for number, rows in enumerate(edges, start=1):
             if len(rows) < 3:
@@ -478,19 +478,10 @@ def _projected_line(q):
     Returns the errors (k, 2 n) over the root of n, and of equations (9) to (12) the direction ``u ~
     (a, 1 / c, 1)`` as a unit vector and the point ``p = (b, -d / c, 0)``.
     """
-    x, y, z = np.moveaxis(q, -1, 0)
-    e1, a, b = _regression(z, x)
-    e2, c, d = _regression(y, z)
-    u = np.concatenate([a, 1 / c, 1 + 0 * a], axis=-1)
-    point = np.concatenate([b, -d / c, 0 * b], axis=-1)
-    errors = np.concatenate([e1, e2], axis=-1) / np.sqrt(x.shape[-1])
-    return errors, unit_vector(u), point
-
-
-def _regression(s, v):
-    """Errors, slope and offset of the straight-line fit ``v = slope s + offset``."""
-    s_mean = s.mean(axis=-1, keepdims=True)
-    v_mean = v.mean(axis=-1, keepdims=True)
-    away = s - s_mean
-    slope = (np.vecdot(away, v) / np.vecdot(away, away))[..., None]
-    return v - v_mean - slope * away, slope, v_mean - slope * s_mean
+    middle = q.mean(axis=1)
+    x, y, z = np.moveaxis(q - middle[:, None], -1, 0)
+    a = (np.vecdot(z, x) / np.vecdot(z, z))[:, None]
+    c = (np.vecdot(y, z) / np.vecdot(y, y))[:, None]
+    errors = np.concatenate([x - a * z, z - c * y], axis=1) / np.sqrt(x.shape[1])
+    direction = np.concatenate([a, 1 / c, np.ones_like(a)], axis=1)
+    return errors, unit_vector(direction), middle - middle[:, 2:] * direction
