@@ -304,7 +304,7 @@ def blocks_of(state, case, scale):
     blocks.append(_rows(np.zeros(len(held)), held))
     for block in blocks:
         missing = width - block.jacobian.shape[-1]
-        jacobian = np.pad(block.jacobian, ((0, 0), (0, 0), (0, missing)))
+        jacobian = np.pad(block.jacobian, {-1: (0, missing)})
         yield replace(block, jacobian=jacobian)
 
 

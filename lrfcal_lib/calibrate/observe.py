@@ -433,10 +433,9 @@ def _feature_sides(along, swept):
     """The longest pair of perpendicular sides, else the longest side: tuple of (ScanEdges,
     ScanSide).
     """
-    numbered = {
-        side.side: (edges, side) for edges in (swept, along) for side in edges.sides
-    }
-    sides = [numbered[number] for number in sorted(numbered)]
+    known = {side.side for side in along.sides}
+    sides = [(along, side) for side in along.sides]
+    sides += [(swept, side) for side in swept.sides if side.side not in known]
     pairs = []
     for one, other in combinations(sides, 2):
         if abs(one[1].direction @ other[1].direction) < RIGHT_ANGLE:

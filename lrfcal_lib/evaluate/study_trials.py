@@ -235,12 +235,6 @@ def _ends_of_lines(ranges, setup, last_beam):
     return points, covariance.reshape(*points.shape, 3)
 
 
-def _ends(ranges):
-    """The first and the last beam on the board of scan lines (n, B), (n, 2)."""
-    _, *ends = row_ends(np.isfinite(ranges))
-    return np.stack(ends, axis=1)
-
-
 def plane_observations(
     obs: JointObservations, pixels, scenario: Scenario
 ) -> CameraObservations:

@@ -243,8 +243,9 @@ def pitches_of_images(boards, solution, models, field_of_view):
         inside = (uv > border) & (uv < models[name].size - border)
         visible &= np.all(inside & (p_camera[..., 2:] > 0), axis=(-2, -1))
 
-    seen, first, last = row_ends(visible.T)
-    return seen, np.linspace(LATTICE[first], LATTICE[last], IMAGES, axis=1)
+    seen, ends = row_ends(visible.T)
+    first, last = LATTICE[ends].T
+    return seen, np.linspace(first, last, IMAGES, axis=1)
 
 
 def candidate_information(boards, pitches, solution, models):
