@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import pandas as pd
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
@@ -138,10 +137,16 @@ def sized(
     J = (after - lengths).T / STEP
     sigma = np.sqrt(np.vecdot(J @ covariance, J))
     return (
-        pd.Series(list(corners), edges)[~np.isnan(corners).any(axis=1)].to_dict(),
-        pd.Series(lengths, edges).dropna().to_dict(),
-        pd.Series(sigma, edges).dropna().to_dict(),
+        _known(edges, corners),
+        _known(edges, lengths.tolist()),
+        _known(edges, sigma.tolist()),
     )
+
+
+def _known(edges, values):
+    """What is not NaN, by edge."""
+    rows = zip(edges, values, strict=True)
+    return {name: value for name, value in rows if not np.isnan(value).any()}
 
 
 def moved_lines(lines: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:

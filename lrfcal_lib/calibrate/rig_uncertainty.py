@@ -1,7 +1,8 @@
 """How well a calibrated rig is known: covariances of all that is shared, and what nothing tells."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated
 
 import numpy as np
@@ -73,13 +74,14 @@ class RigUncertainty:
     range_noise: float
 
 
-def columns_of(names: Sequence[str], camera: str | None = None) -> np.ndarray:
+@cache  # asked for at every edge of a scene
+def columns_of(names: tuple[str, ...], camera: str | None = None) -> np.ndarray:
     """Where each of `COLUMNS` stands among shared unknowns, -1 where it was none, (13,)."""
     wanted = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
     return pd.Index(names).get_indexer(wanted)
 
 
-def selection(names: Sequence[str], camera: str | None = None) -> np.ndarray:
+def selection(names: tuple[str, ...], camera: str | None = None) -> np.ndarray:
     """Which of c shared unknowns each of `COLUMNS` is: ones, a row of zeros where none, (13, c)."""
     return np.eye(len(names) + 1, len(names))[columns_of(names, camera)]
 

@@ -4,6 +4,7 @@ and (16).
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -95,7 +96,7 @@ class SourceFrame:
     placement: int | None = None
     corrections: Corrections = AS_RECORDED
 
-    @property
+    @cached_property
     def T_source_platform(self) -> RigidTransform:
         """While the head stands at the pitch of the image."""
         pitch = self.corrections.pitch(self.placement, self.image_pitch)

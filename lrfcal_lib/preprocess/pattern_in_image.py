@@ -333,13 +333,14 @@ def _ends_in_squares(picture, grid):
     is taken a row off.
     """
     last = np.array(picture.shape[::-1]) - 1
+    picture = picture.astype(float)
     for turns in range(4):
         outermost = np.rot90(grid, turns)[:2]
         edge, inner = (outermost[:, 1:] + outermost[:, :-1]) / 2
         away = BEYOND * (inner - edge)
         places = np.array([edge - away, edge + away])
         visible = np.all((places >= 0) & (places <= last), axis=(0, 2))
-        outside, inside = interpolated(picture.astype(float), places[:, visible])
+        outside, inside = interpolated(picture, places[:, visible])
         sign = np.resize([1.0, -1.0], len(visible))[visible]
         sign -= sign.sum() / max(len(sign), 1)
         contrast = sign @ inside
