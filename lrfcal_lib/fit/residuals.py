@@ -14,7 +14,6 @@ from lrfcal_lib.model.camera import (
     line_distance,
     line_through,
     mirrored,
-    pinhole_jacobian,
     project,
     undistort,
 )
@@ -67,8 +66,9 @@ def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     rotated = rotate_points(pose, obs.crossing_points)
     moved = rotated + pose[..., None, :, 3]  # (16)
     residuals = line_residuals(moved, obs.crossing_lines, obs.model)
-    by_point = pinhole_jacobian(moved, obs.model)
-    gradients = np.vecmat(obs.crossing_lines[..., :2], by_point)  # pixels a metre
+    # of l K q / z by the point q, pixels a metre
+    gradients = obs.crossing_lines @ obs.model.matrix / moved[..., 2:]
+    gradients[..., 2] -= residuals / moved[..., 2]
     jacobian = gradient_by_pose(rotated, gradients)
     noise = moved_noise(pose, gradients, obs.crossing_covariance)
     variance = np.vecdot(gradients, noise) + obs.crossing_line_sigma**2
