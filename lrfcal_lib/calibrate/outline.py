@@ -151,7 +151,10 @@ def _known(edges, values):
 
 def moved_lines(lines: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Lines (s, 3) shifted outwards and turned about points (s, 2) of them by steps (..., s, 2)."""
-    turned = (lines[:, 0] + 1j * lines[:, 1]) * np.exp(1j * step[..., 1])
-    normals = np.stack([turned.real, turned.imag], axis=-1)
+    cosine = np.cos(step[..., 1])
+    sine = np.sin(step[..., 1])
+    a = lines[:, 0]
+    b = lines[:, 1]
+    normals = np.stack([cosine * a - sine * b, sine * a + cosine * b], axis=-1)
     at = line_distance(middle, lines) - step[..., 0] - np.vecdot(normals, middle)
     return np.concatenate([normals, at[..., None]], axis=-1)

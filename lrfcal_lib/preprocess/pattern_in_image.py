@@ -221,7 +221,10 @@ def grid_noise(grid):
     distortion, a bent sheet.
     """
     rows, columns, _ = grid.shape
-    y, x = np.mgrid[:rows, :columns].reshape(2, -1) / (max(rows, columns) - 1) * 2 - 1
+    row, column = np.mgrid[:rows, :columns].reshape(2, -1)
+    last = max(rows, columns) - 1
+    x = column / last * 2 - 1
+    y = row / last * 2 - 1
     flat = np.column_stack([x, y])
     corners = grid.reshape(-1, 2)
     order = 3 if len(flat) >= 16 else 2
