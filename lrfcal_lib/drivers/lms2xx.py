@@ -274,18 +274,13 @@ class LMS2xx(Closed):
         if result:
             raise Refused(f"{self.port}: the device declines {what} (A0 {result:02X})")
 
-    def set_variant(self, fov_deg: float, resolution_deg: float) -> bool:
-        """Set field of view and resolution.
+    def set_variant(self, fov_deg: float, resolution_deg: float) -> None:
+        """Set field of view and resolution, if they differ.
 
         Parameters
         ----------
         fov_deg, resolution_deg
             180 with 1 or 0.5, or 100 with 1, 0.5 or 0.25 deg.
-
-        Returns
-        -------
-        bool
-            Whether they differed.
 
         Raises
         ------
@@ -302,14 +297,13 @@ class LMS2xx(Closed):
                 f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}"
             )
         self._read_status()
-        differs = self._set_variant(wanted)
+        self._set_variant(wanted)
         self._prepare()
-        return differs
 
     def _set_variant(self, wanted):
-        """Set the variant where it was read to be another one; whether it was."""
+        """Set the variant where it was read to be another one."""
         if self.variant == wanted:
-            return False
+            return
         view, step = wanted
         data = struct.pack("<HH", round(view), round(100 * step))
         try:
@@ -322,7 +316,6 @@ class LMS2xx(Closed):
                 f"{self.port}: the {self.type} has no variant {view:g}/{step:g}; it keeps "
                 "{:g} deg in steps of {:g} deg".format(*self.variant)
             )
-        return True
 
     def configure(
         self,
@@ -330,7 +323,7 @@ class LMS2xx(Closed):
         unit: str | None = None,
         measuring_mode: int | None = None,
         realtime_indices: bool | None = None,
-    ) -> bool:
+    ) -> None:
         """Change settings that are kept in flash (some thousand writes), only if they differ.
 
         Parameters
@@ -342,11 +335,6 @@ class LMS2xx(Closed):
         realtime_indices
             Without them dropped and repeated scans cannot be seen.
 
-        Returns
-        -------
-        bool
-            Whether they differed.
-
         Raises
         ------
         Refused
@@ -357,16 +345,15 @@ class LMS2xx(Closed):
         wanted = self.configuration.changed(
             unit=unit, measuring_mode=measuring_mode, realtime_indices=realtime_indices
         )
-        differs = self._write(wanted)
+        self._write(wanted)
         self._prepare()
-        return differs
 
     def _write(self, wanted):
         """Write a configuration that differs from the one read, in installation mode, and read it
-        back; whether it differed.
+        back.
         """
         if self.configuration == wanted:
-            return False
+            return
         try:
             self._mode(INSTALLATION, "the password of the installation mode")
             self._line.ask(wire.CONFIGURE, wanted.block)
@@ -380,7 +367,6 @@ class LMS2xx(Closed):
             raise Refused(
                 f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}"
             )
-        return True
 
     def request(self, timeout: float = 4.0) -> Reading:
         """One scan.

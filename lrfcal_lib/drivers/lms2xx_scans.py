@@ -18,7 +18,7 @@ WINDOW_S = 2.0
 OFF_S = 1.2  # how far a scan may arrive off its expected instant
 JITTER_S = 0.05  # larger corrections of the clock leave scans out, smaller ones are spread
 LEAST_S = MIRROR_TURN / 100  # between two instants told; far less than between two scans
-FORGET_S = 30.0  # after such a pause the number of turns in between is not known
+FORGET = 30.0 / MIRROR_TURN  # turns; after such a pause their number is not known
 STUBBORN = 5  # so many implausible scan indices in a row: the device counts anew
 
 
@@ -95,12 +95,11 @@ class ScanClock:
             return time_s
         turn = index
         if self._arrivals:
-            elapsed_s = time_s - self._instant()
-            if elapsed_s > FORGET_S or self._refused >= STUBBORN:
+            last, _ = self._arrivals[-1]
+            expected = (time_s - self._zero()) / MIRROR_TURN
+            if expected - last > FORGET or self._refused >= STUBBORN:
                 self._arrivals.clear()
             else:
-                last, _ = self._arrivals[-1]
-                expected = last + elapsed_s / MIRROR_TURN
                 turn += 256 * round((expected - turn) / 256)
                 if turn <= last or abs(expected - turn) * MIRROR_TURN >= OFF_S:
                     self._refused += 1
@@ -109,16 +108,15 @@ class ScanClock:
         self._arrivals.append((turn, time_s))
         while self._arrivals[0][1] < time_s - WINDOW_S:  # never the one that came just now
             self._arrivals.popleft()
-        instant = self._instant()
+        instant = turn * MIRROR_TURN + self._zero()
         if instant < self._told - JITTER_S:  # the clock was found to be far ahead
             return None
         self._told = max(instant, self._told + LEAST_S)
         return self._told
 
-    def _instant(self):
-        """Of the last scan, by the earliest arrival of the window."""
-        earliest = min(time_s - turn * MIRROR_TURN for turn, time_s in self._arrivals)
-        return self._arrivals[-1][0] * MIRROR_TURN + earliest
+    def _zero(self):
+        """Instant of turn 0, by the earliest arrival of the window."""
+        return min(time_s - turn * MIRROR_TURN for turn, time_s in self._arrivals)
 
 
 class Assembler:

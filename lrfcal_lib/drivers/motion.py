@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import (
     DOWN,
@@ -181,18 +183,18 @@ class Motion:
         What lies between two readings is stretched to both.
         """
         rows = list(self.rows)
-        pitches = [row.pitch for row in rows]
+        pitches = np.array([row.pitch for row in rows])
         measured = [i for i, row in enumerate(rows) if row.measured]
         for first, last in itertools.pairwise(measured):
             start = pitches[first]
             reckoned = rows[last].reckoned - start
             if reckoned:
                 stretch = (pitches[last] - start) / reckoned
-                for i in range(first + 1, last):
-                    pitches[i] = start + stretch * (pitches[i] - start)
+                between = pitches[first + 1 : last]
+                between[:] = start + stretch * (between - start)
         return [
             (self._zero + row.instant, pitch, row.measured)
-            for row, pitch in zip(rows, pitches, strict=True)
+            for row, pitch in zip(rows, pitches.tolist(), strict=True)
         ]
 
     # ------------------------------------------------------------------------------------------

@@ -77,10 +77,7 @@ def opened(
                 f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}"
             )
     inner = os.open(file, flags | os.O_NONBLOCK, 0o666)
-    mode = "rb"
-    if writes:
-        mode = "r+b" if flags & os.O_RDWR else "wb"
-    stream = os.fdopen(inner, mode)
+    stream = os.fdopen(inner, "r+b" if writes else "rb")
     if writes and os.fstat(inner).st_nlink > 1:
         stream.close()
         raise SessionError(

@@ -9,9 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.board import Board
 from lrfcal_lib.session.faults import dark_images, faults_of_files
 from lrfcal_lib.session.files import (
     SessionError,
@@ -24,7 +22,7 @@ from lrfcal_lib.session.files import (
 from lrfcal_lib.session.images import check_image_size
 from lrfcal_lib.session.scans import read_scans
 from lrfcal_lib.session.shown import printable
-from lrfcal_lib.session.stated import SCHEMA, CameraInfo, LrfInfo, parse_session
+from lrfcal_lib.session.stated import SCHEMA, StatedRig, parse_session
 from lrfcal_lib.session.tables import read_table, whole_number
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog
 
@@ -129,14 +127,15 @@ def read_images(path, facts, unfinished):
     cameras = facts["cameras"]
     out = []
     lines = {}  # in which each file stands
-    skipped = set(map(str, unfinished or ()))
     torn = unfinished is not None
-    rows = read_table(file, IMAGE_COLUMNS, path, torn, needed=bool(cameras))[0]
+    rows = read_table(file, IMAGE_COLUMNS, path, torn, needed=bool(cameras))
     for number, row in enumerate(rows, start=2):
-        if row["purpose"] == DROPPED or row["placement"] in skipped:
+        if row["purpose"] == DROPPED:
             continue
         with naming(f"{file} line {number}"):
             placement = whole_number(row["placement"], "placement")
+            if placement in (unfinished or ()):
+                continue
             record = ImageRecord(
                 camera=known(row["camera"], cameras, "camera"),
                 file=inside(path, row["file"], "images.csv: file"),
@@ -158,7 +157,7 @@ def read_edges(path, facts, records):
     out = []
     lines = {}  # in which each edge of an image stands
     images = {(record.camera, record.file) for record in records}
-    rows = read_table(file, EDGE_COLUMNS, path, needed=False)[0]
+    rows = read_table(file, EDGE_COLUMNS, path, needed=False)
     for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
@@ -226,22 +225,14 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class Session:
-    """A recorded session; the arrays are read when it is opened, the images when they are asked
-    for.
+class Session(StatedRig):
+    """A recorded session with its rig; the arrays are read when it is opened, the images when they
+    are asked for.
 
     Attributes
     ----------
     name, licence, source : str
         `source` says where the recording came from.
-    board : Board
-    lrf : LrfInfo
-    T_head_lrf : RigidTransform or None
-        The platform as its maker or a tape measure states it.
-    platform_sigma : tuple of float
-        How well: standard deviations of the axis' direction (radians) and offset (metres). Where
-        nobody states them, 0.5 deg and 10 mm are assumed: what a set square and a ruler give.
-    cameras : dict of str to CameraInfo
     placements : tuple of int
         All that the session states, also those without data.
     image_records : tuple of ImageRecord
@@ -261,11 +252,6 @@ class Session:
     licence: str
     source: str
     simulated: bool
-    board: Board
-    lrf: LrfInfo
-    T_head_lrf: RigidTransform | None
-    platform_sigma: tuple[float, float]
-    cameras: dict[str, CameraInfo]
     placements: tuple[int, ...]
     image_records: tuple[ImageRecord, ...]
     picks: tuple[EdgePick, ...]
@@ -470,7 +456,7 @@ def _times_back(session):
     for name, columns in TIMED.items():
         file = session.path / name
         last = {}
-        rows = read_table(file, columns, session.path, torn=True, needed=False)[0]
+        rows = read_table(file, columns, session.path, torn=True, needed=False)
         for line, row in enumerate(rows, start=2):
             if not row["t_s"] or not row["placement"] or row.get("purpose") == DROPPED:
                 continue

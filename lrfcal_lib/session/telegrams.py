@@ -15,10 +15,10 @@ from lrfcal_lib.session.files import (
     short,
 )
 from lrfcal_lib.session.lms2xx_frame import OVERHEAD, TelegramError, are_sound
-from lrfcal_lib.session.tables import WHOLE_COLUMNS, read_table, whole_number
+from lrfcal_lib.session.tables import read_table, whole_number
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
-INDEX = [(name, int if name in WHOLE_COLUMNS else float) for name in INDEX_COLUMNS]
+INDEX = [(name, float if name in ("t_s", "pitch_deg") else int) for name in INDEX_COLUMNS]
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
 SCANNED, OTHER, WRONG, TRUNCATED = range(4)
 LONGEST = OVERHEAD + 0xFFFF  # bytes of a telegram
@@ -35,8 +35,9 @@ class TelegramLog:
         In the file; -1 for no placement.
     outcome : ndarray of uint8, shape (n,)
         Index into `OUTCOMES`; 'other' is every sound telegram that holds no whole or partial scan.
-    values : ndarray of int, shape (n, len(REASONS))
-        How many values of a scan had each reason, see ``lrfcal_lib.session.lms2xx_codec.REASONS``.
+    values : ndarray of int, shape (len(REASONS),)
+        How many values of all scans had each reason, see
+        ``lrfcal_lib.session.lms2xx_codec.REASONS``.
     problems : tuple of str
     """
 
@@ -78,7 +79,7 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     """
     data = np.frombuffer(read_bytes(file, within), np.uint8)
     path = file.with_name("index.csv")
-    rows, torn = read_table(path, INDEX_COLUMNS, within, torn=True)
+    rows = read_table(path, INDEX_COLUMNS, within, torn=True)
     with naming(path):
         index = _index(rows)
         _check_index(index, len(data), file)
@@ -100,14 +101,12 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
         groups = codec.decode_scans(data, index.offset, sizes, modes)
         scans = _lines(groups, index)
 
-    values = np.zeros((len(outcome), len(codec.REASONS)), int)
+    values = np.zeros(len(codec.REASONS), int)
     for group in groups:
         outcome[group.rows] = SCANNED
-        values[group.rows] = [
-            np.bincount(reasons, minlength=len(codec.REASONS)) for reasons in group.reasons
-        ]
+        values += np.bincount(group.reasons.ravel(), minlength=len(values))
     problems = [f"{file}: {note}" for note in (*notes, *_damage(index, outcome, len(data)))]
-    if torn:
+    if not read_bytes(path, within).endswith(b"\n"):
         problems.append(f"{path}: the last row is cut off, its telegram is left out")
     return scans, TelegramLog(
         index.offset, index.placement, outcome, values, tuple(problems)
@@ -119,10 +118,10 @@ def _index(rows):
     index = np.recarray(len(rows), INDEX)
     for at, row in enumerate(rows):
         for key, cell in row.items():
-            if key in WHOLE_COLUMNS:
-                index[key][at] = whole_number(cell, f"line {at + 2}: {key}")
-            else:
+            if index.dtype[key].kind == "f":
                 index[key][at] = cell or np.nan
+            else:
+                index[key][at] = whole_number(cell, f"line {at + 2}: {key}")
     return index
 
 
