@@ -445,10 +445,6 @@ class LMS2xx(Closed):
                 self._trouble = str(error)
                 lost = True
                 LOG.warning("LMS2xx: %s; looking for the device", error)
-            except Exception as error:  # told to whoever waits, who would wait for nothing
-                self._trouble = f"the reader thread failed: {error!r}"
-                LOG.exception("LMS2xx reader thread")
-                raise
 
     def _post(self):
         """Post readings until the stream falls silent, or until the end.

@@ -123,11 +123,6 @@ class Link:
         return self.host.now() - self._last
 
     @property
-    def acknowledged(self) -> bool:
-        """Whether the last stray byte is ACK."""
-        return self._stray == ACK
-
-    @property
     def declined(self) -> bool:
         """Whether the last byte is NAK and nothing followed: amid other bytes it means nothing."""
         return self._stray == NAK and not self._rest and self.silent_s > SILENCE_S
@@ -275,7 +270,7 @@ class Link:
                     return arrival, None
                 if arrival.code == NOT_UNDERSTOOD:
                     return None, "not allowed in its present mode, or unknown (92)"
-            if self.acknowledged:
+            if self._stray == ACK:
                 patience = again_s
             if self.declined:
                 return (
@@ -354,7 +349,7 @@ class Link:
             if (
                 codes
                 or self.declined
-                or (self.acknowledged and self.silent_s > 3 * SILENCE_S)
+                or (self._stray == ACK and self.silent_s > 3 * SILENCE_S)
             ):
                 until = begin + STOPPING_S
         return False

@@ -157,12 +157,15 @@ class Assembler:
         self._clock = clock
         self._parts: list[Reading] = []
         view, resolution = variant
-        self.values = round(view / resolution) + 1
+        values = round(view / resolution) + 1
         self.turns = round(1 / resolution)
         if interlaced:
-            self.values = PARTIAL
+            values = PARTIAL
             self.turns = 1
-        size = 10 + 2 * self.values + 2 * configuration.realtime_indices
+        indexed = configuration.realtime_indices
+        # number of values, unit, and whether there are indices and parts
+        self._kind = (values, configuration.unit, indexed, interlaced)
+        size = 10 + 2 * values + 2 * indexed
         scan_s = self.turns * MIRROR_TURN
         self.duration_s = scan_s + transfer_s(size, baudrate)
         self.interval_s = interval_s(size, baudrate, scan_s)
@@ -185,21 +188,14 @@ class Assembler:
             None for a part of a set, and for what is no scan of this variant, unit and kind or is
             not new.
         """
-        configuration = self.configuration
         try:
-            scan = codec.decode_scan(raw, configuration.measuring_mode)
+            scan = codec.decode_scan(raw, self.configuration.measuring_mode)
         except TelegramError:
             return None
         count = scan.words.shape[1]
         index = int(scan.scan_index[0])
         kind = (count + (scan.partial > 0), scan.unit, index >= 0, scan.partial >= 0)
-        expected = (
-            self.values,
-            configuration.unit,
-            configuration.realtime_indices,
-            self.interlaced,
-        )
-        if kind != expected:
+        if kind != self._kind:
             return None
         begun = arrival_s - transfer_s(len(raw), self.baudrate) - self.turns * MIRROR_TURN
         start_s = self._clock.place(index, begun)

@@ -89,8 +89,11 @@ class Motion:
         self._now = line.host.now
         self._zero = line.host.time() - line.host.now()  # date of the instant 0
         up, down = map(math.radians, settings.degrees_per_second or ASSUMED)
-        # by way, 1 up and -1 down, and speed byte
-        self._speeds = {1: {settings.tilt_speed: up}, -1: {settings.tilt_speed: down}}
+        # by whether it goes up, and speed byte
+        self._speeds = {
+            True: {settings.tilt_speed: up},
+            False: {settings.tilt_speed: down},
+        }
         self._longest = FIRST_BURST_S / GROWTH
         if self.calibrated:
             self._longest = math.inf
@@ -105,7 +108,6 @@ class Motion:
         self._pitch: float | None = None
         self._known_at = 0.0
         self._misses = 0
-        self._repeat_s = settings.repeat_s or math.inf
         self._tolerance = math.radians(settings.tolerance_deg)
         self._shortest_s = 2 * line.wire_s() + settings.gap_s  # of a motion and its stop
 
@@ -116,15 +118,14 @@ class Motion:
         """Speed upwards (`way` > 0) or downwards; of other speed bytes in proportion, until they
         were used.
         """
-        speeds = self._speeds[math.copysign(1, way)]
+        speeds = self._speeds[way > 0]
         nearest = min(speeds, key=lambda other: abs(other - step))
         return speeds[nearest] * max(step, 1) / max(nearest, 1)
 
     def learn(self, way, step, speed):
         """Remember a speed that was measured."""
-        way = math.copysign(1, way)
-        self._speeds[way][step] = speed
-        self._speeds[-way].setdefault(step, speed)
+        self._speeds[way > 0][step] = speed
+        self._speeds[way <= 0].setdefault(step, speed)
         self.calibrated = True
 
     def know(self, pitch, instant):
@@ -223,7 +224,7 @@ class Motion:
         """
         end = self._now() + seconds
         while True:
-            due = self._repeated + self._repeat_s
+            due = self._repeated + (self.settings.repeat_s or math.inf)
             if self._now() >= due:
                 self._repeated = self._send(self._frame)
             elif self.abort.wait(max(0.0, min(end, due) - self._now())):

@@ -389,12 +389,11 @@ def read_rig_file(path: str | os.PathLike) -> RigFile:
         With the file, the key and the value, for anything that cannot be used.
     """
     try:
-        data = read_json(path, None)
+        return rig_of(read_json(path, None), Path(path))
     except SessionError as error:
         raise RigFileError(
             f"{error}; 'python -m lrfcal_lib emulate --rig-file' writes an example"
         ) from error
-    return rig_of(data, Path(path))
 
 
 def rig_of(data: dict, path: Path = Path("rig.json")) -> RigFile:

@@ -64,8 +64,7 @@ def repeated_images(session) -> Iterator[Fault]:
     firsts = {}  # by the hash of their content
     pairs = defaultdict(list)
     for record in session.image_records:
-        content = read_bytes(record.file, session.path)
-        first = firsts.setdefault(hash(content), record)
+        first = firsts.setdefault(hash(read_bytes(record.file, session.path)), record)
         if first is not record:
             pairs[first.camera, record.camera].append((first, record))
     for (first_camera, camera), same in pairs.items():

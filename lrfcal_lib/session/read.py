@@ -20,11 +20,11 @@ from lrfcal_lib.session.files import (
     short,
 )
 from lrfcal_lib.session.images import check_image_size
-from lrfcal_lib.session.scans import read_scans
+from lrfcal_lib.session.scans import parts_of, read_npz
 from lrfcal_lib.session.shown import printable
 from lrfcal_lib.session.stated import SCHEMA, StatedRig, parse_session
 from lrfcal_lib.session.tables import read_table, whole_number
-from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog
+from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, read_telegrams
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
 EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
@@ -62,6 +62,24 @@ class EdgePick:
     file: Path
     edge: str
     ends: np.ndarray
+
+
+def read_scans(path):
+    """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or
+    None).
+    """
+    arrays = path / "lrf/scans.npz"
+    telegrams = path / "lrf/telegrams.bin"
+    if os.path.lexists(arrays):
+        return read_npz(arrays, path), None
+    if os.path.lexists(telegrams):
+        return read_telegrams(telegrams, path)
+    if os.path.lexists(path / "lrf") and parts_of(path):
+        raise SessionError(
+            f"{path}: the recording was interrupted; lrfcal_lib.session.write.finish('{path}') "
+            "completes it"
+        )
+    raise SessionError(f"{arrays}: no such file; a session needs the scan lines")
 
 
 # begin names that lead out of a folder, on any system: absolute ones, and those with ``..``
@@ -335,7 +353,6 @@ class Session(StatedRig):
         """
         camera = self.cameras[record.camera]
         data = read_bytes(record.file, self.path)
-        check_image_size(record.file, data, camera)
         with reading(
             record.file,
             "cannot be decoded; remove its row from images.csv or restore the file",

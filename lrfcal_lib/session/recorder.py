@@ -61,11 +61,10 @@ class SessionRecorder(SessionWriter):
                         f"{_first_difference(data[key], mine[key], key)}, unlike the rig now: go "
                         "on with the same rig file, or begin another one"
                     )
-        unfinished = known["unfinished"] or ()
         self.data = data | {"placements": list(known["placements"])}
         self._make_folders()
         mend_tables(self.path)
-        for placement in unfinished:
+        for placement in known["unfinished"] or ():
             self._mark_dropped(placement)
         self._state(unfinished=[])
 

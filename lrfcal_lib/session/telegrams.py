@@ -15,6 +15,7 @@ from lrfcal_lib.session.files import (
     short,
 )
 from lrfcal_lib.session.lms2xx_frame import OVERHEAD, TelegramError, are_sound
+from lrfcal_lib.session.scans import check_scans
 from lrfcal_lib.session.tables import read_table, whole_number
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
@@ -61,7 +62,7 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     Returns
     -------
     scans : dict of ndarray
-        As in scans.npz.
+        As in scans.npz, see :func:`lrfcal_lib.session.scans.check_scans`.
     log : TelegramLog
 
     Raises
@@ -81,8 +82,7 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     path = file.with_name("index.csv")
     rows = read_table(path, INDEX_COLUMNS, within, torn=True)
     with naming(path):
-        index = _index(rows)
-        _check_index(index, len(data), file)
+        index = _index(rows, len(data), file)
         check_amount(len(data) // 2)
 
     sound = are_sound(data, index.offset, index.length)
@@ -99,7 +99,7 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
         modes, notes = _modes(data, index, np.flatnonzero(sound))
         sizes = np.where(sound, index.length, 0)  # what is damaged holds no scan
         groups = codec.decode_scans(data, index.offset, sizes, modes)
-        scans = _lines(groups, index)
+        scans = check_scans(_lines(groups, index))
 
     values = np.zeros(len(codec.REASONS), int)
     for group in groups:
@@ -113,8 +113,12 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     )
 
 
-def _index(rows):
-    """The rows of index.csv as an array of INDEX: NaN for no time or pitch, -1 for no placement."""
+def _index(rows, size, file):
+    """The rows of index.csv as an array of INDEX: NaN for no time or pitch, -1 for no placement.
+
+    Telegrams lie one after the other in the file, but for a last one that is cut off, and every
+    scan has a pitch.
+    """
     index = np.recarray(len(rows), INDEX)
     for at, row in enumerate(rows):
         for key, cell in row.items():
@@ -122,21 +126,6 @@ def _index(rows):
                 index[key][at] = cell or np.nan
             else:
                 index[key][at] = whole_number(cell, f"line {at + 2}: {key}")
-    return index
-
-
-def _place(index, row):
-    """Where a telegram is, as text."""
-    return (
-        f"line {row + 2}, offset {index.offset[row]}, length {index.length[row]}, placement "
-        f"{index.placement[row]}"
-    )
-
-
-def _check_index(index, size, file):
-    """Telegrams lie one after the other in the file, but for a last one that is cut off, and every
-    scan has a pitch.
-    """
     if len(index) == 0:
         raise ValueError(
             f"no telegram in the index, {size} bytes in {file.name}: nothing was recorded"
@@ -161,6 +150,15 @@ def _check_index(index, size, file):
     ):
         if wrong.any():
             raise ValueError(f"{_place(index, wrong.argmax())}: {words}")
+    return index
+
+
+def _place(index, row):
+    """Where a telegram is, as text."""
+    return (
+        f"line {row + 2}, offset {index.offset[row]}, length {index.length[row]}, placement "
+        f"{index.placement[row]}"
+    )
 
 
 def _modes(data, index, sound):

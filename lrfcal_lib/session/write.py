@@ -114,7 +114,7 @@ class SessionWriter:
 
     def _make_folders(self):
         for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
-            files.checked(self.path / name / "any", self.path, make=True)
+            files.checked(self.path / name, self.path, make=True)
         if self.cameras:
             self._begin_table("images.csv", read.IMAGE_COLUMNS)
 
@@ -260,7 +260,7 @@ class SessionWriter:
         pitch: float = math.nan,
         time_s: float = math.nan,
         purpose: str = "board",
-    ) -> None:
+    ) -> str:
         """Append an image.
 
         Parameters
@@ -276,6 +276,11 @@ class SessionWriter:
             Seconds.
         purpose
             'board', 'intrinsics' or 'scene'.
+
+        Returns
+        -------
+        str
+            Its file in the session's folder.
 
         Raises
         ------
@@ -301,6 +306,7 @@ class SessionWriter:
         angle = math.degrees(pitch)
         row = [float(time_s), camera, name, number_cell(placement), angle, purpose]
         self._append_rows("images.csv", [row])
+        return name
 
 
 def finish(path: str | os.PathLike) -> None:
@@ -387,7 +393,8 @@ def write_file(folder: Path, name: str, content: bytes | dict) -> None:
     content
         Bytes, or arrays by name.
     """
-    file = files.checked(folder / name, folder)
+    file = folder / name
+    files.checked(file.parent, folder)
     draft = file.with_name(file.name + ".draft")
     draft.unlink(missing_ok=True)
     with files.opened(draft, folder, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
