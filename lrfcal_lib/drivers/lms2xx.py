@@ -34,7 +34,7 @@ FINE = (100, 0.25)  # variant that interlaced scans need, deg
 USUAL_RATE = 38400  # Bd; where a device is looked for first
 AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
-KEPT = 256  # scans that can be asked for by their instant
+KEPT = 1024  # scans that can be asked for by their instant
 LEAST_QUIET_S = 0.6  # of a stream, before it is taken for silent
 # one attempt to find a lost device; there are more until the stream is stopped
 RECOVERY_S = 8.0
@@ -317,23 +317,15 @@ class LMS2xx(Closed):
                 "{:g} deg in steps of {:g} deg".format(*self.variant)
             )
 
-    def configure(
-        self,
-        *,
-        unit: str | None = None,
-        measuring_mode: int | None = None,
-        realtime_indices: bool | None = None,
-    ) -> None:
+    def configure(self, **changes) -> None:
         """Change settings that are kept in flash (some thousand writes), only if they differ.
 
         Parameters
         ----------
-        unit
-            Of a reading, 'cm' or 'mm'.
-        measuring_mode
-            Key of `lms2xx_codec.TOP`; it tells the largest range, too.
-        realtime_indices
-            Without them dropped and repeated scans cannot be seen.
+        **changes
+            Of :meth:`lms2xx_codec.Configuration.changed`: `unit` of a reading, `measuring_mode`,
+            which tells the largest range, too, and `realtime_indices`, without which dropped and
+            repeated scans cannot be seen.
 
         Raises
         ------
@@ -342,10 +334,7 @@ class LMS2xx(Closed):
         """
         self._need_quiet()
         self._read_configuration()
-        wanted = self.configuration.changed(
-            unit=unit, measuring_mode=measuring_mode, realtime_indices=realtime_indices
-        )
-        self._write(wanted)
+        self._write(self.configuration.changed(**changes))
         self._prepare()
 
     def _write(self, wanted):
@@ -472,13 +461,13 @@ class LMS2xx(Closed):
     ) -> list[Reading]:
         """Consecutive scans of the stream.
 
-        The last 256 scans are kept, so that with the instant of the last scan of one call the next
+        The last 1024 scans are kept, so that with the instant of the last scan of one call the next
         call goes on without a gap.
 
         Parameters
         ----------
         count
-            Of the scans.
+            Of the scans, not more than are kept.
         after
             Date of the host, s, later than which they are; by default that of the call.
         timeout
@@ -499,15 +488,12 @@ class LMS2xx(Closed):
         if after is None:
             after = host.time()
         end = host.now() + timeout
-        readings: list[Reading] = []
         while True:
             self._news.clear()
             alive = self._thread.is_alive()
-            readings += [reading for reading in self._readings if reading.time_s > after]
+            readings = [reading for reading in self._readings if reading.time_s > after]
             if len(readings) >= count:
                 return readings[:count]
-            if readings:
-                after = readings[-1].time_s
             left = end - host.now()
             if left <= 0 or not alive:
                 trouble = self._trouble or "the stream is silent"

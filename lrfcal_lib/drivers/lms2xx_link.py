@@ -151,7 +151,6 @@ class Link:
         self._rest = b""  # bytes of a telegram that is not whole
         self._stray = None  # the last byte outside of telegrams
         self._last = self.host.now()
-        self._kept = []  # arrivals that came with a reply
 
     def send(self, code: int, data: bytes = b"") -> None:
         """Send a request; what arrived before it is thrown away.
@@ -187,10 +186,6 @@ class Link:
         """
         if self.interrupted.is_set():
             raise NoReply(f"{self.path}: waiting was interrupted")
-        if self._kept:
-            kept = self._kept
-            self._kept = []
-            return kept
         missing = 1
         if self._rest:  # a telegram has begun; bytes 2 and 3 state its length
             missing = max(1, whole(self._rest[2:4]) + OVERHEAD - len(self._rest))
@@ -221,7 +216,7 @@ class Link:
     # requests
 
     def ask(self, code: int, data: bytes = b"", *, limit_s: float = math.inf) -> Arrival:
-        """Send a request until its reply comes.
+        """Send a request until its reply comes; what arrives together with it is left out.
 
         Parameters
         ----------
@@ -263,10 +258,8 @@ class Link:
         begin = self.host.now()
         patience = NO_ACK_S
         while (now := self.host.now()) < end:
-            arrivals = self.receive()
-            for at, arrival in enumerate(arrivals):
+            for arrival in self.receive():
                 if arrival.code == code:
-                    self._kept = arrivals[at + 1 :]
                     return arrival, None
                 if arrival.code == NOT_UNDERSTOOD:
                     return None, "not allowed in its present mode, or unknown (92)"

@@ -206,7 +206,7 @@ class Assembler:
         times = start_s + (np.arange(count) % self.turns + quarters / 1440) * MIRROR_TURN
         reading = Reading(
             telegrams=(raw,),
-            ranges=np.where(np.isfinite(scan.ranges[0]), scan.ranges[0], np.nan),
+            ranges=np.nan_to_num(scan.ranges[0], nan=np.nan, posinf=np.nan),
             bearings=np.radians(quarters / 4),
             time_s=float(times[0]),
             beam_times_s=times,

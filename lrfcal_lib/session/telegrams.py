@@ -193,11 +193,11 @@ def _lines(groups, index):
             "no telegram with a scan belongs to a placement: was the device streaming?"
         )
     grids = [codec.scan_quarters(group.words.shape[1], group.partial) for group in groups]
-    kinds = {(len(grid), group.partial) for grid, group in zip(grids, groups, strict=True)}
-    if len(kinds) > 1 and min(group.partial for group in groups) < 0:
-        counts = sorted({len(grid) for grid in grids})
+    counts = {len(grid) for grid in grids}
+    partials = {group.partial for group in groups}
+    if -1 in partials and (len(counts) > 1 or len(partials) > 1):
         raise ValueError(
-            f"scans of {short(counts)} values are mixed: a session holds one variant, "
+            f"scans of {short(sorted(counts))} values are mixed: a session holds one variant, "
             "split the recording"
         )
     # the quarter of a degree that a scan is turned by, -1 for a whole one, -2 for no scan
