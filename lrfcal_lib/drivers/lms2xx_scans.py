@@ -234,8 +234,14 @@ class Assembler:
             return None
         parts = self._parts
         self._parts = []
-        order = np.argsort(np.concatenate([part.bearings for part in parts]))
-        merged = {"telegrams": sum((part.telegrams for part in parts), ())}
-        for name in ("ranges", "bearings", "beam_times_s"):
-            merged[name] = np.concatenate([getattr(part, name) for part in parts])[order]
-        return replace(parts[0], **merged)
+        beams = np.concatenate(
+            [[part.bearings, part.ranges, part.beam_times_s] for part in parts], axis=1
+        )
+        bearings, ranges, times = beams[:, np.argsort(beams[0])]
+        return replace(
+            parts[0],
+            telegrams=sum((part.telegrams for part in parts), ()),
+            ranges=ranges,
+            bearings=bearings,
+            beam_times_s=times,
+        )

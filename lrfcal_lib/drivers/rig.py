@@ -3,9 +3,8 @@
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import urllib3
@@ -127,13 +126,7 @@ class Rig(Closed):
         self._now = host.now
 
     @classmethod
-    def open(
-        cls,
-        stated: RigFile,
-        *,
-        host: Host = REAL,
-        camera: Callable[[str], Camera] | None = None,
-    ) -> "Rig":
+    def open(cls, stated: RigFile, *, host: Host = REAL) -> "Rig":
         """Open all devices and set the laser range finder as the rig file asks.
 
         What is set already is left alone.
@@ -144,8 +137,6 @@ class Rig(Closed):
             The rig file.
         host
             Machine that the drivers run on.
-        camera
-            ``camera(name)`` opens cameras whose images come from elsewhere than stated.
 
         Raises
         ------
@@ -158,7 +149,6 @@ class Rig(Closed):
         settings = devices.lrf.model_dump(exclude_none=True, exclude={"interlaced"})
         if devices.lrf.interlaced:  # it chooses its own
             settings.pop("variant", None)
-        open_camera = camera or partial(_camera, stated)
         with contextlib.ExitStack() as stack:
 
             def opened(name, opener, *args, **options):
@@ -177,7 +167,7 @@ class Rig(Closed):
                 head=opened("head", PanTilt, devices.head.port, devices.head, host=host),
                 lrf=opened("lrf", LMS2xx, host=host, **settings),
                 cameras={
-                    name: opened(f"camera '{name}'", open_camera, name)
+                    name: opened(f"camera '{name}'", _camera, stated, name)
                     for name in stated.cameras
                 },
                 host=host,
