@@ -78,11 +78,11 @@ def stops_of(sweep: tuple[float, float, float]) -> np.ndarray:
         Radians; none where the step is too small.
     """
     first, last, step = sweep
-    if step < FINEST_DEG:
-        return np.empty(0)
-    count = math.ceil(round(abs(last - first) / step, 6)) + 1
+    count = 0
+    if step >= FINEST_DEG:
+        count = math.ceil(round(abs(last - first) / step, 6)) + 1
     if count > MOST_STOPS:
-        return np.empty(0)
+        count = 0
     return np.radians(np.linspace(first, last, count))
 
 

@@ -55,8 +55,11 @@ def faults_of_files(session) -> list[Fault]:
     -------
     list of Fault
     """
-    finders = (repeated_images, repeated_scans, ranges_beyond, bearings_beyond)
-    return [fault for find in finders for fault in find(session)]
+    return [
+        fault
+        for find in (repeated_images, repeated_scans, ranges_beyond, bearings_beyond)
+        for fault in find(session)
+    ]
 
 
 def repeated_images(session) -> Iterator[Fault]:

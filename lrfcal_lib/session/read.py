@@ -20,7 +20,7 @@ from lrfcal_lib.session.files import (
     short,
 )
 from lrfcal_lib.session.images import check_image_size
-from lrfcal_lib.session.scans import parts_of, read_npz
+from lrfcal_lib.session.scans import parts_of, read_npz, scanned
 from lrfcal_lib.session.shown import printable
 from lrfcal_lib.session.stated import SCHEMA, StatedRig, parse_session
 from lrfcal_lib.session.tables import read_table, whole_number
@@ -88,17 +88,17 @@ OUTSIDE = re.compile(r"[/\\]|\w:|(.*[/\\])?\.\.([/\\]|$)")
 
 def missing_parts(placements, scans, records, cameras, unfinished):
     """What a session states and does not hold, as sentences; the rest can be used."""
-    scanned = set(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)].tolist())
+    swept = scanned(scans)
     shot = {(record.camera, record.placement) for record in records}
     for placement in placements:
-        if placement not in scanned:
+        if placement not in swept:
             yield f"placement {placement}: no scan line with a range"
     for placement in unfinished:
         yield (
             f"placement {placement}: its recording was not finished, ignored; 'record --resume' "
             "records it again"
         )
-    for placement in sorted(scanned - {*placements, *unfinished}):
+    for placement in sorted(swept - {*placements, *unfinished}):
         yield f"placement {placement}: in the scan lines but not in session.json, ignored"
     for placement in placements:
         for camera in cameras:

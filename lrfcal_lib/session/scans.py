@@ -33,6 +33,17 @@ LONGEST_HEADER = 10_000
 LONGEST_MEDIAN_RANGE = 200.0
 
 
+def scanned(scans: Mapping[str, np.ndarray]) -> set[int]:
+    """Numbers of the placements that scan lines with a range belong to.
+
+    Parameters
+    ----------
+    scans
+        As of :func:`check_scans`.
+    """
+    return set(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)].tolist())
+
+
 def parts_of(path):
     """Files of a session's sweeps in their order, until it is finished."""
     return sorted(checked(path / "lrf", path).glob("part_*.npz"))

@@ -97,8 +97,10 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
 
     with naming(file):
         modes, notes = _modes(data, index, np.flatnonzero(sound))
-        sizes = np.where(sound, index.length, 0)  # what is damaged holds no scan
-        groups = codec.decode_scans(data, index.offset, sizes, modes)
+        # what is damaged holds no scan
+        groups = codec.decode_scans(
+            data, index.offset, np.where(sound, index.length, 0), modes
+        )
         scans = check_scans(_lines(groups, index))
 
     values = np.zeros(len(codec.REASONS), int)
