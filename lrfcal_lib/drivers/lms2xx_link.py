@@ -330,9 +330,7 @@ class Link:
         until = begin + window
         asked = -math.inf
         while (now := self.host.now()) < min(until, end):
-            pause = ASK_AGAIN_S
-            if self.declined:
-                pause = NAK_PAUSE_S
+            pause = NAK_PAUSE_S if self.declined else ASK_AGAIN_S
             if now - asked > pause:
                 asked = now
                 self.send(MODE, ON_REQUEST)

@@ -94,12 +94,9 @@ class Motion:
             True: {settings.tilt_speed: up},
             False: {settings.tilt_speed: down},
         }
-        self._longest = FIRST_BURST_S / GROWTH
-        if self.calibrated:
-            self._longest = math.inf
-        self._obeys = None  # whether set-tilt moves the head; None until it was tried
-        if settings.absolute is False:
-            self._obeys = False
+        self._longest = math.inf if self.calibrated else FIRST_BURST_S / GROWTH
+        # whether set-tilt moves the head; None until it was tried
+        self._obeys = False if settings.absolute is False else None
         self._dead: set[int] = set()  # speed bytes at which the head does not move
         # way (1 up, -1 down), speed byte and instant of the motion
         self._going: tuple | None = None
