@@ -89,7 +89,7 @@ def change_statements(folder, change):
 
 def change_rows(folder, change, name="images.csv", columns=IMAGE_COLUMNS):
     """Let a function change the rows of a table, a list of dicts."""
-    rows = read_table(folder / name, columns, folder)[0]
+    rows = read_table(folder / name, columns, folder)
     change(rows)
     lines = as_lines([columns, *(row.values() for row in rows)])
     replaced(folder / name, lines)

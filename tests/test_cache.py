@@ -73,7 +73,7 @@ OTHERS = {  # arguments of the second call, or what is changed before it
     "argument": (2,), "option": (1, "joint"), "scan": other_scan, "image": other_image,
     "missing image": lambda session, patch: Path(session.image_records[0].file).unlink(),
     "statement": lambda session, patch: replace(session, platform_sigma=(0.1, 0.1)),
-    "library": lambda session, patch: patch.setattr(cache, "library", lambda: b"another version"),
+    "library": lambda session, patch: patch.setattr(cache, "source_digest", lambda: "another version"),
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from tiny_import import BOUGUET, authors_points, write_source
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session import importers
-from lrfcal_lib.session.files import SessionError
+from lrfcal_lib.session.files import SessionError, naming
 from lrfcal_lib.session.importers import (
     import_lasersetero,
     read_bouguet,
@@ -70,6 +70,12 @@ def results(old, new):
     return lambda folder: read_bouguet(written(folder / "c.m", BOUGUET.replace(old, new)))
 
 
+def recovered(name, points):
+    """What points of a file with this name were made of, as they are when it is imported."""
+    with naming(name):
+        return recover_polar(points)
+
+
 def scattered(lines):
     """Points of which each begins a scan line."""
     return authors_points(
@@ -85,11 +91,11 @@ def line(first):
 
 REFUSED = [
     (
-        lambda _: recover_polar(line(0) + [0, 0, 4e-4], "c 7"),
+        lambda _: recovered("c 7", line(0) + [0, 0, 4e-4]),
         r"c 7: rebuilding the points misses by 0\.\d+ mm, more",
     ),
     (
-        lambda _: recover_polar(line(39.6), "c 8"),
+        lambda _: recovered("c 8", line(39.6)),
         r"c 8: bearings reach 45\.5 \.\. 50\.4 deg, the LMS400 sees 55",
     ),
     (
@@ -100,7 +106,7 @@ REFUSED = [
     (results("700.5", "1e999"), r"c\.m: values of fc are not finite"),
     (results("700.5", "3-2"), r"c\.m: could not convert"),
     (
-        lambda _: recover_polar(scattered(20_000), "c 9"),
+        lambda _: recovered("c 9", scattered(20_000)),
         "c 9: 14020000 values of scan lines, more than 12000000",
     ),
     (lambda folder: read_pcd(folder / "none.pcd"), r"none\.pcd: No such file"),

@@ -138,15 +138,13 @@ def test_a_device_with_an_address_is_found_by_broadcast_and_by_its_own(address):
 def test_only_what_differs_is_set():
     device = emulated(configuration=Configuration())
     with opened(device) as lms:
-        assert not lms.configure(unit="cm", measuring_mode=0, realtime_indices=False)
-        assert not lms.set_variant(180, 0.5)
+        lms.configure(unit="cm", measuring_mode=0, realtime_indices=False)
+        lms.set_variant(180, 0.5)
         assert not {0x77, 0x3B} & set(commands(device)) and device.memory.flash_writes == 0
         block = device.memory.configuration.block
-        assert lms.configure(unit="mm", measuring_mode=4, realtime_indices=True)
-        assert (
-            not lms.configure(unit="mm", measuring_mode=4)
-            and device.memory.flash_writes == 1
-        )
+        lms.configure(unit="mm", measuring_mode=4, realtime_indices=True)
+        lms.configure(unit="mm", measuring_mode=4)
+        assert device.memory.flash_writes == 1
         now = device.memory.configuration
         assert (now.unit, now.measuring_mode, now.realtime_indices) == (
             "mm",
@@ -157,7 +155,9 @@ def test_only_what_differs_is_set():
             now.changed(unit="cm", measuring_mode=0, realtime_indices=False).block == block
         )
         assert device.memory.mode == 0x25
-        assert lms.set_variant(100, 1) and not lms.set_variant(100, 1)
+        for _ in range(2):
+            lms.set_variant(100, 1)
+            assert commands(device).count(0x3B) == 1
         assert lms.variant == (100, 1) and len(lms.request().ranges) == 101
         with pytest.raises(ValueError, match="variants are 100/1.*got 180/0.25"):
             lms.set_variant(180, 0.25)

@@ -21,7 +21,7 @@ from lrfcal_lib.acquire import record
 from lrfcal_lib.acquire.record import record_session
 from lrfcal_lib.calibrate.calibration_file import load_calibration
 from lrfcal_lib.calibrate.pipeline import calibrate_jointly, prepare
-from lrfcal_lib.drivers.rig import Rig
+from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.emulators.rig import EmulatedRig
@@ -59,6 +59,8 @@ def setup():
 class Still:
     """A camera in virtual time, which stands still while an image is drawn."""
 
+    size = None
+
     def __init__(self, rig, name):
         self.rig, self.name, self.count = rig, name, 0
 
@@ -91,7 +93,11 @@ def emulated_rig(setup, file):
         file.write_text(json.dumps(data))
 
         def opened(stated):
-            return Rig.open(stated, host=host, camera=lambda name: Still(emulated, name))
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(
+                    rig_module, "Camera", lambda _, name, **__: Still(emulated, name)
+                )
+                return rig_module.Rig.open(stated, host=host)
 
         yield SimpleNamespace(open=opened)
 

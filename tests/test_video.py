@@ -164,6 +164,13 @@ def test_stream_that_is_silent_for_too_long(server):
         )
 
 
+def test_a_stream_has_no_exposure(server, caplog):
+    with Camera(server.url, name="left", exposure=0.005) as camera:
+        assert camera.size == (64, 48)
+        server.stop()  # nothing that the camera would wait for
+    assert "exposure cannot be set, asked 0.005" in caplog.text
+
+
 def test_frames_that_piled_up_are_known(server):
     stream = MjpegStream(server.url.replace("//", "//user:pass%20word@"), 5)
     assert stream.grab()  # the one that told the size

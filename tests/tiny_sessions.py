@@ -127,14 +127,13 @@ def record(
                 for at in np.radians(image_pitch_deg):
                     back = RigidTransform.from_rotation(Rotation.from_rotvec([-at, 0, 0]))
                     seen = CAMERAS[name] * HEAD.inv() * back * pose
-                    writer.add_image(
+                    file = writer.add_image(
                         name,
                         _image(seen, board, on_wall, rng),
                         number,
                         pitch=float(at),
                         purpose=purpose,
                     )
-                    file = f"images/{name}/{writer.shots[name]:04d}.png"
                     truth["images"][file] = {
                         "pitch_rad": float(at),
                         "T_camera_board": transform_to_json(seen),

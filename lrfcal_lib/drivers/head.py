@@ -16,9 +16,9 @@ from lrfcal_lib.drivers.port import (
     OutOfRange,
     WrongDevice,
 )
+from lrfcal_lib.drivers.rig_file import ROUNDING_DEG
 
 LOG = logging.getLogger(__name__)
-ROUNDING_DEG = 1e-6  # by which a pitch may exceed the limits
 
 
 class PanTilt(port.Closed):

@@ -34,7 +34,7 @@ FINE = (100, 0.25)  # variant that interlaced scans need, deg
 USUAL_RATE = 38400  # Bd; where a device is looked for first
 AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
-KEPT = 256  # scans that can be asked for by their instant
+KEPT = 1024  # scans that can be asked for by their instant
 LEAST_QUIET_S = 0.6  # of a stream, before it is taken for silent
 # one attempt to find a lost device; there are more until the stream is stopped
 RECOVERY_S = 8.0
@@ -274,18 +274,13 @@ class LMS2xx(Closed):
         if result:
             raise Refused(f"{self.port}: the device declines {what} (A0 {result:02X})")
 
-    def set_variant(self, fov_deg: float, resolution_deg: float) -> bool:
-        """Set field of view and resolution.
+    def set_variant(self, fov_deg: float, resolution_deg: float) -> None:
+        """Set field of view and resolution, if they differ.
 
         Parameters
         ----------
         fov_deg, resolution_deg
             180 with 1 or 0.5, or 100 with 1, 0.5 or 0.25 deg.
-
-        Returns
-        -------
-        bool
-            Whether they differed.
 
         Raises
         ------
@@ -302,14 +297,13 @@ class LMS2xx(Closed):
                 f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}"
             )
         self._read_status()
-        differs = self._set_variant(wanted)
+        self._set_variant(wanted)
         self._prepare()
-        return differs
 
     def _set_variant(self, wanted):
-        """Set the variant where it was read to be another one; whether it was."""
+        """Set the variant where it was read to be another one."""
         if self.variant == wanted:
-            return False
+            return
         view, step = wanted
         data = struct.pack("<HH", round(view), round(100 * step))
         try:
@@ -322,30 +316,16 @@ class LMS2xx(Closed):
                 f"{self.port}: the {self.type} has no variant {view:g}/{step:g}; it keeps "
                 "{:g} deg in steps of {:g} deg".format(*self.variant)
             )
-        return True
 
-    def configure(
-        self,
-        *,
-        unit: str | None = None,
-        measuring_mode: int | None = None,
-        realtime_indices: bool | None = None,
-    ) -> bool:
+    def configure(self, **changes) -> None:
         """Change settings that are kept in flash (some thousand writes), only if they differ.
 
         Parameters
         ----------
-        unit
-            Of a reading, 'cm' or 'mm'.
-        measuring_mode
-            Key of `lms2xx_codec.TOP`; it tells the largest range, too.
-        realtime_indices
-            Without them dropped and repeated scans cannot be seen.
-
-        Returns
-        -------
-        bool
-            Whether they differed.
+        **changes
+            Of :meth:`lms2xx_codec.Configuration.changed`: `unit` of a reading, `measuring_mode`,
+            which tells the largest range, too, and `realtime_indices`, without which dropped and
+            repeated scans cannot be seen.
 
         Raises
         ------
@@ -354,19 +334,15 @@ class LMS2xx(Closed):
         """
         self._need_quiet()
         self._read_configuration()
-        wanted = self.configuration.changed(
-            unit=unit, measuring_mode=measuring_mode, realtime_indices=realtime_indices
-        )
-        differs = self._write(wanted)
+        self._write(self.configuration.changed(**changes))
         self._prepare()
-        return differs
 
     def _write(self, wanted):
         """Write a configuration that differs from the one read, in installation mode, and read it
-        back; whether it differed.
+        back.
         """
         if self.configuration == wanted:
-            return False
+            return
         try:
             self._mode(INSTALLATION, "the password of the installation mode")
             self._line.ask(wire.CONFIGURE, wanted.block)
@@ -380,7 +356,6 @@ class LMS2xx(Closed):
             raise Refused(
                 f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}"
             )
-        return True
 
     def request(self, timeout: float = 4.0) -> Reading:
         """One scan.
@@ -459,10 +434,6 @@ class LMS2xx(Closed):
                 self._trouble = str(error)
                 lost = True
                 LOG.warning("LMS2xx: %s; looking for the device", error)
-            except Exception as error:  # told to whoever waits, who would wait for nothing
-                self._trouble = f"the reader thread failed: {error!r}"
-                LOG.exception("LMS2xx reader thread")
-                raise
 
     def _post(self):
         """Post readings until the stream falls silent, or until the end.
@@ -490,13 +461,13 @@ class LMS2xx(Closed):
     ) -> list[Reading]:
         """Consecutive scans of the stream.
 
-        The last 256 scans are kept, so that with the instant of the last scan of one call the next
+        The last 1024 scans are kept, so that with the instant of the last scan of one call the next
         call goes on without a gap.
 
         Parameters
         ----------
         count
-            Of the scans.
+            Of the scans, not more than are kept.
         after
             Date of the host, s, later than which they are; by default that of the call.
         timeout
@@ -517,15 +488,12 @@ class LMS2xx(Closed):
         if after is None:
             after = host.time()
         end = host.now() + timeout
-        readings: list[Reading] = []
         while True:
             self._news.clear()
             alive = self._thread.is_alive()
-            readings += [reading for reading in self._readings if reading.time_s > after]
+            readings = [reading for reading in self._readings if reading.time_s > after]
             if len(readings) >= count:
                 return readings[:count]
-            if readings:
-                after = readings[-1].time_s
             left = end - host.now()
             if left <= 0 or not alive:
                 trouble = self._trouble or "the stream is silent"

@@ -123,11 +123,6 @@ class Link:
         return self.host.now() - self._last
 
     @property
-    def acknowledged(self) -> bool:
-        """Whether the last stray byte is ACK."""
-        return self._stray == ACK
-
-    @property
     def declined(self) -> bool:
         """Whether the last byte is NAK and nothing followed: amid other bytes it means nothing."""
         return self._stray == NAK and not self._rest and self.silent_s > SILENCE_S
@@ -156,7 +151,6 @@ class Link:
         self._rest = b""  # bytes of a telegram that is not whole
         self._stray = None  # the last byte outside of telegrams
         self._last = self.host.now()
-        self._kept = []  # arrivals that came with a reply
 
     def send(self, code: int, data: bytes = b"") -> None:
         """Send a request; what arrived before it is thrown away.
@@ -192,10 +186,6 @@ class Link:
         """
         if self.interrupted.is_set():
             raise NoReply(f"{self.path}: waiting was interrupted")
-        if self._kept:
-            kept = self._kept
-            self._kept = []
-            return kept
         missing = 1
         if self._rest:  # a telegram has begun; bytes 2 and 3 state its length
             missing = max(1, whole(self._rest[2:4]) + OVERHEAD - len(self._rest))
@@ -226,7 +216,7 @@ class Link:
     # requests
 
     def ask(self, code: int, data: bytes = b"", *, limit_s: float = math.inf) -> Arrival:
-        """Send a request until its reply comes.
+        """Send a request until its reply comes; what arrives together with it is left out.
 
         Parameters
         ----------
@@ -268,14 +258,12 @@ class Link:
         begin = self.host.now()
         patience = NO_ACK_S
         while (now := self.host.now()) < end:
-            arrivals = self.receive()
-            for at, arrival in enumerate(arrivals):
+            for arrival in self.receive():
                 if arrival.code == code:
-                    self._kept = arrivals[at + 1 :]
                     return arrival, None
                 if arrival.code == NOT_UNDERSTOOD:
                     return None, "not allowed in its present mode, or unknown (92)"
-            if self.acknowledged:
+            if self._stray == ACK:
                 patience = again_s
             if self.declined:
                 return (
@@ -342,9 +330,7 @@ class Link:
         until = begin + window
         asked = -math.inf
         while (now := self.host.now()) < min(until, end):
-            pause = ASK_AGAIN_S
-            if self.declined:
-                pause = NAK_PAUSE_S
+            pause = NAK_PAUSE_S if self.declined else ASK_AGAIN_S
             if now - asked > pause:
                 asked = now
                 self.send(MODE, ON_REQUEST)
@@ -354,7 +340,7 @@ class Link:
             if (
                 codes
                 or self.declined
-                or (self.acknowledged and self.silent_s > 3 * SILENCE_S)
+                or (self._stray == ACK and self.silent_s > 3 * SILENCE_S)
             ):
                 until = begin + STOPPING_S
         return False

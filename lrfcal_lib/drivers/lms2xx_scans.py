@@ -18,7 +18,7 @@ WINDOW_S = 2.0
 OFF_S = 1.2  # how far a scan may arrive off its expected instant
 JITTER_S = 0.05  # larger corrections of the clock leave scans out, smaller ones are spread
 LEAST_S = MIRROR_TURN / 100  # between two instants told; far less than between two scans
-FORGET_S = 30.0  # after such a pause the number of turns in between is not known
+FORGET = 30.0 / MIRROR_TURN  # turns; after such a pause their number is not known
 STUBBORN = 5  # so many implausible scan indices in a row: the device counts anew
 
 
@@ -95,12 +95,11 @@ class ScanClock:
             return time_s
         turn = index
         if self._arrivals:
-            elapsed_s = time_s - self._instant()
-            if elapsed_s > FORGET_S or self._refused >= STUBBORN:
+            last, _ = self._arrivals[-1]
+            expected = (time_s - self._zero()) / MIRROR_TURN
+            if expected - last > FORGET or self._refused >= STUBBORN:
                 self._arrivals.clear()
             else:
-                last, _ = self._arrivals[-1]
-                expected = last + elapsed_s / MIRROR_TURN
                 turn += 256 * round((expected - turn) / 256)
                 if turn <= last or abs(expected - turn) * MIRROR_TURN >= OFF_S:
                     self._refused += 1
@@ -109,16 +108,15 @@ class ScanClock:
         self._arrivals.append((turn, time_s))
         while self._arrivals[0][1] < time_s - WINDOW_S:  # never the one that came just now
             self._arrivals.popleft()
-        instant = self._instant()
+        instant = turn * MIRROR_TURN + self._zero()
         if instant < self._told - JITTER_S:  # the clock was found to be far ahead
             return None
         self._told = max(instant, self._told + LEAST_S)
         return self._told
 
-    def _instant(self):
-        """Of the last scan, by the earliest arrival of the window."""
-        earliest = min(time_s - turn * MIRROR_TURN for turn, time_s in self._arrivals)
-        return self._arrivals[-1][0] * MIRROR_TURN + earliest
+    def _zero(self):
+        """Instant of turn 0, by the earliest arrival of the window."""
+        return min(time_s - turn * MIRROR_TURN for turn, time_s in self._arrivals)
 
 
 class Assembler:
@@ -159,12 +157,15 @@ class Assembler:
         self._clock = clock
         self._parts: list[Reading] = []
         view, resolution = variant
-        self.values = round(view / resolution) + 1
+        values = round(view / resolution) + 1
         self.turns = round(1 / resolution)
         if interlaced:
-            self.values = PARTIAL
+            values = PARTIAL
             self.turns = 1
-        size = 10 + 2 * self.values + 2 * configuration.realtime_indices
+        indexed = configuration.realtime_indices
+        # number of values, unit, and whether there are indices and parts
+        self._kind = (values, configuration.unit, indexed, interlaced)
+        size = 10 + 2 * values + 2 * indexed
         scan_s = self.turns * MIRROR_TURN
         self.duration_s = scan_s + transfer_s(size, baudrate)
         self.interval_s = interval_s(size, baudrate, scan_s)
@@ -187,21 +188,14 @@ class Assembler:
             None for a part of a set, and for what is no scan of this variant, unit and kind or is
             not new.
         """
-        configuration = self.configuration
         try:
-            scan = codec.decode_scan(raw, configuration.measuring_mode)
+            scan = codec.decode_scan(raw, self.configuration.measuring_mode)
         except TelegramError:
             return None
         count = scan.words.shape[1]
         index = int(scan.scan_index[0])
         kind = (count + (scan.partial > 0), scan.unit, index >= 0, scan.partial >= 0)
-        expected = (
-            self.values,
-            configuration.unit,
-            configuration.realtime_indices,
-            self.interlaced,
-        )
-        if kind != expected:
+        if kind != self._kind:
             return None
         begun = arrival_s - transfer_s(len(raw), self.baudrate) - self.turns * MIRROR_TURN
         start_s = self._clock.place(index, begun)
@@ -212,7 +206,7 @@ class Assembler:
         times = start_s + (np.arange(count) % self.turns + quarters / 1440) * MIRROR_TURN
         reading = Reading(
             telegrams=(raw,),
-            ranges=np.where(np.isfinite(scan.ranges[0]), scan.ranges[0], np.nan),
+            ranges=np.nan_to_num(scan.ranges[0], nan=np.nan, posinf=np.nan),
             bearings=np.radians(quarters / 4),
             time_s=float(times[0]),
             beam_times_s=times,
@@ -240,8 +234,14 @@ class Assembler:
             return None
         parts = self._parts
         self._parts = []
-        order = np.argsort(np.concatenate([part.bearings for part in parts]))
-        merged = {"telegrams": sum((part.telegrams for part in parts), ())}
-        for name in ("ranges", "bearings", "beam_times_s"):
-            merged[name] = np.concatenate([getattr(part, name) for part in parts])[order]
-        return replace(parts[0], **merged)
+        beams = np.concatenate(
+            [[part.bearings, part.ranges, part.beam_times_s] for part in parts], axis=1
+        )
+        bearings, ranges, times = beams[:, np.argsort(beams[0])]
+        return replace(
+            parts[0],
+            telegrams=sum((part.telegrams for part in parts), ()),
+            ranges=ranges,
+            bearings=bearings,
+            beam_times_s=times,
+        )

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import (
     DOWN,
@@ -87,14 +89,14 @@ class Motion:
         self._now = line.host.now
         self._zero = line.host.time() - line.host.now()  # date of the instant 0
         up, down = map(math.radians, settings.degrees_per_second or ASSUMED)
-        # by way, 1 up and -1 down, and speed byte
-        self._speeds = {1: {settings.tilt_speed: up}, -1: {settings.tilt_speed: down}}
-        self._longest = FIRST_BURST_S / GROWTH
-        if self.calibrated:
-            self._longest = math.inf
-        self._obeys = None  # whether set-tilt moves the head; None until it was tried
-        if settings.absolute is False:
-            self._obeys = False
+        # by whether it goes up, and speed byte
+        self._speeds = {
+            True: {settings.tilt_speed: up},
+            False: {settings.tilt_speed: down},
+        }
+        self._longest = math.inf if self.calibrated else FIRST_BURST_S / GROWTH
+        # whether set-tilt moves the head; None until it was tried
+        self._obeys = False if settings.absolute is False else None
         self._dead: set[int] = set()  # speed bytes at which the head does not move
         # way (1 up, -1 down), speed byte and instant of the motion
         self._going: tuple | None = None
@@ -103,7 +105,6 @@ class Motion:
         self._pitch: float | None = None
         self._known_at = 0.0
         self._misses = 0
-        self._repeat_s = settings.repeat_s or math.inf
         self._tolerance = math.radians(settings.tolerance_deg)
         self._shortest_s = 2 * line.wire_s() + settings.gap_s  # of a motion and its stop
 
@@ -114,15 +115,14 @@ class Motion:
         """Speed upwards (`way` > 0) or downwards; of other speed bytes in proportion, until they
         were used.
         """
-        speeds = self._speeds[math.copysign(1, way)]
+        speeds = self._speeds[way > 0]
         nearest = min(speeds, key=lambda other: abs(other - step))
         return speeds[nearest] * max(step, 1) / max(nearest, 1)
 
     def learn(self, way, step, speed):
         """Remember a speed that was measured."""
-        way = math.copysign(1, way)
-        self._speeds[way][step] = speed
-        self._speeds[-way].setdefault(step, speed)
+        self._speeds[way > 0][step] = speed
+        self._speeds[way <= 0].setdefault(step, speed)
         self.calibrated = True
 
     def know(self, pitch, instant):
@@ -181,18 +181,18 @@ class Motion:
         What lies between two readings is stretched to both.
         """
         rows = list(self.rows)
-        pitches = [row.pitch for row in rows]
+        pitches = np.array([row.pitch for row in rows])
         measured = [i for i, row in enumerate(rows) if row.measured]
         for first, last in itertools.pairwise(measured):
             start = pitches[first]
             reckoned = rows[last].reckoned - start
             if reckoned:
                 stretch = (pitches[last] - start) / reckoned
-                for i in range(first + 1, last):
-                    pitches[i] = start + stretch * (pitches[i] - start)
+                between = pitches[first + 1 : last]
+                between[:] = start + stretch * (between - start)
         return [
             (self._zero + row.instant, pitch, row.measured)
-            for row, pitch in zip(rows, pitches, strict=True)
+            for row, pitch in zip(rows, pitches.tolist(), strict=True)
         ]
 
     # ------------------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ class Motion:
         """
         end = self._now() + seconds
         while True:
-            due = self._repeated + self._repeat_s
+            due = self._repeated + (self.settings.repeat_s or math.inf)
             if self._now() >= due:
                 self._repeated = self._send(self._frame)
             elif self.abort.wait(max(0.0, min(end, due) - self._now())):

@@ -6,12 +6,11 @@ import math
 import os
 from dataclasses import dataclass
 
-from lrfcal_lib.drivers.port import REAL, Host, LineLost, PortError, line_lost, stopping
+from lrfcal_lib.drivers.port import Host, LineLost, PortError, line_lost, stopping
 
 LOG = logging.getLogger(__name__)
 SYNC = 0xFF
 FRAME = 7  # bytes
-SHORT = 5  # bytes of a reply without sync and address
 GENERAL = 4  # bytes of a confirmation
 # bits of command 2; without them, and those of the pan, it is a stop
 UP = 0x08
@@ -153,9 +152,7 @@ def decode_tilt(value: int) -> float:
     float
         Radians in [-pi, pi), up positive.
     """
-    if value > TURN // 2:
-        value -= TURN
-    return -math.radians(value / 100)
+    return math.remainder(-math.radians(value / 100), math.tau)
 
 
 # ---------------------------------------------------------------------------------------- replies
@@ -236,7 +233,7 @@ class HeadLine:
         Frames sent, and bytes that came back as an echo or belong to nothing.
     """
 
-    def __init__(self, path: str | os.PathLike, settings, host: Host = REAL):
+    def __init__(self, path: str | os.PathLike, settings, host: Host):
         self.path = path
         self.settings = settings
         self.host = host
@@ -277,10 +274,12 @@ class HeadLine:
         return None
 
     def command(self, frame):
-        """Send a frame that a head may acknowledge; the host's instant at which it was sent."""
-        with self.lock:
-            self._exchange(frame)
-            return self._sent
+        """Send a frame that a head may acknowledge; the host's instant at which it was sent.
+
+        Who calls holds the lock.
+        """
+        self._exchange(frame)
+        return self._sent
 
     def stop(self):
         """Send the stop until it is acknowledged; the instant of the first one.

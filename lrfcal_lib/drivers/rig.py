@@ -3,9 +3,8 @@
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import urllib3
@@ -127,13 +126,7 @@ class Rig(Closed):
         self._now = host.now
 
     @classmethod
-    def open(
-        cls,
-        stated: RigFile,
-        *,
-        host: Host = REAL,
-        camera: Callable[[str], Camera] | None = None,
-    ) -> "Rig":
+    def open(cls, stated: RigFile, *, host: Host = REAL) -> "Rig":
         """Open all devices and set the laser range finder as the rig file asks.
 
         What is set already is left alone.
@@ -144,8 +137,6 @@ class Rig(Closed):
             The rig file.
         host
             Machine that the drivers run on.
-        camera
-            ``camera(name)`` opens cameras whose images come from elsewhere than stated.
 
         Raises
         ------
@@ -158,7 +149,6 @@ class Rig(Closed):
         settings = devices.lrf.model_dump(exclude_none=True, exclude={"interlaced"})
         if devices.lrf.interlaced:  # it chooses its own
             settings.pop("variant", None)
-        open_camera = camera or partial(_camera, stated)
         with contextlib.ExitStack() as stack:
 
             def opened(name, opener, *args, **options):
@@ -172,13 +162,16 @@ class Rig(Closed):
                     raise RigFileError(f"{stated.path}: {name}: {error}") from error
                 return stack.enter_context(contextlib.closing(device))
 
-            head = opened("head", PanTilt, devices.head.port, devices.head, host=host)
-            lrf = opened("lrf", LMS2xx, host=host, **settings)
-            cameras = {
-                name: opened(f"camera '{name}'", open_camera, name)
-                for name in stated.cameras
-            }
-            rig = cls(stated, lrf, head, cameras, host=host)
+            rig = cls(
+                stated,
+                head=opened("head", PanTilt, devices.head.port, devices.head, host=host),
+                lrf=opened("lrf", LMS2xx, host=host, **settings),
+                cameras={
+                    name: opened(f"camera '{name}'", _camera, stated, name)
+                    for name in stated.cameras
+                },
+                host=host,
+            )
             rig._closing = stack.pop_all()
         return rig
 
@@ -256,11 +249,14 @@ class Rig(Closed):
         control = self.stated.devices.control
         if control is None:
             return False
-        url = f"{control}/{command}"
         try:
             # what it sends is not read: an answer without end fills no memory
             answer = urllib3.request(
-                "POST", url, timeout=CONTROL_S, retries=False, preload_content=False
+                "POST",
+                f"{control}/{command}",
+                timeout=CONTROL_S,
+                retries=False,
+                preload_content=False,
             )
             answer.close()
             if answer.status == OBEYED:
@@ -333,8 +329,7 @@ class Rig(Closed):
             As :meth:`acquire`.
         """
         try:
-            rest = self._move(CLOSE, 0.0)
-            return next(self._photograph([camera], rest, "intrinsics"))
+            return next(self._photograph([camera], self._move(CLOSE, 0.0), "intrinsics"))
         except BaseException:
             self.halt()
             raise
@@ -363,7 +358,7 @@ class Rig(Closed):
     def _close(self, placement):
         """Scan again in the first half of a sweep, as level as it was there: walls show most."""
         half = placement.pitch[: len(placement.pitch) // 2 + 1]
-        level = float(half[np.argmin(np.abs(half))])
+        level = min(half.tolist(), key=abs)
         moved = self._move(placement.number, level)
         yield moved
         self._begin_scans()
@@ -378,8 +373,9 @@ class Rig(Closed):
     def _scanned(self, moved, share=math.nan):
         """What is scanned at a stop."""
         readings = tuple(self._scans(moved.time_s))
-        pitch = np.full(len(readings), moved.pitch)
-        return Scanned(moved.placement, readings, pitch, share)
+        return Scanned(
+            moved.placement, readings, np.full(len(readings), moved.pitch), share
+        )
 
     def _scans(self, after):
         """Scans of a stream, or one by one, later than an instant.
@@ -427,7 +423,7 @@ class Rig(Closed):
         first, last = placement.pitch[[0, -1]].tolist()
         images = sorted(placement.image_pitch, reverse=placement.direction < 0)
         for number, pitch in enumerate([*images, first], 1):
-            moved = self._move(placement.number, float(pitch), number, len(images) + 1)
+            moved = self._move(placement.number, pitch, number, len(images) + 1)
             yield moved
             if number <= len(images):
                 yield from self._photograph(self.cameras, moved, placement.purpose)
@@ -473,7 +469,7 @@ class Rig(Closed):
 
 
 def placed(
-    readings: Sequence[Reading], track: Sequence[tuple[float, float, bool]]
+    readings: list[Reading], track: Sequence[tuple[float, float, bool]]
 ) -> tuple[tuple[Reading, ...], np.ndarray, list[Reading]]:
     """Give scans of a sweep their pitch.
 
@@ -494,13 +490,13 @@ def placed(
         Those after the track.
     """
     if not track:
-        return (), np.empty(0), list(readings)
+        return (), np.empty(0), readings
     times, pitch = np.array([point[:2] for point in track]).T
     middle = np.array([np.mean(reading.beam_times_s[[0, -1]]) for reading in readings])
     begin = np.searchsorted(middle, times[0])
     end = np.searchsorted(middle, times[-1], side="right")
     known = np.interp(middle[begin:end], times, pitch)
-    return tuple(readings[begin:end]), known, list(readings[end:])
+    return tuple(readings[begin:end]), known, readings[end:]
 
 
 def unchanged(scans: Iterable[np.ndarray]) -> bool:
@@ -527,7 +523,7 @@ def unchanged(scans: Iterable[np.ndarray]) -> bool:
     spread = len(ranges) * ranges.var(axis=0)
     noise = np.full(len(steps), 2.0)
     ratio = np.divide(steps, spread, out=noise, where=steps > 0)
-    return ratio.size > 0 and bool(ratio.mean() > STILL)
+    return bool(ratio.sum() > STILL * ratio.size)
 
 
 def _camera(stated, name):

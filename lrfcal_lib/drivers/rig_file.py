@@ -16,19 +16,12 @@ from pydantic import (
     StrictStr,
     model_validator,
 )
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.drivers.pelco_d import FASTEST
-from lrfcal_lib.model.board import Board
 from lrfcal_lib.session.files import SessionError, read_json, short
-from lrfcal_lib.session.stated import (
-    CameraInfo,
-    LrfInfo,
-    SessionStated,
-    parse_session,
-    refused,
-)
+from lrfcal_lib.session.stated import SessionStated, StatedRig, parse_session, refused
+from lrfcal_lib.session.write import ABOUT
 
 MOST_STOPS = 5000
 FINEST_DEG = 1e-3
@@ -85,11 +78,11 @@ def stops_of(sweep: tuple[float, float, float]) -> np.ndarray:
         Radians; none where the step is too small.
     """
     first, last, step = sweep
-    if step < FINEST_DEG:
-        return np.empty(0)
-    count = math.ceil(round(abs(last - first) / step, 6)) + 1
+    count = 0
+    if step >= FINEST_DEG:
+        count = math.ceil(round(abs(last - first) / step, 6)) + 1
     if count > MOST_STOPS:
-        return np.empty(0)
+        count = 0
     return np.radians(np.linspace(first, last, count))
 
 
@@ -213,12 +206,12 @@ class HeadSettings(Stated):
         Returns
         -------
         float
-            Radians in [-pi, pi), up positive.
+            Radians, half a turn at most, up positive.
         """
         pitch = elevation - math.radians(self.position_zero_deg)
         if self.invert:
             pitch = -pitch
-        return (pitch + math.pi) % math.tau - math.pi
+        return math.remainder(pitch, math.tau)
 
 
 class HeadDevice(HeadSettings):
@@ -350,17 +343,11 @@ class Plan(Stated):
 
 
 @dataclass(frozen=True)
-class RigFile:
+class RigFile(StatedRig):
     """A rig file; RigFileError if its head or its laser range finder cannot do the plan."""
 
     path: Path
     about: dict  # licence, source, simulated
-    board: Board
-    lrf: LrfInfo
-    T_head_lrf: RigidTransform | None
-    # how well the platform is known: direction (radians) and offset (metres)
-    platform_sigma: tuple[float, float]
-    cameras: dict[str, CameraInfo]
     devices: Devices
     plan: Plan
 
@@ -402,12 +389,11 @@ def read_rig_file(path: str | os.PathLike) -> RigFile:
         With the file, the key and the value, for anything that cannot be used.
     """
     try:
-        data = read_json(path, None)
+        return rig_of(read_json(path, None), Path(path))
     except SessionError as error:
         raise RigFileError(
             f"{error}; 'python -m lrfcal_lib emulate --rig-file' writes an example"
         ) from error
-    return rig_of(data, Path(path))
 
 
 def rig_of(data: dict, path: Path = Path("rig.json")) -> RigFile:
@@ -427,14 +413,14 @@ def rig_of(data: dict, path: Path = Path("rig.json")) -> RigFile:
     """
     try:
         present = {key: value for key, value in data.items() if value is not None}
-        unsaid = {"name": "rig", "licence": "", "source": "", "simulated": False}
+        unsaid = ABOUT | {"name": "rig"}
         stated = parse_session(unsaid | present | {"placements": ()}, RigFileStated)
         _check_cameras(stated["devices"].cameras, stated["cameras"])
     except ValueError as error:
         raise RigFileError(f"{path}: {error}") from error
     about = {key: stated[key] for key in ("licence", "source", "simulated")}
     rest = ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras", "devices", "plan")
-    return RigFile(Path(path), about, **{key: stated[key] for key in rest})
+    return RigFile(path=Path(path), about=about, **{key: stated[key] for key in rest})
 
 
 def _check_cameras(devices, cameras):

@@ -191,8 +191,10 @@ class Camera(Closed):
             self.size = None
         if exposure is None:
             return
-        given_s = capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
-        if cv2.CAP_PROP_EXPOSURE not in self._taken or given_s <= 0:
+        given_s = 0.0
+        if cv2.CAP_PROP_EXPOSURE in self._taken:
+            given_s = capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
+        if given_s <= 0:
             LOG.warning("camera %s: exposure cannot be set, asked %s", self.name, exposure)
         elif abs(given_s - exposure) > SAME_EXPOSURE * exposure:
             LOG.warning("camera %s: exposure is %s, asked %s", self.name, given_s, exposure)

@@ -27,6 +27,7 @@ from lrfcal_lib.measure.suspects import (
 )
 from lrfcal_lib.model.geometry import fit_plane
 from lrfcal_lib.session.read import Session
+from lrfcal_lib.session.scans import scanned
 
 UNEVEN = 0.003  # metres, of real walls
 BENT = 3.0  # times what is allowed, of a wall
@@ -258,9 +259,7 @@ def _stations(session, rig):
     """Placements with a sweep and images of the rig's cameras."""
     require_same_rig(rig, session)
     shown = {r.placement for r in session.image_records if r.camera in rig.cameras}
-    swept = set(
-        session.scans["placement"][np.isfinite(session.scans["ranges"]).any(axis=1)]
-    )
+    swept = scanned(session.scans)
     stations = [p for p in session.placements if p in shown & swept]
     if not stations:
         raise ValueError(

@@ -58,7 +58,8 @@ def cached(stage):
         key = hashlib.sha256(pickle.dumps(call))
         for record in session.image_records:
             key.update(record.file.read_bytes() if record.file.is_file() else b"missing")
-        key.update(library())
+        versions = f"{source_digest()}{np.__version__}{scipy.__version__}{cv2.__version__}"
+        key.update(versions.encode())
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
             with opened(
@@ -98,8 +99,3 @@ def _refuse_others(place, status):
             f"{VARIABLE}: others may write to '{place}' (owner {status.st_uid}, mode "
             f"{status.st_mode & 0o7777:o}), {REMEDY}"
         )
-
-
-def library():
-    """What stands for this library and those it works out its results with."""
-    return f"{source_digest()}{np.__version__}{scipy.__version__}{cv2.__version__}".encode()

@@ -55,8 +55,11 @@ def faults_of_files(session) -> list[Fault]:
     -------
     list of Fault
     """
-    finders = (repeated_images, repeated_scans, ranges_beyond, bearings_beyond)
-    return [fault for find in finders for fault in find(session)]
+    return [
+        fault
+        for find in (repeated_images, repeated_scans, ranges_beyond, bearings_beyond)
+        for fault in find(session)
+    ]
 
 
 def repeated_images(session) -> Iterator[Fault]:
@@ -64,31 +67,25 @@ def repeated_images(session) -> Iterator[Fault]:
     firsts = {}  # by the hash of their content
     pairs = defaultdict(list)
     for record in session.image_records:
-        content = read_bytes(record.file, session.path)
-        first = firsts.setdefault(hash(content), record)
+        first = firsts.setdefault(hash(read_bytes(record.file, session.path)), record)
         if first is not record:
             pairs[first.camera, record.camera].append((first, record))
-    for cameras, both in pairs.items():
-        yield _repeated(session, *cameras, both)
-
-
-def _repeated(session, first_camera, camera, pairs):
-    """The Fault of images of one camera that are images of another one, or of itself, again."""
-    count = len(session.images(camera))
-    examples = short(
-        f"{other.file.relative_to(session.path)} is {first.file.relative_to(session.path)}"
-        for first, other in pairs
-    )
-    placements = tuple(sorted({other.placement for _, other in pairs} - {-1}))
-    cause = "a camera that stood still, or a copy"
-    if first_camera != camera:
-        cause = f"was the folder of camera '{first_camera}' copied?"
-    words = (
-        f"{len(pairs)} of {count} images of camera '{camera}' (in placements: "
-        f"{short(placements)}) are identical to others: {examples}: {cause}; put the right "
-        "images there or remove their rows from images.csv"
-    )
-    return Fault("repeated image", words, len(pairs) > MANY * count, camera, placements)
+    for (first_camera, camera), same in pairs.items():
+        count = len(session.images(camera))
+        examples = short(
+            f"{other.file.relative_to(session.path)} is {first.file.relative_to(session.path)}"
+            for first, other in same
+        )
+        placements = tuple(sorted({other.placement for _, other in same} - {-1}))
+        cause = "a camera that stood still, or a copy"
+        if first_camera != camera:
+            cause = f"was the folder of camera '{first_camera}' copied?"
+        words = (
+            f"{len(same)} of {count} images of camera '{camera}' (in placements: "
+            f"{short(placements)}) are identical to others: {examples}: {cause}; put the right "
+            "images there or remove their rows from images.csv"
+        )
+        yield Fault("repeated image", words, len(same) > MANY * count, camera, placements)
 
 
 def repeated_scans(session) -> Iterator[Fault]:

@@ -26,15 +26,17 @@ class SessionError(ValueError):
         super().__init__(text if len(text) < 2000 else f"{text[:1000]} [...] {text[-500:]}")
 
 
-def checked(file: str | PathLike, within: str | PathLike, make: bool = False) -> Path:
-    """A file of a session; SessionError where a folder on the way to it is none, such as a link."""
+def checked(folder: Path, within: str | PathLike, make: bool = False) -> Path:
+    """A folder in a session's; SessionError where it, or one on the way to it, is none, such as a
+    link.
+    """
     where = Path(within)
-    for part in Path(file).relative_to(within).parts[:-1]:
+    for part in folder.relative_to(within).parts:
         where /= part
         if make:
             where.mkdir(exist_ok=True)
         _refuse_other(where, where.lstat(), "d")
-    return Path(file)
+    return folder
 
 
 def opened(
@@ -67,7 +69,7 @@ def opened(
     file = Path(file)
     writes = flags != os.O_RDONLY
     if within is not None:
-        checked(file, within)
+        checked(file.parent, within)
         flags |= os.O_NOFOLLOW
     with suppress(FileNotFoundError):  # a device is not even opened
         found = os.stat(file, follow_symlinks=within is None)
@@ -77,10 +79,7 @@ def opened(
                 f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}"
             )
     inner = os.open(file, flags | os.O_NONBLOCK, 0o666)
-    mode = "rb"
-    if writes:
-        mode = "r+b" if flags & os.O_RDWR else "wb"
-    stream = os.fdopen(inner, mode)
+    stream = os.fdopen(inner, "r+b" if writes else "rb")
     if writes and os.fstat(inner).st_nlink > 1:
         stream.close()
         raise SessionError(

@@ -133,9 +133,9 @@ def import_lasersetero(src: str | PathLike, dst: str | PathLike) -> float:
         platform_sigma=LASERSETERO_PLATFORM_SIGMA,
     ) as writer:
         for placement, file in clouds.items():
-            ranges, pitch, miss = recover_polar(read_pcd(file), file)
-            values += ranges.size
             with naming(file):
+                ranges, pitch, miss = recover_polar(read_pcd(file))
+                values += ranges.size
                 check_amount(values)
             writer.add_sweep(placement, ranges, BEARINGS, pitch)
             misses.append(miss)
@@ -159,17 +159,13 @@ def numbered(folder, pattern):
     return files
 
 
-def recover_polar(
-    points: np.ndarray, name: str | PathLike
-) -> tuple[np.ndarray, np.ndarray, float]:
+def recover_polar(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Ranges and pitch that the published points of a LaserSetero cloud were made of.
 
     Parameters
     ----------
     points
         Authors' cloud frame, metres, in the order of acquisition, shape (n, 3).
-    name
-        For messages.
 
     Returns
     -------
@@ -183,7 +179,7 @@ def recover_polar(
 
     Raises
     ------
-    SessionError
+    ValueError
         If the rebuilt points miss by more than 0.01 mm, or lie where the LMS400 does not see.
 
     Notes
@@ -201,8 +197,8 @@ def recover_polar(
     # 0.1 deg, so no .5 to round
     steps = np.round(np.degrees(np.arctan2(along, across)) / STEP_DEG).astype(int)
     if steps.min() < FIRST or steps.max() > LAST:
-        raise SessionError(
-            f"{name}: bearings reach {STEP_DEG * steps.min():.1f} .. "
+        raise ValueError(
+            f"bearings reach {STEP_DEG * steps.min():.1f} .. "
             f"{STEP_DEG * steps.max():.1f} deg, the LMS400 sees 55 .. 125 deg"
         )
     bearing = BEARINGS[steps - FIRST]
@@ -220,13 +216,12 @@ def recover_polar(
     )
     miss = float(np.linalg.norm(rebuilt - p_platform, axis=1).max())
     if not miss <= LARGEST_MISS:
-        raise SessionError(
-            f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, more than "
+        raise ValueError(
+            f"rebuilding the points misses by {1000 * miss:.4f} mm, more than "
             f"{1000 * LARGEST_MISS:g} mm; not points of this rig?"
         )
-    with naming(name):
-        # scan lines of few points are long as well
-        check_amount(len(pitch) * len(BEARINGS))
+    # scan lines of few points are long as well
+    check_amount(len(pitch) * len(BEARINGS))
     on_grid = np.full((len(pitch), len(BEARINGS)), np.nan)
     on_grid[line, steps - FIRST] = ranges
     return on_grid, pitch, miss

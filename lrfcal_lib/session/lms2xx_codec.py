@@ -296,7 +296,6 @@ def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
 
 STATUS = 0xB1
 TYPE = 0xBA
-VARIANT = 0xBB
 CONFIGURATION = 0xF4
 CONFIGURED = 0xF7
 CONFIGURATION_BYTES = 34

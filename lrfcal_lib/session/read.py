@@ -9,9 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.board import Board
 from lrfcal_lib.session.faults import dark_images, faults_of_files
 from lrfcal_lib.session.files import (
     SessionError,
@@ -22,11 +20,11 @@ from lrfcal_lib.session.files import (
     short,
 )
 from lrfcal_lib.session.images import check_image_size
-from lrfcal_lib.session.scans import read_scans
+from lrfcal_lib.session.scans import parts_of, read_npz, scanned
 from lrfcal_lib.session.shown import printable
-from lrfcal_lib.session.stated import SCHEMA, CameraInfo, LrfInfo, parse_session
+from lrfcal_lib.session.stated import SCHEMA, StatedRig, parse_session
 from lrfcal_lib.session.tables import read_table, whole_number
-from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog
+from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, read_telegrams
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
 EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
@@ -66,23 +64,41 @@ class EdgePick:
     ends: np.ndarray
 
 
+def read_scans(path):
+    """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or
+    None).
+    """
+    arrays = path / "lrf/scans.npz"
+    telegrams = path / "lrf/telegrams.bin"
+    if os.path.lexists(arrays):
+        return read_npz(arrays, path), None
+    if os.path.lexists(telegrams):
+        return read_telegrams(telegrams, path)
+    if os.path.lexists(path / "lrf") and parts_of(path):
+        raise SessionError(
+            f"{path}: the recording was interrupted; lrfcal_lib.session.write.finish('{path}') "
+            "completes it"
+        )
+    raise SessionError(f"{arrays}: no such file; a session needs the scan lines")
+
+
 # begin names that lead out of a folder, on any system: absolute ones, and those with ``..``
 OUTSIDE = re.compile(r"[/\\]|\w:|(.*[/\\])?\.\.([/\\]|$)")
 
 
 def missing_parts(placements, scans, records, cameras, unfinished):
     """What a session states and does not hold, as sentences; the rest can be used."""
-    scanned = set(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)].tolist())
+    swept = scanned(scans)
     shot = {(record.camera, record.placement) for record in records}
     for placement in placements:
-        if placement not in scanned:
+        if placement not in swept:
             yield f"placement {placement}: no scan line with a range"
     for placement in unfinished:
         yield (
             f"placement {placement}: its recording was not finished, ignored; 'record --resume' "
             "records it again"
         )
-    for placement in sorted(scanned - {*placements, *unfinished}):
+    for placement in sorted(swept - {*placements, *unfinished}):
         yield f"placement {placement}: in the scan lines but not in session.json, ignored"
     for placement in placements:
         for camera in cameras:
@@ -129,14 +145,15 @@ def read_images(path, facts, unfinished):
     cameras = facts["cameras"]
     out = []
     lines = {}  # in which each file stands
-    skipped = set(map(str, unfinished or ()))
     torn = unfinished is not None
-    rows = read_table(file, IMAGE_COLUMNS, path, torn, needed=bool(cameras))[0]
+    rows = read_table(file, IMAGE_COLUMNS, path, torn, needed=bool(cameras))
     for number, row in enumerate(rows, start=2):
-        if row["purpose"] == DROPPED or row["placement"] in skipped:
+        if row["purpose"] == DROPPED:
             continue
         with naming(f"{file} line {number}"):
             placement = whole_number(row["placement"], "placement")
+            if placement in (unfinished or ()):
+                continue
             record = ImageRecord(
                 camera=known(row["camera"], cameras, "camera"),
                 file=inside(path, row["file"], "images.csv: file"),
@@ -158,7 +175,7 @@ def read_edges(path, facts, records):
     out = []
     lines = {}  # in which each edge of an image stands
     images = {(record.camera, record.file) for record in records}
-    rows = read_table(file, EDGE_COLUMNS, path, needed=False)[0]
+    rows = read_table(file, EDGE_COLUMNS, path, needed=False)
     for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
@@ -226,22 +243,14 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class Session:
-    """A recorded session; the arrays are read when it is opened, the images when they are asked
-    for.
+class Session(StatedRig):
+    """A recorded session with its rig; the arrays are read when it is opened, the images when they
+    are asked for.
 
     Attributes
     ----------
     name, licence, source : str
         `source` says where the recording came from.
-    board : Board
-    lrf : LrfInfo
-    T_head_lrf : RigidTransform or None
-        The platform as its maker or a tape measure states it.
-    platform_sigma : tuple of float
-        How well: standard deviations of the axis' direction (radians) and offset (metres). Where
-        nobody states them, 0.5 deg and 10 mm are assumed: what a set square and a ruler give.
-    cameras : dict of str to CameraInfo
     placements : tuple of int
         All that the session states, also those without data.
     image_records : tuple of ImageRecord
@@ -261,11 +270,6 @@ class Session:
     licence: str
     source: str
     simulated: bool
-    board: Board
-    lrf: LrfInfo
-    T_head_lrf: RigidTransform | None
-    platform_sigma: tuple[float, float]
-    cameras: dict[str, CameraInfo]
     placements: tuple[int, ...]
     image_records: tuple[ImageRecord, ...]
     picks: tuple[EdgePick, ...]
@@ -349,7 +353,6 @@ class Session:
         """
         camera = self.cameras[record.camera]
         data = read_bytes(record.file, self.path)
-        check_image_size(record.file, data, camera)
         with reading(
             record.file,
             "cannot be decoded; remove its row from images.csv or restore the file",
@@ -470,7 +473,7 @@ def _times_back(session):
     for name, columns in TIMED.items():
         file = session.path / name
         last = {}
-        rows = read_table(file, columns, session.path, torn=True, needed=False)[0]
+        rows = read_table(file, columns, session.path, torn=True, needed=False)
         for line, row in enumerate(rows, start=2):
             if not row["t_s"] or not row["placement"] or row.get("purpose") == DROPPED:
                 continue

@@ -8,7 +8,7 @@ from lrfcal_lib.session import files, read, stated
 from lrfcal_lib.session.files import SessionError, naming, short
 from lrfcal_lib.session.lock import LOCK
 from lrfcal_lib.session.tables import read_table
-from lrfcal_lib.session.write import SessionWriter, as_lines, cell, mend_tables, write_file
+from lrfcal_lib.session.write import SessionWriter, as_lines, mend_tables, write_file
 
 # of rows of a dropped placement, by table
 MARKS = {"lrf/index.csv": {"placement": ""}, "images.csv": {"purpose": read.DROPPED}}
@@ -61,16 +61,12 @@ class SessionRecorder(SessionWriter):
                         f"{_first_difference(data[key], mine[key], key)}, unlike the rig now: go "
                         "on with the same rig file, or begin another one"
                     )
-        unfinished = known["unfinished"] or ()
         self.data = data | {"placements": list(known["placements"])}
         self._make_folders()
         mend_tables(self.path)
-        for placement in unfinished:
+        for placement in known["unfinished"] or ():
             self._mark_dropped(placement)
         self._state(unfinished=[])
-        for camera in self.cameras:
-            names = [file.stem for file in (self.path / "images" / camera).iterdir()]
-            self.shots[camera] = max(map(int, filter(str.isdecimal, names)), default=0)
 
     def begin_placement(self, placement: int) -> None:
         """State that a placement is being recorded from now on; one that was broken off is dropped.
@@ -131,10 +127,8 @@ class SessionRecorder(SessionWriter):
         rows
             Time of this computer (s), commanded and measured pitch (rad), NaN where unknown.
         """
-        cells = []
-        for time_s, *angles in rows:
-            cells.append(map(cell, (time_s, *map(math.degrees, angles))))
-        self._append_rows("platform.csv", cells)
+        in_degrees = [(time_s, *map(math.degrees, angles)) for time_s, *angles in rows]
+        self._append_rows("platform.csv", in_degrees)
 
     def finish(self) -> None:
         """Close the recording: nothing can be half done in it any more."""
@@ -157,9 +151,9 @@ class SessionRecorder(SessionWriter):
             Of the images.
         """
         counts = dict.fromkeys(self.cameras, 0)
-        if not counts:
-            return counts
-        for row in read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0]:
+        file = self.path / "images.csv"
+        rows = read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(counts))
+        for row in rows:
             if row["camera"] in counts and row["purpose"] == purpose:
                 counts[row["camera"]] += 1
         return counts
@@ -171,9 +165,9 @@ class SessionRecorder(SessionWriter):
     def _mark_dropped(self, placement):
         """Mark the rows of a placement in the tables that there are."""
         for name, columns in read.TIMED.items():
-            rows = read_table(self.path / name, columns, self.path, needed=False)[0]
+            rows = read_table(self.path / name, columns, self.path, needed=False)
             for row in rows:
-                if row["placement"] == str(placement):
+                if row["placement"].removesuffix(".0") == str(placement):
                     row.update(MARKS[name])
             if rows:
                 write_file(

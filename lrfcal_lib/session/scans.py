@@ -1,7 +1,6 @@
 """The scan lines of a session: its arrays, read and checked."""
 
 import math
-import os
 from collections.abc import Mapping
 from io import BytesIO
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
@@ -20,7 +19,6 @@ from lrfcal_lib.session.files import (
     short,
 )
 from lrfcal_lib.session.stated import MILLIMETRES
-from lrfcal_lib.session.telegrams import read_telegrams
 
 ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
 ENTRY = b"PK\1\2"  # begins each line of an archive's table of contents
@@ -35,29 +33,20 @@ LONGEST_HEADER = 10_000
 LONGEST_MEDIAN_RANGE = 200.0
 
 
-def read_scans(path):
-    """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or
-    None).
+def scanned(scans: Mapping[str, np.ndarray]) -> set[int]:
+    """Numbers of the placements that scan lines with a range belong to.
+
+    Parameters
+    ----------
+    scans
+        As of :func:`check_scans`.
     """
-    arrays = path / "lrf/scans.npz"
-    telegrams = path / "lrf/telegrams.bin"
-    if os.path.lexists(arrays):
-        return read_npz(arrays, path), None
-    if os.path.lexists(telegrams):
-        scans, log = read_telegrams(telegrams, path)
-        with naming(telegrams):
-            return check_scans(scans), log
-    if os.path.lexists(path / "lrf") and parts_of(path):
-        raise SessionError(
-            f"{path}: the recording was interrupted; lrfcal_lib.session.write.finish('{path}') "
-            "completes it"
-        )
-    raise SessionError(f"{arrays}: no such file; a session needs the scan lines")
+    return set(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)].tolist())
 
 
 def parts_of(path):
     """Files of a session's sweeps in their order, until it is finished."""
-    return sorted(checked(path / "lrf" / "any", path).parent.glob("part_*.npz"))
+    return sorted(checked(path / "lrf", path).glob("part_*.npz"))
 
 
 def read_npz(file, within):

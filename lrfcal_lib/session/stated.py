@@ -471,6 +471,29 @@ class CameraInfo:
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
 
+@dataclass(frozen=True)
+class StatedRig:
+    """A rig and its board, as sessions and rig files state them.
+
+    Attributes
+    ----------
+    board : Board
+    lrf : LrfInfo
+    T_head_lrf : RigidTransform or None
+        The platform as its maker or a tape measure states it.
+    platform_sigma : tuple of float
+        How well: standard deviations of the axis' direction (radians) and offset (metres). Where
+        nobody states them, 0.5 deg and 10 mm are assumed: what a set square and a ruler give.
+    cameras : dict of str to CameraInfo
+    """
+
+    board: Board
+    lrf: LrfInfo
+    T_head_lrf: RigidTransform | None
+    platform_sigma: tuple[float, float]
+    cameras: dict[str, CameraInfo]
+
+
 def rig_to_json(
     lrf: LrfInfo,
     T_head_lrf: RigidTransform | None,

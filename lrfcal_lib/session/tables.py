@@ -8,7 +8,6 @@ from pathlib import Path
 from lrfcal_lib.session.files import LARGEST_TEXT, SPLIT, SessionError, read_bytes, reading
 
 MOST_ROWS = 200_000
-WHOLE_COLUMNS = {"placement", "offset", "length"}  # of tables, which hold whole numbers
 
 
 def read_table(
@@ -17,8 +16,8 @@ def read_table(
     within: str | PathLike,
     torn: bool = False,
     needed: bool = True,
-) -> tuple[list[dict[str, str]], bool]:
-    """Rows of a CSV file with exactly these columns, and whether one was left out.
+) -> list[dict[str, str]]:
+    """Rows of a CSV file with exactly these columns.
 
     Parameters
     ----------
@@ -37,12 +36,13 @@ def read_table(
         For other columns, rows of other lengths, or too many.
     """
     if not needed and not os.path.lexists(file):
-        return [], False
+        return []
     data = read_bytes(file, within, LARGEST_TEXT)
     with reading(file, "not a CSV file in UTF-8 ({})"):
         text = data.decode()
-        cut = torn and not text.endswith("\n")
-        lines = (text.rpartition("\n")[0] if cut else text).splitlines()
+        if torn:
+            text = text[: text.rfind("\n") + 1]
+        lines = text.splitlines()
         if len(lines) > MOST_ROWS:
             raise SessionError(
                 f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}"
@@ -62,17 +62,16 @@ def read_table(
             raise SessionError(
                 f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?"
             )
-        cells = dict(zip(columns, row, strict=True))
-        for key in WHOLE_COLUMNS & cells.keys():
-            # programs write whole numbers beside empty cells as 1.0
-            cells[key] = cells[key].removesuffix(".0")
-        table.append(cells)
-    return table, cut
+        table.append(dict(zip(columns, row, strict=True)))
+    return table
 
 
 def whole_number(text, name):
-    """A whole number in a table, -1 where the cell is empty; ValueError in words for other text."""
+    """A whole number in a table, -1 where the cell is empty; ValueError in words for other text.
+
+    Programs write whole numbers beside empty cells as 1.0.
+    """
     try:
-        return int(text or -1)
+        return int(text.removesuffix(".0") or -1)
     except ValueError:
         raise ValueError(f"{name} is '{text}': a whole number is needed") from None

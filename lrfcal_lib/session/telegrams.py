@@ -15,10 +15,11 @@ from lrfcal_lib.session.files import (
     short,
 )
 from lrfcal_lib.session.lms2xx_frame import OVERHEAD, TelegramError, are_sound
-from lrfcal_lib.session.tables import WHOLE_COLUMNS, read_table, whole_number
+from lrfcal_lib.session.scans import check_scans
+from lrfcal_lib.session.tables import read_table, whole_number
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
-INDEX = [(name, int if name in WHOLE_COLUMNS else float) for name in INDEX_COLUMNS]
+INDEX = [(name, float if name in ("t_s", "pitch_deg") else int) for name in INDEX_COLUMNS]
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
 SCANNED, OTHER, WRONG, TRUNCATED = range(4)
 LONGEST = OVERHEAD + 0xFFFF  # bytes of a telegram
@@ -35,8 +36,9 @@ class TelegramLog:
         In the file; -1 for no placement.
     outcome : ndarray of uint8, shape (n,)
         Index into `OUTCOMES`; 'other' is every sound telegram that holds no whole or partial scan.
-    values : ndarray of int, shape (n, len(REASONS))
-        How many values of a scan had each reason, see ``lrfcal_lib.session.lms2xx_codec.REASONS``.
+    values : ndarray of int, shape (len(REASONS),)
+        How many values of all scans had each reason, see
+        ``lrfcal_lib.session.lms2xx_codec.REASONS``.
     problems : tuple of str
     """
 
@@ -60,7 +62,7 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     Returns
     -------
     scans : dict of ndarray
-        As in scans.npz.
+        As in scans.npz, see :func:`lrfcal_lib.session.scans.check_scans`.
     log : TelegramLog
 
     Raises
@@ -78,10 +80,9 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     """
     data = np.frombuffer(read_bytes(file, within), np.uint8)
     path = file.with_name("index.csv")
-    rows, torn = read_table(path, INDEX_COLUMNS, within, torn=True)
+    rows = read_table(path, INDEX_COLUMNS, within, torn=True)
     with naming(path):
-        index = _index(rows)
-        _check_index(index, len(data), file)
+        index = _index(rows, len(data), file)
         check_amount(len(data) // 2)
 
     sound = are_sound(data, index.offset, index.length)
@@ -96,48 +97,37 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
 
     with naming(file):
         modes, notes = _modes(data, index, np.flatnonzero(sound))
-        sizes = np.where(sound, index.length, 0)  # what is damaged holds no scan
-        groups = codec.decode_scans(data, index.offset, sizes, modes)
-        scans = _lines(groups, index)
+        # what is damaged holds no scan
+        groups = codec.decode_scans(
+            data, index.offset, np.where(sound, index.length, 0), modes
+        )
+        scans = check_scans(_lines(groups, index))
 
-    values = np.zeros((len(outcome), len(codec.REASONS)), int)
+    values = np.zeros(len(codec.REASONS), int)
     for group in groups:
         outcome[group.rows] = SCANNED
-        values[group.rows] = [
-            np.bincount(reasons, minlength=len(codec.REASONS)) for reasons in group.reasons
-        ]
+        values += np.bincount(group.reasons.ravel(), minlength=len(values))
     problems = [f"{file}: {note}" for note in (*notes, *_damage(index, outcome, len(data)))]
-    if torn:
+    if not read_bytes(path, within).endswith(b"\n"):
         problems.append(f"{path}: the last row is cut off, its telegram is left out")
     return scans, TelegramLog(
         index.offset, index.placement, outcome, values, tuple(problems)
     )
 
 
-def _index(rows):
-    """The rows of index.csv as an array of INDEX: NaN for no time or pitch, -1 for no placement."""
+def _index(rows, size, file):
+    """The rows of index.csv as an array of INDEX: NaN for no time or pitch, -1 for no placement.
+
+    Telegrams lie one after the other in the file, but for a last one that is cut off, and every
+    scan has a pitch.
+    """
     index = np.recarray(len(rows), INDEX)
     for at, row in enumerate(rows):
         for key, cell in row.items():
-            if key in WHOLE_COLUMNS:
-                index[key][at] = whole_number(cell, f"line {at + 2}: {key}")
-            else:
+            if index.dtype[key].kind == "f":
                 index[key][at] = cell or np.nan
-    return index
-
-
-def _place(index, row):
-    """Where a telegram is, as text."""
-    return (
-        f"line {row + 2}, offset {index.offset[row]}, length {index.length[row]}, placement "
-        f"{index.placement[row]}"
-    )
-
-
-def _check_index(index, size, file):
-    """Telegrams lie one after the other in the file, but for a last one that is cut off, and every
-    scan has a pitch.
-    """
+            else:
+                index[key][at] = whole_number(cell, f"line {at + 2}: {key}")
     if len(index) == 0:
         raise ValueError(
             f"no telegram in the index, {size} bytes in {file.name}: nothing was recorded"
@@ -162,6 +152,15 @@ def _check_index(index, size, file):
     ):
         if wrong.any():
             raise ValueError(f"{_place(index, wrong.argmax())}: {words}")
+    return index
+
+
+def _place(index, row):
+    """Where a telegram is, as text."""
+    return (
+        f"line {row + 2}, offset {index.offset[row]}, length {index.length[row]}, placement "
+        f"{index.placement[row]}"
+    )
 
 
 def _modes(data, index, sound):
@@ -196,11 +195,11 @@ def _lines(groups, index):
             "no telegram with a scan belongs to a placement: was the device streaming?"
         )
     grids = [codec.scan_quarters(group.words.shape[1], group.partial) for group in groups]
-    kinds = {(len(grid), group.partial) for grid, group in zip(grids, groups, strict=True)}
-    if len(kinds) > 1 and min(group.partial for group in groups) < 0:
-        counts = sorted({len(grid) for grid in grids})
+    counts = {len(grid) for grid in grids}
+    partials = {group.partial for group in groups}
+    if -1 in partials and (len(counts) > 1 or len(partials) > 1):
         raise ValueError(
-            f"scans of {short(counts)} values are mixed: a session holds one variant, "
+            f"scans of {short(sorted(counts))} values are mixed: a session holds one variant, "
             "split the recording"
         )
     # the quarter of a degree that a scan is turned by, -1 for a whole one, -2 for no scan

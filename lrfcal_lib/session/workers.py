@@ -72,11 +72,11 @@ def spread(work: Callable, items: Iterable) -> list:
             results.update(enumerate(executor.map(partial(_packed, work), items)))
     elif cores > 1:
         results = _forked(work, items, cores)
-    for number, item in enumerate(items):
-        if number not in results:
-            results[number] = _packed(work, item)
     # of each result what it was packed as goes as it is unpacked
-    return [pickle.loads(results.pop(number)) for number in range(len(items))]
+    return [
+        pickle.loads(results.pop(number, None) or _packed(work, item))
+        for number, item in enumerate(items)
+    ]
 
 
 def _can_travel(work):

@@ -78,8 +78,6 @@ class SessionWriter:
         self.cameras = {camera.name: camera for camera in cameras}
         self.bearings: np.ndarray | None = None  # of the sweeps so far
         self.parts = 0  # files of sweeps so far
-        self.shots = dict.fromkeys(self.cameras, 0)  # images so far, by camera
-        self.telegrams = self.path / "lrf/telegrams.bin"
         if not about.keys() <= ABOUT.keys():
             raise TypeError(f"a session has {short(ABOUT)}, got {short(about)}")
         self.data = {
@@ -116,7 +114,7 @@ class SessionWriter:
 
     def _make_folders(self):
         for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
-            files.checked(self.path / name / "any", self.path, make=True)
+            files.checked(self.path / name, self.path, make=True)
         if self.cameras:
             self._begin_table("images.csv", read.IMAGE_COLUMNS)
 
@@ -143,7 +141,7 @@ class SessionWriter:
             write_file(self.path, name, as_lines([columns]))
 
     def _append_rows(self, name, rows):
-        append_file(self.path / name, as_lines(rows), self.path)
+        append_file(self.path, name, as_lines(rows))
 
     def _note_placement(self, placement):
         if placement >= 0 and placement not in self.data["placements"]:
@@ -179,9 +177,10 @@ class SessionWriter:
         SessionError
             For wrong shapes or units, or other bearings than before.
         """
-        if self.telegrams.exists():
+        telegrams = self.path / "lrf/telegrams.bin"
+        if telegrams.exists():
             raise SessionError(
-                f"{self.telegrams}: the session records telegrams: add_telegrams, or begin "
+                f"{telegrams}: the session records telegrams: add_telegrams, or begin "
                 "another one"
             )
         ranges = np.array(ranges, float, ndmin=2)
@@ -246,11 +245,10 @@ class SessionWriter:
                 )
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
-        offset = append_file(self.telegrams, b"".join(telegrams), self.path)
+        offset = append_file(self.path, "lrf/telegrams.bin", b"".join(telegrams))
         offsets = offset + np.cumsum(lengths) - lengths
-        number = number_cell(placement)
-        columns = zip(time_s, offsets, lengths, np.degrees(pitch), strict=True)
-        rows = [[cell(t), at, size, number, cell(angle)] for t, at, size, angle in columns]
+        numbers = [number_cell(placement)] * len(telegrams)
+        rows = zip(time_s, offsets, lengths, numbers, np.degrees(pitch), strict=True)
         self._append_rows("lrf/index.csv", rows)
 
     def add_image(
@@ -262,7 +260,7 @@ class SessionWriter:
         pitch: float = math.nan,
         time_s: float = math.nan,
         purpose: str = "board",
-    ) -> None:
+    ) -> str:
         """Append an image.
 
         Parameters
@@ -279,6 +277,11 @@ class SessionWriter:
         purpose
             'board', 'intrinsics' or 'scene'.
 
+        Returns
+        -------
+        str
+            Its file in the session's folder.
+
         Raises
         ------
         SessionError
@@ -294,14 +297,16 @@ class SessionWriter:
             what = str(image)
             image = files.read_bytes(image)
         check_image_size(what, image, self.cameras[camera])
-        self.shots[camera] += 1
+        names = [file.stem for file in (self.path / "images" / camera).iterdir()]
+        number = 1 + max(map(int, filter(str.isdecimal, names)), default=0)
         kind = "jpg" if image.startswith(JPEG) else "png"
-        name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
+        name = f"images/{camera}/{number:04d}.{kind}"
         write_file(self.path, name, image)
         self._note_placement(placement)
-        angle = cell(math.degrees(pitch))
-        row = [cell(time_s), camera, name, number_cell(placement), angle, purpose]
+        angle = math.degrees(pitch)
+        row = [float(time_s), camera, name, number_cell(placement), angle, purpose]
         self._append_rows("images.csv", [row])
+        return name
 
 
 def finish(path: str | os.PathLike) -> None:
@@ -361,11 +366,13 @@ def mend_tables(path):
 
 def as_lines(rows):
     """Bytes of the rows of a table."""
-    return "".join(",".join(map(str, row)) + "\n" for row in rows).encode()
+    return "".join(",".join(map(cell, row)) + "\n" for row in rows).encode()
 
 
 def cell(value):
-    """A number as it stands in a table, empty for NaN."""
+    """A text or a number as it stands in a table, empty for NaN."""
+    if not isinstance(value, float):
+        return str(value)
     return "" if math.isnan(value) else repr(round(float(value), 9))
 
 
@@ -386,7 +393,8 @@ def write_file(folder: Path, name: str, content: bytes | dict) -> None:
     content
         Bytes, or arrays by name.
     """
-    file = files.checked(folder / name, folder)
+    file = folder / name
+    files.checked(file.parent, folder)
     draft = file.with_name(file.name + ".draft")
     draft.unlink(missing_ok=True)
     with files.opened(draft, folder, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
@@ -445,12 +453,13 @@ def not_written(error: OSError) -> str:
     return f"cannot be written ({error.strerror or error}): {remedy}"
 
 
-def append_file(file, content, within):
-    """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk
-    all or nothing.
+def append_file(folder, name, content):
+    """Append to a file of a session, which is on the disk afterwards; where the new part begins. On
+    a full disk all or nothing.
     """
     left = memoryview(content)
-    with files.opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+    with files.opened(folder / name, folder, flags) as stream:
         handle = stream.fileno()
         begin = os.fstat(handle).st_size
         try:

@@ -306,12 +306,11 @@ def _add_images(writer, setup, taken, truth, times):
     rig = setup.rig
     for shot, images in taken:
         camera = rig.cameras[shot.camera]
-        name = camera.name
         board = shot.placement.T_platform_board
         stops = zip(images, times, shot.stops.true, shot.stops.measured, strict=True)
         for data, time_s, true, measured in stops:
-            writer.add_image(
-                name,
+            file = writer.add_image(
+                camera.name,
                 data,
                 shot.placement.number,
                 pitch=measured,
@@ -322,4 +321,4 @@ def _add_images(writer, setup, taken, truth, times):
             if board is not None:
                 T_camera_board = rig.camera_pose(camera, true) * board
                 known["T_camera_board"] = transform_to_json(T_camera_board)
-            truth["images"][f"images/{name}/{writer.shots[name]:04d}.jpg"] = known
+            truth["images"][file] = known
