@@ -11,12 +11,13 @@ from lrfcal_lib import __version__
 from lrfcal_lib.calibrate.calibration_file import FORMULAS, KIND, SCHEMA, rig_record
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.evaluate.joint_tables import joint_fit
-from lrfcal_lib.evaluate.tables import left_out_residuals, rms
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.verdict import Verdict, judge
 from lrfcal_lib.session.files import opened
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import FILES
 from lrfcal_lib.session.write import whole
+from lrfcal_lib.solvers import left_out_residuals
 
 # numbers one below the other; no text of JSON has a line end
 ROW = re.compile(r"\[\n\s+(?:-?[\d.]\S*|null)(?:\n\s+(?:-?[\d.]\S*|null))*\n\s+\]")
@@ -80,8 +81,7 @@ def _sensor(solution):
         for name, value in solution.sensor.items()
         if name in sigma
     }
-    excluded = [str(problem) for problem in solution.excluded]
-    return sensor | {"noise": solution.noise, "excluded": excluded}
+    return sensor | {"noise": solution.noise, "excluded": [*map(str, solution.excluded)]}
 
 
 def _camera(calibration, camera, method, solution):
@@ -102,7 +102,7 @@ def _camera(calibration, camera, method, solution):
         ),
         "covariance": solution.trusted[:6, :6].tolist(),
         "converged": bool(solution.converged),
-        "unobservable": list(solution.unobservable),
+        "unobservable": solution.unobservable,
         **misfit,
         "n_crossings": len(edge),
         "placements": obs.all_placements.tolist(),

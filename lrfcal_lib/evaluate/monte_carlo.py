@@ -114,8 +114,15 @@ def joint_truth(
     )
     count = len(boards)
     boards = pose_array(RigidTransform.concatenate(boards))
-    own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges) + 1))
-    return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, *own), obs)
+    state = JointState(
+        pose_array(T_head_lrf),
+        poses,
+        sensor,
+        boards,
+        sweeps=np.zeros((count, 2)),
+        sides=np.zeros((count, len(obs.edges) + 1)),
+    )
+    return in_stated_gauge(state, obs)
 
 
 def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials:
@@ -149,7 +156,7 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
         names = joint.solution.names
         errors = state_errors(joint.state, truth, joint.unknowns)
         limit = bound(obs, truth, joint.unknowns)
-        rows.append((int(seed), errors, joint.solution.covariance, limit))
+        rows.append((seed, errors, joint.solution.covariance, limit))
     if not rows:
         last = next(reversed(failed.values()), "no seed given")
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
@@ -211,8 +218,8 @@ def groups_of(names: Sequence[str]) -> dict[str, tuple[list[int], str, float]]:
         pattern = next(pattern for pattern in GROUPS if re.fullmatch(pattern, name))
         words = re.sub(pattern, GROUPS[pattern], name, count=1).replace("_", " ")
         unit, factor = unit_of(name)
-        group = groups.setdefault(words, ([], LOGARITHMS.get(words, unit), factor))
-        group[0].append(i)
+        index, *_ = groups.setdefault(words, ([], LOGARITHMS.get(words, unit), factor))
+        index.append(i)
     return groups
 
 

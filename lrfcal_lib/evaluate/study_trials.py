@@ -12,7 +12,7 @@ from lrfcal_lib.evaluate.monte_carlo import (
     bound,
     joint_truth,
 )
-from lrfcal_lib.fit.covariance import sigma_of
+from lrfcal_lib.fit.covariance import dyads, sigma_of
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     move_pose,
@@ -99,8 +99,9 @@ def run_task(task: Task) -> list[dict]:
     bounds = [{}] * task.trials
     if not task.scenario.corner:
         sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
-        sensor = task.scenario.sensor
-        bounds = [bounds_of_camera(obs, truth, sensor) for obs, truth in sessions]
+        bounds = [
+            bounds_of_camera(obs, truth, task.scenario.sensor) for obs, truth in sessions
+        ]
     rows = []
     for method in task.methods:
         if method in BATCHED:
@@ -139,8 +140,7 @@ def _single(method, shots, scenario, trial, T0, obs):
     try:
         if method == "joint":
             solution = solve_joint(obs, axis=False, sensor=scenario.sensor)
-            camera = solution.state.cameras[0]
-            return camera, solution.solution.covariance[:6, :6], True
+            return solution.state.cameras[0], solution.solution.covariance[:6, :6], True
         planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
         options = {"method": method, "T0": T0} | PLANES[method]
         found = solve_camera(planes, search=False, **options)
@@ -249,14 +249,14 @@ def plane_observations(
     scenario : Scenario
     """
     rays = polar_to_points(1.0, obs.face_bearing)
-    thick = 1e-10 * np.eye(3)
+    along = scenario.sigma_range**2 * dyads(rays)
     return CameraObservations(
         scenario.model,
         pattern_points=scenario.board.pattern.points(),
         pattern_pixels=pixels,
         pattern_sigma_px=scenario.sigma_px,
         plane_points=obs.face_range[:, None] * rays,
-        plane_covariance=scenario.sigma_range**2 * rays[:, :, None] * rays[:, None] + thick,
+        plane_covariance=along + 1e-10 * np.eye(3),  # not quite without thickness
         plane_placement=obs.face_placement,
         board_poses=obs.view_pose,
         board_covariance=obs.view_covariance,
@@ -292,7 +292,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     )
     T_camera_lrf = pose_transform(shots["T_camera_lrf"][trial])
     boards = T_camera_lrf.inv() * pose_transform(shots["true_boards"][trial])
-    truth = joint_truth(
+    return obs, joint_truth(
         obs,
         RigidTransform.identity(),
         {"camera": T_camera_lrf},
@@ -300,7 +300,6 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
         bias=scenario.bias,
         softness=scenario.softness,
     )
-    return obs, truth
 
 
 def _readings(shots, scenario, trial):

@@ -49,6 +49,17 @@ class Truth:
     lengths: tuple[dict, ...]
     setup: str
 
+    def on_board(
+        self, T_platform_board: RigidTransform, p_lrf: np.ndarray, pitch: np.ndarray
+    ) -> np.ndarray:
+        """Points (n, 3) of scans at their true pitch (n,) on a board, or each on its own: x and y
+        in its plane, metres, and a 1, as lines take them.
+        """
+        p_platform = geometry.lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
+        flat = T_platform_board.inv().apply(p_platform)
+        flat[:, 2] = 1.0
+        return flat
+
     def gauge(
         self, rig: CalibratedRig, placement: int, recorded: np.ndarray
     ) -> tuple[float, np.ndarray]:
@@ -200,9 +211,7 @@ def on_true_edges(observations: PlatformObservations, truth: Truth) -> PlatformO
     pitch = observations.edge_pitch
     placement = observations.edge_placement
     boards = RigidTransform.concatenate([truth.boards[p] for p in placement])
-    p_platform = geometry.lrf_to_platform(observations.edge_points, pitch, truth.T_head_lrf)
-    flat = boards.inv().apply(p_platform)
-    flat[:, 2] = 1.0  # x and y in the plane of the board, as lines take them
+    flat = truth.on_board(boards, observations.edge_points, pitch)
     away = pd.DataFrame(np.abs(flat @ truth.board.lines().T))
     of_sides = away.groupby([placement, observations.edge_number]).transform("median")
     line = truth.board.lines()[of_sides.to_numpy().argmin(axis=1)]

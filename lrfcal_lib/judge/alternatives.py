@@ -11,13 +11,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtr, stdtrit
 
-from lrfcal_lib.judge.findings import Finding, Kind, by_sign, no_if
+from lrfcal_lib.judge.findings import Kind, by_sign
 from lrfcal_lib.model.geometry import (
     axis_difference,
     axis_of,
     transform_difference,
 )
 from lrfcal_lib.model.observations import JointObservations
+from lrfcal_lib.session.faults import Fault
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.solvers.joint_model import SENSOR
 from lrfcal_lib.solvers.joint_solution import JointSolution
@@ -309,7 +310,7 @@ def step_words(solution: JointSolution) -> str:
     )
 
 
-def far_from_stated(joint) -> list[Finding]:
+def far_from_stated(joint) -> list[Fault]:
     """What lies far from where session.json puts it.
 
     A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of
@@ -325,11 +326,11 @@ def far_from_stated(joint) -> list[Finding]:
 
 
 def _far(words, angle):
-    """The Finding of what lies far from where it is stated, turned by an angle (radians)."""
-    return Finding(no_if(angle > np.pi / 2), Kind.FAR_FROM_STATED, words)
+    """The Fault of what lies far from where it is stated, turned by an angle (radians)."""
+    return Fault(Kind.FAR_FROM_STATED, words, severe=angle > np.pi / 2)
 
 
-def far_axis(joint) -> Iterator[Finding]:
+def far_axis(joint) -> Iterator[Fault]:
     """The tilt axis, if it is far from where it is stated."""
     session = joint.prepared.session
     solution = joint.solution
@@ -339,8 +340,8 @@ def far_axis(joint) -> Iterator[Finding]:
     variance = np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1)
     sigma = np.hypot(session.platform_sigma, np.sqrt(variance))
     if np.any(apart > FAR * sigma):
-        words = f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
-        yield _far(words, apart[0])
+        where = f"{_apart(*apart)} from where session.json states it"
+        yield _far(f"the tilt axis lies {where}: {CHECK}", apart[0])
 
 
 def guesses_of(session: Session) -> dict[str, RigidTransform]:
@@ -350,11 +351,14 @@ def guesses_of(session: Session) -> dict[str, RigidTransform]:
     ----------
     session
     """
-    cameras = session.cameras.items()
-    return {name: camera.guess for name, camera in cameras if camera.guess is not None}
+    return {
+        name: camera.guess
+        for name, camera in session.cameras.items()
+        if camera.guess is not None
+    }
 
 
-def far_cameras(joint) -> Iterator[Finding]:
+def far_cameras(joint) -> Iterator[Fault]:
     """Cameras that are far from where they are guessed, or stand where another one is guessed."""
     guesses = guesses_of(joint.prepared.session)
     for camera, transform in joint.solution.transforms.items():
@@ -363,17 +367,14 @@ def far_cameras(joint) -> Iterator[Finding]:
         turn, shift = transform_difference(transform, guesses[camera])
         nearest = nearest_guess(transform, guesses)
         if turn > FAR_TURN or shift > FAR_SHIFT:
-            words = (
-                f"camera '{camera}' stands {_apart(turn, shift)} from its guess in "
-                f"session.json: {CHECK}"
-            )
-            yield _far(words, turn)
+            where = f"{_apart(turn, shift)} from its guess in session.json"
+            yield _far(f"camera '{camera}' stands {where}: {CHECK}", turn)
         elif nearest != camera:
-            words = (
+            yield _far(
                 f"camera '{camera}' stands where camera '{nearest}' is said to stand: were the "
-                "folders exchanged?"
+                "folders exchanged?",
+                turn,
             )
-            yield _far(words, turn)
 
 
 def nearest_guess(transform, guesses):
@@ -392,16 +393,16 @@ def distance(a: RigidTransform, b: RigidTransform) -> float:
     return LEVER * turn + shift
 
 
-def exchanged_sides(solution) -> Iterator[Finding]:
+def exchanged_sides(solution) -> Iterator[Fault]:
     """Cameras that are called left and right, and stand the other way round."""
     for left, right in permutations(solution.transforms, 2):
         offset = _right_of_lrf(solution, left) - _right_of_lrf(solution, right)
         if "left" in left.lower() and "right" in right.lower() and offset > 0:
-            words = (
+            yield _far(
                 f"camera '{left}' is {1000 * offset:.0f} mm to the right of camera '{right}': were "
-                "the folders exchanged?"
+                "the folders exchanged?",
+                0.0,
             )
-            yield _far(words, 0.0)
 
 
 def _right_of_lrf(solution, camera):

@@ -301,6 +301,5 @@ def growth_by_depth(solution, camera):
     obs = solution.observations
     nearer = obs.view_pose.copy()
     nearer[obs.view_camera == camera, 2, 3] *= 1 + STEP
-    score = solution.score(replace(obs, view_pose=nearer), STEP)
-    covariance, step, _ = score.solved()
+    covariance, step, _ = solution.score(replace(obs, view_pose=nearer), STEP).solved()
     return step[-1], sigma_of(covariance)[-1]

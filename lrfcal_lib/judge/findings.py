@@ -1,6 +1,5 @@
-"""What is found about a calibration and the recording behind it."""
+"""What is found about a calibration and the recording behind it, and what that makes of it."""
 
-from dataclasses import dataclass
 from enum import StrEnum
 
 
@@ -13,10 +12,11 @@ class Answer(StrEnum):
 
 
 YES, CARE, NO = Answer
+ANSWERS = {False: CARE, True: NO}  # by whether the worst Fault is severe
 
 
 class Kind(StrEnum):
-    """What a finding is about, beside the kinds of :class:`lrfcal_lib.session.faults.Fault`."""
+    """What a :class:`lrfcal_lib.session.faults.Fault` of a calibration is about."""
 
     # the result
     HANDED_OVER = "handed over"
@@ -51,33 +51,9 @@ class Kind(StrEnum):
     LENS = "lens"
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Why a calibration is not simply to be trusted.
-
-    Attributes
-    ----------
-    answer : {'with care', 'no'}
-        What it alone would make of the verdict.
-    kind : str
-        Of :class:`Kind` or of :class:`lrfcal_lib.session.faults.Fault`.
-    words : str
-        What is found, and what to do about it.
-    """
-
-    answer: Answer
-    kind: str
-    words: str
-
-
 def brief(value: float) -> str:
     """A number with two digits, or more before the point."""
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
-
-
-def no_if(severe: bool) -> Answer:
-    """What a finding makes of the verdict: 'no' where it is severe, else 'with care'."""
-    return NO if severe else CARE
 
 
 def by_sign(value: float, positive: str, negative: str) -> str:

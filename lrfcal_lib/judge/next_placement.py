@@ -193,8 +193,7 @@ def outline(solution: JointSolution) -> np.ndarray:
     ----------
     solution
     """
-    corners = solution.observations.corners
-    return np.insert(corners, 2, 0.0, axis=1)
+    return np.insert(solution.observations.corners, 2, 0.0, axis=1)
 
 
 def board_middle(solution: JointSolution) -> np.ndarray:
@@ -221,8 +220,8 @@ def board_poses(solution, grid):
     spin = Rotation.from_euler("z", turn, degrees=True)
     rotation = solution.T_head_lrf.rotation * gaze * geometry.AHEAD * tip * spin
     middle = solution.T_head_lrf.apply(distance * gaze.apply([0.0, 1.0, 0.0]))
-    centre = outline(solution).mean(axis=0)
-    return geometry.pose_array(geometry.carry(rotation, centre, middle))
+    T_platform_board = geometry.carry(rotation, outline(solution).mean(axis=0), middle)
+    return geometry.pose_array(T_platform_board)
 
 
 def pitches_of_images(boards, solution, models, field_of_view):

@@ -66,8 +66,7 @@ class Chain:
         places have taken it up.
         """
         taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
-        unsure = np.diag(doubt**2 * taken_up)
-        return replace(self, covariances=self.covariances + unsure)
+        return replace(self, covariances=self.covariances + np.diag(doubt**2 * taken_up))
 
 
 def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
@@ -98,8 +97,9 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
         on_head = rig.cameras[camera].mount == "head"
         pose = pose_array(rig.cameras[camera].T_camera)
         unseen = known.unseen_of_cameras[camera]
-    head = pose_array(rig.T_head_lrf)
-    return Chain(head, pose, on_head, covariances, unseen, known.sweep_sigma)
+    return Chain(
+        pose_array(rig.T_head_lrf), pose, on_head, covariances, unseen, known.sweep_sigma
+    )
 
 
 def projection_sigma(
