@@ -11,47 +11,45 @@ INTERRUPTED = 130  # exit code after Ctrl-C
 SCENE = "as 'record --scene' recorded it"
 
 
-def run(args):
-    """Do what a verb asks for: its exit code or None. What another verb needs is not imported."""
-    match args.verb:
-        case "import":
-            return import_recording(args)
-        case "check":
-            return check(args)
-        case "calibrate" | "reconstruct" | "merge":
-            return use_sessions(args)
-        case "compare":
-            from lrfcal_lib.report.compare import compare_files
+def compare(args):
+    """Say how far calibrations of one rig differ."""
+    from lrfcal_lib.report.compare import compare_files
 
-            return compare_files(args.calibrations, args.figure)
-        case "measure":
-            return measure(args)
-        case "simulate":
-            from lrfcal_lib.session.workers import side_by_side
-            from lrfcal_lib.simulate.record import simulate
-            from lrfcal_lib.simulate.rig import load_setup
+    return compare_files(args.calibrations, args.figure)
 
-            with side_by_side():
-                simulate(args.dst, load_setup(args.setup))
-            print(f"{args.dst}: simulated")
-        case "record":
-            return record(args)
-        case "report":
-            if args.scheduler is not None:
-                return use_sessions(args)
-            from lrfcal_lib.report.report import main
 
-            return main(args.sessions, args.out, args.jobs, args.store)
-        case "study":
-            from lrfcal_lib.report.study import study
+def simulate(args):
+    """Record a session with a simulated rig."""
+    from lrfcal_lib.session.workers import side_by_side
+    from lrfcal_lib.simulate.record import simulate
+    from lrfcal_lib.simulate.rig import load_setup
 
-            return study(args)
-        case "emulate":
-            from lrfcal_lib.emulators.rig import main
+    with side_by_side():
+        simulate(args.dst, load_setup(args.setup))
+    print(f"{args.dst}: simulated")
 
-            return main(args.setup, args.rig_file, args.feedback)
-        case "board":
-            print_board(args)
+
+def report(args):
+    """Execute the notebooks on sessions, here or on a cluster."""
+    if args.scheduler is not None:
+        return use_sessions(args)
+    from lrfcal_lib.report.report import main
+
+    return main(args.sessions, args.out, args.jobs, args.store)
+
+
+def study(args):
+    """Compare methods on drawn sessions."""
+    from lrfcal_lib.report.study import study
+
+    return study(args)
+
+
+def emulate(args):
+    """Emulate the devices of a rig."""
+    from lrfcal_lib.emulators.rig import main
+
+    return main(args.setup, args.rig_file, args.feedback)
 
 
 def measure(args):
@@ -153,6 +151,24 @@ def record(args):
     elif args.stations or args.calibration:
         raise ValueError("--stations and --calibration are for a scene: add --scene")
     return main(args.rig_file, args.session, **options)
+
+
+# what a verb does: its exit code or None; what another verb needs is not imported
+VERBS = {
+    "import": import_recording,
+    "check": check,
+    "simulate": simulate,
+    "calibrate": use_sessions,
+    "compare": compare,
+    "reconstruct": use_sessions,
+    "merge": use_sessions,
+    "measure": measure,
+    "record": record,
+    "emulate": emulate,
+    "board": print_board,
+    "report": report,
+    "study": study,
+}
 
 
 def between(kind, least, most, what):
@@ -408,7 +424,7 @@ def main(argv=None):
     """
     args = parser().parse_args(argv)
     try:
-        return run(args) or 0
+        return VERBS[args.verb](args) or 0
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -175,8 +175,8 @@ def state_errors(state: JointState, truth: JointState, unknowns: Unknowns) -> np
     """
     head = pose_step(pose_transform(truth.head), pose_transform(state.head))
     cameras = pose_step(pose_transform(truth.cameras), pose_transform(state.cameras))
-    sensor = state.sensor - truth.sensor
-    return np.concatenate([head[AXIS_COLUMNS], cameras.ravel(), sensor])[unknowns.mask]
+    steps = [head[AXIS_COLUMNS], cameras.ravel(), state.sensor - truth.sensor]
+    return np.concatenate(steps)[unknowns.mask]
 
 
 def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.ndarray:

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.fit.covariance import sigma_turn_shift
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
@@ -100,6 +101,10 @@ def read_truth(session: Session) -> Truth | None:
     if not os.path.lexists(file):
         return None
     data = read_json(file, session.path)
+
+    def by_placement(entries, key, read):
+        return {int(number): read(entry[key]) for number, entry in entries.items()}
+
     with naming(f"{file} (simulate the session again)"):
         return Truth(
             T_head_lrf=_pose(data["T_head_lrf"]),
@@ -108,18 +113,9 @@ def read_truth(session: Session) -> Truth | None:
                 for name, entry in data["cameras"].items()
             },
             board=board_from_json(data["board"]),
-            boards={
-                int(number): _pose(entry["T_platform_board"])
-                for number, entry in data["boards"].items()
-            },
-            pitch={
-                int(number): np.asarray(entry["pitch_rad"], float)
-                for number, entry in data["sweeps"].items()
-            },
-            stations={
-                int(number): _pose(entry["T_room_platform"])
-                for number, entry in data.get("stations", {}).items()
-            },
+            boards=by_placement(data["boards"], "T_platform_board", _pose),
+            pitch=by_placement(data["sweeps"], "pitch_rad", np.array),
+            stations=by_placement(data.get("stations", {}), "T_room_platform", _pose),
             lengths=tuple(data.get("lengths", ())),
             setup=data.get("setup", ""),
         )
@@ -182,7 +178,7 @@ def beside_sigma(turn: float, shift: float, covariance: np.ndarray) -> dict[str,
         By column: rotation_error_deg, rotation_sigma_deg, rotation_pull (error over sigma: 1 is
         what a standard deviation promises), and the same of the translation in millimetres.
     """
-    turn_sigma, shift_sigma = np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
+    turn_sigma, shift_sigma = sigma_turn_shift(covariance)
     return {
         "rotation_error_deg": np.rad2deg(turn),
         "rotation_sigma_deg": np.rad2deg(turn_sigma),

@@ -10,7 +10,7 @@ from scipy.special import chdtrc, fdtrc
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse, sigma_of
 from lrfcal_lib.judge.next_placement import board_middle, outline
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import POSE, DegenerateGeometry, apply_pose, pose_step
+from lrfcal_lib.model.geometry import POSE, DegenerateGeometry, apply_pose, carry, pose_step
 from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
@@ -213,8 +213,9 @@ def largest_motion(solution, step, model):
     poses = obs.view_pose[obs.view_camera == step.camera]
     corners = apply_pose(poses[:, :3], outline(solution))
     origin = solution.transforms[obs.cameras[step.camera]].translation
-    turned = Rotation.from_rotvec(step.change[:3]).apply(corners - origin)
-    motion = project(turned + origin + step.change[3:], model) - project(corners, model)
+    turn = Rotation.from_rotvec(step.change[:3])
+    moved = carry(turn, origin, origin + step.change[3:]).apply(corners)
+    motion = project(moved, model) - project(corners, model)
     return np.max(np.linalg.norm(motion, axis=-1))
 
 

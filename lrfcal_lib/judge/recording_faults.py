@@ -196,8 +196,10 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     session = prepared.session
     # also placements that images contradict are left out, of which scans show the board
     if 2 * len(prepared.problems_of(ProblemKind.NO_BOARD)) >= len(session.board_placements):
+        numbers = session.board_placements
+        looked_at = numbers[:: max(len(numbers) // LOOKED_AT, 1)][:LOOKED_AT]
         for reading in UNITS:
-            if shows_boards(session, reading):
+            if len(boards_in(session, looked_at, reading)) > len(looked_at) / 2:
                 return [Fault(reading.kind, reading.words, severe=True)]
         return []
 
@@ -279,13 +281,6 @@ def board_misses(prepared, reading):
                 np.sqrt(max(square, LEAST_MISS**2)), transform, planes=len(each)
             )
     return misses
-
-
-def shows_boards(session, reading):
-    """Whether boards are found in most of some sweeps, read in some way."""
-    numbers = session.board_placements
-    looked_at = numbers[:: max(len(numbers) // LOOKED_AT, 1)][:LOOKED_AT]
-    return len(boards_in(session, looked_at, reading)) > len(looked_at) / 2
 
 
 def boards_in(session, placements, reading):

@@ -85,8 +85,9 @@ def finding_of(doubts):
     certain = best.ratio > (2 * CONTRADICTS) ** 2
     large = best.kind in SIZES and abs(best.value) > LARGE_SIZE
     causes = "; or ".join(doubt.words for doubt in doubts)
-    words = f"statements contradict the data: {causes}"
-    return Fault(best.kind, words, severe=certain and large)
+    return Fault(
+        best.kind, f"statements contradict the data: {causes}", severe=certain and large
+    )
 
 
 def beyond_admitted(joint) -> Iterator[Fault]:

@@ -295,7 +295,7 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
     """
     each = np.einsum("...ik,nkl,...il->n...", jacobian, chain.covariances, jacobian)
     variance = each.max(axis=0, initial=0.0)
-    moved = np.einsum("...ik,mk->...mi", jacobian, chain.unseen)
+    moved = chain.unseen @ jacobian.mT
     size = np.linalg.norm(jacobian, axis=(-2, -1))[..., None]
     least = SEEN * size * np.linalg.norm(chain.unseen, axis=-1)
     matters = np.linalg.norm(moved, axis=-1) > least

@@ -162,10 +162,12 @@ class Verdict:
                 "errors of the model as far as placements disagree about them. Each range has "
                 f"{brief(self.range_noise_mm)} mm of noise of its own."
             )
-        sentences.append(
-            self.suggestion.sentence() if self.suggestion else self.no_suggestion
-        )
-        return [sentence for sentence in sentences if sentence]
+        return [*filter(None, [*sentences, self.advice])]
+
+    @property
+    def advice(self) -> str:
+        """What to record next, or why nothing is suggested."""
+        return self.suggestion.sentence() if self.suggestion else self.no_suggestion
 
     def because(self, findings: list[Fault]) -> "Verdict":
         """The verdict with more findings, which stand before its own; the worst first."""

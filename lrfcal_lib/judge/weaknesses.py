@@ -57,12 +57,17 @@ def diagnose(solution: JointSolution) -> list[Fault]:
 def weak_estimate(solution) -> Iterator[Fault]:
     """What keeps the estimate from an answer."""
     if not solution.converged:
-        iterations = solution.solution.iterations
-        words = f"the estimate has not converged after {iterations} iterations"
-        yield Fault(Kind.CONVERGENCE, words, severe=True)
+        yield Fault(
+            Kind.CONVERGENCE,
+            f"the estimate has not converged after {solution.solution.iterations} iterations",
+            severe=True,
+        )
     if solution.unobservable:
-        words = f"the data do not determine {'; '.join(solution.unobservable)}"
-        yield Fault(Kind.UNOBSERVABLE, words, severe=True)
+        yield Fault(
+            Kind.UNOBSERVABLE,
+            f"the data do not determine {'; '.join(solution.unobservable)}",
+            severe=True,
+        )
 
 
 def weak_placements(solution) -> Iterator[Fault]:
@@ -125,8 +130,10 @@ def large_residuals(solution) -> Iterator[Fault]:
         if square > MISFIT * usual
     ]
     if misfits:
-        words = f"placements fit much worse than the others: {', '.join(misfits)}"
-        yield Fault(Kind.MISFIT, words)
+        yield Fault(
+            Kind.MISFIT,
+            f"placements fit much worse than the others: {', '.join(misfits)}",
+        )
     if solution.excluded:
         yield Fault(Kind.EXCLUDED, "; ".join(map(str, solution.excluded)))
 
@@ -143,8 +150,11 @@ def large_residuals(solution) -> Iterator[Fault]:
     noise = {"ranges": solution.noise["face_scale"]} | noise_of_images(solution)
     large = [f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED]
     if large:
-        words = f"residuals are larger than the stated noise ({', '.join(large)})"
-        yield Fault(Kind.NOISE, words, severe=max(noise.values()) > ABSURD)
+        yield Fault(
+            Kind.NOISE,
+            f"residuals are larger than the stated noise ({', '.join(large)})",
+            severe=max(noise.values()) > ABSURD,
+        )
 
     # beams about an edge always repeat errors: they share a background
     share = solution.noise["face_share"]

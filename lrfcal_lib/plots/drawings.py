@@ -69,9 +69,13 @@ class View:
         color: str = TRUTH,
     ) -> None:
         """A text beside a point (3,), so many printer's points to the right and up."""
-        place = self.flat(point)
         self.ax.annotate(
-            text, place, away, textcoords="offset points", color=color, **CENTRED
+            text,
+            self.flat(point),
+            away,
+            textcoords="offset points",
+            color=color,
+            **CENTRED,
         )
 
     def arrow(self, ends: ArrayLike, color: str, looks: dict = ARROW) -> None:

@@ -155,19 +155,25 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
     ax.plot(bearing[~far], raw[~far], "o", color=RAW, markersize=6, label="raw")
     if far.any():
         words = f"raw, farther: {raw[far].min():.2f} to {raw[far].max():.2f} m"
-        edge = np.full(far.sum(), top)
-        ax.plot(bearing[far], edge, "^", color=RAW, clip_on=False, label=words)
+        at_top = np.minimum(raw[far], top)
+        ax.plot(bearing[far], at_top, "^", color=RAW, clip_on=False, label=words)
     ax.plot(bearing, scan.filtered[line, near], "x", color=TRUTH, label="filtered")
     ax.plot(bearing, fitted, color=FIT, label="line fitted to the board")
     for crossed, style in zip(edges, ("--", "-"), strict=False):
         here = (crossed.line == line) & (crossed.end == end)
         for x, y, _ in crossed.points[here]:
-            at = np.degrees(np.arctan2(y, x))
-            words = crossed.variant.replace("_", " ")
-            ax.axvline(at, color=LRF, linestyle=style, label=words)
+            ax.axvline(
+                np.degrees(np.arctan2(y, x)),
+                color=LRF,
+                linestyle=style,
+                label=crossed.variant.replace("_", " "),
+            )
     ax.invert_xaxis()
-    lowest = np.nanmin(raw) - HEADROOM / 4
-    ax.set(xlabel="bearing [deg]", ylabel="range [m]", ylim=(lowest, top))
+    ax.set(
+        xlabel="bearing [deg]",
+        ylabel="range [m]",
+        ylim=(np.nanmin(raw) - HEADROOM / 4, top),
+    )
     ax.legend()
 
 
@@ -241,9 +247,14 @@ def picture(ax: Axes, image: np.ndarray) -> None:
         shown = shown[..., ::-1]
     ax.imshow(shown, cmap="gray", interpolation="antialiased", vmin=0, vmax=255)
     if gain > 1:
-        words = f"brightened {gain:.1f} times"
-        box = DARK | {"pad": 2}
-        ax.text(0.01, 0.015, words, color="white", bbox=box, transform=ax.transAxes)
+        ax.text(
+            0.01,
+            0.015,
+            f"brightened {gain:.1f} times",
+            color="white",
+            bbox=DARK | {"pad": 2},
+            transform=ax.transAxes,
+        )
     ax.set_axis_off()
 
 
@@ -273,9 +284,14 @@ def board_view(
     for edge in view.edges:
         stretch = stretch_in_image(edge, model)
         ax.plot(*stretch.T, color=color, linewidth=1.6)
-        middle = stretch.mean(axis=0)
         ax.text(
-            *middle, edge.name, color="white", fontsize=8, bbox=box, clip_on=True, **CENTRED
+            *stretch.mean(axis=0),
+            edge.name,
+            color="white",
+            fontsize=8,
+            bbox=box,
+            clip_on=True,
+            **CENTRED,
         )
     unused = ""
     if view.rejected:

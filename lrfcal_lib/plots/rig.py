@@ -58,9 +58,9 @@ def render(
     # of equal pixels the last one, the nearest, stays
     nearest[v, u] = inside
     covering = maximum_filter(nearest, 2 * splat + 1)
-    shown = covering[splat : height - splat, splat : width - splat]
-    white = np.full((1, 3), 255, np.uint8)
-    return np.vstack([colors[order], white])[shown]  # the last row where no point is
+    white = np.full((1, 3), 255, np.uint8)  # the last row, where no point is
+    picture = np.vstack([colors[order], white])[covering]
+    return picture[splat : height - splat, splat : width - splat]
 
 
 def pixels(
@@ -113,8 +113,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
             f"no view from {eye} to {target} with {up} upwards: choose another eye or another up"
         )
     axes = unit_vector(np.stack([right, np.cross(ahead, right), ahead]))
-    rotation = Rotation.from_matrix(axes)
-    return carry(rotation, eye)
+    return carry(Rotation.from_matrix(axes), eye)
 
 
 def face_on(
@@ -180,5 +179,5 @@ def measured_edges(
         ax.plot(*uv.T, "o-", color=FIT)
         at = uv.mean(axis=0)
         at = at + 0.07 * size[1] * unit_vector(at - middle[0])
-        words = f"{1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
-        ax.text(*at, f"{name.upper()} {words}", color=FIT, **CENTRED)
+        words = f"{name.upper()} {1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
+        ax.text(*at, words, color=FIT, **CENTRED)

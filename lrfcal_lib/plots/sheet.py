@@ -27,8 +27,13 @@ def sheet(columns: int, rows: int, square: float) -> Board:
     start = (1 + BORDER) * square
     corners = (np.array([columns, rows]) + 1 + 2 * BORDER) * square * UNIT_SQUARE
     pattern = Chessboard(columns, rows, square, (start, start))
-    edges = ("bottom", "right", "top", "left")
-    return Board("printed", edges, corners, pattern, ("bottom", "left"))
+    return Board(
+        "printed",
+        edges=("bottom", "right", "top", "left"),
+        corners=corners,
+        pattern=pattern,
+        features=("bottom", "left"),
+    )
 
 
 def print_sheet(path: str | PathLike, board: Board, dpi: float = 300) -> None:
@@ -59,6 +64,11 @@ def print_sheet(path: str | PathLike, board: Board, dpi: float = 300) -> None:
     ax.add_patch(Polygon(corners, fill=False, edgecolor="black", linewidth=0.5))
     x, y = low + [PAPER, PAPER / 3]
     ax.plot([x, x + RULER], [y, y], "|-", color="black")
-    words = f"{1000 * RULER:.0f} mm at 100 %; squares of {1000 * side:g} mm"
-    ax.text(x + 1.1 * RULER, y, words, fontsize=7, va="center")
+    ax.text(
+        x + 1.1 * RULER,
+        y,
+        f"{1000 * RULER:.0f} mm at 100 %; squares of {1000 * side:g} mm",
+        fontsize=7,
+        va="center",
+    )
     page.savefig(path, dpi=dpi)

@@ -52,11 +52,9 @@ def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
         print(*judge(calibration).sentences(), sep="\n")
         return UNTRUSTED
     folder = Path(out or Path("reports", Path(path).resolve().name))
-    tasks = [
-        *cloud_tasks(folder, calibration, method),
-        partial(_judged, calibration, method),
-    ]
-    *written, (judged, record) = spread(operator.call, tasks)
+    judging = partial(_judged, calibration, method)
+    clouds = cloud_tasks(folder, calibration, method)
+    *written, (judged, record) = spread(operator.call, [*clouds, judging])
     file = folder / "calibration.json"
     write_calibration(file, record)  # last: where it stands, the clouds do
     print(*judged.sentences(), sep="\n")
@@ -79,8 +77,8 @@ def poses_in_words(calibration: Calibration) -> list[str]:
     for (camera, method), solution in calibration.solutions.items():
         both = [solution.parameters[:6], solution.trusted_sigma[:6]]
         values, sigma = (POSE_UNITS * both).round(2)
-        turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
-        shift = f"translation {values[3:]} +- {sigma[3:]} mm"
-        lines.append(f"{camera:>8} {method:<20} {turn}, {shift}")
-    problems = (*calibration.prepared.problems, *calibration.problems)
-    return [*lines, *map(str, problems)]
+        lines.append(
+            f"{camera:>8} {method:<20} rotation vector {values[:3]} +- {sigma[:3]} deg, "
+            f"translation {values[3:]} +- {sigma[3:]} mm"
+        )
+    return [*lines, *map(str, calibration.prepared.problems + calibration.problems)]

@@ -184,12 +184,14 @@ def store(path, session_path, cache=""):
     ):
         for cell in codes:
             cell.outputs = []
-    kernel = {
-        "display_name": "Python 3 (ipykernel)",
-        "language": "python",
-        "name": "python3",
+    notebook.metadata = {
+        "kernelspec": {
+            "display_name": "Python 3 (ipykernel)",
+            "language": "python",
+            "name": "python3",
+        },
+        "language_info": {"name": "python"},
     }
-    notebook.metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
     nbformat.write(notebook, path)
     return ""
 
@@ -257,8 +259,11 @@ def _store_all(session):
         for path in sorted(NOTEBOOKS.glob(f"{NUMBERED}.ipynb")):
             error = store(path, Path(session).resolve(), cache)
             failed |= bool(error)
-            stream = sys.stderr if error else sys.stdout
-            print(f"{path.name}: {error or 'stored'}", file=stream, flush=True)
+            print(
+                f"{path.name}: {error or 'stored'}",
+                file=sys.stderr if error else sys.stdout,
+                flush=True,
+            )
     return failed
 
 
@@ -345,8 +350,12 @@ def _show_progress(futures):
             name = futures[future].stem
             bar.set_postfix_str(name)
             if bar.disable:
-                said = f"{done} of {count} done after {time.monotonic() - begin:.0f} s"
-                print(f"lrfcal: {said} ({name})", file=sys.stderr, flush=True)
+                seconds = time.monotonic() - begin
+                print(
+                    f"lrfcal: {done} of {count} done after {seconds:.0f} s ({name})",
+                    file=sys.stderr,
+                    flush=True,
+                )
 
 
 def _run(path, environment):
