@@ -13,7 +13,7 @@ from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.verdict import Verdict, judge
-from lrfcal_lib.session.files import opened
+from lrfcal_lib.session.files import read_bytes
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import FILES
 from lrfcal_lib.session.write import whole
@@ -21,12 +21,6 @@ from lrfcal_lib.solvers import left_out_residuals
 
 # numbers one below the other; no text of JSON has a line end
 ROW = re.compile(r"\[\n\s+(?:-?[\d.]\S*|null)(?:\n\s+(?:-?[\d.]\S*|null))*\n\s+\]")
-AXIS_PARAMETERS = [
-    "out_of_scan_plane_rad",
-    "in_scan_plane_rad",
-    "offset_in_scan_plane_m",
-    "offset_across_scan_plane_m",
-]
 
 
 def calibration_record(
@@ -60,7 +54,12 @@ def calibration_record(
         "verdict": judged.record(),
         **rig_record(calibration.rig(method)),
     }
-    record["platform"]["axis_covariance_of"] = AXIS_PARAMETERS
+    record["platform"]["axis_covariance_of"] = [
+        "out_of_scan_plane_rad",
+        "in_scan_plane_rad",
+        "offset_in_scan_plane_m",
+        "offset_across_scan_plane_m",
+    ]
     for camera, solution in calibration.cameras(method).items():
         record["cameras"][camera] |= _camera(calibration, camera, method, solution)
     if calibration.joint is not None and method == "joint":
@@ -118,8 +117,7 @@ def file_hashes(session: Session) -> dict[str, str]:
     images = {record.file for record in session.image_records}
     hashes = {}
     for file in sorted(images.union(stated)):
-        with opened(file, session.path) as stream:
-            digest = hashlib.sha256(stream.read())
+        digest = hashlib.sha256(read_bytes(file, session.path))
         hashes[file.relative_to(session.path).as_posix()] = digest.hexdigest()
     return hashes
 

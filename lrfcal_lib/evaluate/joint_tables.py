@@ -13,14 +13,18 @@ from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.next_placement import board_middle
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import (
+    POSE_UNITS,
+    DegenerateGeometry,
+    move_pose,
+    transform_difference,
+)
 from lrfcal_lib.solvers.joint import solve_again
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
 ALL = 10**9  # crossings
-DEG_MM = geometry.POSE_UNITS[[0, 3]]  # of a turn and a shift
+DEG_MM = POSE_UNITS[[0, 3]]  # of a turn and a shift
 NOISE_WORDS = {
     "face_scale": "scatter of ranges, in stated standard deviations",
     "view_scale": "scatter of board poses in images, in stated standard deviations",
@@ -30,14 +34,6 @@ NOISE_WORDS = {
     "side_sigma": "spread of the edge bias from side to side [log odds]",
     "background_sigma": "spread of the edge bias from placement to placement [log odds]",
 }
-HALVES_COLUMNS = (
-    "pair",
-    "camera",
-    "rotation_deg",
-    "translation_mm",
-    "predicted_rotation_deg",
-    "predicted_translation_mm",
-)
 
 
 def range_residuals(solution: JointSolution) -> tuple[np.ndarray, np.ndarray]:
@@ -83,7 +79,7 @@ def view_residuals(
     obs = solution.observations
     mine = obs.view_camera == obs.cameras.index(camera)
     pose = obs.view_pose[mine, :3]
-    predicted = geometry.move_pose(pose, solution.residuals("view")[mine])
+    predicted = move_pose(pose, solution.residuals("view")[mine])
     middle = board_middle(solution)
     seen = project(pose @ middle, model)
     return seen, project(predicted @ middle, model) - seen
@@ -123,8 +119,8 @@ def noise_table(joint: JointCalibration) -> pd.DataFrame:
     """
     noise = joint.solution.noise
     noise["sigma_pitch"] = np.rad2deg(noise["sigma_pitch"])
-    rows = [(NOISE_WORDS[name], value) for name, value in noise.items()]
-    return pd.DataFrame(rows, columns=["what", "value"])
+    values = pd.Series(noise).rename(NOISE_WORDS)
+    return values.rename_axis("what").reset_index(name="value")
 
 
 def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
@@ -211,7 +207,7 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         the halves share). Splits of which a half leaves something open are missing.
     """
     rng = np.random.default_rng(0)
-    numbers = np.array(list(joint.solution.boards))
+    numbers = list(joint.solution.boards)
     rows = []
     if len(numbers) <= 4:  # two placements determine no rig
         pairs = 0
@@ -222,12 +218,22 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         except DegenerateGeometry:
             continue
         for camera in joint.observations.cameras:
-            apart = geometry.transform_difference(
+            apart = transform_difference(
                 first.transforms[camera], second.transforms[camera]
             )
             predicted = _predicted(joint.solution, camera)
             rows.append((pair, camera, *DEG_MM * apart, *DEG_MM * predicted))
-    return pd.DataFrame(rows, columns=HALVES_COLUMNS)
+    return pd.DataFrame(
+        rows,
+        columns=[
+            "pair",
+            "camera",
+            "rotation_deg",
+            "translation_mm",
+            "predicted_rotation_deg",
+            "predicted_translation_mm",
+        ],
+    )
 
 
 def _estimate_from(joint, placements):

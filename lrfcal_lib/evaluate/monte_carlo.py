@@ -145,15 +145,15 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
     """
     rows = []
     failed = {}
-    names: tuple = ()
+
     for seed in seeds:
         obs, truth = draw(np.random.default_rng(seed))
         try:
             joint = solve(obs)
         except DegenerateGeometry as error:
-            failed[int(seed)] = str(error)
+            failed[seed] = str(error)
             continue
-        names = joint.solution.names
+
         errors = state_errors(joint.state, truth, joint.unknowns)
         limit = bound(obs, truth, joint.unknowns)
         rows.append((seed, errors, joint.solution.covariance, limit))
@@ -161,7 +161,7 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
         last = next(reversed(failed.values()), "no seed given")
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
     seeds, errors, covariances, bounds = map(np.array, zip(*rows, strict=True))
-    return Trials(names, seeds, errors, covariances, bounds, failed)
+    return Trials(joint.solution.names, seeds, errors, covariances, bounds, failed)
 
 
 def state_errors(state: JointState, truth: JointState, unknowns: Unknowns) -> np.ndarray:
@@ -234,7 +234,7 @@ def spread(covariance: np.ndarray, names: Sequence[str]) -> dict[str, float]:
     """
     variance = np.diagonal(covariance)
     return {
-        words: float(factor * np.sqrt(variance[index].sum()))
+        words: factor * np.sqrt(variance[index].sum())
         for words, (index, _, factor) in groups_of(names).items()
     }
 

@@ -66,7 +66,7 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     from lrfcal_lib.simulate.rig import load_setup
 
     rig = calibration.rig(method)
-    placement = int(cloud.placement[0])
+    placement = cloud.placement[0]
     world = world_of(
         load_setup(truth.setup), None, T_room_platform=truth.stations.get(placement)
     )

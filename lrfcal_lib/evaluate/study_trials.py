@@ -132,7 +132,7 @@ def _batch(method, shots, scenario, T0):
         return [str(error)] * len(T0)
     poses = pose_array(solution.transform)
     converged = np.broadcast_to(solution.converged, len(poses))
-    return list(zip(poses, solution.covariance, converged, strict=True))
+    return zip(poses, solution.covariance, converged, strict=True)
 
 
 def _single(method, shots, scenario, trial, T0, obs):
@@ -146,7 +146,7 @@ def _single(method, shots, scenario, trial, T0, obs):
         found = solve_camera(planes, search=False, **options)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:
         return str(error)
-    return pose_array(found.transform), found.covariance[:6, :6], bool(found.converged)
+    return pose_array(found.transform), found.covariance[:6, :6], found.converged
 
 
 def _judged(estimate, true, bounds):
@@ -165,13 +165,12 @@ def _judged(estimate, true, bounds):
         outcome = "not converged"
     if not bounds:
         return {"outcome": outcome} | numbers
-    sigma_bound = sigma_of(bounds["bound"])
     return {
         "outcome": outcome,
         **numbers,
-        **_sizes(sigma_bound, "bound_"),
-        **_sizes(sigma_of(bounds["known"]), "known_"),
-        "over_bound": np.mean((error / sigma_bound) ** 2),
+        **_sizes(bounds["bound"], "bound_"),
+        **_sizes(bounds["known"], "known_"),
+        "over_bound": np.mean((error / bounds["bound"]) ** 2),
         "nees": error @ np.linalg.pinv(covariance) @ error / 6,
         "covered": np.mean(np.abs(error) < HALF_WIDTH * sigma_of(covariance)),
     }
@@ -199,8 +198,9 @@ def crossing_observations(
     if scenario.corner:
         lines = shots["lines"]
         points = shots["points"]
-        noise = scenario.sigma_range**2 * np.eye(3)
-        covariance = np.broadcast_to(noise, (*points.shape, 3))
+        covariance = np.broadcast_to(
+            scenario.sigma_range**2 * np.eye(3), (*points.shape, 3)
+        )
     else:
         lines = np.tile(shots["lines"], (1, 1, scenario.scans, 1))
         points, covariance = _ends_of_lines(shots["ranges"], scenario, last_beam)
@@ -317,15 +317,14 @@ def _readings(shots, scenario, trial):
     # beams about either end of every scan line
     near = np.arange(2 * REACH) - REACH
     window = np.clip(ends[..., None] + [[0], [1]] + near, 0, beams - 1)
-    read = np.take_along_axis(ranges[:, None], window, axis=2)
     at_end = np.repeat(at_ends, near.size)
     return {
-        "face_range": ranges[line, beam],
+        "face_range": ranges[hit],
         "face_bearing": bearings[beam],
         "face_sigma": np.full(len(beam), scenario.sigma_range),
         "face_placement": of_line[line],
         "beam_bearing": bearings[window.ravel()],
-        "beam_hit": np.isfinite(read.ravel()),
+        "beam_hit": np.take_along_axis(hit[:, None], window, axis=2).ravel(),
         "beam_edge": np.repeat(edges, near.size),
         "beam_radius": scenario.radius(at_end),
         "beam_step": scenario.step * at_end,
@@ -334,13 +333,14 @@ def _readings(shots, scenario, trial):
 
 
 def bounds_of_camera(obs, truth, sensor):
-    """Cramer-Rao bounds (6, 6) of the camera, the boards' poses unknown in either: 'bound' with
-    these properties of the sensor unknown, 'known' with none. NaN where the data leave it open.
+    """Cramer-Rao bounds (6,) of the camera's standard deviations, the boards' poses unknown in
+    either: 'bound' with these properties of the sensor unknown, 'known' with none. NaN where the
+    data leave it open.
     """
     bounds = {}
     for name, open_ in (("bound", sensor), ("known", ())):
         unknowns = Unknowns(1, len(obs.edges), axis=False, sensor=open_)
-        bounds[name] = np.full((6, 6), np.nan)
+        bounds[name] = np.full(6, np.nan)
         with suppress(DegenerateGeometry):
-            bounds[name] = bound(obs, truth, unknowns)[:6, :6]
+            bounds[name] = sigma_of(bound(obs, truth, unknowns))[:6]
     return bounds

@@ -1,7 +1,7 @@
 """Tables of what was recorded and calibrated, and the comparison of methods."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +13,8 @@ from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.fit.result import AXIS_NAMES, Solution
 from lrfcal_lib.fit.robust import rms
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, CameraModel
+from lrfcal_lib.model.geometry import paper_parameters
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.outline_in_images import Outline
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -35,14 +35,6 @@ AXIS_ERRORS = {  # of an axis, and what they are called of a camera
     "axis_direction_pull": "rotation_pull",
     "axis_offset_pull": "translation_pull",
 }
-SCAN_COLUMNS = (
-    "placement",
-    "n_points",
-    "sigma_range_mm",
-    "jump_points",
-    "sides_along",
-    "sides_across",
-)
 
 
 def unit_of(parameter: str) -> tuple[str, float]:
@@ -106,13 +98,11 @@ def method_comparison(
     """
     rows = []
     for (camera, name), solution in solutions.items():
-        held: Iterable = ()
         if name == "joint":
             obs = observations[camera, "joint"]
             judge = obs.along()
             used = obs.placements
-            if joint is not None:
-                held = jointly_left_out(joint, camera)
+            held = () if joint is None else jointly_left_out(joint, camera)
         else:
             method = METHODS[name]
             obs = observations[camera, method.variant]
@@ -209,7 +199,7 @@ def platform_calibration_table(
     names = (*AXIS_NAMES, "phi_x", "phi_y", "phi_z", "t_y")
     parameters = {}
     for method, axis in platform.axes.items():
-        phi, ty = geometry.paper_parameters(axis.T_head_lrf)
+        phi, ty = paper_parameters(axis.T_head_lrf)
         sigma = np.append(axis.sigma, np.full(4, np.nan))
         parameters[method,] = names, [*axis.parameters, *phi, ty], sigma
     table = parameter_table(["method"], parameters)
@@ -286,7 +276,17 @@ def scans_table(prepared: Prepared) -> pd.DataFrame:
             len(across),
         )
         rows.append(row)
-    return pd.DataFrame(rows, columns=SCAN_COLUMNS)
+    return pd.DataFrame(
+        rows,
+        columns=[
+            "placement",
+            "n_points",
+            "sigma_range_mm",
+            "jump_points",
+            "sides_along",
+            "sides_across",
+        ],
+    )
 
 
 def intrinsics_table(models: dict[str, CameraModel]) -> pd.DataFrame:

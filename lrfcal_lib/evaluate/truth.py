@@ -11,8 +11,14 @@ from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.covariance import sigma_turn_shift
 from lrfcal_lib.fit.result import Solution
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.geometry import (
+    axis_difference,
+    axis_of,
+    lrf_to_platform,
+    tilt,
+    transform_difference,
+)
 from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.session.files import naming, read_json
 from lrfcal_lib.session.read import Session
@@ -56,7 +62,7 @@ class Truth:
         """Points (n, 3) of scans at their true pitch (n,) on a board, or each on its own: x and y
         in its plane, metres, and a 1, as lines take them.
         """
-        p_platform = geometry.lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
+        p_platform = lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
         flat = T_platform_board.inv().apply(p_platform)
         flat[:, 2] = 1.0
         return flat
@@ -141,7 +147,7 @@ def camera_errors(solution: Solution, truth: Truth, camera: str) -> dict[str, fl
     dict of str to float
         See :func:`beside_sigma`.
     """
-    apart = geometry.transform_difference(solution.transform, truth.cameras[camera])
+    apart = transform_difference(solution.transform, truth.cameras[camera])
     return beside_sigma(*apart, solution.trusted[:6, :6])
 
 
@@ -158,8 +164,8 @@ def axis_errors(axis: KnownAxis, truth: Truth) -> dict[str, float]:
     dict of str to float
         See :func:`beside_sigma`.
     """
-    estimated = geometry.axis_of(axis.T_head_lrf)
-    apart = geometry.axis_difference(estimated, geometry.axis_of(truth.T_head_lrf))
+    estimated = axis_of(axis.T_head_lrf)
+    apart = axis_difference(estimated, axis_of(truth.T_head_lrf))
     return beside_sigma(*apart, axis.covariance)
 
 
@@ -213,5 +219,5 @@ def on_true_edges(observations: PlatformObservations, truth: Truth) -> PlatformO
     line = truth.board.lines()[of_sides.to_numpy().argmin(axis=1)]
     on_edge = flat - np.vecdot(flat, line)[:, None] * line
     on_edge[:, 2] = 0.0
-    p_head = geometry.tilt(boards.apply(on_edge), -pitch)
+    p_head = tilt(boards.apply(on_edge), -pitch)
     return replace(observations, edge_points=truth.T_head_lrf.inv().apply(p_head))

@@ -14,10 +14,6 @@ LENS_PARTS = np.array([6, 4])  # columns and rows that an image is cut into
 LENS_CORNERS = 20  # corners of the chessboard in a part, at least
 LENS_MISS = 0.15  # pixels that corners of a part may miss by alike
 OFF_MIDDLE = 0.2  # of the image's size
-REMEDY = (
-    "state intrinsics of this image size, or take sharp images with the chessboard all over; "
-    "undistort the images of a wide lens first"
-)
 
 
 def lens_findings(prepared: Prepared) -> Iterator[Fault]:
@@ -54,7 +50,8 @@ def lens_findings(prepared: Prepared) -> Iterator[Fault]:
             yield Fault(
                 Kind.LENS,
                 f"the lens of camera '{camera}' is not that of its model ({'; '.join(faults)}): "
-                f"{REMEDY}",
+                "state intrinsics of this image size, or take sharp images with the chessboard all "
+                "over; undistort the images of a wide lens first",
                 severe=other_size,
             )
 

@@ -167,7 +167,7 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
         return found + misread
     if joint is not None:
         changes = camera_changes(joint.solution, prepared, joint.settings)
-        found += faults_of_changes(changes, tuple(prepared.views))
+        found += faults_of_changes(changes, prepared.views)
         found += exchanged_placements(calibration)
     return found
 

@@ -34,7 +34,6 @@ from lrfcal_lib.judge.weaknesses import (
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry, transform_difference
 from lrfcal_lib.model.problem import ProblemKind
-from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.session.faults import Fault
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
@@ -224,8 +223,7 @@ def judge(
         kept = [reason for reason in judged.reasons if reason.kind != Kind.EXCLUDED]
         judged = replace(judged, reasons=tuple(kept))
     findings += sides_elsewhere(prepared)
-    notes = _notes(calibration, method, note)
-    return replace(judged.because(findings), notes=notes)
+    return replace(judged.because(findings), notes=_notes(calibration, method, note))
 
 
 def _notes(calibration, method, lost):
@@ -392,9 +390,8 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
                 "over; record more placements that lean other ways",
                 severe=True,
             )
-    sweeps = any(np.ptp(scan.sweep.pitch) > LEAST_SWEEP for scan in prepared.scans.values())
     unknown = calibration.platform.problem("combined")
-    if unknown and sweeps:
+    if unknown and prepared.swept["half_step"]:
         yield Fault(Kind.FAR_FROM_STATED, unknown.words, severe=True)
 
 

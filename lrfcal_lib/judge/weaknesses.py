@@ -11,7 +11,7 @@ from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.findings import Kind
 from lrfcal_lib.judge.next_placement import group_sigma, sights
 from lrfcal_lib.judge.placements import placements_table
-from lrfcal_lib.model.problem import LEAVES_OUT, Problem
+from lrfcal_lib.model.problem import LEAVES_OUT
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault
 from lrfcal_lib.solvers.joint_solution import JointSolution
@@ -270,16 +270,16 @@ def left_out(calibration: Calibration, method: str) -> tuple[list[Fault], str]:
     """
     prepared = calibration.prepared
     table = placements_table(prepared, calibration.observations).set_index("placement")
-    used = set(table.index[table.used]) - set(prepared.left_out)
-    excluded: dict[int, str] = {}
+    reasons = table.reason.replace("", "no edge").to_dict()
     parts = [problem for problem in prepared.problems if problem.kind not in LEAVES_OUT]
-    images: list[Problem] = []  # and cameras
     if method == "joint" and calibration.joint is not None:
         solution = calibration.joint.solution
         used = set(solution.boards)
-        excluded = solution.excluded_placements
+        reasons |= solution.excluded_placements
         images = [problem for problem in solution.excluded if problem.camera is not None]
-    reasons = table.reason.replace("", "no edge").to_dict() | excluded
+    else:
+        used = set(table.index[table.used]) - set(prepared.left_out)
+        images = []  # and cameras
     lost = [f"{number} ({why})" for number, why in reasons.items() if number not in used]
     words = (
         f"{len(lost)} of {len(table)} placements are left out: {', '.join(lost) or 'none'}"

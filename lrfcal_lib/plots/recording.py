@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap
 
-from lrfcal_lib.model.board import Board, outline_lines
+from lrfcal_lib.model.board import Board, Chessboard, outline_lines
 from lrfcal_lib.model.camera import CameraModel, redistort
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.colors import COLORS as COLORS
@@ -368,6 +368,14 @@ def _lengths(ax, board, outwards, away):
         ax.text(*at, f"{name.upper()}\n{1000 * length:.1f} mm", **CENTRED)
 
 
+def squares(ax: Axes, pattern: Chessboard, colors: ListedColormap) -> None:
+    """The squares of a chessboard in the frame of its board, in a dark and a white colour."""
+    y, x = np.mgrid[-1 : pattern.rows + 1, -1 : pattern.columns + 1]
+    left, low = pattern.origin
+    white = (x + y)[:-1, :-1] % 2
+    ax.pcolormesh(left + pattern.square * x, low + pattern.square * y, white, cmap=colors)
+
+
 def board_plan(ax: Axes, board: Board) -> None:
     """A board with its sizes, corners A, B, ... and printed squares, in its own frame.
 
@@ -379,14 +387,8 @@ def board_plan(ax: Axes, board: Board) -> None:
     """
     corners = board.known_corners()
     ax.fill(*corners.T, color=PRINT.colors[0], linewidth=0)
-    pattern = board.pattern
-    if pattern is not None:
-        y, x = np.mgrid[-1 : pattern.rows + 1, -1 : pattern.columns + 1]
-        left, low = pattern.origin
-        white = (x + y)[:-1, :-1] % 2
-        ax.pcolormesh(
-            left + pattern.square * x, low + pattern.square * y, white, cmap=PRINT
-        )
+    if board.pattern is not None:
+        squares(ax, board.pattern, PRINT)
     _lengths(ax, board, outline_lines(corners)[:, :2], 0.065)
     ax.update_datalim(np.vstack([corners - 0.09, corners + 0.09]))
     to_scale(ax, "x [m]", "y [m]")

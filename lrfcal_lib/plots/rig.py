@@ -147,7 +147,7 @@ def face_on(
     focal = fill * (size[::-1] / spread).min()
     # half of a rectangle about points of a triangle is empty
     spacing = focal * np.sqrt(spread.prod() / 2 / len(points))
-    return T_view, float(focal), int(np.ceil(COVER * spacing))
+    return T_view, focal, int(np.ceil(COVER * spacing))
 
 
 def measured_edges(

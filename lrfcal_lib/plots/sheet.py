@@ -3,10 +3,12 @@
 from os import PathLike
 
 import numpy as np
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patches import Polygon
 
 from lrfcal_lib.model.board import UNIT_SQUARE, Board, Chessboard
+from lrfcal_lib.plots.recording import squares
 
 BORDER = 0.5  # squares between the chessboard and the cut
 PAPER = 0.02  # metres around the cut
@@ -54,20 +56,14 @@ def print_sheet(path: str | PathLike, board: Board, dpi: float = 300) -> None:
     ax = page.add_axes((0, 0, 1, 1))
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_axis_off()
-    pattern = board.pattern
-    first = pattern.outline()[0]
-    side = pattern.square
-    for row, column in np.ndindex(pattern.rows + 1, pattern.columns + 1):
-        if (row + column) % 2 == 0:
-            at = first + side * np.array([column, row])
-            ax.add_patch(Rectangle(at, side, side, color="black", linewidth=0))
+    squares(ax, board.pattern, ListedColormap(["black", "white"]))
     ax.add_patch(Polygon(corners, fill=False, edgecolor="black", linewidth=0.5))
     x, y = low + [PAPER, PAPER / 3]
     ax.plot([x, x + RULER], [y, y], "|-", color="black")
     ax.text(
         x + 1.1 * RULER,
         y,
-        f"{1000 * RULER:.0f} mm at 100 %; squares of {1000 * side:g} mm",
+        f"{1000 * RULER:.0f} mm at 100 %; squares of {1000 * board.pattern.square:g} mm",
         fontsize=7,
         va="center",
     )

@@ -13,10 +13,6 @@ from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.workers import spread
 
 UNTRUSTED = 3  # exit status of a calibration whose verdict is 'no'
-SCENES_ONLY = (
-    "all placements show scenes, and a calibration needs the board: "
-    "record three or more placements of the board with the same rig"
-)
 
 
 def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
@@ -43,7 +39,10 @@ def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
     """
     session = open_session(path)
     if not session.board_placements:
-        print(f"{path}: {SCENES_ONLY}")
+        print(
+            f"{path}: all placements show scenes, and a calibration needs the board: "
+            "record three or more placements of the board with the same rig"
+        )
         return UNTRUSTED
     calibration = calibrate(session)
     print(*poses_in_words(calibration), sep="\n")
