@@ -294,28 +294,21 @@ def _add_rigs(verbs):
     record = verbs.add_parser(
         "record", help="record a session with a rig, real or emulated"
     )
-    record.add_argument(
+    add = record.add_argument
+    add(
         "rig_file",
         help="JSON: the rig, its devices and what to record ('emulate' writes one)",
     )
-    record.add_argument("session", help="folder of the new session")
-    record.add_argument(
+    add("session", help="folder of the new session")
+    add(
         "--resume",
         action="store_true",
         help="go on with a session; finished placements stay",
     )
-    record.add_argument(
-        "--placements", type=how_many, metavar="N", help="record N placements of the plan"
-    )
-    record.add_argument(
-        "--scene", action="store_true", help="record a scene instead of the plan's boards"
-    )
-    record.add_argument(
-        "--stations", type=how_many, metavar="N", help="of the scene (default 1)"
-    )
-    record.add_argument(
-        "--calibration", help="calibration.json of the rig: plans the images of the scene"
-    )
+    add("--placements", type=how_many, metavar="N", help="record N placements of the plan")
+    add("--scene", action="store_true", help="record a scene instead of the plan's boards")
+    add("--stations", type=how_many, metavar="N", help="of the scene (default 1)")
+    add("--calibration", help="calibration.json of the rig: plans the images of the scene")
 
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument(
@@ -373,25 +366,26 @@ def _add_study(verbs):
         "study",
         help="compare methods on many drawn sessions of published and other set-ups",
     )
-    study.add_argument("scenarios", nargs="+", metavar="SCENARIO", help="e.g. paper_rig")
-    study.add_argument("--methods", nargs="+", help="default: all that single shots allow")
-    study.add_argument(
+    add = study.add_argument
+    add("scenarios", nargs="+", metavar="SCENARIO", help="e.g. paper_rig")
+    add("--methods", nargs="+", help="default: all that single shots allow")
+    add(
         "--poses",
         nargs="+",
         type=int,
         metavar="N",
         help="placements (default 5 10 20 50 100)",
     )
-    study.add_argument("--trials", type=int, default=100, help="of each (default 100)")
-    study.add_argument("--seed", type=int, default=0)
-    study.add_argument(
+    add("--trials", type=int, default=100, help="of each (default 100)")
+    add("--seed", type=int, default=0)
+    add(
         "--vary",
         action="append",
         default=[],
         metavar="KEY=V,V,...",
         help="e.g. step_deg=0.25,0.5; several times: every combination",
     )
-    study.add_argument(
+    add(
         "--out",
         required=True,
         help="the table, CSV; a killed study goes on when asked again",

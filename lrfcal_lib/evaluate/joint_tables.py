@@ -214,7 +214,10 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
     for pair in range(pairs):
         parts = np.array_split(rng.permutation(numbers), 2)
         try:
-            first, second = (_estimate_from(joint, part) for part in parts)
+            first, second = (
+                solve_again(joint.observations.select(np.sort(part)), joint.solution)
+                for part in parts
+            )
         except DegenerateGeometry:
             continue
         for camera in joint.observations.cameras:
@@ -234,11 +237,6 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
             "predicted_translation_mm",
         ],
     )
-
-
-def _estimate_from(joint, placements):
-    """The joint estimate from some placements (of several, in any order)."""
-    return solve_again(joint.observations.select(np.sort(placements)), joint.solution)
 
 
 def _predicted(solution, camera):

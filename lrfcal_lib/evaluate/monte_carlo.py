@@ -13,10 +13,10 @@ from scipy.stats import binom, chi2
 from lrfcal_lib.evaluate.tables import unit_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.covariance import (
+    covariance_of,
     dyads,
     name_words,
     null_space,
-    pseudo_inverse,
     sigma_of,
     solve_each,
 )
@@ -207,8 +207,7 @@ def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.n
     if len(left):
         open_ = name_words(left[0] / scale, unknowns.names(obs.cameras), LARGE)
         raise DegenerateGeometry(f"no bound: the data leave {open_} open")
-    unit = dyads(scale)
-    return pseudo_inverse(total * unit) * unit
+    return covariance_of(total, scale, lost=())
 
 
 def groups_of(names: Sequence[str]) -> dict[str, tuple[list[int], str, float]]:

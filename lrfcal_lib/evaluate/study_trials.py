@@ -17,7 +17,6 @@ from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     move_pose,
     polar_to_points,
-    pose_array,
     pose_step,
     pose_transform,
 )
@@ -88,38 +87,37 @@ def run_task(task: Task) -> list[dict]:
         with known sensor, and of the six numbers of the pose the mean squared error over the bound,
         and over the stated covariance, and how many lie in their 90 % intervals.
     """
+    scenario = task.scenario
     rng = np.random.default_rng([task.seed, task.n_poses, task.first])
-    shots = draw_shots(task.scenario, rng, task.trials, task.n_poses)
-    start = np.reshape(task.scenario.start, (2, 1, 1)) * rng.standard_normal(
-        (2, task.trials, 3)
-    )
+    shots = draw_shots(scenario, rng, task.trials, task.n_poses)
+    start = np.reshape(scenario.start, (2, 1, 1)) * rng.standard_normal((2, task.trials, 3))
     T0 = pose_transform(move_pose(shots["T_camera_lrf"], np.concatenate(start, axis=1)))
 
     sessions = []
     bounds = [{}] * task.trials
-    if not task.scenario.corner:
-        sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
-        bounds = [
-            bounds_of_camera(obs, truth, task.scenario.sensor) for obs, truth in sessions
-        ]
+    if not scenario.corner:
+        sessions = [joint_session(shots, scenario, t) for t in range(task.trials)]
+        bounds = [bounds_of_camera(obs, truth, scenario.sensor) for obs, truth in sessions]
     rows = []
     for method in task.methods:
         if method in BATCHED:
-            estimates = _batch(method, shots, task.scenario, T0)
+            estimates = _batch(method, shots, scenario, T0)
         else:
             estimates = [
-                _single(method, shots, task.scenario, t, T0[t], sessions[t][0])
+                _single(method, shots, scenario, t, T0[t], sessions[t][0])
                 for t in range(task.trials)
             ]
         for t, estimate in enumerate(estimates):
-            row = {
-                "scenario": task.scenario.name,
-                **task.scenario.varied,
-                "n_poses": task.n_poses,
-                "trial": task.first + t,
-                "method": method,
-            }
-            rows.append(row | _judged(estimate, shots["T_camera_lrf"][t], bounds[t]))
+            rows.append(
+                {
+                    "scenario": scenario.name,
+                    **scenario.varied,
+                    "n_poses": task.n_poses,
+                    "trial": task.first + t,
+                    "method": method,
+                    **_judged(estimate, shots["T_camera_lrf"][t], bounds[t]),
+                }
+            )
     return rows
 
 
@@ -130,9 +128,8 @@ def _batch(method, shots, scenario, T0):
         solution = solve_camera(obs, **{"method": method, "T0": T0} | BATCHED[method])
     except DegenerateGeometry as error:
         return [str(error)] * len(T0)
-    poses = pose_array(solution.transform)
-    converged = np.broadcast_to(solution.converged, len(poses))
-    return zip(poses, solution.covariance, converged, strict=True)
+    converged = np.broadcast_to(solution.converged, len(T0))
+    return zip(solution.transform, solution.covariance, converged, strict=True)
 
 
 def _single(method, shots, scenario, trial, T0, obs):
@@ -140,21 +137,21 @@ def _single(method, shots, scenario, trial, T0, obs):
     try:
         if method == "joint":
             solution = solve_joint(obs, axis=False, sensor=scenario.sensor)
-            return solution.state.cameras[0], solution.solution.covariance[:6, :6], True
+            return solution.transforms["camera"], solution.solution.covariance[:6, :6], True
         planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
         options = {"method": method, "T0": T0} | PLANES[method]
         found = solve_camera(planes, search=False, **options)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:
         return str(error)
-    return pose_array(found.transform), found.covariance[:6, :6], found.converged
+    return found.transform, found.covariance[:6, :6], found.converged
 
 
 def _judged(estimate, true, bounds):
     """The columns of one estimate."""
     if isinstance(estimate, str):
         return {"outcome": f"refused: {estimate}"}
-    pose, covariance, converged = estimate
-    error = pose_step(pose_transform(true), pose_transform(pose))
+    transform, covariance, converged = estimate
+    error = pose_step(pose_transform(true), transform)
     if not (np.isfinite(error).all() and np.isfinite(covariance).all()):
         return {"outcome": "not finite"}
     numbers = _sizes(error)

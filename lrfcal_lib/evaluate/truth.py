@@ -164,8 +164,7 @@ def axis_errors(axis: KnownAxis, truth: Truth) -> dict[str, float]:
     dict of str to float
         See :func:`beside_sigma`.
     """
-    estimated = axis_of(axis.T_head_lrf)
-    apart = axis_difference(estimated, axis_of(truth.T_head_lrf))
+    apart = axis_difference(axis_of(axis.T_head_lrf), axis_of(truth.T_head_lrf))
     return beside_sigma(*apart, axis.covariance)
 
 

@@ -193,8 +193,7 @@ def _chance_of_step(score, columns, row):
     repeated = np.concatenate([np.arange(shared), columns])
     kept = np.ones((count, len(repeated)))
     kept[:row, shared:] = 0.0
-    both = dyads(kept)
-    whole = both * score.information[:, repeated[:, None], repeated]
+    whole = dyads(kept) * score.information[:, repeated[:, None], repeated]
     parted = Score(whole, score.gradient[:, repeated] * kept)
 
     covariance, step, pulls = parted.solved()
@@ -249,11 +248,11 @@ def change_between(solution, first, later, camera, prepared):
     middles = obs.view_pose[views, :3] @ board_middle(solution)
     motion = project(middles, model) - project(change.inv().apply(middles), model)
     after = int(obs.placements[obs.view_placement[views].min()])
-    growths = [
+    zoom, zoom_sigma = max(
         growth_by_depth(solution, index),
         growth_of_focal_length(prepared, camera, after),
-    ]
-    zoom, zoom_sigma = max(growths, key=lambda growth: abs(growth[0]) / growth[1])
+        key=lambda growth: abs(growth[0]) / growth[1],
+    )
     return CameraChange(
         camera=camera,
         after=after,

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.calibrate.rig import joint_rig
+from lrfcal_lib.calibrate.rig import LMS200, joint_rig
 from lrfcal_lib.calibrate.rig_uncertainty import selection
 from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.result import AXIS_NAMES
@@ -37,19 +37,13 @@ LEANS = {
 # where the middle of a board is put
 PLACES = (
     (1.0, 1.5, 2.0, 2.5, 3.0),  # metres from the LRF
-    (-20, -10, 0, 10, 20),  # degrees to the left
+    range(-20, 21, 10),  # degrees to the left
     (-12, 0, 12),  # degrees up
-    (
-        0,
-        60,
-        120,
-        180,
-        240,
-        300,
-    ),  # degrees in the board's plane, anticlockwise as the rig sees it
+    # degrees in the board's plane, anticlockwise as the rig sees it
+    range(0, 360, 60),
     range(len(LEANS)),
 )
-FIELD_OF_VIEW = (np.radians(40), np.radians(140))  # bearings, of the paper's LMS 200
+FIELD_OF_VIEW = LMS200.field_of_view  # the paper's
 LARGEST_PITCH = np.radians(30)  # of a head that is asked to look at a board
 # pitch angles that images are tried at
 LATTICE = np.linspace(-LARGEST_PITCH, LARGEST_PITCH, 41)

@@ -209,16 +209,17 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     mirrored = []
     for camera, miss in board_misses(prepared, MIRRORED).items():
         if camera in stated and _fits({camera: miss}, {camera: stated[camera]}):
-            fault = Fault(
-                "sense",
-                f"the images of camera '{camera}' are mirrored: the mirror images of its boards "
-                f"lie {1000 * miss.size:.0f} mm from the scans, the images as recorded "
-                f"{1000 * stated[camera].size:.0f} mm; turn mirroring off in the camera, or flip "
-                "the images",
-                severe=True,
-                camera=camera,
+            mirrored.append(
+                Fault(
+                    "sense",
+                    f"the images of camera '{camera}' are mirrored: the mirror images of its "
+                    f"boards lie {1000 * miss.size:.0f} mm from the scans, the images as recorded "
+                    f"{1000 * stated[camera].size:.0f} mm; turn mirroring off in the camera, or "
+                    "flip the images",
+                    severe=True,
+                    camera=camera,
+                )
             )
-            mirrored.append(fault)
     if 0 < len(mirrored) < len(stated):
         return mirrored
 
@@ -392,8 +393,8 @@ def _same_board(calibration, scan, placement):
     for camera in solution.transforms:
         view = prepared.posed(camera).get(placement)
         if view is not None:
-            T_camera_platform = solution.camera_at(camera, view.pitch)
-            on_board = (view.T_camera_board.inv() * T_camera_platform).apply(p_platform)
+            p_camera = solution.camera_at(camera, view.pitch).apply(p_platform)
+            on_board = view.T_camera_board.inv().apply(p_camera)
             beside = (on_board.mean(axis=0) - middle)[:2]
             away = np.median(np.abs(on_board[:, 2]))
             agree.append(away < GOOD and np.linalg.norm(beside) < BESIDE)

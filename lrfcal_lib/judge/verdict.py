@@ -108,7 +108,6 @@ class Verdict:
 
     Attributes
     ----------
-    answer : {'yes', 'with care', 'no'}
     reasons : tuple of Fault
         The worst first; empty for 'yes'.
     errors : dict of float to ExpectedError
@@ -123,13 +122,17 @@ class Verdict:
         What is handed over, and what became of all placements.
     """
 
-    answer: Answer
     reasons: tuple[Fault, ...]
     errors: dict[float, ExpectedError]
     range_noise_mm: float
     suggestion: Suggestion | None = None
     no_suggestion: str = ""
     notes: tuple[str, ...] = ()
+
+    @property
+    def answer(self) -> Answer:
+        """Yes, with care, or no, by the worst of the reasons."""
+        return ANSWERS[self.reasons[0].severe] if self.reasons else YES
 
     def record(self) -> dict:
         """Answer, reasons and expected errors, ready for JSON."""
@@ -171,8 +174,7 @@ class Verdict:
     def because(self, findings: list[Fault]) -> "Verdict":
         """The verdict with more findings, which stand before its own; the worst first."""
         reasons = sorted((*findings, *self.reasons), key=lambda reason: not reason.severe)
-        answer = ANSWERS[reasons[0].severe] if reasons else YES
-        return replace(self, answer=answer, reasons=tuple(reasons))
+        return replace(self, reasons=tuple(reasons))
 
 
 def judge(
@@ -305,7 +307,7 @@ def _expected(rig, pitch, doubt):
         pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
         errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud[i])), pixels)
 
-    judged = Verdict(YES, (), errors, range_noise_mm=1000 * range_noise(rig))
+    judged = Verdict((), errors, range_noise_mm=1000 * range_noise(rig))
     large = errors[WORKING].words(POOR_MM, POOR_PX)
     if not large:
         return judged
@@ -337,7 +339,7 @@ def _refused(calibration, findings):
     if prepared.problems:
         named = "; ".join(map(str, prepared.problems))
         notes = (f"Left out: {len(prepared.problems)} ({named}).",)
-    judged = Verdict(NO, (), {}, np.nan, no_suggestion=RECORD, notes=notes)
+    judged = Verdict((), {}, np.nan, no_suggestion=RECORD, notes=notes)
     return judged.because([*findings, refused])
 
 

@@ -120,8 +120,7 @@ def reading_by_distance(
     u = 1000 * np.asarray(distance)
     b = 1000 * bias
     x = np.linspace(u.min(), u.max(), 400)
-    expected = ndtr((b - x) / (1000 * sigma))
-    ax.plot(x, expected, color=FIT, label="expected, Φ((b - u) / σ)")
+    ax.plot(x, ndtr((b - x) / (1000 * sigma)), color=FIT, label="expected, Φ((b - u) / σ)")
     ax.plot(u[hit], hit[hit], "|", color=LRF, label="beams that read the board")
     ax.plot(u[~hit], hit[~hit], "|", color=PLATFORM, label="beams that read beyond")
     ax.axvline(0, color=TRUTH)

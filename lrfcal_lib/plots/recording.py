@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap
 
-from lrfcal_lib.model.board import Board, Chessboard, outline_lines
+from lrfcal_lib.model.board import Board, Chessboard, outline_lines, side_ends
 from lrfcal_lib.model.camera import CameraModel, redistort
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.colors import COLORS as COLORS
@@ -362,8 +362,7 @@ def _about_lines(ax, view, image, margin, more=""):
 
 def _lengths(ax, board, outwards, away):
     """The lengths of a board's edges, written so many metres `away` along `outwards` (n, 2)."""
-    around = closed(board.known_corners())
-    middles = (around[1:] + around[:-1]) / 2 + away * outwards
+    middles = side_ends(board.known_corners()).mean(axis=1) + away * outwards
     for (name, length), at in zip(board.lengths().items(), middles, strict=True):
         ax.text(*at, f"{name.upper()}\n{1000 * length:.1f} mm", **CENTRED)
 
@@ -403,12 +402,11 @@ def outline(ax: Axes, measured) -> None:
     measured : Outline
     """
     board = measured.board
-    around = closed(board.known_corners())
-    ax.plot(*around.T, color=TRUTH)
+    corners = board.known_corners()
+    ax.plot(*closed(corners).T, color=TRUTH)
     outwards = measured.lines[:, :2]
-    for index, spread in enumerate(measured.line_sd):
-        ends = around[index : index + 2]
-        away = EXAGGERATED * np.nan_to_num(spread) * outwards[index]
+    spreads = EXAGGERATED * np.nan_to_num(measured.line_sd)[:, None] * outwards
+    for ends, away in zip(side_ends(corners), spreads, strict=True):
         band = np.vstack([ends - away, ends[::-1] + away])
         ax.fill(*band.T, color=FIT, alpha=0.25, linewidth=0)
     _lengths(ax, board, outwards, -0.09)

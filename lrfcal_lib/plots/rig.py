@@ -173,8 +173,8 @@ def measured_edges(
     centre = measured.T_platform_plane[None, :3, 3]
     middle = pixels(T_view.apply(centre), size, focal)
     for name, length in measured.lengths.items():
-        after = names[names.index(name) + 1]
-        ends = [measured.corner_point(corner) for corner in (name, after)]
+        both = names[names.index(name) :][:2]
+        ends = [measured.corner_point(corner) for corner in both]
         uv = pixels(T_view.apply(ends), size, focal)
         ax.plot(*uv.T, "o-", color=FIT)
         at = uv.mean(axis=0)
