@@ -347,13 +347,10 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
             )
         elif steps.count(change.after) == len(cameras):
             words += " (or the range finder was: all cameras changed at once)"
-        remedy = (
-            "fix what is loose and record anew, or make two sessions: one of the placements before "
-            f"{change.after}, one of the others"
-        )
         yield Fault(
             kind,
-            f"{words}; {remedy}",
+            f"{words}; fix what is loose and record anew, or make two sessions: one of the "
+            f"placements before {change.after}, one of the others",
             severe=change.size_px > SEVERE_PX,
             camera=change.camera,
             placements=(change.after,),

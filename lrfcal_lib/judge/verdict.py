@@ -230,9 +230,9 @@ def judge(
 
 def _notes(calibration, method, lost):
     """What is handed over, where the cameras are, what was left out, and what is not known."""
-    axis = calibration.platform.axis_with(method)
     notes = [
-        f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.",
+        f"Handed over: the cameras of the method '{method}' and the axis "
+        f"'{calibration.platform.axis_with(method)}'.",
         lost,
     ]
     if method == "joint" and calibration.joint is not None:
@@ -267,8 +267,8 @@ def verdict(
     """
     obs = solution.observations
     pitch = np.concatenate([obs.face_pitch, obs.beam_pitch])
-    expected = _expected(joint_rig(solution, models), pitch, doubt)
-    judged = expected.because(diagnose(solution))
+    rig = joint_rig(solution, models)
+    judged = _expected(rig, pitch, doubt).because(diagnose(solution))
     if not suggest:
         return judged
     try:
@@ -339,8 +339,8 @@ def _refused(calibration, findings):
     if prepared.problems:
         named = "; ".join(map(str, prepared.problems))
         notes = (f"Left out: {len(prepared.problems)} ({named}).",)
-    judged = Verdict((), {}, np.nan, no_suggestion=RECORD, notes=notes)
-    return judged.because([*findings, refused])
+    nothing = Verdict((), {}, np.nan, no_suggestion=RECORD, notes=notes)
+    return nothing.because([*findings, refused])
 
 
 def _scatter_note(placements):
