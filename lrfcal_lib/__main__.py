@@ -11,47 +11,45 @@ INTERRUPTED = 130  # exit code after Ctrl-C
 SCENE = "as 'record --scene' recorded it"
 
 
-def run(args):
-    """Do what a verb asks for: its exit code or None. What another verb needs is not imported."""
-    match args.verb:
-        case "import":
-            return import_recording(args)
-        case "check":
-            return check(args)
-        case "calibrate" | "reconstruct" | "merge":
-            return use_sessions(args)
-        case "compare":
-            from lrfcal_lib.report.compare import compare_files
+def compare(args):
+    """Say how far calibrations of one rig differ."""
+    from lrfcal_lib.report.compare import compare_files
 
-            return compare_files(args.calibrations, args.figure)
-        case "measure":
-            return measure(args)
-        case "simulate":
-            from lrfcal_lib.session.workers import side_by_side
-            from lrfcal_lib.simulate.record import simulate
-            from lrfcal_lib.simulate.rig import load_setup
+    return compare_files(args.calibrations, args.figure)
 
-            with side_by_side():
-                simulate(args.dst, load_setup(args.setup))
-            print(f"{args.dst}: simulated")
-        case "record":
-            return record(args)
-        case "report":
-            if args.scheduler is not None:
-                return use_sessions(args)
-            from lrfcal_lib.report.report import main
 
-            return main(args.sessions, args.out, args.jobs, args.store)
-        case "study":
-            from lrfcal_lib.report.study import study
+def simulate(args):
+    """Record a session with a simulated rig."""
+    from lrfcal_lib.session.workers import side_by_side
+    from lrfcal_lib.simulate.record import simulate
+    from lrfcal_lib.simulate.rig import load_setup
 
-            return study(args)
-        case "emulate":
-            from lrfcal_lib.emulators.rig import main
+    with side_by_side():
+        simulate(args.dst, load_setup(args.setup))
+    print(f"{args.dst}: simulated")
 
-            return main(args.setup, args.rig_file, args.feedback)
-        case "board":
-            print_board(args)
+
+def report(args):
+    """Execute the notebooks on sessions, here or on a cluster."""
+    if args.scheduler is not None:
+        return use_sessions(args)
+    from lrfcal_lib.report.report import main
+
+    return main(args.sessions, args.out, args.jobs, args.store)
+
+
+def study(args):
+    """Compare methods on drawn sessions."""
+    from lrfcal_lib.report.study import study
+
+    return study(args)
+
+
+def emulate(args):
+    """Emulate the devices of a rig."""
+    from lrfcal_lib.emulators.rig import main
+
+    return main(args.setup, args.rig_file, args.feedback)
 
 
 def measure(args):
@@ -153,6 +151,24 @@ def record(args):
     elif args.stations or args.calibration:
         raise ValueError("--stations and --calibration are for a scene: add --scene")
     return main(args.rig_file, args.session, **options)
+
+
+# what a verb does: its exit code or None; what another verb needs is not imported
+VERBS = {
+    "import": import_recording,
+    "check": check,
+    "simulate": simulate,
+    "calibrate": use_sessions,
+    "compare": compare,
+    "reconstruct": use_sessions,
+    "merge": use_sessions,
+    "measure": measure,
+    "record": record,
+    "emulate": emulate,
+    "board": print_board,
+    "report": report,
+    "study": study,
+}
 
 
 def between(kind, least, most, what):
@@ -278,28 +294,21 @@ def _add_rigs(verbs):
     record = verbs.add_parser(
         "record", help="record a session with a rig, real or emulated"
     )
-    record.add_argument(
+    add = record.add_argument
+    add(
         "rig_file",
         help="JSON: the rig, its devices and what to record ('emulate' writes one)",
     )
-    record.add_argument("session", help="folder of the new session")
-    record.add_argument(
+    add("session", help="folder of the new session")
+    add(
         "--resume",
         action="store_true",
         help="go on with a session; finished placements stay",
     )
-    record.add_argument(
-        "--placements", type=how_many, metavar="N", help="record N placements of the plan"
-    )
-    record.add_argument(
-        "--scene", action="store_true", help="record a scene instead of the plan's boards"
-    )
-    record.add_argument(
-        "--stations", type=how_many, metavar="N", help="of the scene (default 1)"
-    )
-    record.add_argument(
-        "--calibration", help="calibration.json of the rig: plans the images of the scene"
-    )
+    add("--placements", type=how_many, metavar="N", help="record N placements of the plan")
+    add("--scene", action="store_true", help="record a scene instead of the plan's boards")
+    add("--stations", type=how_many, metavar="N", help="of the scene (default 1)")
+    add("--calibration", help="calibration.json of the rig: plans the images of the scene")
 
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument(
@@ -357,25 +366,26 @@ def _add_study(verbs):
         "study",
         help="compare methods on many drawn sessions of published and other set-ups",
     )
-    study.add_argument("scenarios", nargs="+", metavar="SCENARIO", help="e.g. paper_rig")
-    study.add_argument("--methods", nargs="+", help="default: all that single shots allow")
-    study.add_argument(
+    add = study.add_argument
+    add("scenarios", nargs="+", metavar="SCENARIO", help="e.g. paper_rig")
+    add("--methods", nargs="+", help="default: all that single shots allow")
+    add(
         "--poses",
         nargs="+",
         type=int,
         metavar="N",
         help="placements (default 5 10 20 50 100)",
     )
-    study.add_argument("--trials", type=int, default=100, help="of each (default 100)")
-    study.add_argument("--seed", type=int, default=0)
-    study.add_argument(
+    add("--trials", type=int, default=100, help="of each (default 100)")
+    add("--seed", type=int, default=0)
+    add(
         "--vary",
         action="append",
         default=[],
         metavar="KEY=V,V,...",
         help="e.g. step_deg=0.25,0.5; several times: every combination",
     )
-    study.add_argument(
+    add(
         "--out",
         required=True,
         help="the table, CSV; a killed study goes on when asked again",
@@ -408,7 +418,7 @@ def main(argv=None):
     """
     args = parser().parse_args(argv)
     try:
-        return run(args) or 0
+        return VERBS[args.verb](args) or 0
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

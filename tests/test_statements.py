@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lrfcal_lib.judge import statements
+from lrfcal_lib.judge.findings import ANSWERS
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.session.stated import LrfInfo
 
@@ -46,7 +47,7 @@ def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers
     found, doubt = statements.contradicts_stated(
         SimpleNamespace(solution=solution, prepared=prepared)
     )
-    assert [reason.answer for reason in found] == answers
+    assert [ANSWERS[reason.severe] for reason in found] == answers
     assert doubt == (abs(offset) / 1000 if found else 0.0)
     assert all(
         "board" in r.words and "squares" in r.words and f"{offset} mm" in r.words

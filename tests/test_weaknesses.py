@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
+from lrfcal_lib.judge.findings import ANSWERS
 from lrfcal_lib.judge.verdict import verdict
 from lrfcal_lib.judge.weaknesses import diagnose, sides_elsewhere
 from lrfcal_lib.model.board import triangle_board
@@ -83,12 +84,12 @@ def test_weak_recordings_are_named(good, kind):
     found = verdict(solution, models_of(rig), suggest=kind == "pitch")
     reasons = {reason.kind: reason for reason in found.reasons}
     assert (
-        reasons[kind].answer == answer
+        ANSWERS[reasons[kind].severe] == answer
         and words in reasons[kind].words
         and words in found.sentences()[0]
     )
     assert found.answer == (
-        "no" if "no" in [reason.answer for reason in found.reasons] else "with care"
+        "no" if any(reason.severe for reason in found.reasons) else "with care"
     )
     if kind == "pitch":
         assert (
@@ -156,14 +157,14 @@ def test_misfit_model_error_and_noise_are_named(good):
     assert words["noise"] == "residuals are larger than the stated noise (ranges 2.6 times)"
     absurd = bad.with_levels(face_scale=1.0, view_scale=11.0, face_share=0.05)
     found = {r.kind: r for r in diagnose(absurd)}
-    assert found["noise"].answer == "no" and found["dependent"].words.startswith(
+    assert found["noise"].severe and found["dependent"].words.startswith(
         "only 5 % of the errors of ranges"
     )
     blurred = {
         r.kind: r for r in diagnose(replace(absurd, lens_scale=4.0))
     }  # intrinsics are as uncertain
     assert (
-        blurred["noise"].answer == "with care"
+        not blurred["noise"].severe
         and "images of 'right' 2.7 times" in blurred["noise"].words
     )
 

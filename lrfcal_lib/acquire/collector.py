@@ -165,9 +165,7 @@ def advise(session: Session) -> str:
     )
     if judged.answer == YES:
         return ""
-    if judged.suggestion:
-        return judged.suggestion.sentence()
-    return judged.no_suggestion
+    return judged.advice
 
 
 class Busy(RuntimeError):

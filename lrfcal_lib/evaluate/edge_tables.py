@@ -13,7 +13,6 @@ from lrfcal_lib.calibrate.observe import outline_of
 from lrfcal_lib.calibrate.outline import MeasuredBoard
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
 
@@ -58,11 +57,9 @@ def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
         for placement, names in prepared.names.items():
             scanned = prepared.edges[variant][placement]
             pitch = truth.pitch[placement][scanned.line]
-            p_platform = geometry.lrf_to_platform(scanned.points, pitch, truth.T_head_lrf)
-            p_board = truth.boards[placement].inv().apply(p_platform)
-            p_board[:, 2] = 1.0  # x and y in its plane, as lines take them
+            flat = truth.on_board(truth.boards[placement], scanned.points, pitch)
             for side, edge in names.items():
-                misses[edge].append(p_board[scanned.side == side] @ lines[edge])
+                misses[edge].append(flat[scanned.side == side] @ lines[edge])
         for edge, parts in misses.items():
             miss = pd.Series(1000 * np.concatenate(parts))
             mean = miss.mean() if len(miss) > 1 else np.nan
@@ -119,8 +116,17 @@ def edge_lengths(
             if np.isfinite(length):
                 hangs = not neighbours(prepared.board.edges, name).isdisjoint(weak)
                 ends = ENDS[variant][hangs]
-            where = prepared.session.name, placement, name, ends, variant
-            rows.append((*where, 1000 * true, 1000 * length, 1000 * sigma))
+            row = (
+                prepared.session.name,
+                placement,
+                name,
+                ends,
+                variant,
+                1000 * true,
+                1000 * length,
+                1000 * sigma,
+            )
+            rows.append(row)
     for name, (true, length) in PAPER_EDGES_MM.items():
         rows.append(("paper", np.nan, name, "scan", "last_beam", true, length, np.nan))
     table = pd.DataFrame(rows, columns=LENGTH_COLUMNS).astype({"placement": "Int64"})
@@ -161,11 +167,10 @@ def edge_summary(table: pd.DataFrame) -> pd.DataFrame:
     size = table.error_mm.abs()
     within = (size < ndtri(0.95) * table.sigma_mm).where(table.sigma_mm.notna())
     table = table.assign(size=size, within=100 * within.astype(float))
-    summary = table.groupby(["source", "ends", "variant"], sort=False).agg(
+    return table.groupby(["source", "ends", "variant"], sort=False, as_index=False).agg(
         n=("size", "size"),
         mean_abs_error_mm=("size", "mean"),
         median_abs_error_mm=("size", "median"),
         mean_error_mm=("error_mm", "mean"),
         within_90_percent=("within", "mean"),
     )
-    return summary.reset_index()

@@ -11,21 +11,16 @@ from lrfcal_lib import __version__
 from lrfcal_lib.calibrate.calibration_file import FORMULAS, KIND, SCHEMA, rig_record
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.evaluate.joint_tables import joint_fit
-from lrfcal_lib.evaluate.tables import left_out_residuals, rms
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.verdict import Verdict, judge
-from lrfcal_lib.session.files import opened
+from lrfcal_lib.session.files import read_bytes
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import FILES
 from lrfcal_lib.session.write import whole
+from lrfcal_lib.solvers import left_out_residuals
 
 # numbers one below the other; no text of JSON has a line end
 ROW = re.compile(r"\[\n\s+(?:-?[\d.]\S*|null)(?:\n\s+(?:-?[\d.]\S*|null))*\n\s+\]")
-AXIS_PARAMETERS = [
-    "out_of_scan_plane_rad",
-    "in_scan_plane_rad",
-    "offset_in_scan_plane_m",
-    "offset_across_scan_plane_m",
-]
 
 
 def calibration_record(
@@ -59,7 +54,12 @@ def calibration_record(
         "verdict": judged.record(),
         **rig_record(calibration.rig(method)),
     }
-    record["platform"]["axis_covariance_of"] = AXIS_PARAMETERS
+    record["platform"]["axis_covariance_of"] = [
+        "out_of_scan_plane_rad",
+        "in_scan_plane_rad",
+        "offset_in_scan_plane_m",
+        "offset_across_scan_plane_m",
+    ]
     for camera, solution in calibration.cameras(method).items():
         record["cameras"][camera] |= _camera(calibration, camera, method, solution)
     if calibration.joint is not None and method == "joint":
@@ -80,8 +80,7 @@ def _sensor(solution):
         for name, value in solution.sensor.items()
         if name in sigma
     }
-    excluded = [str(problem) for problem in solution.excluded]
-    return sensor | {"noise": solution.noise, "excluded": excluded}
+    return sensor | {"noise": solution.noise, "excluded": [*map(str, solution.excluded)]}
 
 
 def _camera(calibration, camera, method, solution):
@@ -102,7 +101,7 @@ def _camera(calibration, camera, method, solution):
         ),
         "covariance": solution.trusted[:6, :6].tolist(),
         "converged": bool(solution.converged),
-        "unobservable": list(solution.unobservable),
+        "unobservable": solution.unobservable,
         **misfit,
         "n_crossings": len(edge),
         "placements": obs.all_placements.tolist(),
@@ -118,8 +117,7 @@ def file_hashes(session: Session) -> dict[str, str]:
     images = {record.file for record in session.image_records}
     hashes = {}
     for file in sorted(images.union(stated)):
-        with opened(file, session.path) as stream:
-            digest = hashlib.sha256(stream.read())
+        digest = hashlib.sha256(read_bytes(file, session.path))
         hashes[file.relative_to(session.path).as_posix()] = digest.hexdigest()
     return hashes
 

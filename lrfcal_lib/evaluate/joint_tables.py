@@ -7,18 +7,24 @@ import pandas as pd
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.pipeline import JointCalibration
-from lrfcal_lib.evaluate.tables import parameter_table, rms
+from lrfcal_lib.evaluate.tables import parameter_table
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
 from lrfcal_lib.fit.residuals import edge_residuals_px
+from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.next_placement import board_middle
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import (
+    POSE_UNITS,
+    DegenerateGeometry,
+    move_pose,
+    transform_difference,
+)
 from lrfcal_lib.solvers.joint import solve_again
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
 ALL = 10**9  # crossings
+DEG_MM = POSE_UNITS[[0, 3]]  # of a turn and a shift
 NOISE_WORDS = {
     "face_scale": "scatter of ranges, in stated standard deviations",
     "view_scale": "scatter of board poses in images, in stated standard deviations",
@@ -28,14 +34,6 @@ NOISE_WORDS = {
     "side_sigma": "spread of the edge bias from side to side [log odds]",
     "background_sigma": "spread of the edge bias from placement to placement [log odds]",
 }
-HALVES_COLUMNS = (
-    "pair",
-    "camera",
-    "rotation_deg",
-    "translation_mm",
-    "predicted_rotation_deg",
-    "predicted_translation_mm",
-)
 
 
 def range_residuals(solution: JointSolution) -> tuple[np.ndarray, np.ndarray]:
@@ -78,9 +76,10 @@ def view_residuals(
     if camera not in solution.transforms:
         cameras = ", ".join(solution.transforms) or "none"
         raise ValueError(f"cameras are {cameras}; got '{camera}'")
-    mine = solution.observations.view_camera == list(solution.transforms).index(camera)
-    pose = solution.observations.view_pose[mine, :3]
-    predicted = geometry.move_pose(pose, solution.residuals("view")[mine])
+    obs = solution.observations
+    mine = obs.view_camera == obs.cameras.index(camera)
+    pose = obs.view_pose[mine, :3]
+    predicted = move_pose(pose, solution.residuals("view")[mine])
     middle = board_middle(solution)
     seen = project(pose @ middle, model)
     return seen, project(predicted @ middle, model) - seen
@@ -101,9 +100,9 @@ def joint_table(joint: JointCalibration) -> pd.DataFrame:
         `Solution.trusted`).
     """
     s = joint.solution.solution
-    sigmas = s.sigma, s.sigma_placements, s.trusted_sigma
+    arrays = s.names, s.parameters, s.sigma, s.sigma_placements, s.trusted_sigma
     columns = ("value", "sigma_noise", "sigma_placements", "sigma")
-    return parameter_table([], {(): (s.names, s.parameters, *sigmas)}, columns)
+    return parameter_table([], {(): arrays}, columns)
 
 
 def noise_table(joint: JointCalibration) -> pd.DataFrame:
@@ -120,8 +119,8 @@ def noise_table(joint: JointCalibration) -> pd.DataFrame:
     """
     noise = joint.solution.noise
     noise["sigma_pitch"] = np.rad2deg(noise["sigma_pitch"])
-    rows = [(NOISE_WORDS[name], value) for name, value in noise.items()]
-    return pd.DataFrame(rows, columns=["what", "value"])
+    values = pd.Series(noise).rename(NOISE_WORDS)
+    return values.rename_axis("what").reset_index(name="value")
 
 
 def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
@@ -167,8 +166,7 @@ def joint_fit(joint: JointCalibration, cameras: Iterable[str] = ()) -> dict[str,
         ``plane_rms_mm`` of face points from their boards, ``edge_rms_px`` of all half-step
         crossings of scan lines from the image edges, the estimated edge bias taken off.
     """
-    solution = joint.solution
-    height = solution.face_points()[:, 2]
+    height = joint.solution.face_points()[:, 2]
     cameras = cameras or joint.observations.cameras
     edges = np.concatenate([edge_misses_px(joint, camera) for camera in cameras])
     return {"plane_rms_mm": 1000 * rms(height), "edge_rms_px": rms(edges)}
@@ -180,7 +178,7 @@ def edge_misses_px(joint: JointCalibration, camera: str) -> np.ndarray:
     Undistorted pixels.
     """
     solution = joint.solution
-    placements = list(joint.solution.boards)
+    placements = list(solution.boards)
     obs = joint.seen_by(camera, crossings=ALL, faces=0).along().select(placements)
     pose = solution.transforms[camera]
     row = pd.Index(placements).get_indexer(obs.crossing_placement)
@@ -209,40 +207,46 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         the halves share). Splits of which a half leaves something open are missing.
     """
     rng = np.random.default_rng(0)
-    numbers = np.array(list(joint.solution.boards))
+    numbers = list(joint.solution.boards)
     rows = []
     if len(numbers) <= 4:  # two placements determine no rig
         pairs = 0
     for pair in range(pairs):
         parts = np.array_split(rng.permutation(numbers), 2)
         try:
-            first, second = (_estimate_from(joint, part) for part in parts)
+            first, second = (
+                solve_again(joint.observations.select(np.sort(part)), joint.solution)
+                for part in parts
+            )
         except DegenerateGeometry:
             continue
         for camera in joint.observations.cameras:
-            turn, shift = geometry.transform_difference(
+            apart = transform_difference(
                 first.transforms[camera], second.transforms[camera]
             )
-            differences = np.rad2deg(turn), 1000 * shift
-            rows.append((pair, camera, *differences, *_predicted(joint.solution, camera)))
-    return pd.DataFrame(rows, columns=HALVES_COLUMNS)
-
-
-def _estimate_from(joint, placements):
-    """The joint estimate from some placements (of several, in any order)."""
-    return solve_again(joint.observations.select(np.sort(placements)), joint.solution)
+            predicted = _predicted(joint.solution, camera)
+            rows.append((pair, camera, *DEG_MM * apart, *DEG_MM * predicted))
+    return pd.DataFrame(
+        rows,
+        columns=[
+            "pair",
+            "camera",
+            "rotation_deg",
+            "translation_mm",
+            "predicted_rotation_deg",
+            "predicted_translation_mm",
+        ],
+    )
 
 
 def _predicted(solution, camera):
-    """Root mean square difference of two halves of the placements as sigma predicts it, degrees and
-    millimetres.
+    """Root mean square difference of two halves of the placements as sigma predicts it, turn and
+    shift, (2,).
     """
     common = np.diag(solution.lens) + solution.step**2
     variances = solution.camera(camera).trusted_sigma ** 2
     variances -= common[solution.columns(f"{camera}_")]
-    parts = np.split(2 * np.sqrt(np.maximum(variances, 0.0)), 2)
-    turn, shift = np.linalg.norm(parts, axis=1)
-    return np.rad2deg(turn), 1000 * shift
+    return 2 * np.sqrt(np.maximum(variances, 0.0).reshape(2, 3).sum(axis=1))
 
 
 def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:
@@ -262,8 +266,7 @@ def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:
     solution = joint.solution
     rows = []
     if joint.settings["axis"]:
-        covariance = solution.covariance("axis_", "offset_")
-        axis = KnownAxis(solution.T_head_lrf, covariance)
+        axis = KnownAxis(solution.T_head_lrf, solution.covariance("axis_", "offset_"))
         rows.append({"what": "tilt axis"} | axis_errors(axis, truth))
     for camera in solution.transforms:
         errors = camera_errors(solution.camera(camera), truth, camera)

@@ -13,10 +13,10 @@ from scipy.stats import binom, chi2
 from lrfcal_lib.evaluate.tables import unit_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.covariance import (
+    covariance_of,
     dyads,
     name_words,
     null_space,
-    pseudo_inverse,
     sigma_of,
     solve_each,
 )
@@ -114,8 +114,15 @@ def joint_truth(
     )
     count = len(boards)
     boards = pose_array(RigidTransform.concatenate(boards))
-    own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges) + 1))
-    return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, *own), obs)
+    state = JointState(
+        pose_array(T_head_lrf),
+        poses,
+        sensor,
+        boards,
+        sweeps=np.zeros((count, 2)),
+        sides=np.zeros((count, len(obs.edges) + 1)),
+    )
+    return in_stated_gauge(state, obs)
 
 
 def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials:
@@ -138,23 +145,23 @@ def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials
     """
     rows = []
     failed = {}
-    names: tuple = ()
+
     for seed in seeds:
         obs, truth = draw(np.random.default_rng(seed))
         try:
             joint = solve(obs)
         except DegenerateGeometry as error:
-            failed[int(seed)] = str(error)
+            failed[seed] = str(error)
             continue
-        names = joint.solution.names
+
         errors = state_errors(joint.state, truth, joint.unknowns)
         limit = bound(obs, truth, joint.unknowns)
-        rows.append((int(seed), errors, joint.solution.covariance, limit))
+        rows.append((seed, errors, joint.solution.covariance, limit))
     if not rows:
         last = next(reversed(failed.values()), "no seed given")
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
     seeds, errors, covariances, bounds = map(np.array, zip(*rows, strict=True))
-    return Trials(names, seeds, errors, covariances, bounds, failed)
+    return Trials(joint.solution.names, seeds, errors, covariances, bounds, failed)
 
 
 def state_errors(state: JointState, truth: JointState, unknowns: Unknowns) -> np.ndarray:
@@ -168,8 +175,8 @@ def state_errors(state: JointState, truth: JointState, unknowns: Unknowns) -> np
     """
     head = pose_step(pose_transform(truth.head), pose_transform(state.head))
     cameras = pose_step(pose_transform(truth.cameras), pose_transform(state.cameras))
-    sensor = state.sensor - truth.sensor
-    return np.concatenate([head[AXIS_COLUMNS], cameras.ravel(), sensor])[unknowns.mask]
+    steps = [head[AXIS_COLUMNS], cameras.ravel(), state.sensor - truth.sensor]
+    return np.concatenate(steps)[unknowns.mask]
 
 
 def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.ndarray:
@@ -200,8 +207,7 @@ def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.n
     if len(left):
         open_ = name_words(left[0] / scale, unknowns.names(obs.cameras), LARGE)
         raise DegenerateGeometry(f"no bound: the data leave {open_} open")
-    unit = dyads(scale)
-    return pseudo_inverse(total * unit) * unit
+    return covariance_of(total, scale, lost=())
 
 
 def groups_of(names: Sequence[str]) -> dict[str, tuple[list[int], str, float]]:
@@ -211,8 +217,8 @@ def groups_of(names: Sequence[str]) -> dict[str, tuple[list[int], str, float]]:
         pattern = next(pattern for pattern in GROUPS if re.fullmatch(pattern, name))
         words = re.sub(pattern, GROUPS[pattern], name, count=1).replace("_", " ")
         unit, factor = unit_of(name)
-        group = groups.setdefault(words, ([], LOGARITHMS.get(words, unit), factor))
-        group[0].append(i)
+        index, *_ = groups.setdefault(words, ([], LOGARITHMS.get(words, unit), factor))
+        index.append(i)
     return groups
 
 
@@ -227,7 +233,7 @@ def spread(covariance: np.ndarray, names: Sequence[str]) -> dict[str, float]:
     """
     variance = np.diagonal(covariance)
     return {
-        words: float(factor * np.sqrt(variance[index].sum()))
+        words: factor * np.sqrt(variance[index].sum())
         for words, (index, _, factor) in groups_of(names).items()
     }
 

@@ -66,9 +66,10 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     from lrfcal_lib.simulate.rig import load_setup
 
     rig = calibration.rig(method)
-    placement = int(cloud.placement[0])
-    station = truth.stations.get(placement)
-    world = world_of(load_setup(truth.setup), None, T_room_platform=station)
+    placement = cloud.placement[0]
+    world = world_of(
+        load_setup(truth.setup), None, T_room_platform=truth.stations.get(placement)
+    )
     recorded = session.sweep(placement).pitch
     true_pitch = truth.pitch[placement]
     turn, shift = truth.gauge(rig, placement, recorded)
@@ -81,18 +82,17 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     hits = world.cast(origins, directions)
     depth = np.where(np.isfinite(hits.distance), length - hits.distance, np.nan)
     # else the rim of the spot read a surface beside the beam: the point is where it is
-    beside = ~(np.abs(depth) < BESIDE)
-    true = origins + np.where(beside, length, hits.distance)[:, None] * directions
+    true_length = np.where(np.abs(depth) < BESIDE, hits.distance, length)
+    true = origins + true_length[:, None] * directions
     blocked = np.zeros(len(points), bool)
     for view in views_of(session, rig, placement):
         painted = np.flatnonzero((cloud.image == view.number) & np.isfinite(depth))
         eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
         blocked[painted] = _hidden(world, eye, true[painted])
-    light = 255 * world.radiance(hits)
     return SceneErrors(
         depth=depth,
         normal=depth * hits.cosine,
-        color=_color_errors(cloud, light),
+        color=_color_errors(cloud, 255 * world.radiance(hits)),
         blocked=blocked,
     )
 
@@ -125,5 +125,5 @@ def as_stated(calibration: Calibration) -> Cloud:
     """
     session = calibration.prepared.session
     sweep = session.sweep(session.scene_placements[0])
-    T_head_lrf = calibration.platform.transform("stated")
-    return join(reconstruct(sweep, [], T_head_lrf, AS_RECORDED, lrf=session.lrf))
+    stated = calibration.platform.transform("stated")
+    return join(reconstruct(sweep, [], stated, AS_RECORDED, lrf=session.lrf))

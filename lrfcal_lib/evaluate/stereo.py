@@ -12,14 +12,6 @@ from lrfcal_lib.preprocess.intrinsics import K5, board_pose
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers import METHODS
 
-COLUMNS = (
-    "method",
-    "baseline_mm",
-    "baseline_error_mm",
-    "translation_error_mm",
-    "rotation_error_deg",
-)
-
 
 @dataclass(frozen=True)
 class StereoReference:
@@ -125,6 +117,21 @@ def stereo_check(solutions: dict, reference: StereoReference) -> pd.DataFrame:
         between = second * first.inv()
         turn, shift = transform_difference(between, reference.T_second_first)
         length = np.linalg.norm(between.translation)
-        millimetres = 1000 * np.array([length, length - baseline, shift])
-        rows.append((method, *millimetres, np.rad2deg(turn)))
-    return pd.DataFrame(rows, columns=COLUMNS)
+        row = (
+            method,
+            1000 * length,
+            1000 * (length - baseline),
+            1000 * shift,
+            np.rad2deg(turn),
+        )
+        rows.append(row)
+    return pd.DataFrame(
+        rows,
+        columns=[
+            "method",
+            "baseline_mm",
+            "baseline_error_mm",
+            "translation_error_mm",
+            "rotation_error_deg",
+        ],
+    )

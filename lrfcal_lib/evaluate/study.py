@@ -205,7 +205,7 @@ def resampled(values: np.ndarray, share: float, statistic=np.median) -> float:
     if len(values) == 0:
         return np.nan
     drawn = np.random.default_rng(0).choice(values, (RESAMPLES, len(values)))
-    return float(np.quantile(statistic(drawn, axis=1), share))
+    return np.quantile(statistic(drawn, axis=1), share)
 
 
 def study_to_file(

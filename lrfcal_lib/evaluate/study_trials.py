@@ -12,12 +12,11 @@ from lrfcal_lib.evaluate.monte_carlo import (
     bound,
     joint_truth,
 )
-from lrfcal_lib.fit.covariance import sigma_of
+from lrfcal_lib.fit.covariance import dyads, sigma_of
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     move_pose,
     polar_to_points,
-    pose_array,
     pose_step,
     pose_transform,
 )
@@ -88,37 +87,37 @@ def run_task(task: Task) -> list[dict]:
         with known sensor, and of the six numbers of the pose the mean squared error over the bound,
         and over the stated covariance, and how many lie in their 90 % intervals.
     """
+    scenario = task.scenario
     rng = np.random.default_rng([task.seed, task.n_poses, task.first])
-    shots = draw_shots(task.scenario, rng, task.trials, task.n_poses)
-    start = np.reshape(task.scenario.start, (2, 1, 1)) * rng.standard_normal(
-        (2, task.trials, 3)
-    )
+    shots = draw_shots(scenario, rng, task.trials, task.n_poses)
+    start = np.reshape(scenario.start, (2, 1, 1)) * rng.standard_normal((2, task.trials, 3))
     T0 = pose_transform(move_pose(shots["T_camera_lrf"], np.concatenate(start, axis=1)))
 
     sessions = []
     bounds = [{}] * task.trials
-    if not task.scenario.corner:
-        sessions = [joint_session(shots, task.scenario, t) for t in range(task.trials)]
-        sensor = task.scenario.sensor
-        bounds = [bounds_of_camera(obs, truth, sensor) for obs, truth in sessions]
+    if not scenario.corner:
+        sessions = [joint_session(shots, scenario, t) for t in range(task.trials)]
+        bounds = [bounds_of_camera(obs, truth, scenario.sensor) for obs, truth in sessions]
     rows = []
     for method in task.methods:
         if method in BATCHED:
-            estimates = _batch(method, shots, task.scenario, T0)
+            estimates = _batch(method, shots, scenario, T0)
         else:
             estimates = [
-                _single(method, shots, task.scenario, t, T0[t], sessions[t][0])
+                _single(method, shots, scenario, t, T0[t], sessions[t][0])
                 for t in range(task.trials)
             ]
         for t, estimate in enumerate(estimates):
-            row = {
-                "scenario": task.scenario.name,
-                **task.scenario.varied,
-                "n_poses": task.n_poses,
-                "trial": task.first + t,
-                "method": method,
-            }
-            rows.append(row | _judged(estimate, shots["T_camera_lrf"][t], bounds[t]))
+            rows.append(
+                {
+                    "scenario": scenario.name,
+                    **scenario.varied,
+                    "n_poses": task.n_poses,
+                    "trial": task.first + t,
+                    "method": method,
+                    **_judged(estimate, shots["T_camera_lrf"][t], bounds[t]),
+                }
+            )
     return rows
 
 
@@ -129,9 +128,8 @@ def _batch(method, shots, scenario, T0):
         solution = solve_camera(obs, **{"method": method, "T0": T0} | BATCHED[method])
     except DegenerateGeometry as error:
         return [str(error)] * len(T0)
-    poses = pose_array(solution.transform)
-    converged = np.broadcast_to(solution.converged, len(poses))
-    return list(zip(poses, solution.covariance, converged, strict=True))
+    converged = np.broadcast_to(solution.converged, len(T0))
+    return zip(solution.transform, solution.covariance, converged, strict=True)
 
 
 def _single(method, shots, scenario, trial, T0, obs):
@@ -139,22 +137,21 @@ def _single(method, shots, scenario, trial, T0, obs):
     try:
         if method == "joint":
             solution = solve_joint(obs, axis=False, sensor=scenario.sensor)
-            camera = solution.state.cameras[0]
-            return camera, solution.solution.covariance[:6, :6], True
+            return solution.transforms["camera"], solution.solution.covariance[:6, :6], True
         planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
         options = {"method": method, "T0": T0} | PLANES[method]
         found = solve_camera(planes, search=False, **options)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:
         return str(error)
-    return pose_array(found.transform), found.covariance[:6, :6], bool(found.converged)
+    return found.transform, found.covariance[:6, :6], found.converged
 
 
 def _judged(estimate, true, bounds):
     """The columns of one estimate."""
     if isinstance(estimate, str):
         return {"outcome": f"refused: {estimate}"}
-    pose, covariance, converged = estimate
-    error = pose_step(pose_transform(true), pose_transform(pose))
+    transform, covariance, converged = estimate
+    error = pose_step(pose_transform(true), transform)
     if not (np.isfinite(error).all() and np.isfinite(covariance).all()):
         return {"outcome": "not finite"}
     numbers = _sizes(error)
@@ -165,13 +162,12 @@ def _judged(estimate, true, bounds):
         outcome = "not converged"
     if not bounds:
         return {"outcome": outcome} | numbers
-    sigma_bound = sigma_of(bounds["bound"])
     return {
         "outcome": outcome,
         **numbers,
-        **_sizes(sigma_bound, "bound_"),
-        **_sizes(sigma_of(bounds["known"]), "known_"),
-        "over_bound": np.mean((error / sigma_bound) ** 2),
+        **_sizes(bounds["bound"], "bound_"),
+        **_sizes(bounds["known"], "known_"),
+        "over_bound": np.mean((error / bounds["bound"]) ** 2),
         "nees": error @ np.linalg.pinv(covariance) @ error / 6,
         "covered": np.mean(np.abs(error) < HALF_WIDTH * sigma_of(covariance)),
     }
@@ -199,8 +195,9 @@ def crossing_observations(
     if scenario.corner:
         lines = shots["lines"]
         points = shots["points"]
-        noise = scenario.sigma_range**2 * np.eye(3)
-        covariance = np.broadcast_to(noise, (*points.shape, 3))
+        covariance = np.broadcast_to(
+            scenario.sigma_range**2 * np.eye(3), (*points.shape, 3)
+        )
     else:
         lines = np.tile(shots["lines"], (1, 1, scenario.scans, 1))
         points, covariance = _ends_of_lines(shots["ranges"], scenario, last_beam)
@@ -249,14 +246,14 @@ def plane_observations(
     scenario : Scenario
     """
     rays = polar_to_points(1.0, obs.face_bearing)
-    thick = 1e-10 * np.eye(3)
+    along = scenario.sigma_range**2 * dyads(rays)
     return CameraObservations(
         scenario.model,
         pattern_points=scenario.board.pattern.points(),
         pattern_pixels=pixels,
         pattern_sigma_px=scenario.sigma_px,
         plane_points=obs.face_range[:, None] * rays,
-        plane_covariance=scenario.sigma_range**2 * rays[:, :, None] * rays[:, None] + thick,
+        plane_covariance=along + 1e-10 * np.eye(3),  # not quite without thickness
         plane_placement=obs.face_placement,
         board_poses=obs.view_pose,
         board_covariance=obs.view_covariance,
@@ -292,7 +289,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     )
     T_camera_lrf = pose_transform(shots["T_camera_lrf"][trial])
     boards = T_camera_lrf.inv() * pose_transform(shots["true_boards"][trial])
-    truth = joint_truth(
+    return obs, joint_truth(
         obs,
         RigidTransform.identity(),
         {"camera": T_camera_lrf},
@@ -300,7 +297,6 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
         bias=scenario.bias,
         softness=scenario.softness,
     )
-    return obs, truth
 
 
 def _readings(shots, scenario, trial):
@@ -318,15 +314,14 @@ def _readings(shots, scenario, trial):
     # beams about either end of every scan line
     near = np.arange(2 * REACH) - REACH
     window = np.clip(ends[..., None] + [[0], [1]] + near, 0, beams - 1)
-    read = np.take_along_axis(ranges[:, None], window, axis=2)
     at_end = np.repeat(at_ends, near.size)
     return {
-        "face_range": ranges[line, beam],
+        "face_range": ranges[hit],
         "face_bearing": bearings[beam],
         "face_sigma": np.full(len(beam), scenario.sigma_range),
         "face_placement": of_line[line],
         "beam_bearing": bearings[window.ravel()],
-        "beam_hit": np.isfinite(read.ravel()),
+        "beam_hit": np.take_along_axis(hit[:, None], window, axis=2).ravel(),
         "beam_edge": np.repeat(edges, near.size),
         "beam_radius": scenario.radius(at_end),
         "beam_step": scenario.step * at_end,
@@ -335,13 +330,14 @@ def _readings(shots, scenario, trial):
 
 
 def bounds_of_camera(obs, truth, sensor):
-    """Cramer-Rao bounds (6, 6) of the camera, the boards' poses unknown in either: 'bound' with
-    these properties of the sensor unknown, 'known' with none. NaN where the data leave it open.
+    """Cramer-Rao bounds (6,) of the camera's standard deviations, the boards' poses unknown in
+    either: 'bound' with these properties of the sensor unknown, 'known' with none. NaN where the
+    data leave it open.
     """
     bounds = {}
     for name, open_ in (("bound", sensor), ("known", ())):
         unknowns = Unknowns(1, len(obs.edges), axis=False, sensor=open_)
-        bounds[name] = np.full((6, 6), np.nan)
+        bounds[name] = np.full(6, np.nan)
         with suppress(DegenerateGeometry):
-            bounds[name] = bound(obs, truth, unknowns)[:6, :6]
+            bounds[name] = sigma_of(bound(obs, truth, unknowns))[:6]
     return bounds

@@ -1,10 +1,9 @@
 """Tables of what was recorded and calibrated, and the comparison of methods."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pandas as pd
 
@@ -12,16 +11,15 @@ from lrfcal_lib.calibrate.cameras import PlatformCalibration
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.covariance import sigma_of
-from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
 from lrfcal_lib.fit.result import AXIS_NAMES, Solution
 from lrfcal_lib.fit.robust import rms
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, CameraModel
+from lrfcal_lib.model.geometry import paper_parameters
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.outline_in_images import Outline
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.solvers import METHODS, left_out
+from lrfcal_lib.solvers import METHODS, left_out, left_out_residuals
 from lrfcal_lib.solvers.pitch import PitchErrors
 
 UNITS = {  # of parameters, and the factor from radians and metres
@@ -37,14 +35,6 @@ AXIS_ERRORS = {  # of an axis, and what they are called of a camera
     "axis_direction_pull": "rotation_pull",
     "axis_offset_pull": "translation_pull",
 }
-SCAN_COLUMNS = (
-    "placement",
-    "n_points",
-    "sigma_range_mm",
-    "jump_points",
-    "sides_along",
-    "sides_across",
-)
 
 
 def unit_of(parameter: str) -> tuple[str, float]:
@@ -63,48 +53,6 @@ def unit_of(parameter: str) -> tuple[str, float]:
     return next(unit for names, unit in UNITS.items() if re.fullmatch(names, parameter))
 
 
-def poses_under(obs: CameraObservations, model: CameraModel | None) -> np.ndarray:
-    """The board poses (p, 4, 4) that a camera sees under other intrinsics.
-
-    As they are where no pattern was seen.
-    """
-    if model is None or len(obs.pattern_points) == 0:
-        return obs.board_poses
-    moved = obs.board_poses.copy()
-    for pose, pixels in zip(moved, obs.pattern_pixels, strict=True):
-        good = np.isfinite(pixels).all(axis=1)
-        if good.sum() >= 6:
-            _, rotvec, shift = cv2.solvePnP(
-                obs.pattern_points[good],
-                pixels[good],
-                model.matrix,
-                model.distortion,
-                cv2.Rodrigues(pose[:3, :3])[0],
-                pose[:3, 3:].copy(),
-                useExtrinsicGuess=True,
-                flags=cv2.SOLVEPNP_ITERATIVE,
-            )
-            pose[:3] = np.hstack([cv2.Rodrigues(rotvec)[0], shift])
-    return moved
-
-
-def plane_residuals_of(obs: CameraObservations, solution: Solution) -> np.ndarray:
-    """Distances of face points from the board planes, under the solution's intrinsics.
-
-    Parameters
-    ----------
-    obs : CameraObservations
-        With n face points.
-    solution : Solution
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Metres.
-    """
-    return plane_residuals_m(obs, solution.transform, poses_under(obs, solution.model))
-
-
 def jointly_left_out(
     joint: JointCalibration, camera: str
 ) -> Iterator[tuple[CameraObservations, Solution]]:
@@ -113,33 +61,9 @@ def jointly_left_out(
     """
     ready = joint.prepared
     for placement, solution in joint.without.items():
-        scan = {placement: ready.scans[placement]}
-        alone = replace(joint, prepared=replace(ready, scans=scan))
-        judge = alone.seen_by(camera, solution).along().select([placement])
-        yield judge, solution.camera(camera)
-
-
-def left_out_residuals(
-    pairs: Iterable[tuple[CameraObservations, Solution]],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of every placement under a calibration from all the others.
-
-    Parameters
-    ----------
-    pairs : iterable of (CameraObservations, Solution)
-        Of :func:`left_out` or :func:`jointly_left_out`.
-
-    Returns
-    -------
-    edges, planes : ndarray, shapes (n,), (m,)
-        Of crossings, pixels, and of face points, metres.
-    """
-    edges = [np.zeros(0)]
-    planes = [np.zeros(0)]
-    for held, solution in pairs:
-        edges.append(edge_residuals_px(held, solution.transform, solution.model))
-        planes.append(plane_residuals_of(held, solution))
-    return np.concatenate(edges), np.concatenate(planes)
+        alone = replace(ready, scans={placement: ready.scans[placement]})
+        shown = replace(joint, prepared=alone).seen_by(camera, solution)
+        yield shown.along().select([placement]), solution.camera(camera)
 
 
 def method_comparison(
@@ -174,13 +98,11 @@ def method_comparison(
     """
     rows = []
     for (camera, name), solution in solutions.items():
-        held: Iterable = ()
         if name == "joint":
             obs = observations[camera, "joint"]
             judge = obs.along()
             used = obs.placements
-            if joint is not None:
-                held = jointly_left_out(joint, camera)
+            held = () if joint is None else jointly_left_out(joint, camera)
         else:
             method = METHODS[name]
             obs = observations[camera, method.variant]
@@ -195,7 +117,7 @@ def method_comparison(
             "camera": camera,
             "method": name,
             "n_placements": len(np.unique(used)),
-            "edge_median_px": float(np.median(np.abs(edge))) if len(edge) else np.nan,
+            "edge_median_px": np.median(np.abs(edge)) if len(edge) else np.nan,
             "edge_rms_px": rms(edge),
             "plane_rms_mm": 1000 * rms(plane),
             "left_out_edge_rms_px": rms(held_edge),
@@ -277,13 +199,14 @@ def platform_calibration_table(
     names = (*AXIS_NAMES, "phi_x", "phi_y", "phi_z", "t_y")
     parameters = {}
     for method, axis in platform.axes.items():
-        phi, ty = geometry.paper_parameters(axis.T_head_lrf)
+        phi, ty = paper_parameters(axis.T_head_lrf)
         sigma = np.append(axis.sigma, np.full(4, np.nan))
         parameters[method,] = names, [*axis.parameters, *phi, ty], sigma
     table = parameter_table(["method"], parameters)
     if truth is not None:
-        axes = platform.axes.items()
-        errors = {method: axis_errors(axis, truth) for method, axis in axes}
+        errors = {
+            method: axis_errors(axis, truth) for method, axis in platform.axes.items()
+        }
         for column, name in AXIS_ERRORS.items():
             table[column] = [errors[method][name] for method in table.method]
     return table
@@ -309,12 +232,12 @@ def sweeps_table(session: Session) -> pd.DataFrame:
         valid = np.isfinite(sweep.ranges)
         step = 0.0
         if len(pitch) > 1:
-            step = float(np.median(np.abs(np.diff(pitch))))
+            step = np.median(np.abs(np.diff(pitch)))
         rows.append(
             {
                 "placement": placement,
                 "n_scan_lines": len(pitch),
-                "n_returns": int(valid.sum()),
+                "n_returns": valid.sum(),
                 "invalid_percent": 100 * (1 - valid.mean()),
                 "pitch_from_deg": pitch[0],
                 "pitch_to_deg": pitch[-1],
@@ -344,11 +267,26 @@ def scans_table(prepared: Prepared) -> pd.DataFrame:
         swept = prepared.swept["half_step"].get(placement)
         along = {s.side for s in prepared.edges["half_step"][placement].sides}
         across = set() if swept is None else {s.side for s in swept.sides} - along
-        count = int(board.mask.sum())
-        sigma_mm = 1000 * board.sigma_range
-        jumps = int(board.n_jump_points)
-        rows.append((placement, count, sigma_mm, jumps, len(along), len(across)))
-    return pd.DataFrame(rows, columns=SCAN_COLUMNS)
+        row = (
+            placement,
+            board.mask.sum(),
+            1000 * board.sigma_range,
+            board.n_jump_points,
+            len(along),
+            len(across),
+        )
+        rows.append(row)
+    return pd.DataFrame(
+        rows,
+        columns=[
+            "placement",
+            "n_points",
+            "sigma_range_mm",
+            "jump_points",
+            "sides_along",
+            "sides_across",
+        ],
+    )
 
 
 def intrinsics_table(models: dict[str, CameraModel]) -> pd.DataFrame:
@@ -427,13 +365,14 @@ def pitch_errors_table(errors: PitchErrors) -> pd.DataFrame:
         Columns placement, direction, offset_deg, sigma_deg.
     """
     each = errors.models["sweep"]
-    columns = {
-        "placement": errors.placements,
-        "direction": errors.direction,
-        "offset_deg": np.rad2deg(each.offset),
-        "sigma_deg": np.rad2deg(each.offset_sigma),
-    }
-    return pd.DataFrame(columns)
+    return pd.DataFrame(
+        {
+            "placement": errors.placements,
+            "direction": errors.direction,
+            "offset_deg": np.rad2deg(each.offset),
+            "sigma_deg": np.rad2deg(each.offset_sigma),
+        }
+    )
 
 
 def axis_knowledge_table(platform: PlatformCalibration) -> pd.DataFrame:

@@ -9,9 +9,16 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.fit.covariance import sigma_turn_shift
 from lrfcal_lib.fit.result import Solution
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.geometry import (
+    axis_difference,
+    axis_of,
+    lrf_to_platform,
+    tilt,
+    transform_difference,
+)
 from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.session.files import naming, read_json
 from lrfcal_lib.session.read import Session
@@ -48,6 +55,17 @@ class Truth:
     stations: dict[int, RigidTransform]
     lengths: tuple[dict, ...]
     setup: str
+
+    def on_board(
+        self, T_platform_board: RigidTransform, p_lrf: np.ndarray, pitch: np.ndarray
+    ) -> np.ndarray:
+        """Points (n, 3) of scans at their true pitch (n,) on a board, or each on its own: x and y
+        in its plane, metres, and a 1, as lines take them.
+        """
+        p_platform = lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
+        flat = T_platform_board.inv().apply(p_platform)
+        flat[:, 2] = 1.0
+        return flat
 
     def gauge(
         self, rig: CalibratedRig, placement: int, recorded: np.ndarray
@@ -89,6 +107,10 @@ def read_truth(session: Session) -> Truth | None:
     if not os.path.lexists(file):
         return None
     data = read_json(file, session.path)
+
+    def by_placement(entries, key, read):
+        return {int(number): read(entry[key]) for number, entry in entries.items()}
+
     with naming(f"{file} (simulate the session again)"):
         return Truth(
             T_head_lrf=_pose(data["T_head_lrf"]),
@@ -97,18 +119,9 @@ def read_truth(session: Session) -> Truth | None:
                 for name, entry in data["cameras"].items()
             },
             board=board_from_json(data["board"]),
-            boards={
-                int(number): _pose(entry["T_platform_board"])
-                for number, entry in data["boards"].items()
-            },
-            pitch={
-                int(number): np.asarray(entry["pitch_rad"], float)
-                for number, entry in data["sweeps"].items()
-            },
-            stations={
-                int(number): _pose(entry["T_room_platform"])
-                for number, entry in data.get("stations", {}).items()
-            },
+            boards=by_placement(data["boards"], "T_platform_board", _pose),
+            pitch=by_placement(data["sweeps"], "pitch_rad", np.array),
+            stations=by_placement(data.get("stations", {}), "T_room_platform", _pose),
             lengths=tuple(data.get("lengths", ())),
             setup=data.get("setup", ""),
         )
@@ -134,7 +147,7 @@ def camera_errors(solution: Solution, truth: Truth, camera: str) -> dict[str, fl
     dict of str to float
         See :func:`beside_sigma`.
     """
-    apart = geometry.transform_difference(solution.transform, truth.cameras[camera])
+    apart = transform_difference(solution.transform, truth.cameras[camera])
     return beside_sigma(*apart, solution.trusted[:6, :6])
 
 
@@ -151,8 +164,7 @@ def axis_errors(axis: KnownAxis, truth: Truth) -> dict[str, float]:
     dict of str to float
         See :func:`beside_sigma`.
     """
-    estimated = geometry.axis_of(axis.T_head_lrf)
-    apart = geometry.axis_difference(estimated, geometry.axis_of(truth.T_head_lrf))
+    apart = axis_difference(axis_of(axis.T_head_lrf), axis_of(truth.T_head_lrf))
     return beside_sigma(*apart, axis.covariance)
 
 
@@ -171,7 +183,7 @@ def beside_sigma(turn: float, shift: float, covariance: np.ndarray) -> dict[str,
         By column: rotation_error_deg, rotation_sigma_deg, rotation_pull (error over sigma: 1 is
         what a standard deviation promises), and the same of the translation in millimetres.
     """
-    turn_sigma, shift_sigma = np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
+    turn_sigma, shift_sigma = sigma_turn_shift(covariance)
     return {
         "rotation_error_deg": np.rad2deg(turn),
         "rotation_sigma_deg": np.rad2deg(turn_sigma),
@@ -200,13 +212,11 @@ def on_true_edges(observations: PlatformObservations, truth: Truth) -> PlatformO
     pitch = observations.edge_pitch
     placement = observations.edge_placement
     boards = RigidTransform.concatenate([truth.boards[p] for p in placement])
-    p_platform = geometry.lrf_to_platform(observations.edge_points, pitch, truth.T_head_lrf)
-    flat = boards.inv().apply(p_platform)
-    flat[:, 2] = 1.0  # x and y in the plane of the board, as lines take them
+    flat = truth.on_board(boards, observations.edge_points, pitch)
     away = pd.DataFrame(np.abs(flat @ truth.board.lines().T))
     of_sides = away.groupby([placement, observations.edge_number]).transform("median")
     line = truth.board.lines()[of_sides.to_numpy().argmin(axis=1)]
     on_edge = flat - np.vecdot(flat, line)[:, None] * line
     on_edge[:, 2] = 0.0
-    p_head = geometry.tilt(boards.apply(on_edge), -pitch)
+    p_head = tilt(boards.apply(on_edge), -pitch)
     return replace(observations, edge_points=truth.T_head_lrf.inv().apply(p_head))

@@ -46,6 +46,21 @@ def sigma_of(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.linalg.diagonal(covariance))
 
 
+def sigma_turn_shift(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations of a turn and of a shift in all directions, radians and metres.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (2 k, 2 k)
+        Of k turns, then k shifts.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+    """
+    return np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
+
+
 def solve_each(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """The vectors x for which ``matrices @ x`` are some vectors.
 

@@ -11,13 +11,15 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtr, stdtrit
 
-from lrfcal_lib.judge.findings import Finding, Kind, by_sign, no_if
+from lrfcal_lib.fit.covariance import sigma_turn_shift
+from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
     axis_difference,
     axis_of,
     transform_difference,
 )
 from lrfcal_lib.model.observations import JointObservations
+from lrfcal_lib.session.faults import Fault
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.solvers.joint_model import SENSOR
 from lrfcal_lib.solvers.joint_solution import JointSolution
@@ -101,17 +103,17 @@ def _lag(obs, s):
 
 
 ALTERNATIVES = {
-    Kind.SQUARES: Alternative(
+    "squares": Alternative(
         _views,
         "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
         "measure a square over many of them",
     ),
-    Kind.OUTLINE: Alternative(
+    "outline": Alternative(
         _outline,
         "the board's outline is {size} +- {sigma} % {sign} than stated",
         "measure the board's edges",
     ),
-    Kind.RANGES: Alternative(
+    "ranges": Alternative(
         lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)),
         "all ranges are {size} +- {sigma} % {sign}",
         "measure a square and an edge of the board, check the unit of the ranges",
@@ -120,20 +122,20 @@ ALTERNATIVES = {
             "too long, or board and squares larger than stated",
         ),
     ),
-    Kind.BEARINGS: Alternative(
+    "bearings": Alternative(
         JointObservations.stretched,
         "bearings are {size} +- {sigma} % too {sign}",
         "check the angular step that session.json states",
         ("small", "large"),
     ),
-    Kind.SPOT: Alternative(
+    "spot": Alternative(
         lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)),
         "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
         "state spot_exit_m and spot_divergence_rad as its maker does",
         worth=0.2,
         reach=5.0,
     ),
-    Kind.LAG: Alternative(
+    "lag": Alternative(
         _lag,
         "the recorded pitch of scan lines is {size} +- {sigma} deg {sign} the sweep",
         "check the time stamps of pitch and scans, sweep slower or stop for every scan",
@@ -152,16 +154,16 @@ def alternatives_of(prepared):
     the pattern's first corner.
     """
     stated = dict(ALTERNATIVES)
-    squares = stated.pop(Kind.SQUARES)
+    squares = stated.pop("squares")
     pattern = prepared.board.pattern
     if pattern is not None:
         change = partial(_views, origin=pattern.origin)
         if prepared.session.board.corners is None:
-            del stated[Kind.OUTLINE]
+            del stated["outline"]
             change = _views_and_outline
-        stated[Kind.SQUARES] = replace(squares, change=change)
+        stated["squares"] = replace(squares, change=change)
     if prepared.session.lrf.spot_exit is None:
-        del stated[Kind.SPOT]
+        del stated["spot"]
     return stated
 
 
@@ -203,7 +205,7 @@ class Doubt:
 def weigh(
     solution: JointSolution,
     admitted_offset: float,
-    stated: Mapping[Kind, Alternative] = ALTERNATIVES,
+    stated: Mapping[str, Alternative] = ALTERNATIVES,
 ) -> list[Doubt]:
     """Every alternative tested by itself, all that was estimated free, the likeliest first.
 
@@ -279,7 +281,7 @@ def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
     asked = []
     for doubt in weigh(solution, admitted_offset, stated):
         harmful = doubt.exceeds(PREFERRED) and doubt.moved > MOVED
-        if doubt.kind == Kind.BEARINGS and not solution.step.any():
+        if doubt.kind == "bearings" and not solution.step.any():
             harmful = (
                 False  # a step that the sensor's disc divides is off for no small reason
             )
@@ -309,7 +311,7 @@ def step_words(solution: JointSolution) -> str:
     )
 
 
-def far_from_stated(joint) -> list[Finding]:
+def far_from_stated(joint) -> list[Fault]:
     """What lies far from where session.json puts it.
 
     A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of
@@ -325,22 +327,21 @@ def far_from_stated(joint) -> list[Finding]:
 
 
 def _far(words, angle):
-    """The Finding of what lies far from where it is stated, turned by an angle (radians)."""
-    return Finding(no_if(angle > np.pi / 2), Kind.FAR_FROM_STATED, words)
+    """The Fault of what lies far from where it is stated, turned by an angle (radians)."""
+    return Fault("far from stated", words, severe=angle > np.pi / 2)
 
 
-def far_axis(joint) -> Iterator[Finding]:
+def far_axis(joint) -> Iterator[Fault]:
     """The tilt axis, if it is far from where it is stated."""
     session = joint.prepared.session
     solution = joint.solution
     if session.T_head_lrf is None or not joint.settings["axis"]:
         return
     apart = axis_difference(solution.axis, axis_of(session.T_head_lrf))
-    variance = np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1)
-    sigma = np.hypot(session.platform_sigma, np.sqrt(variance))
-    if np.any(apart > FAR * sigma):
-        words = f"the tilt axis lies {_apart(*apart)} from where session.json states it: {CHECK}"
-        yield _far(words, apart[0])
+    known = sigma_turn_shift(solution.covariance("axis_", "offset_"))
+    if np.any(apart > FAR * np.hypot(session.platform_sigma, known)):
+        where = f"{_apart(*apart)} from where session.json states it"
+        yield _far(f"the tilt axis lies {where}: {CHECK}", apart[0])
 
 
 def guesses_of(session: Session) -> dict[str, RigidTransform]:
@@ -350,11 +351,14 @@ def guesses_of(session: Session) -> dict[str, RigidTransform]:
     ----------
     session
     """
-    cameras = session.cameras.items()
-    return {name: camera.guess for name, camera in cameras if camera.guess is not None}
+    return {
+        name: camera.guess
+        for name, camera in session.cameras.items()
+        if camera.guess is not None
+    }
 
 
-def far_cameras(joint) -> Iterator[Finding]:
+def far_cameras(joint) -> Iterator[Fault]:
     """Cameras that are far from where they are guessed, or stand where another one is guessed."""
     guesses = guesses_of(joint.prepared.session)
     for camera, transform in joint.solution.transforms.items():
@@ -363,17 +367,14 @@ def far_cameras(joint) -> Iterator[Finding]:
         turn, shift = transform_difference(transform, guesses[camera])
         nearest = nearest_guess(transform, guesses)
         if turn > FAR_TURN or shift > FAR_SHIFT:
-            words = (
-                f"camera '{camera}' stands {_apart(turn, shift)} from its guess in "
-                f"session.json: {CHECK}"
-            )
-            yield _far(words, turn)
+            where = f"{_apart(turn, shift)} from its guess in session.json"
+            yield _far(f"camera '{camera}' stands {where}: {CHECK}", turn)
         elif nearest != camera:
-            words = (
+            yield _far(
                 f"camera '{camera}' stands where camera '{nearest}' is said to stand: were the "
-                "folders exchanged?"
+                "folders exchanged?",
+                turn,
             )
-            yield _far(words, turn)
 
 
 def nearest_guess(transform, guesses):
@@ -392,16 +393,16 @@ def distance(a: RigidTransform, b: RigidTransform) -> float:
     return LEVER * turn + shift
 
 
-def exchanged_sides(solution) -> Iterator[Finding]:
+def exchanged_sides(solution) -> Iterator[Fault]:
     """Cameras that are called left and right, and stand the other way round."""
     for left, right in permutations(solution.transforms, 2):
         offset = _right_of_lrf(solution, left) - _right_of_lrf(solution, right)
         if "left" in left.lower() and "right" in right.lower() and offset > 0:
-            words = (
+            yield _far(
                 f"camera '{left}' is {1000 * offset:.0f} mm to the right of camera '{right}': were "
-                "the folders exchanged?"
+                "the folders exchanged?",
+                0.0,
             )
-            yield _far(words, 0.0)
 
 
 def _right_of_lrf(solution, camera):

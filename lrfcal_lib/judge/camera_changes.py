@@ -10,7 +10,7 @@ from scipy.special import chdtrc, fdtrc
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse, sigma_of
 from lrfcal_lib.judge.next_placement import board_middle, outline
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import POSE, DegenerateGeometry, apply_pose, pose_step
+from lrfcal_lib.model.geometry import POSE, DegenerateGeometry, apply_pose, carry, pose_step
 from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
@@ -193,8 +193,7 @@ def _chance_of_step(score, columns, row):
     repeated = np.concatenate([np.arange(shared), columns])
     kept = np.ones((count, len(repeated)))
     kept[:row, shared:] = 0.0
-    both = dyads(kept)
-    whole = both * score.information[:, repeated[:, None], repeated]
+    whole = dyads(kept) * score.information[:, repeated[:, None], repeated]
     parted = Score(whole, score.gradient[:, repeated] * kept)
 
     covariance, step, pulls = parted.solved()
@@ -213,8 +212,9 @@ def largest_motion(solution, step, model):
     poses = obs.view_pose[obs.view_camera == step.camera]
     corners = apply_pose(poses[:, :3], outline(solution))
     origin = solution.transforms[obs.cameras[step.camera]].translation
-    turned = Rotation.from_rotvec(step.change[:3]).apply(corners - origin)
-    motion = project(turned + origin + step.change[3:], model) - project(corners, model)
+    turn = Rotation.from_rotvec(step.change[:3])
+    moved = carry(turn, origin, origin + step.change[3:]).apply(corners)
+    motion = project(moved, model) - project(corners, model)
     return np.max(np.linalg.norm(motion, axis=-1))
 
 
@@ -248,11 +248,11 @@ def change_between(solution, first, later, camera, prepared):
     middles = obs.view_pose[views, :3] @ board_middle(solution)
     motion = project(middles, model) - project(change.inv().apply(middles), model)
     after = int(obs.placements[obs.view_placement[views].min()])
-    growths = [
+    zoom, zoom_sigma = max(
         growth_by_depth(solution, index),
         growth_of_focal_length(prepared, camera, after),
-    ]
-    zoom, zoom_sigma = max(growths, key=lambda growth: abs(growth[0]) / growth[1])
+        key=lambda growth: abs(growth[0]) / growth[1],
+    )
     return CameraChange(
         camera=camera,
         after=after,
@@ -301,6 +301,5 @@ def growth_by_depth(solution, camera):
     obs = solution.observations
     nearer = obs.view_pose.copy()
     nearer[obs.view_camera == camera, 2, 3] *= 1 + STEP
-    score = solution.score(replace(obs, view_pose=nearer), STEP)
-    covariance, step, _ = score.solved()
+    covariance, step, _ = solution.score(replace(obs, view_pose=nearer), STEP).solved()
     return step[-1], sigma_of(covariance)[-1]

@@ -5,21 +5,17 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.judge.findings import Finding, Kind, no_if
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.preprocess.prepared import Prepared
+from lrfcal_lib.session.faults import Fault
 
 LENS_PARTS = np.array([6, 4])  # columns and rows that an image is cut into
 LENS_CORNERS = 20  # corners of the chessboard in a part, at least
 LENS_MISS = 0.15  # pixels that corners of a part may miss by alike
 OFF_MIDDLE = 0.2  # of the image's size
-REMEDY = (
-    "state intrinsics of this image size, or take sharp images with the chessboard all over; "
-    "undistort the images of a wide lens first"
-)
 
 
-def lens_findings(prepared: Prepared) -> Iterator[Finding]:
+def lens_findings(prepared: Prepared) -> Iterator[Fault]:
     """Cameras whose lens its model does not fit, as the corners of the chessboard show it.
 
     Parameters
@@ -28,7 +24,7 @@ def lens_findings(prepared: Prepared) -> Iterator[Finding]:
 
     Yields
     ------
-    Finding
+    Fault
         One a camera.
     """
     for camera, model in prepared.models.items():
@@ -50,11 +46,13 @@ def lens_findings(prepared: Prepared) -> Iterator[Finding]:
                 "image's centre, as with intrinsics of another image size"
             )
         if faults:
-            words = (
+            yield Fault(
+                "lens",
                 f"the lens of camera '{camera}' is not that of its model ({'; '.join(faults)}): "
-                f"{REMEDY}"
+                "state intrinsics of this image size, or take sharp images with the chessboard all "
+                "over; undistort the images of a wide lens first",
+                severe=other_size,
             )
-            yield Finding(no_if(other_size), Kind.LENS, words)
 
 
 def common_miss(views, points, model):

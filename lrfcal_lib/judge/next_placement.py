@@ -6,15 +6,22 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.calibrate.rig import joint_rig
+from lrfcal_lib.calibrate.rig import LMS200, joint_rig
 from lrfcal_lib.calibrate.rig_uncertainty import selection
 from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.uncertainty import carried, chain_of
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
-from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
+from lrfcal_lib.model.geometry import (
+    AHEAD,
+    POSE_NAMES,
+    DegenerateGeometry,
+    apply_pose,
+    carry,
+    pose_array,
+    pose_transform,
+)
 from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.preprocess.surfaces import row_ends
 from lrfcal_lib.solvers.joint_solution import JointSolution
@@ -30,19 +37,13 @@ LEANS = {
 # where the middle of a board is put
 PLACES = (
     (1.0, 1.5, 2.0, 2.5, 3.0),  # metres from the LRF
-    (-20, -10, 0, 10, 20),  # degrees to the left
+    range(-20, 21, 10),  # degrees to the left
     (-12, 0, 12),  # degrees up
-    (
-        0,
-        60,
-        120,
-        180,
-        240,
-        300,
-    ),  # degrees in the board's plane, anticlockwise as the rig sees it
+    # degrees in the board's plane, anticlockwise as the rig sees it
+    range(0, 360, 60),
     range(len(LEANS)),
 )
-FIELD_OF_VIEW = (np.radians(40), np.radians(140))  # bearings, of the paper's LMS 200
+FIELD_OF_VIEW = LMS200.field_of_view  # the paper's
 LARGEST_PITCH = np.radians(30)  # of a head that is asked to look at a board
 # pitch angles that images are tried at
 LATTICE = np.linspace(-LARGEST_PITCH, LARGEST_PITCH, 41)
@@ -59,7 +60,7 @@ class Suggestion:
     Attributes
     ----------
     T_platform_board : RigidTransform
-    place : tuple of float
+    place : ndarray, shape (5,)
         Distance (metres), bearing, elevation and turn (degrees), number of `LEANS`.
     pitches : ndarray, shape (k,)
         Of the images, radians; empty where no camera is on the head.
@@ -69,7 +70,7 @@ class Suggestion:
     """
 
     T_platform_board: RigidTransform
-    place: tuple[float, ...]
+    place: np.ndarray
     pitches: np.ndarray
     gain: float
     median_gain: float
@@ -131,15 +132,15 @@ def suggest_placement(
     added = candidate_information(boards, pitches, solution, models)
     before = total_sigma(known, solution)
     after = total_sigma(known + added, solution)
-    best = int(np.argmin(after))
+    best = np.argmin(after)
     if "head" not in solution.observations.mounts:
         pitches = pitches[:, :0]
     return Suggestion(
-        T_platform_board=geometry.pose_transform(boards[best]),
-        place=tuple(grid[seen[best]].tolist()),
+        T_platform_board=pose_transform(boards[best]),
+        place=grid[seen[best]],
         pitches=pitches[best],
-        gain=float(1 - after[best] / before),
-        median_gain=float(1 - np.median(after) / before),
+        gain=1 - after[best] / before,
+        median_gain=1 - np.median(after) / before,
     )
 
 
@@ -193,8 +194,7 @@ def outline(solution: JointSolution) -> np.ndarray:
     ----------
     solution
     """
-    corners = solution.observations.corners
-    return np.insert(corners, 2, 0.0, axis=1)
+    return np.insert(solution.observations.corners, 2, 0.0, axis=1)
 
 
 def board_middle(solution: JointSolution) -> np.ndarray:
@@ -219,25 +219,25 @@ def board_poses(solution, grid):
     leans = np.array([*LEANS.values()])[lean[:, 0].astype(int)]
     tip = Rotation.from_euler("xy", leans, degrees=True)
     spin = Rotation.from_euler("z", turn, degrees=True)
-    rotation = solution.T_head_lrf.rotation * gaze * geometry.AHEAD * tip * spin
+    rotation = solution.T_head_lrf.rotation * gaze * AHEAD * tip * spin
     middle = solution.T_head_lrf.apply(distance * gaze.apply([0.0, 1.0, 0.0]))
-    centre = outline(solution).mean(axis=0)
-    return geometry.pose_array(geometry.carry(rotation, centre, middle))
+    T_platform_board = carry(rotation, outline(solution).mean(axis=0), middle)
+    return pose_array(T_platform_board)
 
 
 def pitches_of_images(boards, solution, models, field_of_view):
     """Which of some boards (n, 3, 4) LRF and cameras see wholly, (m,), and pitch angles (m, k) of
     images of them, radians.
     """
-    points = geometry.apply_pose(boards, outline(solution))
+    points = apply_pose(boards, outline(solution))
     bearing, pitch, _ = beams_to(points, solution.T_head_lrf)
     inside = (bearing > field_of_view[0]) & (bearing < field_of_view[1])
     inside &= np.abs(pitch) < LARGEST_PITCH
     visible = np.tile(inside.all(axis=1), (len(LATTICE), 1))
     for name in solution.transforms:
         border = MARGIN * models[name].size
-        poses = geometry.pose_array(solution.camera_at(name, LATTICE))
-        p_camera = geometry.apply_pose(poses[..., None, :, :], points)
+        poses = pose_array(solution.camera_at(name, LATTICE))
+        p_camera = apply_pose(poses[..., None, :, :], points)
         # far outside the image a lens model would fold back
         uv = pinhole(p_camera, models[name])
         inside = (uv > border) & (uv < models[name].size - border)
@@ -256,9 +256,7 @@ def candidate_information(boards, pitches, solution, models):
     share the errors of the one scan.
     """
     obs = solution.observations
-    beams = beams_to(
-        geometry.apply_pose(boards, points_of_face(solution)), solution.T_head_lrf
-    )
+    beams = beams_to(apply_pose(boards, points_of_face(solution)), solution.T_head_lrf)
     images = [pitches if mount == "head" else pitches[:, :1] for mount in obs.mounts]
     count = sum(at.shape[1] for at in images)
     by_scan = np.sqrt(count) * scan_sigma(solution, boards)[:, None]

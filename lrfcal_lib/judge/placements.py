@@ -45,8 +45,8 @@ def placements_table(
             "placement": placement,
             "used": any(placement in obs.all_placements for obs in by_camera.values()),
             "reason": prepared.left_out.get(placement) or "; ".join(notes),
-            "n_scan_lines": int(mask.any(axis=1).sum()),
-            "n_points": int(mask.sum()),
+            "n_scan_lines": mask.any(axis=1).sum(),
+            "n_points": mask.sum(),
         }
         for camera, obs in by_camera.items():
             crossed = obs.crossing_edge[obs.crossing_placement == placement]

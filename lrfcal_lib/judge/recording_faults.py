@@ -15,7 +15,7 @@ from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.judge.alternatives import distance, far_axis, guesses_of
 from lrfcal_lib.judge.camera_changes import camera_changes, explains
-from lrfcal_lib.judge.findings import NO, by_sign
+from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.geometry import (
     POSE,
@@ -167,7 +167,7 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
         return found + misread
     if joint is not None:
         changes = camera_changes(joint.solution, prepared, joint.settings)
-        found += faults_of_changes(changes, tuple(prepared.views))
+        found += faults_of_changes(changes, prepared.views)
         found += exchanged_placements(calibration)
     return found
 
@@ -183,7 +183,7 @@ def hopeless(joint):
     """
     if joint is None or not explains(joint.solution) or joint.solution.unobservable:
         return True
-    return any(far.answer == NO for far in far_axis(joint))
+    return any(far.severe for far in far_axis(joint))
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:
@@ -196,8 +196,10 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     session = prepared.session
     # also placements that images contradict are left out, of which scans show the board
     if 2 * len(prepared.problems_of(ProblemKind.NO_BOARD)) >= len(session.board_placements):
+        numbers = session.board_placements
+        looked_at = numbers[:: max(len(numbers) // LOOKED_AT, 1)][:LOOKED_AT]
         for reading in UNITS:
-            if shows_boards(session, reading):
+            if len(boards_in(session, looked_at, reading)) > len(looked_at) / 2:
                 return [Fault(reading.kind, reading.words, severe=True)]
         return []
 
@@ -207,13 +209,17 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     mirrored = []
     for camera, miss in board_misses(prepared, MIRRORED).items():
         if camera in stated and _fits({camera: miss}, {camera: stated[camera]}):
-            words = (
-                f"the images of camera '{camera}' are mirrored: the mirror images of its boards "
-                f"lie {1000 * miss.size:.0f} mm from the scans, the images as recorded "
-                f"{1000 * stated[camera].size:.0f} mm; turn mirroring off in the camera, or flip "
-                "the images"
+            mirrored.append(
+                Fault(
+                    "sense",
+                    f"the images of camera '{camera}' are mirrored: the mirror images of its "
+                    f"boards lie {1000 * miss.size:.0f} mm from the scans, the images as recorded "
+                    f"{1000 * stated[camera].size:.0f} mm; turn mirroring off in the camera, or "
+                    "flip the images",
+                    severe=True,
+                    camera=camera,
+                )
             )
-            mirrored.append(Fault("sense", words, severe=True, camera=camera))
     if 0 < len(mirrored) < len(stated):
         return mirrored
 
@@ -272,16 +278,10 @@ def board_misses(prepared, reading):
             residuals = pd.Series(np.abs(plane_residuals_m(obs, transform)))
             each = residuals.groupby(obs.plane_placement).median()
             square = each.median() ** 2 - (HALF * reading.length * noise) ** 2
-            size = np.sqrt(max(square, LEAST_MISS**2))
-            misses[camera] = BoardMiss(size, transform, planes=len(each))
+            misses[camera] = BoardMiss(
+                np.sqrt(max(square, LEAST_MISS**2)), transform, planes=len(each)
+            )
     return misses
-
-
-def shows_boards(session, reading):
-    """Whether boards are found in most of some sweeps, read in some way."""
-    numbers = session.board_placements
-    looked_at = numbers[:: max(len(numbers) // LOOKED_AT, 1)][:LOOKED_AT]
-    return len(boards_in(session, looked_at, reading)) > len(looked_at) / 2
 
 
 def boards_in(session, placements, reading):
@@ -309,11 +309,12 @@ def _misread(prepared, fitting, stated):
     # a mirrored cloud fits mirrored images: only where the cameras are said to be can tell
     likely.sort(key=lambda r: (_far_from_guess(prepared, fitting[r]), worst[r]))
     causes = "; or ".join(reading.words for reading in likely)
-    words = (
+    return Fault(
+        likely[0].kind,
         f"{causes}; once this is corrected, scans lie {1000 * worst[likely[0]]:.0f} mm "
-        f"from the boards in the images, as recorded {1000 * _worst(stated):.0f} mm"
+        f"from the boards in the images, as recorded {1000 * _worst(stated):.0f} mm",
+        severe=True,
     )
-    return Fault(likely[0].kind, words, severe=True)
 
 
 def _far_from_guess(prepared, found):
@@ -330,42 +331,30 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
     steps = [change.after for change in changes]
     for change in changes:
         kind = "camera moved"
-        words = _moved(change)
+        words = (
+            f"camera '{change.camera}' was moved before placement {change.after}: turned by "
+            f"{np.degrees(change.turn):.2f} deg and shifted by {1000 * change.shift:.1f} mm, which "
+            f"moves the board by {change.motion_px:.1f} px in its images"
+        )
         if change.zoomed:
             kind = "camera zoomed"
-            words = _zoomed(change)
+            size = f"{100 * abs(change.zoom):.2f} +- {100 * change.zoom_sigma:.2f} %"
+            words = (
+                f"the images of camera '{change.camera}' are {size} "
+                f"{by_sign(change.zoom, 'larger', 'smaller')} from placement {change.after} on, "
+                f"{change.corner_px:.1f} px at their corners: zoom, focus or image size were "
+                "changed"
+            )
         elif steps.count(change.after) == len(cameras):
             words += " (or the range finder was: all cameras changed at once)"
-        remedy = (
-            "fix what is loose and record anew, or make two sessions: one of the placements before "
-            f"{change.after}, one of the others"
-        )
         yield Fault(
             kind,
-            f"{words}; {remedy}",
+            f"{words}; fix what is loose and record anew, or make two sessions: one of the "
+            f"placements before {change.after}, one of the others",
             severe=change.size_px > SEVERE_PX,
             camera=change.camera,
             placements=(change.after,),
         )
-
-
-def _zoomed(change):
-    """A CameraChange of the image scale, in words."""
-    size = f"{100 * abs(change.zoom):.2f} +- {100 * change.zoom_sigma:.2f} %"
-    way = by_sign(change.zoom, "larger", "smaller")
-    return (
-        f"the images of camera '{change.camera}' are {size} {way} from placement {change.after} "
-        f"on, {change.corner_px:.1f} px at their corners: zoom, focus or image size were changed"
-    )
-
-
-def _moved(change):
-    """A CameraChange of the pose, in words."""
-    return (
-        f"camera '{change.camera}' was moved before placement {change.after}: turned by "
-        f"{np.degrees(change.turn):.2f} deg and shifted by {1000 * change.shift:.1f} mm, which "
-        f"moves the board by {change.motion_px:.1f} px in its images"
-    )
 
 
 def exchanged_placements(calibration) -> Iterator[Fault]:
@@ -381,12 +370,13 @@ def exchanged_placements(calibration) -> Iterator[Fault]:
         if _same_board(calibration, scans[first], second) and _same_board(
             calibration, scans[second], first
         ):
-            words = (
+            yield Fault(
+                "exchanged",
                 f"the images of placement {first} fit the scans of placement {second}, and those "
                 f"of {second} the scans of {first}: their numbers are exchanged; exchange them "
-                "back in images.csv"
+                "back in images.csv",
+                placements=(first, second),
             )
-            yield Fault("exchanged", words, placements=(first, second))
 
 
 def _same_board(calibration, scan, placement):
@@ -400,8 +390,8 @@ def _same_board(calibration, scan, placement):
     for camera in solution.transforms:
         view = prepared.posed(camera).get(placement)
         if view is not None:
-            T_camera_platform = solution.camera_at(camera, view.pitch)
-            on_board = (view.T_camera_board.inv() * T_camera_platform).apply(p_platform)
+            p_camera = solution.camera_at(camera, view.pitch).apply(p_platform)
+            on_board = view.T_camera_board.inv().apply(p_camera)
             beside = (on_board.mean(axis=0) - middle)[:2]
             away = np.median(np.abs(on_board[:, 2]))
             agree.append(away < GOOD and np.linalg.norm(beside) < BESIDE)

@@ -12,13 +12,14 @@ from lrfcal_lib.judge.alternatives import (
     doubtful,
     far_from_stated,
 )
-from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, by_sign, no_if
+from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.weaknesses import ABSURD
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.session.faults import Fault
 from lrfcal_lib.solvers.joint import solve_joint
 
 CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
-SIZES = (Kind.SQUARES, Kind.RANGES)  # an error of them is one of all distances
+SIZES = ("squares", "ranges")  # an error of them is one of all distances
 LARGE_SIZE = 0.02  # error of a size that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
 RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
@@ -28,13 +29,13 @@ NOT_WEIGHED = (
 # statements that are falsified on purpose, as relative errors of alternatives
 LIES = {
     "as recorded": {},
-    "squares 5 % too small": {Kind.SQUARES: -0.05},
-    "all sizes 5 % too large": {Kind.OUTLINE: 0.05, Kind.SQUARES: 0.05},
-    "angular step 3 % too large": {Kind.BEARINGS: 0.03},
+    "squares 5 % too small": {"squares": -0.05},
+    "all sizes 5 % too large": {"outline": 0.05, "squares": 0.05},
+    "angular step 3 % too large": {"bearings": 0.03},
 }
 
 
-def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
+def contradicts_stated(joint: JointCalibration) -> tuple[list[Fault], float]:
     """What the data contradict of what session.json states.
 
     What :mod:`lrfcal_lib.judge.alternatives` finds, a range offset that no maker admits, the
@@ -46,29 +47,30 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
 
     Returns
     -------
-    list of Finding
+    list of Fault
     float
         By how much all ranges are off if a size is wrong, metres.
     """
     solution = joint.solution
     if not solution.converged:
-        words = f"{NOT_WEIGHED}: the estimate has not converged"
-        return [Finding(NO, Kind.NOT_WEIGHED, words)], 0.0
+        why = "the estimate has not converged"
+        return [Fault("not weighed", f"{NOT_WEIGHED}: {why}", severe=True)], 0.0
     findings = []
-    stated = alternatives_of(joint.prepared)
-    admitted = joint.prepared.session.lrf.admitted_offset
-    # a spot that is no evenly lit disc looks like one of another size, which does no harm
-    doubts = doubtful(solution, admitted, stated, faint=(Kind.SPOT,))
+    doubts = doubtful(
+        solution,
+        joint.prepared.session.lrf.admitted_offset,
+        alternatives_of(joint.prepared),
+        # a spot that is no evenly lit disc looks like one of another size, which does no harm
+        faint=("spot",),
+    )
     level = solution.noise["face_scale"]
     if doubts:
         findings.append(finding_of(doubts))
     elif level > ABSURD:
         why = f"no single error explains why ranges fit {level:.0f} times worse than stated"
-        findings.append(Finding(NO, Kind.NOT_WEIGHED, f"{NOT_WEIGHED}: {why}"))
+        findings.append(Fault("not weighed", f"{NOT_WEIGHED}: {why}", severe=True))
     sizes = [abs(doubt.value) for doubt in doubts if doubt.kind in SIZES]
-    range_doubt = max(sizes, default=0.0) * float(
-        np.median(solution.observations.face_range)
-    )
+    range_doubt = max(sizes, default=0.0) * np.median(solution.observations.face_range)
     beyond = list(beyond_admitted(joint))
     if beyond:
         range_doubt = max(range_doubt, abs(solution.sensor["range_offset"]))
@@ -78,55 +80,56 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
 
 
 def finding_of(doubts):
-    """The Finding of statements (Doubts, the likeliest first) that explain the data alike."""
+    """The Fault of statements (Doubts, the likeliest first) that explain the data alike."""
     best = doubts[0]
     certain = best.ratio > (2 * CONTRADICTS) ** 2
     large = best.kind in SIZES and abs(best.value) > LARGE_SIZE
     causes = "; or ".join(doubt.words for doubt in doubts)
-    words = f"statements contradict the data: {causes}"
-    return Finding(no_if(certain and large), best.kind, words)
+    return Fault(
+        best.kind, f"statements contradict the data: {causes}", severe=certain and large
+    )
 
 
-def beyond_admitted(joint) -> Iterator[Finding]:
+def beyond_admitted(joint) -> Iterator[Fault]:
     """A range offset that the maker of the range finder does not admit."""
     offset = joint.solution.sensor["range_offset"]
     admitted = joint.prepared.session.lrf.admitted_offset
     margin = CONTRADICTS * joint.solution.sigma.get("range_offset", 0.0)
     if abs(offset) > admitted + margin:
-        words = (
+        yield Fault(
+            "range offset",
             f"the range offset of {1000 * offset:.0f} mm exceeds the {1000 * admitted:.0f} mm that "
             "the maker of the range finder admits (session.json may state systematic_error_m): "
             "check the stated size of the board and of the squares of its chessboard (the expected "
             "errors count this as an error of every range), the unit of the ranges and the angular "
-            "step"
+            "step",
+            severe=abs(offset) > 2 * admitted + margin,
         )
-        severe = abs(offset) > 2 * admitted + margin
-        yield Finding(no_if(severe), Kind.RANGE_OFFSET, words)
 
 
-def beyond_spot(solution) -> Iterator[Finding]:
+def beyond_spot(solution) -> Iterator[Fault]:
     """Readings that change where the stated spot no longer touches the board."""
     bias = solution.edge_bias
     if abs(bias) > RIM:
-        words = (
+        yield Fault(
+            "spot",
             f"readings change at the rim of the stated spot ({100 * bias:.0f} % of its radius "
             "outside the edges): state spot_exit_m and spot_divergence_rad as they are, or measure "
-            "the board's edges"
+            "the board's edges",
         )
-        yield Finding(CARE, Kind.SPOT, words)
 
 
-def pitch_turns_otherwise(solution) -> Iterator[Finding]:
+def pitch_turns_otherwise(solution) -> Iterator[Fault]:
     """A platform that turns more or less than its recorded pitch says."""
     scale = solution.sensor["pitch_scale"]
     sigma = solution.sigma.get("pitch_scale", 0.0)
     if abs(scale) > max(CONTRADICTS * sigma, LARGE_SCALE):
-        words = (
+        yield Fault(
+            "pitch scale",
             f"the platform turns {100 * abs(scale):.1f} +- {100 * sigma:.1f} % "
             f"{by_sign(scale, 'more', 'less')} than its recorded pitch says: check its gear or "
-            "encoder (the estimate has corrected this)"
+            "encoder (the estimate has corrected this)",
         )
-        yield Finding(CARE, Kind.PITCH_SCALE, words)
 
 
 def falsified(joint: JointCalibration) -> pd.DataFrame:

@@ -66,8 +66,7 @@ class Chain:
         places have taken it up.
         """
         taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
-        unsure = np.diag(doubt**2 * taken_up)
-        return replace(self, covariances=self.covariances + unsure)
+        return replace(self, covariances=self.covariances + np.diag(doubt**2 * taken_up))
 
 
 def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
@@ -88,7 +87,7 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
     links = selection(known.names, camera)
     both = np.stack([known.covariance, known.trusted])
     # zero for what is known; what has no bound is among `unseen`
-    bounded = np.where(np.isfinite(both), both, 0.0)
+    bounded = np.nan_to_num(both, nan=0.0, posinf=0.0, neginf=0.0)
     covariances = links @ bounded @ links.T
 
     on_head = True
@@ -98,8 +97,9 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
         on_head = rig.cameras[camera].mount == "head"
         pose = pose_array(rig.cameras[camera].T_camera)
         unseen = known.unseen_of_cameras[camera]
-    head = pose_array(rig.T_head_lrf)
-    return Chain(head, pose, on_head, covariances, unseen, known.sweep_sigma)
+    return Chain(
+        pose_array(rig.T_head_lrf), pose, on_head, covariances, unseen, known.sweep_sigma
+    )
 
 
 def projection_sigma(
@@ -154,8 +154,7 @@ def projection_sigma(
 
 def pixel_grid(model: CameraModel, grid: tuple[int, int]) -> np.ndarray:
     """Middles of the cells that columns and rows cut an image into, (rows, columns, 2), pixels."""
-    cells = np.stack(np.meshgrid(*map(np.arange, grid)), axis=-1)
-    return (cells + 0.5) * model.size / grid - 0.5
+    return (np.indices(grid).T + 0.5) * model.size / grid - 0.5
 
 
 def point_sigma(
@@ -164,7 +163,7 @@ def point_sigma(
     pitches: np.ndarray,
     distances: ArrayLike,
     *,
-    reference: float = 0.0,
+    reference: float,
 ) -> np.ndarray:
     """How far off a reconstructed point may be, over the field of view.
 
@@ -196,7 +195,7 @@ def point_sigma(
 def root_mean_square(sigma: np.ndarray) -> float:
     """Of what scans reach (no NaN); inf where they reach nothing."""
     reached = sigma[~np.isnan(sigma)]
-    return float(np.sqrt(np.mean(reached**2))) if reached.size else np.inf
+    return np.sqrt(np.mean(reached**2)) if reached.size else np.inf
 
 
 def range_noise(rig: CalibratedRig) -> float:
@@ -249,9 +248,8 @@ def carried(
     bearing, pitch, distance = np.broadcast_arrays(bearing, pitch, distance)
     R = chain.head[:, :3]
     t = chain.head[:, 3]
-    back = float(
-        chain.on_head
-    )  # 1: points go back through the axis to the head at the image
+    # where it is 1, points go back through the axis to the head at the image
+    back = chain.on_head
     turn = pitch - back * image_pitch
     beam = polar_to_points(1.0, bearing) @ R.T
     p_head = distance[..., None] * beam
@@ -295,7 +293,7 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
     """
     each = np.einsum("...ik,nkl,...il->n...", jacobian, chain.covariances, jacobian)
     variance = each.max(axis=0, initial=0.0)
-    moved = np.einsum("...ik,mk->...mi", jacobian, chain.unseen)
+    moved = chain.unseen @ jacobian.mT
     size = np.linalg.norm(jacobian, axis=(-2, -1))[..., None]
     least = SEEN * size * np.linalg.norm(chain.unseen, axis=-1)
     matters = np.linalg.norm(moved, axis=-1) > least

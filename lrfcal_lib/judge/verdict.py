@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.judge.alternatives import step_words
-from lrfcal_lib.judge.findings import CARE, NO, YES, Answer, Finding, Kind, brief, no_if
+from lrfcal_lib.judge.findings import ANSWERS, CARE, NO, YES, Answer, brief
 from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_placement
 from lrfcal_lib.judge.recording_faults import explained, recording_faults
@@ -34,7 +34,7 @@ from lrfcal_lib.judge.weaknesses import (
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry, transform_difference
 from lrfcal_lib.model.problem import ProblemKind
-from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
+from lrfcal_lib.session.faults import Fault
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
 FIRST = {
@@ -108,8 +108,7 @@ class Verdict:
 
     Attributes
     ----------
-    answer : {'yes', 'with care', 'no'}
-    reasons : tuple of Finding
+    reasons : tuple of Fault
         The worst first; empty for 'yes'.
     errors : dict of float to ExpectedError
         By distance in metres, errors of the model included as far as they scatter over placements;
@@ -123,19 +122,27 @@ class Verdict:
         What is handed over, and what became of all placements.
     """
 
-    answer: Answer
-    reasons: tuple[Finding, ...]
+    reasons: tuple[Fault, ...]
     errors: dict[float, ExpectedError]
     range_noise_mm: float
     suggestion: Suggestion | None = None
     no_suggestion: str = ""
     notes: tuple[str, ...] = ()
 
+    @property
+    def answer(self) -> Answer:
+        """Yes, with care, or no, by the worst of the reasons."""
+        return ANSWERS[self.reasons[0].severe] if self.reasons else YES
+
     def record(self) -> dict:
         """Answer, reasons and expected errors, ready for JSON."""
+        reasons = [
+            {"answer": ANSWERS[reason.severe], "kind": reason.kind, "words": reason.words}
+            for reason in self.reasons
+        ]
         return {
             "answer": self.answer,
-            "reasons": [vars(reason) for reason in self.reasons],
+            "reasons": reasons,
             "notes": self.notes,
             "expected_error_at_m": {
                 f"{d:g}": error.record() for d, error in self.errors.items()
@@ -157,16 +164,17 @@ class Verdict:
                 "errors of the model as far as placements disagree about them. Each range has "
                 f"{brief(self.range_noise_mm)} mm of noise of its own."
             )
-        sentences.append(
-            self.suggestion.sentence() if self.suggestion else self.no_suggestion
-        )
-        return [sentence for sentence in sentences if sentence]
+        return [*filter(None, [*sentences, self.advice])]
 
-    def because(self, findings: list[Finding]) -> "Verdict":
+    @property
+    def advice(self) -> str:
+        """What to record next, or why nothing is suggested."""
+        return self.suggestion.sentence() if self.suggestion else self.no_suggestion
+
+    def because(self, findings: list[Fault]) -> "Verdict":
         """The verdict with more findings, which stand before its own; the worst first."""
-        reasons = sorted((*findings, *self.reasons), key=lambda reason: reason.answer != NO)
-        answer = reasons[0].answer if reasons else YES
-        return replace(self, answer=answer, reasons=tuple(reasons))
+        reasons = sorted((*findings, *self.reasons), key=lambda reason: not reason.severe)
+        return replace(self, reasons=tuple(reasons))
 
 
 def judge(
@@ -191,8 +199,7 @@ def judge(
     prepared = calibration.prepared
     joint = calibration.joint
     faults = recording_faults(calibration)
-    findings = [Finding(no_if(fault.severe), fault.kind, fault.words) for fault in faults]
-    findings += lens_findings(prepared)
+    findings = [*faults, *lens_findings(prepared)]
     doubt = 0.0
     # also where the joint estimate is not handed over: a wrong size may be why
     if joint is not None and not explained(faults):
@@ -215,18 +222,17 @@ def judge(
     many_lost, note = left_out(calibration, method)
     findings += [*blind_cameras(prepared), *many_lost]
     if many_lost:  # which says what was excluded, too
-        kept = [reason for reason in judged.reasons if reason.kind != Kind.EXCLUDED]
+        kept = [reason for reason in judged.reasons if reason.kind != "excluded"]
         judged = replace(judged, reasons=tuple(kept))
     findings += sides_elsewhere(prepared)
-    notes = _notes(calibration, method, note)
-    return replace(judged.because(findings), notes=notes)
+    return replace(judged.because(findings), notes=_notes(calibration, method, note))
 
 
 def _notes(calibration, method, lost):
     """What is handed over, where the cameras are, what was left out, and what is not known."""
-    axis = calibration.platform.axis_with(method)
     notes = [
-        f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.",
+        f"Handed over: the cameras of the method '{method}' and the axis "
+        f"'{calibration.platform.axis_with(method)}'.",
         lost,
     ]
     if method == "joint" and calibration.joint is not None:
@@ -261,8 +267,8 @@ def verdict(
     """
     obs = solution.observations
     pitch = np.concatenate([obs.face_pitch, obs.beam_pitch])
-    judged = _expected(joint_rig(solution, models), pitch, doubt)
-    judged = judged.because(diagnose(solution))
+    rig = joint_rig(solution, models)
+    judged = _expected(rig, pitch, doubt).because(diagnose(solution))
     if not suggest:
         return judged
     try:
@@ -301,13 +307,16 @@ def _expected(rig, pitch, doubt):
         pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
         errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud[i])), pixels)
 
-    judged = Verdict(YES, (), errors, range_noise_mm=1000 * range_noise(rig))
+    judged = Verdict((), errors, range_noise_mm=1000 * range_noise(rig))
     large = errors[WORKING].words(POOR_MM, POOR_PX)
     if not large:
         return judged
-    severe = bool(errors[WORKING].words(BAD_MM, BAD_PX))
-    words = f"the expected error at {WORKING:g} m is {large}"
-    return judged.because([Finding(no_if(severe), Kind.ERROR, words)])
+    error = Fault(
+        "error",
+        f"the expected error at {WORKING:g} m is {large}",
+        severe=bool(errors[WORKING].words(BAD_MM, BAD_PX)),
+    )
+    return judged.because([error])
 
 
 def _refused(calibration, findings):
@@ -325,13 +334,13 @@ def _refused(calibration, findings):
         why = lost[0].words if lost else "the session has no camera"
         if calibration.platform.solutions:
             why += "; the tilt axis is known from the edges in the sweeps"
-    refused = Finding(NO, Kind.HANDED_OVER, f"nothing can be handed over: {why}")
+    refused = Fault("handed over", f"nothing can be handed over: {why}", severe=True)
     notes = ()
     if prepared.problems:
-        lost = [str(problem) for problem in prepared.problems]
-        notes = (f"Left out: {len(lost)} ({'; '.join(lost)}).",)
-    judged = Verdict(NO, (), {}, np.nan, no_suggestion=RECORD, notes=notes)
-    return judged.because([*findings, refused])
+        named = "; ".join(map(str, prepared.problems))
+        notes = (f"Left out: {len(prepared.problems)} ({named}).",)
+    nothing = Verdict((), {}, np.nan, no_suggestion=RECORD, notes=notes)
+    return nothing.because([*findings, refused])
 
 
 def _scatter_note(placements):
@@ -349,11 +358,12 @@ def _scatter_note(placements):
 def _without_joint(calibration, method, doubt):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
     pitch = [scan.sweep.pitch for scan in calibration.prepared.scans.values()]
-    judged = _expected(calibration.rig(method), np.concatenate(pitch), doubt)
-    return judged.because([_not_joint(calibration), *_weak_cameras(calibration, method)])
+    return _expected(calibration.rig(method), np.concatenate(pitch), doubt).because(
+        [_not_joint(calibration), *_weak_cameras(calibration, method)]
+    )
 
 
-def _weak_cameras(calibration, method) -> Iterator[Finding]:
+def _weak_cameras(calibration, method) -> Iterator[Fault]:
     """What is weak about cameras that were calibrated one by one."""
     prepared = calibration.prepared
     solved = calibration.cameras(method)
@@ -362,38 +372,38 @@ def _weak_cameras(calibration, method) -> Iterator[Finding]:
         for camera in solved
     )
     if fewest < FEW:
-        words = f"only {fewest} placements, {FEW} or more are needed"
-        yield Finding(NO, Kind.PLACEMENTS, words)
+        yield Fault(
+            "placements",
+            f"only {fewest} placements, {FEW} or more are needed",
+            severe=True,
+        )
     for camera in prepared.views:
         if camera not in solved:
             problem = calibration.problem(method, camera)
             why = problem.words if problem else "no result"
-            words = f"camera '{camera}' is not handed over ({why})"
-            yield Finding(CARE, Kind.CAMERAS, words)
+            yield Fault("cameras", f"camera '{camera}' is not handed over ({why})")
     for camera, solution in solved.items():
         if solution.rival is not None:
             turn, shift = transform_difference(solution.transform, solution.rival)
-            words = (
+            yield Fault(
+                "second minimum",
                 f"a second minimum explains the data nearly as well: camera '{camera}' "
                 f"{np.degrees(turn):.0f} deg and {1000 * shift:.0f} mm from where it is handed "
-                "over; record more placements that lean other ways"
+                "over; record more placements that lean other ways",
+                severe=True,
             )
-            yield Finding(NO, Kind.SECOND_MINIMUM, words)
-    sweeps = any(np.ptp(scan.sweep.pitch) > LEAST_SWEEP for scan in prepared.scans.values())
     unknown = calibration.platform.problem("combined")
-    if unknown and sweeps:
-        yield Finding(NO, Kind.FAR_FROM_STATED, unknown.words)
+    if unknown and prepared.swept["half_step"]:
+        yield Fault("far from stated", unknown.words, severe=True)
 
 
 def _not_joint(calibration):
-    """The Finding that another method than the joint estimate is handed over, and why."""
+    """The Fault that another method than the joint estimate is handed over, and why."""
     joint = calibration.joint
     at_once = calibration.problem("joint")
     bad = [at_once.words] if at_once else []
     if joint is not None:
-        findings = diagnose(joint.solution)
-        bad = [finding.words for finding in findings if finding.answer == NO]
+        bad = [fault.words for fault in diagnose(joint.solution) if fault.severe]
     why = "; ".join(bad) or "another method was asked for"
     severe = joint is None or not joint.solution.converged
-    words = f"the joint estimate is not handed over ({why})"
-    return Finding(no_if(severe), Kind.HANDED_OVER, words)
+    return Fault("handed over", f"the joint estimate is not handed over ({why})", severe)

@@ -5,14 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from lrfcal_lib.calibrate.pipeline import Calibration, largest_range
-from lrfcal_lib.fit.covariance import solve_each
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.fit.robust import rms
-from lrfcal_lib.judge.findings import CARE, NO, Finding, Kind, no_if
 from lrfcal_lib.judge.next_placement import group_sigma, sights
 from lrfcal_lib.judge.placements import placements_table
-from lrfcal_lib.model.problem import LEAVES_OUT, Problem
+from lrfcal_lib.model.problem import LEAVES_OUT
 from lrfcal_lib.preprocess.prepared import Prepared
+from lrfcal_lib.session.faults import Fault
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
 # placements: too few, and few
@@ -34,7 +34,7 @@ UNSEEN = 0.2  # share of the placements that a camera may miss without a warning
 MOST = 0.5  # share of the scans across an edge: where so many lie elsewhere, its statement does
 
 
-def diagnose(solution: JointSolution) -> list[Finding]:
+def diagnose(solution: JointSolution) -> list[Fault]:
     """Weaknesses of a joint estimate and of the recording behind it.
 
     Parameters
@@ -43,7 +43,7 @@ def diagnose(solution: JointSolution) -> list[Finding]:
 
     Returns
     -------
-    list of Finding
+    list of Fault
     """
     return [
         *weak_estimate(solution),
@@ -53,36 +53,42 @@ def diagnose(solution: JointSolution) -> list[Finding]:
     ]
 
 
-def weak_estimate(solution) -> Iterator[Finding]:
+def weak_estimate(solution) -> Iterator[Fault]:
     """What keeps the estimate from an answer."""
     if not solution.converged:
-        iterations = solution.solution.iterations
-        words = f"the estimate has not converged after {iterations} iterations"
-        yield Finding(NO, Kind.CONVERGENCE, words)
+        yield Fault(
+            "convergence",
+            f"the estimate has not converged after {solution.solution.iterations} iterations",
+            severe=True,
+        )
     if solution.unobservable:
-        words = f"the data do not determine {'; '.join(solution.unobservable)}"
-        yield Finding(NO, Kind.UNOBSERVABLE, words)
+        yield Fault(
+            "unobservable",
+            f"the data do not determine {'; '.join(solution.unobservable)}",
+            severe=True,
+        )
 
 
-def weak_placements(solution) -> Iterator[Finding]:
+def weak_placements(solution) -> Iterator[Fault]:
     """The number of placements, and boards that stand alike."""
     count = len(solution.boards)
     if count < FEW:
-        words = (
-            f"only {count} placements, {FEW} or more are needed to see errors of the model"
+        yield Fault(
+            "placements",
+            f"only {count} placements, {FEW} or more are needed to see errors of the model",
+            severe=count < FEWEST,
         )
-        yield Finding(no_if(count < FEWEST), Kind.PLACEMENTS, words)
     distance = np.linalg.norm(sights(solution.board_poses, solution), axis=1)
     if count > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance):
-        words = (
+        yield Fault(
+            "distance",
             f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): "
             "errors at other distances are extrapolated, and a range offset is hard to tell from "
-            "shifts"
+            "shifts",
         )
-        yield Finding(CARE, Kind.DISTANCE, words)
 
 
-def weak_pitch(solution) -> Iterator[Finding]:
+def weak_pitch(solution) -> Iterator[Fault]:
     """The pitch of scans and images, which shows the axis."""
     if AXIS_NAMES[0] not in solution.solution.names:
         return
@@ -98,22 +104,23 @@ def weak_pitch(solution) -> Iterator[Finding]:
         where = ""
     span = largest_range(pitch, placement)
     if span < SMALL_PITCH:
-        words = (
+        yield Fault(
+            "pitch",
             f"the recorded pitch spans only {np.degrees(span):.1f} deg{where}: the tilt axis "
-            "is hardly determined"
+            "is hardly determined",
+            severe=True,
         )
-        yield Finding(NO, Kind.PITCH, words)
     elif (
         len(image_pitch) and largest_range(image_pitch, image_placement) < SMALL_IMAGE_PITCH
     ):
-        words = (
+        yield Fault(
+            "image pitch",
             "every placement has its images at one pitch: the tilt axis rests on the scans of "
-            "small boards"
+            "small boards",
         )
-        yield Finding(CARE, Kind.IMAGE_PITCH, words)
 
 
-def large_residuals(solution) -> Iterator[Finding]:
+def large_residuals(solution) -> Iterator[Fault]:
     """What residuals and their scatter over placements say against the model."""
     usual = max(np.median([*solution.misfit.values()]), 1.0)
     misfits = [
@@ -122,35 +129,40 @@ def large_residuals(solution) -> Iterator[Finding]:
         if square > MISFIT * usual
     ]
     if misfits:
-        words = f"placements fit much worse than the others: {', '.join(misfits)}"
-        yield Finding(CARE, Kind.MISFIT, words)
+        yield Fault(
+            "misfit",
+            f"placements fit much worse than the others: {', '.join(misfits)}",
+        )
     if solution.excluded:
-        yield Finding(CARE, Kind.EXCLUDED, "; ".join(map(str, solution.excluded)))
+        yield Fault("excluded", "; ".join(map(str, solution.excluded)))
 
     ratio = scatter_over_placements(solution)
     worst = max(ratio, key=ratio.__getitem__)
     if ratio[worst] > MODEL_ERROR:
         what = "the axis" if worst == "axis" else f"camera '{worst}'"
-        words = (
+        yield Fault(
+            "model error",
             f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: "
-            "an error of the model"
+            "an error of the model",
         )
-        yield Finding(CARE, Kind.MODEL_ERROR, words)
 
     noise = {"ranges": solution.noise["face_scale"]} | noise_of_images(solution)
     large = [f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED]
     if large:
-        words = f"residuals are larger than the stated noise ({', '.join(large)})"
-        yield Finding(no_if(max(noise.values()) > ABSURD), Kind.NOISE, words)
+        yield Fault(
+            "noise",
+            f"residuals are larger than the stated noise ({', '.join(large)})",
+            severe=max(noise.values()) > ABSURD,
+        )
 
     # beams about an edge always repeat errors: they share a background
     share = solution.noise["face_share"]
     if share < DEPENDENT:
-        words = (
+        yield Fault(
+            "dependent",
             f"only {100 * share:.0f} % of the errors of ranges are independent: neighbouring "
-            "ranges have the same error (bent boards, or a wrong pitch)"
+            "ranges have the same error (bent boards, or a wrong pitch)",
         )
-        yield Finding(CARE, Kind.DEPENDENT, words)
 
 
 def scatter_over_placements(solution):
@@ -177,8 +189,7 @@ def noise_of_images(solution: JointSolution) -> dict[str, float]:
     if len(obs.view_camera) == 0:
         return {}
     level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)
-    factors = np.linalg.cholesky(obs.view_covariance)
-    white = solve_each(factors, solution.residuals("view"))
+    white = np.matvec(inverse_root(obs.view_covariance), solution.residuals("view"))
     usual = max(rms(white), np.finfo(float).tiny)
     return {
         f"images of '{camera}'": level * rms(white[obs.view_camera == number]) / usual
@@ -186,7 +197,7 @@ def noise_of_images(solution: JointSolution) -> dict[str, float]:
     }
 
 
-def sides_elsewhere(prepared: Prepared) -> Iterator[Finding]:
+def sides_elsewhere(prepared: Prepared) -> Iterator[Fault]:
     """Edges of the board that lie elsewhere than stated in most scans across them.
 
     Parameters
@@ -195,7 +206,7 @@ def sides_elsewhere(prepared: Prepared) -> Iterator[Finding]:
 
     Yields
     ------
-    Finding
+    Fault
         One an edge.
     """
     elsewhere = [side for sides in prepared.dropped.values() for side in sides.values()]
@@ -207,15 +218,15 @@ def sides_elsewhere(prepared: Prepared) -> Iterator[Finding]:
         if len(dropped) >= FEWEST and len(dropped) > MOST * crossed:
             turn = np.degrees(np.median([side.turn for side in dropped]))
             off = 1000 * np.median([side.distance for side in dropped])
-            words = (
+            yield Fault(
+                "outline",
                 f"the board's edge '{edge}' lies elsewhere than its outline says in "
                 f"{len(dropped)} of {crossed} scans ({off:.0f} mm off, turned by {turn:.1f} deg) "
-                "and is not used there: measure the board's edges (corners_m)"
+                "and is not used there: measure the board's edges (corners_m)",
             )
-            yield Finding(CARE, Kind.OUTLINE, words)
 
 
-def blind_cameras(prepared: Prepared) -> Iterator[Finding]:
+def blind_cameras(prepared: Prepared) -> Iterator[Fault]:
     """Cameras that do not see the board in many placements.
 
     Parameters
@@ -224,7 +235,7 @@ def blind_cameras(prepared: Prepared) -> Iterator[Finding]:
 
     Yields
     ------
-    Finding
+    Fault
         One a camera.
     """
     placements = prepared.session.board_placements
@@ -232,14 +243,14 @@ def blind_cameras(prepared: Prepared) -> Iterator[Finding]:
         why = {p: views[p].reason if p in views else "no image" for p in placements}
         unseen = [f"{placement} ({words})" for placement, words in why.items() if words]
         if len(unseen) > UNSEEN * len(placements):
-            words = (
+            yield Fault(
+                "left out",
                 f"camera '{camera}' does not see the board in {len(unseen)} of {len(placements)} "
-                f"placements: {', '.join(unseen)}"
+                f"placements: {', '.join(unseen)}",
             )
-            yield Finding(CARE, Kind.LEFT_OUT, words)
 
 
-def left_out(calibration: Calibration, method: str) -> tuple[list[Finding], str]:
+def left_out(calibration: Calibration, method: str) -> tuple[list[Fault], str]:
     """What the result of a method does not rest on.
 
     Parameters
@@ -250,7 +261,7 @@ def left_out(calibration: Calibration, method: str) -> tuple[list[Finding], str]
 
     Returns
     -------
-    list of Finding
+    list of Fault
         One where more placements are left out than may be without a warning. It stands for what
         :func:`large_residuals` says of those that the estimate excluded.
     str
@@ -258,28 +269,26 @@ def left_out(calibration: Calibration, method: str) -> tuple[list[Finding], str]
     """
     prepared = calibration.prepared
     table = placements_table(prepared, calibration.observations).set_index("placement")
-    used = set(table.index[table.used]) - set(prepared.left_out)
-    excluded: dict[int, str] = {}
+    reasons = table.reason.replace("", "no edge").to_dict()
     parts = [problem for problem in prepared.problems if problem.kind not in LEAVES_OUT]
-    images: list[Problem] = []  # and cameras
     if method == "joint" and calibration.joint is not None:
         solution = calibration.joint.solution
         used = set(solution.boards)
-        excluded = solution.excluded_placements
+        reasons |= solution.excluded_placements
         images = [problem for problem in solution.excluded if problem.camera is not None]
-    reasons = table.reason.replace("", "no edge").to_dict() | excluded
+    else:
+        used = set(table.index[table.used]) - set(prepared.left_out)
+        images = []  # and cameras
     lost = [f"{number} ({why})" for number, why in reasons.items() if number not in used]
     words = (
         f"{len(lost)} of {len(table)} placements are left out: {', '.join(lost) or 'none'}"
     )
     findings = []
-    notes = []
+    note = f"{words}. "
     if len(lost) > LOST * len(table):
-        findings.append(Finding(CARE, Kind.LEFT_OUT, words))
+        findings.append(Fault("left out", words))
+        note = ""
         parts += images  # otherwise a finding says it
-    else:
-        notes.append(f"{words}.")
     if parts:
-        named = "; ".join(map(str, parts))
-        notes.append(f"Parts left out beside them: {len(parts)} ({named}).")
-    return findings, " ".join(notes)
+        note += f"Parts left out beside them: {len(parts)} ({'; '.join(map(str, parts))})."
+    return findings, note.strip()

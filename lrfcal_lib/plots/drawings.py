@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.model.board import UNIT_SQUARE, Board
 from lrfcal_lib.model.camera import CameraModel, pinhole
 from lrfcal_lib.model.geometry import unit_vector
-from lrfcal_lib.plots.colors import AXES_RGB, LEFT, LRF, RIGHT, TRUTH, closed
+from lrfcal_lib.plots.colors import AXES_RGB, LEFT, LRF, RIGHT, TRUTH
 from lrfcal_lib.plots.recording import CENTRED, to_scale
 from lrfcal_lib.plots.rig import Vector, look_at
 
@@ -58,7 +58,7 @@ class View:
         self, corners: np.ndarray, color: str, alpha: float = 0.2, edge: str | None = None
     ) -> None:
         """A flat area with corners (n, 3), metres."""
-        flat = self.flat(closed(corners))
+        flat = self.flat(corners)
         self.ax.fill(*flat.T, facecolor=to_rgba(color, alpha), edgecolor=edge or color)
 
     def name(
@@ -69,9 +69,13 @@ class View:
         color: str = TRUTH,
     ) -> None:
         """A text beside a point (3,), so many printer's points to the right and up."""
-        place = self.flat(point)
         self.ax.annotate(
-            text, place, away, textcoords="offset points", color=color, **CENTRED
+            text,
+            self.flat(point),
+            away,
+            textcoords="offset points",
+            color=color,
+            **CENTRED,
         )
 
     def arrow(self, ends: ArrayLike, color: str, looks: dict = ARROW) -> None:
@@ -93,10 +97,11 @@ class View:
 
     def box(self, T: RigidTransform, low: ArrayLike, high: ArrayLike, color: str) -> None:
         """A solid box between two corners (3,) of its own frame, metres, the far faces first."""
-        faces = []
-        for axis, end in product(range(3), (0, 1)):
-            at_high = np.insert(UNIT_SQUARE, axis, end, axis=1)
-            faces.append(T.apply(np.where(at_high, high, low)))
+        at_high = [
+            np.insert(UNIT_SQUARE, axis, end, axis=1)
+            for axis, end in product(range(3), (0, 1))
+        ]
+        faces = T.apply(np.where(at_high, high, low))
         for face in sorted(faces, key=lambda face: -self.T_view.apply(face)[:, 2].mean()):
             self.face(face, "white", 1.0, edge=color)
             self.face(face, color, 0.35)

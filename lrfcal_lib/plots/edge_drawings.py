@@ -6,6 +6,7 @@ from matplotlib.patches import Circle
 from scipy.special import ndtr
 
 from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.observations import thin
 from lrfcal_lib.plots.colors import FIT, LEFT, LRF, PLATFORM, TRUTH
 
 BEAMS = 12  # drawn of a scan
@@ -40,7 +41,7 @@ def plane_constraint(
     last = flat[:, 0].max() + 0.15
     ax.plot([first, last], [height, height], color=TRUTH, linewidth=2)
     ax.hlines(height, 0, first, TRUTH, linewidth=0.6, linestyle=":")
-    beams = np.array([[lrf, point] for point in flat[:: max(1, len(flat) // BEAMS)]])
+    beams = np.array([[lrf, point] for point in thin(flat, BEAMS)])
     ax.plot(*beams.T, color=LRF, linewidth=0.5, alpha=0.6)
     ax.plot(*flat.T, ".", color=LRF, markersize=3)
     ax.plot(*lrf, "o", color=LRF, markersize=8)
@@ -119,8 +120,7 @@ def reading_by_distance(
     u = 1000 * np.asarray(distance)
     b = 1000 * bias
     x = np.linspace(u.min(), u.max(), 400)
-    expected = ndtr((b - x) / (1000 * sigma))
-    ax.plot(x, expected, color=FIT, label="expected, Φ((b - u) / σ)")
+    ax.plot(x, ndtr((b - x) / (1000 * sigma)), color=FIT, label="expected, Φ((b - u) / σ)")
     ax.plot(u[hit], hit[hit], "|", color=LRF, label="beams that read the board")
     ax.plot(u[~hit], hit[~hit], "|", color=PLATFORM, label="beams that read beyond")
     ax.axvline(0, color=TRUTH)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap
 
-from lrfcal_lib.model.board import Board, outline_lines
+from lrfcal_lib.model.board import Board, Chessboard, outline_lines, side_ends
 from lrfcal_lib.model.camera import CameraModel, redistort
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.colors import COLORS as COLORS
@@ -155,19 +155,25 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
     ax.plot(bearing[~far], raw[~far], "o", color=RAW, markersize=6, label="raw")
     if far.any():
         words = f"raw, farther: {raw[far].min():.2f} to {raw[far].max():.2f} m"
-        edge = np.full(far.sum(), top)
-        ax.plot(bearing[far], edge, "^", color=RAW, clip_on=False, label=words)
+        at_top = np.minimum(raw[far], top)
+        ax.plot(bearing[far], at_top, "^", color=RAW, clip_on=False, label=words)
     ax.plot(bearing, scan.filtered[line, near], "x", color=TRUTH, label="filtered")
     ax.plot(bearing, fitted, color=FIT, label="line fitted to the board")
     for crossed, style in zip(edges, ("--", "-"), strict=False):
         here = (crossed.line == line) & (crossed.end == end)
         for x, y, _ in crossed.points[here]:
-            at = np.degrees(np.arctan2(y, x))
-            words = crossed.variant.replace("_", " ")
-            ax.axvline(at, color=LRF, linestyle=style, label=words)
+            ax.axvline(
+                np.degrees(np.arctan2(y, x)),
+                color=LRF,
+                linestyle=style,
+                label=crossed.variant.replace("_", " "),
+            )
     ax.invert_xaxis()
-    lowest = np.nanmin(raw) - HEADROOM / 4
-    ax.set(xlabel="bearing [deg]", ylabel="range [m]", ylim=(lowest, top))
+    ax.set(
+        xlabel="bearing [deg]",
+        ylabel="range [m]",
+        ylim=(np.nanmin(raw) - HEADROOM / 4, top),
+    )
     ax.legend()
 
 
@@ -241,9 +247,14 @@ def picture(ax: Axes, image: np.ndarray) -> None:
         shown = shown[..., ::-1]
     ax.imshow(shown, cmap="gray", interpolation="antialiased", vmin=0, vmax=255)
     if gain > 1:
-        words = f"brightened {gain:.1f} times"
-        box = DARK | {"pad": 2}
-        ax.text(0.01, 0.015, words, color="white", bbox=box, transform=ax.transAxes)
+        ax.text(
+            0.01,
+            0.015,
+            f"brightened {gain:.1f} times",
+            color="white",
+            bbox=DARK | {"pad": 2},
+            transform=ax.transAxes,
+        )
     ax.set_axis_off()
 
 
@@ -273,9 +284,14 @@ def board_view(
     for edge in view.edges:
         stretch = stretch_in_image(edge, model)
         ax.plot(*stretch.T, color=color, linewidth=1.6)
-        middle = stretch.mean(axis=0)
         ax.text(
-            *middle, edge.name, color="white", fontsize=8, bbox=box, clip_on=True, **CENTRED
+            *stretch.mean(axis=0),
+            edge.name,
+            color="white",
+            fontsize=8,
+            bbox=box,
+            clip_on=True,
+            **CENTRED,
         )
     unused = ""
     if view.rejected:
@@ -346,10 +362,17 @@ def _about_lines(ax, view, image, margin, more=""):
 
 def _lengths(ax, board, outwards, away):
     """The lengths of a board's edges, written so many metres `away` along `outwards` (n, 2)."""
-    around = closed(board.known_corners())
-    middles = (around[1:] + around[:-1]) / 2 + away * outwards
+    middles = side_ends(board.known_corners()).mean(axis=1) + away * outwards
     for (name, length), at in zip(board.lengths().items(), middles, strict=True):
         ax.text(*at, f"{name.upper()}\n{1000 * length:.1f} mm", **CENTRED)
+
+
+def squares(ax: Axes, pattern: Chessboard, colors: ListedColormap) -> None:
+    """The squares of a chessboard in the frame of its board, in a dark and a white colour."""
+    y, x = np.mgrid[-1 : pattern.rows + 1, -1 : pattern.columns + 1]
+    left, low = pattern.origin
+    white = (x + y)[:-1, :-1] % 2
+    ax.pcolormesh(left + pattern.square * x, low + pattern.square * y, white, cmap=colors)
 
 
 def board_plan(ax: Axes, board: Board) -> None:
@@ -363,14 +386,8 @@ def board_plan(ax: Axes, board: Board) -> None:
     """
     corners = board.known_corners()
     ax.fill(*corners.T, color=PRINT.colors[0], linewidth=0)
-    pattern = board.pattern
-    if pattern is not None:
-        y, x = np.mgrid[-1 : pattern.rows + 1, -1 : pattern.columns + 1]
-        left, low = pattern.origin
-        white = (x + y)[:-1, :-1] % 2
-        ax.pcolormesh(
-            left + pattern.square * x, low + pattern.square * y, white, cmap=PRINT
-        )
+    if board.pattern is not None:
+        squares(ax, board.pattern, PRINT)
     _lengths(ax, board, outline_lines(corners)[:, :2], 0.065)
     ax.update_datalim(np.vstack([corners - 0.09, corners + 0.09]))
     to_scale(ax, "x [m]", "y [m]")
@@ -385,12 +402,11 @@ def outline(ax: Axes, measured) -> None:
     measured : Outline
     """
     board = measured.board
-    around = closed(board.known_corners())
-    ax.plot(*around.T, color=TRUTH)
+    corners = board.known_corners()
+    ax.plot(*closed(corners).T, color=TRUTH)
     outwards = measured.lines[:, :2]
-    for index, spread in enumerate(measured.line_sd):
-        ends = around[index : index + 2]
-        away = EXAGGERATED * np.nan_to_num(spread) * outwards[index]
+    spreads = EXAGGERATED * np.nan_to_num(measured.line_sd)[:, None] * outwards
+    for ends, away in zip(side_ends(corners), spreads, strict=True):
         band = np.vstack([ends - away, ends[::-1] + away])
         ax.fill(*band.T, color=FIT, alpha=0.25, linewidth=0)
     _lengths(ax, board, outwards, -0.09)

@@ -36,6 +36,11 @@ def _side_by_side(count):
     return (np.arange(count) + 0.5) / count - 0.5
 
 
+def _rms(values):
+    """Root mean square."""
+    return np.sqrt(np.mean(values**2))
+
+
 def residual_strips(
     ax: Axes, residuals: np.ndarray, placement: np.ndarray, label: str, color: str
 ) -> None:
@@ -53,7 +58,7 @@ def residual_strips(
     names, columns = np.unique(placement, return_inverse=True)
     for column in range(len(names)):
         values = residuals[columns == column]
-        rms = np.sqrt(np.mean(values**2))
+        rms = _rms(values)
         ax.bar(column, 2 * rms, 0.8, -rms, color=color, alpha=0.2, linewidth=0)
         at = column + 0.6 * _side_by_side(len(values))
         ax.plot(at, values, ".", color=color, markersize=2.5)
@@ -225,7 +230,7 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> N
         xlabel="range [m]",
         ylabel="predicted - measured [mm]",
         ylim=(-limit, limit),
-        title=f"Ranges: {np.sqrt(points.residual.pow(2).mean()):.2g} mm rms",
+        title=f"Ranges: {_rms(points.residual):.2g} mm rms",
     )
     ax.legend()
 
@@ -262,7 +267,7 @@ def residuals_by_region(
             width=0.005,
         )
         ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S")
-        title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
+        title = f"{name}: {_rms(length):.2g} px rms, predicted - seen"
     ax.set(
         xlim=(0, model.width),
         ylim=(model.height, 0),

@@ -58,9 +58,9 @@ def render(
     # of equal pixels the last one, the nearest, stays
     nearest[v, u] = inside
     covering = maximum_filter(nearest, 2 * splat + 1)
-    shown = covering[splat : height - splat, splat : width - splat]
-    white = np.full((1, 3), 255, np.uint8)
-    return np.vstack([colors[order], white])[shown]  # the last row where no point is
+    white = np.full((1, 3), 255, np.uint8)  # the last row, where no point is
+    picture = np.vstack([colors[order], white])[covering]
+    return picture[splat : height - splat, splat : width - splat]
 
 
 def pixels(
@@ -113,8 +113,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
             f"no view from {eye} to {target} with {up} upwards: choose another eye or another up"
         )
     axes = unit_vector(np.stack([right, np.cross(ahead, right), ahead]))
-    rotation = Rotation.from_matrix(axes)
-    return carry(rotation, eye)
+    return carry(Rotation.from_matrix(axes), eye)
 
 
 def face_on(
@@ -148,7 +147,7 @@ def face_on(
     focal = fill * (size[::-1] / spread).min()
     # half of a rectangle about points of a triangle is empty
     spacing = focal * np.sqrt(spread.prod() / 2 / len(points))
-    return T_view, float(focal), int(np.ceil(COVER * spacing))
+    return T_view, focal, int(np.ceil(COVER * spacing))
 
 
 def measured_edges(
@@ -174,11 +173,11 @@ def measured_edges(
     centre = measured.T_platform_plane[None, :3, 3]
     middle = pixels(T_view.apply(centre), size, focal)
     for name, length in measured.lengths.items():
-        after = names[names.index(name) + 1]
-        ends = [measured.corner_point(corner) for corner in (name, after)]
+        both = names[names.index(name) :][:2]
+        ends = [measured.corner_point(corner) for corner in both]
         uv = pixels(T_view.apply(ends), size, focal)
         ax.plot(*uv.T, "o-", color=FIT)
         at = uv.mean(axis=0)
         at = at + 0.07 * size[1] * unit_vector(at - middle[0])
-        words = f"{1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
-        ax.text(*at, f"{name.upper()} {words}", color=FIT, **CENTRED)
+        words = f"{name.upper()} {1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
+        ax.text(*at, words, color=FIT, **CENTRED)

@@ -3,10 +3,12 @@
 from os import PathLike
 
 import numpy as np
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patches import Polygon
 
 from lrfcal_lib.model.board import UNIT_SQUARE, Board, Chessboard
+from lrfcal_lib.plots.recording import squares
 
 BORDER = 0.5  # squares between the chessboard and the cut
 PAPER = 0.02  # metres around the cut
@@ -27,8 +29,13 @@ def sheet(columns: int, rows: int, square: float) -> Board:
     start = (1 + BORDER) * square
     corners = (np.array([columns, rows]) + 1 + 2 * BORDER) * square * UNIT_SQUARE
     pattern = Chessboard(columns, rows, square, (start, start))
-    edges = ("bottom", "right", "top", "left")
-    return Board("printed", edges, corners, pattern, ("bottom", "left"))
+    return Board(
+        "printed",
+        edges=("bottom", "right", "top", "left"),
+        corners=corners,
+        pattern=pattern,
+        features=("bottom", "left"),
+    )
 
 
 def print_sheet(path: str | PathLike, board: Board, dpi: float = 300) -> None:
@@ -49,16 +56,15 @@ def print_sheet(path: str | PathLike, board: Board, dpi: float = 300) -> None:
     ax = page.add_axes((0, 0, 1, 1))
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_axis_off()
-    pattern = board.pattern
-    first = pattern.outline()[0]
-    side = pattern.square
-    for row, column in np.ndindex(pattern.rows + 1, pattern.columns + 1):
-        if (row + column) % 2 == 0:
-            at = first + side * np.array([column, row])
-            ax.add_patch(Rectangle(at, side, side, color="black", linewidth=0))
+    squares(ax, board.pattern, ListedColormap(["black", "white"]))
     ax.add_patch(Polygon(corners, fill=False, edgecolor="black", linewidth=0.5))
     x, y = low + [PAPER, PAPER / 3]
     ax.plot([x, x + RULER], [y, y], "|-", color="black")
-    words = f"{1000 * RULER:.0f} mm at 100 %; squares of {1000 * side:g} mm"
-    ax.text(x + 1.1 * RULER, y, words, fontsize=7, va="center")
+    ax.text(
+        x + 1.1 * RULER,
+        y,
+        f"{1000 * RULER:.0f} mm at 100 %; squares of {1000 * board.pattern.square:g} mm",
+        fontsize=7,
+        va="center",
+    )
     page.savefig(path, dpi=dpi)

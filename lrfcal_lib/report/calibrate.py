@@ -13,10 +13,6 @@ from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.workers import spread
 
 UNTRUSTED = 3  # exit status of a calibration whose verdict is 'no'
-SCENES_ONLY = (
-    "all placements show scenes, and a calibration needs the board: "
-    "record three or more placements of the board with the same rig"
-)
 
 
 def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
@@ -43,7 +39,10 @@ def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
     """
     session = open_session(path)
     if not session.board_placements:
-        print(f"{path}: {SCENES_ONLY}")
+        print(
+            f"{path}: all placements show scenes, and a calibration needs the board: "
+            "record three or more placements of the board with the same rig"
+        )
         return UNTRUSTED
     calibration = calibrate(session)
     print(*poses_in_words(calibration), sep="\n")
@@ -52,11 +51,9 @@ def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
         print(*judge(calibration).sentences(), sep="\n")
         return UNTRUSTED
     folder = Path(out or Path("reports", Path(path).resolve().name))
-    tasks = [
-        *cloud_tasks(folder, calibration, method),
-        partial(_judged, calibration, method),
-    ]
-    *written, (judged, record) = spread(operator.call, tasks)
+    judging = partial(_judged, calibration, method)
+    clouds = cloud_tasks(folder, calibration, method)
+    *written, (judged, record) = spread(operator.call, [*clouds, judging])
     file = folder / "calibration.json"
     write_calibration(file, record)  # last: where it stands, the clouds do
     print(*judged.sentences(), sep="\n")
@@ -79,8 +76,8 @@ def poses_in_words(calibration: Calibration) -> list[str]:
     for (camera, method), solution in calibration.solutions.items():
         both = [solution.parameters[:6], solution.trusted_sigma[:6]]
         values, sigma = (POSE_UNITS * both).round(2)
-        turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
-        shift = f"translation {values[3:]} +- {sigma[3:]} mm"
-        lines.append(f"{camera:>8} {method:<20} {turn}, {shift}")
-    problems = (*calibration.prepared.problems, *calibration.problems)
-    return [*lines, *map(str, problems)]
+        lines.append(
+            f"{camera:>8} {method:<20} rotation vector {values[:3]} +- {sigma[:3]} deg, "
+            f"translation {values[3:]} +- {sigma[3:]} mm"
+        )
+    return [*lines, *map(str, calibration.prepared.problems + calibration.problems)]

@@ -62,8 +62,10 @@ def handed_over(file):
     for name, camera in record["cameras"].items():
         values = POSE_UNITS * [*camera["rotvec_rad"], *camera["translation_m"]]
         sigmas = POSE_UNITS * np.array(list(camera["sigma"].values()), float)
-        shown = zip(values, sigmas, POSE_DIGITS, strict=True)
-        poses[name] = [f"{value:z.{n}f} ± {sigma:.{n}f}" for value, sigma, n in shown]
+        poses[name] = [
+            f"{value:z.{n}f} ± {sigma:.{n}f}"
+            for value, sigma, n in zip(values, sigmas, POSE_DIGITS, strict=True)
+        ]
     sources = {camera["maps"].split(" to ")[0] for camera in record["cameras"].values()}
     return {"method": record["method"], "poses": poses, "sources": sorted(sources)}
 

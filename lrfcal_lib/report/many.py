@@ -14,8 +14,8 @@ from lrfcal_lib.session.workers import side_by_side
 def each_session(
     work: Callable[..., int],
     sessions: Sequence[str],
-    out: str | None = None,
-    scheduler: str | None = None,
+    out: str | None,
+    scheduler: str | None,
 ) -> int:
     """Do something with sessions: one after the other on all cores of this machine, or each on a
     worker of a cluster, which gives the same files.
@@ -26,9 +26,9 @@ def each_session(
         ``work(session, out=folder)``, an exit code.
     sessions : sequence of path-like
         Workers of a cluster see them, and write, under the same path as this machine.
-    out : path-like, optional
+    out : path-like or None
         Folder of the files of a single session.
-    scheduler : str, optional
+    scheduler : str or None
         See :func:`lrfcal_lib.session.cluster.workers_at`.
 
     Returns

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.fit.covariance import sigma_turn_shift
 from lrfcal_lib.measure.scene import station_cloud, write_scene
 from lrfcal_lib.measure.stations import Joined, advice, join_stations, joined_cloud
 from lrfcal_lib.report.reconstruct import open_scene
@@ -93,8 +94,7 @@ def stations_table(joined: Joined) -> pd.DataFrame:
     """Where the stations stood in the joined frame, and how well that is known."""
     rows = []
     for number, T in joined.T_world_station.items():
-        variances = np.diag(joined.covariance_of(number)).reshape(2, 3)
-        turn, shift = np.sqrt(variances.sum(axis=1))
+        turn, shift = sigma_turn_shift(joined.covariance_of(number))
         yaw = T.rotation.as_euler("ZYX", degrees=True)[0]
         rows.append([number, *T.translation, yaw, 1000 * shift, np.degrees(turn)])
     names = ["station", "x_m", "y_m", "z_m", "yaw_deg", "sigma_mm", "sigma_deg"]

@@ -160,9 +160,9 @@ def table(
     styler = shown.style.format(shapes, na_rep="–").format_index(
         lambda c: escape(in_words(c, True)), axis=1
     )
-    styler = styler.hide(axis="index").set_uuid(name)
     caption = caption or str(in_words(name)).capitalize()
-    made = styler.set_caption(escape(caption)).to_html()
+    styler = styler.hide(axis="index").set_caption(escape(caption))
+    made = styler.to_html(table_uuid=name)
     _record("tables", name, {"name": name, "caption": caption, "html": made})
     return HTML(made)
 
@@ -229,15 +229,18 @@ def finding(
             shown = "unknown"
             known = None
     shown = f"{shown} {unit}".strip()
-    entry = {
-        "key": key,
-        "value": known,
-        "unit": unit,
-        "text": text,
-        "shown": shown,
-        "main": main,
-    }
-    _record("findings", key, entry)
+    _record(
+        "findings",
+        key,
+        {
+            "key": key,
+            "value": known,
+            "unit": unit,
+            "text": text,
+            "shown": shown,
+            "main": main,
+        },
+    )
     print(f"{text}: {shown}")
 
 

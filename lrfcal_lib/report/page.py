@@ -142,14 +142,14 @@ def turned(text):
     for part in soup(["style", "caption"]):
         part.decompose()
     for table in soup("table"):
-        heads = table.thead("th") if table.thead else []
+        heads = table.select("thead th")
         for head in heads:
             head.string = in_words(head.get_text(), column=True)
         columns = 0 if _fits(table) else len(heads)
         table.attrs = {"class": next(name for least, name in WIDTHS if columns >= least)}
         for part in table(["th", "td", "tr"]):
             part.attrs = {}
-        for row in table.tbody("tr") if table.tbody else ():
+        for row in table.select("tbody tr"):
             for head, cell in zip(heads, row(["th", "td"]), strict=False):
                 cell["data-label"] = head.string
                 if re.fullmatch(r"[-+]?[\d.]+(e[-+]\d+)?|–|nan", cell.get_text().strip()):

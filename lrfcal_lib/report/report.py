@@ -26,8 +26,15 @@ from nbclient.exceptions import CellControlSignal, DeadKernelError
 from nbconvert.filters import strip_ansi
 from tqdm import tqdm
 
-from lrfcal_lib.report import first_screen, page
+from lrfcal_lib.report.first_screen import (
+    first_picture,
+    handed_over,
+    headline,
+    main_verdict,
+    sentences_below,
+)
 from lrfcal_lib.report.notebook import ROOT, SHIPPED
+from lrfcal_lib.report.page import TEMPLATES, render
 from lrfcal_lib.session.cache import VARIABLE as CACHE
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import open_session
@@ -184,12 +191,14 @@ def store(path, session_path, cache=""):
     ):
         for cell in codes:
             cell.outputs = []
-    kernel = {
-        "display_name": "Python 3 (ipykernel)",
-        "language": "python",
-        "name": "python3",
+    notebook.metadata = {
+        "kernelspec": {
+            "display_name": "Python 3 (ipykernel)",
+            "language": "python",
+            "name": "python3",
+        },
+        "language_info": {"name": "python"},
     }
-    notebook.metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
     nbformat.write(notebook, path)
     return ""
 
@@ -257,8 +266,11 @@ def _store_all(session):
         for path in sorted(NOTEBOOKS.glob(f"{NUMBERED}.ipynb")):
             error = store(path, Path(session).resolve(), cache)
             failed |= bool(error)
-            stream = sys.stderr if error else sys.stdout
-            print(f"{path.name}: {error or 'stored'}", file=stream, flush=True)
+            print(
+                f"{path.name}: {error or 'stored'}",
+                file=sys.stderr if error else sys.stdout,
+                flush=True,
+            )
     return failed
 
 
@@ -345,8 +357,12 @@ def _show_progress(futures):
             name = futures[future].stem
             bar.set_postfix_str(name)
             if bar.disable:
-                said = f"{done} of {count} done after {time.monotonic() - begin:.0f} s"
-                print(f"lrfcal: {said} ({name})", file=sys.stderr, flush=True)
+                seconds = time.monotonic() - begin
+                print(
+                    f"lrfcal: {done} of {count} done after {seconds:.0f} s ({name})",
+                    file=sys.stderr,
+                    flush=True,
+                )
 
 
 def _run(path, environment):
@@ -380,7 +396,7 @@ def write_pages(out, session, runs, found, seconds):
     numbers = {run.name: run.name[:2].removeprefix("0") for run in runs}
     drawn = {}  # figures and tables of each notebook, as HTML
     for before, run, after in zip([None, *runs], runs, [*runs[1:], None], strict=False):
-        body, *drawn[run.name] = page.render(
+        body, *drawn[run.name] = render(
             run.notebook, found[run.name], numbers[run.name], out
         )
         _write_page(
@@ -400,7 +416,7 @@ def write_pages(out, session, runs, found, seconds):
     ]
     (out / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
-    main = first_screen.main_verdict(verdicts)
+    main = main_verdict(verdicts)
     _write_page(
         out / "index.html",
         "report.html.jinja",
@@ -414,10 +430,10 @@ def write_pages(out, session, runs, found, seconds):
         verdicts=verdicts,
         told={entry["key"]: entry for entry in findings},
         main=main,
-        headline=first_screen.headline(out, main),
-        handed=first_screen.handed_over(out / "calibration.json"),
-        rest=first_screen.sentences_below(main),
-        picture=first_screen.first_picture(drawn),
+        headline=headline(out, main),
+        handed=handed_over(out / "calibration.json"),
+        rest=sentences_below(main),
+        picture=first_picture(drawn),
         files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
     )
@@ -425,7 +441,7 @@ def write_pages(out, session, runs, found, seconds):
 
 def _write_page(file, template, **values):
     """Write a page made by a template."""
-    text = page.TEMPLATES.get_template(template).render(**values)
+    text = TEMPLATES.get_template(template).render(**values)
     file.write_text(text, encoding="utf-8")
 
 

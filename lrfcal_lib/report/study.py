@@ -21,7 +21,7 @@ def study(args):
         tqdm(total=len(tasks), desc="tasks", disable=None) as bar,
     ):
         table = study_to_file(tasks, args.out, executor, bar.update)
-    failed = int(table.failed.sum())
     print(
-        f"{args.out}: {len(table)} rows; {failed} of {table.trials.sum()} estimates failed"
+        f"{args.out}: {len(table)} rows; {table.failed.sum()} of {table.trials.sum()} estimates "
+        "failed"
     )

@@ -19,18 +19,22 @@ SHOWN = 3  # images of a camera that are looked at
 
 @dataclass(frozen=True)
 class Fault:
-    """Something about a recording that cannot be right.
+    """Something about a recording, or about a calibration that rests on it, that is not right.
 
     Attributes
     ----------
     kind : str
-        'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark'; of
-        :mod:`lrfcal_lib.judge.recording_faults` also 'camera moved', 'camera zoomed',
-        'exchanged', 'numbers', 'sense', 'unit'.
+        Of the files 'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark'; of
+        the recording 'camera moved', 'camera zoomed', 'exchanged', 'numbers', 'sense', 'unit',
+        'lens'; of the result 'handed over', 'convergence', 'unobservable', 'second minimum',
+        'error'; of the placements 'placements', 'cameras', 'left out', 'excluded', 'distance',
+        'pitch', 'image pitch'; of residuals 'misfit', 'model error', 'noise', 'dependent'; of what
+        is stated 'squares', 'outline', 'ranges', 'bearings', 'spot', 'lag', 'range offset',
+        'pitch scale', 'far from stated', 'not weighed'.
     words : str
         What was found, where, and what to do about it.
     severe : bool
-        Nothing that rests on it can be trusted.
+        Nothing that rests on it can be trusted; else it is to be used with care.
     camera : str or None
     placements : tuple of int
         Those concerned, where it is not the whole recording.

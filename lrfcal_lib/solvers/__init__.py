@@ -3,12 +3,13 @@
 A table of the methods and their choice; equations are in the modules of their residuals.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
 
+import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import RigidTransform
@@ -17,6 +18,7 @@ from scipy.special import chdtri
 from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.fit.robust import rms
+from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_difference
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers import lines, plane_start, planes
@@ -283,11 +285,11 @@ def best_method(
     """
     errors = {}
     for method in CANDIDATES:
-        of_cameras = [
-            _left_out_errors(obs, method, solutions[camera, method])
-            for camera, obs in observations.items()
-            if (camera, method) in solutions
-        ]
+        of_cameras = []
+        for camera, obs in observations.items():
+            if (camera, method) in solutions:
+                held = left_out(obs, obs.along(), method, solutions[camera, method])
+                of_cameras.append([rms(misses) for misses in left_out_residuals(held)])
         if of_cameras:
             errors[method] = [_mean(column) for column in zip(*of_cameras, strict=True)]
     table = np.array(list(errors.values())).reshape(-1, 2)
@@ -298,14 +300,53 @@ def best_method(
     return list(errors)[np.nanargmin(score)]
 
 
-def _left_out_errors(obs, method, full):
-    """Root mean squares of left-out crossings (pixels) and face points (metres)."""
+def left_out_residuals(
+    pairs: Iterable[tuple[CameraObservations, Solution]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of every placement under a calibration from all the others.
+
+    Parameters
+    ----------
+    pairs : iterable of (CameraObservations, Solution)
+        Of :func:`left_out`, or what else is judged by a calibration; each under its intrinsics.
+
+    Returns
+    -------
+    edges, planes : ndarray, shapes (n,), (m,)
+        Of crossings, pixels, and of face points, metres.
+    """
     edges = [np.zeros(0)]
-    faces = [np.zeros(0)]
-    for held, solution in left_out(obs, obs.along(), method, full):
-        edges.append(edge_residuals_px(held, solution.transform))
-        faces.append(plane_residuals_m(held, solution.transform))
-    return [rms(np.concatenate(errors)) for errors in (edges, faces)]
+    planes = [np.zeros(0)]
+    for held, solution in pairs:
+        edges.append(edge_residuals_px(held, solution.transform, solution.model))
+        poses = poses_under(held, solution.model)
+        planes.append(plane_residuals_m(held, solution.transform, poses))
+    return np.concatenate(edges), np.concatenate(planes)
+
+
+def poses_under(obs: CameraObservations, model: CameraModel | None) -> np.ndarray:
+    """The board poses (p, 4, 4) that a camera sees under other intrinsics.
+
+    As they are where no pattern was seen.
+    """
+    if model is None or len(obs.pattern_points) == 0:
+        return obs.board_poses
+    moved = obs.board_poses.copy()
+    for pose, pixels in zip(moved, obs.pattern_pixels, strict=True):
+        good = np.isfinite(pixels).all(axis=1)
+        if good.sum() >= 6:
+            _, rotvec, shift = cv2.solvePnP(
+                obs.pattern_points[good],
+                pixels[good],
+                model.matrix,
+                model.distortion,
+                cv2.Rodrigues(pose[:3, :3])[0],
+                pose[:3, 3:].copy(),
+                useExtrinsicGuess=True,
+                flags=cv2.SOLVEPNP_ITERATIVE,
+            )
+            pose[:3] = np.hstack([cv2.Rodrigues(rotvec)[0], shift])
+    return moved
 
 
 def _mean(values):
