@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtr, stdtrit
 
 from lrfcal_lib.fit.covariance import sigma_turn_shift
-from lrfcal_lib.judge.findings import by_sign
+from lrfcal_lib.judge.findings import Kind, by_sign
 from lrfcal_lib.model.geometry import (
     axis_difference,
     axis_of,
@@ -103,17 +103,17 @@ def _lag(obs, s):
 
 
 ALTERNATIVES = {
-    "squares": Alternative(
+    Kind.SQUARES: Alternative(
         _views,
         "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
         "measure a square over many of them",
     ),
-    "outline": Alternative(
+    Kind.OUTLINE: Alternative(
         _outline,
         "the board's outline is {size} +- {sigma} % {sign} than stated",
         "measure the board's edges",
     ),
-    "ranges": Alternative(
+    Kind.RANGES: Alternative(
         lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)),
         "all ranges are {size} +- {sigma} % {sign}",
         "measure a square and an edge of the board, check the unit of the ranges",
@@ -122,20 +122,20 @@ ALTERNATIVES = {
             "too long, or board and squares larger than stated",
         ),
     ),
-    "bearings": Alternative(
+    Kind.BEARINGS: Alternative(
         JointObservations.stretched,
         "bearings are {size} +- {sigma} % too {sign}",
         "check the angular step that session.json states",
         ("small", "large"),
     ),
-    "spot": Alternative(
+    Kind.SPOT: Alternative(
         lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)),
         "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
         "state spot_exit_m and spot_divergence_rad as its maker does",
         worth=0.2,
         reach=5.0,
     ),
-    "lag": Alternative(
+    Kind.LAG: Alternative(
         _lag,
         "the recorded pitch of scan lines is {size} +- {sigma} deg {sign} the sweep",
         "check the time stamps of pitch and scans, sweep slower or stop for every scan",
@@ -154,16 +154,16 @@ def alternatives_of(prepared):
     the pattern's first corner.
     """
     stated = dict(ALTERNATIVES)
-    squares = stated.pop("squares")
+    squares = stated.pop(Kind.SQUARES)
     pattern = prepared.board.pattern
     if pattern is not None:
         change = partial(_views, origin=pattern.origin)
         if prepared.session.board.corners is None:
-            del stated["outline"]
+            del stated[Kind.OUTLINE]
             change = _views_and_outline
-        stated["squares"] = replace(squares, change=change)
+        stated[Kind.SQUARES] = replace(squares, change=change)
     if prepared.session.lrf.spot_exit is None:
-        del stated["spot"]
+        del stated[Kind.SPOT]
     return stated
 
 
@@ -205,7 +205,7 @@ class Doubt:
 def weigh(
     solution: JointSolution,
     admitted_offset: float,
-    stated: Mapping[str, Alternative] = ALTERNATIVES,
+    stated: Mapping[Kind, Alternative] = ALTERNATIVES,
 ) -> list[Doubt]:
     """Every alternative tested by itself, all that was estimated free, the likeliest first.
 
@@ -281,7 +281,7 @@ def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
     asked = []
     for doubt in weigh(solution, admitted_offset, stated):
         harmful = doubt.exceeds(PREFERRED) and doubt.moved > MOVED
-        if doubt.kind == "bearings" and not solution.step.any():
+        if doubt.kind == Kind.BEARINGS and not solution.step.any():
             harmful = (
                 False  # a step that the sensor's disc divides is off for no small reason
             )
@@ -328,7 +328,7 @@ def far_from_stated(joint) -> list[Fault]:
 
 def _far(words, angle):
     """The Fault of what lies far from where it is stated, turned by an angle (radians)."""
-    return Fault("far from stated", words, severe=angle > np.pi / 2)
+    return Fault(Kind.FAR_FROM_STATED, words, severe=angle > np.pi / 2)
 
 
 def far_axis(joint) -> Iterator[Fault]:
