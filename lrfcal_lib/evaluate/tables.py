@@ -4,7 +4,6 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pandas as pd
 
@@ -12,7 +11,6 @@ from lrfcal_lib.calibrate.cameras import PlatformCalibration
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.covariance import sigma_of
-from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
 from lrfcal_lib.fit.result import AXIS_NAMES, Solution
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model import geometry
@@ -21,7 +19,7 @@ from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.outline_in_images import Outline
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.solvers import METHODS, left_out
+from lrfcal_lib.solvers import METHODS, left_out, left_out_residuals
 from lrfcal_lib.solvers.pitch import PitchErrors
 
 UNITS = {  # of parameters, and the factor from radians and metres
@@ -63,48 +61,6 @@ def unit_of(parameter: str) -> tuple[str, float]:
     return next(unit for names, unit in UNITS.items() if re.fullmatch(names, parameter))
 
 
-def poses_under(obs: CameraObservations, model: CameraModel | None) -> np.ndarray:
-    """The board poses (p, 4, 4) that a camera sees under other intrinsics.
-
-    As they are where no pattern was seen.
-    """
-    if model is None or len(obs.pattern_points) == 0:
-        return obs.board_poses
-    moved = obs.board_poses.copy()
-    for pose, pixels in zip(moved, obs.pattern_pixels, strict=True):
-        good = np.isfinite(pixels).all(axis=1)
-        if good.sum() >= 6:
-            _, rotvec, shift = cv2.solvePnP(
-                obs.pattern_points[good],
-                pixels[good],
-                model.matrix,
-                model.distortion,
-                cv2.Rodrigues(pose[:3, :3])[0],
-                pose[:3, 3:].copy(),
-                useExtrinsicGuess=True,
-                flags=cv2.SOLVEPNP_ITERATIVE,
-            )
-            pose[:3] = np.hstack([cv2.Rodrigues(rotvec)[0], shift])
-    return moved
-
-
-def plane_residuals_of(obs: CameraObservations, solution: Solution) -> np.ndarray:
-    """Distances of face points from the board planes, under the solution's intrinsics.
-
-    Parameters
-    ----------
-    obs : CameraObservations
-        With n face points.
-    solution : Solution
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Metres.
-    """
-    return plane_residuals_m(obs, solution.transform, poses_under(obs, solution.model))
-
-
 def jointly_left_out(
     joint: JointCalibration, camera: str
 ) -> Iterator[tuple[CameraObservations, Solution]]:
@@ -117,29 +73,6 @@ def jointly_left_out(
         alone = replace(joint, prepared=replace(ready, scans=scan))
         judge = alone.seen_by(camera, solution).along().select([placement])
         yield judge, solution.camera(camera)
-
-
-def left_out_residuals(
-    pairs: Iterable[tuple[CameraObservations, Solution]],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of every placement under a calibration from all the others.
-
-    Parameters
-    ----------
-    pairs : iterable of (CameraObservations, Solution)
-        Of :func:`left_out` or :func:`jointly_left_out`.
-
-    Returns
-    -------
-    edges, planes : ndarray, shapes (n,), (m,)
-        Of crossings, pixels, and of face points, metres.
-    """
-    edges = [np.zeros(0)]
-    planes = [np.zeros(0)]
-    for held, solution in pairs:
-        edges.append(edge_residuals_px(held, solution.transform, solution.model))
-        planes.append(plane_residuals_of(held, solution))
-    return np.concatenate(edges), np.concatenate(planes)
 
 
 def method_comparison(

@@ -127,7 +127,7 @@ def suggest_placement(
             "view and the calibration"
         )
     boards = boards[seen]
-    known = solution.information().sum(axis=0)
+    known = solution.score().information.sum(axis=0)
     added = candidate_information(boards, pitches, solution, models)
     before = total_sigma(known, solution)
     after = total_sigma(known + added, solution)

@@ -82,9 +82,10 @@ class CameraModel:
         rms_px : float, optional
         """
         fx, fy, cx, cy = map(float, values[:4])
-        size = self.width, self.height
         lens = np.array(values[4:])
-        return CameraModel(*size, fx, fy, cx, cy, lens, covariance, rms_px)
+        return CameraModel(
+            self.width, self.height, fx, fy, cx, cy, lens, covariance, rms_px
+        )
 
 
 def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
@@ -303,11 +304,9 @@ def redistort(uv: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2)
         Pixels; NaN for what lies so far outside that the lens would fold it back into the image.
     """
-    focal = np.array([model.fx, model.fy])
-    centre = np.array([model.cx, model.cy])
-    normalized = (uv - centre) / focal
-    recorded = distort(normalized, model.distortion) * focal + centre
-    recorded[np.sum(normalized**2, axis=-1) >= fold(model)] = np.nan
+    sights = model.sights(uv)
+    recorded = project(sights, model)
+    recorded[np.sum(sights[..., :2] ** 2, axis=-1) >= fold(model)] = np.nan
     return recorded
 
 

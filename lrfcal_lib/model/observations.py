@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
@@ -356,9 +355,10 @@ class JointObservations(_Grouped):
         if np.any(self.face_sigma <= 0):
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
 
-    def lines(self):
-        """Sides of the board, see :meth:`lrfcal_lib.model.board.Board.lines`."""
-        return outline_lines(self.corners)
+    @property
+    def count(self) -> int:
+        """Number of ranges, beams and views together."""
+        return len(self.face_range) + len(self.beam_hit) + len(self.view_pitch)
 
     def select(self, placements):
         """The observations of some placements (numbers) only."""

@@ -3,7 +3,7 @@
 A table of the methods and their choice; equations are in the modules of their residuals.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,10 +14,15 @@ from scipy import ndimage
 from scipy.spatial.transform import RigidTransform
 from scipy.special import chdtri
 
-from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m
+from lrfcal_lib.fit.residuals import (
+    edge_residuals_px,
+    line_block,
+    plane_residuals_m,
+    under_intrinsics,
+)
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.fit.robust import rms
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_difference
+from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose, pose_array
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers import lines, plane_start, planes
 
@@ -255,6 +260,30 @@ def left_out(
             )
 
 
+def left_out_residuals(
+    pairs: Iterable[tuple[CameraObservations, Solution]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of every placement under a calibration from all the others.
+
+    Parameters
+    ----------
+    pairs : iterable of (CameraObservations, Solution)
+        As of :func:`left_out`.
+
+    Returns
+    -------
+    edges, planes : ndarray, shapes (n,), (m,)
+        Of crossings, pixels, and of face points, metres.
+    """
+    edges = [np.zeros(0)]
+    planes = [np.zeros(0)]
+    for held, solution in pairs:
+        seen = under_intrinsics(held, solution)
+        edges.append(edge_residuals_px(seen, solution.transform))
+        planes.append(plane_residuals_m(seen, solution.transform))
+    return np.concatenate(edges), np.concatenate(planes)
+
+
 def best_method(
     observations: dict[str, CameraObservations], solutions: dict[tuple[str, str], Solution]
 ) -> str | None:
@@ -283,13 +312,14 @@ def best_method(
     """
     errors = {}
     for method in CANDIDATES:
-        of_cameras = [
-            _left_out_errors(obs, method, solutions[camera, method])
-            for camera, obs in observations.items()
-            if (camera, method) in solutions
-        ]
+        of_cameras = []
+        for camera, obs in observations.items():
+            if (camera, method) in solutions:
+                pairs = left_out(obs, obs.along(), method, solutions[camera, method])
+                of_cameras.append([rms(misses) for misses in left_out_residuals(pairs)])
         if of_cameras:
-            errors[method] = [_mean(column) for column in zip(*of_cameras, strict=True)]
+            known = np.ma.masked_invalid(of_cameras)
+            errors[method] = known.mean(axis=0).filled(np.nan)
     table = np.array(list(errors.values())).reshape(-1, 2)
     judging = ~np.isnan(table).all(axis=0)  # where no edge was seen, planes judge alone
     score = np.prod(table[:, judging], axis=1)
@@ -298,38 +328,20 @@ def best_method(
     return list(errors)[np.nanargmin(score)]
 
 
-def _left_out_errors(obs, method, full):
-    """Root mean squares of left-out crossings (pixels) and face points (metres)."""
-    edges = [np.zeros(0)]
-    faces = [np.zeros(0)]
-    for held, solution in left_out(obs, obs.along(), method, full):
-        edges.append(edge_residuals_px(held, solution.transform))
-        faces.append(plane_residuals_m(held, solution.transform))
-    return [rms(np.concatenate(errors)) for errors in (edges, faces)]
-
-
-def _mean(values):
-    """Mean of the finite values; NaN where there are none."""
-    finite = [value for value in values if np.isfinite(value)]
-    return np.mean(finite) if finite else np.nan
-
-
 def best_minimum(obs, row, minima):
     """The best of several Solutions, with another one as `rival` that explains the data nearly as
     well.
     """
     squares = [_misses(obs, row, solution.transform) ** 2 for solution in minima]
     sizes = plane_start.sizes_of_minima(np.array(squares))
-    points = getattr(obs, f"{row.uses}_points")
-    depths = np.array([solution.transform.apply(points)[:, 2] for solution in minima])
+    poses = np.array([pose_array(solution.transform) for solution in minima])
+    depths = apply_pose(poses, getattr(obs, f"{row.uses}_points"))[..., 2]
     before = np.mean(depths < 0, axis=1) <= 0.5  # most of the board is ahead of the camera
-    order = np.lexsort([sizes, ~before])
-    best = order[0]
+    best, *others = plane_start.far_apart(poses, np.lexsort([sizes, ~before]))
     nearly = (before == before[best]) & (sizes <= plane_start.NEARLY * sizes[best])
-    for i in order[nearly[order]]:
-        turn, _ = transform_difference(minima[i].transform, minima[best].transform)
-        if turn > plane_start.SAME_TURN:
-            return replace(minima[best], rival=minima[i].transform)
+    for other in others:
+        if nearly[other]:
+            return replace(minima[best], rival=minima[other].transform)
     return minima[best]
 
 

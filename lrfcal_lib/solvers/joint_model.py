@@ -14,6 +14,7 @@ from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
 from lrfcal_lib.model import geometry
+from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.geometry import move_pose
 from lrfcal_lib.model.observations import JointObservations
 
@@ -29,7 +30,7 @@ LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the 
 SOFTEST = np.log([1e-3, 10.0])  # spot radii, limits of the softness
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JointState:
     """Everything that moves.
 
@@ -225,7 +226,14 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
     view["pose"][~view["used"]] = np.eye(4)
     on_head = np.isin(obs.mounts, "head")
     return JointData(
-        face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, levels
+        face,
+        beam,
+        view,
+        outline_lines(obs.corners),
+        obs.middle,
+        obs.direction,
+        on_head,
+        levels,
     )
 
 

@@ -66,7 +66,7 @@ def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> St
     which ones are wrong.
     """
     data = gather(obs, levels)
-    tried: list[Start] = []
+    tried = []
     for states in start_states(obs):
         for state in states:
             if not unknowns.axis:
@@ -111,8 +111,7 @@ def agreeing_start(obs, state, data, unknowns):
         cut = gather(kept, data.levels) if left_out else data
         found = minimum(fitting, cut, coarse(unknowns), steps=FEW_STEPS)
         share = left_out_share(obs, left_out)
-        count = len(kept.face_range) + len(kept.beam_hit) + len(kept.view_pitch)
-        cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / count
+        cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / kept.count
         badness = cost * (1 + PENALTY * share)
         attempts.append(
             Start(kept, found.state, left_out, badness, miss, bool(found.converged))

@@ -27,7 +27,7 @@ from lrfcal_lib.solvers.joint_model import (
     Unknowns,
     gather,
 )
-from lrfcal_lib.solvers.joint_noise import on_board
+from lrfcal_lib.solvers.joint_noise import face_points, heights
 from lrfcal_lib.solvers.joint_residuals import named_blocks
 
 WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
@@ -167,11 +167,6 @@ class JointSolution:
         """
         return dict(zip(SENSOR, self.state.sensor.tolist(), strict=True))
 
-    @property
-    def sweeps(self) -> dict[int, np.ndarray]:
-        """Offset (rad) and stretch of the recorded pitch of each sweep, by placement."""
-        return self._by_placement(self.state.sweeps)
-
     def _by_placement(self, values):
         return dict(zip(self.observations.placements.tolist(), values, strict=True))
 
@@ -194,16 +189,15 @@ class JointSolution:
         """Factors on the stated standard deviations, and shares of independent errors, as
         estimated.
         """
-        names = [
+        names = (
             "face_scale",
             "face_share",
             "beam_share",
             "sigma_pitch",
             "side_sigma",
             "background_sigma",
-        ]
-        if self.observations.cameras:
-            names.append("view_scale")
+            "view_scale",
+        )
         return {name: float(getattr(self.data.levels, name)) for name in names}
 
     @property
@@ -295,23 +289,17 @@ class JointSolution:
         ndarray, shape (m, 1) or (v, 6)
             Of ranges to faces, metres, or of poses in images, radians and metres.
         """
-        if group not in self.blocks:
-            return np.zeros((0, {"face": 1, "view": 6}[group]))
         used = getattr(self.data, group)["used"]
-        return self._in_order(group, self.blocks[group].residuals.reshape(*used.shape, -1))
-
-    def face_points(self) -> np.ndarray:
-        """Measured points of the faces in the frames of their boards, metres, shape (m, 3)."""
-        return self._in_order("face", on_board(self.state, self.data))
-
-    def _in_order(self, group, padded):
-        """Rows of a group in the order of the observations, shape (p, n, k) -> (m, k)."""
+        padded = self.blocks[group].residuals.reshape(*used.shape, -1)
         placement = getattr(self.observations, f"{group}_placement")
         rows = np.zeros((len(placement), padded.shape[-1]))
-        rows[np.argsort(placement, kind="stable")] = padded[
-            getattr(self.data, group)["used"]
-        ]
+        rows[np.argsort(placement, kind="stable")] = padded[used]
         return rows
+
+    def face_heights(self) -> np.ndarray:
+        """Heights of the measured points over their boards, metres, placement by placement."""
+        points = face_points(self.state, self.data)
+        return heights(points, self.state.boards)[self.data.face["used"]]
 
     def with_levels(self, **changed) -> "JointSolution":
         """The same estimate at other noise levels, fields of
@@ -319,10 +307,6 @@ class JointSolution:
         """
         levels = replace(self.data.levels, **changed)
         return replace(self, data=replace(self.data, levels=levels))
-
-    def information(self) -> np.ndarray:
-        """What every placement says about the shared unknowns, shape (p, c, c)."""
-        return self.score().information
 
     def score(self, changed: JointObservations | None = None, step: float = 1.0) -> Score:
         """What every placement says about the shared unknowns and, tested, about one more.
@@ -366,17 +350,14 @@ class JointSolution:
 def joint_words(
     direction: np.ndarray, names: tuple[str, ...], cameras: tuple[str, ...]
 ) -> str:
-    """A direction of the shared unknowns in words."""
-    direction = np.asarray(direction) / np.max(np.abs(direction))
+    """A direction of the shared unknowns, its largest component 1, in words."""
     large = np.abs(direction) > NAMED
     words = []
     for camera in cameras:
         index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
         if large[index].any():
             words.append(motion_words(direction[index], camera))
-    words += [
-        WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS
-    ]
+    words += [WORDS[name] for name in np.array(names)[large] if name in WORDS]
     return " with ".join(words)
 
 
@@ -398,17 +379,14 @@ def expected_information(
     ndarray, shape (p, c, c)
     """
     data = gather(obs)
-    hit = np.ones_like(data.beam["hit"])
-    all_read = replace(data, beam=data.beam | {"hit": hit})
-    none_read = replace(data, beam=data.beam | {"hit": ~hit})
-    read = named_blocks(state, all_read, unknowns)
     hessian = np.zeros(())
-    if "beam" in read:  # over both readings, weighted by how likely each is
-        hits = read["beam"]
-        misses = named_blocks(state, none_read, unknowns)["beam"]
-        chance = np.exp(-np.asarray(hits.cost))
-        for block, share in ((hits, chance), (misses, 1 - chance)):
-            J = np.sqrt(share)[..., None] * block.white_jacobian
+    for reads in (True, False):  # each beam, weighted by how likely that is
+        hit = np.full_like(data.beam["hit"], reads)
+        trial = replace(data, beam=data.beam | {"hit": hit})
+        blocks = named_blocks(state, trial, unknowns)
+        if "beam" in blocks:
+            beams = blocks.pop("beam")
+            J = np.exp(-0.5 * beams.cost)[..., None] * beams.white_jacobian
             hessian = hessian + J.mT @ J
-    others = [block for name, block in read.items() if name != "beam"]
-    return reduced_hessian(hessian + linearise(others).hessian, unknowns.shared)
+    hessian = hessian + linearise(blocks.values()).hessian
+    return reduced_hessian(hessian, unknowns.shared)

@@ -103,29 +103,27 @@ def state_of(obs: JointObservations, head: np.ndarray, cameras: np.ndarray) -> J
     """All unknowns from an axis and the cameras (as in JointState): boards from first images."""
     count = len(obs.placements)
     _, first = np.unique(obs.view_placement, return_index=True)
+    boards = boards_in_images(obs, head, cameras)[first]
     return JointState(
         head=head,
         cameras=cameras,
         sensor=np.array([0.0, 0.0, np.log(START_SOFTNESS), 0.0, 0.0]),
-        boards=boards_in_images(obs, head, cameras, first),
+        boards=boards,
         sweeps=np.zeros((count, 2)),
         sides=np.zeros((count, len(obs.edges) + 1)),
     )
 
 
 def boards_in_images(
-    obs: JointObservations, head: np.ndarray, cameras: np.ndarray, views: np.ndarray
+    obs: JointObservations, head: np.ndarray, cameras: np.ndarray
 ) -> np.ndarray:
-    """``T_platform_board`` (n, 3, 4) from some views (n,), each by itself.
+    """``T_platform_board`` (v, 3, 4) from the views, each by itself.
 
     `head` and `cameras` as in JointState.
     """
-    camera = obs.view_camera[views]
-    on_head = np.isin(obs.mounts, "head")[camera]
-    pitch = np.where(on_head, obs.view_pitch[views], 0.0)
+    on_head = np.isin(obs.mounts, "head")[obs.view_camera]
+    pitch = np.where(on_head, obs.view_pitch, 0.0)
     T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
-    T_camera_board = RigidTransform.from_matrix(obs.view_pose[views])
     T_platform_lrf = platform_from_head(pitch) * T_head_lrf
-    return pose_array(
-        T_platform_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
-    )
+    T_platform_camera = T_platform_lrf * pose_transform(cameras[obs.view_camera]).inv()
+    return pose_array(T_platform_camera * RigidTransform.from_matrix(obs.view_pose))

@@ -85,7 +85,7 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     half = p // 2 + 2
     for count in {half, max(half, FEWEST_LINES if flat else FEWEST_PLANES)}:
         order = np.argsort(squares[:, :count].mean(axis=1))
-        first += [*order[:4], *_apart(candidates, order)]
+        first += [*order[:4], *far_apart(candidates, order)]
     best = candidates[np.unique(first)]
 
     def evaluate(pose):
@@ -98,7 +98,7 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     plain = rough(state=robust).state
     minima = np.concatenate([robust, plain, best])
     sizes = sizes_of_minima(_squares(minima, triangles, sets), sets.number)
-    apart = np.array(_apart(minima, np.argsort(sizes)))
+    apart = np.array(far_apart(minima, np.argsort(sizes)))
     nearly = sizes[apart] <= NEARLY * sizes[apart[0]]
     return pose_transform(minima[apart[nearly]])
 
@@ -128,7 +128,7 @@ def common_plane(triangles):
     frame = np.eye(4)
     frame[:3, :3] = axes.T
     frame[3, :3] = -axes @ centre[0]
-    return frame, bool(spread[2] < FLAT * spread[0])
+    return frame, spread[2] < FLAT * spread[0]
 
 
 def closed_form(triangles: np.ndarray, boards: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -242,7 +242,7 @@ def _squares(poses, triangles, sets):
     return np.vecdot(residuals, residuals) / sets.number
 
 
-def _apart(poses, order):
+def far_apart(poses, order):
     """Indices of the first poses in some order that are turned against all before, `MOST_APART`."""
     chosen = []
     left = np.asarray(order)
