@@ -30,7 +30,7 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint import in_stated_gauge
-from lrfcal_lib.solvers.joint_model import JointState, Unknowns
+from lrfcal_lib.solvers.joint_model import JointState, Unknowns, undisturbed
 from lrfcal_lib.solvers.joint_solution import expected_information
 
 INTERVAL = 0.9
@@ -112,10 +112,9 @@ def joint_truth(
     sensor = np.array(
         [range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0]
     )
-    count = len(boards)
     boards = pose_array(RigidTransform.concatenate(boards))
-    own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges) + 1))
-    return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, *own), obs)
+    state = undisturbed(obs, pose_array(T_head_lrf), poses, sensor, boards)
+    return in_stated_gauge(state, obs)
 
 
 def monte_carlo(draw: Callable, solve: Callable, seeds: Iterable[int]) -> Trials:

@@ -23,7 +23,6 @@ from lrfcal_lib.model.geometry import (
     cross,
     gradient_by_pose,
     rotate_and_move,
-    rotate_points,
 )
 from lrfcal_lib.model.observations import CameraObservations
 
@@ -101,8 +100,8 @@ def sight_block(pose: np.ndarray, points: np.ndarray, normals: np.ndarray) -> Bl
     return Block(residuals, jacobian)
 
 
-def sight_normals(lines: np.ndarray, model: CameraModel) -> tuple[np.ndarray, np.ndarray]:
-    """Planes through the camera centre and image lines.
+def sight_normals(lines: np.ndarray, model: CameraModel) -> np.ndarray:
+    """Normals of the planes through the camera centre and image lines.
 
     Parameters
     ----------
@@ -112,14 +111,10 @@ def sight_normals(lines: np.ndarray, model: CameraModel) -> tuple[np.ndarray, np
 
     Returns
     -------
-    normals : ndarray, shape (..., 3)
+    ndarray, shape (..., 3)
         Unit vectors, camera frame.
-    lengths : ndarray, shape (...)
-        Of ``K^T l``.
     """
-    raw = lines @ model.matrix
-    length = np.linalg.norm(raw, axis=-1)
-    return raw / length[..., None], length
+    return geometry.unit_vector(lines @ model.matrix)
 
 
 def edge_residuals_px(obs: CameraObservations, transform: RigidTransform) -> np.ndarray:
@@ -258,4 +253,5 @@ def moved_noise(
     -------
     ndarray, shape (..., n, 3)
     """
-    return rotate_points(pose, np.vecmat(gradient @ pose[..., :3], covariance))
+    rotation = pose[..., :3]
+    return np.vecmat(gradient @ rotation, covariance) @ rotation.mT

@@ -176,7 +176,7 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
         Of 'axis' and of each camera, as far as they were unknown.
     """
     variance = np.linalg.diagonal(covariance) / scales_of(solution) ** 2
-    columns = {"axis": solution.columns("axis_") + solution.columns("offset_")}
+    columns = {"axis": solution.columns("axis_", "offset_")}
     for camera in solution.transforms:
         columns[camera] = solution.columns(f"{camera}_")
     return {

@@ -134,12 +134,12 @@ def _pixels(normalized, model):
     return normalized * [model.fx, model.fy] + [model.cx, model.cy]
 
 
-def pinhole_jacobian(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
+def pinhole_jacobian(p_camera: np.ndarray, model: CameraModel) -> np.ndarray:
     """Derivative of :func:`pinhole` by the point.
 
     Parameters
     ----------
-    p_camera : array_like, shape (..., 3)
+    p_camera : ndarray, shape (..., 3)
         Metres.
     model : CameraModel
 
@@ -148,7 +148,7 @@ def pinhole_jacobian(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2, 3)
         Pixels per metre.
     """
-    z = np.asarray(p_camera)[..., 2:]
+    z = p_camera[..., 2:]
     J = model.matrix[:2] / z[..., None]  # of which pixels are J @ p_camera
     J[..., 2] -= np.matvec(J, p_camera) / z
     return J

@@ -521,21 +521,6 @@ def move_pose(pose: np.ndarray, delta: np.ndarray) -> np.ndarray:
     return np.concatenate([turned, (pose[..., 3] + delta[..., 3:6])[..., None]], axis=-1)
 
 
-def rotate_points(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """``R p`` of points under poses.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3, 4)
-    points : ndarray, shape (..., n, 3) or (n, 3)
-
-    Returns
-    -------
-    ndarray, shape (..., n, 3)
-    """
-    return points @ pose[..., :3].mT
-
-
 def apply_pose(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """``R p + t`` of points under poses.
 
@@ -553,7 +538,7 @@ def apply_pose(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def rotate_and_move(pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """``R p`` and ``R p + t`` of points under poses, each (..., n, 3); see :func:`apply_pose`."""
-    rotated = rotate_points(pose, points)
+    rotated = points @ pose[..., :3].mT
     return rotated, rotated + pose[..., None, :, 3]
 
 

@@ -310,22 +310,22 @@ def best_method(
     winner by a margin that may be within the noise (53.0 against 58.1 px mm on the LMS400
     recording).
     """
-    errors = {}
+    errors = []
     for method in CANDIDATES:
-        of_cameras = []
+        of_cameras = [(np.nan, np.nan)]  # of none
         for camera, obs in observations.items():
             if (camera, method) in solutions:
                 pairs = left_out(obs, obs.along(), method, solutions[camera, method])
-                of_cameras.append([rms(misses) for misses in left_out_residuals(pairs)])
-        if of_cameras:
-            known = np.ma.masked_invalid(of_cameras)
-            errors[method] = known.mean(axis=0).filled(np.nan)
-    table = np.array(list(errors.values())).reshape(-1, 2)
+                edges, faces = left_out_residuals(pairs)
+                of_cameras.append((rms(edges), rms(faces)))
+        known = np.ma.masked_invalid(of_cameras)
+        errors.append(known.mean(axis=0).filled(np.nan))
+    table = np.array(errors)
     judging = ~np.isnan(table).all(axis=0)  # where no edge was seen, planes judge alone
     score = np.prod(table[:, judging], axis=1)
     if not judging.any() or np.isnan(score).all():
         return None
-    return list(errors)[np.nanargmin(score)]
+    return CANDIDATES[np.nanargmin(score)]
 
 
 def best_minimum(obs, row, minima):

@@ -110,17 +110,6 @@ class JointSettings:
         if self.noise not in ("stated", "estimate"):
             raise ValueError(f"noise is 'stated' or 'estimate', got {self.noise!r}")
 
-    def unknowns(self, obs: JointObservations) -> Unknowns:
-        """The unknowns for some observations."""
-        return Unknowns(
-            len(obs.cameras),
-            len(obs.edges),
-            axis=self.axis,
-            sensor=tuple(self.sensor),
-            sweep=self.sweep,
-            sides=self.sides,
-        )
-
 
 def solve_joint(
     obs: JointObservations,
@@ -152,7 +141,14 @@ def solve_joint(
     if len(obs.placements) == 0:
         raise DegenerateGeometry("no placement to calibrate with")
     obs, left_out = without_blind_cameras(obs, required)
-    unknowns = chosen.unknowns(obs)
+    unknowns = Unknowns(
+        len(obs.cameras),
+        len(obs.edges),
+        axis=chosen.axis,
+        sensor=tuple(chosen.sensor),
+        sweep=chosen.sweep,
+        sides=chosen.sides,
+    )
     levels = Levels(sweep_sigma=chosen.sweep_sigma, step_sigma=chosen.step_sigma)
     arrived = False
     if start is None:
@@ -167,7 +163,7 @@ def solve_joint(
     if not arrived:
         start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
     state = minimum(start, data, unknowns, LAST_STEP, FIRST_STEPS).state
-    data = replace(data, levels=replace(data.levels, lapse=chosen.lapse))
+    data = data.with_levels(lapse=chosen.lapse)
     if chosen.noise == "estimate":
         state, data = settle(state, data, unknowns)
     if chosen.noise == "estimate" or chosen.lapse:
@@ -209,7 +205,7 @@ def in_stated_gauge(state: JointState, obs: JointObservations) -> JointState:
     head = geometry.head_from_axis(geometry.axis_of(found), obs.T_head_lrf)
     change = head * found.inv()
     cameras = state.cameras.copy()
-    on_base = np.isin(obs.mounts, "platform")
+    on_base = ~obs.on_head
     cameras[on_base] = pose_array(pose_transform(cameras[on_base]) * change.inv())
     boards = pose_array(change * pose_transform(state.boards))
     return replace(state, head=pose_array(head), boards=boards, cameras=cameras)

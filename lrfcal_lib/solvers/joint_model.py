@@ -63,6 +63,14 @@ class JointState:
         )
 
 
+def undisturbed(obs, head, cameras, sensor, boards) -> JointState:
+    """A state whose sweeps have no errors of their own, and whose sides are like all others."""
+    count = len(boards)
+    sweeps = np.zeros((count, 2))
+    sides = np.zeros((count, len(obs.edges) + 1))
+    return JointState(head, cameras, sensor, boards, sweeps, sides)
+
+
 @dataclass(frozen=True)
 class Unknowns:
     """Which columns of the full Jacobian are unknown.
@@ -90,9 +98,10 @@ class Unknowns:
         """Where the unknowns stand in a Jacobian: first the shared ones, then the placement's
         own.
         """
-        widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras}
-        widths |= {name: int(name in self.sensor) for name in SENSOR}
-        widths |= {
+        widths = {
+            "axis": 4 * self.axis,
+            "cameras": 6 * self.cameras,
+            **{name: name in self.sensor for name in SENSOR},
             "board": 6,
             "sweep": SWEEPS[self.sweep],
             "sides": (self.edges + 1) * self.sides,
@@ -189,6 +198,10 @@ class JointData:
     on_head: np.ndarray
     levels: Levels
 
+    def with_levels(self, **changed) -> "JointData":
+        """The same with other noise levels, fields of :class:`Levels` by name."""
+        return replace(self, levels=replace(self.levels, **changed))
+
 
 def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
     """Observations as padded arrays, with noise levels other than those stated."""
@@ -224,7 +237,6 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
     for group in (face, beam):
         group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
     view["pose"][~view["used"]] = np.eye(4)
-    on_head = np.isin(obs.mounts, "head")
     return JointData(
         face,
         beam,
@@ -232,7 +244,7 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
         outline_lines(obs.corners),
         obs.middle,
         obs.direction,
-        on_head,
+        obs.on_head,
         levels,
     )
 

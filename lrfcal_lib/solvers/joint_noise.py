@@ -62,7 +62,7 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
         number = SWEEPS[unknowns.sweep]
         scatter = sweep_levels(state.sweeps[:, :number], data, hessian, gradient, c)
         changed["sweep_sigma"] = (*scatter.tolist(), *levels.sweep_sigma[number:])
-    return replace(data, levels=replace(levels, **changed))
+    return data.with_levels(**changed)
 
 
 def settled(before: Levels, after: Levels) -> bool:

@@ -205,7 +205,7 @@ def edge_distance(state, data, group, ray):
     away = origin + lines[..., 2:] * outwards
     m = cross(ray.direction, along)
     square = np.vecdot(m, m)[..., None]
-    sign = np.where(np.vecdot(m, outwards) < 0, -1.0, 1.0)[..., None]
+    sign = np.copysign(1.0, np.vecdot(m, outwards))[..., None]
     across = sign * m / np.sqrt(square)
     distance = np.vecdot(across, away)
     reach = np.vecdot(cross(along, away), m)[..., None] / square

@@ -75,9 +75,9 @@ def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> St
                     known = RigidTransform.identity()
                 state = replace(state, head=pose_array(known))
             tried.append(agreeing_start(obs, state, data, unknowns))
-        if min(start.badness for start in tried) < GOOD_START:
+        best = min(tried, key=lambda start: start.badness)
+        if best.badness < GOOD_START:
             break
-    best = min(tried, key=lambda start: start.badness)
     if best.miss > ROUGH_MISS:  # a camera that was knocked is to be named, not refused
         refuse_contradiction(best.kept, best.state, ROUGH_MISS)
     if left_out_share(obs, best.left_out) > LARGEST_SHARE:
@@ -113,9 +113,7 @@ def agreeing_start(obs, state, data, unknowns):
         share = left_out_share(obs, left_out)
         cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / kept.count
         badness = cost * (1 + PENALTY * share)
-        attempts.append(
-            Start(kept, found.state, left_out, badness, miss, bool(found.converged))
-        )
+        attempts.append(Start(kept, found.state, left_out, badness, miss, found.converged))
         if not left_out or share > LARGEST_SHARE:
             break
         state = state_of(obs, found.state.head, found.state.cameras)

@@ -15,7 +15,7 @@ from lrfcal_lib.fit.edge_likelihood import disc_edge
 from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import pose_array, pose_parameters, pose_transform
+from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
@@ -233,16 +233,18 @@ class JointSolution:
             self._by_placement(sweeps),
         )
 
-    def columns(self, prefix: str) -> list[int]:
-        """Indices of the shared unknowns whose names begin so."""
-        return [i for i, name in enumerate(self.solution.names) if name.startswith(prefix)]
+    def columns(self, *prefixes: str) -> list[int]:
+        """Indices of the shared unknowns whose names begin so, or so."""
+        return [
+            i for i, name in enumerate(self.solution.names) if name.startswith(prefixes)
+        ]
 
     def covariance(self, *prefixes: str) -> np.ndarray:
         """Covariance to rely on of groups of shared unknowns, e.g. 'left_' or 'axis'.
 
         See `Solution.trusted`.
         """
-        index = sum(map(self.columns, prefixes), [])
+        index = self.columns(*prefixes)
         return self.solution.trusted[np.ix_(index, index)]
 
     def camera_at(self, name: str, pitch: ArrayLike) -> RigidTransform:
@@ -260,14 +262,12 @@ class JointSolution:
         by_placements = whole.covariance_placements
         if by_placements is not None:
             by_placements = by_placements[both]
-        pose = pose_array(self.transforms[name])
         return replace(
             whole,
             transform=self.transforms[name],
-            parameters=pose_parameters(pose),
+            parameters=whole.parameters[index],
             names=geometry.POSE_NAMES,
             jacobian=whole.jacobian[..., index],
-            state=pose,
             covariance=whole.covariance[both],
             covariance_placements=by_placements,
         )
@@ -305,8 +305,7 @@ class JointSolution:
         """The same estimate at other noise levels, fields of
         :class:`lrfcal_lib.solvers.joint_model.Levels` by name.
         """
-        levels = replace(self.data.levels, **changed)
-        return replace(self, data=replace(self.data, levels=levels))
+        return replace(self, data=self.data.with_levels(**changed))
 
     def score(self, changed: JointObservations | None = None, step: float = 1.0) -> Score:
         """What every placement says about the shared unknowns and, tested, about one more.

@@ -41,7 +41,8 @@ def distance_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     Two residuals of one thing: that of :func:`lrfcal_lib.fit.residuals.line_block` is larger by
     focal length / depth.
     """
-    normals, length = sight_normals(obs.crossing_lines, obs.model)
+    normals = sight_normals(obs.crossing_lines, obs.model)
+    length = np.linalg.norm(obs.crossing_lines @ obs.model.matrix, axis=-1)
     plain = sight_block(pose, obs.crossing_points, normals)
     depth = apply_pose(pose, obs.crossing_points)[..., 2]
     noise = moved_noise(pose, normals, obs.crossing_covariance)
@@ -138,7 +139,7 @@ def start_from_lines(obs: CameraObservations) -> RigidTransform:
     """
     obs.require("crossing")
     points = obs.crossing_points
-    normals, _ = sight_normals(obs.crossing_lines, obs.model)
+    normals = sight_normals(obs.crossing_lines, obs.model)
     rotations = start_rotations()
     offsets = -np.vecdot(normals, points @ rotations.mT)
     poses = shifted(rotations, normals, offsets)

@@ -233,7 +233,7 @@ def gather(cameras):
         on_sight = _Rows(
             points=obs.crossing_points,
             scatter=np.zeros((len(placement), 3)),
-            normal=sight_normals(obs.crossing_lines, obs.model)[0],
+            normal=sight_normals(obs.crossing_lines, obs.model),
             distance=np.zeros(len(placement)),
             pitch=obs.crossing_pitch,
             placement=placement,
@@ -321,13 +321,12 @@ def _model(name, solution, rows, turn, numbers):
     scatter = np.matvec(poses[rows.camera][:, :, :3], rows.scatter)
     away = distances - np.vecdot(rows.normal, scatter)
     misfit = np.sum((rows.weight * away / unit) ** 2)
-    # the offset common to all sweeps goes with the cameras' poses
-    free = {"none": 0, "direction": 1, "sweep": p - 1, "sweep_stretch": 2 * p - 1}[name]
+    free = len(errors)
+    if free >= p:  # the offset common to all sweeps goes with the cameras' poses
+        free -= 1
     level = misfit / max(numbers - POSE - free, 1)
     known = replace(solution, covariance=level / solution.inflation * solution.covariance)
-    offset = np.zeros(p)
-    sigma = np.zeros(p)
-    stretch = np.zeros(p)
+    offset, sigma, stretch = np.zeros((3, p))
     if name == "direction":
         offset = errors * turn
         sigma = np.full(p, known.trusted_sigma[-1])

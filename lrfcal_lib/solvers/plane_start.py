@@ -115,6 +115,18 @@ def sizes_of_minima(squares: np.ndarray, weights: np.ndarray | None = None) -> n
     return np.sqrt(np.average(capped, axis=1, weights=weights))
 
 
+def far_apart(poses, order):
+    """Indices of the first poses in some order that are turned against all before, `MOST_APART`."""
+    chosen = []
+    left = order
+    while len(left) and len(chosen) < MOST_APART:
+        first = left[0]
+        chosen.append(first)
+        turns = np.linalg.trace(poses[left, :, :3] @ poses[first, :, :3].T)
+        left = left[turns < 1 + 2 * np.cos(SAME_TURN)]
+    return chosen
+
+
 def common_plane(triangles):
     """The plane that all compressed points of a recording lie in, and whether they do.
 
@@ -240,18 +252,6 @@ def _squares(poses, triangles, sets):
     """Mean squared distances (n, p) of each placement's points from its plane, at n poses."""
     residuals = plane_residuals(poses[:, None], triangles, sets.boards)
     return np.vecdot(residuals, residuals) / sets.number
-
-
-def far_apart(poses, order):
-    """Indices of the first poses in some order that are turned against all before, `MOST_APART`."""
-    chosen = []
-    left = np.asarray(order)
-    while len(left) and len(chosen) < MOST_APART:
-        first = left[0]
-        chosen.append(first)
-        turns = np.linalg.trace(poses[left, :, :3] @ poses[first, :, :3].T)
-        left = left[turns < 1 + 2 * np.cos(SAME_TURN)]
-    return chosen
 
 
 def _centred(triangles):

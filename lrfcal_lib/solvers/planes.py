@@ -3,6 +3,7 @@ sees; with the intrinsics, too.
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -371,7 +372,7 @@ def estimate_with_lens(
             lambda state, planes=planes: residual(state, planes, obs, lens),
             state,
             _move_with_lens,
-            read=lambda state: _read_with_lens(state, lens),
+            read=partial(_read_with_lens, lens=lens),
             names=POSE_NAMES + INTRINSIC_NAMES[:lens],
             method=method,
             scales=(1.0,) * 6 + LENS_SCALES[:lens],
