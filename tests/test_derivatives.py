@@ -99,9 +99,10 @@ def tilt_axis():
     state = head, boards.poses, np.full((4, 2), 0.02)
 
     def blocks(s):
-        return platform.platform_blocks(
+        *derived, _ = platform.platform_blocks(
             platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1)))), *data, 1e-3
         )
+        return derived  # the last one holds what no point shows
 
     for i, block in enumerate(blocks(np.zeros(12))):
         used = (
@@ -114,7 +115,7 @@ def tilt_axis():
 
 def recorded_pitch():
     cameras, *_ = pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))[1]
-    rows = pitch.gather(list(cameras.values()), np.arange(1, 6))
+    rows = pitch.gather(list(cameras.values()))
     pose = pose_array(
         RigidTransform.from_components(
             [0.1, 0.2, 0.3], Rotation.from_rotvec([1.5, 0.1, 0.2])

@@ -78,7 +78,7 @@ def test_joint_refinement_bears_errors_common_to_a_placement():
     along = obs.plane_points / np.linalg.norm(obs.plane_points, axis=1, keepdims=True)
     bent = replace(obs, plane_points=obs.plane_points + shift[:, None] * along)
     found = solve_camera(bent, "zhang_pless_joint")
-    own = plane_residuals_m(bent, found.transform, found.board_poses)
+    own = plane_residuals_m(replace(bent, board_poses=found.board_poses), found.transform)
     assert found.board_poses.shape == (20, 4, 4) and np.sqrt(np.mean(own**2)) < 0.013
     error = np.abs(found.model.parameters - rig.model.parameters)
     assert (error < 3 * np.sqrt(np.diag(found.model.covariance))).all(), (

@@ -98,7 +98,7 @@ def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
     RigUncertainty
     """
     estimate = solution.solution
-    information = solution.information().sum(axis=0)
+    information = solution.score().information.sum(axis=0)
     noise = 0.0
     if len(solution.observations.face_sigma):
         stated = np.median(solution.observations.face_sigma)

@@ -166,10 +166,13 @@ def joint_fit(joint: JointCalibration, cameras: Iterable[str] = ()) -> dict[str,
         ``plane_rms_mm`` of face points from their boards, ``edge_rms_px`` of all half-step
         crossings of scan lines from the image edges, the estimated edge bias taken off.
     """
-    height = joint.solution.face_points()[:, 2]
+    solution = joint.solution
     cameras = cameras or joint.observations.cameras
     edges = np.concatenate([edge_misses_px(joint, camera) for camera in cameras])
-    return {"plane_rms_mm": 1000 * rms(height), "edge_rms_px": rms(edges)}
+    return {
+        "plane_rms_mm": 1000 * rms(solution.face_heights()),
+        "edge_rms_px": rms(edges),
+    }
 
 
 def edge_misses_px(joint: JointCalibration, camera: str) -> np.ndarray:

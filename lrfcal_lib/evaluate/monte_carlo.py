@@ -30,7 +30,7 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint import in_stated_gauge
-from lrfcal_lib.solvers.joint_model import JointState, Unknowns
+from lrfcal_lib.solvers.joint_model import JointState, Unknowns, undisturbed
 from lrfcal_lib.solvers.joint_solution import expected_information
 
 INTERVAL = 0.9
@@ -112,16 +112,8 @@ def joint_truth(
     sensor = np.array(
         [range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0]
     )
-    count = len(boards)
     boards = pose_array(RigidTransform.concatenate(boards))
-    state = JointState(
-        pose_array(T_head_lrf),
-        poses,
-        sensor,
-        boards,
-        sweeps=np.zeros((count, 2)),
-        sides=np.zeros((count, len(obs.edges) + 1)),
-    )
+    state = undisturbed(obs, pose_array(T_head_lrf), poses, sensor, boards)
     return in_stated_gauge(state, obs)
 
 

@@ -90,7 +90,7 @@ def inverse_root(covariance: np.ndarray) -> np.ndarray:
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
-def null_space(hessian: np.ndarray, scales: np.ndarray, limit: float = 1.0) -> np.ndarray:
+def null_space(hessian: np.ndarray, scales: np.ndarray, limit: float) -> np.ndarray:
     """Directions that normal equations of whitened residuals do not determine.
 
     Parameters
@@ -213,7 +213,7 @@ def placement_covariance(
 def axis_words(direction):
     """A direction in words: the name of an axis within 8 degrees, otherwise its components."""
     direction = unit_vector(direction)
-    largest = int(np.argmax(np.abs(direction)))
+    largest = np.argmax(np.abs(direction))
     direction = direction * np.sign(direction[largest])
     if direction[largest] > np.cos(np.radians(8)):
         return "xyz"[largest]

@@ -27,7 +27,7 @@ def disc_share(x: np.ndarray) -> np.ndarray:
     ndarray
         1 for x <= -1, 0 for x >= 1.
     """
-    inside = np.clip(np.asarray(x, float), -1.0, 1.0)
+    inside = np.clip(x, -1.0, 1.0)
     return (np.arccos(inside) - inside * np.sqrt(1 - inside**2)) / np.pi
 
 

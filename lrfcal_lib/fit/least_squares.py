@@ -79,6 +79,20 @@ class Block:
     corrected: np.ndarray | None = None
     cost: np.ndarray | None = None
 
+    @classmethod
+    def of_groups(cls, residuals, jacobian, whitener, corrected=None, **rest):
+        """The Block of residuals (..., m, d) with their Jacobian (..., m, d, k); the rest is as
+        above.
+        """
+        shape = residuals.shape[:-2] + (-1,)
+        by_unknowns = shape + jacobian.shape[-1:]
+        if corrected is not None:
+            corrected = corrected.reshape(by_unknowns)
+        jacobian = jacobian.reshape(by_unknowns)
+        return cls(
+            residuals.reshape(shape), jacobian, whitener, corrected=corrected, **rest
+        )
+
     @property
     def size(self):
         """Number d of residuals that are judged together by a robust loss."""
@@ -146,24 +160,6 @@ def _level(z, count, block, axes):
     wide = (*z.shape[: z.ndim + min(np.atleast_1d(axes))], -1)
     level = medians((z / usual).reshape(wide), (inside & (z == z)).reshape(wide))
     return np.maximum(np.expand_dims(level, axes), 1e-9)
-
-
-def remembered(evaluate: Callable) -> Callable:
-    """The same function, which is not asked twice in a row about one state.
-
-    Parameters
-    ----------
-    evaluate : callable
-        Of a state, which nobody changes in place.
-    """
-    last: list = [None, None]
-
-    def once(state):
-        if state is not last[0]:
-            last[:] = state, evaluate(state)
-        return last[1]
-
-    return once
 
 
 def _axes(shared):
@@ -266,10 +262,10 @@ def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
 
 
 def _by_shared(back):
-    """Derivatives (p, k, c) of the best values of all unknowns by the shared ones."""
-    own = -back[..., :-1]
-    same = np.eye(own.shape[-1])
-    return np.concatenate([np.broadcast_to(same, (len(own), *same.shape)), own], axis=1)
+    """The best step of all unknowns by that of the shared ones and a 1, (p, k, c + 1)."""
+    columns = back.shape[-1]
+    same = np.eye(columns - 1, columns)
+    return np.concatenate([np.broadcast_to(same, (len(back), *same.shape)), -back], axis=1)
 
 
 def likeliest(
@@ -281,9 +277,9 @@ def likeliest(
     reduced, right, back = eliminate(hessian, gradient, shared)
     by_shared = _by_shared(back)
     inverse = pseudo_inverse(np.sum(reduced, axis=0))
-    steps = by_shared @ (-inverse @ np.sum(right, axis=0))
-    steps[:, shared:] -= back[..., shared]
-    covariance = by_shared @ inverse @ by_shared.mT
+    steps = by_shared @ np.append(-inverse @ np.sum(right, axis=0), 1.0)
+    derivatives = by_shared[..., :-1]
+    covariance = derivatives @ inverse @ derivatives.mT
     covariance[:, shared:, shared:] += pseudo_inverse(hessian[:, shared:, shared:])
     return steps, covariance
 
@@ -302,8 +298,7 @@ def _step(hessian, gradient, damping, shared):
     else:
         reduced, right, back = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
-        whole = _by_shared(back) @ common
-        whole[:, shared:] -= back[..., shared]
+        whole = _by_shared(back) @ np.append(common, 1.0)
         step = common, whole[:, shared:]
     length = np.vecdot(whole, np.matvec(hessian, whole))
     promised = -np.vecdot(whole, gradient) - 0.5 * length

@@ -4,10 +4,12 @@ from planes.
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block
+from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import (
     CameraModel,
@@ -20,12 +22,13 @@ from lrfcal_lib.model.camera import (
 from lrfcal_lib.model.geometry import (
     cross,
     gradient_by_pose,
-    rotate_points,
+    rotate_and_move,
 )
 from lrfcal_lib.model.observations import CameraObservations
 
 # metres; no printed board is flatter, and a board along the beam has no range noise across it
 SIGMA_FLOOR = 1e-4
+FEWEST_CORNERS = 6  # of a pattern, for its pose
 
 
 def line_residuals(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) -> np.ndarray:
@@ -63,8 +66,7 @@ def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
         ``T_camera_source``.
     obs : CameraObservations
     """
-    rotated = rotate_points(pose, obs.crossing_points)
-    moved = rotated + pose[..., None, :, 3]  # (16)
+    rotated, moved = rotate_and_move(pose, obs.crossing_points)  # (16)
     residuals = line_residuals(moved, obs.crossing_lines, obs.model)
     # of l K q / z by the point q, pixels a metre
     gradients = obs.crossing_lines @ obs.model.matrix / moved[..., 2:]
@@ -79,9 +81,7 @@ def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     )
 
 
-def sight_block(
-    pose: np.ndarray, points: np.ndarray, normals: np.ndarray, sigma: float
-) -> Block:
+def sight_block(pose: np.ndarray, points: np.ndarray, normals: np.ndarray) -> Block:
     """Distances of points from planes through the camera centre, metres.
 
     Parameters
@@ -91,18 +91,17 @@ def sight_block(
     points : ndarray, shape (..., n, 3)
         Source frame, metres.
     normals : ndarray, shape (..., n, 3)
-        Of the planes, see :func:`sight_normals`.
-    sigma : float
-        Of every distance, metres.
+        Of the planes, see :func:`sight_normals`; over the standard deviation of distances for
+        distances in that.
     """
-    rotated = rotate_points(pose, points)
-    residuals = np.vecdot(normals, rotated + pose[..., None, :, 3])
+    rotated, moved = rotate_and_move(pose, points)
+    residuals = np.vecdot(normals, moved)
     jacobian = gradient_by_pose(rotated, np.broadcast_to(normals, rotated.shape))
-    return Block(residuals, jacobian, np.asarray(1 / sigma))
+    return Block(residuals, jacobian)
 
 
-def sight_normals(lines: np.ndarray, model: CameraModel) -> tuple[np.ndarray, np.ndarray]:
-    """Planes through the camera centre and image lines.
+def sight_normals(lines: np.ndarray, model: CameraModel) -> np.ndarray:
+    """Normals of the planes through the camera centre and image lines.
 
     Parameters
     ----------
@@ -112,19 +111,13 @@ def sight_normals(lines: np.ndarray, model: CameraModel) -> tuple[np.ndarray, np
 
     Returns
     -------
-    normals : ndarray, shape (..., 3)
+    ndarray, shape (..., 3)
         Unit vectors, camera frame.
-    lengths : ndarray, shape (...)
-        Of ``K^T l``.
     """
-    raw = lines @ model.matrix
-    length = np.linalg.norm(raw, axis=-1)
-    return raw / length[..., None], length
+    return geometry.unit_vector(lines @ model.matrix)
 
 
-def edge_residuals_px(
-    obs: CameraObservations, transform: RigidTransform, model: CameraModel | None = None
-) -> np.ndarray:
+def edge_residuals_px(obs: CameraObservations, transform: RigidTransform) -> np.ndarray:
     """Signed distances of the projected crossings from their image lines, equation (20).
 
     Parameters
@@ -132,31 +125,16 @@ def edge_residuals_px(
     obs : CameraObservations
     transform : RigidTransform
         ``T_camera_source``.
-    model : CameraModel, optional
-        Other intrinsics than ``obs.model``: the image lines are then moved there (two points of
-        each are distorted with the old model and undistorted with the new one).
 
     Returns
     -------
     ndarray, shape (n,)
         Undistorted pixels; positive outside the board.
     """
-    if model is not None and len(obs.crossing_points):
-        lines = obs.crossing_lines
-        uv = mirrored(transform.apply(obs.crossing_points), obs.model)
-        foot = uv - line_distance(uv, lines)[:, None] * lines[:, :2]
-        along = lines[:, [1, 0]] * [10.0, -10.0]
-        sights = obs.model.sights(np.stack([foot + along, foot - along]))
-        moved = line_through(*undistort(project(sights, obs.model), model))
-        obs = replace(obs, crossing_lines=moved, model=model)
     return line_block(geometry.pose_array(transform), obs).residuals
 
 
-def plane_residuals_m(
-    obs: CameraObservations,
-    transform: RigidTransform,
-    board_poses: np.ndarray | None = None,
-) -> np.ndarray:
+def plane_residuals_m(obs: CameraObservations, transform: RigidTransform) -> np.ndarray:
     """Signed distances of the board-face points from the planes the camera sees.
 
     Parameters
@@ -164,21 +142,51 @@ def plane_residuals_m(
     obs : CameraObservations
     transform : RigidTransform
         ``T_camera_source``.
-    board_poses : ndarray, shape (p, 4, 4), optional
-        Other poses than ``obs.board_poses`` (of a joint refinement).
 
     Returns
     -------
     ndarray, shape (m,)
         Metres, along the board's z; NaN for placements whose board pose the camera does not know.
     """
-    poses = obs.board_poses if board_poses is None else board_poses
     out = np.full(len(obs.plane_points), np.nan)
     row, known = np.nonzero(obs.placements[:, None] == obs.plane_placement)
-    normal = poses[row, :3, 2]
-    point = poses[row, :3, 3]
-    out[known] = np.vecdot(normal, transform.apply(obs.plane_points[known]) - point)
+    boards = obs.board_poses[row]
+    away = transform.apply(obs.plane_points[known]) - boards[:, :3, 3]
+    out[known] = np.vecdot(boards[:, :3, 2], away)
     return out
+
+
+def under_intrinsics(obs: CameraObservations, solution: Solution) -> CameraObservations:
+    """The observations as they are under the intrinsics of a solution, where it has refined them.
+
+    Two points of each image line beside its crossing are distorted with the old model and
+    undistorted with the new one; poses of boards whose pattern was seen are those that fit it.
+    """
+    model = solution.model
+    if model is None:
+        return obs
+    lines = obs.crossing_lines
+    uv = mirrored(solution.transform.apply(obs.crossing_points), obs.model)
+    foot = uv - line_distance(uv, lines)[:, None] * lines[:, :2]
+    along = lines[:, [1, 0]] * [10.0, -10.0]
+    sights = obs.model.sights(np.stack([foot + along, foot - along]))
+    moved = line_through(*undistort(project(sights, obs.model), model))
+    boards = obs.board_poses.copy()
+    for pose, pixels in zip(boards, obs.pattern_pixels, strict=True):
+        good = np.isfinite(pixels).all(axis=1)
+        if good.sum() >= FEWEST_CORNERS:
+            _, rotvec, shift = cv2.solvePnP(
+                obs.pattern_points[good],
+                pixels[good],
+                model.matrix,
+                model.distortion,
+                cv2.Rodrigues(pose[:3, :3])[0],
+                pose[:3, 3:].copy(),
+                useExtrinsicGuess=True,
+                flags=cv2.SOLVEPNP_ITERATIVE,
+            )
+            pose[:3] = np.hstack([cv2.Rodrigues(rotvec)[0], shift])
+    return replace(obs, model=model, crossing_lines=moved, board_poses=boards)
 
 
 def read_pose(pose: np.ndarray) -> tuple[RigidTransform, np.ndarray]:
@@ -245,4 +253,5 @@ def moved_noise(
     -------
     ndarray, shape (..., n, 3)
     """
-    return rotate_points(pose, np.vecmat(gradient @ pose[..., :3], covariance))
+    rotation = pose[..., :3]
+    return np.vecmat(gradient @ rotation, covariance) @ rotation.mT

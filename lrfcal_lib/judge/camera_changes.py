@@ -139,10 +139,7 @@ def explains(solution: JointSolution) -> bool:
     solution
     """
     noise = solution.noise
-    return (
-        solution.converged
-        and max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
-    )
+    return solution.converged and max(noise["face_scale"], noise["view_scale"]) <= NOISY
 
 
 def with_change(obs, step, camera, prepared, settings):

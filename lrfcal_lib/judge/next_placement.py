@@ -128,7 +128,7 @@ def suggest_placement(
             "view and the calibration"
         )
     boards = boards[seen]
-    known = solution.information().sum(axis=0)
+    known = solution.score().information.sum(axis=0)
     added = candidate_information(boards, pitches, solution, models)
     before = total_sigma(known, solution)
     after = total_sigma(known + added, solution)
@@ -177,7 +177,7 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
         Of 'axis' and of each camera, as far as they were unknown.
     """
     variance = np.linalg.diagonal(covariance) / scales_of(solution) ** 2
-    columns = {"axis": solution.columns("axis_") + solution.columns("offset_")}
+    columns = {"axis": solution.columns("axis_", "offset_")}
     for camera in solution.transforms:
         columns[camera] = solution.columns(f"{camera}_")
     return {

@@ -94,7 +94,7 @@ def weak_pitch(solution) -> Iterator[Fault]:
     if AXIS_NAMES[0] not in solution.solution.names:
         return
     obs = solution.observations
-    of_view = np.array(obs.mounts, str)[obs.view_camera] == "head"
+    of_view = obs.on_head[obs.view_camera]
     image_pitch = obs.view_pitch[of_view]
     image_placement = obs.view_placement[of_view]
     pitch = np.concatenate([obs.face_pitch, obs.beam_pitch, image_pitch])

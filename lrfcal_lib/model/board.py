@@ -42,8 +42,8 @@ class Chessboard:
 
     def outline(self) -> np.ndarray:
         """Corners of the printed squares together, shape (4, 2), metres."""
-        first = np.asarray(self.origin) - self.square
-        size = self.square * np.array([self.columns + 1, self.rows + 1])
+        first = np.subtract(self.origin, self.square)
+        size = np.multiply(self.square, [self.columns + 1, self.rows + 1])
         return first + size * UNIT_SQUARE
 
 
@@ -111,7 +111,6 @@ def outline_lines(corners: ArrayLike) -> np.ndarray:
     ndarray, shape (n, 3)
         Row i from corner i to i + 1.
     """
-    corners = np.asarray(corners, float)
     points = np.insert(corners, 2, 1.0, axis=1)
     lines = cross(points, np.roll(points, -1, axis=0))
     twice_area = lines[:, 2].sum()
@@ -130,7 +129,6 @@ def corners_of_lines(lines: ArrayLike) -> np.ndarray:
     -------
     ndarray, shape (..., n, 2)
     """
-    lines = np.asarray(lines, float)
     points = cross(np.roll(lines, 1, axis=-2), lines)
     return points[..., :2] / points[..., 2:]
 

@@ -82,9 +82,10 @@ class CameraModel:
         rms_px : float, optional
         """
         fx, fy, cx, cy = map(float, values[:4])
-        size = self.width, self.height
         lens = np.array(values[4:])
-        return CameraModel(*size, fx, fy, cx, cy, lens, covariance, rms_px)
+        return CameraModel(
+            self.width, self.height, fx, fy, cx, cy, lens, covariance, rms_px
+        )
 
 
 def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
@@ -133,12 +134,12 @@ def _pixels(normalized, model):
     return normalized * [model.fx, model.fy] + [model.cx, model.cy]
 
 
-def pinhole_jacobian(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
+def pinhole_jacobian(p_camera: np.ndarray, model: CameraModel) -> np.ndarray:
     """Derivative of :func:`pinhole` by the point.
 
     Parameters
     ----------
-    p_camera : array_like, shape (..., 3)
+    p_camera : ndarray, shape (..., 3)
         Metres.
     model : CameraModel
 
@@ -147,7 +148,7 @@ def pinhole_jacobian(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2, 3)
         Pixels per metre.
     """
-    z = np.asarray(p_camera)[..., 2:]
+    z = p_camera[..., 2:]
     J = model.matrix[:2] / z[..., None]  # of which pixels are J @ p_camera
     J[..., 2] -= np.matvec(J, p_camera) / z
     return J
@@ -303,11 +304,9 @@ def redistort(uv: ArrayLike, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 2)
         Pixels; NaN for what lies so far outside that the lens would fold it back into the image.
     """
-    focal = np.array([model.fx, model.fy])
-    centre = np.array([model.cx, model.cy])
-    normalized = (uv - centre) / focal
-    recorded = distort(normalized, model.distortion) * focal + centre
-    recorded[np.sum(normalized**2, axis=-1) >= fold(model)] = np.nan
+    sights = model.sights(uv)
+    recorded = project(sights, model)
+    recorded[np.sum(sights[..., :2] ** 2, axis=-1) >= fold(model)] = np.nan
     return recorded
 
 

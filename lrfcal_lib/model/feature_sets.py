@@ -23,7 +23,7 @@ def point_set(
     -------
     ndarray of bool, shape (...)
     """
-    away = np.linalg.norm(np.asarray(positions, float) - point, axis=-1)
+    away = np.linalg.norm(np.subtract(positions, point), axis=-1)
     return np.abs(away - distance) <= tolerance
 
 
@@ -49,9 +49,7 @@ def line_set(
     -------
     ndarray of bool, shape (...)
     """
-    away = np.linalg.norm(
-        np.cross(np.asarray(positions, float) - point, direction), axis=-1
-    )
+    away = np.linalg.norm(np.cross(np.subtract(positions, point), direction), axis=-1)
     return away <= distance + tolerance
 
 
@@ -77,7 +75,7 @@ def plane_set(
     -------
     ndarray of bool, shape (...)
     """
-    height = (np.asarray(positions, float) - point) @ np.asarray(normal, float)
+    height = np.vecdot(np.subtract(positions, point), normal)
     return (height >= -tolerance) & (height <= distance + tolerance)
 
 
@@ -111,7 +109,7 @@ def crossing_volume(radius: float, angle: ArrayLike) -> np.ndarray:
     ndarray, shape (...)
         Cubic metres: smallest for perpendicular axes, infinite for parallel ones.
     """
-    sine = np.abs(np.sin(np.asarray(angle, float)))
+    sine = np.abs(np.sin(angle))
     with np.errstate(divide="ignore"):
         return np.where(sine > 1e-15, 16 * radius**3 / 3 / sine, np.inf)
 

@@ -456,21 +456,6 @@ def pose_transform(pose: np.ndarray, proper: bool = False) -> RigidTransform:
     )  # much faster than from components
 
 
-def exp_rotation(w: ArrayLike) -> np.ndarray:
-    """Rotation matrices of rotation vectors.
-
-    Parameters
-    ----------
-    w : array_like, shape (..., 3)
-        Radians.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-    """
-    return Rotation.from_rotvec(w).as_matrix()
-
-
 def log_rotation(R: np.ndarray) -> np.ndarray:
     """Rotation vectors of rotation matrices.
 
@@ -532,23 +517,8 @@ def move_pose(pose: np.ndarray, delta: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (..., 3, 4)
     """
-    turned = exp_rotation(delta[..., :3]) @ pose[..., :3]
+    turned = Rotation.from_rotvec(delta[..., :3]).as_matrix() @ pose[..., :3]
     return np.concatenate([turned, (pose[..., 3] + delta[..., 3:6])[..., None]], axis=-1)
-
-
-def rotate_points(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """``R p`` of points under poses.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3, 4)
-    points : ndarray, shape (..., n, 3) or (n, 3)
-
-    Returns
-    -------
-    ndarray, shape (..., n, 3)
-    """
-    return points @ pose[..., :3].mT
 
 
 def apply_pose(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -563,7 +533,13 @@ def apply_pose(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (..., n, 3)
     """
-    return rotate_points(pose, points) + pose[..., None, :, 3]
+    return rotate_and_move(pose, points)[1]
+
+
+def rotate_and_move(pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``R p`` and ``R p + t`` of points under poses, each (..., n, 3); see :func:`apply_pose`."""
+    rotated = points @ pose[..., :3].mT
+    return rotated, rotated + pose[..., None, :, 3]
 
 
 def gradient_by_pose(rotated: np.ndarray, gradient: np.ndarray) -> np.ndarray:

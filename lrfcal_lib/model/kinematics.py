@@ -55,7 +55,6 @@ class Corrections:
 
     def points(self, p_lrf: ArrayLike) -> np.ndarray:
         """Measured points (..., 3) of the LRF frame without the range offset, metres."""
-        p_lrf = np.asarray(p_lrf, float)
         length = np.linalg.norm(p_lrf, axis=-1, keepdims=True)
         return p_lrf * (1 - self.range_offset / np.maximum(length, 1e-9))
 

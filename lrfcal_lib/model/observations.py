@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
@@ -46,29 +45,25 @@ class _Grouped:
         groups that are known.
         """
         for f in fields(self):
-            if not f.metadata:
-                continue
-            group, shape, default = f.metadata.values()
             value = getattr(self, f.name)
-            if value is None:
-                count = counts.get(group, 0)
-                value = np.arange(count)
-                if default is not None:
-                    sizes = [counts.get(size, size) for size in shape]
-                    value = np.full((count, *sizes), default)
-                object.__setattr__(self, f.name, value)
-            counts.setdefault(group, value.shape[value.ndim - len(shape) - 1])
-        for name, value in vars(self).items():
-            if name == "pattern_pixels":  # NaN where not seen
-                continue
+            if f.metadata:
+                group, shape, default = f.metadata.values()
+                if value is None:
+                    count = counts.get(group, 0)
+                    value = np.arange(count)
+                    if default is not None:
+                        sizes = [counts.get(size, size) for size in shape]
+                        value = np.full((count, *sizes), default)
+                    object.__setattr__(self, f.name, value)
+                counts.setdefault(group, value.shape[value.ndim - len(shape) - 1])
             if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
                 continue
             bad = ~np.isfinite(value)
-            if bad.any():
+            if bad.any() and f.name != "pattern_pixels":  # NaN where not seen
                 row = np.argwhere(bad)[0, 0]
                 raise ValueError(
-                    f"{name}{whose} holds {bad.sum()} values that are not finite, the first in row "
-                    f"{row} ({value[row].ravel()[:3]}): leave such observations out"
+                    f"{f.name}{whose} holds {bad.sum()} values that are not finite, the first in "
+                    f"row {row} ({value[row].ravel()[:3]}): leave such observations out"
                 )
 
     def keep(self, **masks):
@@ -356,9 +351,15 @@ class JointObservations(_Grouped):
         if np.any(self.face_sigma <= 0):
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
 
-    def lines(self):
-        """Sides of the board, see :meth:`lrfcal_lib.model.board.Board.lines`."""
-        return outline_lines(self.corners)
+    @property
+    def on_head(self) -> Array:
+        """Which cameras are fixed to the head, bool (c,)."""
+        return np.isin(self.mounts, "head")
+
+    @property
+    def count(self) -> int:
+        """Number of ranges, beams and views together."""
+        return len(self.face_range) + len(self.beam_hit) + len(self.view_pitch)
 
     def select(self, placements):
         """The observations of some placements (numbers) only."""

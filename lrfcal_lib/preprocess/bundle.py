@@ -14,7 +14,7 @@ from lrfcal_lib.model.geometry import (
     move_pose,
     pose_array,
     pose_transform,
-    rotate_points,
+    rotate_and_move,
 )
 
 SIGMA_FLOOR_PX = 0.05  # corner detectors are never better than this on real prints
@@ -82,16 +82,14 @@ class Bundle:
         jacobian : ndarray, shape (c, v, k, 2, n)
         """
         raised = points + (basis @ self.shape)[:, None] * UP
-        turned = rotate_points(self.poses, raised)
-        p_first = turned + self.poses[:, None, :, 3]
+        turned, p_first = rotate_and_move(self.poses, raised)
         views = np.eye(len(self.poses))[:, None, None, :, None]
         pixels = []
         jacobian = []
         for lens, mount, own in zip(
             self.lenses, self.mounting, np.eye(len(self.lenses)), strict=True
         ):
-            mounted = rotate_points(mount, p_first)
-            p_camera = mounted + mount[:, 3]
+            mounted, p_camera = rotate_and_move(mount, p_first)
             fx, fy, cx, cy = lens[:4]
             model = CameraModel(1, 1, fx, fy, cx, cy, lens[4:])
             by_point, by_lens = project_jacobians(p_camera, model)

@@ -12,7 +12,7 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     pose_step,
     pose_transform,
-    rotate_points,
+    rotate_and_move,
 )
 
 ROUNDS = 15  # of Gauss-Newton
@@ -95,8 +95,7 @@ def line_misses(edges, points, model: CameraModel, pose):
         By ``[w, v]``.
     """
     lines = np.stack([edge.line for edge in edges])
-    turned = rotate_points(pose, points)
-    p_camera = turned + pose[:, 3]
+    turned, p_camera = rotate_and_move(pose, points)
     uv = pinhole(p_camera, model)
     distance = line_distance(uv, lines[:, None])
     by_point = np.vecmat(lines[:, None, :2], pinhole_jacobian(p_camera, model))

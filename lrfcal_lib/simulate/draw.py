@@ -22,7 +22,7 @@ from lrfcal_lib.model.geometry import (
     gradient_by_pose,
     move_pose,
     polar_to_points,
-    rotate_points,
+    rotate_and_move,
     tilt,
 )
 from lrfcal_lib.model.kinematics import camera_at
@@ -305,8 +305,7 @@ def seen_poses(devices, true, rng, noise):
     """
     pattern = devices.board.pattern
     corners = CORNERS if pattern is None else pattern.points()
-    turned = rotate_points(true, corners)
-    points = turned + true[:, None, :, 3]
+    turned, points = rotate_and_move(true, corners)
     by_point = project_jacobians(points, devices.model)[0]
     rows = (len(true), 2 * len(corners), 3)
     J = gradient_by_pose(turned.repeat(2, axis=1), by_point.reshape(rows))

@@ -9,17 +9,20 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
 
-import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import RigidTransform
 from scipy.special import chdtri
 
-from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m
+from lrfcal_lib.fit.residuals import (
+    edge_residuals_px,
+    line_block,
+    plane_residuals_m,
+    under_intrinsics,
+)
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.fit.robust import rms
-from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_difference
+from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose, pose_array
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers import lines, plane_start, planes
 
@@ -257,6 +260,30 @@ def left_out(
             )
 
 
+def left_out_residuals(
+    pairs: Iterable[tuple[CameraObservations, Solution]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of every placement under a calibration from all the others.
+
+    Parameters
+    ----------
+    pairs : iterable of (CameraObservations, Solution)
+        As of :func:`left_out`.
+
+    Returns
+    -------
+    edges, planes : ndarray, shapes (n,), (m,)
+        Of crossings, pixels, and of face points, metres.
+    """
+    edges = [np.zeros(0)]
+    planes = [np.zeros(0)]
+    for held, solution in pairs:
+        seen = under_intrinsics(held, solution)
+        edges.append(edge_residuals_px(seen, solution.transform))
+        planes.append(plane_residuals_m(seen, solution.transform))
+    return np.concatenate(edges), np.concatenate(planes)
+
+
 def best_method(
     observations: dict[str, CameraObservations], solutions: dict[tuple[str, str], Solution]
 ) -> str | None:
@@ -283,76 +310,22 @@ def best_method(
     winner by a margin that may be within the noise (53.0 against 58.1 px mm on the LMS400
     recording).
     """
-    errors = {}
+    errors = []
     for method in CANDIDATES:
-        of_cameras = []
+        of_cameras = [(np.nan, np.nan)]  # of none
         for camera, obs in observations.items():
             if (camera, method) in solutions:
-                held = left_out(obs, obs.along(), method, solutions[camera, method])
-                of_cameras.append([rms(misses) for misses in left_out_residuals(held)])
-        if of_cameras:
-            errors[method] = [_mean(column) for column in zip(*of_cameras, strict=True)]
-    table = np.array(list(errors.values())).reshape(-1, 2)
+                pairs = left_out(obs, obs.along(), method, solutions[camera, method])
+                edges, faces = left_out_residuals(pairs)
+                of_cameras.append((rms(edges), rms(faces)))
+        known = np.ma.masked_invalid(of_cameras)
+        errors.append(known.mean(axis=0).filled(np.nan))
+    table = np.array(errors)
     judging = ~np.isnan(table).all(axis=0)  # where no edge was seen, planes judge alone
     score = np.prod(table[:, judging], axis=1)
     if not judging.any() or np.isnan(score).all():
         return None
-    return list(errors)[np.nanargmin(score)]
-
-
-def left_out_residuals(
-    pairs: Iterable[tuple[CameraObservations, Solution]],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of every placement under a calibration from all the others.
-
-    Parameters
-    ----------
-    pairs : iterable of (CameraObservations, Solution)
-        Of :func:`left_out`, or what else is judged by a calibration; each under its intrinsics.
-
-    Returns
-    -------
-    edges, planes : ndarray, shapes (n,), (m,)
-        Of crossings, pixels, and of face points, metres.
-    """
-    edges = [np.zeros(0)]
-    planes = [np.zeros(0)]
-    for held, solution in pairs:
-        edges.append(edge_residuals_px(held, solution.transform, solution.model))
-        poses = poses_under(held, solution.model)
-        planes.append(plane_residuals_m(held, solution.transform, poses))
-    return np.concatenate(edges), np.concatenate(planes)
-
-
-def poses_under(obs: CameraObservations, model: CameraModel | None) -> np.ndarray:
-    """The board poses (p, 4, 4) that a camera sees under other intrinsics.
-
-    As they are where no pattern was seen.
-    """
-    if model is None or len(obs.pattern_points) == 0:
-        return obs.board_poses
-    moved = obs.board_poses.copy()
-    for pose, pixels in zip(moved, obs.pattern_pixels, strict=True):
-        good = np.isfinite(pixels).all(axis=1)
-        if good.sum() >= 6:
-            _, rotvec, shift = cv2.solvePnP(
-                obs.pattern_points[good],
-                pixels[good],
-                model.matrix,
-                model.distortion,
-                cv2.Rodrigues(pose[:3, :3])[0],
-                pose[:3, 3:].copy(),
-                useExtrinsicGuess=True,
-                flags=cv2.SOLVEPNP_ITERATIVE,
-            )
-            pose[:3] = np.hstack([cv2.Rodrigues(rotvec)[0], shift])
-    return moved
-
-
-def _mean(values):
-    """Mean of the finite values; NaN where there are none."""
-    finite = [value for value in values if np.isfinite(value)]
-    return np.mean(finite) if finite else np.nan
+    return CANDIDATES[np.nanargmin(score)]
 
 
 def best_minimum(obs, row, minima):
@@ -361,16 +334,14 @@ def best_minimum(obs, row, minima):
     """
     squares = [_misses(obs, row, solution.transform) ** 2 for solution in minima]
     sizes = plane_start.sizes_of_minima(np.array(squares))
-    points = getattr(obs, f"{row.uses}_points")
-    depths = np.array([solution.transform.apply(points)[:, 2] for solution in minima])
+    poses = np.array([pose_array(solution.transform) for solution in minima])
+    depths = apply_pose(poses, getattr(obs, f"{row.uses}_points"))[..., 2]
     before = np.mean(depths < 0, axis=1) <= 0.5  # most of the board is ahead of the camera
-    order = np.lexsort([sizes, ~before])
-    best = order[0]
+    best, *others = plane_start.far_apart(poses, np.lexsort([sizes, ~before]))
     nearly = (before == before[best]) & (sizes <= plane_start.NEARLY * sizes[best])
-    for i in order[nearly[order]]:
-        turn, _ = transform_difference(minima[i].transform, minima[best].transform)
-        if turn > plane_start.SAME_TURN:
-            return replace(minima[best], rival=minima[i].transform)
+    for other in others:
+        if nearly[other]:
+            return replace(minima[best], rival=minima[other].transform)
     return minima[best]
 
 

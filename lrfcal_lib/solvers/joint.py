@@ -5,12 +5,13 @@ Equations (4) to (6) and (16) to (19) at once, every board's pose unknown and el
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
-from lrfcal_lib.fit.least_squares import remembered, solve
+from lrfcal_lib.fit.least_squares import solve
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
@@ -43,10 +44,8 @@ from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words
 
 # what counts as a change by one, beside rad and m
 SCALES = {
-    "range_offset": 1.0,
     "edge_log_odds": 10.0,
     "edge_log_softness": 10.0,
-    "pitch_scale": 1.0,
 }
 FIRST_STEPS = 60
 NOISE_ROUNDS = 10
@@ -111,17 +110,6 @@ class JointSettings:
         if self.noise not in ("stated", "estimate"):
             raise ValueError(f"noise is 'stated' or 'estimate', got {self.noise!r}")
 
-    def unknowns(self, obs: JointObservations) -> Unknowns:
-        """The unknowns for some observations."""
-        return Unknowns(
-            len(obs.cameras),
-            len(obs.edges),
-            axis=self.axis,
-            sensor=tuple(self.sensor),
-            sweep=self.sweep,
-            sides=self.sides,
-        )
-
 
 def solve_joint(
     obs: JointObservations,
@@ -153,7 +141,14 @@ def solve_joint(
     if len(obs.placements) == 0:
         raise DegenerateGeometry("no placement to calibrate with")
     obs, left_out = without_blind_cameras(obs, required)
-    unknowns = chosen.unknowns(obs)
+    unknowns = Unknowns(
+        len(obs.cameras),
+        len(obs.edges),
+        axis=chosen.axis,
+        sensor=tuple(chosen.sensor),
+        sweep=chosen.sweep,
+        sides=chosen.sides,
+    )
     levels = Levels(sweep_sigma=chosen.sweep_sigma, step_sigma=chosen.step_sigma)
     arrived = False
     if start is None:
@@ -168,15 +163,14 @@ def solve_joint(
     if not arrived:
         start = minimum(start, data, coarse(unknowns), steps=FIRST_STEPS).state
     state = minimum(start, data, unknowns, LAST_STEP, FIRST_STEPS).state
-    data = replace(data, levels=replace(data.levels, lapse=chosen.lapse))
+    data = data.with_levels(lapse=chosen.lapse)
     if chosen.noise == "estimate":
         state, data = settle(state, data, unknowns)
     if chosen.noise == "estimate" or chosen.lapse:
         state = minimum(state, data, unknowns, LAST_STEP).state
     if required:  # a cause before what follows from it: edges that fit nowhere, say
         refuse_contradiction(obs, state, LAST_MISS, left_out)
-    solution = finished(obs, state, data, unknowns, required)
-    return replace(solution, excluded=tuple(left_out))
+    return finished(obs, state, data, unknowns, required, left_out)
 
 
 def solve_again(obs: JointObservations, like: JointSolution) -> JointSolution:
@@ -189,8 +183,7 @@ def solve_again(obs: JointObservations, like: JointSolution) -> JointSolution:
     obs = obs.select(like.observations.placements[rows])
     data = gather(obs, like.data.levels)
     state = minimum(like.state.of_placements(rows), data, like.unknowns, LAST_STEP).state
-    found = finished(obs, state, data, like.unknowns, required=True)
-    return replace(found, excluded=like.excluded)
+    return finished(obs, state, data, like.unknowns, required=True, excluded=like.excluded)
 
 
 def settle(state, data, unknowns):
@@ -212,16 +205,17 @@ def in_stated_gauge(state: JointState, obs: JointObservations) -> JointState:
     head = geometry.head_from_axis(geometry.axis_of(found), obs.T_head_lrf)
     change = head * found.inv()
     cameras = state.cameras.copy()
-    on_base = np.isin(obs.mounts, "platform")
+    on_base = ~obs.on_head
     cameras[on_base] = pose_array(pose_transform(cameras[on_base]) * change.inv())
     boards = pose_array(change * pose_transform(state.boards))
     return replace(state, head=pose_array(head), boards=boards, cameras=cameras)
 
 
-def finished(obs, state, data, unknowns, required):
+def finished(obs, state, data, unknowns, required, excluded):
     """The last steps, in the gauge of the stated platform, and all that a solution says."""
     names = unknowns.names(obs.cameras)
-    blocks = remembered(lambda at: named_blocks(at, data, unknowns))
+    # the last ones that the minimiser asks for are asked for again
+    blocks = lru_cache(maxsize=1)(lambda at: named_blocks(at, data, unknowns))
     found = solve(
         lambda at: blocks(at).values(),
         in_stated_gauge(state, obs),
@@ -237,7 +231,7 @@ def finished(obs, state, data, unknowns, required):
         limit=UNSEEN,
         max_iterations=MOST_STEPS,
         tolerance=LAST_STEP,
-        n_observations=len(obs.face_range) + len(obs.beam_hit) + len(obs.view_pitch),
+        n_observations=obs.count,
     )
     lens = lens_share(obs, found, data, unknowns)
     found = found.widened(lens.covariance - lens.counted, lens.covariance)
@@ -247,7 +241,7 @@ def finished(obs, state, data, unknowns, required):
         obs,
         data,
         unknowns,
-        excluded=(),
+        excluded=tuple(excluded),
         misfit=dict(zip(obs.placements.tolist(), squares.tolist(), strict=True)),
         lens=lens.covariance,
         lens_scale=lens.scatter,

@@ -11,11 +11,11 @@ from scipy import ndimage
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.padding import medians
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import POSE, DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.solvers.joint_model import JointData, JointState
-from lrfcal_lib.solvers.joint_noise import face_points
+from lrfcal_lib.solvers.joint_noise import face_points, heights
 from lrfcal_lib.solvers.joint_start import boards_in_images
 
 CONTRADICTS = ProblemKind.CONTRADICTS
@@ -23,7 +23,6 @@ LARGEST_SHARE = 0.3  # of the placements that may contradict the others
 LAST_MISS = 0.025  # metres, of a board from where images of it put it
 MOST_SIGMA = 4.0  # by which images may put a board elsewhere, of what is stated of them
 FAR_MISS = 5.0  # times the usual miss: an image puts the board elsewhere
-BOARD = 6  # numbers of a pose
 
 
 def of_placement(obs, row, kind, why):
@@ -51,27 +50,26 @@ def left_out_share(obs: JointObservations, left_out: list[Problem]) -> float:
 
 def without_blind_cameras(obs, required):
     """Leave out cameras that never see a board; refuse them where everything is required."""
-    seeing = []
-    left_out = []
-    for number, name in enumerate(obs.cameras):
-        if number in obs.view_camera:
-            seeing.append(name)
-            continue
-        words = "it never sees the board, its pose stays open"
-        left_out.append(Problem(Stage.JOINT, ProblemKind.NO_IMAGES, words, camera=name))
+    why = "it never sees the board, its pose stays open"
+    blind = np.setdiff1d(np.arange(len(obs.cameras)), obs.view_camera)
+    left_out = [
+        Problem(Stage.JOINT, ProblemKind.NO_IMAGES, why, camera=obs.cameras[number])
+        for number in blind
+    ]
     if required and left_out:
         words = "; ".join(map(str, left_out))
         raise DegenerateGeometry(f"{words}; leave it out with obs.with_cameras")
-    return obs.with_cameras(seeing), left_out
+    return obs.with_cameras(np.delete(obs.cameras, blind)), left_out
 
 
 def without_lost_placements(obs):
     """Leave out placements that no image shows: nothing says where their board is at the start."""
     shown = np.isin(np.arange(len(obs.placements)), obs.view_placement)
-    left_out = []
-    for row in np.flatnonzero(~shown):
-        why = "no image shows the board"
-        left_out.append(of_placement(obs, row, ProblemKind.TOO_LITTLE, why))
+    why = "no image shows the board"
+    left_out = [
+        of_placement(obs, row, ProblemKind.TOO_LITTLE, why)
+        for row in np.flatnonzero(~shown)
+    ]
     if not shown.any():
         raise DegenerateGeometry("; ".join(map(str, left_out)))
     return obs.select(obs.placements[shown]), left_out
@@ -88,7 +86,7 @@ def refuse_contradiction(
     place = obs.view_placement
     if not len(place):
         return
-    boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
+    boards = boards_in_images(obs, state.head, state.cameras)
     misses = np.linalg.norm(boards[..., 3] - state.boards[place, :, 3], axis=1)
     stated = np.sqrt(np.linalg.trace(obs.view_covariance[:, 3:, 3:]))
     before = sum(p.kind == CONTRADICTS and p.camera is None for p in left_out)
@@ -112,16 +110,15 @@ def face_miss(state: JointState, data: JointData) -> float:
 
 def _misses(points, boards, used):
     """How far points (p, n, 3) are off their boards (p, 3, 4), metres (medians)."""
-    heights = np.vecdot(points - boards[:, None, :, 3], boards[:, None, :, 2])
-    return medians(np.abs(heights), used)
+    return medians(np.abs(heights(points, boards)), used)
 
 
 def without_contradictions(obs, state, data):
     """Leave out images that put the board far off where it was scanned, and placements of which
-    none is left.
+    none is left. Every placement has one.
     """
     place = obs.view_placement
-    boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
+    boards = boards_in_images(obs, state.head, state.cameras)
     misses = _misses(face_points(state, data)[place], boards, data.face["used"][place])
     wrong = misses > max(LAST_MISS, FAR_MISS * np.median(misses))
     if not wrong.any():
@@ -129,8 +126,6 @@ def without_contradictions(obs, state, data):
     good, first = np.unique(place[~wrong], return_index=True)
     out = np.setdiff1d(place, good)
     single = wrong & np.isin(place, good)
-    moved = state.boards.copy()
-    moved[good] = boards[~wrong][first]
     left_out = []
     for row in out:
         miss = 1000 * misses[place == row].min()
@@ -139,9 +134,8 @@ def without_contradictions(obs, state, data):
     for view in np.flatnonzero(single):
         why = f"it puts the board {1000 * misses[view]:.0f} mm off the scan"
         left_out.append(of_image(obs, view, why))
-    kept = np.setdiff1d(np.arange(len(obs.placements)), out)
-    rest = obs.keep(view=~single).select(obs.placements[kept])
-    return rest, replace(state, boards=moved).of_placements(kept), left_out
+    rest = obs.keep(view=~single).select(obs.placements[good])
+    return rest, replace(state.of_placements(good), boards=boards[~wrong][first]), left_out
 
 
 def misfits(blocks: dict[str, Block], data: JointData) -> np.ndarray:
@@ -149,12 +143,10 @@ def misfits(blocks: dict[str, Block], data: JointData) -> np.ndarray:
 
     1 is what the noise explains, (p,).
     """
-    total = np.zeros(len(data.middle))
-    count = np.zeros(len(data.middle))
+    count = data.face["used"].sum(axis=1) + POSE * data.view["used"].sum(axis=1)
+    total = np.zeros(len(count))
     if "face" in blocks:
         total += np.sum(blocks["face"].white ** 2, axis=1) / data.levels.face_share
-        count += data.face["used"].sum(axis=1)
     if "view" in blocks:
         total += np.sum(blocks["view"].white ** 2, axis=1)
-        count += BOARD * data.view["used"].sum(axis=1)
-    return total / np.maximum(count - BOARD, 1)
+    return total / np.maximum(count - POSE, 1)

@@ -73,7 +73,7 @@ def lens_share(
 ) -> LensShare:
     """The LensShare of a solution."""
     c = unknowns.shared
-    if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
+    if not np.any(obs.lens_covariance):
         exact = np.zeros((c, c))
         return LensShare(exact, exact, 0.0)
     block = view_block(found.state, data, unknowns)
@@ -90,9 +90,10 @@ def lens_share(
     left = shift - reduced @ gain - J_own @ (own @ (J_own.mT @ shift))
     square = np.sum(left @ spread * left)
     level = data.levels.view_scale**2
-    taken = np.sum((J_own @ own) * J_own) + np.sum((reduced @ finite) * reduced)
+    information = np.sum(reduced.mT @ reduced, axis=0)
+    taken = np.sum((J_own @ own) * J_own) + np.sum(information * finite)
     # rows that are left to show it
     square *= level / max(6 * len(obs.view_camera) - taken, 1.0)
     share = np.clip(level - 1, 0, square) / level
-    counted = share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite
-    return LensShare(gain @ spread @ gain.T, counted, float(np.sqrt(square)))
+    counted = share * finite @ information @ finite
+    return LensShare(gain @ spread @ gain.T, counted, np.sqrt(square))

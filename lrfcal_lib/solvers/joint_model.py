@@ -14,6 +14,7 @@ from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
 from lrfcal_lib.model import geometry
+from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.geometry import move_pose
 from lrfcal_lib.model.observations import JointObservations
 
@@ -29,7 +30,7 @@ LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the 
 SOFTEST = np.log([1e-3, 10.0])  # spot radii, limits of the softness
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JointState:
     """Everything that moves.
 
@@ -62,6 +63,14 @@ class JointState:
         )
 
 
+def undisturbed(obs, head, cameras, sensor, boards) -> JointState:
+    """A state whose sweeps have no errors of their own, and whose sides are like all others."""
+    count = len(boards)
+    sweeps = np.zeros((count, 2))
+    sides = np.zeros((count, len(obs.edges) + 1))
+    return JointState(head, cameras, sensor, boards, sweeps, sides)
+
+
 @dataclass(frozen=True)
 class Unknowns:
     """Which columns of the full Jacobian are unknown.
@@ -89,9 +98,10 @@ class Unknowns:
         """Where the unknowns stand in a Jacobian: first the shared ones, then the placement's
         own.
         """
-        widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras}
-        widths |= {name: int(name in self.sensor) for name in SENSOR}
-        widths |= {
+        widths = {
+            "axis": 4 * self.axis,
+            "cameras": 6 * self.cameras,
+            **{name: name in self.sensor for name in SENSOR},
             "board": 6,
             "sweep": SWEEPS[self.sweep],
             "sides": (self.edges + 1) * self.sides,
@@ -188,6 +198,10 @@ class JointData:
     on_head: np.ndarray
     levels: Levels
 
+    def with_levels(self, **changed) -> "JointData":
+        """The same with other noise levels, fields of :class:`Levels` by name."""
+        return replace(self, levels=replace(self.levels, **changed))
+
 
 def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
     """Observations as padded arrays, with noise levels other than those stated."""
@@ -223,9 +237,15 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
     for group in (face, beam):
         group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
     view["pose"][~view["used"]] = np.eye(4)
-    on_head = np.isin(obs.mounts, "head")
     return JointData(
-        face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, levels
+        face,
+        beam,
+        view,
+        outline_lines(obs.corners),
+        obs.middle,
+        obs.direction,
+        obs.on_head,
+        levels,
     )
 
 

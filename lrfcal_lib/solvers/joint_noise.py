@@ -14,6 +14,7 @@ from lrfcal_lib.solvers.joint_residuals import (
     meeting,
     named_blocks,
     rays,
+    sides_of_beams,
 )
 
 PARTS = 3  # of a board in x and in y
@@ -51,8 +52,7 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
         changed["beam_share"] = beam_share(state, data, blocks["beam"], c, spread)
     if "view" in blocks:
         factor, sigma = view_levels(data, blocks["view"], hessian, gradient, c)
-        scale = np.clip(levels.view_scale * factor, *SCALE_LIMITS)
-        changed["view_scale"] = float(scale)
+        changed["view_scale"] = np.clip(levels.view_scale * factor, *SCALE_LIMITS)
         changed["sigma_pitch"] = sigma
     if "side" in blocks and "beam" in blocks:
         changed["side_sigma"], changed["background_sigma"] = side_levels(
@@ -62,7 +62,7 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
         number = SWEEPS[unknowns.sweep]
         scatter = sweep_levels(state.sweeps[:, :number], data, hessian, gradient, c)
         changed["sweep_sigma"] = (*scatter.tolist(), *levels.sweep_sigma[number:])
-    return replace(data, levels=replace(levels, **changed))
+    return data.with_levels(**changed)
 
 
 def settled(before: Levels, after: Levels) -> bool:
@@ -80,9 +80,9 @@ def face_points(state: JointState, data: JointData) -> np.ndarray:
     return ray.origin + (data.face["range"] - state.sensor[0])[..., None] * ray.direction
 
 
-def on_board(state: JointState, data: JointData) -> np.ndarray:
-    """Measured face points in the boards' frames, shape (p, n, 3)."""
-    return (face_points(state, data) - state.boards[:, None, :, 3]) @ state.boards[:, :, :3]
+def heights(points: np.ndarray, boards: np.ndarray) -> np.ndarray:
+    """Of points (p, n, 3) over their boards (p, 3, 4), metres, shape (p, n)."""
+    return np.vecdot(points - boards[:, None, :, 3], boards[:, None, :, 2])
 
 
 def face_levels(state, data, block, shared, spread):
@@ -98,8 +98,8 @@ def face_levels(state, data, block, shared, spread):
     used = data.face["used"]
     weight = data.face["weight"]
     z = weight * block.residuals
-    by_own = (weight / levels.face_scale)[..., None] * block.jacobian[..., shared:]
-    taken = levels.face_share * np.sum(by_own * (by_own @ spread))
+    by_own = block.white_jacobian[..., shared:]
+    taken = np.sum(by_own * (by_own @ spread))
     scale = np.sqrt(np.sum(z**2) / max(used.sum() - taken, 1))
     # where the ranges should end: noise must not decide which part a point lies in
     exact = meeting(state, rays(state, data, data.face)).point
@@ -114,7 +114,7 @@ def face_levels(state, data, block, shared, spread):
     ]
     most = np.fmax(*excess)
     share = levels.face_share if np.isnan(most) else np.exp(-most)
-    return float(scale), float(share)
+    return scale, share
 
 
 def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
@@ -132,7 +132,7 @@ def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
     residuals : ndarray, shape (p, n)
         In standard deviations.
     by_own : ndarray, shape (p, n, k)
-        Derivatives of `residuals`.
+        Their derivatives, times the root of `share`.
     share : float
         Of the information that the estimate counts.
     spread : ndarray, shape (p, k, k)
@@ -144,7 +144,7 @@ def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
     score = np.vecmat(residuals, modes)
     pull = modes.mT @ by_own
     there = counted > 0
-    taken = share * np.vecdot(pull, pull @ spread)[there] / counted[there]
+    taken = np.vecdot(pull, pull @ spread)[there] / counted[there]
     told = np.sum((1 - taken) ** 2)
     if told < 1:
         return np.nan
@@ -176,7 +176,7 @@ def beam_share(state, data, block, shared, spread):
     """
     before = data.levels.beam_share
     used = data.beam["used"]
-    by_own = block.jacobian[..., shared:]
+    by_own = block.white_jacobian[..., shared:]
     root = used * np.linalg.norm(by_own[..., 3:6], axis=-1)  # root information
     lapsed = data.levels.lapse * np.exp(np.where(used, block.cost, 0.0) / before)
     curvature = root**2 * (1 - block.residuals**2 * lapsed / (1 - lapsed))
@@ -190,7 +190,7 @@ def beam_share(state, data, block, shared, spread):
     middle = np.sum(edges**2 * along, axis=1, keepdims=True) / information
     slopes = edges * (along - middle)
     excess = common_errors(slopes, block.residuals, by_own, before, spread, gain)
-    return before if np.isnan(excess) else float(gain * np.exp(-excess))
+    return before if np.isnan(excess) else gain * np.exp(-excess)
 
 
 def view_levels(data, block, hessian, gradient, shared):
@@ -207,7 +207,7 @@ def view_levels(data, block, hessian, gradient, shared):
     """
     views, view_gradient, *_ = linearise([block])
     others = hessian - views, gradient - view_gradient
-    rows = 6 * int(data.view["used"].sum())
+    rows = 6 * data.view["used"].sum()
     levels = PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]
     costs = []
     factors = []
@@ -218,14 +218,14 @@ def view_levels(data, block, hessian, gradient, shared):
             cost, factor = judged(trial, factor, others, rows, shared)
         costs.append(cost)
         factors.append(factor)
-    best = int(np.argmin(costs))
+    best = np.argmin(costs)
     sigma = levels[best]
     if 1 < best < len(costs) - 1:  # between the levels: a parabola through three of them
         near = slice(best - 1, best + 2)
         bend, slope, _ = np.polyfit(np.log(levels[near] / sigma), costs[near], 2)
         if bend > 0:
             sigma *= np.exp(-slope / (2 * bend))
-    return factors[best], float(sigma * factors[best])
+    return factors[best], sigma * factors[best]
 
 
 def judged(block, factor, others, rows, shared):
@@ -253,7 +253,7 @@ def judged(block, factor, others, rows, shared):
         np.vecdot(moved, right).sum() + rows * np.log(f2) + block.log_determinant + freedom
     )
     better = (left + f2) / (max(rows - taken / f2, 0.0) + 1)
-    return cost, float(np.sqrt(better))
+    return cost, np.sqrt(better)
 
 
 def sweep_levels(sweeps, data, hessian, gradient, shared):
@@ -302,11 +302,10 @@ def side_levels(sides, data, hessian, gradient):
     """
     edges = sides.shape[1] - 1
     sigma2 = data.levels.of_sides(edges) ** 2
-    shown = np.zeros(sides.shape, bool)
-    place, beam = np.nonzero(data.beam["used"])
-    shown[place, data.beam["edge"][place, beam]] = True
-    shown[place, -1] = True
-    counted = np.sum(shown, axis=0)
+    shown = np.any(data.beam["used"][..., None] & sides_of_beams(data, edges), axis=1)
+    kinds = [0, edges]  # where the deviations of sides begin, and what they have in common
+    counted = np.add.reduceat(np.sum(shown, axis=0), kinds)
+    usual = np.square([Levels.side_sigma, Levels.background_sigma])
     prior = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM * sigma2 + sides**2)  # as in `side_block`
     last = np.arange(hessian.shape[-1])[-edges - 1 :]
     weight = prior * sigma2
@@ -314,9 +313,7 @@ def side_levels(sides, data, hessian, gradient):
         more = weight / sigma2 - prior
         square = sum(expecting(more, sides, last, hessian, gradient, 0))
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)
-        total = np.sum(weight * square * shown, axis=0)
-        of_side = (total[:-1].sum() + Levels.side_sigma**2) / (counted[:-1].sum() + 1)
-        of_placement = (total[-1] + Levels.background_sigma**2) / (counted[-1] + 1)
-        both = np.clip([of_side, of_placement], *np.square(SIDE_LIMITS))
+        total = np.add.reduceat(np.sum(weight * square * shown, axis=0), kinds)
+        both = np.clip((total + usual) / (counted + 1), *np.square(SIDE_LIMITS))
         sigma2 = np.repeat(both, [edges, 1])
     return np.sqrt(both).tolist()

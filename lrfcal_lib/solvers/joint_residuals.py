@@ -89,9 +89,8 @@ def true_pitch(state, data, pitch):
     away = pitch - data.middle[:, None]
     turn = np.broadcast_to(data.direction[:, None], pitch.shape)
     by_parts = np.stack([pitch, turn, np.ones_like(pitch), away], axis=-1)
-    shared = by_parts[..., :2] @ state.sensor[3:]
-    own = np.matvec(by_parts[..., 2:], state.sweeps)
-    return pitch + shared + own, by_parts
+    parts = np.insert(state.sweeps, [0, 0], state.sensor[3:], axis=1)
+    return pitch + np.matvec(by_parts, parts), by_parts
 
 
 class Rays(NamedTuple):
@@ -206,7 +205,7 @@ def edge_distance(state, data, group, ray):
     away = origin + lines[..., 2:] * outwards
     m = cross(ray.direction, along)
     square = np.vecdot(m, m)[..., None]
-    sign = np.where(np.vecdot(m, outwards) < 0, -1.0, 1.0)[..., None]
+    sign = np.copysign(1.0, np.vecdot(m, outwards))[..., None]
     across = sign * m / np.sqrt(square)
     distance = np.vecdot(across, away)
     reach = np.vecdot(cross(along, away), m)[..., None] / square
@@ -228,14 +227,12 @@ def beam_block(state, data, unknowns):
     lapse = data.levels.lapse
     cost, score, information = beam_terms(margin, sigma, group["hit"], lapse)
     head, parts = ray_columns(-edge.across, edge.reach, ray)
-    mine = group["edge"][..., None] == np.arange(unknowns.edges + 1)
-    mine[..., -1] = True
     J = assemble(
         unknowns,
         parts,
         axis=head,
         board=gradient_by_pose(edge.nearest, edge.across),
-        sides=slope[..., None] * mine,
+        sides=slope[..., None] * sides_of_beams(data, unknowns.edges),
         edge_log_odds=slope[..., None],
         edge_log_softness=(-margin * share_soft)[..., None],
     )
@@ -246,6 +243,15 @@ def beam_block(state, data, unknowns):
     return Block(
         residuals, (root * alive)[..., None] * J, np.sqrt(share), cost=cost * share
     )
+
+
+def sides_of_beams(data, edges):
+    """Which of the deviations of a placement from the sensor's edge bias beams see, (p, n, e + 1):
+    that of their side, and what all have in common.
+    """
+    mine = data.beam["edge"][..., None] == np.arange(edges + 1)
+    mine[..., -1] = True
+    return mine
 
 
 def view_block(state, data, unknowns):
@@ -284,10 +290,9 @@ def view_block(state, data, unknowns):
         board=_by_pose(left @ R_camera_platform, 0.0, R_camera_platform),
         cameras=among_cameras(of_camera, view["camera"], unknowns.cameras),
     )
-    p, v = pitch.shape
-    return ViewBlock(
-        residuals.reshape(p, 6 * v),
-        J.reshape(p, 6 * v, -1),
+    return ViewBlock.of_groups(
+        residuals,
+        J,
         view["whitener"] / data.levels.view_scale,
         by_pitch=by_pitch[..., 0],
         same=same_stop(view["pitch"], view["used"]),

@@ -66,7 +66,7 @@ def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> St
     which ones are wrong.
     """
     data = gather(obs, levels)
-    tried: list[Start] = []
+    tried = []
     for states in start_states(obs):
         for state in states:
             if not unknowns.axis:
@@ -75,9 +75,9 @@ def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> St
                     known = RigidTransform.identity()
                 state = replace(state, head=pose_array(known))
             tried.append(agreeing_start(obs, state, data, unknowns))
-        if min(start.badness for start in tried) < GOOD_START:
+        best = min(tried, key=lambda start: start.badness)
+        if best.badness < GOOD_START:
             break
-    best = min(tried, key=lambda start: start.badness)
     if best.miss > ROUGH_MISS:  # a camera that was knocked is to be named, not refused
         refuse_contradiction(best.kept, best.state, ROUGH_MISS)
     if left_out_share(obs, best.left_out) > LARGEST_SHARE:
@@ -111,12 +111,9 @@ def agreeing_start(obs, state, data, unknowns):
         cut = gather(kept, data.levels) if left_out else data
         found = minimum(fitting, cut, coarse(unknowns), steps=FEW_STEPS)
         share = left_out_share(obs, left_out)
-        count = len(kept.face_range) + len(kept.beam_hit) + len(kept.view_pitch)
-        cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / count
+        cost = np.nan_to_num(found.cost_history[-1], nan=np.inf) / kept.count
         badness = cost * (1 + PENALTY * share)
-        attempts.append(
-            Start(kept, found.state, left_out, badness, miss, bool(found.converged))
-        )
+        attempts.append(Start(kept, found.state, left_out, badness, miss, found.converged))
         if not left_out or share > LARGEST_SHARE:
             break
         state = state_of(obs, found.state.head, found.state.cameras)

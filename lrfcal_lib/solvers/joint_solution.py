@@ -15,7 +15,7 @@ from lrfcal_lib.fit.edge_likelihood import disc_edge
 from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import pose_array, pose_parameters, pose_transform
+from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
@@ -27,7 +27,7 @@ from lrfcal_lib.solvers.joint_model import (
     Unknowns,
     gather,
 )
-from lrfcal_lib.solvers.joint_noise import on_board
+from lrfcal_lib.solvers.joint_noise import face_points, heights
 from lrfcal_lib.solvers.joint_residuals import named_blocks
 
 WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
@@ -167,11 +167,6 @@ class JointSolution:
         """
         return dict(zip(SENSOR, self.state.sensor.tolist(), strict=True))
 
-    @property
-    def sweeps(self) -> dict[int, np.ndarray]:
-        """Offset (rad) and stretch of the recorded pitch of each sweep, by placement."""
-        return self._by_placement(self.state.sweeps)
-
     def _by_placement(self, values):
         return dict(zip(self.observations.placements.tolist(), values, strict=True))
 
@@ -194,16 +189,15 @@ class JointSolution:
         """Factors on the stated standard deviations, and shares of independent errors, as
         estimated.
         """
-        names = [
+        names = (
             "face_scale",
             "face_share",
             "beam_share",
             "sigma_pitch",
             "side_sigma",
             "background_sigma",
-        ]
-        if self.observations.cameras:
-            names.append("view_scale")
+            "view_scale",
+        )
         return {name: float(getattr(self.data.levels, name)) for name in names}
 
     @property
@@ -239,16 +233,18 @@ class JointSolution:
             self._by_placement(sweeps),
         )
 
-    def columns(self, prefix: str) -> list[int]:
-        """Indices of the shared unknowns whose names begin so."""
-        return [i for i, name in enumerate(self.solution.names) if name.startswith(prefix)]
+    def columns(self, *prefixes: str) -> list[int]:
+        """Indices of the shared unknowns whose names begin so, or so."""
+        return [
+            i for i, name in enumerate(self.solution.names) if name.startswith(prefixes)
+        ]
 
     def covariance(self, *prefixes: str) -> np.ndarray:
         """Covariance to rely on of groups of shared unknowns, e.g. 'left_' or 'axis'.
 
         See `Solution.trusted`.
         """
-        index = sum(map(self.columns, prefixes), [])
+        index = self.columns(*prefixes)
         return self.solution.trusted[np.ix_(index, index)]
 
     def camera_at(self, name: str, pitch: ArrayLike) -> RigidTransform:
@@ -266,14 +262,12 @@ class JointSolution:
         by_placements = whole.covariance_placements
         if by_placements is not None:
             by_placements = by_placements[both]
-        pose = pose_array(self.transforms[name])
         return replace(
             whole,
             transform=self.transforms[name],
-            parameters=pose_parameters(pose),
+            parameters=whole.parameters[index],
             names=geometry.POSE_NAMES,
             jacobian=whole.jacobian[..., index],
-            state=pose,
             covariance=whole.covariance[both],
             covariance_placements=by_placements,
         )
@@ -295,34 +289,23 @@ class JointSolution:
         ndarray, shape (m, 1) or (v, 6)
             Of ranges to faces, metres, or of poses in images, radians and metres.
         """
-        if group not in self.blocks:
-            return np.zeros((0, {"face": 1, "view": 6}[group]))
         used = getattr(self.data, group)["used"]
-        return self._in_order(group, self.blocks[group].residuals.reshape(*used.shape, -1))
-
-    def face_points(self) -> np.ndarray:
-        """Measured points of the faces in the frames of their boards, metres, shape (m, 3)."""
-        return self._in_order("face", on_board(self.state, self.data))
-
-    def _in_order(self, group, padded):
-        """Rows of a group in the order of the observations, shape (p, n, k) -> (m, k)."""
+        padded = self.blocks[group].residuals.reshape(*used.shape, -1)
         placement = getattr(self.observations, f"{group}_placement")
         rows = np.zeros((len(placement), padded.shape[-1]))
-        rows[np.argsort(placement, kind="stable")] = padded[
-            getattr(self.data, group)["used"]
-        ]
+        rows[np.argsort(placement, kind="stable")] = padded[used]
         return rows
+
+    def face_heights(self) -> np.ndarray:
+        """Heights of the measured points over their boards, metres, placement by placement."""
+        points = face_points(self.state, self.data)
+        return heights(points, self.state.boards)[self.data.face["used"]]
 
     def with_levels(self, **changed) -> "JointSolution":
         """The same estimate at other noise levels, fields of
         :class:`lrfcal_lib.solvers.joint_model.Levels` by name.
         """
-        levels = replace(self.data.levels, **changed)
-        return replace(self, data=replace(self.data, levels=levels))
-
-    def information(self) -> np.ndarray:
-        """What every placement says about the shared unknowns, shape (p, c, c)."""
-        return self.score().information
+        return replace(self, data=self.data.with_levels(**changed))
 
     def score(self, changed: JointObservations | None = None, step: float = 1.0) -> Score:
         """What every placement says about the shared unknowns and, tested, about one more.
@@ -366,17 +349,14 @@ class JointSolution:
 def joint_words(
     direction: np.ndarray, names: tuple[str, ...], cameras: tuple[str, ...]
 ) -> str:
-    """A direction of the shared unknowns in words."""
-    direction = np.asarray(direction) / np.max(np.abs(direction))
+    """A direction of the shared unknowns, its largest component 1, in words."""
     large = np.abs(direction) > NAMED
     words = []
     for camera in cameras:
         index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
         if large[index].any():
             words.append(motion_words(direction[index], camera))
-    words += [
-        WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS
-    ]
+    words += [WORDS[name] for name in np.array(names)[large] if name in WORDS]
     return " with ".join(words)
 
 
@@ -398,17 +378,14 @@ def expected_information(
     ndarray, shape (p, c, c)
     """
     data = gather(obs)
-    hit = np.ones_like(data.beam["hit"])
-    all_read = replace(data, beam=data.beam | {"hit": hit})
-    none_read = replace(data, beam=data.beam | {"hit": ~hit})
-    read = named_blocks(state, all_read, unknowns)
     hessian = np.zeros(())
-    if "beam" in read:  # over both readings, weighted by how likely each is
-        hits = read["beam"]
-        misses = named_blocks(state, none_read, unknowns)["beam"]
-        chance = np.exp(-np.asarray(hits.cost))
-        for block, share in ((hits, chance), (misses, 1 - chance)):
-            J = np.sqrt(share)[..., None] * block.white_jacobian
+    for reads in (True, False):  # each beam, weighted by how likely that is
+        hit = np.full_like(data.beam["hit"], reads)
+        trial = replace(data, beam=data.beam | {"hit": hit})
+        blocks = named_blocks(state, trial, unknowns)
+        if "beam" in blocks:
+            beams = blocks.pop("beam")
+            J = np.exp(-0.5 * beams.cost)[..., None] * beams.white_jacobian
             hessian = hessian + J.mT @ J
-    others = [block for name, block in read.items() if name != "beam"]
-    return reduced_hessian(hessian + linearise(others).hessian, unknowns.shared)
+    hessian = hessian + linearise(blocks.values()).hessian
+    return reduced_hessian(hessian, unknowns.shared)

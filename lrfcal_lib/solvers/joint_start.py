@@ -16,7 +16,7 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.model.kinematics import SourceFrame, platform_from_head
 from lrfcal_lib.model.observations import CameraObservations, JointObservations, thin
-from lrfcal_lib.solvers.joint_model import JointState
+from lrfcal_lib.solvers.joint_model import JointState, undisturbed
 from lrfcal_lib.solvers.plane_start import start_from_planes
 
 START_SOFTNESS = 0.2  # spot radii
@@ -39,17 +39,13 @@ def start_states(obs: JointObservations) -> Iterator[list[JointState]]:
     heads = [RigidTransform.identity(), RigidTransform.from_rotation(backwards)]
     if obs.T_head_lrf is not None:
         heads.insert(0, obs.T_head_lrf)
-    possible = False
     reasons = []
     for head in heads:
         try:
-            states = _states(obs, head)
+            yield _states(obs, head)
         except (DegenerateGeometry, np.linalg.LinAlgError) as error:
             reasons.append(str(error))
-            continue
-        possible = True
-        yield states
-    if not possible:
+    if len(reasons) == len(heads):
         every = "; ".join(dict.fromkeys(reasons))
         raise DegenerateGeometry(f"no start value for the joint estimate: {every}")
 
@@ -101,31 +97,22 @@ def _camera(obs, camera, head):
 
 def state_of(obs: JointObservations, head: np.ndarray, cameras: np.ndarray) -> JointState:
     """All unknowns from an axis and the cameras (as in JointState): boards from first images."""
-    count = len(obs.placements)
     _, first = np.unique(obs.view_placement, return_index=True)
-    return JointState(
-        head=head,
-        cameras=cameras,
-        sensor=np.array([0.0, 0.0, np.log(START_SOFTNESS), 0.0, 0.0]),
-        boards=boards_in_images(obs, head, cameras, first),
-        sweeps=np.zeros((count, 2)),
-        sides=np.zeros((count, len(obs.edges) + 1)),
-    )
+    boards = boards_in_images(obs, head, cameras)[first]
+    sensor = np.array([0.0, 0.0, np.log(START_SOFTNESS), 0.0, 0.0])
+    return undisturbed(obs, head, cameras, sensor, boards)
 
 
 def boards_in_images(
-    obs: JointObservations, head: np.ndarray, cameras: np.ndarray, views: np.ndarray
+    obs: JointObservations, head: np.ndarray, cameras: np.ndarray
 ) -> np.ndarray:
-    """``T_platform_board`` (n, 3, 4) from some views (n,), each by itself.
+    """``T_platform_board`` (v, 3, 4) from the views, each by itself.
 
     `head` and `cameras` as in JointState.
     """
-    camera = obs.view_camera[views]
-    on_head = np.isin(obs.mounts, "head")[camera]
-    pitch = np.where(on_head, obs.view_pitch[views], 0.0)
+    on_head = obs.on_head[obs.view_camera]
+    pitch = np.where(on_head, obs.view_pitch, 0.0)
     T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
-    T_camera_board = RigidTransform.from_matrix(obs.view_pose[views])
     T_platform_lrf = platform_from_head(pitch) * T_head_lrf
-    return pose_array(
-        T_platform_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
-    )
+    T_platform_camera = T_platform_lrf * pose_transform(cameras[obs.view_camera]).inv()
+    return pose_array(T_platform_camera * RigidTransform.from_matrix(obs.view_pose))

@@ -1,6 +1,5 @@
 """Cameras from lines (equations 16 to 21), after Wasielewski and Strauss, and after Bauermann."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -23,7 +22,7 @@ from lrfcal_lib.model.geometry import (
     gradient_by_pose,
     move_pose,
     pose_transform,
-    rotate_points,
+    rotate_and_move,
 )
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.plane_start import shifted, start_rotations
@@ -42,8 +41,9 @@ def distance_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     Two residuals of one thing: that of :func:`lrfcal_lib.fit.residuals.line_block` is larger by
     focal length / depth.
     """
-    normals, length = sight_normals(obs.crossing_lines, obs.model)
-    plain = sight_block(pose, obs.crossing_points, normals, 1.0)
+    normals = sight_normals(obs.crossing_lines, obs.model)
+    length = np.linalg.norm(obs.crossing_lines @ obs.model.matrix, axis=-1)
+    plain = sight_block(pose, obs.crossing_points, normals)
     depth = apply_pose(pose, obs.crossing_points)[..., 2]
     noise = moved_noise(pose, normals, obs.crossing_covariance)
     of_sight = obs.crossing_line_sigma * depth / length  # metres at the crossing
@@ -55,8 +55,7 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     """Reprojection errors of named points (Bauermann), pixels; a loss judges u and v of a point
     together.
     """
-    rotated = rotate_points(pose, obs.scene_points)
-    moved = rotated + pose[..., None, :, 3]
+    rotated, moved = rotate_and_move(pose, obs.scene_points)
     by_point = pinhole_jacobian(moved, obs.model)
     errors = mirrored(moved, obs.model) - obs.scene_pixels
 
@@ -71,13 +70,7 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     corrected = jacobian - noise_correction(
         rotated, moved[..., None, :], by_point, shift[..., None, :]
     )
-    shape = errors.shape[:-2] + (-1,)
-    return Block(
-        errors.reshape(shape),
-        jacobian.reshape(shape + (6,)),
-        inverse_root(noise),
-        corrected=corrected.reshape(shape + (6,)),
-    )
+    return Block.of_groups(errors, jacobian, inverse_root(noise), corrected)
 
 
 def estimate_pose(
@@ -111,8 +104,10 @@ def estimate_pose(
     Solution
     """
 
-    def equal_weights(pose, _):
-        """The residuals with one weight for all, at a pose."""
+    def freeze(pose, _):
+        """The residuals; without weights of their own with that of their mean at a pose."""
+        if weighted:
+            return partial(residual, obs=obs)
         weight = np.mean(_variances(residual(pose, obs)), axis=-1, keepdims=True) ** -0.5
 
         def plain(pose):
@@ -121,9 +116,8 @@ def estimate_pose(
 
         return plain
 
-    problem: Callable[[np.ndarray], Block] = partial(residual, obs=obs)
-    if not weighted:
-        problem, pose = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
+    rounds = 0 if weighted else 2
+    problem, pose = minimise_in_rounds(freeze, pose, move_pose, rounds, **options)
     placements = getattr(obs, f"{uses}_placement")
     unknowns = pose_unknowns(method, obs.camera)
     return solve(problem, pose, move_pose, groups=placements, **unknowns, **options)
@@ -145,13 +139,13 @@ def start_from_lines(obs: CameraObservations) -> RigidTransform:
     """
     obs.require("crossing")
     points = obs.crossing_points
-    normals, _ = sight_normals(obs.crossing_lines, obs.model)
+    normals = sight_normals(obs.crossing_lines, obs.model)
     rotations = start_rotations()
     offsets = -np.vecdot(normals, points @ rotations.mT)
     poses = shifted(rotations, normals, offsets)
 
     def evaluate(pose):
-        return sight_block(pose, points, normals, START_SIGMA)
+        return sight_block(pose, points, normals / START_SIGMA)
 
     for robust in (False, True):
         poses = minimise(evaluate, poses, move_pose, robust=robust, max_iterations=40).state
@@ -162,8 +156,6 @@ def start_from_lines(obs: CameraObservations) -> RigidTransform:
             f"camera '{obs.camera}': no pose puts the {len(points)} points in front of the camera"
         )
     poses = poses[ahead]
-    angle = np.abs(sight_block(poses, points, normals, 1.0).residuals) / np.abs(
-        depth[ahead]
-    )
+    angle = np.abs(sight_block(poses, points, normals).residuals) / np.abs(depth[ahead])
     best = np.sort(angle, axis=1)[:, : max(6, int(AGREEING * len(points)))]
     return pose_transform(poses[np.argmin(np.sum(best**2, axis=1))])

@@ -14,6 +14,7 @@ from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.residuals import sight_normals
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
+    POSE,
     POSE_NAMES,
     DegenerateGeometry,
     cross,
@@ -21,7 +22,6 @@ from lrfcal_lib.model.geometry import (
     gradient_by_pose,
     move_pose,
     pose_array,
-    pose_parameters,
     tilt,
 )
 from lrfcal_lib.model.kinematics import TILT_AXIS
@@ -31,7 +31,6 @@ from lrfcal_lib.solvers.plane_start import start_from_planes
 # independent numbers: a plane's distance and two angles; an edge's offset and angle
 PLANE_NUMBERS = 3
 EDGE_NUMBERS = 2
-POSE_NUMBERS = 6
 FEWEST = 4  # placements, to compare sweeps
 # offset (radians) and stretch: hold what one sweep cannot show, and the common offset
 PRIOR = (np.radians(5.0), 0.5)
@@ -84,7 +83,7 @@ class PitchModel:
         if more <= 0 or free <= 0:
             return self
         F = (small.misfit - self.misfit) / more / (self.misfit / free)
-        return replace(self, F=float(F), p_value=float(fdtrc(more, free, max(F, 0.0))))
+        return replace(self, F=F, p_value=fdtrc(more, free, max(F, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ def estimate_pitch_errors(
     """
     placements = _common_placements(cameras)
     turn = np.array([direction[p] for p in placements])
-    rows = gather(list(cameras.values()), placements)
+    rows = gather([obs.select(placements) for obs in cameras.values()])
     each = np.eye(len(placements))[rows.placement]
     middles = np.array([middle[p] for p in placements])
     away = rows.pitch - middles[rows.placement]
@@ -179,7 +178,7 @@ def estimate_pitch_errors(
         solution = _solve(name, rows, by_unknown, poses)
         model = _model(name, solution, rows, turn, numbers)
         if name == "direction":
-            by_direction = (float(solution.parameters[-1]), float(model.offset_sigma[0]))
+            by_direction = (solution.parameters[-1], model.offset_sigma[0])
         if name == "none":
             wanted = before = model
         if model.tested(wanted, numbers).p_value < LEVEL:
@@ -206,10 +205,10 @@ def _common_placements(cameras):
     return placements
 
 
-def gather(cameras, placements):
-    """The rows of all cameras; the faces are those of the first."""
-    faces = cameras[0].keep(plane=np.isin(cameras[0].plane_placement, placements))
-    face = np.searchsorted(placements, faces.plane_placement)
+def gather(cameras):
+    """The rows of all cameras, which see the same placements; the faces are those of the first."""
+    faces = cameras[0]
+    placements, face = np.unique(faces.plane_placement, return_inverse=True)
     scatter = np.zeros(faces.plane_points.shape)
     for index in range(len(placements)):
         points = faces.plane_points[face == index]
@@ -217,8 +216,7 @@ def gather(cameras, placements):
         scatter[face == index] = np.outer(points @ normal - distance, normal)
     parts = []
     for number, obs in enumerate(cameras):
-        known = np.intersect1d(placements, obs.placements, return_indices=True)[2]
-        board = obs.board_poses[known][face]
+        board = obs.board_poses[np.argsort(obs.placements)][face]
         on_board = _Rows(
             points=faces.plane_points,
             scatter=scatter,
@@ -230,15 +228,14 @@ def gather(cameras, placements):
             weight=_shares(face),
             on_face=np.ones(len(face), bool),
         )
-        edges = obs.keep(crossing=np.isin(obs.crossing_placement, placements))
-        placement = np.searchsorted(placements, edges.crossing_placement)
-        _, edge = np.unique(edges.crossing_edge, return_inverse=True)
+        placement = np.searchsorted(placements, obs.crossing_placement)
+        _, edge = np.unique(obs.crossing_edge, return_inverse=True)
         on_sight = _Rows(
-            points=edges.crossing_points,
+            points=obs.crossing_points,
             scatter=np.zeros((len(placement), 3)),
-            normal=sight_normals(edges.crossing_lines, edges.model)[0],
+            normal=sight_normals(obs.crossing_lines, obs.model),
             distance=np.zeros(len(placement)),
-            pitch=edges.crossing_pitch,
+            pitch=obs.crossing_pitch,
             placement=placement,
             camera=np.full(len(placement), number),
             weight=_shares(placement + len(placements) * edge),
@@ -293,11 +290,6 @@ def _solve(name, rows, by_unknown, poses):
     count = by_unknown.shape[1]
     sweeps = np.arange(count) % (rows.placement.max() + 1)
 
-    def read(state):
-        """No transform, and all unknowns."""
-        poses, errors = state
-        return None, np.concatenate([pose_parameters(poses).ravel(), errors])
-
     def move(state, step):
         """Retraction of poses and unknowns of the pitch."""
         poses, errors = state
@@ -309,7 +301,7 @@ def _solve(name, rows, by_unknown, poses):
         move,
         names=[*POSE_NAMES] * len(poses) + ["pitch"] * count,
         method=f"pitch_{name}",
-        read=read,
+        read=lambda state: (None, state[1]),  # unknowns of the pitch
         groups=np.concatenate([rows.placement, sweeps]),
         required=False,
         limit=10.0,
@@ -328,14 +320,13 @@ def _model(name, solution, rows, turn, numbers):
     # what a scan scatters about its own plane tells nothing of the pitch
     scatter = np.matvec(poses[rows.camera][:, :, :3], rows.scatter)
     away = distances - np.vecdot(rows.normal, scatter)
-    misfit = float(np.sum((rows.weight * away / unit) ** 2))
-    # the offset common to all sweeps goes with the cameras' poses
-    free = {"none": 0, "direction": 1, "sweep": p - 1, "sweep_stretch": 2 * p - 1}[name]
-    level = misfit / max(numbers - POSE_NUMBERS - free, 1)
+    misfit = np.sum((rows.weight * away / unit) ** 2)
+    free = len(errors)
+    if free >= p:  # the offset common to all sweeps goes with the cameras' poses
+        free -= 1
+    level = misfit / max(numbers - POSE - free, 1)
     known = replace(solution, covariance=level / solution.inflation * solution.covariance)
-    offset = np.zeros(p)
-    sigma = np.zeros(p)
-    stretch = np.zeros(p)
+    offset, sigma, stretch = np.zeros((3, p))
     if name == "direction":
         offset = errors * turn
         sigma = np.full(p, known.trusted_sigma[-1])
@@ -353,6 +344,6 @@ def _model(name, solution, rows, turn, numbers):
         stretch=stretch,
         misfit=misfit,
         plane_rms=rms(distances[rows.on_face]),
-        n_parameters=POSE_NUMBERS + free,
-        converged=bool(solution.converged),
+        n_parameters=POSE + free,
+        converged=solution.converged,
     )

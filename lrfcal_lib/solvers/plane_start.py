@@ -85,7 +85,7 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     half = p // 2 + 2
     for count in {half, max(half, FEWEST_LINES if flat else FEWEST_PLANES)}:
         order = np.argsort(squares[:, :count].mean(axis=1))
-        first += [*order[:4], *_apart(candidates, order)]
+        first += [*order[:4], *far_apart(candidates, order)]
     best = candidates[np.unique(first)]
 
     def evaluate(pose):
@@ -98,7 +98,7 @@ def start_from_planes(obs: CameraObservations) -> RigidTransform:
     plain = rough(state=robust).state
     minima = np.concatenate([robust, plain, best])
     sizes = sizes_of_minima(_squares(minima, triangles, sets), sets.number)
-    apart = np.array(_apart(minima, np.argsort(sizes)))
+    apart = np.array(far_apart(minima, np.argsort(sizes)))
     nearly = sizes[apart] <= NEARLY * sizes[apart[0]]
     return pose_transform(minima[apart[nearly]])
 
@@ -115,6 +115,18 @@ def sizes_of_minima(squares: np.ndarray, weights: np.ndarray | None = None) -> n
     return np.sqrt(np.average(capped, axis=1, weights=weights))
 
 
+def far_apart(poses, order):
+    """Indices of the first poses in some order that are turned against all before, `MOST_APART`."""
+    chosen = []
+    left = order
+    while len(left) and len(chosen) < MOST_APART:
+        first = left[0]
+        chosen.append(first)
+        turns = np.linalg.trace(poses[left, :, :3] @ poses[first, :, :3].T)
+        left = left[turns < 1 + 2 * np.cos(SAME_TURN)]
+    return chosen
+
+
 def common_plane(triangles):
     """The plane that all compressed points of a recording lie in, and whether they do.
 
@@ -128,7 +140,7 @@ def common_plane(triangles):
     frame = np.eye(4)
     frame[:3, :3] = axes.T
     frame[3, :3] = -axes @ centre[0]
-    return frame, bool(spread[2] < FLAT * spread[0])
+    return frame, spread[2] < FLAT * spread[0]
 
 
 def closed_form(triangles: np.ndarray, boards: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -240,18 +252,6 @@ def _squares(poses, triangles, sets):
     """Mean squared distances (n, p) of each placement's points from its plane, at n poses."""
     residuals = plane_residuals(poses[:, None], triangles, sets.boards)
     return np.vecdot(residuals, residuals) / sets.number
-
-
-def _apart(poses, order):
-    """Indices of the first poses in some order that are turned against all before, `MOST_APART`."""
-    chosen = []
-    left = np.asarray(order)
-    while len(left) and len(chosen) < MOST_APART:
-        first = left[0]
-        chosen.append(first)
-        turns = np.linalg.trace(poses[left, :, :3] @ poses[first, :, :3].T)
-        left = left[turns < 1 + 2 * np.cos(SAME_TURN)]
-    return chosen
 
 
 def _centred(triangles):

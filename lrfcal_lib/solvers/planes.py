@@ -3,6 +3,7 @@ sees; with the intrinsics, too.
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from lrfcal_lib.model.geometry import (
     move_pose,
     pose_array,
     pose_transform,
-    rotate_points,
+    rotate_and_move,
 )
 from lrfcal_lib.model.observations import CameraObservations
 
@@ -107,7 +108,7 @@ def estimate_from_planes(
     rounds = ROUNDS if weighted else 0
     problem, pose = minimise_in_rounds(freeze, pose, move_pose, rounds, **options)
     chi2_rest = correct_and_compress(sets, pose)[2] if weighted else 0.0
-    count = int(sets.number.sum())
+    count = sets.number.sum()
     return solve(
         problem,
         pose,
@@ -241,11 +242,10 @@ def plane_block(pose, triangles, boards, whitener=None, count=None, offset=0.0) 
     judges a placement as a whole.
     """
     residuals, by_pose, _ = plane_terms(pose[..., None, :, :], triangles, boards, offset)
-    shape = residuals.shape[:-2] + (-1,)
     if whitener is None:
         whitener = np.eye(4)
     whitener = np.broadcast_to(whitener, residuals.shape + (4,))
-    return Block(residuals.reshape(shape), by_pose.reshape(shape + (6,)), whitener, count)
+    return Block.of_groups(residuals, by_pose, whitener, count=count)
 
 
 def board_whitener(pose, triangles, boards, board_covariance):
@@ -289,7 +289,7 @@ def plane_error(obs: CameraObservations, solution: Solution) -> float:
     return rms(ndimage.mean(distance, obs.plane_placement, placements))
 
 
-def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> list[Block]:
+def planes_and_pattern(state, planes, obs: CameraObservations, lens) -> list[Block]:
     """Residuals by placement of pose, intrinsics and board poses (p, 3, 4): point-plane distances,
     pattern corners.
 
@@ -305,8 +305,7 @@ def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> lis
     distances = Block(residuals, jacobian, whitener[:, None])
 
     camera = obs.model.with_parameters(intrinsics)
-    corners = apply_pose(boards, obs.pattern_points)
-    rotated = rotate_points(boards, obs.pattern_points)
+    rotated, corners = rotate_and_move(boards, obs.pattern_points)
     by_point, by_lens = project_jacobians(corners, camera)
     visible = np.isfinite(obs.pattern_pixels)
     errors = np.where(visible, project(corners, camera) - obs.pattern_pixels, 0.0)
@@ -314,10 +313,8 @@ def planes_and_pattern(state, planes, obs: CameraObservations, lens=LENS) -> lis
     jacobian = np.concatenate(
         [np.zeros_like(by_board), by_lens[..., :lens], by_board], axis=-1
     )
-    p = len(boards)
-    weights = visible.reshape(p, -1) / obs.pattern_sigma_px
-    jacobian = jacobian.reshape(p, -1, jacobian.shape[-1])
-    return [distances, Block(errors.reshape(p, -1), jacobian, weights)]
+    weights = visible.reshape(len(boards), -1) / obs.pattern_sigma_px
+    return [distances, Block.of_groups(errors, jacobian, weights)]
 
 
 def estimate_with_lens(
@@ -367,7 +364,7 @@ def estimate_with_lens(
         plane_block, obs, pose, method=method, uses=uses, **options
     )
     error = plane_error(obs, solution)
-    numbers = int(np.sum(plane_sets(obs).number) + visible.sum())
+    numbers = np.sum(plane_sets(obs).number) + visible.sum()
     state = (pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3])
     for _ in range(2):
         planes, rest = _planes_at(obs, state, error)
@@ -375,7 +372,7 @@ def estimate_with_lens(
             lambda state, planes=planes: residual(state, planes, obs, lens),
             state,
             _move_with_lens,
-            read=lambda state: _read_with_lens(state, lens),
+            read=partial(_read_with_lens, lens=lens),
             names=POSE_NAMES + INTRINSIC_NAMES[:lens],
             method=method,
             scales=(1.0,) * 6 + LENS_SCALES[:lens],
@@ -426,10 +423,9 @@ def _read_with_lens(state, lens):
 def _with_refined_model(solution, obs, lens):
     """The Solution with its intrinsics as a CameraModel, and the boards' poses."""
     _, intrinsics, boards = solution.state
-    corners = 2 * len(obs.pattern_points)
-    errors = solution.residuals[:, -corners:] * obs.pattern_sigma_px
-    visible = np.isfinite(obs.pattern_pixels).sum() / 2
-    miss = float(np.sqrt(np.sum(errors**2) / visible))  # per corner, as OpenCV has it
+    corners = apply_pose(boards, obs.pattern_points)
+    misses = project(corners, obs.model.with_parameters(intrinsics)) - obs.pattern_pixels
+    miss = 2**0.5 * rms(misses)  # per corner, as OpenCV has it
     covariance = np.pad(solution.covariance[6:, 6:], (0, LENS - lens))
     model = obs.model.with_parameters(intrinsics, covariance, miss)
     return replace(solution, model=model, board_poses=pose_transform(boards).as_matrix())

@@ -75,10 +75,6 @@ class PlatformSolution:
         """The tilt axis in the LRF frame."""
         return axis_of(self.solution.transform)
 
-    def __repr__(self):
-        count = f"{len(self.placements)} placements"
-        return f"PlatformSolution({self.solution.method}, {self.axis}, {count})"
-
 
 def start_head(T0):
     """Start value of ``T_head_lrf``: given, or an axis through the LRF's origin along its x."""
@@ -118,8 +114,8 @@ def solve_platform(
     gauge = start_head(T0)
     for final in (False, True):  # the second time in the gauge of the axis of the first
         boards = prepare_boards(obs, gauge)
-        on_edges = int(boards.edge["used"].sum())
-        points = on_edges + int(boards.face["used"].sum())
+        on_edges = boards.edge["used"].sum()
+        points = on_edges + boards.face["used"].sum()
         p = len(boards.placements)
         state = geometry.pose_array(gauge), boards.poses, np.zeros((p, 2))
         solution = solve(
@@ -245,8 +241,7 @@ def _start_board(edges, face):
 
 
 def distances(state, group):
-    """Distances (p, n, 3) of points from their edge in the board's plane and across it, and their
-    places along edge 1.
+    """Distances (p, n, 2) of points from their edge in the board's plane and across it.
 
     And their Jacobians by the unknowns, by the point and by the pitch. Edge 1 lies along x of the
     board, edge 2 along y but for the skew and the gap. The second distance serves for points on the
@@ -260,11 +255,10 @@ def distances(state, group):
     b = lever @ boards[:, :, :3]
     cosine = second * np.cos(bends[:, :1])
     sine = second * np.sin(bends[:, :1])
-    normals = np.zeros(b.shape[:2] + (3, 3))  # board frame
+    normals = np.zeros(b.shape[:2] + (2, 3))  # board frame
     normals[..., 0, 0] = cosine
     normals[..., 0, 1] = 1 - second + sine
     normals[..., 1, 2] = 1.0
-    normals[..., 2, 0] = 1.0
     r = np.matvec(normals, b)
     r[..., 1] -= second * bends[:, 1:]
     gradient = normals @ boards[:, None, :, :3].mT  # by q, platform frame
@@ -292,30 +286,24 @@ def distance_block(state, group, sigma_pitch, which):
     moved = group | {"points": points, "pitch": pitch}
     corrected = distances(state, moved)[1][:, :, which]
     whitener = inverse_root(noise) * group["used"][..., None, None]
-    p = len(r)
-    J = J.reshape(p, -1, 12)
-    return Block(r.reshape(p, -1), J, whitener, corrected=corrected.reshape(J.shape))
+    return Block.of_groups(r, J, whitener, corrected)
 
 
 def platform_blocks(state, edge, face, sigma_pitch):
     """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
     head, boards, bends = state
     p = len(boards)
-    used = edge["used"]
     lone = ~np.any(edge["second"], axis=1)
     tolerance = np.broadcast_to(np.eye(12)[10:], (p, 2, 12))
-    # a board seen with one edge may slide along it: its origin is held at the middle of that edge's
-    # points
-    r, J, *_ = distances(state, edge)
-    share = used / np.maximum(used.sum(axis=1, keepdims=True), 1)
-    middle = np.vecdot(share, r[..., 2])[:, None]
-    by_middle = np.vecmat(share, J[..., 2, :])[:, None]
+    # a board seen with one edge may slide along it, which no point shows: it is held
+    slide = np.zeros((p, 1, 12))
+    slide[:, 0, 7:10] = boards[:, :, 0]
     stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))
     return [
         distance_block(state, edge, sigma_pitch, slice(0, 2)),
         distance_block(state, face, sigma_pitch, slice(1, 2)),
         Block(bends, tolerance, stiff),
-        Block(middle, by_middle, lone[:, None] * 100.0),
+        Block(np.zeros((p, 1)), slide, lone[:, None] * 100.0),
     ]
 
 
