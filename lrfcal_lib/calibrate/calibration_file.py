@@ -15,7 +15,14 @@ from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import Endless, LrfInfo, Positive, from_json, plain
+from lrfcal_lib.session.stated import (
+    Endless,
+    LensStated,
+    LrfInfo,
+    Positive,
+    from_json,
+    plain,
+)
 
 SCHEMA = 3
 KIND = "lrfcal calibration"
@@ -83,18 +90,11 @@ class PlatformWritten(BaseModel):
     axis_covariance: Annotated[np.ndarray, rows(4, 4)]
 
 
-class LensWritten(BaseModel):
+class LensWritten(LensStated):
     """What ``CameraModel(**lens)`` takes."""
 
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
-    fx: Positive
-    fy: Positive
-    cx: FiniteFloat
-    cy: FiniteFloat
-    distortion: Annotated[np.ndarray, rows(5)]
-    covariance: Annotated[np.ndarray, rows(9, 9)] | None
-    rms_px: FiniteFloat | None
 
 
 class CameraWritten(BaseModel):

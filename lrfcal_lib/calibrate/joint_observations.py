@@ -17,8 +17,7 @@ CELLS_PER_EDGE = 160  # a placement
 def observe_joint(
     prepared: Prepared, views: dict[str, list[BoardView]]
 ) -> JointObservations:
-    """Everything that the joint estimate uses of a session, of the placements that are not left
-    out.
+    """Everything that the joint estimate uses of a session.
 
     Parameters
     ----------
@@ -32,7 +31,7 @@ def observe_joint(
     """
     session = prepared.session
     board = prepared.board
-    scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.left_out}
+    scans = prepared.scans
     if board.corners is None and board.pattern is not None:
         # nobody knows the outline: no beam is named after the sides of the printed squares
         corners = board.pattern.outline()
@@ -74,12 +73,9 @@ def _ranges(scans):
 
 def _beams(prepared, scans):
     """Beams about the named sides of placements, by row: columns by name."""
-    along = prepared.edges["half_step"]
-    swept = prepared.swept["half_step"]
     for row, (placement, scan) in enumerate(scans.items()):
-        cells = edge_cells(
-            scan, along[placement], swept.get(placement), prepared.session.lrf
-        )
+        ways = prepared.edges[placement]["half_step"]
+        cells = edge_cells(scan, ways, prepared.session.lrf)
         for side, name in prepared.names.get(placement, {}).items():
             about = cells[thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE)]
             yield {

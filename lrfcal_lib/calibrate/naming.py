@@ -4,7 +4,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.calibrate.observe import observe, platform_of, source_of
+from lrfcal_lib.calibrate.observe import observe, sides_of, source_of
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, unit_vector
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
@@ -50,28 +50,17 @@ def name_sides(
             if placement not in prepared.scans or placement in names:
                 continue
             T_board_source = view.T_camera_board.inv() * T_camera_source
-            sides = _sides_on_board(prepared, camera, placement, T_board_source)
+            source = source_of(prepared, camera, placement, None)
+            sides = {}
+            for side in sides_of(prepared, placement):
+                points = source.points(side.points, side.pitch)
+                sides[side.number] = T_board_source.apply(points)
             names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
             for why in dropped[placement].values():
                 problems.append(
                     Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement)
                 )
     return names, dropped, problems
-
-
-def _sides_on_board(prepared, camera, placement, T_board_source):
-    """Points (n, 3) of the sides of a sweep by number, board frame, metres."""
-    source = source_of(prepared, camera, placement, platform_of(prepared))
-    sides: dict = {}
-    for edges in (prepared.edges["half_step"], prepared.swept["half_step"]):
-        if placement not in edges:
-            continue
-        scanned = edges[placement]
-        for number in np.unique(scanned.side[scanned.side >= 0]).tolist():
-            rows = scanned.side == number
-            points = source.points(scanned.points[rows], scanned.pitch[rows])
-            sides.setdefault(number, T_board_source.apply(points))
-    return sides
 
 
 def rough_poses(prepared: Prepared) -> tuple[dict[str, RigidTransform], list[Problem]]:

@@ -265,8 +265,7 @@ def without(prepared: Prepared) -> Prepared:
         scans=kept(prepared.scans),
         names=kept(prepared.names),
         dropped=kept(prepared.dropped),
-        edges={variant: kept(edges) for variant, edges in prepared.edges.items()},
-        swept={variant: kept(edges) for variant, edges in prepared.swept.items()},
+        edges=kept(prepared.edges),
     )
 
 

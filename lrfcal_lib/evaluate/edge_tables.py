@@ -56,7 +56,7 @@ def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
     for variant in VARIANTS:
         misses = {edge: [np.zeros(0)] for edge in lines}
         for placement, names in prepared.names.items():
-            scanned = prepared.edges[variant][placement]
+            scanned = prepared.edges[placement][variant][0]
             pitch = truth.pitch[placement][scanned.line]
             p_platform = geometry.lrf_to_platform(scanned.points, pitch, truth.T_head_lrf)
             p_board = truth.boards[placement].inv().apply(p_platform)

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from lrfcal_lib.calibrate.cameras import PlatformCalibration
+from lrfcal_lib.calibrate.observe import sides_of
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.covariance import sigma_of
@@ -341,13 +342,13 @@ def scans_table(prepared: Prepared) -> pd.DataFrame:
     """
     rows = []
     for placement, board in prepared.scans.items():
-        swept = prepared.swept["half_step"].get(placement)
-        along = {s.side for s in prepared.edges["half_step"][placement].sides}
-        across = set() if swept is None else {s.side for s in swept.sides} - along
+        across = [side.across for side in sides_of(prepared, placement) if side.straight]
         count = int(board.mask.sum())
         sigma_mm = 1000 * board.sigma_range
         jumps = int(board.n_jump_points)
-        rows.append((placement, count, sigma_mm, jumps, len(along), len(across)))
+        rows.append(
+            (placement, count, sigma_mm, jumps, across.count(False), across.count(True))
+        )
     return pd.DataFrame(rows, columns=SCAN_COLUMNS)
 
 

@@ -102,6 +102,7 @@ def view_board(
     board : Board
         With a pattern, or with known corners.
     model : CameraModel
+        For images of this size.
     view : BoardView
         Says whose image it is; for a board with a pattern it has the `pixels` of its corners, in
         the right order.
@@ -117,12 +118,6 @@ def view_board(
         An image that cannot be used is no error: `reason` says why.
     """
     picks = picks or {}
-    if image.shape[:2] != (model.height, model.width):
-        reason = (
-            f"the image is {image.shape[1]} x {image.shape[0]}, the intrinsics are for "
-            f"{model.width} x {model.height} pixels"
-        )
-        return replace(view, reason=reason)
     if board.pattern is None:
         return _view_plain(view, image, board, model, picks)
     view = _view_pattern(view, image, board, model, picks, lines, relief)
@@ -238,20 +233,14 @@ def _view_plain(view, image, board, model, picks):
     except EdgeNotSeen as error:
         return replace(view, reason=str(error))
     views = []
-    for found in outline_poses(sides, board, model):
+    for found in outline_poses(sides, board, model, view):
         inner = np.mean([edge.centre for edge in found.edges], axis=0)
         edges = {edge.name: edge for edge in found.edges}
         off = [line_distance(uv, edges[name].line) for name, uv in ends.items()]
         if np.abs(off).max(initial=0.0) >= SAME_NAMES_PX:
             continue
         edges |= {name: picked_edge(name, uv, inner) for name, uv in ends.items()}
-        explained = replace(
-            view,
-            edges=tuple(edges.values()),
-            T_camera_board=found.T_camera_board,
-            covariance=found.covariance,
-        )
-        views.append(explained)
+        views.append(replace(found, edges=tuple(edges.values())))
     if not views:
         reason = f"no pose of board '{board.name}' explains the outline in the image"
         return replace(view, reason=reason)

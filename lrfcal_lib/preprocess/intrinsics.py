@@ -268,9 +268,8 @@ def _rough(views, points, size):
             f"{len(views)} views of the pattern do not determine the intrinsics (OpenCV: "
             f"{error.err})"
         ) from error
-    fx, cx = matrix[0, [0, 2]]
-    fy, cy = matrix[1, [1, 2]]
-    model = CameraModel(*size, float(fx), float(fy), float(cx), float(cy), lens.ravel())
+    of_pinhole = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]  # fx, fy, cx, cy
+    model = CameraModel(*size, *of_pinhole.tolist(), lens.ravel())
     return model, opencv_poses(turns, shifts)
 
 

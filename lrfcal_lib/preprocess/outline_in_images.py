@@ -4,6 +4,7 @@ A wide search finds straight edges parallel to the sides of the pattern, and whi
 board is in every image; the narrow search then finds each edge, and the outline is their median.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -119,7 +120,7 @@ def edge_votes(
     return np.stack(shares)
 
 
-def turned_views(votes: np.ndarray, up: np.ndarray, leader: np.ndarray) -> np.ndarray:
+def turned_views(votes: np.ndarray, up: np.ndarray, leader: Sequence[int]) -> np.ndarray:
     """Which views see the pattern turned by 180 deg against the others.
 
     Parameters
@@ -128,9 +129,9 @@ def turned_views(votes: np.ndarray, up: np.ndarray, leader: np.ndarray) -> np.nd
         Of :func:`edge_votes`.
     up : ndarray, shape (v,)
         Component of the board's y axis down the image: most views keep y down.
-    leader : ndarray of int, shape (v,)
+    leader : sequence of int, length v
         The first of the views that are turned alike, see
-        :class:`lrfcal_lib.preprocess.turns.Alike`.
+        :func:`lrfcal_lib.preprocess.turns.alike`.
 
     Returns
     -------

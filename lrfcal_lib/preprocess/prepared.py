@@ -92,10 +92,10 @@ class Prepared:
         it.
     scans : dict of int to BoardScan
         By placement.
-    edges : dict of str to dict of int to ScanEdges
-        Crossings of scan lines with the board's sides by edge-point variant and placement.
-    swept : dict of str to dict of int to ScanEdges
-        The same across the scan lines, where the sweep enters and leaves the board.
+    edges : dict of int to dict of str to list of ScanEdges
+        By placement and edge-point variant: where scan lines cross the board's sides; and, unless
+        it is a single shot, the same across the scan lines, where the sweep enters and leaves the
+        board.
     models : dict of str to CameraModel
     views : dict of str to dict of int to BoardView
         By camera and placement; where there are images at several pitch angles, the one with most
@@ -118,7 +118,6 @@ class Prepared:
     board: Board
     scans: dict
     edges: dict
-    swept: dict
     models: dict = field(default_factory=dict)
     views: dict = field(default_factory=dict)
     outline: Outline | None = None
@@ -199,20 +198,16 @@ def prepare_scans(session: Session) -> Prepared:
         Without cameras.
     """
     scans = {}
+    edges = {}
     problems = []
-    edges: dict[str, dict] = {variant: {} for variant in VARIANTS}
-    swept: dict[str, dict] = {variant: {} for variant in VARIANTS}
     for result in spread(partial(_crossed, session), session.board_placements):
         if isinstance(result, Problem):
             problems.append(result)
             continue
-        scan, along, across = result
+        scan, crossed = result
         scans[scan.placement] = scan
-        for variant in VARIANTS:
-            edges[variant][scan.placement] = along[variant]
-            if across:
-                swept[variant][scan.placement] = across[variant]
-    return Prepared(session, session.board, scans, edges, swept, problems=tuple(problems))
+        edges[scan.placement] = crossed
+    return Prepared(session, session.board, scans, edges, problems=tuple(problems))
 
 
 def _crossed(session, placement):
@@ -227,10 +222,10 @@ def _crossed(session, placement):
     except BoardNotFound as error:
         return Problem(Stage.SCANS, ProblemKind.NO_BOARD, str(error), placement)
     along, sides = crossings(scan)
-    across = {}
+    ways = [along]
     if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
-        across, _ = crossings(scan, True, sides)
-    return scan, along, across
+        ways.append(crossings(scan, True, sides)[0])
+    return scan, {variant: [way[variant] for way in ways] for variant in VARIANTS}
 
 
 def prepare_images(prepared: Prepared) -> Prepared:
