@@ -52,8 +52,9 @@ class Eye(NamedTuple):
         Blue, green, red.
     cell : float
         Width of the depth buffer's square cells, pixels.
-    nearest : ndarray of float32
-        The depth buffer, flat: distances, metres.
+    nearest : ndarray of float32, shape (workers, n)
+        Depth buffers, flat: distances, metres. Each thread has its own; the first one is that of
+        all in the end.
     noise : float
         Metres by which a point may lie behind another one of the same surface.
     exposure : ndarray, shape (2,)
@@ -73,12 +74,12 @@ class Eye(NamedTuple):
 
 
 @njit(**COMPILED)
-def hide(points, eye):
-    """Write the distances (metres) of points (n, 3) into the depth buffer of an Eye."""
+def hide(points, eye, worker):
+    """Write the distances (metres) of points (n, 3) into a depth buffer of an Eye."""
     rows = np.empty((6, TILE), np.float32)
     at = np.empty(TILE, np.int32)
     far = rows[5]
-    nearest = eye.nearest
+    nearest = eye.nearest[worker]
     for start in range(0, len(points), TILE):
         count = min(TILE, len(points) - start)
         _locate(points[start : start + count], eye, rows, at)
@@ -98,7 +99,7 @@ def paint(points, normals, eye, sums, best, source):
     of its surface over a cell.
     """
     lens = eye.lens
-    nearest = eye.nearest
+    nearest = eye.nearest[0]
     height, width, _ = eye.image.shape
     corner = 0.25 * (width * width + height * height)  # squared pixels from the middle
     slant = eye.cell / lens[0]  # of a cell, metres at a distance of one

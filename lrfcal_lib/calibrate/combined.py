@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.joint_observations import observe_joint
 from lrfcal_lib.calibrate.observe import LEAST_STRETCH, named_sides
@@ -23,7 +24,7 @@ from lrfcal_lib.calibrate.outline import (
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import CameraModel, line_distance
+from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.kinematics import SourceFrame
 from lrfcal_lib.preprocess.board_in_scan import face_points
@@ -243,9 +244,7 @@ def edges_in_cloud(solution, prepared, placement, face):
         centre = T_platform_camera.translation
         height = (plane[:, 3] - centre) @ normal
         for edge in view.edges:
-            off = line_distance(edge.ends, edge.line)
-            uv = edge.ends - np.outer(off, edge.line[:2])
-            sight = T_platform_camera.rotation.apply(lens.sights(uv))
+            sight = T_platform_camera.rotation.apply(lens.sights(edge.ends))
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
     return {name: np.concatenate(points) for name, points in sides.items()}
@@ -299,17 +298,17 @@ def blocks_of(state, case, scale):
     if case.images:
         blocks.append(image_block(state, case, scale))
     blocks.append(_rows(case.whitener @ state.change, case.whitener))
-    count = 2 * len(case.middle)
-    width = unknowns.shared + unknowns.own + count
-    start = unknowns.columns["board"].start
     board = state.joint.boards[0]
-    held = np.zeros((3 + count, width))
-    held[0, start : start + 3] = STILL * board[:, 2]  # turn of board and sides together
-    held[1:3, start + 3 : start + 6] = STILL * board[:, :2].T  # their shift
-    held[3:, -count:] = np.diag(np.tile(FAR, len(case.middle)))
+    held = block_diag(
+        np.zeros((0, unknowns.shared)),
+        STILL * board[None, :, 2],  # turn of board and sides together
+        STILL * board[:, :2].T,  # their shift
+        np.zeros((0, unknowns.own - geometry.POSE)),
+        np.diag(np.tile(FAR, len(case.middle))),
+    )
     blocks.append(_rows(np.zeros(len(held)), held))
     for block in blocks:
-        missing = width - block.jacobian.shape[-1]
+        missing = held.shape[1] - block.jacobian.shape[-1]
         jacobian = np.pad(block.jacobian, {-1: (0, missing)})
         yield replace(block, jacobian=jacobian)
 

@@ -30,13 +30,7 @@ def observe_joint(
     JointObservations
     """
     session = prepared.session
-    board = prepared.board
     scans = prepared.scans
-    if board.corners is None and board.pattern is not None:
-        # nobody knows the outline: no beam is named after the sides of the printed squares
-        corners = board.pattern.outline()
-    else:
-        corners = board.known_corners()
     lens_covariance = np.zeros((len(views), LENS, LENS))
     for number, camera in enumerate(views):
         known = prepared.models[camera].covariance
@@ -46,8 +40,9 @@ def observe_joint(
         placements=np.array(list(scans), int),
         direction=np.array([session.sweep_direction(p) for p in scans], int),
         middle=np.array([np.mean(scan.sweep.pitch) for scan in scans.values()]),
-        edges=tuple(board.edges),
-        corners=corners,
+        edges=tuple(prepared.board.edges),
+        # where nobody knows them, no beam is named after the sides of the printed squares
+        corners=prepared.board.outline(),
         cameras=tuple(views),
         mounts=tuple(session.cameras[camera].mount for camera in views),
         T_head_lrf=session.T_head_lrf,

@@ -387,7 +387,7 @@ def outline(ax: Axes, measured) -> None:
     board = measured.board
     around = closed(board.known_corners())
     ax.plot(*around.T, color=TRUTH)
-    outwards = measured.lines[:, :2]
+    outwards = board.lines()[:, :2]
     for index, spread in enumerate(measured.line_sd):
         ends = around[index : index + 2]
         away = EXAGGERATED * np.nan_to_num(spread) * outwards[index]

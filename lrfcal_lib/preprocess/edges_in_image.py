@@ -143,7 +143,7 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     ----------
     name : str
     ends : ndarray, shape (2, 2)
-        Undistorted pixels.
+        Undistorted pixels; ValueError where they are the same.
     inner : ndarray, shape (2,)
         A point of the board, likewise.
 
@@ -153,10 +153,6 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     """
     length = np.linalg.norm(ends[1] - ends[0])
     centre = ends.mean(axis=0)
-    if length < 1:
-        raise ValueError(
-            f"edge '{name}' was picked with two points {length:.2f} px apart: pick them far apart"
-        )
     line = outward_line(ends[0], ends[1], centre - inner)
     covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
     return ImageEdge(name, line, covariance, centre, ends, n_points=2, rms_px=0.0)

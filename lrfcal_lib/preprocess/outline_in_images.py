@@ -60,9 +60,6 @@ class Outline:
     ----------
     board : Board
         With its corners filled in.
-    lines : ndarray, shape (E, 3)
-        Board-frame lines ``a x + b y + c = 0``, unit normals out of the board, in the order of
-        ``board.edges``.
     line_sd : ndarray, shape (E,)
         Standard deviation over the views of an edge's offset at its middle, metres.
     length_sd : dict of str to float
@@ -73,7 +70,6 @@ class Outline:
     """
 
     board: Board
-    lines: np.ndarray
     line_sd: np.ndarray
     length_sd: dict[str, float]
     n_lengths: dict[str, int]
@@ -248,7 +244,6 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).T
     return Outline(
         board=replace(board, corners=corners_of_lines(fitted)),
-        lines=fitted,
         line_sd=np.array([spread for _, spread in medians]),
         length_sd=dict(zip(board.edges, map(_spread, lengths), strict=True)),
         n_lengths=dict(zip(board.edges, np.isfinite(lengths).sum(axis=1), strict=True)),

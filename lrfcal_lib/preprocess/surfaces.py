@@ -317,12 +317,10 @@ def _grown(surface, points):
 
 def _size_limits(board, grown):
     """Limits of a board with its outline grown (m)."""
-    unknown = board.corners is None and board.pattern is not None
-    corners = board.pattern.outline() if unknown else board.known_corners()
-    corners = corners.astype(np.float32)
+    corners = board.outline().astype(np.float32)
     area = cv2.contourArea(corners)
     length = pdist(corners).max()
-    if unknown:
+    if board.corners is None:
         return Limits(0.3 * area, 4 * area, 2.5 * length)
     rim = cv2.arcLength(corners, True)
     return Limits(0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown)

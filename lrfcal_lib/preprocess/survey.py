@@ -141,7 +141,7 @@ def survey(session: Session) -> Survey:
     views = see(lines)
     outline = None
     if board.corners is None and not unseen:
-        views = see(measure_outline(views, board, models).lines)
+        views = see(measure_outline(views, board, models).board.lines())
         outline = measure_outline(views, board, models)
         board = outline.board
     lost = [shot.view for shot in begun if shot.reason]
