@@ -241,10 +241,12 @@ def load_calibration(path: str | Path) -> CalibratedRig:
 
 def _made(file):
     """The CalibratedRig of a CalibrationFile."""
-    cameras = {}
-    for name, camera in file.cameras.items():
-        model = CameraModel(**dict(camera.lens))
-        cameras[name] = CalibratedCamera(camera.matrix, camera.mount, model)
+    cameras = {
+        name: CalibratedCamera(
+            camera.matrix, camera.mount, CameraModel(**dict(camera.lens))
+        )
+        for name, camera in file.cameras.items()
+    }
     known = file.uncertainty
     if known is not None:
         if set(known.unseen_of_cameras) != set(cameras):

@@ -353,10 +353,10 @@ def image_block(state, case, scale):
     jacobians = []
     for image in case.images:
         a, b, c = state.lines[image.number]
-        places = np.zeros((1, 2, 3))
-        places[0, :, :2] = [-c * a, -c * b] + np.outer(PLACES, [-b, a])
+        flat = [-c * a, -c * b] + np.outer(PLACES, [-b, a])
+        places = np.insert(flat, 2, 0.0, axis=1)
         misses, by_pose = line_misses(
-            [image.edge], places, image.model, poses[0, image.row]
+            [image.edge], places[None], image.model, poses[0, image.row]
         )
         J = by_pose[0] @ by_all[image.row]
         by_sides = side_columns(J, np.full(2, image.number), state, case)

@@ -6,6 +6,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.observe import observe, sides_of, source_of
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.camera import line_distance
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, unit_vector
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.pattern_in_image import SMALL_SQUARE_PX
@@ -51,10 +52,10 @@ def name_sides(
                 continue
             T_board_source = view.T_camera_board.inv() * T_camera_source
             source = source_of(prepared, camera, placement, None)
-            sides = {}
-            for side in sides_of(prepared, placement):
-                points = source.points(side.points, side.pitch)
-                sides[side.number] = T_board_source.apply(points)
+            sides = {
+                side.number: T_board_source.apply(source.points(side.points, side.pitch))
+                for side in sides_of(prepared, placement)
+            }
             names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
             for why in dropped[placement].values():
                 problems.append(
@@ -132,7 +133,7 @@ def nearest_edges(
     dropped = {}
     cost = np.zeros((len(sides), len(lines)))
     for row, points in enumerate(sides.values()):
-        distances = points[:, :2] @ lines[:, :2].T + lines[:, 2]
+        distances = line_distance(points[:, None, :2], lines)
         cost[row] = np.median(np.abs(distances), axis=0)
     numbers = list(sides)
     for row, column in zip(*linear_sum_assignment(cost), strict=True):

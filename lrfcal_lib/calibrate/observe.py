@@ -4,7 +4,7 @@ and stacked as observations.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections, Sou
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations, thin
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_scan import ScanEdges, ScanSide
-from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
+from lrfcal_lib.preprocess.prepared import Prepared
 
 ONE_SCAN = "one_scan"
 # neighbouring scan lines repeat each other's errors; a line in space needs few points
@@ -93,16 +93,6 @@ def observe(
         **stack("crossing_", crossed),
         **stack("scene_", corners),
     )
-
-
-def observe_all(
-    prepared: Prepared, T_head_lrf: RigidTransform | None = None
-) -> dict[tuple[str, str], CameraObservations]:
-    """Observations of all cameras in every edge-point variant, by camera and variant."""
-    return {
-        (camera, variant): observe(prepared, camera, variant, T_head_lrf)
-        for camera, variant in product(prepared.views, (*VARIANTS, ONE_SCAN))
-    }
 
 
 def platform_observations(
@@ -381,8 +371,11 @@ def _one_scan_line(features, view, sides):
     """The paper's choice: of the two edges of `features`, the points of the middle one of the lines
     crossing both.
     """
-    seen = [name for name in features if view.edge(name) is not None]
-    sides = [side for side in sides if side.name in seen and not side.across]
+    sides = [
+        side
+        for side in sides
+        if side.name in features and view.edge(side.name) and not side.across
+    ]
     if len(sides) != 2:
         return
     both = np.intersect1d(*(side.edges.line[side.rows] for side in sides))

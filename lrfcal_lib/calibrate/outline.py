@@ -6,7 +6,7 @@ import numpy as np
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.camera import line_distance
+from lrfcal_lib.model.camera import line_distance, line_through
 from lrfcal_lib.model.geometry import fit_line
 
 STEP = 1e-6  # of shifts and turns of lines, metres and radians: for derivatives of lengths
@@ -69,8 +69,7 @@ def measure_board(
         row = edges.index(name)
         flat = (points - pose[:, 3]) @ pose[:, :2]
         middle, direction, rms = fit_line(flat)
-        normal = direction[::-1] * [1.0, -1.0]
-        lines[row] = np.append(normal, -normal @ middle)
+        lines[row] = line_through(middle, middle + direction)
         middles[row] = middle
         shift = rms**2 / max(len(flat) - 1, 1)
         spread = np.mean(((flat - middle) @ direction) ** 2)

@@ -6,6 +6,7 @@ import operator
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -20,8 +21,8 @@ from lrfcal_lib.calibrate.cameras import (
 from lrfcal_lib.calibrate.joint_observations import observe_joint
 from lrfcal_lib.calibrate.naming import name_sides
 from lrfcal_lib.calibrate.observe import (
+    ONE_SCAN,
     observe,
-    observe_all,
     platform_observations,
 )
 from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig, joint_rig
@@ -34,6 +35,7 @@ from lrfcal_lib.model.observations import CameraObservations, JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.prepared import (
     LEAST_SWEEP,
+    VARIANTS,
     PitchNoise,
     Prepared,
     prepare_images,
@@ -228,7 +230,11 @@ def _calibrate(session, methods):
 def _one_by_one(prepared, methods):
     """Calibrate the platform, then every camera."""
     platform = tilt_axis(prepared)
-    observations = observe_all(prepared, platform.transform("combined"))
+    axis = platform.transform("combined")
+    observations = {
+        (camera, variant): observe(prepared, camera, variant, axis)
+        for camera, variant in product(prepared.views, (*VARIANTS, ONE_SCAN))
+    }
     solutions, problems = calibrate_cameras(observations, methods)
     return Calibration(prepared, platform, observations, solutions, tuple(problems))
 
@@ -250,7 +256,12 @@ def prepare(session: Session) -> Prepared:
     names, dropped, problems = name_sides(ready)
     every = (*ready.problems, *problems)
     ready = without(replace(ready, names=names, dropped=dropped, problems=every))
-    return replace(ready, pitch_noise=pitch_noise(find_pitch_errors(ready)))
+    errors = find_pitch_errors(ready)
+    if errors is None:
+        return ready
+    wanted = errors.models[errors.wanted]
+    noise = PitchNoise(rms(wanted.offset), rms(wanted.stretch))
+    return replace(ready, pitch_noise=noise)
 
 
 def without(prepared: Prepared) -> Prepared:
@@ -294,14 +305,6 @@ def find_pitch_errors(prepared: Prepared) -> PitchErrors | None:
     return None
 
 
-def pitch_noise(errors: PitchErrors | None) -> PitchNoise:
-    """How far a recorded pitch is off; zero where the data do not ask for any."""
-    if errors is None:
-        return PitchNoise()
-    model = errors.models[errors.wanted]
-    return PitchNoise(rms(model.offset), rms(model.stretch))
-
-
 def tilt_axis(prepared: Prepared) -> PlatformCalibration:
     """The tilt axis of a session by every method, see
     :func:`lrfcal_lib.calibrate.cameras.calibrate_platform`.
@@ -317,8 +320,7 @@ def tilt_axis(prepared: Prepared) -> PlatformCalibration:
     """
     session = prepared.session
     observations = {
-        variant: platform_observations(prepared, variant)
-        for variant in ("last_beam", "half_step")
+        variant: platform_observations(prepared, variant) for variant in VARIANTS
     }
     return calibrate_platform(
         observations,

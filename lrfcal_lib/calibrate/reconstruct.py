@@ -100,7 +100,7 @@ def _refuse(sweep, lrf):
             f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no "
             "range)"
         )
-    first, last = np.degrees([min(sweep.bearings), max(sweep.bearings)]).round(2)
+    first, last = np.degrees(sweep.bearings[[0, -1]]).round(2)
     right, left = np.degrees(lrf.field_of_view).round(2)
     step = np.degrees(lrf.bearing_step)
     if first < right - step or last > left + step:

@@ -8,6 +8,7 @@ from scipy.ndimage import map_coordinates
 
 from lrfcal_lib.fit.robust import biweight, rms, robust_sigma
 from lrfcal_lib.model.camera import CameraModel, line_through, pinhole, redistort
+from lrfcal_lib.model.geometry import unit_lines
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -111,8 +112,7 @@ def refine_edge(
     if not LEAST_PROFILES <= length < LONGEST * max(image.shape):
         raise EdgeNotSeen(f"its predicted length is {length:.0f} px")
     along = (end - start) / length
-    normal = np.array([along[1], -along[0]])
-    normal = normal * np.sign(normal @ outward)
+    normal = outward_line(start, end, outward)[:2]
     columns = np.arange(int(length) + 1)
     pad = 3 * SMOOTH_PX + 1
     across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
@@ -238,8 +238,7 @@ def board_line(view, edge, model):
     Shape (3,).
     """
     pose = view.T_camera_board.as_matrix()
-    line = (model.matrix @ pose[:3, [0, 1, 3]]).T @ edge.line
-    return line / np.hypot(line[0], line[1])
+    return unit_lines((model.matrix @ pose[:3, [0, 1, 3]]).T @ edge.line)
 
 
 def on_board(xy, pose, model):

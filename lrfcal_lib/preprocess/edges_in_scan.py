@@ -282,10 +282,8 @@ def background_odds(here, behind):
     ``2 ln(here / behind)``, the inverse square law; 0 with nothing behind, or so close that both
     give one echo.
     """
-    behind = np.asarray(behind, float)
     apart = np.isfinite(behind) & (behind - here >= MIXING)
-    ratio = here / np.where(apart, behind, 1.0)
-    return 2 * np.log(np.where(apart, ratio, 1.0))
+    return 2 * np.log(np.where(apart, here / behind, 1.0))
 
 
 def plane_range(scan, rays, pitch) -> tuple[np.ndarray, np.ndarray]:

@@ -447,10 +447,10 @@ def _orders(shots, pattern, models, mirrored):
     """
     orders = pattern_orders(pattern, mirrored=mirrored)
     turns = turned_boards(pattern, orders)
-    poses = []
-    for shot in shots:
-        model = models[shot.record.camera]
-        poses.append(first_pose(pattern.points(), shot.view.pixels, model) * turns)
+    poses = [
+        first_pose(pattern.points(), shot.view.pixels, models[shot.view.camera]) * turns
+        for shot in shots
+    ]
     leader, together = alike(
         [pose.rotation for pose in poses], [shot.view for shot in shots]
     )
