@@ -9,8 +9,8 @@ from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.problem import LEAVES_OUT, Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_image import BoardView
-from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
-from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
+from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, BoardScan, find_board
+from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, ScanEdges, crossings
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.outline_in_images import Outline
 from lrfcal_lib.preprocess.survey import small_squares, survey
@@ -221,11 +221,26 @@ def _crossed(session, placement):
         )
     except BoardNotFound as error:
         return Problem(Stage.SCANS, ProblemKind.NO_BOARD, str(error), placement)
+    return scan, all_crossings(scan)
+
+
+def all_crossings(scan: BoardScan) -> dict[str, list[ScanEdges]]:
+    """Where scan lines, and columns unless it is a single shot, cross the board's edges.
+
+    Parameters
+    ----------
+    scan : BoardScan
+
+    Returns
+    -------
+    dict of str to list of ScanEdges
+        By edge-point variant.
+    """
     along, sides = crossings(scan)
     ways = [along]
     if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
         ways.append(crossings(scan, True, sides)[0])
-    return scan, {variant: [way[variant] for way in ways] for variant in VARIANTS}
+    return {variant: [way[variant] for way in ways] for variant in VARIANTS}
 
 
 def prepare_images(prepared: Prepared) -> Prepared:
