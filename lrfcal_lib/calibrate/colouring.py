@@ -81,9 +81,9 @@ def hide(points, eye, worker):
     far = rows[5]
     nearest = eye.nearest[worker]
     for start in range(0, len(points), TILE):
-        count = min(TILE, len(points) - start)
-        _locate(points[start : start + count], eye, rows, at)
-        for i in range(count):
+        tile = points[start : start + TILE]
+        _locate(tile, eye, rows, at)
+        for i in range(len(tile)):
             if at[i] >= 0:
                 nearest[at[i]] = min(nearest[at[i]], far[i])
 
@@ -112,11 +112,11 @@ def paint(points, normals, eye, sums, best, source):
     least = np.float32(1 - slant * STEEPEST)
     x, y, z, us, vs, far = rows
     for start in range(0, len(points), TILE):
-        count = min(TILE, len(points) - start)
+        tile = points[start : start + TILE]
         few = 0
-        _locate(points[start : start + count], eye, rows, at)
+        _locate(tile, eye, rows, at)
         # those that some incidence would let be seen, counted without a branch
-        for i in range(count):
+        for i in range(len(tile)):
             chosen[few] = i
             few += (at[i] >= 0) & (far[i] * least <= nearest[max(at[i], 0)] + slack)
         for i in chosen[:few]:

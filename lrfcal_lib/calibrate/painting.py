@@ -160,7 +160,7 @@ class Painter:
             logs[k] = np.log(np.where((grey > darkest) & (grey < brightest), grey, np.nan))
             model = view.model
             uv = project(view.T_camera_platform.apply(points), model)
-            corner = 0.25 * (model.width**2 + model.height**2)
+            corner = np.sum(model.size**2) / 4
             radii[k] = np.sum((uv - [model.cx, model.cy]) ** 2, axis=1) / corner
         gain, falloff = _compared(logs, radii)
         self.exposures[:, 0] = gain - gain.mean()

@@ -122,12 +122,14 @@ def first_pose(
         When there is none in front of the camera.
     """
     good = np.isfinite(pixels).all(axis=1)
-    board = points[good]
-    image = pixels[good]
     why = f"{good.sum()} corners do not determine a pose in front of the camera"
     try:
         solved, turn, shift = cv2.solvePnP(
-            board, image, model.matrix, model.distortion, flags=cv2.SOLVEPNP_SQPNP
+            points[good],
+            pixels[good],
+            model.matrix,
+            model.distortion,
+            flags=cv2.SOLVEPNP_SQPNP,
         )
     except cv2.error as error:
         raise ValueError(f"{why} (OpenCV: {error.err})") from error
