@@ -441,7 +441,7 @@ def _corners(prepared, camera, variant, T_head_lrf) -> Iterator[dict]:
             scatter = max(board.scatter[name], board.scatter[before])
             yield {
                 "points": T_source_platform.apply(corner)[None],
-                "covariance": [scatter**2 * np.eye(3) + np.outer(error, error)],
+                "covariance": [scatter**2 * np.eye(3) + dyads(error)],
                 "pixels": [corners_of_lines(np.stack([previous.line, edge.line]))[1]],
                 "sigma_px": np.sqrt(edge.covariance[0, 0] + previous.covariance[0, 0]),
                 "placement": placement,

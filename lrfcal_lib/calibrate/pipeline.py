@@ -166,11 +166,14 @@ class Calibration:
             rig = joint_rig(self.joint.solution, self.prepared.models)
             return replace(rig, axis=axis, lrf=session.lrf, session=session.name)
         solved = self.cameras(method)
-        cameras = {}
-        for camera, solution in solved.items():
-            mount = session.cameras[camera].mount
-            model = solution.model or self.prepared.models[camera]
-            cameras[camera] = CalibratedCamera(solution.transform, mount, model)
+        cameras = {
+            camera: CalibratedCamera(
+                solution.transform,
+                session.cameras[camera].mount,
+                solution.model or self.prepared.models[camera],
+            )
+            for camera, solution in solved.items()
+        }
         noise = [scan.sigma_range for scan in self.prepared.scans.values()]
         uncertainty = uncertainty_one_by_one(
             axis.covariance,

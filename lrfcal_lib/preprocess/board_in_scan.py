@@ -284,7 +284,7 @@ def face_points(
     ranges = sweep.ranges[line, beam]
     bearings = sweep.bearings[beam]
     # keeps the covariance regular; bearings are all but exact
-    spread = 0.1 * np.median(np.diff(sweep.bearings))
+    spread = 0.1 * median_step(sweep.bearings)
     covariance = polar_covariance(ranges, bearings, scan.sigma_range, spread)
     return polar_to_points(ranges, bearings), sweep.pitch[line], covariance
 

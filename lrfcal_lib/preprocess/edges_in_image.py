@@ -8,7 +8,6 @@ from scipy.ndimage import map_coordinates
 
 from lrfcal_lib.fit.robust import biweight, rms, robust_sigma
 from lrfcal_lib.model.camera import CameraModel, line_through, pinhole, redistort
-from lrfcal_lib.model.geometry import unit_lines
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -230,15 +229,6 @@ def outward_line(a, b, outward):
     """Pixel (or board) line through two points whose unit normal points to one side."""
     line = line_through(a, b)
     return line if line[:2] @ outward > 0 else -line
-
-
-def board_line(view, edge, model):
-    """The image line of an edge as a line on the board, unit normal outwards, metres.
-
-    Shape (3,).
-    """
-    pose = view.T_camera_board.as_matrix()
-    return unit_lines((model.matrix @ pose[:3, [0, 1, 3]]).T @ edge.line)
 
 
 def on_board(xy, pose, model):

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess.bundle import (
@@ -235,7 +236,7 @@ def scale_covariance(pose: RigidTransform, pixels, pattern: Chessboard) -> np.nd
     side = square_px(pattern.grid(pixels))
     away = np.zeros(6)
     away[3:] = scale_error(side) * pose.apply(pattern.points().mean(axis=0))
-    return np.outer(away, away)
+    return dyads(away)
 
 
 def raised_points(pattern: Chessboard, relief: np.ndarray | None = None) -> np.ndarray:

@@ -13,12 +13,10 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.robust import robust_sigma
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, side_ends
-from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import DegenerateGeometry, unit_vector
+from lrfcal_lib.model.camera import CameraModel, line_distance, line_through
+from lrfcal_lib.model.geometry import DegenerateGeometry, unit_lines, unit_vector
 from lrfcal_lib.preprocess.edges_in_image import (
-    board_line,
     on_board,
-    outward_line,
     peaks,
     sample,
     step_contrast,
@@ -228,9 +226,11 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     visible = [view for view in views if not view.reason]
     lines = np.full((len(visible), len(board.edges), 3), np.nan)
     for of_view, view in zip(lines, visible, strict=True):
+        pose = view.T_camera_board.as_matrix()
+        pixels_of_board = models[view.camera].matrix @ pose[:3, [0, 1, 3]]
         for edge in view.edges:
             row = board.edges.index(edge.name)
-            of_view[row] = board_line(view, edge, models[view.camera])
+            of_view[row] = unit_lines(edge.line @ pixels_of_board)
     unseen = np.isnan(lines).all(axis=(0, 2))
     if unseen.any():
         raise DegenerateGeometry(
@@ -238,13 +238,17 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
             f"{len(visible)} images: pick it by hand in edges.csv or give the corners of the board"
         )
     ends = side_ends(corners_of_lines(np.nanmedian(lines, axis=0)))
-    medians = [_median_line(lines[:, i], of_edge) for i, of_edge in enumerate(ends)]
-    fitted = np.array([line for line, _ in medians])
+    normals = unit_vector(np.nanmedian(lines[..., :2], axis=0))
+    # where every line crosses the normals raised at the two ends of its edge
+    cosine = np.vecdot(lines[..., :2], normals)
+    offsets = -line_distance(ends, lines[:, :, None]) / cosine[..., None]
+    ends += np.nanmedian(offsets, axis=0)[..., None] * normals[:, None]
+    fitted = line_through(ends[:, 0], ends[:, 1])
     corners = corners_of_lines(lines)
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).T
     return Outline(
         board=replace(board, corners=corners_of_lines(fitted)),
-        line_sd=np.array([spread for _, spread in medians]),
+        line_sd=np.array([_spread(offset) for offset in offsets.mean(axis=2).T]),
         length_sd=dict(zip(board.edges, map(_spread, lengths), strict=True)),
         n_lengths=dict(zip(board.edges, np.isfinite(lengths).sum(axis=1), strict=True)),
     )
@@ -276,20 +280,6 @@ def _outer_peak(votes):
         best = int(i)
         start = best + 2 * LINE_WIDTH
     return best
-
-
-def _median_line(lines, ends):
-    """Median line (of n, 3) from its offsets at two ends, and the spread at the middle.
-
-    NaN where an image does not show it.
-    """
-    normal = unit_vector(np.nanmedian(lines[:, :2], axis=0))
-    # where every line crosses the normals raised at the two ends
-    distance = lines[:, :2] @ ends.T + lines[:, 2:]
-    cosine = lines[:, :2] @ normal
-    offsets = -distance / cosine[:, None]
-    a, b = ends + np.nanmedian(offsets, axis=0)[:, None] * normal
-    return outward_line(a, b, normal), _spread(offsets.mean(axis=1))
 
 
 def _spread(values):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -477,8 +478,8 @@ def _turned_alike(views):
         poses = [view, *view.alternatives]
         rotation = Rotation.concatenate([each.T_camera_board.rotation for each in poses])
         normals = rotation.as_matrix()[:, :, 2]
-        same = np.flatnonzero(normals @ normals[0] > SAME_PLANE)
-        turned.append([poses[i] for i in same])
+        same = normals @ normals[0] > SAME_PLANE
+        turned.append(list(compress(poses, same)))
         rotations.append(rotation[same])
     _, together = alike(rotations, posed)
     chosen = [same[order[0]] for same, order in zip(turned, together, strict=True)]
