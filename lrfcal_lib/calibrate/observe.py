@@ -116,7 +116,7 @@ def platform_observations(
     faces = []
     for placement, edges in prepared.edges.items():
         if len(edges[variant]) == 1:
-            continue
+            continue  # a single shot
         feature = _feature_sides(list(sides_of(prepared, placement, variant)))
         for number, side in enumerate(feature, 1):
             rows = thin(side.rows, PLATFORM_POINTS)
@@ -418,9 +418,8 @@ def _corners(prepared, camera, variant, T_head_lrf) -> Iterator[dict]:
     meet.
     """
     names = prepared.board.edges
-    named = prepared.names.keys() & prepared.scans.keys()
     for placement, view in prepared.views[camera].items():
-        if placement not in named or len(prepared.edges[placement][variant]) == 1:
+        if placement not in prepared.names or len(prepared.edges[placement][variant]) == 1:
             continue
         board, _ = outline_of(prepared, placement, variant, T_head_lrf)
         T_source_platform = source_of(

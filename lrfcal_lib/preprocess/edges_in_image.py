@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from lrfcal_lib.fit.robust import biweight, rms, robust_sigma
+from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.model.camera import CameraModel, line_through, pinhole, redistort
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
@@ -54,7 +54,6 @@ class ImageEdge:
         Ends of the stretch that was really seen.
     n_points : int
         Profiles that the line was fitted to (2 for a pick).
-    rms_px : float
     """
 
     name: str
@@ -63,7 +62,6 @@ class ImageEdge:
     centre: np.ndarray
     ends: np.ndarray
     n_points: int
-    rms_px: float
 
 
 class EdgeNotSeen(ValueError):
@@ -131,7 +129,6 @@ def refine_edge(
         centre=centre,
         ends=np.stack([first, last]),
         n_points=len(columns),
-        rms_px=rms(misses),
     )
 
 
@@ -154,7 +151,7 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     centre = ends.mean(axis=0)
     line = outward_line(ends[0], ends[1], centre - inner)
     covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
-    return ImageEdge(name, line, covariance, centre, ends, n_points=2, rms_px=0.0)
+    return ImageEdge(name, line, covariance, centre, ends, n_points=2)
 
 
 def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:
