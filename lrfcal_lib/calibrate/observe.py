@@ -418,8 +418,9 @@ def _corners(prepared, camera, variant, T_head_lrf) -> Iterator[dict]:
     meet.
     """
     names = prepared.board.edges
+    named = prepared.names.keys() & prepared.scans.keys()
     for placement, view in prepared.views[camera].items():
-        if placement not in prepared.names or len(prepared.edges[placement][variant]) == 1:
+        if placement not in named or len(prepared.edges[placement][variant]) == 1:
             continue
         board, _ = outline_of(prepared, placement, variant, T_head_lrf)
         T_source_platform = source_of(
