@@ -224,17 +224,16 @@ def load_calibration(path: str | Path) -> CalibratedRig:
     if not path.exists():
         raise SessionError(f"{path}: there is no such file; 'calibrate' writes it")
     data = read_json(path, None)
-    if data.get("kind") != KIND and data.get("schema") != 1:
+    schema = data.get("schema")
+    if data.get("kind") != KIND and schema != 1:
         raise SessionError(
             f"{path}: is no calibration: its key 'kind' is {data.get('kind')!r}, not {KIND!r}; "
             "'calibrate' writes calibration.json"
         )
-    if data["schema"] != SCHEMA:
-        newer = isinstance(data["schema"], int) and data["schema"] > SCHEMA
+    if schema != SCHEMA:
+        newer = isinstance(schema, int) and schema > SCHEMA
         remedy = "take a newer lrfcal" if newer else AGAIN
-        raise SessionError(
-            f"{path}: schema {data['schema']}, this reads {SCHEMA}: {remedy}"
-        )
+        raise SessionError(f"{path}: schema {schema}, this reads {SCHEMA}: {remedy}")
     with naming(path):
         return _made(from_json(CalibrationFile, data))
 

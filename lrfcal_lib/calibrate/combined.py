@@ -168,7 +168,7 @@ def as_scattered(
     off = lengths - (weights * lengths).sum() / weights.sum()
     square = (weights * off**2).sum().sum()
     freedom = (lengths.count() - 1).sum()
-    grow = float(np.sqrt(max(square / max(freedom, 1), 1.0)))
+    grow = np.sqrt(max(square / max(freedom, 1), 1.0))
     grown = {}
     for placement, (board, scanned) in measured.items():
         sigma = {name: grow * value for name, value in board.sigma.items()}

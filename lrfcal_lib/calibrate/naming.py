@@ -139,7 +139,7 @@ def nearest_edges(
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
         number = numbers[row]
         edge = board.edges[column]
-        distance = float(cost[row, column])
+        distance = cost[row, column]
         turn, allowed = _turn(sides[number], lines[column])
         if distance > NAME_DISTANCE:
             dropped[number] = DroppedSide(edge, distance)
@@ -159,4 +159,4 @@ def _turn(points, line):
     _, direction, rms = fit_line(points)
     flat = unit_vector(direction[:2])
     noise = TURNED * rms * np.sqrt(12 / len(points)) / np.ptp(points @ direction)
-    return float(np.arcsin(min(abs(flat @ line[:2]), 1.0))), np.hypot(NAME_ANGLE, noise)
+    return np.arcsin(min(abs(flat @ line[:2]), 1.0)), np.hypot(NAME_ANGLE, noise)

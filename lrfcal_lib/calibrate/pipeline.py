@@ -180,7 +180,7 @@ class Calibration:
             solved,
             admitted_offset=session.lrf.admitted_offset,
             sweep_sigma=astuple(self.prepared.pitch_noise),
-            range_noise=float(np.median(noise)) if noise else session.lrf.sigma_range,
+            range_noise=np.median(noise) if noise else session.lrf.sigma_range,
         )
         return CalibratedRig(
             method=method,
@@ -301,7 +301,7 @@ def find_pitch_errors(prepared: Prepared) -> PitchErrors | None:
     if not fixed or not prepared.scans:
         return None
     direction = {p: session.sweep_direction(p) for p in prepared.scans}
-    middle = {p: float(np.mean(scan.sweep.pitch)) for p, scan in prepared.scans.items()}
+    middle = {p: np.mean(scan.sweep.pitch) for p, scan in prepared.scans.items()}
     observations = {c: observe(prepared, c, faces=PITCH_POINTS) for c in fixed}
     with suppress(DegenerateGeometry):
         return estimate_pitch_errors(observations, direction, middle)

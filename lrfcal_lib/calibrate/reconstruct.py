@@ -115,7 +115,7 @@ def _pitch_step(sweep):
     turns = np.abs(np.diff(sweep.pitch))
     if not turns.any():
         return 0.0
-    return float(np.median(turns[turns > 0]))
+    return np.median(turns[turns > 0])
 
 
 def _coloured(block, sweep, painter, wanted, sigma_range):
@@ -142,7 +142,7 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
         range=sweep.ranges[block.lines][take],
         intensity=intensity,
         sigma=np.nan_to_num(block.scatter[take], nan=sigma_range),
-        removed=int((wanted & ~block.good).sum()),
+        removed=(wanted & ~block.good).sum(),
     )
 
 

@@ -106,7 +106,7 @@ def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
     noise = 0.0
     if len(solution.observations.face_sigma):
         stated = np.median(solution.observations.face_sigma)
-        noise = float(stated * solution.noise["face_scale"])
+        noise = stated * solution.noise["face_scale"]
     return RigUncertainty(
         names=estimate.names,
         covariance=estimate.covariance,

@@ -255,7 +255,7 @@ def raised_points(pattern: Chessboard, relief: np.ndarray | None = None) -> np.n
     """
     if relief is None:
         return pattern.points()
-    return pattern.points() + np.asarray(relief, float)[:, None] * UP
+    return pattern.points() + relief[:, None] * UP
 
 
 def _rough(views, points, size):

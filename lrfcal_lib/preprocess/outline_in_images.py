@@ -100,7 +100,7 @@ def edge_votes(
     for normal in SIDE_NORMALS:
         along = np.abs(normal[::-1])
         s = np.arange(-square, size @ along + square, APART * STEP * square)
-        corner = np.asarray(pattern.origin) + np.maximum(normal, 0) * size
+        corner = pattern.origin + np.maximum(normal, 0) * size
         xy = corner + s[None, :, None] * along + distances[:, None, None] * normal
         strip = sample(image, model, on_board(xy, pose, model))
         height = step_contrast(strip, SMOOTH_STEPS, along=AVERAGED_PROFILES)
@@ -188,15 +188,15 @@ def side_lines(pattern: Chessboard, distances) -> np.ndarray:
     Parameters
     ----------
     pattern : Chessboard
-    distances : sequence of 4 floats
+    distances : ndarray, shape (4,)
         Outside the outermost inner corners: top, right, bottom, left; metres.
 
     Returns
     -------
     ndarray, shape (4, 3)
     """
-    corner = np.asarray(pattern.origin) + np.maximum(SIDE_NORMALS, 0) * _size(pattern)
-    offset = -np.vecdot(corner, SIDE_NORMALS) - np.asarray(distances, float)
+    corner = pattern.origin + np.maximum(SIDE_NORMALS, 0) * _size(pattern)
+    offset = -np.vecdot(corner, SIDE_NORMALS) - distances
     return np.column_stack([SIDE_NORMALS, offset])
 
 
@@ -277,7 +277,7 @@ def _outer_peak(votes):
         gap = votes[start : max(i - 2 * LINE_WIDTH, start)]
         if gap.size and gap.mean() > QUIET:
             break
-        best = int(i)
+        best = i
         start = best + 2 * LINE_WIDTH
     return best
 
@@ -286,5 +286,5 @@ def _spread(values):
     """Standard deviation about the median; NaN below two values that are known."""
     values = values[np.isfinite(values)]
     if len(values) < 2:
-        return float("nan")
+        return np.nan
     return robust_sigma(values - np.median(values))

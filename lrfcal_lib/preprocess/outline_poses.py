@@ -92,7 +92,7 @@ def outline_poses(edges, board: Board, model: CameraModel, view) -> list:
     """
     # seen from the printed side x to y turns left, in the image (v down) that is the other way
     # round
-    sides = list(edges)[::-1]
+    sides = edges[::-1]
     flat = board.points()
     views: list = []
     for shift in range(len(sides)):

@@ -52,7 +52,7 @@ class PitchNoise:
         ndarray
             Radians.
         """
-        return np.hypot(self.offset, self.stretch * (np.asarray(pitch) - middle))
+        return np.hypot(self.offset, self.stretch * (pitch - middle))
 
 
 @dataclass(frozen=True)

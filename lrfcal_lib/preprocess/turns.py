@@ -90,7 +90,7 @@ def _between(base, other):
     cost = UPRIGHT * candidates.magnitude()
     for turns in possible:
         cost += [(turns * candidate.inv()).magnitude().min() for candidate in candidates]
-    return candidates[int(np.argmin(cost))]
+    return candidates[np.argmin(cost)]
 
 
 def decide(scores: np.ndarray, leader: np.ndarray) -> np.ndarray:
