@@ -183,7 +183,6 @@ def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named):
         board=SimpleNamespace(pattern=PATTERN),
         scans={},
         edges={},
-        swept={},
         models={"left": model},
         views={"left": views},
     )

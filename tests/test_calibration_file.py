@@ -98,6 +98,7 @@ def changed(record, where, value):
 DAMAGED = {  # what stands in the file: where, value, what is said
     "a later schema": (("schema",), 4, "schema 4, this reads 3: take a newer lrfcal"),
     "an older schema": (("schema",), 2, "schema 2, this reads 3: calibrate its session again"),
+    "no schema": (("schema",), None, "schema None, this reads 3: calibrate its session again"),
     "a session": (("kind",), None, "is no calibration"),
     "a skewed rotation": (("cameras", "left", "matrix", 0, 0), 0.5, "no rotation"),
     "a mirrored rotation": (("cameras", "left", "matrix"), np.diag([1, 1, -1, 1]).tolist(), "no rotation"),

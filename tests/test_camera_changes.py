@@ -42,7 +42,6 @@ def drawn(seed, count=14, **settings):
         board=SimpleNamespace(pattern=None),
         scans={},
         edges={},
-        swept={},
         models=models,
         views={camera: {} for camera in models},
     )

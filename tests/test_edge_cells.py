@@ -25,7 +25,7 @@ def cells_of(made, change=None):
     board = board_in_scan.find_board(sweep, made.board, HEAD)
     along = edge_points(board)
     swept = sweep_edges(board)
-    return board, edge_cells(board, along, swept, LRF)
+    return board, edge_cells(board, [along, swept], LRF)
 
 
 def outside(made, cells):

@@ -122,7 +122,7 @@ PARALLEL = [pose_of(0.3 * i, (0.0, 0.0), (0.02 * i, 0.0, 0.8 + 0.1 * i)) for i i
     "8 image coordinates cannot determine 15 unknowns":
         lambda: adjust(ONE[None, None, :4], PATTERN.points()[:4], [MODEL], STACKED),
     "four corners of the pattern or more, got 3": lambda: board_pose(np.where(np.arange(24)[:, None] < 3, ONE, np.nan), PATTERN, MODEL),
-    "two points 0.00 px apart": lambda: picked_edge("top", np.full((2, 2), 3.0), np.zeros(2)),
+    "a line needs two different points": lambda: picked_edge("top", np.full((2, 2), 3.0), np.zeros(2)),
     "predicted length is 3 px": lambda: refine_edge(BLANK, MODEL, "top", *np.array([[10, 10], [13, 10], [0, -1]]), 5.0),
 }.items())  # fmt: skip
 def test_what_does_not_suffice(message, call):

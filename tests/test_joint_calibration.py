@@ -169,7 +169,8 @@ def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(quick):
         Problem(Stage.SCANS, kind, "a dog ran through", placement)
         for placement in quick.prepared.scans
     ]
-    lost = pipeline.joint_or_problem(replace(quick.prepared, problems=tuple(problems)))
+    prepared = replace(quick.prepared, problems=tuple(problems))
+    lost = pipeline.joint_or_problem(pipeline.without(prepared))
     again = pipeline.with_joint(replace(quick, joint=None), lost)
     assert again.joint is None and "no placement" in again.problem("joint").words
     assert again.solutions is quick.solutions

@@ -47,13 +47,11 @@ def test_far_and_crooked_sides_stay_unnamed_with_a_reason():
 
 
 def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
-    parts = {"last_beam": {1: "a", 2: "b"}, "half_step": {1: "a", 2: "b"}}
     ready = Prepared(
         None,
         None,
         {1: "a", 2: "b"},
-        parts,
-        parts,
+        {1: "a", 2: "b"},
         names={1: {}, 2: {}},
         views={"left": {1: "v", 2: "v"}},
     )
@@ -63,5 +61,5 @@ def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
     )
     ready = replace(ready, problems=(whole, part))
     left = pipeline.without(ready)
-    assert list(left.scans) == list(left.names) == list(left.edges["half_step"]) == [1]
+    assert list(left.scans) == list(left.names) == list(left.edges) == [1]
     assert list(left.views["left"]) == [1, 2]

@@ -21,7 +21,7 @@ def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
     }
     seen = survey.Survey(views, {}, None, SHEET)
     monkeypatch.setattr(prepared, "survey", lambda session, **options: seen)
-    problems = prepared.prepare_images(prepared.Prepared(None, SHEET, {}, {}, {})).problems
+    problems = prepared.prepare_images(prepared.Prepared(None, SHEET, {}, {})).problems
     (problem,) = problems
     assert problem.kind == ProblemKind.SMALL_SQUARES and problem.camera == "left"
     assert "placements 4), 7.0 px at least" in problem.words and str(problem).startswith(

@@ -19,22 +19,21 @@ from shared import campaign
 
 from lrfcal_lib.evaluate.stereo import stereo_reference
 from lrfcal_lib.model.board import Chessboard
+from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.intrinsics import (
     estimate_intrinsics,
 )
+from lrfcal_lib.preprocess.prepared import Prepared
 
 
 def stereo(first, second, pattern=PATTERN, models=(MODEL, MODEL)):
     """The mounting of two cameras from the corners that they see at placements 0, 1, ..., and its covariance."""
     views = [
-        {p: SimpleNamespace(pixels=own) for p, own in enumerate(seen)}
-        for seen in (first, second)
+        {p: BoardView(pixels=own) for p, own in enumerate(seen)} for seen in (first, second)
     ]
     views, models = (dict(enumerate(each)) for each in (views, models))
     board = SimpleNamespace(pattern=pattern)
-    reference = stereo_reference(
-        SimpleNamespace(board=board, views=views, models=models, relief=None)
-    )
+    reference = stereo_reference(Prepared(None, board, {}, {}, models, views))
     return reference.T_second_first, reference.covariance
 
 

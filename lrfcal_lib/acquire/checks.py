@@ -13,8 +13,8 @@ from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
-from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
+from lrfcal_lib.preprocess.prepared import all_crossings
 from lrfcal_lib.session.faults import DARK, brightness, repeated_images, repeated_scans
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session, Sweep
@@ -180,12 +180,8 @@ def check_scan(
 
 def _check_sides(scan):
     """How many straight sides of the board the scans cross, and how."""
-    along, known = crossings(scan)
-    sides = along["half_step"].sides
-    if np.ptp(scan.sweep.pitch) > 0:
-        columns, _ = crossings(scan, True, known)
-        sides = columns["half_step"].sides + sides
-    by_number = {side.side: side for side in sides}
+    ways = all_crossings(scan)["half_step"]
+    by_number = {side.side: side for way in reversed(ways) for side in way.sides}
     good = [side for side in by_number.values() if side.n_points >= FEWEST_CROSSINGS]
     if not good:
         return Light("edges", "bad", NO_SIDE)

@@ -15,7 +15,14 @@ from lrfcal_lib.model.geometry import pose_transform
 from lrfcal_lib.model.kinematics import Corrections
 from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import Endless, LrfInfo, Positive, from_json, plain
+from lrfcal_lib.session.stated import (
+    Endless,
+    LensStated,
+    LrfInfo,
+    Positive,
+    from_json,
+    plain,
+)
 
 SCHEMA = 3
 KIND = "lrfcal calibration"
@@ -83,18 +90,11 @@ class PlatformWritten(BaseModel):
     axis_covariance: Annotated[np.ndarray, rows(4, 4)]
 
 
-class LensWritten(BaseModel):
+class LensWritten(LensStated):
     """What ``CameraModel(**lens)`` takes."""
 
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
-    fx: Positive
-    fy: Positive
-    cx: FiniteFloat
-    cy: FiniteFloat
-    distortion: Annotated[np.ndarray, rows(5)]
-    covariance: Annotated[np.ndarray, rows(9, 9)] | None
-    rms_px: FiniteFloat | None
 
 
 class CameraWritten(BaseModel):
@@ -224,27 +224,28 @@ def load_calibration(path: str | Path) -> CalibratedRig:
     if not path.exists():
         raise SessionError(f"{path}: there is no such file; 'calibrate' writes it")
     data = read_json(path, None)
-    if data.get("kind") != KIND and data.get("schema") != 1:
+    schema = data.get("schema")
+    if data.get("kind") != KIND and schema != 1:
         raise SessionError(
             f"{path}: is no calibration: its key 'kind' is {data.get('kind')!r}, not {KIND!r}; "
             "'calibrate' writes calibration.json"
         )
-    if data["schema"] != SCHEMA:
-        newer = isinstance(data["schema"], int) and data["schema"] > SCHEMA
+    if schema != SCHEMA:
+        newer = isinstance(schema, int) and schema > SCHEMA
         remedy = "take a newer lrfcal" if newer else AGAIN
-        raise SessionError(
-            f"{path}: schema {data['schema']}, this reads {SCHEMA}: {remedy}"
-        )
+        raise SessionError(f"{path}: schema {schema}, this reads {SCHEMA}: {remedy}")
     with naming(path):
         return _made(from_json(CalibrationFile, data))
 
 
 def _made(file):
     """The CalibratedRig of a CalibrationFile."""
-    cameras = {}
-    for name, camera in file.cameras.items():
-        model = CameraModel(**dict(camera.lens))
-        cameras[name] = CalibratedCamera(camera.matrix, camera.mount, model)
+    cameras = {
+        name: CalibratedCamera(
+            camera.matrix, camera.mount, CameraModel(**dict(camera.lens))
+        )
+        for name, camera in file.cameras.items()
+    }
     known = file.uncertainty
     if known is not None:
         if set(known.unseen_of_cameras) != set(cameras):

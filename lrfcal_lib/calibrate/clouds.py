@@ -77,7 +77,12 @@ def cloud_blocks(
         if mask is None:
             sweep, _ = without_closing(sweep)
         else:
-            sweep, mask = _about(sweep, mask)
+            lines, beams = (
+                slice(max(0, shown.min() - MARGIN), shown.max() + MARGIN + 1)
+                for shown in np.nonzero(mask)
+            )
+            sweep = sweep.part(lines, beams)
+            mask = mask[lines, beams]
         yield from sweep_blocks(session, rig, sweep, views, mask)
 
 
@@ -98,15 +103,6 @@ def sweep_blocks(
         continuous=session.continuous,
         mask=mask,
     )
-
-
-def _about(sweep, mask):
-    """A Sweep cut down to what a mask shows and a margin about it, and the mask likewise."""
-    lines, beams = (
-        slice(max(0, shown.min() - MARGIN), shown.max() + MARGIN + 1)
-        for shown in np.nonzero(mask)
-    )
-    return sweep.part(lines, beams), mask[lines, beams]
 
 
 def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]:

@@ -52,8 +52,9 @@ class Eye(NamedTuple):
         Blue, green, red.
     cell : float
         Width of the depth buffer's square cells, pixels.
-    nearest : ndarray of float32
-        The depth buffer, flat: distances, metres.
+    nearest : ndarray of float32, shape (workers, n)
+        Depth buffers, flat: distances, metres. Each thread has its own; the first one is that of
+        all in the end.
     noise : float
         Metres by which a point may lie behind another one of the same surface.
     exposure : ndarray, shape (2,)
@@ -73,16 +74,16 @@ class Eye(NamedTuple):
 
 
 @njit(**COMPILED)
-def hide(points, eye):
-    """Write the distances (metres) of points (n, 3) into the depth buffer of an Eye."""
+def hide(points, eye, worker):
+    """Write the distances (metres) of points (n, 3) into a depth buffer of an Eye."""
     rows = np.empty((6, TILE), np.float32)
     at = np.empty(TILE, np.int32)
     far = rows[5]
-    nearest = eye.nearest
+    nearest = eye.nearest[worker]
     for start in range(0, len(points), TILE):
-        count = min(TILE, len(points) - start)
-        _locate(points[start : start + count], eye, rows, at)
-        for i in range(count):
+        tile = points[start : start + TILE]
+        _locate(tile, eye, rows, at)
+        for i in range(len(tile)):
             if at[i] >= 0:
                 nearest[at[i]] = min(nearest[at[i]], far[i])
 
@@ -98,7 +99,7 @@ def paint(points, normals, eye, sums, best, source):
     of its surface over a cell.
     """
     lens = eye.lens
-    nearest = eye.nearest
+    nearest = eye.nearest[0]
     height, width, _ = eye.image.shape
     corner = 0.25 * (width * width + height * height)  # squared pixels from the middle
     slant = eye.cell / lens[0]  # of a cell, metres at a distance of one
@@ -111,11 +112,11 @@ def paint(points, normals, eye, sums, best, source):
     least = np.float32(1 - slant * STEEPEST)
     x, y, z, us, vs, far = rows
     for start in range(0, len(points), TILE):
-        count = min(TILE, len(points) - start)
+        tile = points[start : start + TILE]
         few = 0
-        _locate(points[start : start + count], eye, rows, at)
+        _locate(tile, eye, rows, at)
         # those that some incidence would let be seen, counted without a branch
-        for i in range(count):
+        for i in range(len(tile)):
             chosen[few] = i
             few += (at[i] >= 0) & (far[i] * least <= nearest[max(at[i], 0)] + slack)
         for i in chosen[:few]:

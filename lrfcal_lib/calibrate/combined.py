@@ -5,25 +5,28 @@ what it is worth.
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.joint_observations import observe_joint
-from lrfcal_lib.calibrate.observe import LEAST_STRETCH, in_platform, named_sides
+from lrfcal_lib.calibrate.observe import LEAST_STRETCH, named_sides
 from lrfcal_lib.calibrate.outline import (
     MeasuredBoard,
+    bounded,
     measure_board,
     moved_lines,
     plane_frame,
-    sized,
 )
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import CameraModel, line_distance
+from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.kinematics import SourceFrame
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import ImageEdge
 from lrfcal_lib.preprocess.pose_from_lines import line_misses
@@ -128,9 +131,9 @@ def combined_outlines(
     for placement in observations.placements.tolist():
         with suppress(DegenerateGeometry):
             cases[placement] = case_of(joint, observations, placement)
-    measured: dict = {}
     scale = 1.0
     for _ in range(SCALE_ROUNDS + 1):
+        measured: dict = {}
         square = 0.0
         freedom = 0.0
         for placement, case in list(cases.items()):
@@ -140,7 +143,6 @@ def combined_outlines(
             except (DegenerateGeometry, np.linalg.LinAlgError):
                 # what is left open, as by single scans, has no answer
                 del cases[placement]
-                measured.pop(placement, None)
                 continue
             cases[placement] = replace(case, start=state)
             if case.images:
@@ -166,7 +168,7 @@ def as_scattered(
     off = lengths - (weights * lengths).sum() / weights.sum()
     square = (weights * off**2).sum().sum()
     freedom = (lengths.count() - 1).sum()
-    grow = float(np.sqrt(max(square / max(freedom, 1), 1.0)))
+    grow = np.sqrt(max(square / max(freedom, 1), 1.0))
     grown = {}
     for placement, (board, scanned) in measured.items():
         sigma = {name: grow * value for name, value in board.sigma.items()}
@@ -182,7 +184,12 @@ def case_of(joint, observations, placement):
     prepared = joint.prepared
     solution = joint.without.get(placement, joint.solution)
     edges = tuple(prepared.board.edges)
-    source = in_platform(placement, solution.T_head_lrf, solution.corrections)
+    source = SourceFrame(
+        solution.T_head_lrf,
+        "platform",
+        placement=placement,
+        corrections=solution.corrections,
+    )
     p_lrf, pitch, _ = face_points(prepared.scans[placement])
     face = source.points(p_lrf, pitch)
     sides = edges_in_cloud(solution, prepared, placement, face)
@@ -204,7 +211,7 @@ def case_of(joint, observations, placement):
     obs = obs.keep(beam=np.isin(obs.beam_edge, [edges.index(name) for name in sides]))
     state = replace(
         solution.state,
-        boards=board[None, :3],
+        boards=board[None],
         sweeps=np.zeros((1, 2)),
         sides=np.zeros((1, len(edges) + 1)),
     )
@@ -225,7 +232,7 @@ def edges_in_cloud(solution, prepared, placement, face):
     points (k, 3) by edge, platform frame, metres.
     """
     plane = plane_frame(face)
-    normal = plane[:3, 2]
+    normal = plane[:, 2]
     sides: dict = {}
     for camera, views in prepared.views.items():
         view = views.get(placement)
@@ -235,11 +242,9 @@ def edges_in_cloud(solution, prepared, placement, face):
         T_platform_camera = solution.camera_at(camera, pitch).inv()
         lens = prepared.models[camera]
         centre = T_platform_camera.translation
-        height = (plane[:3, 3] - centre) @ normal
+        height = (plane[:, 3] - centre) @ normal
         for edge in view.edges:
-            off = line_distance(edge.ends, edge.line)
-            uv = edge.ends - np.outer(off, edge.line[:2])
-            sight = T_platform_camera.rotation.apply(lens.sights(uv))
+            sight = T_platform_camera.rotation.apply(lens.sights(edge.ends))
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
     return {name: np.concatenate(points) for name, points in sides.items()}
@@ -293,17 +298,17 @@ def blocks_of(state, case, scale):
     if case.images:
         blocks.append(image_block(state, case, scale))
     blocks.append(_rows(case.whitener @ state.change, case.whitener))
-    count = 2 * len(case.middle)
-    width = unknowns.shared + unknowns.own + count
-    start = unknowns.columns["board"].start
     board = state.joint.boards[0]
-    held = np.zeros((3 + count, width))
-    held[0, start : start + 3] = STILL * board[:, 2]  # turn of board and sides together
-    held[1:3, start + 3 : start + 6] = STILL * board[:, :2].T  # their shift
-    held[3:, -count:] = np.diag(np.tile(FAR, len(case.middle)))
+    held = block_diag(
+        np.zeros((0, unknowns.shared)),
+        STILL * board[None, :, 2],  # turn of board and sides together
+        STILL * board[:, :2].T,  # their shift
+        np.zeros((0, unknowns.own - geometry.POSE)),
+        np.diag(np.tile(FAR, len(case.middle))),
+    )
     blocks.append(_rows(np.zeros(len(held)), held))
     for block in blocks:
-        missing = width - block.jacobian.shape[-1]
+        missing = held.shape[1] - block.jacobian.shape[-1]
         jacobian = np.pad(block.jacobian, {-1: (0, missing)})
         yield replace(block, jacobian=jacobian)
 
@@ -327,9 +332,9 @@ def side_columns(J, edge, state, case):
     arm = case.middle @ R[:, :2].T
     by_shift = np.vecdot(shift, outward[edge])
     by_turn = np.vecdot(turn, R[:, 2]) - np.vecdot(shift, np.cross(R[:, 2], arm)[edge])
-    columns = np.zeros((*edge.shape, len(arm), 2))
+    by_both = np.stack([by_shift, by_turn], axis=-1)
     mine = edge[..., None] == np.arange(len(arm))
-    columns[mine] = np.stack([by_shift, by_turn], axis=-1).reshape(-1, 2)
+    columns = np.where(mine[..., None], by_both[..., None, :], 0.0)
     return columns.reshape(*edge.shape, -1)
 
 
@@ -348,10 +353,10 @@ def image_block(state, case, scale):
     jacobians = []
     for image in case.images:
         a, b, c = state.lines[image.number]
-        places = np.zeros((1, 2, 3))
-        places[0, :, :2] = [-c * a, -c * b] + np.outer(PLACES, [-b, a])
+        flat = [-c * a, -c * b] + np.outer(PLACES, [-b, a])
+        places = np.insert(flat, 2, 0.0, axis=1)
         misses, by_pose = line_misses(
-            [image.edge], places, image.model, poses[0, image.row]
+            [image.edge], places[None], image.model, poses[0, image.row]
         )
         J = by_pose[0] @ by_all[image.row]
         by_sides = side_columns(J, np.full(2, image.number), state, case)
@@ -367,21 +372,16 @@ def _measured(case, state, covariance):
     edges = case.edges
     beam = case.data.beam
     beams = np.bincount(beam["edge"][beam["used"]], minlength=len(edges))
-    shown = [image.number for image in case.images]
-    good = np.union1d(np.flatnonzero(beams >= FEWEST_CELLS), shown).astype(int)
-    if not len(good):
+    shown = np.isin(np.arange(len(edges)), [image.number for image in case.images])
+    scanned = (beams >= FEWEST_CELLS) & ~shown
+    good = scanned | shown
+    if not good.any():
         raise DegenerateGeometry("nothing shows a side")
-    columns = np.arange(len(covariance))[-2 * len(edges) :].reshape(-1, 2)[good].ravel()
-    lines = {edges[number]: state.lines[number] for number in good}
-    corners, lengths, sigma = sized(
-        lines, case.middle[good], covariance[np.ix_(columns, columns)], edges
-    )
-    lengths = {name: size for name, size in lengths.items() if sigma[name] < WIDEST * size}
-    board = MeasuredBoard(
-        T_platform_plane=np.vstack([state.joint.boards[0], [0, 0, 0, 1]]),
-        lines=lines,
-        corners=corners,
-        lengths=lengths,
-        sigma={name: sigma[name] for name in lengths},
-    )
-    return board, frozenset(edges[number] for number in np.setdiff1d(good, shown))
+    lines = np.where(good[:, None], state.lines, np.nan)
+    of_sides = covariance[-2 * len(edges) :, -2 * len(edges) :]
+    board = bounded(state.joint.boards[0], edges, lines, case.middle, of_sides)
+    sizes = board.lengths
+    sigma = {name: s for name, s in board.sigma.items() if s < WIDEST * sizes[name]}
+    lengths = {name: sizes[name] for name in sigma}
+    board = replace(board, lengths=lengths, sigma=sigma)
+    return board, frozenset(compress(edges, scanned))

@@ -17,8 +17,7 @@ CELLS_PER_EDGE = 160  # a placement
 def observe_joint(
     prepared: Prepared, views: dict[str, list[BoardView]]
 ) -> JointObservations:
-    """Everything that the joint estimate uses of a session, of the placements that are not left
-    out.
+    """Everything that the joint estimate uses of a session.
 
     Parameters
     ----------
@@ -31,13 +30,7 @@ def observe_joint(
     JointObservations
     """
     session = prepared.session
-    board = prepared.board
-    scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.left_out}
-    if board.corners is None and board.pattern is not None:
-        # nobody knows the outline: no beam is named after the sides of the printed squares
-        corners = board.pattern.outline()
-    else:
-        corners = board.known_corners()
+    scans = prepared.scans
     lens_covariance = np.zeros((len(views), LENS, LENS))
     for number, camera in enumerate(views):
         known = prepared.models[camera].covariance
@@ -47,8 +40,9 @@ def observe_joint(
         placements=np.array(list(scans), int),
         direction=np.array([session.sweep_direction(p) for p in scans], int),
         middle=np.array([np.mean(scan.sweep.pitch) for scan in scans.values()]),
-        edges=tuple(board.edges),
-        corners=corners,
+        edges=tuple(prepared.board.edges),
+        # where nobody knows them, no beam is named after the sides of the printed squares
+        corners=prepared.board.outline(),
         cameras=tuple(views),
         mounts=tuple(session.cameras[camera].mount for camera in views),
         T_head_lrf=session.T_head_lrf,
@@ -74,12 +68,9 @@ def _ranges(scans):
 
 def _beams(prepared, scans):
     """Beams about the named sides of placements, by row: columns by name."""
-    along = prepared.edges["half_step"]
-    swept = prepared.swept["half_step"]
     for row, (placement, scan) in enumerate(scans.items()):
-        cells = edge_cells(
-            scan, along[placement], swept.get(placement), prepared.session.lrf
-        )
+        ways = prepared.edges[placement]["half_step"]
+        cells = edge_cells(scan, ways, prepared.session.lrf)
         for side, name in prepared.names.get(placement, {}).items():
             about = cells[thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE)]
             yield {

@@ -70,7 +70,9 @@ def mixed(ranges: np.ndarray, steps: tuple[float, float], lrf: LrfInfo) -> np.nd
     ndarray, shape (l, b)
         Metres.
     """
-    spots = _spots(ranges, steps, lrf)
+    diameter = lrf.spot_exit / np.nan_to_num(ranges, nan=1.0) + lrf.spot_divergence
+    # in samples, across the lines and along them (l, b, 2); next to nothing without a step
+    spots = diameter[..., None] / np.where(np.greater(steps, 0), steps, 1e9)
     odd, dented, nearer = _beside(ranges, spots, lrf.sigma_range)
     planes = _Planes(ranges, spots, lrf.sigma_range)
     odd = planes.off(ranges, odd, 0.6)
@@ -81,15 +83,6 @@ def mixed(ranges: np.ndarray, steps: tuple[float, float], lrf: LrfInfo) -> np.nd
     alike = (count > np.where(odd, 2.5, 4.5)) & np.isfinite(ranges)
     wide = spots.min(axis=-1) > 2
     return np.where(wide, alike, odd) * np.maximum(nearer, 1e-6)
-
-
-def _spots(ranges, steps, lrf):
-    """Diameter of the spot in samples, across the lines and along them (l, b, 2); next to nothing
-    where there is no step.
-    """
-    distance = np.nan_to_num(ranges, nan=1.0)
-    diameter = lrf.spot_exit / distance + lrf.spot_divergence  # radians
-    return diameter[..., None] / np.where(np.greater(steps, 0), steps, 1e9)
 
 
 def _samples(spots, share, fewest):

@@ -4,8 +4,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.calibrate.observe import observe, platform_of, source_of
+from lrfcal_lib.calibrate.observe import observe, sides_of, source_of
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.camera import line_distance
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, unit_vector
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.pattern_in_image import SMALL_SQUARE_PX
@@ -50,28 +51,17 @@ def name_sides(
             if placement not in prepared.scans or placement in names:
                 continue
             T_board_source = view.T_camera_board.inv() * T_camera_source
-            sides = _sides_on_board(prepared, camera, placement, T_board_source)
+            source = source_of(prepared, camera, placement, None)
+            sides = {
+                side.number: T_board_source.apply(source.points(side.points, side.pitch))
+                for side in sides_of(prepared, placement)
+            }
             names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
             for why in dropped[placement].values():
                 problems.append(
                     Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement)
                 )
     return names, dropped, problems
-
-
-def _sides_on_board(prepared, camera, placement, T_board_source):
-    """Points (n, 3) of the sides of a sweep by number, board frame, metres."""
-    source = source_of(prepared, camera, placement, platform_of(prepared))
-    sides: dict = {}
-    for edges in (prepared.edges["half_step"], prepared.swept["half_step"]):
-        if placement not in edges:
-            continue
-        scanned = edges[placement]
-        for number in np.unique(scanned.side[scanned.side >= 0]).tolist():
-            rows = scanned.side == number
-            points = source.points(scanned.points[rows], scanned.pitch[rows])
-            sides.setdefault(number, T_board_source.apply(points))
-    return sides
 
 
 def rough_poses(prepared: Prepared) -> tuple[dict[str, RigidTransform], list[Problem]]:
@@ -143,13 +133,13 @@ def nearest_edges(
     dropped = {}
     cost = np.zeros((len(sides), len(lines)))
     for row, points in enumerate(sides.values()):
-        distances = points[:, :2] @ lines[:, :2].T + lines[:, 2]
+        distances = line_distance(points[:, None, :2], lines)
         cost[row] = np.median(np.abs(distances), axis=0)
     numbers = list(sides)
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
         number = numbers[row]
         edge = board.edges[column]
-        distance = float(cost[row, column])
+        distance = cost[row, column]
         turn, allowed = _turn(sides[number], lines[column])
         if distance > NAME_DISTANCE:
             dropped[number] = DroppedSide(edge, distance)
@@ -169,4 +159,4 @@ def _turn(points, line):
     _, direction, rms = fit_line(points)
     flat = unit_vector(direction[:2])
     noise = TURNED * rms * np.sqrt(12 / len(points)) / np.ptp(points @ direction)
-    return float(np.arcsin(min(abs(flat @ line[:2]), 1.0))), np.hypot(NAME_ANGLE, noise)
+    return np.arcsin(min(abs(flat @ line[:2]), 1.0)), np.hypot(NAME_ANGLE, noise)

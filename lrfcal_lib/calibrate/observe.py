@@ -4,7 +4,7 @@ and stacked as observations.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections, SourceFrame
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations, thin
 from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edges_in_scan import ScanEdges
-from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
+from lrfcal_lib.preprocess.edges_in_scan import ScanEdges, ScanSide
+from lrfcal_lib.preprocess.prepared import Prepared
 
 ONE_SCAN = "one_scan"
 # neighbouring scan lines repeat each other's errors; a line in space needs few points
@@ -61,7 +61,6 @@ def observe(
     -------
     CameraObservations
     """
-    T_head_lrf = platform_of(prepared, T_head_lrf)
     views = prepared.views[camera]
     posed = prepared.posed(camera)
     rule = "last_beam" if variant == ONE_SCAN else variant
@@ -96,16 +95,6 @@ def observe(
     )
 
 
-def observe_all(
-    prepared: Prepared, T_head_lrf: RigidTransform | None = None
-) -> dict[tuple[str, str], CameraObservations]:
-    """Observations of all cameras in every edge-point variant, by camera and variant."""
-    return {
-        (camera, variant): observe(prepared, camera, variant, T_head_lrf)
-        for camera, variant in product(prepared.views, (*VARIANTS, ONE_SCAN))
-    }
-
-
 def platform_observations(
     prepared: Prepared, variant: str = "half_step"
 ) -> PlatformObservations:
@@ -125,15 +114,17 @@ def platform_observations(
     """
     sides = []
     faces = []
-    for placement, swept in prepared.swept[variant].items():
-        feature = _feature_sides(prepared.edges[variant][placement], swept)
-        for number, (edges, side) in enumerate(feature, 1):
-            rows = thin(np.flatnonzero(edges.side == side.side), PLATFORM_POINTS)
+    for placement, edges in prepared.edges.items():
+        if len(edges[variant]) == 1:
+            continue  # a single shot
+        feature = _feature_sides(list(sides_of(prepared, placement, variant)))
+        for number, side in enumerate(feature, 1):
+            rows = thin(side.rows, PLATFORM_POINTS)
             sides.append(
                 {
-                    "points": edges.points[rows],
-                    "covariance": edges.covariance[rows],
-                    "pitch": edges.pitch[rows],
+                    "points": side.edges.points[rows],
+                    "covariance": side.edges.covariance[rows],
+                    "pitch": side.edges.pitch[rows],
                     "placement": placement,
                     "number": number,
                 }
@@ -180,7 +171,8 @@ def outline_of(
     DegenerateGeometry
         If the sweep does not cross enough scan lines to span a plane.
     """
-    source = in_platform(placement, platform_of(prepared, T_head_lrf))
+    T_head_lrf = platform_of(prepared, T_head_lrf)
+    source = SourceFrame(T_head_lrf, "platform", placement=placement)
     p_lrf, pitch, _ = face_points(prepared.scans[placement])
     sides = {}
     across = set()
@@ -210,7 +202,7 @@ def source_of(
     prepared: Prepared,
     camera: str,
     placement: int,
-    T_head_lrf: RigidTransform,
+    T_head_lrf: RigidTransform | None,
     corrections: Corrections = AS_RECORDED,
 ) -> SourceFrame:
     """A placement in the frame that one of its cameras is fixed to.
@@ -220,7 +212,8 @@ def source_of(
     prepared : Prepared
     camera : str
     placement : int
-    T_head_lrf : RigidTransform
+    T_head_lrf : RigidTransform or None
+        See :func:`platform_of`.
     corrections : Corrections
 
     Returns
@@ -229,14 +222,8 @@ def source_of(
     """
     mount = prepared.session.cameras[camera].mount
     pitch = prepared.views[camera][placement].pitch
+    T_head_lrf = platform_of(prepared, T_head_lrf)
     return SourceFrame(T_head_lrf, mount, pitch, placement, corrections)
-
-
-def in_platform(
-    placement: int, T_head_lrf: RigidTransform, corrections: Corrections = AS_RECORDED
-) -> SourceFrame:
-    """A placement in the platform frame."""
-    return SourceFrame(T_head_lrf, "platform", 0.0, placement, corrections)
 
 
 def platform_of(
@@ -261,25 +248,31 @@ def platform_of(
 
 
 @dataclass(frozen=True)
-class NamedSide:
-    """A side of the scan that has the name of an edge.
+class SweepSide:
+    """A side of the board in a sweep.
 
     Attributes
     ----------
+    number : int
+        Within the placement.
     name : str
-        Of the board's edge.
+        Of the board's edge; empty where it has none.
     edges : ScanEdges
         That hold its points.
     rows : ndarray of int
         Which of them.
     across : bool
         Whether it was found across the scan lines.
+    straight : ScanSide or None
+        None for a single shot, which shows one point.
     """
 
+    number: int
     name: str
     edges: ScanEdges
     rows: np.ndarray
     across: bool
+    straight: ScanSide | None
 
     @property
     def points(self) -> np.ndarray:
@@ -291,32 +284,62 @@ class NamedSide:
         """As recorded, radians, shape (n,)."""
         return self.edges.pitch[self.rows]
 
+    @property
+    def length(self) -> float:
+        """Of the stretch that the sweep shows, metres."""
+        return self.straight.length if self.straight else 0.0
 
-def named_sides(
-    prepared: Prepared, placement: int, variant: str = "half_step", stretch: float = 0.0
-) -> Iterator[NamedSide]:
-    """The sides of a placement that have names, one by one.
+
+def sides_of(
+    prepared: Prepared, placement: int, variant: str = "half_step"
+) -> Iterator[SweepSide]:
+    """The sides of a placement, those found along the scan lines first.
 
     Parameters
     ----------
     prepared : Prepared
     placement : int
     variant : {'half_step', 'last_beam'}
+
+    Yields
+    ------
+    SweepSide
+    """
+    names = prepared.names.get(placement, {})
+    known = {-1}
+    for across, edges in enumerate(prepared.edges[placement][variant]):
+        straight = {side.side: side for side in edges.sides}
+        for number in sorted(set(edges.side.tolist()) - known):
+            known.add(number)
+            yield SweepSide(
+                number=number,
+                name=names.get(number, ""),
+                edges=edges,
+                rows=np.flatnonzero(edges.side == number),
+                across=bool(across),
+                straight=straight.get(number),
+            )
+
+
+def named_sides(
+    prepared: Prepared, placement: int, variant: str = "half_step", stretch: float = 0.0
+) -> Iterator[SweepSide]:
+    """The sides of a placement that have names, one by one.
+
+    Parameters
+    ----------
+    prepared, placement, variant
+        See :func:`sides_of`.
     stretch : float
         Share of an edge that the sweep must show.
 
     Yields
     ------
-    NamedSide
+    SweepSide
     """
-    along = prepared.edges[variant][placement]
-    swept = prepared.swept[variant].get(placement)
-    for number, name in prepared.names.get(placement, {}).items():
-        across = number not in along.side
-        edges = swept if across else along
-        length = next((side.length for side in edges.sides if side.side == number), 0.0)
-        if length >= stretch * prepared.board.lengths()[name]:
-            yield NamedSide(name, edges, np.flatnonzero(edges.side == number), across)
+    for side in sides_of(prepared, placement, variant):
+        if side.name and side.length >= stretch * prepared.board.lengths()[side.name]:
+            yield side
 
 
 def _boards_in_images(posed, corners):
@@ -348,8 +371,11 @@ def _one_scan_line(features, view, sides):
     """The paper's choice: of the two edges of `features`, the points of the middle one of the lines
     crossing both.
     """
-    seen = [name for name in features if view.edge(name) is not None]
-    sides = [side for side in sides if side.name in seen and not side.across]
+    sides = [
+        side
+        for side in sides
+        if side.name in features and view.edge(side.name) and not side.across
+    ]
     if len(sides) != 2:
         return
     both = np.intersect1d(*(side.edges.line[side.rows] for side in sides))
@@ -394,7 +420,7 @@ def _corners(prepared, camera, variant, T_head_lrf) -> Iterator[dict]:
     names = prepared.board.edges
     named = prepared.names.keys() & prepared.scans.keys()
     for placement, view in prepared.views[camera].items():
-        if placement not in named or placement not in prepared.swept[variant]:
+        if placement not in named or len(prepared.edges[placement][variant]) == 1:
             continue
         board, _ = outline_of(prepared, placement, variant, T_head_lrf)
         T_source_platform = source_of(
@@ -407,40 +433,27 @@ def _corners(prepared, camera, variant, T_head_lrf) -> Iterator[dict]:
             if edge is None or previous is None:
                 continue
             corner = board.corner_point(name)
-            error = _pitch_error(prepared, corner, board.T_platform_plane[:3, 3])
-            error = T_source_platform.rotation.apply(error)
+            _, y, z = np.column_stack([corner, board.T_platform_plane[:, 3]])
+            pitch, middle = np.arctan2(z, y)
+            sigma = prepared.pitch_noise.sigma(pitch, middle)
+            error = T_source_platform.rotation.apply(sigma * np.cross(TILT_AXIS, corner))
             # not averaged down: neighbours share errors
             scatter = max(board.scatter[name], board.scatter[before])
             yield {
                 "points": T_source_platform.apply(corner)[None],
-                "covariance": [scatter**2 * np.eye(3) + np.outer(error, error)],
+                "covariance": [scatter**2 * np.eye(3) + dyads(error)],
                 "pixels": [corners_of_lines(np.stack([previous.line, edge.line]))[1]],
                 "sigma_px": np.sqrt(edge.covariance[0, 0] + previous.covariance[0, 0]),
                 "placement": placement,
             }
 
 
-def _pitch_error(prepared, corner, middle):
-    """By how much an error of the pitch moves a corner (3,) of a board with this middle, platform
-    frame, metres.
-    """
-    at = np.arctan2(corner[2], corner[1])
-    about = np.arctan2(middle[2], middle[1])
-    return prepared.pitch_noise.sigma(at, about) * np.cross(TILT_AXIS, corner)
-
-
-def _feature_sides(along, swept):
-    """The longest pair of perpendicular sides, else the longest side: tuple of (ScanEdges,
-    ScanSide).
-    """
-    known = {side.side for side in along.sides}
-    sides = [(along, side) for side in along.sides]
-    sides += [(swept, side) for side in swept.sides if side.side not in known]
+def _feature_sides(sides):
+    """The longest pair of perpendicular sides, else the longest side: tuple of SweepSide."""
     pairs = []
-    for one, other in combinations(sides, 2):
-        if abs(one[1].direction @ other[1].direction) < RIGHT_ANGLE:
-            pairs.append((one, other))
-    features = pairs or [(one,) for one in sides]
-    return max(
-        features, key=lambda it: np.prod([side.length for _, side in it]), default=()
-    )
+    for pair in combinations(sides, 2):
+        one, other = (side.straight.direction for side in pair)
+        if abs(one @ other) < RIGHT_ANGLE:
+            pairs.append(pair)
+    features = pairs or [(side,) for side in sides]
+    return max(features, key=lambda it: np.prod([side.length for side in it]), default=())

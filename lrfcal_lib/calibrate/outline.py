@@ -1,12 +1,12 @@
 """Edge lengths of boards in the cloud by least squares."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.camera import line_distance
+from lrfcal_lib.model.camera import line_distance, line_through
 from lrfcal_lib.model.geometry import fit_line
 
 STEP = 1e-6  # of shifts and turns of lines, metres and radians: for derivatives of lengths
@@ -18,7 +18,7 @@ class MeasuredBoard:
 
     Attributes
     ----------
-    T_platform_plane : ndarray, shape (4, 4)
+    T_platform_plane : ndarray, shape (3, 4)
         Origin in the middle of the face, z along the normal towards the sensor.
     lines, corners : dict of str to ndarray, shapes (3,) and (2,)
         Sides that were measured, ``a x + b y + c = 0`` in the plane, metres, and where an edge
@@ -37,10 +37,8 @@ class MeasuredBoard:
 
     def corner_point(self, name: str) -> np.ndarray:
         """The corner where an edge starts, shape (3,), in the frame of the cloud."""
-        return (
-            self.T_platform_plane[:3, 3]
-            + self.T_platform_plane[:3, :2] @ self.corners[name]
-        )
+        pose = self.T_platform_plane[:3]
+        return pose[:, 3] + pose[:, :2] @ self.corners[name]
 
 
 def measure_board(
@@ -63,83 +61,78 @@ def measure_board(
         Standard deviations are those of the points about the lines alone.
     """
     pose = plane_frame(face)
-    if not sides:
-        return MeasuredBoard(pose, {}, {}, {})
-    lines = {}
-    middles = []
-    variances = []  # of shift and turn
+    lines = np.full((len(edges), 3), np.nan)
+    middles = np.zeros((len(edges), 2))
+    variances = np.zeros((len(edges), 2))  # of shift and turn
+    scatter = {}
     for name, points in sides.items():
-        flat = (points - pose[:3, 3]) @ pose[:3, :2]
+        row = edges.index(name)
+        flat = (points - pose[:, 3]) @ pose[:, :2]
         middle, direction, rms = fit_line(flat)
-        normal = direction[::-1] * [1.0, -1.0]
-        lines[name] = np.append(normal, -normal @ middle)
-        middles.append(middle)
+        lines[row] = line_through(middle, middle + direction)
+        middles[row] = middle
         shift = rms**2 / max(len(flat) - 1, 1)
         spread = np.mean(((flat - middle) @ direction) ** 2)
-        variances += [shift, shift / max(spread, 1e-12)]
-    corners, lengths, sigma = sized(lines, np.array(middles), np.diag(variances), edges)
-    scatter = {name: fit_line(points)[2] for name, points in sides.items()}
-    return MeasuredBoard(pose, lines, corners, lengths, scatter, sigma)
+        variances[row] = shift, shift / max(spread, 1e-12)
+        scatter[name] = fit_line(points)[2]
+    board = bounded(pose, edges, lines, middles, np.diag(variances.ravel()))
+    return replace(board, scatter=scatter)
 
 
 def plane_frame(points: np.ndarray) -> np.ndarray:
-    """A frame (4, 4) in the plane of points: origin in their middle, z towards their origin."""
+    """A frame (3, 4) in the plane of points: origin in their middle, z towards their origin."""
     away, distance, _ = geometry.fit_plane(points)
     normal = -away
     centre = np.nanmean(points, axis=0)
-    pose = np.eye(4)
-    pose[:3, :2] = geometry.plane_axes(normal).T
-    pose[:3, 2] = normal
-    pose[:3, 3] = centre - normal * (normal @ centre + distance)
-    return pose
+    origin = centre - normal * (normal @ centre + distance)
+    return np.column_stack([*geometry.plane_axes(normal), normal, origin])
 
 
-def sized(
-    lines: dict[str, np.ndarray],
+def bounded(
+    pose: np.ndarray,
+    edges: tuple[str, ...],
+    lines: np.ndarray,
     middle: np.ndarray,
     covariance: np.ndarray,
-    edges: tuple[str, ...],
-) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, float]]:
-    """Corners and lengths of an outline, and how well the lengths are known.
+) -> MeasuredBoard:
+    """The board that lines bound: its corners and lengths, and how well the lengths are known.
 
     Parameters
     ----------
-    lines : dict of str to ndarray, shape (3,)
-        Sides by name.
-    middle : ndarray, shape (s, 2)
-        Points of the sides, about which they turn, metres.
-    covariance : ndarray, shape (2 s, 2 s)
-        Of shift and turn of every side, metres and radians.
+    pose : ndarray, shape (3, 4)
+        ``T_platform_plane``.
     edges : tuple of str
-        All of the board in order around it.
+        E of them, in order around the board.
+    lines : ndarray, shape (E, 3)
+        Sides in the plane, NaN where one was not measured.
+    middle : ndarray, shape (E, 2)
+        Points of the sides, about which they turn, metres.
+    covariance : ndarray, shape (2 E, 2 E)
+        Of shift and turn of every side, metres and radians.
 
     Returns
     -------
-    corners : dict of str to ndarray, shape (2,)
-        Where an edge meets the one before it, of two known neighbours.
-    lengths, sigma : dict of str to float
-        Of edges between two corners, and their standard deviations.
+    MeasuredBoard
+        Its corners are those of two known neighbours, its lengths those between two corners.
     """
-    straight = np.array(list(lines.values()))
-    index = [edges.index(name) for name in lines]
 
-    def outline(known):
-        """Corners (..., E, 2) and lengths (..., E) with lines (..., s, 3); NaN where some miss."""
-        every = np.full((*known.shape[:-2], len(edges), 3), np.nan)
-        every[..., index, :] = known
-        corners = corners_of_lines(every)
+    def outline(lines):
+        """Corners (..., E, 2) and lengths (..., E) with lines (..., E, 3); NaN where some miss."""
+        corners = corners_of_lines(lines)
         along = np.roll(corners, -1, axis=-2) - corners
         return corners, np.linalg.norm(along, axis=-1)
 
-    corners, lengths = outline(straight)
+    corners, lengths = outline(lines)
     steps = STEP * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
-    _, after = outline(moved_lines(straight, middle, steps))
+    _, after = outline(moved_lines(lines, middle, steps))
     J = (after - lengths).T / STEP
     sigma = np.sqrt(np.vecdot(J @ covariance, J))
-    return (
-        _known(edges, corners),
-        _known(edges, lengths.tolist()),
-        _known(edges, sigma.tolist()),
+    return MeasuredBoard(
+        T_platform_plane=pose,
+        lines=_known(edges, lines),
+        corners=_known(edges, corners),
+        lengths=_known(edges, lengths.tolist()),
+        sigma=_known(edges, sigma.tolist()),
     )
 
 

@@ -71,14 +71,11 @@ class Painter:
     def __init__(self, views: Sequence[View], step: float, noise: float):
         self.views = views
         self.exposures = np.zeros((len(views), 2))
-        self.buffers = []  # of depth, one a thread
         self.eyes = []
         for view, exposure in zip(views, self.exposures, strict=True):
             pose = _single(pose_array(view.T_camera_platform))
             cell = max(LEAST_CELL, 2 * step * view.model.fx)
             rows, columns = (int(n / cell) + 1 for n in view.image.shape[:2])
-            buffer = np.full((WORKERS, rows * columns), np.inf, np.float32)
-            self.buffers.append(buffer)
             self.eyes.append(
                 colouring.Eye(
                     pose=pose,
@@ -86,7 +83,7 @@ class Painter:
                     lens=_single(np.r_[view.model.parameters, fold(view.model)]),
                     image=view.image,
                     cell=cell,
-                    nearest=buffer[0],
+                    nearest=np.full((WORKERS, rows * columns), np.inf, np.float32),
                     noise=noise,
                     exposure=exposure,
                     number=view.number,
@@ -99,12 +96,12 @@ class Painter:
         def work(rows, worker):
             """Some points, into the depth buffers of one thread."""
             part = _single(points[rows])
-            for eye, buffer in zip(self.eyes, self.buffers, strict=True):
-                colouring.hide(part, eye._replace(nearest=buffer[worker]))
+            for eye in self.eyes:
+                colouring.hide(part, eye, worker)
 
         _share(work, len(points))
-        for buffer in self.buffers:
-            np.min(buffer, axis=0, out=buffer[0])
+        for eye in self.eyes:
+            np.min(eye.nearest, axis=0, out=eye.nearest[0])
 
     def paint(
         self, points: np.ndarray, normals: np.ndarray, only: slice = slice(None)
@@ -163,7 +160,7 @@ class Painter:
             logs[k] = np.log(np.where((grey > darkest) & (grey < brightest), grey, np.nan))
             model = view.model
             uv = project(view.T_camera_platform.apply(points), model)
-            corner = 0.25 * (model.width**2 + model.height**2)
+            corner = np.sum(model.size**2) / 4
             radii[k] = np.sum((uv - [model.cx, model.cy]) ** 2, axis=1) / corner
         gain, falloff = _compared(logs, radii)
         self.exposures[:, 0] = gain - gain.mean()

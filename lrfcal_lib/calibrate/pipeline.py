@@ -6,6 +6,7 @@ import operator
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -20,8 +21,8 @@ from lrfcal_lib.calibrate.cameras import (
 from lrfcal_lib.calibrate.joint_observations import observe_joint
 from lrfcal_lib.calibrate.naming import name_sides
 from lrfcal_lib.calibrate.observe import (
+    ONE_SCAN,
     observe,
-    observe_all,
     platform_observations,
 )
 from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig, joint_rig
@@ -34,6 +35,7 @@ from lrfcal_lib.model.observations import CameraObservations, JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.prepared import (
     LEAST_SWEEP,
+    VARIANTS,
     PitchNoise,
     Prepared,
     prepare_images,
@@ -164,18 +166,21 @@ class Calibration:
             rig = joint_rig(self.joint.solution, self.prepared.models)
             return replace(rig, axis=axis, lrf=session.lrf, session=session.name)
         solved = self.cameras(method)
-        cameras = {}
-        for camera, solution in solved.items():
-            mount = session.cameras[camera].mount
-            model = solution.model or self.prepared.models[camera]
-            cameras[camera] = CalibratedCamera(solution.transform, mount, model)
+        cameras = {
+            camera: CalibratedCamera(
+                solution.transform,
+                session.cameras[camera].mount,
+                solution.model or self.prepared.models[camera],
+            )
+            for camera, solution in solved.items()
+        }
         noise = [scan.sigma_range for scan in self.prepared.scans.values()]
         uncertainty = uncertainty_one_by_one(
             axis.covariance,
             solved,
             admitted_offset=session.lrf.admitted_offset,
             sweep_sigma=astuple(self.prepared.pitch_noise),
-            range_noise=float(np.median(noise)) if noise else session.lrf.sigma_range,
+            range_noise=np.median(noise) if noise else session.lrf.sigma_range,
         )
         return CalibratedRig(
             method=method,
@@ -228,7 +233,11 @@ def _calibrate(session, methods):
 def _one_by_one(prepared, methods):
     """Calibrate the platform, then every camera."""
     platform = tilt_axis(prepared)
-    observations = observe_all(prepared, platform.transform("combined"))
+    axis = platform.transform("combined")
+    observations = {
+        (camera, variant): observe(prepared, camera, variant, axis)
+        for camera, variant in product(prepared.views, (*VARIANTS, ONE_SCAN))
+    }
     solutions, problems = calibrate_cameras(observations, methods)
     return Calibration(prepared, platform, observations, solutions, tuple(problems))
 
@@ -250,7 +259,12 @@ def prepare(session: Session) -> Prepared:
     names, dropped, problems = name_sides(ready)
     every = (*ready.problems, *problems)
     ready = without(replace(ready, names=names, dropped=dropped, problems=every))
-    return replace(ready, pitch_noise=pitch_noise(find_pitch_errors(ready)))
+    errors = find_pitch_errors(ready)
+    if errors is None:
+        return ready
+    wanted = errors.models[errors.wanted]
+    noise = PitchNoise(rms(wanted.offset), rms(wanted.stretch))
+    return replace(ready, pitch_noise=noise)
 
 
 def without(prepared: Prepared) -> Prepared:
@@ -265,8 +279,7 @@ def without(prepared: Prepared) -> Prepared:
         scans=kept(prepared.scans),
         names=kept(prepared.names),
         dropped=kept(prepared.dropped),
-        edges={variant: kept(edges) for variant, edges in prepared.edges.items()},
-        swept={variant: kept(edges) for variant, edges in prepared.swept.items()},
+        edges=kept(prepared.edges),
     )
 
 
@@ -288,19 +301,11 @@ def find_pitch_errors(prepared: Prepared) -> PitchErrors | None:
     if not fixed or not prepared.scans:
         return None
     direction = {p: session.sweep_direction(p) for p in prepared.scans}
-    middle = {p: float(np.mean(scan.sweep.pitch)) for p, scan in prepared.scans.items()}
+    middle = {p: np.mean(scan.sweep.pitch) for p, scan in prepared.scans.items()}
     observations = {c: observe(prepared, c, faces=PITCH_POINTS) for c in fixed}
     with suppress(DegenerateGeometry):
         return estimate_pitch_errors(observations, direction, middle)
     return None
-
-
-def pitch_noise(errors: PitchErrors | None) -> PitchNoise:
-    """How far a recorded pitch is off; zero where the data do not ask for any."""
-    if errors is None:
-        return PitchNoise()
-    model = errors.models[errors.wanted]
-    return PitchNoise(rms(model.offset), rms(model.stretch))
 
 
 def tilt_axis(prepared: Prepared) -> PlatformCalibration:
@@ -318,8 +323,7 @@ def tilt_axis(prepared: Prepared) -> PlatformCalibration:
     """
     session = prepared.session
     observations = {
-        variant: platform_observations(prepared, variant)
-        for variant in ("last_beam", "half_step")
+        variant: platform_observations(prepared, variant) for variant in VARIANTS
     }
     return calibrate_platform(
         observations,

@@ -100,7 +100,7 @@ def _refuse(sweep, lrf):
             f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no "
             "range)"
         )
-    first, last = np.degrees([min(sweep.bearings), max(sweep.bearings)]).round(2)
+    first, last = np.degrees(sweep.bearings[[0, -1]]).round(2)
     right, left = np.degrees(lrf.field_of_view).round(2)
     step = np.degrees(lrf.bearing_step)
     if first < right - step or last > left + step:
@@ -115,7 +115,7 @@ def _pitch_step(sweep):
     turns = np.abs(np.diff(sweep.pitch))
     if not turns.any():
         return 0.0
-    return float(np.median(turns[turns > 0]))
+    return np.median(turns[turns > 0])
 
 
 def _coloured(block, sweep, painter, wanted, sigma_range):
@@ -142,7 +142,7 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
         range=sweep.ranges[block.lines][take],
         intensity=intensity,
         sigma=np.nan_to_num(block.scatter[take], nan=sigma_range),
-        removed=int((wanted & ~block.good).sum()),
+        removed=(wanted & ~block.good).sum(),
     )
 
 

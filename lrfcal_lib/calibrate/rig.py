@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.rig_uncertainty import RigUncertainty, joint_uncertainty
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.model.kinematics import Corrections, camera_at
+from lrfcal_lib.model.geometry import polar_to_points
+from lrfcal_lib.model.kinematics import Corrections, SourceFrame, camera_at
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
@@ -108,11 +108,12 @@ class CalibratedRig:
         ndarray
             NaN where nothing came back, or behind the camera.
         """
-        scan = self.corrections.points(polar_to_points(ranges, bearings))
-        true_pitch = pitch * (1 + self.corrections.pitch_scale)
-        p_platform = lrf_to_platform(scan, true_pitch, self.T_head_lrf)
-        p_camera = self.camera_at(name, true_pitch).apply(p_platform)
-        return project(p_camera, self.cameras[name].model)
+        camera = self.cameras[name]
+        source = SourceFrame(
+            self.T_head_lrf, camera.mount, pitch, corrections=self.corrections
+        )
+        p_source = source.points(polar_to_points(ranges, bearings), pitch)
+        return project(camera.T_camera.apply(p_source), camera.model)
 
 
 def joint_rig(solution: JointSolution, models: dict[str, CameraModel]) -> CalibratedRig:

@@ -41,6 +41,10 @@ def rows(*shape: int | None) -> PlainValidator:
     return PlainValidator(array_of)
 
 
+Square = Annotated[np.ndarray, rows(None, None)]
+Motions = Annotated[np.ndarray, rows(None, len(COLUMNS))]
+
+
 @dataclass(frozen=True)
 class RigUncertainty:
     """How well everything that a rig shares is known, radians and metres.
@@ -65,11 +69,11 @@ class RigUncertainty:
     """
 
     names: tuple[str, ...]
-    covariance: Annotated[np.ndarray, rows(None, None)]
-    trusted: Annotated[np.ndarray, rows(None, None)]
-    lens: Annotated[np.ndarray, rows(None, None)]
-    unseen_of_cloud: Annotated[np.ndarray, rows(None, 13)]
-    unseen_of_cameras: dict[str, Annotated[np.ndarray, rows(None, 13)]]
+    covariance: Square
+    trusted: Square
+    lens: Square
+    unseen_of_cloud: Motions
+    unseen_of_cameras: dict[str, Motions]
     sweep_sigma: tuple[float, float]
     range_noise: float
 
@@ -102,7 +106,7 @@ def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
     noise = 0.0
     if len(solution.observations.face_sigma):
         stated = np.median(solution.observations.face_sigma)
-        noise = float(stated * solution.noise["face_scale"])
+        noise = stated * solution.noise["face_scale"]
     return RigUncertainty(
         names=estimate.names,
         covariance=estimate.covariance,

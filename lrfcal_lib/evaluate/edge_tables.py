@@ -55,7 +55,7 @@ def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
     for variant in VARIANTS:
         misses = {edge: [np.zeros(0)] for edge in lines}
         for placement, names in prepared.names.items():
-            scanned = prepared.edges[variant][placement]
+            scanned = prepared.edges[placement][variant][0]
             pitch = truth.pitch[placement][scanned.line]
             flat = truth.on_board(truth.boards[placement], scanned.points, pitch)
             for side, edge in names.items():

@@ -56,16 +56,14 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
             f"a stereo reference needs two cameras and a pattern, got {len(prepared.views)} cameras"
         )
     first, second = list(prepared.views)[:2]
-    shown = []
-    for views in (prepared.views[first], prepared.views[second]):
-        shown.append({p: v.pixels for p, v in views.items() if v.pixels is not None})
+    shown = [prepared.patterned(camera) for camera in (first, second)]
     common = sorted(shown[0].keys() & shown[1].keys())
     if not common:
         raise ValueError(
             "no placement shows the pattern to both cameras: the stereo check needs at least one"
         )
     models = [prepared.models[first], prepared.models[second]]
-    pixels = np.array([[of_camera[p] for p in common] for of_camera in shown])
+    pixels = np.array([[of_camera[p].pixels for p in common] for of_camera in shown])
     poses = []
     for model, of_camera in zip(models, pixels, strict=True):
         boards = [board_pose(image, pattern, model)[0] for image in of_camera]

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from lrfcal_lib.calibrate.cameras import PlatformCalibration
+from lrfcal_lib.calibrate.observe import sides_of
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.covariance import sigma_of
@@ -264,16 +265,14 @@ def scans_table(prepared: Prepared) -> pd.DataFrame:
     """
     rows = []
     for placement, board in prepared.scans.items():
-        swept = prepared.swept["half_step"].get(placement)
-        along = {s.side for s in prepared.edges["half_step"][placement].sides}
-        across = set() if swept is None else {s.side for s in swept.sides} - along
+        across = [side.across for side in sides_of(prepared, placement) if side.straight]
         row = (
             placement,
             board.mask.sum(),
             1000 * board.sigma_range,
             board.n_jump_points,
-            len(along),
-            len(across),
+            across.count(False),
+            across.count(True),
         )
         rows.append(row)
     return pd.DataFrame(

@@ -87,6 +87,14 @@ class Board:
         """Corners of the outline in space, board frame, metres, shape (n, 3)."""
         return np.insert(self.known_corners(), 2, 0.0, axis=1)
 
+    def outline(self):
+        """Corners of the outline, of the printed squares where nobody has measured it, metres,
+        shape (n, 2); ValueError where there are none.
+        """
+        if self.corners is None and self.pattern is not None:
+            return self.pattern.outline()
+        return self.known_corners()
+
     def known_corners(self):
         """Corners of the outline, metres, shape (n, 2); ValueError where nobody has
         measured them.

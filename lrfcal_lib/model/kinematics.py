@@ -101,7 +101,7 @@ class SourceFrame:
         pitch = self.corrections.pitch(self.placement, self.image_pitch)
         return camera_at(RigidTransform.identity(), self.mount, self.T_head_lrf, pitch)
 
-    def points(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+    def points(self, p_lrf: np.ndarray, pitch: ArrayLike) -> np.ndarray:
         """Measured points (..., 3) at their recorded pitch (...), in this frame, metres."""
         return self.T_source_platform.apply(self._in_platform(p_lrf, pitch))
 

@@ -404,7 +404,7 @@ def outline(ax: Axes, measured) -> None:
     board = measured.board
     corners = board.known_corners()
     ax.plot(*closed(corners).T, color=TRUTH)
-    outwards = measured.lines[:, :2]
+    outwards = board.lines()[:, :2]
     spreads = EXAGGERATED * np.nan_to_num(measured.line_sd)[:, None] * outwards
     for ends, away in zip(side_ends(corners), spreads, strict=True):
         band = np.vstack([ends - away, ends[::-1] + away])

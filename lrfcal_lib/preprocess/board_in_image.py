@@ -1,6 +1,7 @@
 """The board in one image: its pose and its straight outer edges, with a pattern or plain."""
 
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -102,6 +103,7 @@ def view_board(
     board : Board
         With a pattern, or with known corners.
     model : CameraModel
+        For images of this size.
     view : BoardView
         Says whose image it is; for a board with a pattern it has the `pixels` of its corners, in
         the right order.
@@ -117,12 +119,6 @@ def view_board(
         An image that cannot be used is no error: `reason` says why.
     """
     picks = picks or {}
-    if image.shape[:2] != (model.height, model.width):
-        reason = (
-            f"the image is {image.shape[1]} x {image.shape[0]}, the intrinsics are for "
-            f"{model.width} x {model.height} pixels"
-        )
-        return replace(view, reason=reason)
     if board.pattern is None:
         return _view_plain(view, image, board, model, picks)
     view = _view_pattern(view, image, board, model, picks, lines, relief)
@@ -194,7 +190,7 @@ def pose_with_edges(view, board, model: CameraModel) -> tuple[RigidTransform, np
     misses, by_pose = line_residuals(view.edges, board, model, pose_array(pose))
     expected = np.eye(2) + by_pose @ covariance @ by_pose.mT
     chi2 = np.vecdot(misses, solve_each(expected, misses))
-    agreeing = [view.edges[i] for i in np.flatnonzero(chi2 < AGREE_CHI2)]
+    agreeing = list(compress(view.edges, chi2 < AGREE_CHI2))
     if not agreeing:
         return pose, covariance
     return pose_from_edges(agreeing, board, model, pose, covariance)[:2]
@@ -218,13 +214,14 @@ def _view_pattern(view, image, board, model, picks, lines, relief):
             continue
         middle = (start + end) / 2
         beside = middle + WINDOW * line[:2]
-        uv = on_board(np.stack([start, end, middle, beside]), pose, model)
-        window = np.linalg.norm(uv[3] - uv[2])
+        places = np.stack([start, end, middle, beside])
+        a, b, middle_px, beside_px = on_board(places, pose, model)
+        window = np.linalg.norm(beside_px - middle_px)
         reach = np.clip(window, LEAST_REACH_PX, MOST_REACH_PX)
         prior = max(window / WINDOW * PREDICTION_SIGMA, 1.0)
-        outward = uv[2] - inner
+        outward = middle_px - inner
         try:
-            edges.append(refine_edge(image, model, name, *uv[:2], outward, reach, prior))
+            edges.append(refine_edge(image, model, name, a, b, outward, reach, prior))
         except EdgeNotSeen as error:
             rejected.append((name, str(error)))
     return replace(view, edges=tuple(edges), rejected=tuple(rejected))
@@ -238,20 +235,14 @@ def _view_plain(view, image, board, model, picks):
     except EdgeNotSeen as error:
         return replace(view, reason=str(error))
     views = []
-    for found in outline_poses(sides, board, model):
+    for found in outline_poses(sides, board, model, view):
         inner = np.mean([edge.centre for edge in found.edges], axis=0)
         edges = {edge.name: edge for edge in found.edges}
         off = [line_distance(uv, edges[name].line) for name, uv in ends.items()]
         if np.abs(off).max(initial=0.0) >= SAME_NAMES_PX:
             continue
         edges |= {name: picked_edge(name, uv, inner) for name, uv in ends.items()}
-        explained = replace(
-            view,
-            edges=tuple(edges.values()),
-            T_camera_board=found.T_camera_board,
-            covariance=found.covariance,
-        )
-        views.append(explained)
+        views.append(replace(found, edges=tuple(edges.values())))
     if not views:
         reason = f"no pose of board '{board.name}' explains the outline in the image"
         return replace(view, reason=reason)
@@ -268,8 +259,7 @@ def _sides(image, board, model, ends):
         return [picked_edge(name, ends[name], inner) for name in board.edges][::-1]
     corners = undistort(find_polygon(image, len(board.known_corners())), model)
     middle = corners.mean(axis=0)
-    sides = []
-    for a, b in side_ends(corners, OUTLINE_INSET):
-        outward = (a + b) / 2 - middle
-        sides.append(refine_edge(image, model, "", a, b, outward, SEARCH_PX))
-    return sides
+    return [
+        refine_edge(image, model, "", a, b, (a + b) / 2 - middle, SEARCH_PX)
+        for a, b in side_ends(corners, OUTLINE_INSET)
+    ]

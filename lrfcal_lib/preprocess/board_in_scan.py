@@ -121,7 +121,8 @@ def find_board(
     mask = surface.mask
     filtered = median_filter(sweep.ranges, mask)
     lines, information = fit_lines(filtered, sweep.bearings)
-    fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
+    rays = polar_to_points(1.0, sweep.bearings)[:, :2]
+    fitted = np.where(_span(mask), _line_ranges(lines, rays), np.nan)
     residuals = np.where(mask, sweep.ranges - fitted, np.nan)
     residuals = residuals[np.abs(residuals) <= PLANE_NOISE * 2]
     if not residuals.size:
@@ -202,7 +203,7 @@ def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.
         Inverse covariance for ranges with a standard deviation of 1 m; NaN with fewer than four
         beams.
     """
-    rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    rays = polar_to_points(1.0, bearings)[:, :2]
     products = dyads(rays)
     few = np.isfinite(ranges).sum(axis=1) < FEWEST_BEAMS
     r = np.where(few[:, None], 1.0, ranges)  # something to fit all the same
@@ -213,7 +214,7 @@ def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.
     for _ in range(LINE_ROUNDS):
         information = np.einsum("lb,bij->lij", weights, products)
         lines = solve_each(information, (weights / r) @ rays)
-        misses = np.where(valid, np.abs(r - _line_ranges(lines, bearings)), np.nan)
+        misses = np.where(valid, np.abs(r - _line_ranges(lines, rays)), np.nan)
         sigma = np.maximum(NORMAL * np.nanmedian(misses, axis=1), LEAST_SIGMA)[:, None]
         weights = np.nan_to_num(base * biweight(misses, sigma))
     lines[few] = np.nan
@@ -283,7 +284,7 @@ def face_points(
     ranges = sweep.ranges[line, beam]
     bearings = sweep.bearings[beam]
     # keeps the covariance regular; bearings are all but exact
-    spread = 0.1 * np.median(np.diff(sweep.bearings))
+    spread = 0.1 * median_step(sweep.bearings)
     covariance = polar_covariance(ranges, bearings, scan.sigma_range, spread)
     return polar_to_points(ranges, bearings), sweep.pitch[line], covariance
 
@@ -293,9 +294,9 @@ def median_step(angles: np.ndarray) -> float:
     return np.median(np.abs(np.diff(angles))) if len(angles) > 1 else np.inf
 
 
-def _line_ranges(lines, bearings):
-    """Ranges (L, B) of the fitted lines (L, 2): every line in every direction."""
-    along = lines @ np.stack([np.cos(bearings), np.sin(bearings)])
+def _line_ranges(lines, rays):
+    """Ranges (L, B) of the fitted lines (L, 2) along rays (B, 2): every line in every direction."""
+    along = lines @ rays.T
     with np.errstate(divide="ignore"):
         return np.where(along > 0, 1 / along, np.nan)
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import covariance_of
@@ -161,8 +162,7 @@ def waves(points: np.ndarray) -> np.ndarray:
     ndarray, shape (k, k - 3)
     """
     planes = np.insert(points[:, :2], 0, 1.0, axis=1)
-    u, _, _ = np.linalg.svd(planes)
-    return u[:, 3:]
+    return null_space(planes.T)
 
 
 def adjust(

@@ -4,7 +4,6 @@ It shows what changes the ranges at that pitch: a shift along a wall that fills 
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -84,17 +83,17 @@ def closing_of(sweep: Sweep) -> Closing | None:
     near = np.argsort(away, kind="stable")[: max(LINES, np.sum(away <= PLAY))]
     _, stops = np.unique(sweep.pitch[near], return_index=True)
     lines = sweep.ranges[near[stops]]
-    last = closing.ranges[-1]
-    apart = [_apart(last, line) for line in lines]
-    expected = [_apart(*pair) for pair in pairwise(lines)]
-    if not (np.isfinite(apart).any() and np.isfinite(expected).any()):
+    apart = _apart(lines - closing.ranges[-1])
+    expected = _apart(np.diff(lines, axis=0))
+    if not (len(apart) and len(expected)):
         return None
-    return Closing(np.nanmin(apart), np.nanmedian(expected))
+    return Closing(apart.min(), np.median(expected))
 
 
-def _apart(first, second):
-    """By which most ranges differ at most, metres; NaN where too few came back both times."""
-    apart = np.abs(first - second)
-    if np.isfinite(apart).sum() < LEAST:
-        return np.nan
-    return np.nanquantile(apart, QUANTILE)
+def _apart(changes):
+    """By which most ranges of lines (n, B) differ at most, metres, of those of which enough came
+    back both times.
+    """
+    apart = np.abs(changes)
+    enough = np.isfinite(apart).sum(axis=1) >= LEAST
+    return np.nanquantile(apart[enough], QUANTILE, axis=1)

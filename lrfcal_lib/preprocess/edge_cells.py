@@ -1,5 +1,7 @@
 """The beams about every boundary of the board in a scan: who read it, and what stands behind."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import ndimage
 
@@ -26,18 +28,14 @@ CORNER = 1.0  # spot radii: a spot nearer than this to a second edge may reach o
 SURE = 5.0  # standard deviations of a range: what is nearer to the board's plane read the board
 
 
-def edge_cells(
-    scan: BoardScan, along: ScanEdges, swept: ScanEdges | None, lrf: LrfInfo
-) -> np.recarray:
+def edge_cells(scan: BoardScan, ways: Sequence[ScanEdges], lrf: LrfInfo) -> np.recarray:
     """The beams about every boundary of the board, along and across the scan lines.
 
     Parameters
     ----------
     scan : BoardScan
-    along : ScanEdges
-        Of :func:`lrfcal_lib.preprocess.edges_in_scan.crossings`.
-    swept : ScanEdges or None
-        The same across the scan lines; None for a single shot.
+    ways : sequence of ScanEdges
+        Of :func:`lrfcal_lib.preprocess.edges_in_scan.crossings`, along and across the scan lines.
     lrf : LrfInfo
         Knows the spot.
 
@@ -56,7 +54,6 @@ def edge_cells(
         outline has such a background they stay, with `background` 0; so do all cells where most
         boundaries have no return behind them (clouds cut to the board).
     """
-    ways = [edges for edges in (along, swept) if edges is not None]
     sweep = scan.sweep
     ends = [np.column_stack([e.cell, e.step, e.side])[e.side >= 0] for e in ways]
     cell, step, side = np.split(np.concatenate(ends), [2, 4], axis=1)
@@ -95,8 +92,7 @@ def edge_cells(
         "step": np.where(across, *gaps),
     }
     arrays = [column[keep] for column in columns.values()]
-    names = ",".join(columns)
-    return np.rec.fromarrays(arrays, names=names)  # type: ignore[call-overload]
+    return np.rec.fromarrays(arrays, names=list(columns))  # type: ignore[call-overload]
 
 
 def _readings(scan, cells, k, board, radius, gaps, close):

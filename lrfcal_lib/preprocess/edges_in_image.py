@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from lrfcal_lib.fit.robust import biweight, rms, robust_sigma
+from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.model.camera import CameraModel, line_through, pinhole, redistort
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
@@ -54,7 +54,6 @@ class ImageEdge:
         Ends of the stretch that was really seen.
     n_points : int
         Profiles that the line was fitted to (2 for a pick).
-    rms_px : float
     """
 
     name: str
@@ -63,7 +62,6 @@ class ImageEdge:
     centre: np.ndarray
     ends: np.ndarray
     n_points: int
-    rms_px: float
 
 
 class EdgeNotSeen(ValueError):
@@ -111,8 +109,7 @@ def refine_edge(
     if not LEAST_PROFILES <= length < LONGEST * max(image.shape):
         raise EdgeNotSeen(f"its predicted length is {length:.0f} px")
     along = (end - start) / length
-    normal = np.array([along[1], -along[0]])
-    normal = normal * np.sign(normal @ outward)
+    normal = outward_line(start, end, outward)[:2]
     columns = np.arange(int(length) + 1)
     pad = 3 * SMOOTH_PX + 1
     across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
@@ -132,7 +129,6 @@ def refine_edge(
         centre=centre,
         ends=np.stack([first, last]),
         n_points=len(columns),
-        rms_px=rms(misses),
     )
 
 
@@ -143,7 +139,7 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     ----------
     name : str
     ends : ndarray, shape (2, 2)
-        Undistorted pixels.
+        Undistorted pixels; ValueError where they are the same.
     inner : ndarray, shape (2,)
         A point of the board, likewise.
 
@@ -153,13 +149,9 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     """
     length = np.linalg.norm(ends[1] - ends[0])
     centre = ends.mean(axis=0)
-    if length < 1:
-        raise ValueError(
-            f"edge '{name}' was picked with two points {length:.2f} px apart: pick them far apart"
-        )
     line = outward_line(ends[0], ends[1], centre - inner)
     covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
-    return ImageEdge(name, line, covariance, centre, ends, n_points=2, rms_px=0.0)
+    return ImageEdge(name, line, covariance, centre, ends, n_points=2)
 
 
 def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:
@@ -234,16 +226,6 @@ def outward_line(a, b, outward):
     """Pixel (or board) line through two points whose unit normal points to one side."""
     line = line_through(a, b)
     return line if line[:2] @ outward > 0 else -line
-
-
-def board_line(view, edge, model):
-    """The image line of an edge as a line on the board, unit normal outwards, metres.
-
-    Shape (3,).
-    """
-    pose = view.T_camera_board.as_matrix()
-    line = (model.matrix @ pose[:3, [0, 1, 3]]).T @ edge.line
-    return line / np.hypot(line[0], line[1])
 
 
 def on_board(xy, pose, model):

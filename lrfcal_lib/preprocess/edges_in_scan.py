@@ -6,6 +6,7 @@ import numpy as np
 
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
+    fit_line,
     lrf_to_platform,
     plane_axes,
     polar_to_points,
@@ -13,7 +14,7 @@ from lrfcal_lib.model.geometry import (
     unit_vector,
 )
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
-from lrfcal_lib.preprocess.straight_runs import LEAST_TURN, line_of, straight_runs
+from lrfcal_lib.preprocess.straight_runs import LEAST_TURN, straight_runs
 from lrfcal_lib.preprocess.surfaces import SAME_PITCH, depth_jump, row_ends
 
 VARIANTS = ("last_beam", "half_step")
@@ -281,10 +282,8 @@ def background_odds(here, behind):
     ``2 ln(here / behind)``, the inverse square law; 0 with nothing behind, or so close that both
     give one echo.
     """
-    behind = np.asarray(behind, float)
     apart = np.isfinite(behind) & (behind - here >= MIXING)
-    ratio = here / np.where(apart, behind, 1.0)
-    return 2 * np.log(np.where(apart, ratio, 1.0))
+    return 2 * np.log(np.where(apart, here / behind, 1.0))
 
 
 def plane_range(scan, rays, pitch) -> tuple[np.ndarray, np.ndarray]:
@@ -472,17 +471,17 @@ def _spacing(scan):
 
 def _side_through(scan, flat, axes, pitch):
     """The ScanSide, without its number, through points (n, 2) of the board's plane."""
-    centre, direction, along, across = line_of(flat)
+    centre, direction, miss = fit_line(flat)
+    along = (flat - centre) @ direction
     ends = centre + np.outer([along.min(), along.max()], direction)
     scan_normal = _to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch)
     level = np.cross(scan_normal, scan.normal)  # of the scan line on the board
     cosine = abs(unit_vector(level) @ (direction @ axes))
-    variance = np.sum(across**2) / (len(flat) - 2)
     return ScanSide(
         side=-1,
         n_points=len(flat),
         length=np.ptp(along),
-        rms=np.sqrt(variance),
+        rms=miss * np.sqrt(len(flat) / (len(flat) - 2)),
         angle=np.arccos(min(cosine, 1.0)),
         ends=ends @ axes + scan.distance * scan.normal,
     )

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess.bundle import (
@@ -122,12 +123,14 @@ def first_pose(
         When there is none in front of the camera.
     """
     good = np.isfinite(pixels).all(axis=1)
-    board = points[good]
-    image = pixels[good]
     why = f"{good.sum()} corners do not determine a pose in front of the camera"
     try:
         solved, turn, shift = cv2.solvePnP(
-            board, image, model.matrix, model.distortion, flags=cv2.SOLVEPNP_SQPNP
+            points[good],
+            pixels[good],
+            model.matrix,
+            model.distortion,
+            flags=cv2.SOLVEPNP_SQPNP,
         )
     except cv2.error as error:
         raise ValueError(f"{why} (OpenCV: {error.err})") from error
@@ -233,7 +236,7 @@ def scale_covariance(pose: RigidTransform, pixels, pattern: Chessboard) -> np.nd
     side = square_px(pattern.grid(pixels))
     away = np.zeros(6)
     away[3:] = scale_error(side) * pose.apply(pattern.points().mean(axis=0))
-    return np.outer(away, away)
+    return dyads(away)
 
 
 def raised_points(pattern: Chessboard, relief: np.ndarray | None = None) -> np.ndarray:
@@ -252,7 +255,7 @@ def raised_points(pattern: Chessboard, relief: np.ndarray | None = None) -> np.n
     """
     if relief is None:
         return pattern.points()
-    return pattern.points() + np.asarray(relief, float)[:, None] * UP
+    return pattern.points() + relief[:, None] * UP
 
 
 def _rough(views, points, size):
@@ -268,9 +271,8 @@ def _rough(views, points, size):
             f"{len(views)} views of the pattern do not determine the intrinsics (OpenCV: "
             f"{error.err})"
         ) from error
-    fx, cx = matrix[0, [0, 2]]
-    fy, cy = matrix[1, [1, 2]]
-    model = CameraModel(*size, float(fx), float(fy), float(cx), float(cy), lens.ravel())
+    of_pinhole = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]  # fx, fy, cx, cy
+    model = CameraModel(*size, *of_pinhole.tolist(), lens.ravel())
     return model, opencv_poses(turns, shifts)
 
 

@@ -4,6 +4,7 @@ A wide search finds straight edges parallel to the sides of the pattern, and whi
 board is in every image; the narrow search then finds each edge, and the outline is their median.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,12 +13,10 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.robust import robust_sigma
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, side_ends
-from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import DegenerateGeometry, unit_vector
+from lrfcal_lib.model.camera import CameraModel, line_distance, line_through
+from lrfcal_lib.model.geometry import DegenerateGeometry, unit_lines, unit_vector
 from lrfcal_lib.preprocess.edges_in_image import (
-    board_line,
     on_board,
-    outward_line,
     peaks,
     sample,
     step_contrast,
@@ -59,9 +58,6 @@ class Outline:
     ----------
     board : Board
         With its corners filled in.
-    lines : ndarray, shape (E, 3)
-        Board-frame lines ``a x + b y + c = 0``, unit normals out of the board, in the order of
-        ``board.edges``.
     line_sd : ndarray, shape (E,)
         Standard deviation over the views of an edge's offset at its middle, metres.
     length_sd : dict of str to float
@@ -72,7 +68,6 @@ class Outline:
     """
 
     board: Board
-    lines: np.ndarray
     line_sd: np.ndarray
     length_sd: dict[str, float]
     n_lengths: dict[str, int]
@@ -105,7 +100,7 @@ def edge_votes(
     for normal in SIDE_NORMALS:
         along = np.abs(normal[::-1])
         s = np.arange(-square, size @ along + square, APART * STEP * square)
-        corner = np.asarray(pattern.origin) + np.maximum(normal, 0) * size
+        corner = pattern.origin + np.maximum(normal, 0) * size
         xy = corner + s[None, :, None] * along + distances[:, None, None] * normal
         strip = sample(image, model, on_board(xy, pose, model))
         height = step_contrast(strip, SMOOTH_STEPS, along=AVERAGED_PROFILES)
@@ -119,7 +114,7 @@ def edge_votes(
     return np.stack(shares)
 
 
-def turned_views(votes: np.ndarray, up: np.ndarray, leader: np.ndarray) -> np.ndarray:
+def turned_views(votes: np.ndarray, up: np.ndarray, leader: Sequence[int]) -> np.ndarray:
     """Which views see the pattern turned by 180 deg against the others.
 
     Parameters
@@ -128,9 +123,9 @@ def turned_views(votes: np.ndarray, up: np.ndarray, leader: np.ndarray) -> np.nd
         Of :func:`edge_votes`.
     up : ndarray, shape (v,)
         Component of the board's y axis down the image: most views keep y down.
-    leader : ndarray of int, shape (v,)
+    leader : sequence of int, length v
         The first of the views that are turned alike, see
-        :class:`lrfcal_lib.preprocess.turns.Alike`.
+        :func:`lrfcal_lib.preprocess.turns.alike`.
 
     Returns
     -------
@@ -193,15 +188,15 @@ def side_lines(pattern: Chessboard, distances) -> np.ndarray:
     Parameters
     ----------
     pattern : Chessboard
-    distances : sequence of 4 floats
+    distances : ndarray, shape (4,)
         Outside the outermost inner corners: top, right, bottom, left; metres.
 
     Returns
     -------
     ndarray, shape (4, 3)
     """
-    corner = np.asarray(pattern.origin) + np.maximum(SIDE_NORMALS, 0) * _size(pattern)
-    offset = -np.vecdot(corner, SIDE_NORMALS) - np.asarray(distances, float)
+    corner = pattern.origin + np.maximum(SIDE_NORMALS, 0) * _size(pattern)
+    offset = -np.vecdot(corner, SIDE_NORMALS) - distances
     return np.column_stack([SIDE_NORMALS, offset])
 
 
@@ -231,9 +226,11 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     visible = [view for view in views if not view.reason]
     lines = np.full((len(visible), len(board.edges), 3), np.nan)
     for of_view, view in zip(lines, visible, strict=True):
+        pose = view.T_camera_board.as_matrix()
+        pixels_of_board = models[view.camera].matrix @ pose[:3, [0, 1, 3]]
         for edge in view.edges:
             row = board.edges.index(edge.name)
-            of_view[row] = board_line(view, edge, models[view.camera])
+            of_view[row] = unit_lines(edge.line @ pixels_of_board)
     unseen = np.isnan(lines).all(axis=(0, 2))
     if unseen.any():
         raise DegenerateGeometry(
@@ -241,14 +238,17 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
             f"{len(visible)} images: pick it by hand in edges.csv or give the corners of the board"
         )
     ends = side_ends(corners_of_lines(np.nanmedian(lines, axis=0)))
-    medians = [_median_line(lines[:, i], of_edge) for i, of_edge in enumerate(ends)]
-    fitted = np.array([line for line, _ in medians])
+    normals = unit_vector(np.nanmedian(lines[..., :2], axis=0))
+    # where every line crosses the normals raised at the two ends of its edge
+    cosine = np.vecdot(lines[..., :2], normals)
+    offsets = -line_distance(ends, lines[:, :, None]) / cosine[..., None]
+    ends += np.nanmedian(offsets, axis=0)[..., None] * normals[:, None]
+    fitted = line_through(ends[:, 0], ends[:, 1])
     corners = corners_of_lines(lines)
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).T
     return Outline(
         board=replace(board, corners=corners_of_lines(fitted)),
-        lines=fitted,
-        line_sd=np.array([spread for _, spread in medians]),
+        line_sd=np.array([_spread(offset) for offset in offsets.mean(axis=2).T]),
         length_sd=dict(zip(board.edges, map(_spread, lengths), strict=True)),
         n_lengths=dict(zip(board.edges, np.isfinite(lengths).sum(axis=1), strict=True)),
     )
@@ -277,28 +277,14 @@ def _outer_peak(votes):
         gap = votes[start : max(i - 2 * LINE_WIDTH, start)]
         if gap.size and gap.mean() > QUIET:
             break
-        best = int(i)
+        best = i
         start = best + 2 * LINE_WIDTH
     return best
-
-
-def _median_line(lines, ends):
-    """Median line (of n, 3) from its offsets at two ends, and the spread at the middle.
-
-    NaN where an image does not show it.
-    """
-    normal = unit_vector(np.nanmedian(lines[:, :2], axis=0))
-    # where every line crosses the normals raised at the two ends
-    distance = lines[:, :2] @ ends.T + lines[:, 2:]
-    cosine = lines[:, :2] @ normal
-    offsets = -distance / cosine[:, None]
-    a, b = ends + np.nanmedian(offsets, axis=0)[:, None] * normal
-    return outward_line(a, b, normal), _spread(offsets.mean(axis=1))
 
 
 def _spread(values):
     """Standard deviation about the median; NaN below two values that are known."""
     values = values[np.isfinite(values)]
     if len(values) < 2:
-        return float("nan")
+        return np.nan
     return robust_sigma(values - np.median(values))

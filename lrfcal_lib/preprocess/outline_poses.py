@@ -1,6 +1,6 @@
 """A dark board without pattern in an image: its outline, and all poses that explain it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.camera import CameraModel, pinhole
 from lrfcal_lib.model.geometry import unit_vector
-from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge
+from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen
 from lrfcal_lib.preprocess.intrinsics import opencv_poses
 from lrfcal_lib.preprocess.pattern_in_image import grey
 from lrfcal_lib.preprocess.pose_from_lines import pose_from_edges
@@ -22,15 +22,6 @@ BLUR_PX = 1.0
 EXACT_PX = 0.5
 EXACT_CHI2 = 16  # a corner
 SAME_POSE = 1e-3  # radians
-
-
-@dataclass(frozen=True)
-class OutlinePose:
-    """A pose that explains an outline, its covariance (6, 6) of ``[w, v]``, and named edges."""
-
-    T_camera_board: RigidTransform
-    covariance: np.ndarray
-    edges: tuple[ImageEdge, ...]
 
 
 def find_polygon(image: np.ndarray, n_corners: int) -> np.ndarray:
@@ -76,7 +67,7 @@ def find_polygon(image: np.ndarray, n_corners: int) -> np.ndarray:
     )
 
 
-def outline_poses(edges, board: Board, model: CameraModel) -> list[OutlinePose]:
+def outline_poses(edges, board: Board, model: CameraModel, view) -> list:
     """All poses of a board that explain the sides of a polygon, most frontal first.
 
     The printed side (z of the board) faces the camera. Three lines are six equations for six
@@ -91,16 +82,19 @@ def outline_poses(edges, board: Board, model: CameraModel) -> list[OutlinePose]:
         In the turning sense of :func:`find_polygon`.
     board : Board
     model : CameraModel
+    view : BoardView
+        Says whose image it is.
 
     Returns
     -------
-    list of OutlinePose
+    list of BoardView
+        With a pose, its covariance and named edges.
     """
     # seen from the printed side x to y turns left, in the image (v down) that is the other way
     # round
-    sides = list(edges)[::-1]
+    sides = edges[::-1]
     flat = board.points()
-    poses: list[OutlinePose] = []
+    views: list = []
     for shift in range(len(sides)):
         turned = sides[shift:] + sides[:shift]
         named = tuple(
@@ -118,11 +112,14 @@ def outline_poses(edges, board: Board, model: CameraModel) -> list[OutlinePose]:
             exact = off < EXACT_PX or chi2 < EXACT_CHI2 * len(corners)
             known = any(
                 pose.rotation.approx_equal(other.T_camera_board.rotation, SAME_POSE)
-                for other in poses
+                for other in views
             )
             if exact and frontal(pose) > 0 and not known:
-                poses.append(OutlinePose(pose, covariance, named))
-    return sorted(poses, key=lambda pose: -frontal(pose.T_camera_board))
+                explained = replace(
+                    view, T_camera_board=pose, covariance=covariance, edges=named
+                )
+                views.append(explained)
+    return sorted(views, key=lambda each: -frontal(each.T_camera_board))
 
 
 def frontal(pose: RigidTransform) -> float:

@@ -399,7 +399,7 @@ def spread_views(pixels, count: int) -> list:
     flat = pixels.reshape(len(pixels), -1)
     apart = cdist(flat, flat)
     size = np.ptp(pixels, axis=1).prod(axis=1)
-    chosen = [int(np.argmax(size))]
+    chosen = [np.argmax(size)]
     while len(chosen) < count:
-        chosen.append(int(apart[:, chosen].min(axis=1).argmax()))
+        chosen.append(apart[:, chosen].min(axis=1).argmax())
     return [pixels[i] for i in chosen[:count]]

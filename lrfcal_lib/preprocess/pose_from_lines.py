@@ -100,15 +100,10 @@ def line_misses(edges, points, model: CameraModel, pose):
     distance = line_distance(uv, lines[:, None])
     by_point = np.vecmat(lines[:, None, :2], pinhole_jacobian(p_camera, model))
     by_pose = gradient_by_pose(turned, by_point)
-    white = _whiteners(edges, lines, uv)
-    return np.matvec(white, distance), white @ by_pose
-
-
-def _whiteners(edges, lines, uv):
-    """Inverse Cholesky factors (E, n, n) of the covariance of distances of pixels from lines."""
     centres = np.stack([edge.centre for edge in edges])
     covariance = np.stack([edge.covariance for edge in edges])
-    along = np.stack([lines[:, 1], -lines[:, 0]], axis=1)
-    lever = np.einsum("enk,ek->en", uv - centres[:, None], along)
-    design = np.stack([np.ones_like(lever), lever], axis=2)
-    return inverse_root(design @ covariance @ design.mT)
+    along = lines[:, [1, 0]] * [1, -1]
+    lever = np.matvec(uv - centres[:, None], along)
+    design = np.stack([np.ones_like(lever), lever], axis=2)  # by offset and angle of a line
+    white = inverse_root(design @ covariance @ design.mT)
+    return np.matvec(white, distance), white @ by_pose

@@ -9,8 +9,8 @@ from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.problem import LEAVES_OUT, Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_image import BoardView
-from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
-from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
+from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, BoardScan, find_board
+from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, ScanEdges, crossings
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.outline_in_images import Outline
 from lrfcal_lib.preprocess.survey import small_squares, survey
@@ -52,7 +52,7 @@ class PitchNoise:
         ndarray
             Radians.
         """
-        return np.hypot(self.offset, self.stretch * (np.asarray(pitch) - middle))
+        return np.hypot(self.offset, self.stretch * (pitch - middle))
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,10 @@ class Prepared:
         it.
     scans : dict of int to BoardScan
         By placement.
-    edges : dict of str to dict of int to ScanEdges
-        Crossings of scan lines with the board's sides by edge-point variant and placement.
-    swept : dict of str to dict of int to ScanEdges
-        The same across the scan lines, where the sweep enters and leaves the board.
+    edges : dict of int to dict of str to list of ScanEdges
+        By placement and edge-point variant: where scan lines cross the board's sides; and, unless
+        it is a single shot, the same across the scan lines, where the sweep enters and leaves the
+        board.
     models : dict of str to CameraModel
     views : dict of str to dict of int to BoardView
         By camera and placement; where there are images at several pitch angles, the one with most
@@ -118,7 +118,6 @@ class Prepared:
     board: Board
     scans: dict
     edges: dict
-    swept: dict
     models: dict = field(default_factory=dict)
     views: dict = field(default_factory=dict)
     outline: Outline | None = None
@@ -199,20 +198,16 @@ def prepare_scans(session: Session) -> Prepared:
         Without cameras.
     """
     scans = {}
+    edges = {}
     problems = []
-    edges: dict[str, dict] = {variant: {} for variant in VARIANTS}
-    swept: dict[str, dict] = {variant: {} for variant in VARIANTS}
     for result in spread(partial(_crossed, session), session.board_placements):
         if isinstance(result, Problem):
             problems.append(result)
             continue
-        scan, along, across = result
+        scan, crossed = result
         scans[scan.placement] = scan
-        for variant in VARIANTS:
-            edges[variant][scan.placement] = along[variant]
-            if across:
-                swept[variant][scan.placement] = across[variant]
-    return Prepared(session, session.board, scans, edges, swept, problems=tuple(problems))
+        edges[scan.placement] = crossed
+    return Prepared(session, session.board, scans, edges, problems=tuple(problems))
 
 
 def _crossed(session, placement):
@@ -226,11 +221,26 @@ def _crossed(session, placement):
         )
     except BoardNotFound as error:
         return Problem(Stage.SCANS, ProblemKind.NO_BOARD, str(error), placement)
+    return scan, all_crossings(scan)
+
+
+def all_crossings(scan: BoardScan) -> dict[str, list[ScanEdges]]:
+    """Where scan lines, and columns unless it is a single shot, cross the board's edges.
+
+    Parameters
+    ----------
+    scan : BoardScan
+
+    Returns
+    -------
+    dict of str to list of ScanEdges
+        By edge-point variant.
+    """
     along, sides = crossings(scan)
-    across = {}
+    ways = [along]
     if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
-        across, _ = crossings(scan, True, sides)
-    return scan, along, across
+        ways.append(crossings(scan, True, sides)[0])
+    return {variant: [way[variant] for way in ways] for variant in VARIANTS}
 
 
 def prepare_images(prepared: Prepared) -> Prepared:

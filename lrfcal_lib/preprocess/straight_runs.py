@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import fit_line, unit_vector
 
 FEWEST_POINTS = 5  # of a run
 MOST_RUNS = 4  # on one hand of a board
@@ -48,34 +48,13 @@ def straight_runs(
         if len(run) < FEWEST_POINTS:
             break
         left = np.setdiff1d(left, run)
-        _, direction, along, _ = line_of(points[run])
+        _, direction, _ = fit_line(points[run])
+        length = np.ptp(points[run] @ direction)
         cosines = [abs(direction @ other) for other in directions]
-        if max(cosines, default=0.0) < np.cos(LEAST_TURN) and np.ptp(along) >= shortest:
+        if max(cosines, default=0.0) < np.cos(LEAST_TURN) and length >= shortest:
             runs.append(run)
             directions.append(direction)
     return runs
-
-
-def line_of(points: np.ndarray, among=slice(None)):
-    """Least squares line of some points.
-
-    Parameters
-    ----------
-    points : ndarray, shape (n, 2)
-        Metres.
-    among : index
-        Those that the line goes through.
-
-    Returns
-    -------
-    centre, direction : ndarray, shape (2,)
-    along, across : ndarray, shape (n,)
-        Places of all points, metres.
-    """
-    centre = points[among].mean(axis=0)
-    offset = points - centre
-    across, direction = np.linalg.eigh(offset[among].T @ offset[among])[1].T
-    return centre, direction, offset @ direction, offset @ across
 
 
 def _without_gaps(run, order):
@@ -103,5 +82,6 @@ def _consensus(points, tolerance, apart, rng):
     on = np.abs(distance[best]) < tolerance
     for _ in range(REFINE_ROUNDS):
         if on.sum() >= 2:
-            on = np.abs(line_of(points, on)[3]) < tolerance
+            centre, (x, y), _ = fit_line(points[on])
+            on = np.abs((points - centre) @ [-y, x]) < tolerance
     return on

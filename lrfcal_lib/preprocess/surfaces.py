@@ -74,7 +74,7 @@ class Limits:
 
 def depth_jump(ranges, step):
     """Change of range (metres) between beams a `step` apart that no face of a board makes."""
-    return DEPTH_NOISE + STEEPEST * np.asarray(ranges) * np.abs(step)
+    return DEPTH_NOISE + STEEPEST * ranges * np.abs(step)
 
 
 def segments(ranges, *, jump=DEPTH_NOISE, bridge=0) -> np.ndarray:
@@ -194,7 +194,7 @@ def _upright(sweep, T_head_lrf):
     if np.ptp(sweep.pitch) > SAME_PITCH:
         return None
     across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
-    return tilt(across_scan, float(sweep.pitch[0]))
+    return tilt(across_scan, sweep.pitch[0])
 
 
 def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
@@ -243,7 +243,7 @@ def plane_size(points: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
     """Area (m2; 0 for a single line) and greatest length (m) of points in a plane."""
     flat = points @ plane_axes(normal).T
     hull = cv2.convexHull(flat.astype(np.float32))[:, 0]
-    return cv2.contourArea(hull), float(pdist(hull).max())
+    return cv2.contourArea(hull), pdist(hull).max()
 
 
 def row_ends(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -278,7 +278,6 @@ def _by_distance(sweep):
 def _planes(sweep, points, mask, upright, rng):
     """Flat connected parts of a surface: the largest plane first, then what is left."""
     left = mask.copy()
-    known = np.nan_to_num(points, nan=1e9)
     for _ in range(MOST_PLANES):
         if left.sum() < FEWEST_POINTS:
             return
@@ -286,7 +285,7 @@ def _planes(sweep, points, mask, upright, rng):
         if plane is None:
             return
         normal, distance = plane
-        on = left & (np.abs(known @ normal - distance) < PLANE_NOISE)
+        on = left & (np.abs(points @ normal - distance) < PLANE_NOISE)
         labels = surfaces(np.where(on, sweep.ranges, np.nan), sweep.bearings, sweep.pitch)
         count = np.bincount(labels[labels >= 0])
         for label in np.flatnonzero(count >= max(FEWEST_POINTS, SMALL_PART * count.max())):
@@ -317,12 +316,10 @@ def _grown(surface, points):
 
 def _size_limits(board, grown):
     """Limits of a board with its outline grown (m)."""
-    unknown = board.corners is None and board.pattern is not None
-    corners = board.pattern.outline() if unknown else board.known_corners()
-    corners = corners.astype(np.float32)
+    corners = board.outline().astype(np.float32)
     area = cv2.contourArea(corners)
     length = pdist(corners).max()
-    if unknown:
+    if board.corners is None:
         return Limits(0.3 * area, 4 * area, 2.5 * length)
     rim = cv2.arcLength(corners, True)
     return Limits(0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -112,13 +113,11 @@ def survey(session: Session) -> Survey:
     Raises
     ------
     ValueError
-        If a camera has no intrinsics and the board no pattern, or too few images show it; if a pick
-        names an edge that the board does not have.
+        If a camera has no intrinsics and the board no pattern, or too few images show it.
     """
     board = session.board
     stated = {name: camera.model for name, camera in session.cameras.items()}
     unknown = [name for name, model in stated.items() if model is None]
-    _check_picks(session.picks, board)
     read = session.read_image
     look = partial(_look, read=read, board=board, picks=session.picks)
     if board.pattern is None:
@@ -143,7 +142,7 @@ def survey(session: Session) -> Survey:
     views = see(lines)
     outline = None
     if board.corners is None and not unseen:
-        views = see(measure_outline(views, board, models).lines)
+        views = see(measure_outline(views, board, models).board.lines())
         outline = measure_outline(views, board, models)
         board = outline.board
     lost = [shot.view for shot in begun if shot.reason]
@@ -194,7 +193,7 @@ def _like_prepared(record, prepared, finder):
     if known.file == view.file or known.pixels is None:
         return replace(known, file=view.file, pitch=record.pitch)
     read = prepared.session.read_image
-    shot = _begin(record, read, board, finder, 1)
+    shot = _begin(Shot(record, view), read, board, finder, 1)
     if shot.reason:
         return shot.view
     corners = shot.view.pixels[pattern_orders(board.pattern)]
@@ -243,24 +242,12 @@ def small_squares(views, pattern) -> dict[str, str]:
     return words
 
 
-def _check_picks(picks, board):
-    """Refuse edges that the board does not have."""
-    for pick in picks:
-        if pick.edge not in board.edges:
-            raise ValueError(
-                f"{pick.file}: picked edge '{pick.edge}' is not one of the board's edges "
-                f"{board.edges}"
-            )
-
-
-def _placement(record):
-    """Placement of which an image is one, negative for none."""
-    return -1 if record.purpose == "intrinsics" else record.placement
-
-
 def _view(record):
-    """The view of an image in which nothing was looked for yet."""
-    return BoardView(record.camera, record.file.name, _placement(record), record.pitch)
+    """The view of an image in which nothing was looked for yet; of no placement where it was
+    taken for the intrinsics.
+    """
+    placement = -1 if record.purpose == "intrinsics" else record.placement
+    return BoardView(record.camera, record.file.name, placement, record.pitch)
 
 
 def _look(shot, models, *, read, board, picks, lines=None, relief=None):
@@ -292,17 +279,18 @@ def _by_camera(cameras, views):
 
 
 def _choices(session, purposes):
-    """Records in lists of those of which one is to be used, the best first."""
+    """Shots in lists of those of which one is to be used, the best first."""
     groups = {}
     for record in session.image_records:
         if record.purpose in purposes:
-            placement = _placement(record)
-            alone = record.file if placement < 0 else None
-            groups.setdefault((record.camera, placement, alone), []).append(record)
+            view = _view(record)
+            alone = record.file if view.placement < 0 else None
+            group = groups.setdefault((view.camera, view.placement, alone), [])
+            group.append(Shot(record, view))
     for group in groups.values():
-        pitch = [record.pitch for record in group]
+        pitch = [shot.view.pitch for shot in group]
         middle = (min(pitch) + max(pitch)) / 2
-        group.sort(key=lambda record: abs(record.pitch - middle))
+        group.sort(key=lambda shot: abs(shot.view.pitch - middle))
     return groups.values()
 
 
@@ -311,8 +299,8 @@ def _first(group, begin):
     does.
     """
     begun = []
-    for record in group:
-        begun.append(begin(record))
+    for shot in group:
+        begun.append(begin(shot))
         if not begun[-1].reason:
             return begun[-1]
     return begun[0]
@@ -326,24 +314,17 @@ def _survey_plain(session, look, models, unknown):
             f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find "
             "them with: state them"
         )
-    begin = partial(_begin_plain, look=partial(look, models=models))
-    first = partial(_first, begin=begin)
+    first = partial(_first, begin=partial(look, models=models))
     views = _turned_alike(spread(first, _choices(session, {"board"})))
     return Survey(_by_camera(models, views), models, None, board)
 
 
-def _begin_plain(record, look):
-    """The view of a board without pattern."""
-    return look(Shot(record, _view(record)))
-
-
-def _begin(record, read, board, finder, count):
+def _begin(shot, read, board, finder, count):
     """A shot with the corners of the pattern in any order, or with the reason why not.
 
     With the part of the image that is looked at again, where there is room for so many.
     """
-    image = read(record)
-    shot = Shot(record, _view(record))
+    image = read(shot.record)
     try:
         corners = finder(image)
     except PatternNotFound as error:
@@ -463,21 +444,23 @@ def _orders(shots, pattern, models, mirrored):
 
     Corners (m, n, k, 2) in n orders, those that belong together in one column, m stacks of the
     rough ``T_camera_board`` that go with them, and the leaders of
-    :class:`lrfcal_lib.preprocess.turns.Alike`.
+    :func:`lrfcal_lib.preprocess.turns.alike`.
     """
     orders = pattern_orders(pattern, mirrored=mirrored)
     turns = turned_boards(pattern, orders)
-    poses = []
-    for shot in shots:
-        model = models[shot.record.camera]
-        poses.append(first_pose(pattern.points(), shot.view.pixels, model) * turns)
-    together = alike([pose.rotation for pose in poses], [shot.view for shot in shots])
+    poses = [
+        first_pose(pattern.points(), shot.view.pixels, models[shot.view.camera]) * turns
+        for shot in shots
+    ]
+    leader, together = alike(
+        [pose.rotation for pose in poses], [shot.view for shot in shots]
+    )
     corners = []
     posed = []
-    for shot, pose, order in zip(shots, poses, together.order, strict=True):
+    for shot, pose, order in zip(shots, poses, together, strict=True):
         corners.append(shot.view.pixels[orders[order]])
         posed.append(pose[order])
-    return np.array(corners), posed, together.leader
+    return np.array(corners), posed, leader
 
 
 def _order_scores(shot_and_poses, read, board, models):
@@ -495,9 +478,9 @@ def _turned_alike(views):
         poses = [view, *view.alternatives]
         rotation = Rotation.concatenate([each.T_camera_board.rotation for each in poses])
         normals = rotation.as_matrix()[:, :, 2]
-        same = np.flatnonzero(normals @ normals[0] > SAME_PLANE)
-        turned.append([poses[i] for i in same])
+        same = normals @ normals[0] > SAME_PLANE
+        turned.append(list(compress(poses, same)))
         rotations.append(rotation[same])
-    together = alike(rotations, posed)
-    chosen = [same[order[0]] for same, order in zip(turned, together.order, strict=True)]
+    _, together = alike(rotations, posed)
+    chosen = [same[order[0]] for same, order in zip(turned, together, strict=True)]
     return chosen + [view for view in views if view.reason]

@@ -1,7 +1,5 @@
 """Boards that look the same when turned: one turn for all images of a placement."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -13,22 +11,6 @@ UPRIGHT = 0.05
 # a board frame whose z points into the board is believed when the other explains less than this
 # share
 CLEARLY = 0.95
-
-
-@dataclass(frozen=True)
-class Alike:
-    """Orders of a pattern's corners that belong together in images of one placement.
-
-    Attributes
-    ----------
-    leader : ndarray of int, shape (m,)
-        The first image of the same placement.
-    order : list of ndarray of int, shape (n,)
-        By image (m), the order in it that goes with each order in the leader.
-    """
-
-    leader: np.ndarray
-    order: list[np.ndarray]
 
 
 def turned_boards(pattern: Chessboard, orders: np.ndarray) -> RigidTransform:
@@ -53,7 +35,7 @@ def turned_boards(pattern: Chessboard, orders: np.ndarray) -> RigidTransform:
     return carry(rotation, middle, middle)
 
 
-def alike(rotations, views) -> Alike:
+def alike(rotations, views) -> tuple[list[int], list[np.ndarray]]:
     """Which orders of a pattern's corners belong together in the images of one placement.
 
     Between two images of one camera the head turns by less than any two orders differ. How a camera
@@ -70,7 +52,10 @@ def alike(rotations, views) -> Alike:
 
     Returns
     -------
-    Alike
+    leader : list of int
+        By image (m), the first one of the same placement.
+    order : list of ndarray of int, shape (n,)
+        By image (m), the order in it that goes with each order in the leader.
     """
     placements = [view.placement for view in views]
     leader = [i if p < 0 else placements.index(p) for i, p in enumerate(placements)]
@@ -88,7 +73,7 @@ def alike(rotations, views) -> Alike:
         turn = turn_of_camera[views[i].camera] * turn_of_camera[views[j].camera].inv()
         off = [(rotations[i] * ahead.inv()).magnitude() for ahead in turn * rotations[j]]
         order.append(np.argmin(off, axis=1))
-    return Alike(np.array(leader, int), order)
+    return leader, order
 
 
 def _between(base, other):
@@ -105,7 +90,7 @@ def _between(base, other):
     cost = UPRIGHT * candidates.magnitude()
     for turns in possible:
         cost += [(turns * candidate.inv()).magnitude().min() for candidate in candidates]
-    return candidates[int(np.argmin(cost))]
+    return candidates[np.argmin(cost)]
 
 
 def decide(scores: np.ndarray, leader: np.ndarray) -> np.ndarray:
@@ -116,8 +101,8 @@ def decide(scores: np.ndarray, leader: np.ndarray) -> np.ndarray:
     scores : ndarray, shape (m, n)
         How well each order explains each image, those that belong together in one column; orders
         of a mirrored board frame are the second half.
-    leader : ndarray of int, shape (m,)
-        See :class:`Alike`.
+    leader : sequence of int, length m
+        See :func:`alike`.
 
     Returns
     -------
