@@ -393,7 +393,8 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
                 severe=True,
             )
     unknown = calibration.platform.problem("combined")
-    if unknown and prepared.swept["half_step"]:
+    sweeps = any(len(ways["half_step"]) > 1 for ways in prepared.edges.values())
+    if unknown and sweeps:
         yield Fault(Kind.FAR_FROM_STATED, unknown.words, severe=True)
 
 
