@@ -86,6 +86,14 @@ def test_results_come_first_hashes_last_and_lenses_are_camera_models(record, qui
         )
 
 
+def test_a_lens_that_nothing_determined_is_read_without_bound(record, tmp_path):
+    where = ("cameras", "left", "lens", "covariance")
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(changed(record, where, [[None] * 9] * 9)))
+    covariance = load_calibration(path).cameras["left"].model.covariance
+    np.testing.assert_array_equal(covariance, np.full((9, 9), np.inf))
+
+
 def changed(record, where, value):
     data = json.loads(json.dumps(record))
     inner = data

@@ -17,7 +17,6 @@ from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import (
     Endless,
-    LensStated,
     LrfInfo,
     Positive,
     from_json,
@@ -90,11 +89,18 @@ class PlatformWritten(BaseModel):
     axis_covariance: Annotated[np.ndarray, rows(4, 4)]
 
 
-class LensWritten(LensStated):
-    """What ``CameraModel(**lens)`` takes."""
+class LensWritten(BaseModel):
+    """What ``CameraModel(**lens)`` takes; without bound where a calibration has not determined it."""
 
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
+    fx: Positive
+    fy: Positive
+    cx: FiniteFloat
+    cy: FiniteFloat
+    distortion: Annotated[np.ndarray, rows(5)]
+    covariance: Annotated[np.ndarray, rows(9, 9)] | None
+    rms_px: FiniteFloat | None
 
 
 class CameraWritten(BaseModel):
