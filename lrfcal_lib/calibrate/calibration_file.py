@@ -90,7 +90,7 @@ class PlatformWritten(BaseModel):
 
 
 class LensWritten(BaseModel):
-    """What ``CameraModel(**lens)`` takes; without bound where a calibration has not determined it."""
+    """What ``CameraModel(**lens)`` takes; without bound where nothing has determined it."""
 
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
