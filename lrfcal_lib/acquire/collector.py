@@ -5,14 +5,12 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lrfcal_lib.acquire.checks import Light, check_placement
-from lrfcal_lib.acquire.record import Recording, RecordingError, Sweeping
+from lrfcal_lib.acquire.record import Recording, RecordingError, View
 from lrfcal_lib.calibrate.pipeline import (
     Calibration,
     calibrate,
@@ -21,9 +19,8 @@ from lrfcal_lib.calibrate.pipeline import (
     prepare,
 )
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
-from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned
+from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import Placement, read_rig_file, rig_of
-from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.judge.verdict import YES, judge, verdict
 from lrfcal_lib.model.geometry import POSE_UNITS, DegenerateGeometry
@@ -178,39 +175,6 @@ class Interrupted(RuntimeError):
     """The user stopped what was under way."""
 
 
-@dataclass
-class View(Sweeping):
-    """What the rig sees, and how far the placement recorded last is."""
-
-    ranges: np.ndarray | None = None  # (B,), of the newest scan, metres
-    bearings: np.ndarray | None = None  # (B,), radians
-    measured: bool = False  # the head tells its pitch
-    frames: dict[str, Frame] = field(default_factory=dict)  # the newest by camera
-    # ranges by pitch, of the placement recorded last
-    rows: dict[float, np.ndarray] = field(default_factory=dict)
-    trouble: str = ""  # what cannot be seen, and why
-
-    def note(self, event: Event) -> None:
-        """Take an event of the placement into account.
-
-        Parameters
-        ----------
-        event
-            Of the placement.
-        """
-        super().note(event)
-        match event:
-            case Moved():
-                self.measured = event.measured
-            case Scanned():
-                for reading, pitch in zip(event.readings, event.pitch, strict=True):
-                    self.rows[pitch] = reading.ranges
-                self.ranges = reading.ranges
-                self.bearings = reading.bearings
-            case Photographed():
-                self.frames[event.camera] = event.frame
-
-
 class Collector(Closed):
     """Connects a rig, records with it and calibrates what was recorded; a context manager.
 
@@ -257,9 +221,7 @@ class Collector(Closed):
     @property
     def finished(self) -> tuple[int, ...]:
         """Numbers of the placements that are recorded and safe."""
-        if self.recording is None:
-            return ()
-        return self.recording.finished
+        return self.recording.finished if self.recording else ()
 
     def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> Rig:
         """Open a rig and a session; one that was recorded with the same rig goes on.

@@ -439,11 +439,7 @@ class Panel(Closed):
         collector = self.collector
         parts = self.parts
         parts.state.value = HTML.state("ready" if collector.connected else "off")
-        parts.task.value = HTML.title("Next placement") + HTML.soft("connect a rig first")
-        if collector.connected:
-            parts.task.value = HTML.task(
-                collector.task(), collector.emulated, collector.finished
-            )
+        parts.task.value = HTML.task(collector, collector.task())
         parts.enable(collector, busy=False)
 
     def _show_progress(self, share, text):

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from lrfcal_lib.acquire.checks import Light, check_scene
-from lrfcal_lib.acquire.record import Boards, ask_before
+from lrfcal_lib.acquire.record import Boards
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import ListedPlacement, Placement, RigFile
 from lrfcal_lib.measure.planning import plan_images
 from lrfcal_lib.measure.scene import colored_blocks, station_of
@@ -30,6 +29,8 @@ class Stations(Boards):
     rig
         What is known of the rig; without, images are taken where the plan says.
     """
+
+    kind = "station"
 
     def __init__(self, count: int, rig: CalibratedRig | None = None):
         self.count = count
@@ -83,19 +84,13 @@ class Stations(Boards):
         )
         return images
 
-    def ready(self, rig: Rig, placement: Placement, before: int | None) -> str:
+    def place_of(self, placement: Placement) -> int | str:
         """As of :class:`Boards`; an emulated rig goes where its plan puts the station."""
-        place: int | str = "none"
-        if placement.number in self._listed:
-            place = placement.number
-        if rig.move_board(place):
-            return ""
-        return ask_before(
-            "station",
-            placement.number,
-            "set the rig up, so that nobody moves it or walks by",
-            before,
-        )
+        return placement.number if placement.number in self._listed else "none"
+
+    def to_prepare(self, placement: Placement) -> str:
+        """As of :class:`Boards`."""
+        return "set the rig up, so that nobody moves it or walks by"
 
     def check(self, session: Session, number: int) -> list[Light]:
         """How good a station is: share of returns, share with a colour, whether it moved."""

@@ -120,7 +120,7 @@ class Scenario(Devices):
         axis in the board, anywhere in the image.
         """
         angle = rng.uniform(0, 2 * np.pi, count)
-        axis = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
+        axis = polar_to_points(1.0, angle)
         rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
         away = rng.uniform(*self.distances, count)
         pixels = rng.uniform(0, self.model.size, (count, 2))
@@ -129,12 +129,9 @@ class Scenario(Devices):
 
     def _around(self, rng, count):
         """Poses ``T_world_lrf`` of an LRF that looks at the origin but for turns."""
-        direction = np.zeros((count, 3))
-        open_ = np.ones(count, bool)
-        while open_.any():
-            v = rng.uniform(0, 1, (open_.sum(), 3))
-            direction[open_] = unit_vector(v)
-            open_ = direction.min(axis=1) < np.sin(self.least_angle)
+        direction = np.full((count, 3), -1.0)
+        while np.any(open_ := direction.min(axis=1) < np.sin(self.least_angle)):
+            direction[open_] = unit_vector(rng.uniform(0, 1, (open_.sum(), 3)))
         z = -direction
         x = unit_vector(np.cross(z, [0.0, 0.0, 1.0]))
         looking = np.stack([x, np.cross(z, x), z], axis=-1)
@@ -183,10 +180,10 @@ def draw_shots(
     while missing.any() and len(parts) < MOST_ROUNDS:
         trial = np.repeat(np.arange(trials), 2 * missing)
         conditions, shots = draw(setup, rng, T_camera_lrf[trial])
-        usable = np.logical_and.reduce(list(conditions.values()))
-        failing.append([100 * np.mean(~good) for good in conditions.values()])
+        good = np.array([*conditions.values()])
+        failing.append(100 * np.mean(~good, axis=1))
         shots["trial"] = trial
-        part = {name: value[usable] for name, value in shots.items()}
+        part = {name: value[good.all(axis=0)] for name, value in shots.items()}
         parts.append(part)
         missing = np.maximum(missing - np.bincount(part["trial"], minlength=trials), 0)
     if missing.any():
