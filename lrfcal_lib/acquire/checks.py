@@ -1,7 +1,6 @@
 """Is what was just recorded any good? Lights for one placement, from what is on the disk."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
@@ -49,9 +48,7 @@ class Light:
     text: str
 
 
-def check_placement(
-    session: Session, placement: int, advice: Callable[[Session], str] | None = None
-) -> list[Light]:
+def check_placement(session: Session, placement: int) -> list[Light]:
     """Check a placement that was just recorded.
 
     Nothing is raised for data that cannot be used: that is what the lights are for.
@@ -62,15 +59,12 @@ def check_placement(
         Opened after the placement was finished.
     placement
         Its number.
-    advice
-        ``advice(session)`` says in a sentence what the next placement should add; '' if all is
-        known well enough.
 
     Returns
     -------
     list of Light
         'scan', 'edges', 'recording' for each of its scans and images that another placement has,
-        too, one for each camera, and 'information' where there is advice.
+        too, and one for each camera.
     """
     try:
         sweep = session.sweep(placement)
@@ -93,11 +87,6 @@ def check_placement(
             for record in session.images(name, placement)
         ]
         lights.append(_together(f"camera {name}", images))
-    if advice is not None:
-        light = Light("information", "ok", "every direction is well determined")
-        if text := advice(session):
-            light = Light("information", "warn", text)
-        lights.append(light)
     return lights
 
 
@@ -155,12 +144,12 @@ def check_scan(
         f"{1000 * scan.sigma_range:.1f} mm rms"
     )
     cut = [*compress(("first", "last"), hit[[0, -1]])]
-    light = Light("scan", "ok", text)
+    fault = ""
     if hit.sum() < FEWEST_LINES:
-        light = Light("scan", "warn", f"{text}: take a smaller step, or go nearer")
+        fault = ": take a smaller step, or go nearer"
     elif cut and np.ptp(sweep.pitch) > 0:
-        words = f"{text}; the {' and '.join(cut)} line hits it: sweep farther"
-        light = Light("scan", "warn", words)
+        fault = f"; the {' and '.join(cut)} line hits it: sweep farther"
+    light = Light("scan", "warn" if fault else "ok", text + fault)
     return [light, _check_sides(scan)]
 
 

@@ -352,9 +352,7 @@ class Collector(Closed):
         if self._devices.acquire(blocking=False):
             try:
                 view.pitch, view.measured = rig.head.pitch()
-                reading = _scan(rig.lrf)
-                view.ranges = reading.ranges
-                view.bearings = reading.bearings
+                view.reading = _scan(rig.lrf)
             except DeviceError as error:
                 troubles.append(str(error))
             finally:
@@ -407,11 +405,14 @@ class Collector(Closed):
             self._record(placement, progress)
         progress(1.0, "checking what was recorded")
         session = open_session(recording.path)
-        adviser = None  # while every other placement helps
-        if len(session.board_placements) >= ADVICE_FROM:
-            adviser = self._advise
-        self.lights[number] = check_placement(session, number, adviser)
-        return self.lights[number]
+        lights = check_placement(session, number)
+        if placement.purpose == "board" and len(session.board_placements) >= ADVICE_FROM:
+            self._advice = advise(session)
+            state = "warn" if self._advice else "ok"
+            words = self._advice or "every direction is well determined"
+            lights.append(Light("information", state, words))
+        self.lights[number] = lights
+        return lights
 
     def _record(self, placement, progress):
         """Record a placement; Interrupted if the user stops it."""
@@ -429,10 +430,6 @@ class Collector(Closed):
                 raise Interrupted(
                     f"stopped: placement {placement.number} does not count, record it again"
                 ) from error
-
-    def _advise(self, session):
-        self._advice = advise(session)
-        return self._advice
 
     def again(self) -> int:
         """Take the placement recorded last out of the session, to record it again; its number.

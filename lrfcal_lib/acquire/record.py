@@ -10,10 +10,10 @@ from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 from tqdm import tqdm
 
 from lrfcal_lib.acquire.checks import Light, check_image, check_placement
+from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, read_rig_file
@@ -324,11 +324,10 @@ class View:
     measured: bool = False  # the head tells its pitch
     stop: str = ""
     share: float = 0.0  # of the sweep
-    ranges: np.ndarray | None = None  # (B,), of the newest scan, metres
-    bearings: np.ndarray | None = None  # (B,), radians
+    reading: Reading | None = None  # the newest
     frames: dict[str, Frame] = field(default_factory=dict)  # the newest by camera
-    # ranges by pitch, of the placement recorded last
-    rows: dict[float, np.ndarray] = field(default_factory=dict)
+    # by pitch, of the placement recorded last
+    rows: dict[float, Reading] = field(default_factory=dict)
     trouble: str = ""  # what cannot be seen, and why
 
     def note(self, event: Event) -> None:
@@ -341,11 +340,9 @@ class View:
                 self.share = (event.number - 1) / event.of
             case Scanned():
                 self.scans += len(event.readings)
-                for reading, pitch in zip(event.readings, event.pitch, strict=True):
-                    self.rows[pitch] = reading.ranges
-                self.pitch = pitch
-                self.ranges = reading.ranges
-                self.bearings = reading.bearings
+                self.rows |= zip(event.pitch, event.readings, strict=True)
+                self.pitch = event.pitch[-1]
+                self.reading = event.readings[-1]
                 if math.isfinite(event.share):
                     self.share = event.share
             case Photographed():
@@ -453,15 +450,14 @@ def record_session(
     rig: Rig,
     path: str | os.PathLike,
     *,
-    resume: bool = False,
-    count: int | None = None,
     guide: Boards = BOARDS,
+    **options,
 ) -> Recording:
     """Record a session with an open rig, from the first placement that is missing to the last.
 
     Parameters
     ----------
-    rig, path, resume, count
+    rig, path, **options
         As of :class:`Recording`.
     guide
         What is asked before a placement, and checked after it.
@@ -476,7 +472,7 @@ def record_session(
     DeviceError, SessionError, RecordingError
         With a note that says what is safe.
     """
-    with Recording(rig, path, resume=resume, count=count) as recording:
+    with Recording(rig, path, **options) as recording:
         if recording.finished:
             print(f"{path}: going on, {recording.safe()}", flush=True)
         try:
@@ -526,12 +522,7 @@ def _placements(recording, guide):
 
 
 def main(
-    rig_file: str | os.PathLike,
-    path: str | os.PathLike,
-    *,
-    resume: bool = False,
-    count: int | None = None,
-    guide: Boards = BOARDS,
+    rig_file: str | os.PathLike, path: str | os.PathLike, guide: Boards = BOARDS, **options
 ) -> int:
     """Record from the command line.
 
@@ -539,9 +530,7 @@ def main(
     ----------
     rig_file
         Its path.
-    path, resume, count
-        As of :func:`record_session`.
-    guide
+    path, guide, **options
         As of :func:`record_session`.
 
     Returns
@@ -555,7 +544,7 @@ def main(
         stated = guide.planned(read_rig_file(rig_file))
         print(f"{rig_file}: opening the devices", flush=True)
         with Rig.open(stated) as rig:
-            recording = record_session(rig, path, resume=resume, count=count, guide=guide)
+            recording = record_session(rig, path, guide=guide, **options)
     except (
         DeviceError,
         RecordingError,

@@ -43,12 +43,6 @@ class Stations(Boards):
 
         Sweep and numbers are those of the scenes that the plan lists, as far as there are any.
         """
-        if self.rig is not None:
-            # what its range finder is set to shows once it is open
-            known: Any = SimpleNamespace(
-                name=stated.path, cameras=stated.cameras, lrf=self.rig.lrf
-            )
-            require_same_rig(self.rig, known)
         plan = stated.plan
         numbers = [p.number for p in plan.to_do() if p.purpose == "scene"][: self.count]
         self._listed = tuple(numbers)
@@ -57,6 +51,11 @@ class Stations(Boards):
         sweep = scene.pitch_deg or plan.pitch_deg
         images = scene.image_pitch_deg or plan.image_pitch_deg
         if self.rig is not None:
+            # what its range finder is set to shows once it is open
+            known: Any = SimpleNamespace(
+                name=stated.path, cameras=stated.cameras, lrf=self.rig.lrf
+            )
+            require_same_rig(self.rig, known)
             images = self._images(sweep, stated.devices.head.pitch_limits_deg)
         while len(numbers) < self.count:
             numbers.append(max(numbers, default=0) + 1)
@@ -98,17 +97,13 @@ class Stations(Boards):
         lights = [check_scene(sweep)]
         if self.rig is not None:
             require_same_rig(self.rig, session)
-            lights.append(self._colors(session, number))
+            station = station_of(session, self.rig, number)
+            seen = [cloud.seen for cloud in colored_blocks(session, self.rig, station)]
+            share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
+            text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
+            state = "ok" if share > EXPECTED * self.share else "warn"
+            lights.append(Light("colour", state, text))
         return [*lights, _still(sweep)]
-
-    def _colors(self, session, number):
-        """The Light of the share of points that get a colour."""
-        station = station_of(session, self.rig, number)
-        seen = [cloud.seen for cloud in colored_blocks(session, self.rig, station)]
-        share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
-        text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
-        state = "ok" if share > EXPECTED * self.share else "warn"
-        return Light("colour", state, text)
 
 
 def _still(sweep):

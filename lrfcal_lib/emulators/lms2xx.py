@@ -188,7 +188,9 @@ class EmulatedLms(SerialDevice):
                 # the scan that is being measured when the request is whole
                 begun = at + ACK_S + 2 * self.byte_s
                 scans = math.floor((begun - self._zero) / MIRROR_TURN / memory.turns)
-                self._measure(scans * memory.turns, -1, partial(self.emit, then=self._finish))
+                self._measure(
+                    scans * memory.turns, -1, partial(self.emit, then=self._finish)
+                )
             case code, data if (reply := memory.reply(code, data)) is not None:
                 delay = WRITE_S if code in WRITTEN else REPLY_S
                 self.answer(at, 0x80 | code, reply, delay=delay)
@@ -394,9 +396,7 @@ class EmulatedLms(SerialDevice):
         if memory.mode == REFLECTIVITY:  # behind every range
             answered = words <= largest(ENCODED[configuration.measuring_mode])
             words = np.stack([words, WHITE * answered], axis=1)
-        indices = None
-        if configuration.realtime_indices:
-            indices = scan.turn, self.telegrams
+        indices = (scan.turn, self.telegrams) if configuration.realtime_indices else None
         return codec.encode_words(
             words,
             unit=configuration.unit,

@@ -106,17 +106,15 @@ class EmulatedRig:
     def plan(self) -> dict:
         """What a recording of this rig can do: its placements, each with its sweep."""
         setup = self.setup
-        placements = []
-        for placement in self.world.placements.values():
-            sweep = [*placement.sweep, setup.step_of(placement)]
-            placements.append(
-                {
-                    "number": placement.number,
-                    "board": placement.purpose == "board",
-                    "pitch_deg": np.degrees(sweep).round(4).tolist(),
-                    "image_pitch_deg": np.degrees(placement.image_pitch).round(4).tolist(),
-                }
-            )
+        placements = [
+            {
+                "number": p.number,
+                "board": p.purpose == "board",
+                "pitch_deg": np.degrees([*p.sweep, setup.step_of(p)]).round(4).tolist(),
+                "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
+            }
+            for p in self.world.placements.values()
+        ]
         return {"intrinsics_images": setup.intrinsics_views, "placements": placements}
 
     def rig_file(self) -> dict:
@@ -177,10 +175,10 @@ class EmulatedRig:
 def practice_setup() -> tuple[Setup, list[Placement]]:
     """A rig and placements that are recorded in a minute."""
     setup = load_setup(PRACTICE)
-    placements = []
-    for placement in placements_of(setup):
-        images = placement.image_pitch
-        placements.append(replace(placement, image_pitch=(images[0], images[-1])))
+    placements = [
+        replace(p, image_pitch=(p.image_pitch[0], p.image_pitch[-1]))
+        for p in placements_of(setup)
+    ]
     return setup, placements
 
 

@@ -248,11 +248,29 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self):
         """Send the images of a camera."""
+        server = self.server
         name = self.path.strip("/").removesuffix(".mjpg")
-        if name in self.server.cameras:
-            return self._stream(name)
-        known = ", ".join(f"{name}.mjpg" for name in self.server.cameras)
-        return self.send_error(404, f"there are {known}")
+        if name not in server.cameras:
+            known = ", ".join(f"{camera}.mjpg" for camera in server.cameras)
+            self.send_error(404, f"there are {known}")
+            return
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            self.send_response(200)
+            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+            self.send_header("Cache-Control", "no-cache")
+            self.end_headers()
+            while not server.quit.is_set():
+                _, data = server.image(name)
+                if data is None:
+                    # a blank line: the camera lives, its head moves
+                    self.wfile.write(b"\r\n")
+                else:
+                    head = (
+                        "--frame\r\nContent-Type: image/jpeg\r\n"
+                        f"Content-Length: {len(data)}\r\n\r\n"
+                    )
+                    self.wfile.write(head.encode() + data + b"\r\n")
+                    server.quit.wait(1 / FPS)
 
     def do_POST(self):
         """Move the board."""
@@ -275,26 +293,6 @@ class _Handler(BaseHTTPRequestHandler):
             return self.send_error(400, str(error))
         self.send_response(204)
         return self.end_headers()
-
-    def _stream(self, name):
-        server = self.server
-        with contextlib.suppress(ConnectionError, TimeoutError):
-            self.send_response(200)
-            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-            self.send_header("Cache-Control", "no-cache")
-            self.end_headers()
-            while not server.quit.is_set():
-                _, data = server.image(name)
-                if data is None:
-                    # a blank line: the camera lives, its head moves
-                    self.wfile.write(b"\r\n")
-                else:
-                    head = (
-                        "--frame\r\nContent-Type: image/jpeg\r\n"
-                        f"Content-Length: {len(data)}\r\n\r\n"
-                    )
-                    self.wfile.write(head.encode() + data + b"\r\n")
-                    server.quit.wait(1 / FPS)
 
     def log_message(self, *_):
         pass

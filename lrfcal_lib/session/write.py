@@ -262,7 +262,7 @@ class SessionWriter:
         pitch: float = math.nan,
         time_s: float = math.nan,
         purpose: str = "board",
-    ) -> None:
+    ) -> str:
         """Append an image.
 
         Parameters
@@ -278,6 +278,11 @@ class SessionWriter:
             Seconds.
         purpose
             'board', 'intrinsics' or 'scene'.
+
+        Returns
+        -------
+        str
+            Its place in the session.
 
         Raises
         ------
@@ -302,6 +307,7 @@ class SessionWriter:
         angle = cell(math.degrees(pitch))
         row = [cell(time_s), camera, name, number_cell(placement), angle, purpose]
         self._append_rows("images.csv", [row])
+        return name
 
 
 def finish(path: str | os.PathLike) -> None:

@@ -5,6 +5,7 @@ import os
 import shutil
 from dataclasses import asdict
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -135,18 +136,18 @@ def close_views(setup: Setup, number: int) -> list[Placement]:
 
 def shots_of(setup, placements):
     """All images of a setup in the order in which they are written, a list of Shots."""
-    out = []
     cameras = range(len(setup.rig.cameras))
     still = Stops(*np.zeros((3, 1)))
-    for number in cameras:
-        for i, close in enumerate(close_views(setup, number)):
-            out.append(Shots(number, close, still, (PHOTO, number, 0, i)))
-    for placement in placements:
-        stops, _ = stops_of(setup, placement)
-        for number in cameras:
-            key = (PHOTO, number, placement.number)
-            out.append(Shots(number, placement, stops, key))
-    return out
+    close = [
+        Shots(number, placement, still, (PHOTO, number, 0, i))
+        for number in cameras
+        for i, placement in enumerate(close_views(setup, number))
+    ]
+    return close + [
+        Shots(number, p, stops_of(setup, p)[0], (PHOTO, number, p.number))
+        for p in placements
+        for number in cameras
+    ]
 
 
 def photograph(setup, shots):
@@ -277,15 +278,15 @@ def _add_placements(writer, setup, placements, truth):
     configuration = Configuration().changed(unit=unit)
     writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
     shots = shots_of(setup, placements)
-    taken = list(zip(shots, spread(partial(photograph, setup), shots), strict=True))
-    close = [pair for pair in taken if pair[0].placement.purpose == "intrinsics"]
+    taken = zip(shots, spread(partial(photograph, setup), shots), strict=True)
+    cameras = len(setup.rig.cameras)
+    close = islice(taken, cameras * setup.intrinsics_views)
     _add_images(writer, setup, close, truth, [np.nan])
     for placement in placements:
         number = placement.number
         images, lines = stops_of(setup, placement)
         shot_at = clock + pause * np.arange(1, len(images.true) + 1)
-        own = [pair for pair in taken if pair[0].placement == placement]
-        _add_images(writer, setup, own, truth, shot_at)
+        _add_images(writer, setup, islice(taken, cameras), truth, shot_at)
         first = shot_at[-1] + pause
         began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
@@ -304,12 +305,11 @@ def _add_images(writer, setup, taken, truth, times):
     rig = setup.rig
     for shot, images in taken:
         camera = rig.cameras[shot.camera]
-        name = camera.name
         board = shot.placement.T_platform_board
         stops = zip(images, times, shot.stops.true, shot.stops.measured, strict=True)
         for data, time_s, true, measured in stops:
-            writer.add_image(
-                name,
+            file = writer.add_image(
+                camera.name,
                 data,
                 shot.placement.number,
                 pitch=measured,
@@ -320,4 +320,4 @@ def _add_images(writer, setup, taken, truth, times):
             if board is not None:
                 T_camera_board = rig.camera_pose(camera, true) * board
                 known["T_camera_board"] = transform_to_json(T_camera_board)
-            truth["images"][f"images/{name}/{writer.shots[name]:04d}.jpg"] = known
+            truth["images"][file] = known

@@ -35,7 +35,6 @@ MOST_TRIES = 4000
 PITCH_GRID = np.radians(
     np.arange(-30.0, 30.1, 0.5)
 )  # pitch angles at which an image may be taken
-OUTSIDE = np.radians(2.0)  # a sweep begins and ends this far outside the board
 LEAST_SPAN = np.radians(4.0)  # of the pitch angles at which all cameras see the board
 CLOSE = -1  # number of a placement that is held close to a camera,
 NEAR = (0.22, 0.45)  # so many metres away
@@ -186,15 +185,15 @@ class Setup:
     rig: InstanceOf[Rig]
     pairs: NonNegativeInt  # pairs of board placements; none in a recording of the room only
     distances: tuple[float, float]  # of the board, metres
-    step: PositiveFloat = math.radians(0.25)  # between the stops of a sweep, radians
-    margin: PositiveFloat = OUTSIDE  # of a sweep beyond the board, radians
-    intrinsics_views: NonNegativeInt = 20  # images of the board held close, a camera
+    step: PositiveFloat  # between the stops of a sweep, radians
+    margin: PositiveFloat  # of a sweep beyond the board, radians
+    intrinsics_views: NonNegativeInt  # images of the board held close, a camera
     # first pitch, last pitch and step of the sweep of the room, radians; empty for none
-    room_sweep: tuple[()] | tuple[float, float, float] = ()
-    room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
+    room_sweep: tuple[()] | tuple[float, float, float]
+    room_images: tuple[float, ...]  # pitch angles of the images of the room, radians
     # T_room_platform of each sweep of the room; empty for one sweep from where the boards are seen
-    stations: tuple[InstanceOf[RigidTransform], ...] = ()
-    quality: Annotated[int, Field(ge=1, le=100)] = 95  # of JPEG
+    stations: tuple[InstanceOf[RigidTransform], ...]
+    quality: Annotated[int, Field(ge=1, le=100)]  # of JPEG
 
     def step_of(self, placement: "Placement") -> float:
         """Between the stops of a sweep, radians."""
@@ -225,17 +224,18 @@ def load_setup(name: str) -> Setup:
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
     row = in_radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
-    seen = row["image_width"], row["exposure"]
-    cameras = [_camera(key, camera, *seen) for key, camera in row["cameras"].items()]
     rig = Rig(
         beam=replace(LMS221, **row["beam"]),
         platform=Platform(**in_radians(row["platform"])),
         T_head_lrf=_placed(row["head"]),
         T_head_lrf_stated=_placed(row["head_stated"]),
-        cameras=tuple(cameras),
+        cameras=tuple(
+            _camera(key, camera, row["image_width"], row["exposure"])
+            for key, camera in row["cameras"].items()
+        ),
         board=printed_triangle(),
     )
-    stations = tuple(_placed(station) for station in row.get("stations", ()))
+    stations = tuple(_placed(station) for station in row["stations"])
     # what else is in the row the Setup ignores
     return Setup(**row | {"name": name, "rig": rig, "stations": stations})
 
@@ -316,7 +316,7 @@ def pairs(
     count: int,
     distances: tuple[float, float],
     rng: np.random.Generator,
-    margin: float = OUTSIDE,
+    margin: float,
 ) -> list[Placement]:
     """Placements in pairs: at one place, turned by about a right angle and tilted otherwise.
 
