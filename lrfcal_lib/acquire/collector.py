@@ -100,7 +100,7 @@ class Result:
     """A calibration."""
 
     answer: str  # whether to trust it: yes, with care, no
-    sentences: tuple[str, ...]
+    sentences: list[str]
     method: str  # whose poses are handed over; '' where none is
     # by camera: rotation vector (degrees) and translation (mm), each with its sigma
     poses: dict[str, tuple[str, ...]]
@@ -125,9 +125,9 @@ def calibrate_recording(path: Path) -> Result:
     """
     calibration = calibrate(open_session(path), CANDIDATES)
     judged = judge(calibration)
-    sentences = tuple(judged.sentences())
+    sentences = judged.sentences()
     if not judged.errors:
-        sentences += ("Nothing is written.",)
+        sentences.append("Nothing is written.")
         return Result(judged.answer, sentences, "", {}, None, calibration)
     method = handed_over(calibration)
     poses = {}
