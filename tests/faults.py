@@ -237,6 +237,10 @@ class FaultyHead(FaultyLine, EmulatedHead):
             self.write(data, at)
         super().receive(data, at)
 
+    def pitch(self):
+        """True pitch now, radians."""
+        return float(self.head.pitch(self.host.now()))
+
     def turned(self, frame):
         """A frame as a head that hangs upside down understands it."""
         ways = frame.command2 & (pelco_d.UP | pelco_d.DOWN)

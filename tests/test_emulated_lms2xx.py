@@ -7,7 +7,6 @@ from virtual import Bench, lms
 from lrfcal_lib.session.lms2xx_frame import (
     encode_telegram,
 )
-from lrfcal_lib.simulate.beam import VARIANTS
 
 ZEROS = "00 " * 21
 TYPE = "02 00 01 00 3A 1E 12"
@@ -18,7 +17,9 @@ SCAN = "02 00 02 00 30 01 31 18"
 RESET = "02 00 01 00 10 34 12"  # fmt: skip
 STOP = "02 00 02 00 20 25 35 08"
 INSTALL = "02 00 0A 00 20 00 53 49 43 4B 5F 4C 4D 53 BE C5"
-VARIANT = {v: encode_telegram(0x3B, np.array(v, "<u2").tobytes()) for v in VARIANTS}
+VARIANT = {
+    v: encode_telegram(0x3B, np.array(v, "<u2").tobytes()) for v in ((180, 50), (100, 25))
+}
 WRITE_TL = f"02 00 23 00 77 00 00 70 00 00 00 01 00 00 02 02 {ZEROS} 02 00 11 88"
 WRITE_CAP = f"02 00 23 00 77 00 00 70 00 00 04 01 00 00 02 02 {ZEROS} 02 00 94 8A"
 

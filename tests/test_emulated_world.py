@@ -46,7 +46,7 @@ def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch_of_every_beam(
     times = 0.1 + QUARTERS % 4 / 75.08
     scans, _ = zip(*(world.scan(0, QUARTERS, times) for _ in range(30)), strict=True)
     pitch = world.head.pitch(times)
-    still = world_of(SETUP, placements[0].T_platform_board)
+    still = world_of(SETUP, placements[0])
     ideal = lrf.ideal_readings(
         beam, still, beam.bearings(), pitch + 0 * times, SETUP.rig.T_head_lrf
     )[0]
@@ -66,8 +66,8 @@ def test_the_board_is_moved_by_who_records(world):
     server.start()
     data["devices"]["control"] = server.control
     driver = make_rig(data)
-    assert driver.move_board(2) and world.place == ("placement", 2)
-    assert driver.hold_close("left", 3) and world.place == ("close", "left", 3)
+    assert driver.move_board(2) and world.current[0] == ("placement", 2)
+    assert driver.hold_close("left", 3) and world.current[0] == ("close", "left", 3)
     for call, message in (
         (
             lambda: driver.move_board(9),
@@ -105,7 +105,7 @@ def test_no_web_page_moves_the_board(world, order):
     request = urllib.request.Request(url, method=method, headers={"Host": host})
     with pytest.raises(urllib.error.HTTPError, match="40[34]"):
         urllib.request.urlopen(request, timeout=DEADLINE)
-    assert world.place == ("placement", None)
+    assert world.current[0] == ("placement", None)
     server.close()
 
 

@@ -92,7 +92,7 @@ def test_one_thing_at_a_time(connected, monkeypatch):
     assert begun.wait(WAIT_S)
     with pytest.raises(Busy, match="wait until it is done, or press stop"):
         connected.move_to(0.1)
-    assert connected.look().ranges is None  # the devices are left alone
+    assert connected.look().reading is None  # the devices are left alone
     go_on.set()
     thread.join(WAIT_S)
     assert connected.finished == (1,)
@@ -104,7 +104,7 @@ def test_what_cannot_be_done_yet_or_any_more(connected):
         with pytest.raises(DeviceError, match="press connect"):
             call()
     made.stop()
-    assert made.look().ranges is None and made.task() is None
+    assert made.look().reading is None and made.task() is None
     with pytest.raises(RecordingError, match="at least three placements"):
         connected.calibrate()
     with pytest.raises(RecordingError, match="no placement to record again"):
@@ -112,6 +112,15 @@ def test_what_cannot_be_done_yet_or_any_more(connected):
     connected.capture()
     with pytest.raises(RecordingError, match="plan of this rig is done"):
         connected.capture()
+
+
+def test_advice_is_a_light_and_where_the_board_goes_next(fake, tmp_path):
+    with Collector() as made:
+        made.connect(fake(), tmp_path / "s")
+        *before, lights = [made.capture() for _ in range(collector.ADVICE_FROM)]
+        assert "information" not in [light.name for each in before for light in each]
+        assert (lights[-1].name, lights[-1].state) == ("information", "warn")
+        assert lights[-1].text == made.task().guidance == "put it there"
 
 
 def test_advice_where_nothing_is_determined_yet(monkeypatch):
@@ -291,13 +300,17 @@ def a_calibration(path, answer="yes", size=SIZE):
     return path
 
 
+def view_of(ranges, bearings, pitch=0.0):
+    """What the rig sees where only a scan matters."""
+    reading = SimpleNamespace(ranges=ranges, bearings=bearings)
+    return SimpleNamespace(reading=reading, pitch=pitch)
+
+
 def test_the_scan_is_drawn_where_a_calibration_puts_it(panel, tmp_path):
     size = width, height = 320, 240
     image = np.zeros((height, width, 3), np.uint8)
     bearings = np.radians([75.0, 90.0, 105.0, 170.0])
-    view = SimpleNamespace(
-        ranges=np.array([1.0, np.nan, 3.0, 2.0]), bearings=bearings, pitch=0.2
-    )
+    view = view_of(np.array([1.0, np.nan, 3.0, 2.0]), bearings, pitch=0.2)
     plain, words = panel._overlaid("left", image, view)
     assert plain is image and "dots" not in words
     assert chosen(panel, a_calibration(tmp_path / "c.json", size=size)) == ""
@@ -313,7 +326,7 @@ def test_the_scan_is_drawn_where_a_calibration_puts_it(panel, tmp_path):
 
 
 def test_a_calibration_that_does_not_fit_is_said(panel, tmp_path):
-    view = SimpleNamespace(ranges=np.ones(3), bearings=np.ones(3), pitch=0.0)
+    view = view_of(np.ones(3), np.ones(3))
     image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     (tmp_path / "broken.json").write_text("{")
     assert "not JSON" in chosen(panel, tmp_path / "broken.json")
@@ -334,7 +347,7 @@ def test_what_check_says_of_the_calibration_is_marked(panel, fake, tmp_path, mon
     )
     monkeypatch.setattr(page, "holds", lambda session, rig: held)
     image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    view = SimpleNamespace(ranges=np.ones(3), bearings=np.full(3, 1.5), pitch=0.0)
+    view = view_of(np.ones(3), np.full(3, 1.5))
     scenes = [{"number": number, "board": False} for number in (1, 2)]
     panel.parts.rig.value = str(fake(placements=scenes))
     chosen(panel, a_calibration(tmp_path / "c.json"))

@@ -209,7 +209,7 @@ def spots_alone(setup, placement, lines):
     """
     spots = []
     hits = []
-    world = world_of(setup, placement.T_platform_board)
+    world = world_of(setup, placement)
     plain = beam.echo
     pitch = stops_of(setup, placement)[1].true[lines]
     bearings, pitch = np.broadcast_arrays(setup.rig.beam.bearings(), pitch[:, None])

@@ -11,7 +11,7 @@ from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.session.lms2xx_codec import largest
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate import lengths, record
-from lrfcal_lib.simulate.rig import load_setup
+from lrfcal_lib.simulate.rig import Placement, load_setup
 from lrfcal_lib.simulate.scene import furnished_room
 
 ROOM = DATA / "room_lms221"
@@ -96,7 +96,7 @@ def test_ends_of_lengths_lie_on_things_of_the_room():
         np.testing.assert_allclose(stored["ends"], computed["ends"], rtol=0, atol=1e-12)
     assert [row["kind"] for row in truth].count("edge-edge") == 10 and len(truth) == 20
     assert len({row["name"] for row in truth}) == 20
-    room = record.world_of(SETUP, None)
+    room = record.world_of(SETUP, Placement(0))
     for row in truth:
         assert 0.01 < row["metres"] < 6.5
         for corners in map(np.array, row["ends"]):

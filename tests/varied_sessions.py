@@ -370,7 +370,11 @@ def record(path, seed, **given):
     rig = rig_of(v)
     rng = np.random.default_rng([v.seed, 2])
     placements = pairs(
-        rig, v.placements // 2, v.distances, np.random.default_rng([v.seed, 3])
+        rig,
+        v.placements // 2,
+        v.distances,
+        np.random.default_rng([v.seed, 3]),
+        np.radians(2.0),
     )
     lrf = LrfInfo(
         f"{rig.beam.name} (varied)", tuple(rig.beam.bearings()[[0, -1]]), np.radians(v.resolution / 100), v.sigma_range,

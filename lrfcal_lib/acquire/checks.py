@@ -1,8 +1,8 @@
 """Is what was just recorded any good? Lights for one placement, from what is on the disk."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import cv2
@@ -48,9 +48,7 @@ class Light:
     text: str
 
 
-def check_placement(
-    session: Session, placement: int, advice: Callable[[Session], str] | None = None
-) -> list[Light]:
+def check_placement(session: Session, placement: int) -> list[Light]:
     """Check a placement that was just recorded.
 
     Nothing is raised for data that cannot be used: that is what the lights are for.
@@ -61,14 +59,12 @@ def check_placement(
         Opened after the placement was finished.
     placement
         Its number.
-    advice
-        ``advice(session)`` says in a sentence what the next placement should add; '' if all is
-        known well enough.
 
     Returns
     -------
     list of Light
-        'scan', 'edges', one for each camera, and 'information' where there is advice.
+        'scan', 'edges', 'recording' for each of its scans and images that another placement has,
+        too, and one for each camera.
     """
     try:
         sweep = session.sweep(placement)
@@ -78,7 +74,11 @@ def check_placement(
     if scene and sweep is not None:
         return [check_scene(sweep)]
     lights = check_scan(sweep, session.board, session.T_head_lrf, session.lrf)
-    lights += check_repetition(session, placement)
+    lights += [
+        Light("recording", "bad", fault.words)
+        for fault in (*repeated_images(session), *repeated_scans(session))
+        if placement in fault.placements
+    ]
     if scene:
         return lights
     for name, camera in session.cameras.items():
@@ -87,11 +87,6 @@ def check_placement(
             for record in session.images(name, placement)
         ]
         lights.append(_together(f"camera {name}", images))
-    if advice is not None:
-        light = Light("information", "ok", "every direction is well determined")
-        if text := advice(session):
-            light = Light("information", "warn", text)
-        lights.append(light)
     return lights
 
 
@@ -116,27 +111,8 @@ def _together(name, lights):
         return Light(name, "bad", "no image")
     good = [light for light in lights if light.state != "bad"]
     worst = max(good or lights, key=lambda light: STATES.index(light.state))
-    state = worst.state
-    if good and good != lights:
-        state = "warn"
+    state = "warn" if good and good != lights else worst.state
     return Light(name, state, f"{len(good)} of {len(lights)} images: {worst.text}")
-
-
-def check_repetition(session: Session, placement: int) -> list[Light]:
-    """A Light 'recording' for each of a placement's scans and images that another one has, too.
-
-    Parameters
-    ----------
-    session
-        With the placement.
-    placement
-        Its number.
-    """
-    return [
-        Light("recording", "bad", fault.words)
-        for fault in (*repeated_images(session), *repeated_scans(session))
-        if placement in fault.placements
-    ]
 
 
 def check_scan(
@@ -162,19 +138,18 @@ def check_scan(
         return [
             Light("scan", "bad", f"no board: {error}; sweep over all of it, free of walls")
         ]
-    rows = np.flatnonzero(scan.mask.any(axis=1))
+    hit = np.any(scan.mask, axis=1)
     text = (
-        f"board on {len(rows)} scan lines at {abs(scan.distance):.2f} m, "
+        f"board on {hit.sum()} scan lines at {abs(scan.distance):.2f} m, "
         f"{1000 * scan.sigma_range:.1f} mm rms"
     )
-    ends = {"first": 0, "last": len(sweep.pitch) - 1}
-    cut = [name for name, row in ends.items() if row in rows]
-    light = Light("scan", "ok", text)
-    if len(rows) < FEWEST_LINES:
-        light = Light("scan", "warn", f"{text}: take a smaller step, or go nearer")
+    cut = [*compress(("first", "last"), hit[[0, -1]])]
+    fault = ""
+    if hit.sum() < FEWEST_LINES:
+        fault = ": take a smaller step, or go nearer"
     elif cut and np.ptp(sweep.pitch) > 0:
-        words = f"{text}; the {' and '.join(cut)} line hits it: sweep farther"
-        light = Light("scan", "warn", words)
+        fault = f"; the {' and '.join(cut)} line hits it: sweep farther"
+    light = Light("scan", "warn" if fault else "ok", text + fault)
     return [light, _check_sides(scan)]
 
 
@@ -230,19 +205,15 @@ def check_image(
         large, (pattern.columns, pattern.rows), enlarged
     )
     rise /= scale
-    faults = []
-    if rise > BLURRED_PX:
-        faults.append("blurred: hold the board still, and focus")
-    if white < DARK:
-        faults.append(DARKNESS)
-    if white > CLIPPED:
-        faults.append("overexposed: use less light or a shorter exposure")
-    if white - dark < LOW_CONTRAST:
-        faults.append("little contrast: avoid glare")
+    faults = {
+        "blurred: hold the board still, and focus": rise > BLURRED_PX,
+        DARKNESS: white < DARK,
+        "overexposed: use less light or a shorter exposure": white > CLIPPED,
+        "little contrast: avoid glare": white - dark < LOW_CONTRAST,
+    }
     text = f"pattern found, edges rise in {rise:.1f} px, squares {dark:.0f} and {white:.0f} of 255"
-    if not faults:
-        return Light(name, "ok", text)
-    return Light(name, "warn", "; ".join([text, *faults]))
+    words = "; ".join([text, *compress(faults, faults.values())])
+    return Light(name, "warn" if any(faults.values()) else "ok", words)
 
 
 def _check_plain(image, board, model, name):

@@ -5,14 +5,12 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lrfcal_lib.acquire.checks import Light, check_placement
-from lrfcal_lib.acquire.record import Recording, RecordingError, Sweeping
+from lrfcal_lib.acquire.record import Recording, RecordingError, View
 from lrfcal_lib.calibrate.pipeline import (
     Calibration,
     calibrate,
@@ -21,9 +19,8 @@ from lrfcal_lib.calibrate.pipeline import (
     prepare,
 )
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
-from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned
+from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import Placement, read_rig_file, rig_of
-from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.judge.verdict import YES, judge, verdict
 from lrfcal_lib.model.geometry import POSE_UNITS, DegenerateGeometry
@@ -103,7 +100,7 @@ class Result:
     """A calibration."""
 
     answer: str  # whether to trust it: yes, with care, no
-    sentences: tuple[str, ...]
+    sentences: list[str]
     method: str  # whose poses are handed over; '' where none is
     # by camera: rotation vector (degrees) and translation (mm), each with its sigma
     poses: dict[str, tuple[str, ...]]
@@ -128,9 +125,9 @@ def calibrate_recording(path: Path) -> Result:
     """
     calibration = calibrate(open_session(path), CANDIDATES)
     judged = judge(calibration)
-    sentences = tuple(judged.sentences())
+    sentences = judged.sentences()
     if not judged.errors:
-        sentences += ("Nothing is written.",)
+        sentences.append("Nothing is written.")
         return Result(judged.answer, sentences, "", {}, None, calibration)
     method = handed_over(calibration)
     poses = {}
@@ -174,39 +171,6 @@ class Busy(RuntimeError):
 
 class Interrupted(RuntimeError):
     """The user stopped what was under way."""
-
-
-@dataclass
-class View(Sweeping):
-    """What the rig sees, and how far the placement recorded last is."""
-
-    ranges: np.ndarray | None = None  # (B,), of the newest scan, metres
-    bearings: np.ndarray | None = None  # (B,), radians
-    measured: bool = False  # the head tells its pitch
-    frames: dict[str, Frame] = field(default_factory=dict)  # the newest by camera
-    # ranges by pitch, of the placement recorded last
-    rows: dict[float, np.ndarray] = field(default_factory=dict)
-    trouble: str = ""  # what cannot be seen, and why
-
-    def note(self, event: Event) -> None:
-        """Take an event of the placement into account.
-
-        Parameters
-        ----------
-        event
-            Of the placement.
-        """
-        super().note(event)
-        match event:
-            case Moved():
-                self.measured = event.measured
-            case Scanned():
-                for reading, pitch in zip(event.readings, event.pitch, strict=True):
-                    self.rows[pitch] = reading.ranges
-                self.ranges = reading.ranges
-                self.bearings = reading.bearings
-            case Photographed():
-                self.frames[event.camera] = event.frame
 
 
 class Collector(Closed):
@@ -255,9 +219,7 @@ class Collector(Closed):
     @property
     def finished(self) -> tuple[int, ...]:
         """Numbers of the placements that are recorded and safe."""
-        if self.recording is None:
-            return ()
-        return self.recording.finished
+        return self.recording.finished if self.recording else ()
 
     def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> Rig:
         """Open a rig and a session; one that was recorded with the same rig goes on.
@@ -388,9 +350,7 @@ class Collector(Closed):
         if self._devices.acquire(blocking=False):
             try:
                 view.pitch, view.measured = rig.head.pitch()
-                reading = _scan(rig.lrf)
-                view.ranges = reading.ranges
-                view.bearings = reading.bearings
+                view.reading = _scan(rig.lrf)
             except DeviceError as error:
                 troubles.append(str(error))
             finally:
@@ -443,11 +403,14 @@ class Collector(Closed):
             self._record(placement, progress)
         progress(1.0, "checking what was recorded")
         session = open_session(recording.path)
-        adviser = None  # while every other placement helps
-        if len(session.board_placements) >= ADVICE_FROM:
-            adviser = self._advise
-        self.lights[number] = check_placement(session, number, adviser)
-        return self.lights[number]
+        lights = check_placement(session, number)
+        if placement.purpose == "board" and len(session.board_placements) >= ADVICE_FROM:
+            self._advice = advise(session)
+            state = "warn" if self._advice else "ok"
+            words = self._advice or "every direction is well determined"
+            lights.append(Light("information", state, words))
+        self.lights[number] = lights
+        return lights
 
     def _record(self, placement, progress):
         """Record a placement; Interrupted if the user stops it."""
@@ -465,10 +428,6 @@ class Collector(Closed):
                 raise Interrupted(
                     f"stopped: placement {placement.number} does not count, record it again"
                 ) from error
-
-    def _advise(self, session):
-        self._advice = advise(session)
-        return self._advice
 
     def again(self) -> int:
         """Take the placement recorded last out of the session, to record it again; its number.

@@ -439,11 +439,7 @@ class Panel(Closed):
         collector = self.collector
         parts = self.parts
         parts.state.value = HTML.state("ready" if collector.connected else "off")
-        parts.task.value = HTML.title("Next placement") + HTML.soft("connect a rig first")
-        if collector.connected:
-            parts.task.value = HTML.task(
-                collector.task(), collector.emulated, collector.finished
-            )
+        parts.task.value = HTML.task(collector, collector.task())
         parts.enable(collector, busy=False)
 
     def _show_progress(self, share, text):
@@ -457,29 +453,26 @@ class Panel(Closed):
             self._sweep = task.placement.pitch[[0, -1]]
 
     def _keep_looking(self):
-        field_of_view = self.collector.rig.lrf_info.field_of_view
         while not self._quit.wait(LOOK_S):
             try:
-                self._show_view(self.collector.look(), field_of_view)
+                self._show_view(self.collector.look())
             except Exception:  # a view that fails must not end the view
                 LOG.exception("the view of the rig failed")
                 self._quit.wait(10 * LOOK_S)
 
-    def _show_view(self, view, field_of_view):
+    def _show_view(self, view):
         """Show a View of the rig."""
         pictures = self.parts.pictures
         how = HTML.soft(PITCH[view.measured])
         self.parts.pitch.value = f"<b>{np.degrees(view.pitch):+.2f}°</b> {how}"
 
-        if view.ranges is not None:
-            known = np.isfinite(view.ranges).sum()
-            picture = scan_picture(view.ranges, view.bearings, field_of_view)
-            pictures["scan"].show(picture, f"{known} beams came back")
+        if view.reading is not None:
+            known = np.isfinite(view.reading.ranges).sum()
+            pictures["scan"].show(scan_picture(view.reading), f"{known} beams came back")
         if self._sweep is not None:
             rows = dict(view.rows)  # a copy: the recording goes on
-            picture = sweep_picture(rows, view.bearings, self._sweep)
             words = f"{len(rows)} scan lines; near is bright, white is no range"
-            pictures["sweep"].show(picture, words)
+            pictures["sweep"].show(sweep_picture(rows, self._sweep), words)
         for name, frame in dict(view.frames).items():
             image, words = self._overlaid(name, frame.image, view)
             pictures[name].show(jpeg(image), words)
@@ -491,15 +484,16 @@ class Panel(Closed):
         rig = self._calibrated
         height, width = image.shape[:2]
         words = f"{width} x {height} pixels"
-        if rig is None or view.ranges is None:
+        scan = view.reading
+        if rig is None or scan is None:
             return image, words
         if name not in rig.cameras:
             return image, f"{words}; the calibration does not know this camera"
         model = rig.cameras[name].model
         if (model.width, model.height) != (width, height):
             return image, f"{words}; the calibration is of {model.width} x {model.height}"
-        pixels = rig.project_scan(name, view.ranges, view.bearings, view.pitch)
-        image = with_scan(image, pixels, view.ranges)
+        pixels = rig.project_scan(name, scan.ranges, scan.bearings, view.pitch)
+        image = with_scan(image, pixels, scan.ranges)
         words = f"{words}; dots: the scan, near is bright"
         if name in self._moved:
             cv2.rectangle(image, (0, 0), (width - 1, height - 1), RED, round(width / 50))

@@ -5,10 +5,11 @@ import io
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
 
+from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.plots.colors import LRF
 from lrfcal_lib.plots.recording import range_image
+from lrfcal_lib.session.images import encode_jpeg
 from lrfcal_lib.session.read import Sweep
 
 WIDTH = 400  # of a picture, pixels
@@ -18,43 +19,27 @@ PLAIN = {"figsize": (4, 3), "dpi": 100, "layout": "none"}
 NEAR_IS_BRIGHT = "viridis_r"
 
 
-def scan_picture(
-    ranges: ArrayLike, bearings: ArrayLike, field_of_view: tuple[float, float]
-) -> bytes:
-    """A scan from above, the laser range finder below, as a PNG file.
-
-    Parameters
-    ----------
-    ranges
-        (B,), metres, NaN for none.
-    bearings
-        (B,), radians.
-    field_of_view
-        First and last bearing, radians.
-    """
+def scan_picture(reading: Reading) -> bytes:
+    """A scan from above, the laser range finder below, as a PNG file."""
     figure = Figure(**PLAIN)
     ax = figure.add_axes((0.1, 0.1, 0.8, 0.85), projection="polar")
-    ax.plot(bearings, ranges, ".", color=LRF, markersize=3)
-    known = np.ravel(ranges)[np.isfinite(ranges)]
+    ax.plot(reading.bearings, reading.ranges, ".", color=LRF, markersize=3)
+    known = reading.ranges[np.isfinite(reading.ranges)]
     far = np.percentile(known, 90) if len(known) else 0.0
     ax.set_rlim(0, REACHES[np.searchsorted(REACHES[:-1], far)])
-    ax.set_thetalim(*field_of_view)
+    ax.set_thetalim(*reading.bearings[[0, -1]])
     ax.set_rorigin(0)
     figure.text(0.5, 0.03, "range [m]", ha="center")
     return _png(figure)
 
 
-def sweep_picture(
-    rows: dict[float, np.ndarray], bearings: np.ndarray, pitch: tuple[float, float]
-) -> bytes:
+def sweep_picture(rows: dict[float, Reading], pitch: tuple[float, float]) -> bytes:
     """A sweep as it grows: ranges as colours, near is bright; a PNG file.
 
     Parameters
     ----------
     rows
-        Ranges (B,), metres, by pitch, radians.
-    bearings
-        (B,), radians; not used without rows.
+        By pitch, radians.
     pitch
         Its ends, radians.
     """
@@ -62,7 +47,9 @@ def sweep_picture(
     ax = figure.add_axes((0.17, 0.17, 0.81, 0.79))
     if len(rows) > 1:
         known = np.array(list(rows))
-        sweep = Sweep(0, np.array(list(rows.values())), bearings, known, np.nan * known)
+        readings = list(rows.values())
+        ranges = np.array([reading.ranges for reading in readings])
+        sweep = Sweep(0, ranges, readings[0].bearings, known, np.nan * known)
         range_image(ax, sweep, limits=(None, None)).set_cmap(NEAR_IS_BRIGHT)
     ax.set(ylim=np.degrees(np.sort(pitch)), aspect="auto")
     return _png(figure)
@@ -116,4 +103,4 @@ def jpeg(image: np.ndarray) -> bytes:
     scale = WIDTH / image.shape[1]
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    return encode_jpeg(image, 85)

@@ -7,15 +7,17 @@ import os
 import signal
 import sys
 from collections.abc import Generator, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tqdm import tqdm
 
 from lrfcal_lib.acquire.checks import Light, check_image, check_placement
+from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, read_rig_file
+from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.lms2xx_codec import encode_configuration
 from lrfcal_lib.session.read import Session, open_session
@@ -83,40 +85,35 @@ class Recording(Closed):
         resume: bool = False,
         count: int | None = None,
     ):
+        stated = rig.stated
         self.rig = rig
         self.path = Path(path)
-        self.plan = rig.stated.plan.to_do(count)
-        with self._safely(), contextlib.ExitStack() as stack:
-            self.writer = self._open(resume)
-            stack.callback(self.close)
-            # a scan does not tell its measuring mode, this does
-            self.writer.add_telegrams(
-                -1, [encode_configuration(rig.lrf.configuration)], time_s=rig.clock()
-            )
-            stack.pop_all()
-
-    def _open(self, resume):
-        """The session, to write to."""
-        rig = self.rig
-        stated = rig.stated
+        self.plan = stated.plan.to_do(count)
         reference = {
             "recording": HOW[stated.plan.mode],
             "pitch": PITCH[rig.head.has_feedback],
             "scene_placements": [p.number for p in self.plan if p.purpose == "scene"],
         }
         source = stated.about["source"] or f"recorded with {stated.path.name}"
-        return SessionRecorder(
-            self.path,
-            stated.board,
-            rig.lrf_info,
-            stated.cameras.values(),
-            stated.T_head_lrf,
-            platform_sigma=stated.platform_sigma,
-            reference=reference,
-            continuous=stated.plan.mode == "continuous",
-            resume=resume,
-            **stated.about | {"source": source},
-        )
+        with self._safely(), contextlib.ExitStack() as stack:
+            self.writer = SessionRecorder(
+                self.path,
+                stated.board,
+                rig.lrf_info,
+                stated.cameras.values(),
+                stated.T_head_lrf,
+                platform_sigma=stated.platform_sigma,
+                reference=reference,
+                continuous=stated.plan.mode == "continuous",
+                resume=resume,
+                **stated.about | {"source": source},
+            )
+            stack.callback(self.close)
+            # a scan does not tell its measuring mode, this does
+            self.writer.add_telegrams(
+                -1, [encode_configuration(rig.lrf.configuration)], time_s=rig.clock()
+            )
+            stack.pop_all()
 
     @property
     def finished(self) -> tuple[int, ...]:
@@ -233,9 +230,7 @@ class Recording(Closed):
         safe = "no placement was finished"
         if self.finished:
             safe = f"placements {', '.join(map(str, self.finished))} are safe"
-        if resume:
-            safe = f"{safe}; --resume goes on from there"
-        return safe
+        return f"{safe}; --resume goes on from there" if resume else safe
 
     def _lost(self):
         """Whether a reader does not find all that was finished, with its scans."""
@@ -262,9 +257,7 @@ class Recording(Closed):
         with self._safely():
             match event:
                 case Moved():
-                    measured = math.nan
-                    if event.measured:
-                        measured = event.pitch
+                    measured = event.pitch if event.measured else math.nan
                     writer.add_platform([(event.time_s, event.commanded, measured)])
                 case Scanned():
                     scans = zip(event.readings, event.pitch, strict=True)
@@ -322,35 +315,39 @@ def ask(text: str) -> str:
 
 
 @dataclass
-class Sweeping:
-    """What the events of a placement tell of how far it is."""
+class View:
+    """What the rig sees, and how far the placement recorded last is."""
 
     scans: int = 0
     images: int = 0
     pitch: float = 0.0  # radians
+    measured: bool = False  # the head tells its pitch
     stop: str = ""
     share: float = 0.0  # of the sweep
+    reading: Reading | None = None  # the newest
+    frames: dict[str, Frame] = field(default_factory=dict)  # the newest by camera
+    # by pitch, of the placement recorded last
+    rows: dict[float, Reading] = field(default_factory=dict)
+    trouble: str = ""  # what cannot be seen, and why
 
     def note(self, event: Event) -> None:
-        """Take an event into account.
-
-        Parameters
-        ----------
-        event
-            Of the placement.
-        """
+        """Take an event of the placement into account."""
         match event:
             case Moved():
                 self.stop = f"stop {event.number} of {event.of}, "
                 self.pitch = event.pitch
+                self.measured = event.measured
                 self.share = (event.number - 1) / event.of
             case Scanned():
                 self.scans += len(event.readings)
+                self.rows |= zip(event.pitch, event.readings, strict=True)
                 self.pitch = event.pitch[-1]
+                self.reading = event.readings[-1]
                 if math.isfinite(event.share):
                     self.share = event.share
             case Photographed():
                 self.images += 1
+                self.frames[event.camera] = event.frame
 
     def counts(self):
         """What was recorded, as text."""
@@ -377,7 +374,7 @@ def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) 
         f"{first:.2f} to {last:.2f} deg",
         flush=True,
     )
-    sweeping = Sweeping()
+    view = View()
     with tqdm(
         total=1,
         bar_format=LINE,
@@ -386,11 +383,11 @@ def follow(placement: Placement, number: int, of: int, events: Iterable[Event]) 
         mininterval=LINE_S[sys.stdout.isatty()],
     ) as line:
         for event in events:
-            sweeping.note(event)
-            words = f"{sweeping.stop}{math.degrees(sweeping.pitch):+.2f} deg, {sweeping.counts()}"
+            view.note(event)
+            words = f"{view.stop}{math.degrees(view.pitch):+.2f} deg, {view.counts()}"
             line.set_description_str(words, refresh=False)
-            line.update(sweeping.share - line.n)
-    print(f"  {sweeping.counts()}", flush=True)
+            line.update(view.share - line.n)
+    print(f"  {view.counts()}", flush=True)
 
 
 def show(light: Light, name: str) -> None:
@@ -401,18 +398,34 @@ def show(light: Light, name: str) -> None:
 class Boards:
     """Recording what the plan lists."""
 
+    kind = "placement"  # what the user is asked for
+
     def planned(self, stated: RigFile) -> RigFile:
         """The rig file with what is to be recorded."""
         return stated
 
     def ready(self, rig: Rig, placement: Placement, before: int | None) -> str:
         """Wait until a placement can be recorded: '', or what else the user wants, 'q' or 'r'."""
-        if rig.move_board(placement.number):
+        if rig.move_board(self.place_of(placement)):
             return ""
-        what = "put the board"
-        if placement.purpose == "scene":
-            what = "take the board away"
-        return ask_before("placement", placement.number, what, before)
+        possible = ["", "q"]
+        again = ""
+        if before is not None:
+            possible.append("r")
+            again = f", r: {self.kind} {before} again"
+        asked = f"{self.kind} {placement.number}: {self.to_prepare(placement)}"
+        text = f"{asked}, then press Enter{again} (q: end here) "
+        while (answer := ask(text)) not in possible:
+            pass
+        return answer
+
+    def place_of(self, placement: Placement) -> int | str:
+        """Where the board of an emulated rig belongs."""
+        return placement.number
+
+    def to_prepare(self, placement: Placement) -> str:
+        """What the user does before a placement."""
+        return "take the board away" if placement.purpose == "scene" else "put the board"
 
     def check(self, session: Session, number: int) -> list[Light]:
         """Lights of a finished placement."""
@@ -437,15 +450,14 @@ def record_session(
     rig: Rig,
     path: str | os.PathLike,
     *,
-    resume: bool = False,
-    count: int | None = None,
     guide: Boards = BOARDS,
+    **options,
 ) -> Recording:
     """Record a session with an open rig, from the first placement that is missing to the last.
 
     Parameters
     ----------
-    rig, path, resume, count
+    rig, path, **options
         As of :class:`Recording`.
     guide
         What is asked before a placement, and checked after it.
@@ -460,7 +472,7 @@ def record_session(
     DeviceError, SessionError, RecordingError
         With a note that says what is safe.
     """
-    with Recording(rig, path, resume=resume, count=count) as recording:
+    with Recording(rig, path, **options) as recording:
         if recording.finished:
             print(f"{path}: going on, {recording.safe()}", flush=True)
         try:
@@ -478,14 +490,14 @@ def _close_views(recording):
     wanted = recording.rig.stated.plan.intrinsics_images
     for camera, view in recording.close_views_to_do():
         title = f"camera '{camera}', view {view + 1} of {wanted}"
-        kept = False
-        while not kept:
+        while True:
             emulated = recording.rig.hold_close(camera, view)
             if not emulated:
                 ask(f"{title}: hold the board close, tilted otherwise than before; Enter ")
             light = recording.run_close(camera)
             show(light, title)
-            kept = emulated or light.state != "bad"
+            if emulated or light.state != "bad":
+                break
 
 
 def _placements(recording, guide):
@@ -509,26 +521,8 @@ def _placements(recording, guide):
             print(f"  {left} of {of} placements left", flush=True)
 
 
-def ask_before(kind: str, number: int, what: str, before: int | None) -> str:
-    """Ask for something to be done before a placement or station: '', 'q' to end, 'r' to repeat."""
-    possible = ["", "q"]
-    again = ""
-    if before is not None:
-        possible.append("r")
-        again = f", r: {kind} {before} again"
-    text = f"{kind} {number}: {what}, then press Enter{again} (q: end here) "
-    while (answer := ask(text)) not in possible:
-        pass
-    return answer
-
-
 def main(
-    rig_file: str | os.PathLike,
-    path: str | os.PathLike,
-    *,
-    resume: bool = False,
-    count: int | None = None,
-    guide: Boards = BOARDS,
+    rig_file: str | os.PathLike, path: str | os.PathLike, guide: Boards = BOARDS, **options
 ) -> int:
     """Record from the command line.
 
@@ -536,9 +530,7 @@ def main(
     ----------
     rig_file
         Its path.
-    path, resume, count
-        As of :func:`record_session`.
-    guide
+    path, guide, **options
         As of :func:`record_session`.
 
     Returns
@@ -552,7 +544,7 @@ def main(
         stated = guide.planned(read_rig_file(rig_file))
         print(f"{rig_file}: opening the devices", flush=True)
         with Rig.open(stated) as rig:
-            recording = record_session(rig, path, resume=resume, count=count, guide=guide)
+            recording = record_session(rig, path, guide=guide, **options)
     except (
         DeviceError,
         RecordingError,

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from lrfcal_lib.acquire.checks import Light, check_scene
-from lrfcal_lib.acquire.record import Boards, ask_before
+from lrfcal_lib.acquire.record import Boards
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import ListedPlacement, Placement, RigFile
 from lrfcal_lib.measure.planning import plan_images
 from lrfcal_lib.measure.scene import colored_blocks, station_of
@@ -31,6 +30,8 @@ class Stations(Boards):
         What is known of the rig; without, images are taken where the plan says.
     """
 
+    kind = "station"
+
     def __init__(self, count: int, rig: CalibratedRig | None = None):
         self.count = count
         self.rig = rig
@@ -42,12 +43,6 @@ class Stations(Boards):
 
         Sweep and numbers are those of the scenes that the plan lists, as far as there are any.
         """
-        if self.rig is not None:
-            # what its range finder is set to shows once it is open
-            known: Any = SimpleNamespace(
-                name=stated.path, cameras=stated.cameras, lrf=self.rig.lrf
-            )
-            require_same_rig(self.rig, known)
         plan = stated.plan
         numbers = [p.number for p in plan.to_do() if p.purpose == "scene"][: self.count]
         self._listed = tuple(numbers)
@@ -56,6 +51,11 @@ class Stations(Boards):
         sweep = scene.pitch_deg or plan.pitch_deg
         images = scene.image_pitch_deg or plan.image_pitch_deg
         if self.rig is not None:
+            # what its range finder is set to shows once it is open
+            known: Any = SimpleNamespace(
+                name=stated.path, cameras=stated.cameras, lrf=self.rig.lrf
+            )
+            require_same_rig(self.rig, known)
             images = self._images(sweep, stated.devices.head.pitch_limits_deg)
         while len(numbers) < self.count:
             numbers.append(max(numbers, default=0) + 1)
@@ -83,19 +83,13 @@ class Stations(Boards):
         )
         return images
 
-    def ready(self, rig: Rig, placement: Placement, before: int | None) -> str:
+    def place_of(self, placement: Placement) -> int | str:
         """As of :class:`Boards`; an emulated rig goes where its plan puts the station."""
-        place: int | str = "none"
-        if placement.number in self._listed:
-            place = placement.number
-        if rig.move_board(place):
-            return ""
-        return ask_before(
-            "station",
-            placement.number,
-            "set the rig up, so that nobody moves it or walks by",
-            before,
-        )
+        return placement.number if placement.number in self._listed else "none"
+
+    def to_prepare(self, placement: Placement) -> str:
+        """As of :class:`Boards`."""
+        return "set the rig up, so that nobody moves it or walks by"
 
     def check(self, session: Session, number: int) -> list[Light]:
         """How good a station is: share of returns, share with a colour, whether it moved."""
@@ -103,17 +97,13 @@ class Stations(Boards):
         lights = [check_scene(sweep)]
         if self.rig is not None:
             require_same_rig(self.rig, session)
-            lights.append(self._colors(session, number))
+            station = station_of(session, self.rig, number)
+            seen = [cloud.seen for cloud in colored_blocks(session, self.rig, station)]
+            share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
+            text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
+            state = "ok" if share > EXPECTED * self.share else "warn"
+            lights.append(Light("colour", state, text))
         return [*lights, _still(sweep)]
-
-    def _colors(self, session, number):
-        """The Light of the share of points that get a colour."""
-        station = station_of(session, self.rig, number)
-        seen = [cloud.seen for cloud in colored_blocks(session, self.rig, station)]
-        share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
-        text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
-        state = "ok" if share > EXPECTED * self.share else "warn"
-        return Light("colour", state, text)
 
 
 def _still(sweep):

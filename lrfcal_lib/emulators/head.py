@@ -5,6 +5,7 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, QUERY_TILT, TILT, UP, encode_extended
@@ -17,7 +18,6 @@ KEPT = 2000  # knots of the motion
 TURN_AROUND_S = 0.010  # from the end of a frame to a reply
 # to queries of pan, tilt, zoom, magnification
 ANSWERS = {0x51: 0x59, QUERY_TILT: TILT, 0x55: 0x5D, 0x61: 0x63}
-FRAGMENT_S = 0.1  # a frame begun is forgotten after so long
 
 
 class Head:
@@ -42,7 +42,7 @@ class Head:
         # look: a look sees the table of before or of after.
         self._knots = np.array([(0.0, pitch, (1 + self.platform.stretch) * pitch)])
 
-    def move(self, instant: float, goal: float, speed: float) -> None:
+    def move(self, instant: float, goal: ArrayLike, speed: float) -> None:
         """Tilt towards an angle, at most to a limit; the motor reacts a little later.
 
         Parameters
@@ -59,7 +59,7 @@ class Head:
         goal = np.clip(goal, *self.platform.limits)
         dragged = self.pitch(reacts)
         knots: list = [(reacts, now, dragged)]
-        if speed and goal != now:
+        if speed:
             arrives = reacts + abs((goal - now) / speed)
             knots.append((arrives, goal, self._with_play(dragged, goal)))
         before = self._knots[self._knots[:, 0] < reacts]
@@ -85,7 +85,7 @@ class Head:
         """
         reacts = instant + REACT_S
         if self.moving(reacts):
-            self.move(instant, float(self.motor(reacts)), 0.0)
+            self.move(instant, self.motor(reacts), 0.0)
 
     def motor(self, instant: float | np.ndarray) -> np.ndarray:
         """Angle of the motor.
@@ -112,7 +112,7 @@ class Head:
         """
         return bool(instant < self._knots[-1, 0])
 
-    def settled(self, instant: float, rest_s: float = 0.0) -> bool:
+    def settled(self, instant: float, rest_s: float) -> bool:
         """Whether the head has been at rest for the time in which it settles.
 
         Parameters
@@ -154,11 +154,8 @@ class Head:
         float
             Radians.
         """
-        angle = float(self.motor(instant - self.platform.latency))
-        step = self.platform.encoder_step
-        if not step:
-            return angle
-        return round(angle / step) * step
+        angle = self.motor(instant - self.platform.latency)
+        return float(self.platform.encoded(angle))
 
     def _with_play(self, dragged, motor):
         """The head stays where it was until the motor is half the play ahead of it."""
@@ -205,7 +202,7 @@ class EmulatedHead(SerialDevice):
         Of :class:`Habits`.
     """
 
-    gap_s = FRAGMENT_S
+    gap_s = 0.1  # a frame begun is forgotten after so long
 
     def __init__(
         self,
@@ -225,10 +222,6 @@ class EmulatedHead(SerialDevice):
     def baudrate(self) -> int:
         """Of its line."""
         return self.habits.baudrate
-
-    def pitch(self) -> float:
-        """True pitch now, radians."""
-        return float(self.head.pitch(self.host.now()))
 
     def take(self, raw: bytes, at: float) -> int:
         """Obey what frames of the host say.

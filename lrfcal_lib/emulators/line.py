@@ -4,8 +4,7 @@ The port is a pseudo-terminal served by a thread, whose rate is read at the mast
 one garbles bytes as on a real line.
 """
 
-import heapq
-import itertools
+import bisect
 import math
 import os
 import select
@@ -15,6 +14,7 @@ import tty
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,6 @@ CHUNK_S = 0.005  # bytes that leave within this time are written at once
 LOOK_S = 0.02  # how often to see whether somebody opened the port
 END_S = 5  # longest wait for the end of the thread
 SOON = 1e-9  # s; so far ahead counts as now, whatever the rounding
-NONE = -1  # file of a terminal that is not plugged in
 SENDING = "sending"  # tag of what is planned until the last byte is out
 
 
@@ -41,7 +40,7 @@ class SerialDevice(ABC):
     Parameters
     ----------
     path
-        Where the port appears, a symbolic link that stays the same when the port comes back.
+        Where the port appears, a symbolic link.
     host
         Whose time the device lives in.
     seed
@@ -64,8 +63,7 @@ class SerialDevice(ABC):
         self._heard = 0.0  # the last byte from the host
         self._noise = np.random.default_rng([seed, 4])
         self._buffer = b""  # bytes of a telegram that is not whole
-        self._agenda: list = []  # heap of instant, order, action, tag
-        self._order = itertools.count()
+        self._agenda: list = []  # instant, action, tag, in order
 
     @property
     @abstractmethod
@@ -121,7 +119,7 @@ class SerialDevice(ABC):
         tag
             To cancel it by.
         """
-        heapq.heappush(self._agenda, (instant, next(self._order), action, tag))
+        bisect.insort(self._agenda, (instant, action, tag), key=itemgetter(0))
 
     def cancel(self, tag: str) -> None:
         """Forget what was planned.
@@ -131,8 +129,7 @@ class SerialDevice(ABC):
         tag
             Of the plans.
         """
-        self._agenda = [item for item in self._agenda if item[3] != tag]
-        heapq.heapify(self._agenda)
+        self._agenda = [item for item in self._agenda if item[2] != tag]
 
     def abort(self) -> None:
         """Stop sending at once, in the middle of a reply if need be."""
@@ -179,7 +176,7 @@ class SerialDevice(ABC):
     def advance(self) -> None:
         """Do all that is due by now."""
         while self.due() <= self.host.now() + SOON:
-            instant, _, action, _ = heapq.heappop(self._agenda)
+            instant, action, _ = self._agenda.pop(0)
             action(instant)
 
     def hear(self, data: bytes) -> None:
@@ -240,12 +237,6 @@ class Terminal(threading.Thread):
         self.open = False
         self._device = device
         self._quit = False
-        self._master = NONE
-
-    @property
-    def there(self) -> bool:
-        """Whether the port is plugged in."""
-        return self._master != NONE
 
     @property
     def rate(self) -> int:
@@ -265,8 +256,7 @@ class Terminal(threading.Thread):
                 wait = min(self._device.due() - REAL.now(), LOOK_S)
                 listened = [self._master] if self.open else []
                 select.select(listened, [], [], max(0.0, wait))
-                if self.there:
-                    self._listen()
+                self._listen()
                 self._device.advance()
         except (
             Exception
@@ -312,12 +302,8 @@ class Terminal(threading.Thread):
         path.unlink(missing_ok=True)
         path.symlink_to(os.ttyname(slave))
         os.close(slave)
-        self.open = False
 
     def unplug(self) -> None:
         """Take the pseudo-terminal away; whoever holds it gets an error."""
-        if self.there:
-            Path(self._device.path).unlink(missing_ok=True)
-            os.close(self._master)
-            self._master = NONE
-            self.open = False
+        Path(self._device.path).unlink(missing_ok=True)
+        os.close(self._master)

@@ -45,16 +45,11 @@ WRITE_S = 0.107  # the same where flash is written (measured: 0x77)
 RESET_S = 0.010
 # most that a change of mode takes longer while streaming (measured: 71 to 588 ms)
 STOP_S = 0.52
-GAP_S = 0.006  # a host that pauses longer within a telegram is not heard
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 # A stream that lags so far leaves scans out, as no host can know how late they are.
 LATE_S = 0.5
 POWERED_S = 60.0  # how long ago it was switched on
 WHITE = 100  # reflectivity of all that answers: the simulated world states none
-# results of command 0x20
-DONE = b"\0"
-WRONG = b"\1"
-FAULT = b"\2"
 
 
 class Scan(NamedTuple):
@@ -90,7 +85,7 @@ class EmulatedLms(SerialDevice):
         Scans counted since power-on.
     """
 
-    gap_s = GAP_S
+    gap_s = 0.006  # a host that pauses longer within a telegram is not heard
 
     def __init__(
         self,
@@ -192,8 +187,10 @@ class EmulatedLms(SerialDevice):
             case 0x30, b"\x01" if not self._selection.head:
                 # the scan that is being measured when the request is whole
                 begun = at + ACK_S + 2 * self.byte_s
-                turn = self._turn_of(begun, memory.turns, math.floor)
-                self._measure(turn, -1, partial(self.emit, then=self._finish))
+                scans = math.floor((begun - self._zero) / MIRROR_TURN / memory.turns)
+                self._measure(
+                    scans * memory.turns, -1, partial(self.emit, then=self._finish)
+                )
             case code, data if (reply := memory.reply(code, data)) is not None:
                 delay = WRITE_S if code in WRITTEN else REPLY_S
                 self.answer(at, 0x80 | code, reply, delay=delay)
@@ -219,26 +216,23 @@ class EmulatedLms(SerialDevice):
         def set_rate(_):
             memory.baudrate = rate
 
-        if rate in memory.baudrates and not parameters:
-            self.answer(at, 0xA0, DONE, set_rate)
-        elif rate and not parameters:
-            self.answer(at, 0xA0, FAULT)
-        elif selection is None:
+        if selection is None:
             self.answer(at, 0x92)
+        elif rate in memory.baudrates:
+            self.answer(at, 0xA0, b"\0", set_rate)
+        elif rate:
+            self.answer(at, 0xA0, b"\2")  # a fault
         elif mode == INSTALLATION and parameters != memory.password:
-            self.answer(at, 0xA0, WRONG)
+            self.answer(at, 0xA0, b"\1")  # wrong
         else:
             delay = REPLY_S + self._rng.uniform(0, 0.02)
             if self.streaming:
                 delay += self._rng.uniform(0, STOP_S)
             memory.mode = mode
             self._selection = selection
-            self.answer(at, 0xA0, DONE, delay=delay)
+            self.answer(at, 0xA0, b"\0", delay=delay)
 
     # ---------------------------------------------------------------------------------- replies
-
-    def _encode(self, code, data=b""):
-        return encode_telegram(code, data, status=0x10, address=0x80 | self.memory.address)
 
     def answer(
         self,
@@ -263,8 +257,8 @@ class EmulatedLms(SerialDevice):
         """
         if effect is not None:  # else that of the command whose reply this one interrupted
             self._effect = effect
-        reply = partial(self.reply, self._encode(code, data), then=self._finish)
-        self.at(at + delay, reply, SENDING)
+        raw = encode_telegram(code, data, status=0x10, address=0x80 | self.memory.address)
+        self.at(at + delay, partial(self.reply, raw, then=self._finish), SENDING)
 
     def _finish(self, at):
         """A reply is out: do what is left of the command, and stream from the next scan on."""
@@ -272,8 +266,7 @@ class EmulatedLms(SerialDevice):
             self._effect(at)
             self._effect = None
         if self.streaming:
-            self._partial = 0
-            self._turn = self._turn_of(at, self._turns, math.ceil)
+            self._stream_from(at)
             self._plan()
 
     def reply(
@@ -320,13 +313,15 @@ class EmulatedLms(SerialDevice):
         self._buffer = b""
         self._zero = at
         self.telegrams = 0
-        self.reply(self._encode(0x90, self.memory.model.encode()), at)
+        self.answer(at, 0x90, self.memory.model.encode(), delay=0.0)
 
     # ------------------------------------------------------------------------------------ scans
 
-    def _turn_of(self, instant, turns, rounded):
-        """First turn of the scan that is measured then (math.floor), or of the next (math.ceil)."""
-        return rounded((instant - self._zero) / MIRROR_TURN / turns) * turns
+    def _stream_from(self, instant):
+        """The next scan of the stream is the one that begins after an instant."""
+        turns = self._turns
+        self._partial = 0
+        self._turn = math.ceil((instant - self._zero) / MIRROR_TURN / turns) * turns
 
     @property
     def _turns(self):
@@ -401,9 +396,7 @@ class EmulatedLms(SerialDevice):
         if memory.mode == REFLECTIVITY:  # behind every range
             answered = words <= largest(ENCODED[configuration.measuring_mode])
             words = np.stack([words, WHITE * answered], axis=1)
-        indices = None
-        if configuration.realtime_indices:
-            indices = scan.turn, self.telegrams
+        indices = (scan.turn, self.telegrams) if configuration.realtime_indices else None
         return codec.encode_words(
             words,
             unit=configuration.unit,
@@ -419,12 +412,10 @@ class EmulatedLms(SerialDevice):
 
         The indices show the gap.
         """
-        turns = self._turns
-        late = self.host.now() - self._zero - (self._turn + turns) * MIRROR_TURN
+        late = self.host.now() - self._zero - (self._turn + self._turns) * MIRROR_TURN
         if late > LATE_S:
             self.telegrams += 1
-            self._partial = 0
-            self._turn = self._turn_of(self.host.now(), turns, math.ceil)
+            self._stream_from(self.host.now())
         part = -1
         if self.memory.mode == INTERLACED:
             # which there are depends on the resolution that is set

@@ -6,34 +6,27 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lrfcal_lib.drivers.lms2xx_link import RATES
-from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import SCAN, TOP, UNITS, Configuration
-from lrfcal_lib.simulate.beam import VARIANTS
+from lrfcal_lib.session.lms2xx_codec import SCAN, TOP, UNITS, VARIANTS, Configuration
 
 BAUD_WORD = {9600: 0x8067, 19200: 0x8033, 38400: 0x8019, 500000: 0x8001}
 BAUD_COMMAND = {command: rate for rate, command in RATES.items()}
 # operating modes
 INSTALLATION = 0x00
-DIAGNOSIS = 0x10
-STREAM = 0x24
 REQUEST = 0x25
 MEAN = 0x26
 PART = 0x27
 INTERLACED = 0x2A
 REFLECTIVITY = 0x2B
-# bytes of their parameters (manual, 7.2): password; scans; first and last value; parts and these
-PARAMETERS = {
+# code of the telegrams that they send; 0x24: whole scans
+STREAMED = {0x24: SCAN, MEAN: 0xB6, PART: 0xB7, INTERLACED: SCAN, REFLECTIVITY: 0xF5}
+# bytes of parameters (manual, 7.2): password; scans; first and last value; parts and these; none in
+# diagnosis, and where a rate is set
+PARAMETERS = dict.fromkeys([0x10, REQUEST, *STREAMED, *BAUD_COMMAND], 0) | {
     INSTALLATION: 8,
-    DIAGNOSIS: 0,
-    STREAM: 0,
-    REQUEST: 0,
     MEAN: 1,
     PART: 4,
-    INTERLACED: 0,
     REFLECTIVITY: 6,
 }
-# code of the telegrams that they send
-STREAMED = {STREAM: SCAN, MEAN: 0xB6, PART: 0xB7, INTERLACED: SCAN, REFLECTIVITY: 0xF5}
 WRITTEN = (0x3B, 0x77)  # commands that write to flash
 SCANS = range(2, 251)  # of a mean
 LAST = 401  # value that can be asked for; there may be fewer
@@ -97,7 +90,10 @@ class Memory:
             case 0x3A:
                 return self.model.encode()
             case 0x3B if len(data) == 4:
-                taken = self.set_variant(tuple(np.frombuffer(data, "<u2").tolist()))
+                view, step = np.frombuffer(data, "<u2").tolist()
+                taken = (view, step / 100) in VARIANTS and view <= self.widest
+                if taken:
+                    self.variant = view, step
                 return bytes([taken]) + words_of(self.variant)
             case 0x74:
                 return self.configuration.block
@@ -105,24 +101,6 @@ class Memory:
                 taken = self.write_configuration(data)
                 return bytes([taken]) + self.configuration.block
         return None
-
-    def set_variant(self, variant: tuple[int, int]) -> bool:
-        """Take a variant.
-
-        Parameters
-        ----------
-        variant
-            Degrees and 1/100 degree.
-
-        Returns
-        -------
-        bool
-            Whether the device offers it.
-        """
-        offered = variant in VARIANTS and variant[0] <= self.widest
-        if offered:
-            self.variant = variant
-        return offered
 
     def write_configuration(self, block: bytes) -> bool:
         """Take a configuration.
@@ -137,9 +115,7 @@ class Memory:
         bool
             Whether its values are possible.
         """
-        block = (
-            bytes(block) + self.configuration.block[len(block) : codec.CONFIGURATION_BYTES]
-        )
+        block += self.configuration.block[len(block) :]
         if block[5] not in ENCODED or block[6] >= len(UNITS):
             return False
         self.configuration = Configuration(block)

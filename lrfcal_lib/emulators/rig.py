@@ -18,13 +18,12 @@ from lrfcal_lib.emulators.head import EmulatedHead
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld
 from lrfcal_lib.session import stated
-from lrfcal_lib.simulate.rig import PLACES, Placement, Setup, load_setup, pairs, random
+from lrfcal_lib.simulate.rig import Placement, Setup, load_setup, placements_of
 
 # that says nothing about an emulated camera: it sends no image while the head moves
 SILENCE_S = 600.0
 LOOK_S = 0.5
 PRACTICE = "practice"
-MARGIN = np.radians(1.0)  # of a sweep beyond the board
 QUICK_HEAD = {"baudrate": 38400, "go_speed": 60.0}  # habits
 QUICK_SETTINGS = {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}  # of its driver
 
@@ -107,20 +106,15 @@ class EmulatedRig:
     def plan(self) -> dict:
         """What a recording of this rig can do: its placements, each with its sweep."""
         setup = self.setup
-        placements = []
-        for placement in self.world.placements.values():
-            board = placement.T_platform_board is not None
-            step = setup.step
-            if not board and setup.room_sweep:
-                step = setup.room_sweep[2]
-            placements.append(
-                {
-                    "number": placement.number,
-                    "board": board,
-                    "pitch_deg": np.degrees([*placement.sweep, step]).round(4).tolist(),
-                    "image_pitch_deg": np.degrees(placement.image_pitch).round(4).tolist(),
-                }
-            )
+        placements = [
+            {
+                "number": p.number,
+                "board": p.purpose == "board",
+                "pitch_deg": np.degrees([*p.sweep, setup.step_of(p)]).round(4).tolist(),
+                "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
+            }
+            for p in self.world.placements.values()
+        ]
         return {"intrinsics_images": setup.intrinsics_views, "placements": placements}
 
     def rig_file(self) -> dict:
@@ -129,11 +123,7 @@ class EmulatedRig:
         """
         setup = self.setup
         rig = setup.rig
-        cameras = {}
-        for info, camera in zip(rig.camera_infos(), rig.cameras, strict=True):
-            if setup.intrinsics_views == 0:
-                info = replace(info, model=camera.model)
-            cameras[info.name] = info
+        cameras = rig.camera_infos(known=setup.intrinsics_views == 0)
         return {
             "schema": stated.SCHEMA,
             "name": f"{setup.name}_emulated",
@@ -185,16 +175,10 @@ class EmulatedRig:
 def practice_setup() -> tuple[Setup, list[Placement]]:
     """A rig and placements that are recorded in a minute."""
     setup = load_setup(PRACTICE)
-    cameras = tuple(
-        replace(camera, exposure=replace(camera.exposure, samples=2))
-        for camera in setup.rig.cameras
-    )
-    setup = replace(setup, rig=replace(setup.rig, cameras=cameras))
-    rng = random(setup, PLACES)
-    placements = []
-    for placement in pairs(setup.rig, setup.pairs, setup.distances, rng, MARGIN):
-        images = placement.image_pitch
-        placements.append(replace(placement, image_pitch=(images[0], images[-1])))
+    placements = [
+        replace(p, image_pitch=(p.image_pitch[0], p.image_pitch[-1]))
+        for p in placements_of(setup)
+    ]
     return setup, placements
 
 

@@ -12,15 +12,14 @@ import time
 from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-import cv2
 import numpy as np
 
 from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.head import Head
+from lrfcal_lib.session.images import encode_jpeg
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import close_views, world_of
 from lrfcal_lib.simulate.rig import Placement, Setup, placements_of
-from lrfcal_lib.simulate.scene import Imager
 
 STILL = 1e-7  # radians within which a scan at rest is cast once
 LOOK_S = 0.05
@@ -65,11 +64,6 @@ class EmulatedWorld:
         self._seen: tuple = (None, None)
         self.put(None)
 
-    @property
-    def place(self) -> tuple:
-        """Where the board is."""
-        return self.current[0]
-
     def put(self, number: int | None) -> None:
         """Put the board at a placement.
 
@@ -83,20 +77,12 @@ class EmulatedWorld:
         ValueError
             For a placement that the setup does not have.
         """
-        if number is None:
-            self.current = ("placement", None), world_of(self.setup, None)
-            return
-        if number not in self.placements:
+        places = {None: Placement(0)} | self.placements
+        if number not in places:
             known = ", ".join(map(str, self.placements))
             raise ValueError(f"no placement {number}; there are {known}, and none")
-        placement = self.placements[number]
-        world = world_of(
-            self.setup,
-            placement.T_platform_board,
-            T_room_platform=placement.T_room_platform,
-        )
         # in one go, as a scan may be cast meanwhile
-        self.current = ("placement", number), world
+        self.current = ("placement", number), world_of(self.setup, places[number])
 
     def hold_close(self, camera: str, view: int) -> None:
         """Hold the board close to a camera, in one of the views for its intrinsics.
@@ -120,8 +106,8 @@ class EmulatedWorld:
                 f"no view {view} of camera '{camera}'; there are 0 to {count - 1} of "
                 f"{', '.join(names)}"
             )
-        pose = close_views(self.setup, names.index(camera))[view]
-        self.current = ("close", camera, view), world_of(self.setup, pose, stand=False)
+        close = close_views(self.setup, names.index(camera))[view]
+        self.current = ("close", camera, view), world_of(self.setup, close)
 
     def scan(
         self, turn: int, quarters: np.ndarray, times: np.ndarray
@@ -177,7 +163,6 @@ class CameraServer(ThreadingHTTPServer):
         self.rest_s = rest_s
         self.quit = threading.Event()
         self.cameras = {camera.name: camera for camera in world.setup.rig.cameras}
-        self._imagers: dict[str, Imager] = {}
         # what is shown, and a JPEG file, by camera
         self._images: dict = dict.fromkeys(self.cameras, (None, None))
         self._count = itertools.count()
@@ -227,7 +212,7 @@ class CameraServer(ThreadingHTTPServer):
                 if key is not None:
                     if self._images[name][0] != key:
                         self._images[name] = key, self._draw(name, scene, key[2])
-                    if self._key(name, self.world.place) == key:
+                    if self._key(name, self.world.current[0]) == key:
                         return self._images[name]
             self.quit.wait(LOOK_S)
         return None, None
@@ -243,13 +228,10 @@ class CameraServer(ThreadingHTTPServer):
     def _draw(self, name, scene, pitch):
         """JPEG of what a camera sees."""
         camera = self.cameras[name]
-        if name not in self._imagers:
-            self._imagers[name] = Imager(camera.model, camera.exposure)
         rng = np.random.default_rng([0, next(self._count)])
         pose = self.world.setup.rig.camera_pose(camera, pitch)
-        image = self._imagers[name].render(scene, pose, rng)
-        _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-        return encoded.tobytes()
+        image = camera.imager.render(scene, pose, rng)
+        return encode_jpeg(image, QUALITY)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -266,11 +248,29 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self):
         """Send the images of a camera."""
+        server = self.server
         name = self.path.strip("/").removesuffix(".mjpg")
-        if name in self.server.cameras:
-            return self._stream(name)
-        known = ", ".join(f"{name}.mjpg" for name in self.server.cameras)
-        return self.send_error(404, f"there are {known}")
+        if name not in server.cameras:
+            known = ", ".join(f"{camera}.mjpg" for camera in server.cameras)
+            self.send_error(404, f"there are {known}")
+            return
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            self.send_response(200)
+            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+            self.send_header("Cache-Control", "no-cache")
+            self.end_headers()
+            while not server.quit.is_set():
+                _, data = server.image(name)
+                if data is None:
+                    # a blank line: the camera lives, its head moves
+                    self.wfile.write(b"\r\n")
+                else:
+                    head = (
+                        "--frame\r\nContent-Type: image/jpeg\r\n"
+                        f"Content-Length: {len(data)}\r\n\r\n"
+                    )
+                    self.wfile.write(head.encode() + data + b"\r\n")
+                    server.quit.wait(1 / FPS)
 
     def do_POST(self):
         """Move the board."""
@@ -293,26 +293,6 @@ class _Handler(BaseHTTPRequestHandler):
             return self.send_error(400, str(error))
         self.send_response(204)
         return self.end_headers()
-
-    def _stream(self, name):
-        server = self.server
-        with contextlib.suppress(ConnectionError, TimeoutError):
-            self.send_response(200)
-            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-            self.send_header("Cache-Control", "no-cache")
-            self.end_headers()
-            while not server.quit.is_set():
-                _, data = server.image(name)
-                if data is None:
-                    # a blank line: the camera lives, its head moves
-                    self.wfile.write(b"\r\n")
-                else:
-                    head = (
-                        "--frame\r\nContent-Type: image/jpeg\r\n"
-                        f"Content-Length: {len(data)}\r\n\r\n"
-                    )
-                    self.wfile.write(head.encode() + data + b"\r\n")
-                    server.quit.wait(1 / FPS)
 
     def log_message(self, *_):
         pass

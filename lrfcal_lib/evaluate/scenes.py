@@ -63,13 +63,12 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     if truth is None:
         return None
     from lrfcal_lib.simulate.record import world_of
-    from lrfcal_lib.simulate.rig import load_setup
+    from lrfcal_lib.simulate.rig import Placement, load_setup
 
     rig = calibration.rig(method)
     placement = cloud.placement[0]
-    world = world_of(
-        load_setup(truth.setup), None, T_room_platform=truth.stations.get(placement)
-    )
+    station = Placement(placement, T_room_platform=truth.stations.get(placement))
+    world = world_of(load_setup(truth.setup), station)
     recorded = session.sweep(placement).pitch
     true_pitch = truth.pitch[placement]
     turn, shift = truth.gauge(rig, placement, recorded)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
+from lrfcal_lib.session.images import encode_jpeg
 
 AT_ONCE = 1 << 18  # points that are handed over to the library
 PIXEL = 5e-6  # metres; E57 wants a focal length in metres, of which only the ratio counts
@@ -146,8 +147,7 @@ class E57Writer:
         matrix, _ = cv2.getOptimalNewCameraMatrix(*lens, size, 1.0, wide)
         maps = cv2.initUndistortRectifyMap(*lens, None, matrix, wide, cv2.CV_32FC2)[0]
         flat = cv2.remap(view.image, maps, None, cv2.INTER_LINEAR)
-        quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-        jpeg = cv2.imencode(".jpg", flat, quality)[1].ravel()
+        jpeg = bytearray(encode_jpeg(flat, QUALITY))
         blob = self._nodes.BlobNode(self._image_file, len(jpeg))
         image = {
             "guid": new_guid(),

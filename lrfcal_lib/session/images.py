@@ -4,6 +4,8 @@ import struct
 from io import BytesIO
 from os import PathLike
 
+import cv2
+import numpy as np
 from PIL import Image
 
 from lrfcal_lib.session.files import SessionError, reading
@@ -15,6 +17,19 @@ HEADER = 1 << 19  # bytes in which the size stands, whatever remarks are before 
 # by marker, which does not occur within coded pixels; each scan takes up to 30 ms at 30 megapixels,
 # programs write about ten
 LIMITS = {b"\xff\xda": (100, "scans"), b"\xff\xe1": (10_000, "segments of remarks")}
+
+
+def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
+    """Content of a JPEG file.
+
+    Parameters
+    ----------
+    image
+        (height, width, 3), blue, green, red.
+    quality
+        1 to 100.
+    """
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def image_size(file: str | PathLike, data: bytes) -> tuple[int, int]:

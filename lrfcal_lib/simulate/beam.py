@@ -9,15 +9,19 @@ from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.geometry import polar_to_points, tilt, unit_vector
-from lrfcal_lib.session.lms2xx_codec import REASONS, encode_values, largest
+from lrfcal_lib.session.lms2xx_codec import (
+    REASONS,
+    VARIANTS,
+    encode_values,
+    largest,
+    scan_quarters,
+)
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.scene import World, need
 
 NOT_VALID, DAZZLED, WEAK = (
     REASONS.index(words) for words in ("not valid", "dazzled", "noise")
 )
-# deg, 1/100 deg: of telegram 0x3B
-VARIANTS = ((100, 25), (100, 50), (100, 100), (180, 50), (180, 100))
 UNITS = {0.001: "mm", 0.01: "cm"}  # by metres a count
 
 
@@ -29,7 +33,7 @@ class Beam:
     """
 
     name: str = "LMS221-30206"
-    # fields of view it can be set to, degrees (technical description, chapter 12)
+    # fields of view it can be set to, degrees (technical description, chapter 12); for the record
     angles: tuple[int, ...] = (100, 180)
     # diameter of the spot at the window, metres, and its growth with distance, radians (technical
     # description)
@@ -57,11 +61,13 @@ class Beam:
     rings: NonNegativeInt = 4  # of sub-rays over the spot, 1 + 3 rings (rings + 1) of them
 
     def __post_init__(self):
-        known = [variant for variant in VARIANTS if variant[0] in self.angles]
-        variant = f"{self.field_of_view} deg in steps of {self.resolution / 100:g} deg"
-        listed = ", ".join(f"{angle}/{step / 100:g}" for angle, step in known)
-        words = f"no whole scans of {variant}; it can be set to {listed}"
-        need((self.field_of_view, self.resolution) in known, f"{self.name} has {words}")
+        step = self.resolution / 100
+        listed = ", ".join(f"{angle}/{step:g}" for angle, step in sorted(VARIANTS))
+        need(
+            (self.field_of_view, step) in VARIANTS,
+            f"{self.name} has no whole scans of {self.field_of_view} deg in steps of {step:g} deg; "
+            f"it can be set to {listed}",
+        )
 
     @property
     def turns(self) -> int:
@@ -76,9 +82,8 @@ class Beam:
         ndarray, shape (B,)
             0 right, pi/2 ahead (40 to 140 deg for 100 deg variants).
         """
-        count = self.field_of_view * 100 // self.resolution + 1
-        first = 90 - self.field_of_view / 2
-        return np.radians(first + np.arange(count) * self.resolution / 100)
+        values = self.field_of_view * 100 // self.resolution + 1
+        return np.radians(scan_quarters(values) / 4)
 
     @property
     def unit_name(self) -> str:
@@ -127,8 +132,7 @@ def spot_pattern(rings: int) -> np.ndarray:
     radius = np.sqrt((inside - count / 2) / inside[-1])
     radius[0] = 0.0
     turn = np.concatenate([2 * np.pi * np.arange(n) / n for n in count])
-    unit = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return np.repeat(radius, count)[:, None] * unit
+    return polar_to_points(np.repeat(radius, count), turn)[:, :2]
 
 
 def echo(

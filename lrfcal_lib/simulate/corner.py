@@ -87,5 +87,5 @@ def _image_lines(setup, rng, T_camera_target):
     whole = (inside.any(axis=-1, keepdims=True) & long).all(axis=(1, 2))
 
     noisy = ends[:, 0] + setup.sigma_px * rng.standard_normal(ends[:, 0].shape)
-    start, end = np.moveaxis(np.insert(noisy, 2, 1.0, axis=-1), 1, 0)
-    return unit_lines(np.cross(start, end)), whole
+    both = np.insert(noisy, 2, 1.0, axis=-1).swapaxes(0, 1)
+    return unit_lines(np.cross(*both)), whole

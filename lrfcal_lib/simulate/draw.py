@@ -220,11 +220,15 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     bias = _bias_of_sides(bench, rng)[edge]
     hit = (u + jitter < bias * radius) & sensible
     # near to an edge across the scan lines, and along them
-    near = []
-    for axis in (0, 1):
-        changes = np.diff(hit, axis=axis, append=hit.take([-1], axis))
-        near.append(maximum_filter1d(changes, 2 * REACH, axis, mode="constant"))
-    across, along = near
+    across, along = (
+        maximum_filter1d(
+            np.diff(hit, axis=axis, append=hit.take([-1], axis)),
+            2 * REACH,
+            axis,
+            mode="constant",
+        )
+        for axis in (0, 1)
+    )
     second = np.sort(distances, axis=-1)[..., -2]
     alone = second <= -2 * radius  # elsewhere two edges cut the spot
     row, b = np.nonzero((across | along) & alone & sensible)

@@ -34,13 +34,13 @@ def room_lengths() -> list[dict]:
     """
     lengths = []
     for row in LENGTHS:
-        ends = [_corners(*end) for end in row["ends"]]
+        ends = np.stack([_corners(*end) for end in row["ends"]])
         lengths.append(
             {
                 "name": row["name"],
                 "kind": row["kind"],
-                "metres": _distance(row["name"], *ends),
-                "ends": [corners.tolist() for corners in ends],
+                "metres": _distance(row["name"], ends),
+                "ends": ends.tolist(),
             }
         )
     return lengths
@@ -60,10 +60,9 @@ def _corners(part, number, sides):
     return furnished(part)[number].pose.apply(np.unique(corners, axis=0))
 
 
-def _distance(name, first, second):
-    """Between two parallel faces, or two parallel edges: metres."""
-    faces = len(first) == 4
-    ends = np.stack([first, second])
+def _distance(name, ends):
+    """Between two parallel faces (2, 4, 3), or two parallel edges (2, 2, 3): metres."""
+    faces = ends.shape[1] == 4
     middles = ends.mean(axis=1)
     axes = np.linalg.svd(ends - middles[:, None])[2]
     # the normals of faces, the directions of edges

@@ -5,29 +5,35 @@ import os
 import shutil
 from dataclasses import asdict
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.kinematics import MIRROR_TURN
+from lrfcal_lib.session.images import encode_jpeg
 from lrfcal_lib.session.lms2xx_codec import (
     Configuration,
     encode_configuration,
     encode_words,
 )
 from lrfcal_lib.session.read import PLATFORM_COLUMNS
-from lrfcal_lib.session.stated import transform_to_json
+from lrfcal_lib.session.stated import board_to_json, model_to_json, transform_to_json
 from lrfcal_lib.session.workers import spread
 from lrfcal_lib.session.write import SessionWriter, write_file
 from lrfcal_lib.simulate.beam import scan
 from lrfcal_lib.simulate.lengths import room_lengths
-from lrfcal_lib.simulate.rig import Placement, Setup, held_close, placements_of, random
+from lrfcal_lib.simulate.rig import (
+    CLOSE,
+    Placement,
+    Setup,
+    held_close,
+    placements_of,
+    random,
+)
 from lrfcal_lib.simulate.scene import (
-    Imager,
     World,
     board_on_stand,
     furnished,
@@ -57,7 +63,7 @@ class Stops(NamedTuple):
 class Shots(NamedTuple):
     """Images of one camera, by its number in the rig, at one placement.
 
-    `key` is that of the random numbers. The board held close to a camera is placement -1.
+    `key` is that of the random numbers.
     """
 
     camera: int
@@ -65,37 +71,22 @@ class Shots(NamedTuple):
     stops: Stops
     key: tuple
 
-    @property
-    def purpose(self) -> str:
-        """What the images are for, as a session names it."""
-        if self.placement.number < 0:
-            return "intrinsics"
-        return "scene" if self.placement.T_platform_board is None else "board"
 
-
-def world_of(
-    setup: Setup,
-    T_platform_board: RigidTransform | None,
-    stand: bool = True,
-    T_room_platform: RigidTransform | None = None,
-) -> World:
-    """The room with the board in it.
+def world_of(setup: Setup, placement: Placement) -> World:
+    """The room at a placement: with the board on its stand, or held by nothing before a camera; or
+    with a laid table instead, seen from a station if it is one.
 
     Parameters
     ----------
     setup
-    T_platform_board
-        None for a laid table instead of the board.
-    stand
-        Whether the board is on its stand, or held by nothing.
-    T_room_platform
-        Of a station, where there is no board.
+    placement
     """
-    if T_platform_board is None:
+    if placement.T_platform_board is None:
         room = furnished_room(*furnished("still life"))
-        return room if T_room_platform is None else room.seen_from(T_room_platform)
-    things = board_on_stand(setup.rig.board, T_platform_board, setup.rig.ring)
-    return furnished_room(*(things if stand else things[:1]))
+        station = placement.T_room_platform
+        return room if station is None else room.seen_from(station)
+    things = board_on_stand(setup.rig.board, placement.T_platform_board, setup.rig.ring)
+    return furnished_room(*(things if placement.purpose == "board" else things[:1]))
 
 
 def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
@@ -108,9 +99,7 @@ def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     setup
     placement
     """
-    step = setup.step
-    if placement.T_platform_board is None:
-        _, _, step = setup.room_sweep  # type: ignore[misc]
+    step = setup.step_of(placement)
     rng = random(setup, STOPS, placement.number)
     way = placement.direction
     images = np.array(placement.image_pitch)
@@ -123,14 +112,13 @@ def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
 def sweep_of(setup, placement):
     """The scan lines of a placement, one a stop of the sweep: words (L, B) as a device sends."""
     pitch = stops_of(setup, placement)[1].true
-    station = placement.T_room_platform
-    world = world_of(setup, placement.T_platform_board, T_room_platform=station)
+    world = world_of(setup, placement)
     rng = random(setup, SWEEP, placement.number)
     return scan(setup.rig.beam, world, pitch[:, None], setup.rig.T_head_lrf, rng)
 
 
-def close_views(setup: Setup, number: int) -> list[RigidTransform]:
-    """Poses ``T_platform_board`` of the board held close to a camera while the head is at 0.
+def close_views(setup: Setup, number: int) -> list[Placement]:
+    """Placements of the board held close to a camera while the head is at 0.
 
     Parameters
     ----------
@@ -142,44 +130,35 @@ def close_views(setup: Setup, number: int) -> list[RigidTransform]:
     camera = rig.cameras[number]
     still = rig.camera_pose(camera, 0.0).inv()
     rng = random(setup, VIEWS, number)
-    return [still * pose for pose in held_close(rig, camera, setup.intrinsics_views, rng)]
+    poses = held_close(rig, camera, setup.intrinsics_views, rng)
+    return [Placement(CLOSE, still * pose) for pose in poses]
 
 
 def shots_of(setup, placements):
     """All images of a setup in the order in which they are written, a list of Shots."""
-    out = []
     cameras = range(len(setup.rig.cameras))
     still = Stops(*np.zeros((3, 1)))
-    for number in cameras:
-        for i, pose in enumerate(close_views(setup, number)):
-            close = Placement(-1, pose, sweep=(0.0, 0.0), image_pitch=(0.0,))
-            out.append(Shots(number, close, still, (PHOTO, number, 0, i)))
-    for placement in placements:
-        stops, _ = stops_of(setup, placement)
-        for number in cameras:
-            key = (PHOTO, number, placement.number)
-            out.append(Shots(number, placement, stops, key))
-    return out
+    close = [
+        Shots(number, placement, still, (PHOTO, number, 0, i))
+        for number in cameras
+        for i, placement in enumerate(close_views(setup, number))
+    ]
+    return close + [
+        Shots(number, p, stops_of(setup, p)[0], (PHOTO, number, p.number))
+        for p in placements
+        for number in cameras
+    ]
 
 
 def photograph(setup, shots):
     """Take pictures, a list of JPEG files as bytes."""
     rig = setup.rig
     camera = rig.cameras[shots.camera]
-    imager = Imager(camera.model, camera.exposure)
-    placement = shots.placement
-    world = world_of(
-        setup,
-        placement.T_platform_board,
-        stand=shots.purpose == "board",
-        T_room_platform=placement.T_room_platform,
-    )
+    world = world_of(setup, shots.placement)
     rng = random(setup, *shots.key)
     poses = rig.camera_pose(camera, shots.stops.true)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, setup.quality]
     return [
-        cv2.imencode(".jpg", imager.render(world, pose, rng), quality)[1].tobytes()
-        for pose in poses
+        encode_jpeg(camera.imager.render(world, pose, rng), setup.quality) for pose in poses
     ]
 
 
@@ -222,27 +201,14 @@ def _record(folder, name, setup):
     placements = placements_of(setup)
     reference = {
         "recording": RECORDING,
-        "scene_placements": [p.number for p in placements if p.T_platform_board is None],
+        "scene_placements": [p.number for p in placements if p.purpose == "scene"],
     }
-    # what only the simulator knows
-    truth = {
-        "simulated": True,
-        "setup": setup.name,
-        "seed": setup.seed,
-        **rig.truth(),
-        "boards": {},
-        "lrf": asdict(rig.beam),
-        "platform": asdict(rig.platform),
-        "sweeps": {},
-        "images": {},
-    }
-    if setup.stations:
-        truth |= {"stations": {}, "lengths": room_lengths()}
+    truth = _truth(setup, placements)
     with SessionWriter(
         folder,
         rig.board,
         rig.beam.info("simulated"),
-        rig.camera_infos(),
+        rig.camera_infos().values(),
         rig.T_head_lrf_stated,
         name=name,
         licence=LICENCE,
@@ -256,6 +222,45 @@ def _record(folder, name, setup):
     rows = table.to_csv(index=False, float_format="%.4f")
     write_file(folder, "platform.csv", rows.encode())
     write_file(folder, "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
+
+
+def _truth(setup, placements):
+    """What only the simulator knows, as JSON has it; sweeps and images come with the recording."""
+    rig = setup.rig
+    cameras = {
+        c.name: {
+            "T_camera_lrf": transform_to_json(c.mounting),
+            "intrinsics": model_to_json(c.model),
+            "exposure": asdict(c.exposure),
+        }
+        for c in rig.cameras
+    }
+    boards = {
+        p.number: {"T_platform_board": transform_to_json(p.T_platform_board)}
+        for p in placements
+        if p.purpose == "board"
+    }
+    truth = {
+        "simulated": True,
+        "setup": setup.name,
+        "seed": setup.seed,
+        "T_head_lrf": transform_to_json(rig.T_head_lrf),
+        "cameras": cameras,
+        "board": board_to_json(rig.board),
+        "boards": boards,
+        "lrf": asdict(rig.beam),
+        "platform": asdict(rig.platform),
+        "sweeps": {},
+        "images": {},
+    }
+    if setup.stations:
+        truth["stations"] = {
+            p.number: {"T_room_platform": transform_to_json(p.T_room_platform)}
+            for p in placements
+            if p.purpose == "scene"
+        }
+        truth["lengths"] = room_lengths()
+    return truth
 
 
 def _add_placements(writer, setup, placements, truth):
@@ -273,21 +278,15 @@ def _add_placements(writer, setup, placements, truth):
     configuration = Configuration().changed(unit=unit)
     writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
     shots = shots_of(setup, placements)
-    taken = list(zip(shots, spread(partial(photograph, setup), shots), strict=True))
-    close = [pair for pair in taken if pair[0].purpose == "intrinsics"]
+    taken = zip(shots, spread(partial(photograph, setup), shots), strict=True)
+    cameras = len(setup.rig.cameras)
+    close = islice(taken, cameras * setup.intrinsics_views)
     _add_images(writer, setup, close, truth, [np.nan])
     for placement in placements:
         number = placement.number
-        board = placement.T_platform_board
-        if board is not None:
-            truth["boards"][number] = {"T_platform_board": transform_to_json(board)}
-        station = placement.T_room_platform
-        if station is not None:
-            truth["stations"][number] = {"T_room_platform": transform_to_json(station)}
         images, lines = stops_of(setup, placement)
         shot_at = clock + pause * np.arange(1, len(images.true) + 1)
-        own = [pair for pair in taken if pair[0].placement == placement]
-        _add_images(writer, setup, own, truth, shot_at)
+        _add_images(writer, setup, islice(taken, cameras), truth, shot_at)
         first = shot_at[-1] + pause
         began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
@@ -315,7 +314,7 @@ def _add_images(writer, setup, taken, truth, times):
                 shot.placement.number,
                 pitch=measured,
                 time_s=np.round(time_s, 4),
-                purpose=shot.purpose,
+                purpose=shot.placement.purpose,
             )
             known = {"pitch_rad": float(true)}
             if board is not None:

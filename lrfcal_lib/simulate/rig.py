@@ -2,7 +2,8 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -24,22 +25,19 @@ from lrfcal_lib.model.geometry import AHEAD, apply_pose, carry, pose_array
 from lrfcal_lib.model.kinematics import beams_to, camera_at
 from lrfcal_lib.session.stated import (
     CameraInfo,
-    board_to_json,
-    model_to_json,
-    transform_to_json,
 )
 from lrfcal_lib.simulate.beam import LMS221, Beam
 from lrfcal_lib.simulate.scenarios import in_radians
-from lrfcal_lib.simulate.scene import Exposure, need
+from lrfcal_lib.simulate.scene import Exposure, Imager, need
 from lrfcal_lib.simulate.shots import PATTERN
 
 MOST_TRIES = 4000
 PITCH_GRID = np.radians(
     np.arange(-30.0, 30.1, 0.5)
 )  # pitch angles at which an image may be taken
-OUTSIDE = np.radians(2.0)  # a sweep begins and ends this far outside the board
 LEAST_SPAN = np.radians(4.0)  # of the pitch angles at which all cameras see the board
-CLOSE = (0.22, 0.45)  # metres from the camera to a board that is held close
+CLOSE = -1  # number of a placement that is held close to a camera,
+NEAR = (0.22, 0.45)  # so many metres away
 PLACES = 3  # stream of random numbers
 
 
@@ -99,10 +97,14 @@ class Platform:
             f"platform: pitch {first:.2f} to {last:.2f} deg is asked for, it turns {low:.2f} to "
             f"{high:.2f} deg",
         )
-        step = self.encoder_step
         motor = commanded + self.noise * rng.standard_normal(commanded.shape)
         head = (1 + self.stretch) * motor - direction * self.backlash / 2
-        return head, np.rint(motor / step) * step if step else motor
+        return head, self.encoded(motor)
+
+    def encoded(self, motor: np.ndarray) -> np.ndarray:
+        """What the encoder says of angles of the motor, radians."""
+        step = self.encoder_step
+        return np.rint(motor / step) * step if step else motor
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,11 @@ class RigCamera:
     mounting: RigidTransform  # T_camera_lrf
     guess: RigidTransform  # the same as a tape measure gives it
     exposure: Exposure = Exposure()
+
+    @cached_property
+    def imager(self) -> Imager:
+        """Takes its pictures."""
+        return Imager(self.model, self.exposure)
 
 
 @dataclass(frozen=True)
@@ -143,27 +150,18 @@ class Rig:
         """
         return camera_at(camera.mounting, "head", self.T_head_lrf, pitch)
 
-    def camera_infos(self) -> list[CameraInfo]:
-        """What a session states of the cameras."""
-        return [
-            CameraInfo(c.name, "head", c.model.width, c.model.height, None, c.guess)
-            for c in self.cameras
-        ]
-
-    def truth(self) -> dict:
-        """Mountings, intrinsics and board as only the simulator knows them, as JSON has them."""
-        cameras = {
-            c.name: {
-                "T_camera_lrf": transform_to_json(c.mounting),
-                "intrinsics": model_to_json(c.model),
-                "exposure": asdict(c.exposure),
-            }
-            for c in self.cameras
-        }
+    def camera_infos(self, known: bool = False) -> dict[str, CameraInfo]:
+        """What a session states of the cameras, by name; the intrinsics where they are known."""
         return {
-            "T_head_lrf": transform_to_json(self.T_head_lrf),
-            "cameras": cameras,
-            "board": board_to_json(self.board),
+            c.name: CameraInfo(
+                c.name,
+                "head",
+                c.model.width,
+                c.model.height,
+                c.model if known else None,
+                c.guess,
+            )
+            for c in self.cameras
         }
 
 
@@ -173,8 +171,8 @@ def shows(model, T_camera_board, points, margin):
     For a pose, or each of a stack of poses.
     """
     p = apply_pose(pose_array(T_camera_board), points)
-    within_45_deg = np.abs(p[..., :2]) <= p[..., 2:]
-    ahead = (p[..., 2] >= 0.1) & within_45_deg.all(axis=-1)
+    # within 45 deg of the axis, and no nearer than 0.1 m
+    ahead = p[..., 2] >= np.abs(p[..., :2]).max(axis=-1, initial=0.1)
     return np.all(ahead & model.shows(project(p, model), margin), axis=-1)
 
 
@@ -187,14 +185,21 @@ class Setup:
     rig: InstanceOf[Rig]
     pairs: NonNegativeInt  # pairs of board placements; none in a recording of the room only
     distances: tuple[float, float]  # of the board, metres
-    step: PositiveFloat = math.radians(0.25)  # between the stops of a sweep, radians
-    intrinsics_views: NonNegativeInt = 20  # images of the board held close, a camera
+    step: PositiveFloat  # between the stops of a sweep, radians
+    margin: PositiveFloat  # of a sweep beyond the board, radians
+    intrinsics_views: NonNegativeInt  # images of the board held close, a camera
     # first pitch, last pitch and step of the sweep of the room, radians; empty for none
-    room_sweep: tuple[()] | tuple[float, float, float] = ()
-    room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
+    room_sweep: tuple[()] | tuple[float, float, float]
+    room_images: tuple[float, ...]  # pitch angles of the images of the room, radians
     # T_room_platform of each sweep of the room; empty for one sweep from where the boards are seen
-    stations: tuple[InstanceOf[RigidTransform], ...] = ()
-    quality: Annotated[int, Field(ge=1, le=100)] = 95  # of JPEG
+    stations: tuple[InstanceOf[RigidTransform], ...]
+    quality: Annotated[int, Field(ge=1, le=100)]  # of JPEG
+
+    def step_of(self, placement: "Placement") -> float:
+        """Between the stops of a sweep, radians."""
+        if placement.T_platform_board is None and self.room_sweep:
+            return self.room_sweep[2]
+        return self.step
 
 
 def printed_triangle() -> Board:
@@ -219,23 +224,24 @@ def load_setup(name: str) -> Setup:
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
     row = in_radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
-    width = row["image_width"]
-    cameras = [_camera(key, camera, width) for key, camera in row["cameras"].items()]
     rig = Rig(
         beam=replace(LMS221, **row["beam"]),
         platform=Platform(**in_radians(row["platform"])),
         T_head_lrf=_placed(row["head"]),
         T_head_lrf_stated=_placed(row["head_stated"]),
-        cameras=tuple(cameras),
+        cameras=tuple(
+            _camera(key, camera, row["image_width"], row["exposure"])
+            for key, camera in row["cameras"].items()
+        ),
         board=printed_triangle(),
     )
-    stations = tuple(_placed(station) for station in row.get("stations", ()))
+    stations = tuple(_placed(station) for station in row["stations"])
     # what else is in the row the Setup ignores
     return Setup(**row | {"name": name, "rig": rig, "stations": stations})
 
 
-def _camera(name, row, width):
-    """A camera with images so many pixels wide."""
+def _camera(name, row, width, exposure):
+    """A camera with images so many pixels wide, and settings of the exposure of all cameras."""
     scale = width / row["size"][0]
     turn = Rotation.from_rotvec(row["turn"], degrees=True) * AHEAD
     mounting = carry(turn, row["centre"])
@@ -245,7 +251,7 @@ def _camera(name, row, width):
     width, height = (round(v * scale) for v in row["size"])
     pinhole = [v * scale for v in row["pinhole"]]
     model = CameraModel(width, height, *pinhole, np.array(row["distortion"]))
-    return RigCamera(name, model, mounting, guess, Exposure(**row["exposure"]))
+    return RigCamera(name, model, mounting, guess, Exposure(**exposure | row["exposure"]))
 
 
 def _placed(row):
@@ -258,15 +264,21 @@ def _placed(row):
 class Placement:
     """The board at one place, and what is recorded of it."""
 
-    number: int
+    number: int  # CLOSE for a board that is held before a camera
     # None for a sweep of the room, with a laid table near the rig
-    T_platform_board: RigidTransform | None
-    sweep: tuple[
-        float, float
-    ]  # pitch commands of the first and the last scan line, radians
+    T_platform_board: RigidTransform | None = None
+    # pitch commands of the first and the last scan line, radians
+    sweep: tuple[float, float] = (0.0, 0.0)
     # pitch commands of the images in the order in which they are taken, radians
-    image_pitch: tuple[float, ...]
+    image_pitch: tuple[float, ...] = (0.0,)
     T_room_platform: RigidTransform | None = None  # of a station; room is room.json's frame
+
+    @property
+    def purpose(self) -> str:
+        """What its images are for, as a session names it."""
+        if self.number == CLOSE:
+            return "intrinsics"
+        return "scene" if self.T_platform_board is None else "board"
 
     @property
     def direction(self):
@@ -288,7 +300,8 @@ def placements_of(setup: Setup) -> list[Placement]:
     """
     out = []
     if setup.pairs:
-        out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
+        rng = random(setup, PLACES)
+        out = pairs(setup.rig, setup.pairs, setup.distances, rng, setup.margin)
     if setup.room_sweep:
         first, last, _ = setup.room_sweep
         for T_room_platform in setup.stations or (None,):
@@ -303,7 +316,7 @@ def pairs(
     count: int,
     distances: tuple[float, float],
     rng: np.random.Generator,
-    margin: float = OUTSIDE,
+    margin: float,
 ) -> list[Placement]:
     """Placements in pairs: at one place, turned by about a right angle and tilted otherwise.
 
@@ -326,10 +339,9 @@ def pairs(
     ValueError
         If the board does not fit into a view, or no place is found that everything sees.
     """
-    asked = f"{count} pairs at {distances} m"
     need(
         count >= 1 and 0.3 <= distances[0] <= distances[1],
-        f"{asked}: at least one pair, at 0.3 m or more, is needed",
+        f"{count} pairs at {distances} m: at least one pair, at 0.3 m or more, is needed",
     )
     out = []
     shuffled = rng.permutation(np.linspace(*distances, count))
@@ -370,8 +382,7 @@ def _pair(rig, distance, turn, rng):
     centre = rig.board.points().mean(axis=0)
     out = []
     for more in (0.0, 90.0):
-        lean = [rng.uniform(-35, 35), rng.uniform(-28, 28)]
-        angles = [*lean, turn + more + rng.uniform(-12, 12)]
+        angles = rng.uniform([-35, -28, -12], [35, 28, 12]) + [0, 0, turn + more]
         leant = Rotation.from_euler("YXZ", angles, degrees=True)
         turned = Rotation.from_euler("z", -azimuth) * AHEAD * leant
         out.append(carry(turned, centre, middle))
@@ -384,19 +395,18 @@ def _spans(rig, pose, margin):
     None where that is too little.
     """
     points = rig.board.points()
-    shown = np.ones(len(PITCH_GRID), bool)
-    for camera in rig.cameras:
-        poses = rig.camera_pose(camera, PITCH_GRID) * pose
-        shown &= shows(camera.model, poses, points, margin=12.0)
-    seen = PITCH_GRID[shown]
-    if not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
+    shown = [
+        shows(camera.model, rig.camera_pose(camera, PITCH_GRID) * pose, points, margin=12.0)
+        for camera in rig.cameras
+    ]
+    seen = PITCH_GRID[np.all(shown, axis=0)]
+    if len(seen) < 2 or np.ptp(seen) <= LEAST_SPAN:
         return None
     bearing, pitch, _ = beams_to(pose.apply(points), rig.T_head_lrf)
     half_field = np.radians(rig.beam.field_of_view / 2)
     if np.abs(bearing - np.pi / 2).max() >= half_field - 2 * margin:
         return None
-    sweep = pitch.min() - margin, pitch.max() + margin
-    return sweep, (seen[0], seen[-1])
+    return (pitch.min() - margin, pitch.max() + margin), seen[[0, -1]]
 
 
 def held_close(
@@ -424,19 +434,18 @@ def held_close(
     """
     m = camera.model
     points = rig.board.pattern.points()
-    columns = max(int(np.ceil(np.sqrt(count * 4 / 3))), 1)
-    rows = np.ceil(count / columns)
+    columns = math.ceil(math.sqrt(count * 4 / 3)) or 1
+    rows = math.ceil(count / columns)
     to_camera = Rotation.from_euler("x", 180, degrees=True)
     out = []
     for i in range(count):
         row, column = divmod(i, columns)
         pixel = np.array([(column + 0.5) / columns, (row + 0.5) / rows]) * m.size
         # towards the middle of the image first, then away from the camera
-        for attempt in range(2 * MOST_TRIES):
-            tried = attempt / MOST_TRIES
+        for tried in np.arange(2 * MOST_TRIES) / MOST_TRIES:
             inwards = (m.size / 2 - pixel) * min(tried, 1.0)
             shown = pixel + inwards + rng.normal(0, 15, 2)
-            z = rng.uniform(*CLOSE) * max(tried, 1.0)
+            z = rng.uniform(*NEAR) * max(tried, 1.0)
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])
             turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
             place = z * m.sights(shown)

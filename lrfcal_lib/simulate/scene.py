@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, project, undistort
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import polar_to_points, unit_vector
 from lrfcal_lib.simulate import shapes, textures
 from lrfcal_lib.simulate.shapes import polygon, rod
 from lrfcal_lib.simulate.textures import chessboard, plain
@@ -241,9 +241,8 @@ def board_on_stand(board, T_platform_board, ring):
     head = behind + 0.3 * unit_vector(away) + [0.0, 0.0, -0.02]
     knee = [*head[:2], min(head[2] - 0.3, FLOOR + 0.75)]
     rods = [(middle, behind, 0.006), (behind, head, 0.008), (head, knee, 0.011)]
-    for turn in np.radians([80, 200, 320]):
-        foot = [head[0] + 0.38 * np.cos(turn), head[1] + 0.38 * np.sin(turn), FLOOR]
-        rods.append((knee, foot, 0.010))
+    feet = polar_to_points(0.38, np.radians([80, 200, 320])) + [*head[:2], FLOOR]
+    rods += [(knee, foot, 0.010) for foot in feet]
     sheet = Thing(
         polygon(board.corners), (chessboard, board, 0.07, 0.75, ring), T_platform_board
     )

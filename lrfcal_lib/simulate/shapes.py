@@ -6,6 +6,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
+from lrfcal_lib.model.board import UNIT_SQUARE
 from lrfcal_lib.model.geometry import plane_axes, unit_vector
 
 BOX_CORNERS = np.array(list(product((-1, 1), repeat=3)))  # of a box of 2 m about the origin
@@ -31,9 +32,7 @@ def rectangle(width: float, height: float) -> np.ndarray:
     width, height
         Along x and y, metres.
     """
-    w = width / 2
-    h = height / 2
-    return polygon([[-w, -h], [w, -h], [w, h], [-w, h]])
+    return polygon((UNIT_SQUARE - 0.5) * [width, height])
 
 
 def grid_surface(x, y, z):

@@ -95,7 +95,7 @@ class Scenario(Devices):
     def boards(self, rng, T_camera_lrf):
         """Poses ``T_lrf_board`` of boards (or corners), one for each rig."""
         count = len(T_camera_lrf)
-        middle = np.append(self.board.corners.mean(axis=0), 0.0)
+        middle = self.board.points().mean(axis=0)
         if self.poses == "tilted":
             return T_camera_lrf.inv() * self._tilted(rng, count, middle)
         if self.poses == "ahead":
@@ -120,7 +120,7 @@ class Scenario(Devices):
         axis in the board, anywhere in the image.
         """
         angle = rng.uniform(0, 2 * np.pi, count)
-        axis = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
+        axis = polar_to_points(1.0, angle)
         rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
         away = rng.uniform(*self.distances, count)
         pixels = rng.uniform(0, self.model.size, (count, 2))
@@ -129,12 +129,9 @@ class Scenario(Devices):
 
     def _around(self, rng, count):
         """Poses ``T_world_lrf`` of an LRF that looks at the origin but for turns."""
-        direction = np.zeros((count, 3))
-        open_ = np.ones(count, bool)
-        while open_.any():
-            v = rng.uniform(0, 1, (open_.sum(), 3))
-            direction[open_] = unit_vector(v)
-            open_ = direction.min(axis=1) < np.sin(self.least_angle)
+        direction = np.full((count, 3), -1.0)
+        while np.any(open_ := direction.min(axis=1) < np.sin(self.least_angle)):
+            direction[open_] = unit_vector(rng.uniform(0, 1, (open_.sum(), 3)))
         z = -direction
         x = unit_vector(np.cross(z, [0.0, 0.0, 1.0]))
         looking = np.stack([x, np.cross(z, x), z], axis=-1)
@@ -183,10 +180,10 @@ def draw_shots(
     while missing.any() and len(parts) < MOST_ROUNDS:
         trial = np.repeat(np.arange(trials), 2 * missing)
         conditions, shots = draw(setup, rng, T_camera_lrf[trial])
-        usable = np.logical_and.reduce(list(conditions.values()))
-        failing.append([100 * np.mean(~good) for good in conditions.values()])
+        good = np.array([*conditions.values()])
+        failing.append(100 * np.mean(~good, axis=1))
         shots["trial"] = trial
-        part = {name: value[usable] for name, value in shots.items()}
+        part = {name: value[good.all(axis=0)] for name, value in shots.items()}
         parts.append(part)
         missing = np.maximum(missing - np.bincount(part["trial"], minlength=trials), 0)
     if missing.any():
@@ -213,8 +210,9 @@ def board_shots(setup, rng, T_camera_lrf):
     board = setup.board
     T_lrf_board = setup.boards(rng, T_camera_lrf)
     at_lrf = pose_array(T_lrf_board)
-    edges, clear = _crossed_edges(setup, at_lrf)
-    ranges, hit, enough = _scans(setup, rng, at_lrf)
+    ends = apply_pose(at_lrf, board.points())
+    edges, clear = _crossed_edges(setup, at_lrf, ends)
+    ranges, hit, enough = _scans(setup, rng, at_lrf, ends)
 
     true = pose_array(T_camera_lrf * T_lrf_board)
     corners = apply_pose(true, board.points())
@@ -249,11 +247,10 @@ def board_shots(setup, rng, T_camera_lrf):
     }
 
 
-def _crossed_edges(setup, pose):
-    """Edges (n, 2) of convex boards at poses (n, 3, 4) that the scan plane crosses, at the low and
-    the high bearing, and whether both crossings are clear of the other edges.
+def _crossed_edges(setup, pose, ends):
+    """Edges (n, 2) that the scan plane crosses, at the low and the high bearing, of convex boards
+    at poses (n, 3, 4) with corners there, and whether both crossings are clear of other edges.
     """
-    ends = apply_pose(pose, setup.board.points())
     following = np.roll(ends, -1, axis=1)
     height = ends[..., 2]
     crossed = height * following[..., 2] < 0
@@ -269,9 +266,9 @@ def _crossed_edges(setup, pose):
     return edges, (crossed.sum(axis=1) == 2) & (second < -least).all(axis=1)
 
 
-def _scans(setup, rng, pose):
-    """Of the scan lines over boards at poses (n, 3, 4): exact ranges (n, B), which beams hit (n, S,
-    B), and whether there are enough in every one.
+def _scans(setup, rng, pose, ends):
+    """Of the scan lines over boards at poses (n, 3, 4) with corners there: exact ranges (n, B),
+    which beams hit (n, S, B), and whether there are enough in every one.
     """
     distances, ranges = _beside(setup, pose, polar_to_points(1.0, setup.bearings()))
     spot = setup.radius(np.abs(ranges))
@@ -282,8 +279,7 @@ def _scans(setup, rng, pose):
     soft = np.hypot(setup.softness, setup.floor * setup.step * ranges / spot)[:, None]
     flips = rng.standard_normal((len(pose), setup.scans, ranges.shape[1]))
     # rays along the board meet its plane far away, where the least softness means nothing
-    corners = apply_pose(pose, setup.board.points())
-    farthest = np.linalg.norm(corners, axis=-1).max(axis=-1, keepdims=True)
+    farthest = np.linalg.norm(ends, axis=-1).max(axis=-1, keepdims=True)
     sensible = (ranges > 0) & (ranges < FARTHER * farthest)
     hit = (outside < setup.bias + soft * flips) & sensible[:, None]
     enough = hit.sum(axis=-1) >= setup.fewest_beams

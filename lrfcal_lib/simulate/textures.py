@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+LINE = 0.0055  # metres, of a printed page
 # random values that textures are made of
 LATTICE = np.random.default_rng(20091001).random((64,) * 3)
 
@@ -18,14 +19,13 @@ def value_noise(points, cell):
     low = whole_below(at)
     f = at - low
     f = f * f * (3 - 2 * f)
-    cells = np.stack([low & 63, (low + 1) & 63])  # (2, n, 3)
+    cells = np.stack([low, low + 1]) & 63  # (2, n, 3)
     shares = np.stack([1 - f, f])
     axes = np.arange(3)
-    out = 0.0
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.prod(shares[corner, :, axes], axis=0)
-        out = out + weight * LATTICE[tuple(cells[corner, :, axes])]
-    return out
+    return sum(
+        np.prod(shares[corner, :, axes], axis=0) * LATTICE[tuple(cells[corner, :, axes])]
+        for corner in np.ndindex(2, 2, 2)
+    )
 
 
 def plain(
@@ -60,13 +60,13 @@ def wood(points, color, cell=(0.5, 0.03, 0.03)):
     return tone[:, None] * color
 
 
-def planks(points, color, width=0.18, length=1.4):
-    """A wooden floor: boards along y with dark joints."""
-    across = points[:, 0] / width
+def planks(points, color):
+    """A wooden floor: boards of 0.18 m by 1.4 m along y with dark joints."""
+    across = points[:, 0] / 0.18
     row = whole_below(across)
-    board = whole_below(points[:, 1] / length + 0.37 * row)
+    board = whole_below(points[:, 1] / 1.4 + 0.37 * row)
     tone = LATTICE[row & 63, board & 63, 7]
-    dark = np.where(from_whole(across) * width < 0.002, 0.55, 1.0)
+    dark = np.where(from_whole(across) * 0.18 < 0.002, 0.55, 1.0)
     return wood(points, color, (0.03, 0.6, 1.0)) * ((0.85 + 0.3 * tone) * dark)[:, None]
 
 
@@ -89,17 +89,18 @@ def tiles(points, color, joint, size):
     return np.where(near[:, None], joint, tone[:, None] * color)
 
 
-def printed_page(points, width, height, heading=0.1, line=0.0055):
+def printed_page(points, width, height):
     """White paper in the plane z = 0 about the origin: words as dark bars, heading, picture."""
-    x = points[:, 0] / width + 0.5
-    y = 0.5 - points[:, 1] / height
-    lines = points[:, 1] / line
+    across, up, _ = points.T
+    x = across / width + 0.5
+    y = 0.5 - up / height
+    lines = up / LINE
     row = whole_below(lines)
-    word = whole_below((points[:, 0] + 0.31 * row * line) / (2.1 * line))
+    word = whole_below((across + 0.31 * row * LINE) / (2.1 * LINE))
     ink = LATTICE[row & 63, word & 63, 3] > 0.22
     ink &= np.mod(lines, 1.0) < 0.5
     ink &= between(x, 0.1, 0.9) & between(y, 0.18, 0.93)
-    ink |= (np.abs(y - heading) < 0.025) & between(x, 0.2, 0.8)
+    ink |= (np.abs(y - 0.1) < 0.025) & between(x, 0.2, 0.8)
     grey = np.where(ink, 0.12, 0.86)
     picture = between(x, 0.52, 0.88) & between(y, 0.55, 0.8)
     grey = np.where(picture, 0.25 + 0.5 * value_noise(points, 0.02), grey)
@@ -119,10 +120,11 @@ def between(values, low, high):
 def poster(points, width, height, colors):
     """A picture: hills under a sky with a sun, in the plane z = 0 about the origin."""
     sky, sun, far, near = colors
-    x = points[:, 0] / width + 0.5
-    y = points[:, 1] / height + 0.5
+    across, up, _ = points.T
+    x = across / width + 0.5
+    y = up / height + 0.5
     out = (0.7 + 0.4 * y)[:, None] * sky
-    from_sun = np.hypot(points[:, 0] - 0.2 * width, points[:, 1] - 0.2 * height)
+    from_sun = np.hypot(across - 0.2 * width, up - 0.2 * height)
     far_hills = 0.45 + 0.12 * np.sin(7 * x + 1)
     near_hills = 0.25 + 0.08 * np.sin(11 * x)
     margin = (np.abs(x - 0.5) > 0.47) | (np.abs(y - 0.5) > 0.48)
@@ -133,12 +135,12 @@ def poster(points, width, height, colors):
     return out
 
 
-def book_spines(points, seed, pitch=0.035):
-    """Coloured backs of books side by side along x."""
+def book_spines(points, seed):
+    """Coloured backs of books side by side along x, 35 mm each."""
     rng = np.random.default_rng(seed)
     tones = rng.uniform(0.1, 0.6, (64, 1))
     palette = tones * (0.55 + rng.uniform(0.0, 0.6, (64, 3)))
-    at = points[:, 0] / pitch
+    at = points[:, 0] / 0.035
     color = palette[whole_below(at) & 63]
     label = between(np.mod(points[:, 2], 0.3), 0.19, 0.225)
     color[label] = 0.75
