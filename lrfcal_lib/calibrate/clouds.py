@@ -133,7 +133,9 @@ def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]
         camera = rig.cameras.get(record.camera)
         if camera is None or (camera.mount == "head" and not np.isfinite(record.pitch)):
             continue
-        pitch = float(rig.corrections.pitch(placement, record.pitch))
+        pitch = 0.0
+        if camera.mount == "head":
+            pitch = float(rig.corrections.pitch(placement, record.pitch))
         number = session.image_records.index(record)
         T_camera_platform = rig.camera_at(record.camera, pitch)
         image = session.read_image(record)

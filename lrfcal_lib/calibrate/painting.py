@@ -34,7 +34,7 @@ class View:
     image : ndarray of uint8, shape (height, width, 3)
         Blue, green, red as OpenCV reads it. ValueError if it has another size than the model.
     pitch : float
-        Of the head, radians.
+        Of the head, radians; 0 for a camera on the base.
     """
 
     number: int

@@ -10,13 +10,15 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from lrfcal_lib.calibrate.cloud import Cloud
+from lrfcal_lib.calibrate.painting import View
+from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.pulls import (
     PITCH_NOISE,
     SPREAD,
     Pull,
-    View,
     poses_of,
     pull_of_groups,
+    seen,
     without,
 )
 from lrfcal_lib.measure.surfaces import BENT
@@ -53,7 +55,11 @@ class _Pair:
 
 
 def pairs_pull(
-    cloud: Cloud, of_point: np.ndarray, views: list[View], start: np.ndarray
+    cloud: Cloud,
+    of_point: np.ndarray,
+    views: list[View],
+    rig: CalibratedRig,
+    start: np.ndarray,
 ) -> Pull | None:
     """What pairs of images say about a rig; None where they show too little.
 
@@ -67,25 +73,27 @@ def pairs_pull(
         The number of the surface, -1 for none.
     views : list of View
         Images of the station.
+    rig : CalibratedRig
+        That knows its uncertainty.
     start : ndarray, shape (c,)
         Change of the unknowns that creases ask for: pairs leave open what moves both images alike.
     """
     patches = np.flatnonzero(of_point >= 0)[::EVERY]
     surfaces = of_point[patches, None] == np.unique(of_point[patches])
-    clear = {id(view): clear_places(cloud, view)[patches] for view in views}
-    stops = np.unique([view.pitch for view in views if not view.fixed])
+    clear = {view.number: clear_places(cloud, view, rig)[patches] for view in views}
+    stops = np.unique([view.pitch for view in views])
     pairs = []
     for first, second in combinations(views, 2):
         turned = abs(first.pitch - second.pitch)
         same = first.camera == second.camera
         if turned < (NEAR_PITCH if same else 1e-3):
-            both = clear[id(first)] & clear[id(second)]
+            both = clear[first.number] & clear[second.number]
             rows = cloud.rows(patches[both])
-            pairs.append(_pair(rows, surfaces[both], first, second, stops))
+            pairs.append(_pair(rows, surfaces[both], first, second, rig, stops))
     if sum(len(pair.cell) for pair in pairs) < FEWEST:
         return None
     cameras = dict.fromkeys(view.camera for view in views)
-    poses = np.concatenate([poses_of(views[0].rig, camera) for camera in cameras])
+    poses = np.concatenate([poses_of(rig, camera) for camera in cameras])
     noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
     x = np.pad(start, (0, len(noise)))
     fitted = np.r_[poses, len(start) : len(x)]
@@ -93,7 +101,7 @@ def pairs_pull(
     # what moves both images alike stays where creases have it
     prior = np.diag(np.r_[np.tile(SPREAD / 4, len(cameras)), noise] ** -2.0)
     for blur in BLURS:
-        sharp = {id(view): cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
+        sharp = {view.number: cv2.GaussianBlur(_grey(view), (0, 0), blur) for view in views}
         parts = [_compared(pair, sharp, x) for pair in pairs]
         H, b, D = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
@@ -106,7 +114,12 @@ def pairs_pull(
     return replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())
 
 
-def clear_places(cloud, view):
+def _grey(view):
+    """The image of a view in grey (h, w)."""
+    return cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+
+
+def clear_places(cloud, view, rig):
     """Which points (n,) a view shows with nothing nearer or farther beside them: of a plane the
     inverse of the depth is linear in the pixels.
     """
@@ -119,7 +132,7 @@ def clear_places(cloud, view):
     nearness = 1 / p_camera[:, 2]
     normals = view.T_camera_platform.rotation.apply(cloud.normals[clear])
     slope = np.linalg.norm(normals[:, :2], axis=1) / np.abs(np.vecdot(normals, p_camera))
-    noise = BEFORE * view.rig.lrf.sigma_range * nearness**2
+    noise = BEFORE * rig.lrf.sigma_range * nearness**2
     off = REACH * slope / model.fx + noise
     alone = np.ones(len(nearness), bool)
     for side in (1, -1):  # what is nearer, then what is farther
@@ -130,15 +143,15 @@ def clear_places(cloud, view):
     return clear
 
 
-def _pair(patches, surfaces, first, second, stops):
+def _pair(patches, surfaces, first, second, rig, stops):
     """The clearest patches that two images show, each of one of some surfaces (n, s)."""
-    p_first, J_first = _carried(first, patches, surfaces, stops)
-    p_second, J_second = _carried(second, patches, surfaces, stops)
+    p_first, J_first = _carried(first, rig, patches, surfaces, stops)
+    p_second, J_second = _carried(second, rig, patches, surfaces, stops)
     spacing = SPACING * p_first[:, 2] / first.model.fx
     a, inside = _samples(patches.normals, first, p_first, spacing)
     b, also = _samples(patches.normals, second, p_second, spacing)
     rows = np.flatnonzero(inside & also)
-    texture = sample(first.grey, first.model, a[rows])[..., 0].std(axis=1)
+    texture = sample(_grey(first), first.model, a[rows])[..., 0].std(axis=1)
     order = np.argsort(-texture)[:CLEAREST]
     rows = rows[order[texture[order] > LEAST_TEXTURE]]
     cell = np.floor(patches.bearing / CELL) + 1000 * np.floor(patches.pitch / CELL)
@@ -153,12 +166,13 @@ def _pair(patches, surfaces, first, second, stops):
     )
 
 
-def _carried(view, patches, surfaces, stops):
+def _carried(view, rig, patches, surfaces, stops):
     """Patches (n, 3) in the camera frame, and their derivatives by the unknowns of a Pull, by the
     pitch at which the head stopped, and by the height of each surface.
     """
-    p_camera, J = view.carried(patches.points)
-    here = (stops == view.pitch) & (not view.fixed)
+    p_camera, J = seen(patches.points, view, rig)
+    on_head = rig.cameras[view.camera].mount == "head"
+    here = on_head & (stops == view.pitch)
     raised = view.T_camera_platform.rotation.apply(patches.normals)
     # an image pitched more sees what a sweep pitched less shows
     parts = [J, -J[..., -1:] * here, raised[..., None] * surfaces[:, None]]
@@ -188,7 +202,7 @@ def _compared(pair, sharp, x):
     values = []
     gradients = []
     for view, uv, J in zip(pair.views, pair.uv, pair.by_unknown, strict=True):
-        patch, gradient = _normalised(sharp[id(view)], view.model, uv + (J @ x)[:, None])
+        patch, gradient = _normalised(sharp[view.number], view.model, uv + (J @ x)[:, None])
         values.append(patch)
         gradients.append(gradient)
     alike = np.mean(values[0] * values[1], axis=1)
