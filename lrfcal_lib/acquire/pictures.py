@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from lrfcal_lib.plots.colors import LRF
 from lrfcal_lib.plots.recording import range_image
+from lrfcal_lib.session import write
 from lrfcal_lib.session.read import Sweep
 
 WIDTH = 400  # of a picture, pixels
@@ -116,4 +117,4 @@ def jpeg(image: np.ndarray) -> bytes:
     scale = WIDTH / image.shape[1]
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    return write.jpeg(image, 85)

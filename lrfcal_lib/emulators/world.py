@@ -12,11 +12,11 @@ import time
 from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-import cv2
 import numpy as np
 
 from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.head import Head
+from lrfcal_lib.session.write import jpeg
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import close_views, world_of
 from lrfcal_lib.simulate.rig import Placement, Setup, placements_of
@@ -248,8 +248,7 @@ class CameraServer(ThreadingHTTPServer):
         rng = np.random.default_rng([0, next(self._count)])
         pose = self.world.setup.rig.camera_pose(camera, pitch)
         image = self._imagers[name].render(scene, pose, rng)
-        _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-        return encoded.tobytes()
+        return jpeg(image, QUALITY)
 
 
 class _Handler(BaseHTTPRequestHandler):

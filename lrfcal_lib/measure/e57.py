@@ -3,7 +3,7 @@
 import errno
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import cv2
@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
+from lrfcal_lib.session.write import jpeg
 
 AT_ONCE = 1 << 18  # points that are handed over to the library
 PIXEL = 5e-6  # metres; E57 wants a focal length in metres, of which only the ratio counts
@@ -19,16 +20,19 @@ QUALITY = 95  # of JPEG
 WIDER = 1.15  # times as wide and high as the recorded one is an image without distortion
 COLORS = ("colorRed", "colorGreen", "colorBlue")
 COLOR_LIMITS = {
-    f"{name}{end}": level
-    for name in COLORS
-    for end, level in (("Minimum", 0), ("Maximum", 255))
+    "colorRedMinimum": 0,
+    "colorRedMaximum": 255,
+    "colorGreenMinimum": 0,
+    "colorGreenMaximum": 255,
+    "colorBlueMinimum": 0,
+    "colorBlueMaximum": 255,
 }
 POINT = ("cartesianX", "cartesianY", "cartesianZ")
 # E57 looks along -z, y up; ours along z, y down
 E57_FROM_OPENCV = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0.0, 0.0]))
 
 
-class E57Writer:
+class E57Writer(AbstractContextManager):
     """Writes an E57 file scan by scan, each scan block by block; a context manager.
 
     Parameters
@@ -51,9 +55,6 @@ class E57Writer:
         self._file = E57(str(path), "w")
         self._image_file = self._file.image_file
         self._nodes = libe57
-
-    def __enter__(self):
-        return self
 
     def __exit__(self, kind, error, trace):
         try:
@@ -99,7 +100,9 @@ class E57Writer:
 
         def write(cloud):
             """Hand over what fits into the buffers."""
-            columns = _values(cloud)
+            columns = dict(zip(POINT, cloud.points.T, strict=True))
+            columns |= zip(COLORS, cloud.colors.T, strict=True)
+            columns["intensity"] = cloud.intensity
             for start in range(0, len(cloud.points), AT_ONCE):
                 part = slice(start, start + AT_ONCE)
                 for field, array in arrays.items():
@@ -146,9 +149,8 @@ class E57Writer:
         matrix, _ = cv2.getOptimalNewCameraMatrix(*lens, size, 1.0, wide)
         maps = cv2.initUndistortRectifyMap(*lens, None, matrix, wide, cv2.CV_32FC2)[0]
         flat = cv2.remap(view.image, maps, None, cv2.INTER_LINEAR)
-        quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-        jpeg = cv2.imencode(".jpg", flat, quality)[1].ravel()
-        blob = self._nodes.BlobNode(self._image_file, len(jpeg))
+        pixels = np.frombuffer(jpeg(flat, QUALITY), np.uint8)
+        blob = self._nodes.BlobNode(self._image_file, len(pixels))
         image = {
             "guid": new_guid(),
             "name": name,
@@ -158,7 +160,7 @@ class E57Writer:
             "pinholeRepresentation": _pinhole(matrix, wide) | {"jpegImage": blob},
         }
         self._file.root["images2D"].append(self._node(image))
-        blob.write(jpeg, 0, len(jpeg))
+        blob.write(pixels, 0, len(pixels))
 
     def _node(self, value):
         """A value as a node; mappings become structures, nodes stay."""
@@ -176,18 +178,13 @@ class E57Writer:
         return value
 
 
-def _values(cloud):
-    """Values of the points by their names in the file."""
-    columns = dict(zip(POINT, cloud.points.T, strict=True))
-    columns |= dict(zip(COLORS, cloud.colors.T, strict=True))
-    return columns | {"intensity": cloud.intensity}
-
-
 def _pose(T):
     """A RigidTransform as a structure."""
-    x, y, z, w = T.rotation.as_quat(canonical=True).tolist()
-    translation = dict(zip("xyz", T.translation.tolist(), strict=True))
-    return {"rotation": {"w": w, "x": x, "y": y, "z": z}, "translation": translation}
+    turn = T.rotation.as_quat(canonical=True, scalar_first=True).tolist()
+    return {
+        "rotation": dict(zip("wxyz", turn, strict=True)),
+        "translation": dict(zip("xyz", T.translation.tolist(), strict=True)),
+    }
 
 
 def _pinhole(matrix, size):

@@ -33,6 +33,12 @@ def new_session_path() -> Path:
     return Path(folder, time.strftime("%Y-%m-%d_%H%M%S")).absolute()
 
 
+def jpeg(pixels: np.ndarray, quality: int) -> bytes:
+    """Content of a JPEG file of blue-green-red pixels (h, w, 3)."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    return cv2.imencode(".jpg", pixels, options)[1].tobytes()
+
+
 class SessionWriter:
     """Write a session so that a crash loses at most what was being written.
 

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform
@@ -22,7 +21,7 @@ from lrfcal_lib.session.lms2xx_codec import (
 from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.session.workers import spread
-from lrfcal_lib.session.write import SessionWriter, write_file
+from lrfcal_lib.session.write import SessionWriter, jpeg, write_file
 from lrfcal_lib.simulate.beam import scan
 from lrfcal_lib.simulate.lengths import room_lengths
 from lrfcal_lib.simulate.rig import Placement, Setup, held_close, placements_of, random
@@ -176,11 +175,7 @@ def photograph(setup, shots):
     )
     rng = random(setup, *shots.key)
     poses = rig.camera_pose(camera, shots.stops.true)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, setup.quality]
-    return [
-        cv2.imencode(".jpg", imager.render(world, pose, rng), quality)[1].tobytes()
-        for pose in poses
-    ]
+    return [jpeg(imager.render(world, pose, rng), setup.quality) for pose in poses]
 
 
 def simulate(path: str | os.PathLike, setup: Setup) -> None:
