@@ -2,8 +2,8 @@
 
 import errno
 import uuid
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import cv2
@@ -64,11 +64,15 @@ class E57Writer(AbstractContextManager):
         if isinstance(error, self._nodes.E57Exception):
             raise OSError(errno.EIO, f"E57: {error}") from error
 
-    @contextmanager
     def scan(
-        self, name: str, guid: str, T_file_scan: RigidTransform, intensity: bool
-    ) -> Iterator[Callable[[Cloud], None]]:
-        """Append a scan.
+        self,
+        name: str,
+        guid: str,
+        T_file_scan: RigidTransform,
+        intensity: bool,
+        clouds: Iterable[Cloud],
+    ) -> Iterator[Cloud]:
+        """Append a scan, block by block.
 
         Parameters
         ----------
@@ -78,13 +82,21 @@ class E57Writer(AbstractContextManager):
             Its pose.
         intensity
             Whether its points have one.
+        clouds
+            Its points in its own frame.
 
         Yields
         ------
-        callable
-            ``write(cloud)`` appends points in the scan's own frame.
+        Cloud
+            Each of the blocks once it is written.
         """
-        arrays, prototype, buffers = self._columns(intensity)
+        fields = [*POINT, *COLORS, "intensity"] if intensity else [*POINT, *COLORS]
+        prototype = self._nodes.StructureNode(self._image_file)
+        for field in fields:
+            node = self._nodes.FloatNode(self._image_file, 0.0, self._nodes.E57_SINGLE)
+            if field in COLORS:
+                node = self._nodes.IntegerNode(self._image_file, 0, 0, 255)
+            prototype.set(field, node)
         codecs = self._nodes.VectorNode(self._image_file, True)
         points = self._nodes.CompressedVectorNode(self._image_file, prototype, codecs)
         scan = {
@@ -96,36 +108,19 @@ class E57Writer(AbstractContextManager):
             "points": points,
         }
         self._file.data3d.append(self._node(scan))
+        arrays, buffers = self._file.make_buffers(fields, AT_ONCE)
         writer = points.writer(buffers)
-
-        def write(cloud):
-            """Hand over what fits into the buffers."""
-            columns = dict(zip(POINT, cloud.points.T, strict=True))
-            columns |= zip(COLORS, cloud.colors.T, strict=True)
-            columns["intensity"] = cloud.intensity
-            for start in range(0, len(cloud.points), AT_ONCE):
-                part = slice(start, start + AT_ONCE)
-                for field, array in arrays.items():
-                    values = columns[field][part]
-                    array[: len(values)] = values
-                writer.write(len(values))
-
         try:
-            yield write
+            for cloud in clouds:
+                columns = (*cloud.points.T, *cloud.colors.T, cloud.intensity)
+                for start in range(0, len(cloud.points), AT_ONCE):
+                    for array, column in zip(arrays.values(), columns, strict=False):
+                        part = column[start : start + AT_ONCE]
+                        array[: len(part)] = part
+                    writer.write(len(part))
+                yield cloud
         finally:
             writer.close()
-
-    def _columns(self, intensity):
-        """Arrays by field, with the library's statement of their types and its view of them."""
-        fields = [*POINT, *COLORS, "intensity"] if intensity else [*POINT, *COLORS]
-        prototype = self._nodes.StructureNode(self._image_file)
-        for field in fields:
-            node = self._nodes.FloatNode(self._image_file, 0.0, self._nodes.E57_SINGLE)
-            if field in COLORS:
-                node = self._nodes.IntegerNode(self._image_file, 0, 0, 255)
-            prototype.set(field, node)
-        arrays, buffers = self._file.make_buffers(fields, AT_ONCE)
-        return arrays, prototype, buffers
 
     def image(
         self, name: str, scan: str, T_file_camera: RigidTransform, view: View

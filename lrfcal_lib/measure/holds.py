@@ -191,11 +191,9 @@ class Held:
             f"from {self.creases / 4:.0f} m of creases, where surfaces meet, against edges of "
             f"images, and {self.regions:.0f} regions of surfaces that two images show{on_head}"
         )
-        lines = [f"{name}: {first[self.answer]}"]
-        lines += [shift.sentence() for shift in self.shifts]
-        lines += [wall.sentence() for wall in self.walls]
-        lines += [passes.sentence() for passes in self.passes]
-        return [*lines, basis]
+        found: tuple[Shift | Wall | Passes, ...] = (*self.shifts, *self.walls, *self.passes)
+        sentences = [each.sentence() for each in found]
+        return [f"{name}: {first[self.answer]}", *sentences, basis]
 
 
 def holds(session: Session, rig: CalibratedRig) -> Held:

@@ -23,7 +23,7 @@ from lrfcal_lib.measure.pulls import (
 )
 from lrfcal_lib.measure.surfaces import BENT
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import pose_array, rotate_points, unit_vector
 from lrfcal_lib.preprocess.edges_in_image import sample
 
 EVERY = 9  # points of a surface between patches
@@ -187,10 +187,8 @@ def _samples(normals, view, middle, spacing):
     right[np.linalg.norm(right, axis=1) < 0.1] = [1.0, 0.0, 0.0]
     right = unit_vector(right)
     down = np.cross(normals, right)
-    sides = view.T_camera_platform.rotation.apply(
-        np.stack([right, down], axis=1).reshape(-1, 3)
-    )
-    sides = sides.reshape(-1, 2, 3) * spacing[:, None, None]
+    pose = pose_array(view.T_camera_platform)
+    sides = rotate_points(pose, np.stack([right, down], axis=1)) * spacing[:, None, None]
     steps = np.indices((2 * HALF + 1,) * 2).reshape(2, -1) - HALF
     points = middle[:, None] + np.einsum("is,nij->nsj", steps, sides)
     inside = view.model.shows(project(points, view.model), BORDER).all(axis=1)

@@ -248,12 +248,10 @@ def _written(writer, session, rig, joined, told, clouds, scenes):
         guid = new_guid()
         intensity = station.sweep.intensities is not None
         thinned = []
-        with writer.scan(f"station {number}", guid, pose, intensity) as write:
-            for cloud in blocks:
-                write(cloud)
-                thinned.append(cloud.rows(slice(None, None, every)))
-                told(len(cloud.points))
-                yield placed(cloud, pose, joined.covariance_of(number))
+        for cloud in writer.scan(f"station {number}", guid, pose, intensity, blocks):
+            thinned.append(cloud.rows(slice(None, None, every)))
+            told(len(cloud.points))
+            yield placed(cloud, pose, joined.covariance_of(number))
         scenes[number] = features_of(join(thinned), rig, station.views)
         for view in station.views:
             name = f"station {number}, {view.camera}, image {view.number}"

@@ -18,7 +18,6 @@ from lrfcal_lib.plots.colors import AXES_RGB, FIT, PLATFORM, closed, color_of
 MOST_POINTS = 150_000  # that browsers turn smoothly
 PAGE = {"xref": "paper", "yref": "paper", "xanchor": "left", "yanchor": "bottom"}
 SCRIPT = Path(__file__).with_name("scene.js")
-PLOT = "document.getElementById('scene')"
 EYE = (-0.3, -1.5, 0.55)  # where one looks from at first, in widths of the scene
 GAP = np.full((1, 3), np.nan)  # where a line breaks
 
@@ -81,9 +80,9 @@ def scene_page(
         '<html><head><meta charset="utf-8"></head><body>\n'
         f"<script>{_plotly_js()}</script>\n"
         '<div id="scene" style="height:100vh"></div>\n'
-        f"<script>Plotly.newPlot({PLOT}, ...{plot}).then(() => {{\n"
-        f"{SCRIPT.read_text()}\nslowWheel({PLOT});\n"
-        f"panel({PLOT}, {_in_script(data)});\n}});</script>\n"
+        f"<script>Plotly.newPlot('scene', ...{plot}).then((scene) => {{\n"
+        f"{SCRIPT.read_text()}\nslowWheel(scene);\n"
+        f"panel(scene, {_in_script(data)});\n}});</script>\n"
         "</body></html>\n"
     )
     Path(path).write_text(page, encoding="utf-8")
