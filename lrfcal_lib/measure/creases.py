@@ -208,7 +208,7 @@ def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
     R = view.T_camera_platform.rotation.as_matrix()
     way = creases.along[inside] @ R.T
     tangent = unit_vector(np.matvec(by_point, way))
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    normal = tangent[:, ::-1] * [-1, 1]
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
     by_place = np.vecmat(normal, by_point) / reach
     off = np.matvec(creases.off[inside] @ R.T, by_place)

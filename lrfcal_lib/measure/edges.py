@@ -55,8 +55,7 @@ def edges_of(
     -------
     list of Feature
     """
-    of_views = spread(partial(_edges_in, cloud, surfaces, views), views)
-    return [edge for of_view in of_views for edge in of_view]
+    return sum(spread(partial(_edges_in, cloud, surfaces, views), views), [])
 
 
 def _edges_in(cloud, surfaces, views, view):

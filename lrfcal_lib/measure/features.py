@@ -225,7 +225,7 @@ def mean_length(lengths: Sequence[Length]) -> Length:
     return Length(
         metres=float(weight @ [length.metres for length in lengths]),
         noise=float(weight**2 @ [length.noise for length in lengths]),
-        shared=weight @ np.array([length.shared for length in lengths]),
+        shared=weight @ [length.shared for length in lengths],
         rig=lengths[0].rig,
     )
 

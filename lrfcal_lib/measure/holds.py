@@ -213,7 +213,8 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     ------
     ValueError
         If the rig does not say how well it is known, or the session has no sweep, no image, no
-        camera of the rig, or images of another size.
+        camera of the rig, a station whose images are all of an unknown pitch, or images of another
+        size.
     """
     uncertainty_of(rig)
     of_creases = []

@@ -158,17 +158,14 @@ def _pair(patches, surfaces, first, second, rig, stops):
     return _Pair(
         views=(first, second),
         uv=(a[rows], b[rows]),
-        by_unknown=(
-            pinhole_jacobian(p_first[rows], first.model) @ J_first[rows],
-            pinhole_jacobian(p_second[rows], second.model) @ J_second[rows],
-        ),
+        by_unknown=(J_first[rows], J_second[rows]),
         cell=cell[rows],
     )
 
 
 def _carried(view, rig, patches, surfaces, stops):
-    """Patches (n, 3) in the camera frame, and their derivatives by the unknowns of a Pull, by the
-    pitch at which the head stopped, and by the height of each surface.
+    """Patches (n, 3) in the camera frame, and the derivatives (n, 2, c) of their pixels by the
+    unknowns of a Pull, by the pitch at which the head stopped, and by the height of each surface.
     """
     p_camera, J = seen(patches.points, view, rig)
     on_head = rig.cameras[view.camera].mount == "head"
@@ -176,7 +173,8 @@ def _carried(view, rig, patches, surfaces, stops):
     raised = view.T_camera_platform.rotation.apply(patches.normals)
     # an image pitched more sees what a sweep pitched less shows
     parts = [J, -J[..., -1:] * here, raised[..., None] * surfaces[:, None]]
-    return p_camera, np.concatenate(parts, axis=-1)
+    by_point = pinhole_jacobian(p_camera, view.model)
+    return p_camera, by_point @ np.concatenate(parts, axis=-1)
 
 
 def _samples(normals, view, middle, spacing):
@@ -197,18 +195,16 @@ def _samples(normals, view, middle, spacing):
 
 def _compared(pair, sharp, x):
     """Of each patch of a pair: tensor (2, 2), slope (2,), derivatives (2, c)."""
-    values = []
-    gradients = []
-    for view, uv, J in zip(pair.views, pair.uv, pair.by_unknown, strict=True):
-        patch, gradient = _normalised(sharp[view.number], view.model, uv + (J @ x)[:, None])
-        values.append(patch)
-        gradients.append(gradient)
-    alike = np.mean(values[0] * values[1], axis=1)
+    (first, of_first), (second, of_second) = (
+        _normalised(sharp[view.number], view.model, uv + (J @ x)[:, None])
+        for view, uv, J in zip(pair.views, pair.uv, pair.by_unknown, strict=True)
+    )
+    alike = np.mean(first * second, axis=1)
     weight = np.clip((alike - ALIKE) / (1 - ALIKE), 0, None) ** 2
-    gradient = np.mean(gradients, axis=0)
+    gradient = (of_first + of_second) / 2
     weighted = gradient * weight[:, None, None]
     tensor = np.einsum("nsi,nsj->nij", weighted, gradient)
-    slope = np.vecmat(values[1] - values[0], weighted)
+    slope = np.vecmat(second - first, weighted)
     by_first, by_second = pair.by_unknown
     return np.nan_to_num(tensor), np.nan_to_num(slope), by_second - by_first
 

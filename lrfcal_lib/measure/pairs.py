@@ -19,6 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.robust import biweight, robust_sigma, sums_by
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
 from lrfcal_lib.model.geometry import (
@@ -349,7 +350,7 @@ class Pair:
     @cached_property
     def whiten(self) -> np.ndarray:
         """What makes a miss one of unit covariance, (6, 6)."""
-        return np.linalg.cholesky(np.linalg.inv(self.covariance)).T
+        return inverse_root(self.covariance)
 
     def miss(self, poses: Mapping[int, RigidTransform]) -> np.ndarray:
         """Turn and shift (6,) by which poses of the stations differ from it."""

@@ -66,14 +66,13 @@ class Joined:
     pairs: tuple[Pair, ...]
     problems: tuple[Problem, ...]
 
-    def miss(self, pair: Pair) -> tuple[float, float]:
-        """Turn (radians) and shift (metres) by which a pair differs from the poses of all.
+    def miss(self, pair: Pair) -> np.ndarray:
+        """Turn (radians) and shift (metres), (2,), by which a pair differs from the poses of all.
 
         That is the error which loops through it leave there; 0 without loops.
         """
         miss = pair.miss(self.T_world_station).reshape(2, 3)
-        turn, shift = np.linalg.norm(miss, axis=1)
-        return float(turn), float(shift)
+        return np.linalg.norm(miss, axis=1)
 
     def covariance_of(self, station: int) -> np.ndarray:
         """Of turn and shift of a station, (6, 6)."""
