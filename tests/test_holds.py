@@ -21,7 +21,15 @@ from shared import campaign
 from lrfcal_lib.calibrate.cloud import join
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.measure.features import largest_plane
-from lrfcal_lib.measure.holds import Answer, Passes, holds, passes_of, wall_of
+from lrfcal_lib.measure.holds import (
+    Answer,
+    Passes,
+    flattened,
+    holds,
+    passes_of,
+    wall_of,
+)
+from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.simulate import scene
 
 TURN = np.radians(0.3)
@@ -156,6 +164,31 @@ def test_a_range_finder_that_was_turned_on_its_axis_bends_walls(seen, degrees, b
     sweep = seen.sweep(1)
     cloud = join(reconstruct(sweep, [], rig.T_head_lrf, rig.corrections, lrf=seen.lrf))
     assert wall_of(cloud.rows(largest_plane(cloud)), rig, 1).bent == bent
+
+
+def test_a_column_does_not_pass_for_a_wall(seen):
+    """Readings of it lie off its plane by more than those of walls; where all are as uneven, all pass."""
+    rig = true_rig(seen)
+    sweep = seen.sweep(1)
+    cloud = join(reconstruct(sweep, [], rig.T_head_lrf, rig.corrections, lrf=seen.lrf))
+    cloud = cloud.rows(np.arange(3000))
+    rng = np.random.default_rng(3)
+    x, z, noise = rng.normal(0, [[0.5], [0.5], [0.005]], (3, 3000))
+    of_point = np.repeat([0, 1, -1], [2000, 600, 400])
+    angle = np.clip(x, -0.6, 0.6)
+    round_about = np.column_stack([0.15 * np.sin(angle), 2 - 0.15 * np.cos(angle), z])
+    wall = np.column_stack([x, 3 + noise, z])
+    template = planes_of(cloud, rig)[0][0]
+    axis = np.array([0.0, 1.0, 0.0])
+    planes = [
+        replace(template, centre=distance * axis, axis=axis) for distance in (3.0, 1.86)
+    ]
+    for column, passing in ((round_about, {0, -1}), (wall - 1.14 * axis, {0, 1, -1})):
+        points = np.where(of_point[:, None] == 1, column, wall)
+        moved, of_flat = flattened(replace(cloud, points=points), planes, of_point)
+        assert set(of_flat) == passing
+        np.testing.assert_allclose(moved.points[of_point == 0, 1], 3.0)
+        np.testing.assert_array_equal(moved.points[of_point == -1], points[of_point == -1])
 
 
 def test_images_of_no_camera_of_the_rig_are_refused(seen):

@@ -91,30 +91,32 @@ def largest_plane(cloud: Cloud, tolerance: float = 0.04) -> np.ndarray:
     return near & (np.abs(cloud.normals @ normal) > FACING)
 
 
-def flatness(points: np.ndarray) -> tuple[np.ndarray, float]:
+def flatness(points: np.ndarray, together: int = PATCH) -> tuple[np.ndarray, float]:
     """How far a wall is from a plane.
 
     Parameters
     ----------
     points : ndarray, shape (n, 3)
         Metres.
+    together : int
+        How many of them average the noise out of a patch.
 
     Returns
     -------
     miss : ndarray, shape (n,)
         Signed distance of each point, metres.
     flatness : float
-        Root mean square of the mean distances of patches of `PATCH` points, without their noise.
+        Root mean square of the mean distances of patches, without their noise.
     """
     normal, offset, _ = fit_plane(points)
     miss = points @ normal - offset
     flat = (points - points.mean(axis=0)) @ null_space(normal[None])
-    side = np.sqrt(PATCH * np.prod(np.ptp(flat, axis=0)) / len(points))
+    side = np.sqrt(together * np.prod(np.ptp(flat, axis=0)) / len(points))
     cells = np.rint(flat / side).astype(int)
     _, patch, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     mean = np.bincount(patch, miss) / count
-    noise = np.var(miss - mean[patch]) / PATCH
-    square = np.mean(mean[count >= PATCH / 2] ** 2)
+    noise = np.var(miss - mean[patch]) / together
+    square = np.mean(mean[count >= together / 2] ** 2)
     return miss, float(np.sqrt(max(square - noise, 0.0)))
 
 

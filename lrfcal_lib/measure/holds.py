@@ -30,6 +30,10 @@ from lrfcal_lib.session.read import Session
 
 UNEVEN = 0.003  # metres, of real walls
 BENT = 3.0  # times what is allowed, of a wall
+# metres by which a column bends more than what is flat: readings lie up to 10 mm off its plane
+ROUND = 0.002
+FEW = 10  # points of a patch of a narrow surface
+USUAL = 0.25  # of the points of a cloud are on surfaces that bend less than most
 FEWEST_POINTS = 200  # of a wall, or of two passes
 STEEP = 3.0  # metres a radian, by which ranges grow with the pitch on a smooth surface
 SAME_PLACE = 0.5  # of the readings agree where two sweeps are of one place
@@ -233,8 +237,8 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
             views.setdefault((view.camera, view.pitch), view)
         creases = creases_of(cloud, planes, of_point)
         of_creases += [sights(creases, view, rig) for view in views.values()]
-        flat = flattened(cloud, planes, of_point)
-        stations.append((flat, of_point, list(views.values())))
+        moved, of_flat = flattened(cloud, planes, of_point)
+        stations.append((moved, of_flat, list(views.values())))
     start = likeliest_change(of_creases, rig)
     pulls = [pairs_pull(*station, rig, start) for station in stations]
     of_pairs = [pull for pull in pulls if pull is not None]
@@ -272,12 +276,17 @@ def _swept(session):
 
 
 def flattened(cloud, planes, of_point):
-    """A cloud whose points of flat surfaces are moved onto them: single readings are noisy."""
+    """A cloud whose points of flat surfaces are moved onto them, as single readings are noisy, and
+    which surface each is of; -1 also for what only passes for flat, like a column.
+    """
     points = cloud.points.copy()
+    bend = np.full(len(points), np.inf)
     for number, plane in enumerate(planes):
         rows = of_point == number
+        bend[rows] = flatness(points[rows], FEW)[1]
         points[rows] = plane.foot(points[rows])
-    return replace(cloud, points=points)
+    bent = bend > np.quantile(bend, USUAL, method="lower") + ROUND
+    return replace(cloud, points=points), np.where(bent, -1, of_point)
 
 
 def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
