@@ -101,7 +101,7 @@ def pairs_pull(
     # what moves both images alike stays where creases have it
     prior = np.diag(np.r_[np.tile(SPREAD / 4, len(cameras)), noise] ** -2.0)
     for blur in BLURS:
-        sharp = {view.number: cv2.GaussianBlur(_grey(view), (0, 0), blur) for view in views}
+        sharp = {view.number: cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
         parts = [_compared(pair, sharp, x) for pair in pairs]
         H, b, D = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
@@ -112,11 +112,6 @@ def pairs_pull(
     cell = np.concatenate([pair.cell for pair in pairs])
     pull = pull_of_groups(information, by_row, cell, compared_at, poses)
     return replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())
-
-
-def _grey(view):
-    """The image of a view in grey (h, w)."""
-    return cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
 
 
 def clear_places(cloud, view, rig):
@@ -151,21 +146,24 @@ def _pair(patches, surfaces, first, second, rig, stops):
     a, inside = _samples(patches.normals, first, p_first, spacing)
     b, also = _samples(patches.normals, second, p_second, spacing)
     rows = np.flatnonzero(inside & also)
-    texture = sample(_grey(first), first.model, a[rows])[..., 0].std(axis=1)
+    texture = sample(first.grey, first.model, a[rows])[..., 0].std(axis=1)
     order = np.argsort(-texture)[:CLEAREST]
     rows = rows[order[texture[order] > LEAST_TEXTURE]]
     cell = np.floor(patches.bearing / CELL) + 1000 * np.floor(patches.pitch / CELL)
     return _Pair(
         views=(first, second),
         uv=(a[rows], b[rows]),
-        by_unknown=(J_first[rows], J_second[rows]),
+        by_unknown=(
+            pinhole_jacobian(p_first[rows], first.model) @ J_first[rows],
+            pinhole_jacobian(p_second[rows], second.model) @ J_second[rows],
+        ),
         cell=cell[rows],
     )
 
 
 def _carried(view, rig, patches, surfaces, stops):
-    """Patches (n, 3) in the camera frame, and the derivatives (n, 2, c) of their pixels by the
-    unknowns of a Pull, by the pitch at which the head stopped, and by the height of each surface.
+    """Patches (n, 3) in the camera frame, and their derivatives by the unknowns of a Pull, by the
+    pitch at which the head stopped, and by the height of each surface.
     """
     p_camera, J = seen(patches.points, view, rig)
     on_head = rig.cameras[view.camera].mount == "head"
@@ -173,8 +171,7 @@ def _carried(view, rig, patches, surfaces, stops):
     raised = view.T_camera_platform.rotation.apply(patches.normals)
     # an image pitched more sees what a sweep pitched less shows
     parts = [J, -J[..., -1:] * here, raised[..., None] * surfaces[:, None]]
-    by_point = pinhole_jacobian(p_camera, view.model)
-    return p_camera, by_point @ np.concatenate(parts, axis=-1)
+    return p_camera, np.concatenate(parts, axis=-1)
 
 
 def _samples(normals, view, middle, spacing):
