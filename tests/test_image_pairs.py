@@ -10,9 +10,9 @@ from holds_draws import ROOM, true_rig
 from scipy.spatial.transform import Rotation
 
 from lrfcal_lib.calibrate.cloud import ROWS, Cloud
+from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.measure import image_pairs
 from lrfcal_lib.measure.image_pairs import clear_places, pairs_pull
-from lrfcal_lib.measure.pulls import View
 from lrfcal_lib.measure.suspects import suspects
 from lrfcal_lib.model.camera import project, undistort
 from lrfcal_lib.session.read import open_session
@@ -76,16 +76,25 @@ def scanned(columns):
     return Cloud(**values | {"bearing": bearing.ravel(), "pitch": pitch.ravel()})
 
 
+def view_of(rig, camera, image, number=0):
+    """The image of a camera at pitch 0."""
+    return View(
+        number, camera, rig.camera_at(camera, 0.0), rig.cameras[camera].model, image
+    )
+
+
 def evidence_of(rig, columns):
     """That a camera has moved, by what pairs of images say."""
     views = [
-        View(rig, camera, 0.0, picture(rig, camera, columns)) for camera in rig.cameras
+        view_of(rig, camera, picture(rig, camera, columns), number)
+        for number, camera in enumerate(rig.cameras)
     ]
     cloud = scanned(columns)
     pull = pairs_pull(
         cloud,
         np.zeros(len(cloud.points), int),
         views,
+        rig,
         np.zeros(len(rig.uncertainty.names) + 1),
     )
     return max(shift.evidence for shift in suspects([], [pull], rig)), pull
@@ -104,7 +113,8 @@ def test_what_stands_before_a_wall_is_not_taken_for_the_wall(rig, monkeypatch):
 @pytest.mark.parametrize("degrees", [0, 30, 60])
 def test_a_wall_seen_at_an_angle_does_not_hide_itself(rig, degrees):
     """Of a plane the inverse of the depth is linear in the pixels."""
-    view = View(rig, "left", 0.0, np.zeros((1, 1, 3), np.uint8))
+    model = rig.cameras["left"].model
+    view = view_of(rig, "left", np.zeros((model.height, model.width, 3), np.uint8))
     normal = Rotation.from_euler("z", degrees, degrees=True).apply([0.0, -1.0, 0.0])
     cloud = scanned([])
     ray = cloud.points / np.linalg.norm(cloud.points, axis=1, keepdims=True)
@@ -114,5 +124,5 @@ def test_a_wall_seen_at_an_angle_does_not_hide_itself(rig, degrees):
     cloud = replace(cloud, points=points, normals=np.tile(normal, (len(ray), 1)))
     shown = view.model.shows(project(view.T_camera_platform.apply(points), view.model))
     assert shown.sum() > 300
-    assert clear_places(cloud, view)[shown].mean() > 0.98
-    assert not clear_places(cloud, view)[~shown].any()
+    assert clear_places(cloud, view, rig)[shown].mean() > 0.98
+    assert not clear_places(cloud, view, rig)[~shown].any()

@@ -84,7 +84,8 @@ def measuring(scene, tmp_path_factory):
     """A page with it."""
     file = tmp_path_factory.mktemp("page") / "scene.html"
     cloud = scene.cloud
-    data = for_page({scene.planes[0].placement: scene})
+    number = scene.planes[0].placement
+    data = for_page({number: scene}, {number: RigidTransform.identity()})
     interactive.scene_page(
         file, cloud.points, cloud.colors, cloud.seen, {}, title="A room", measuring=data
     )

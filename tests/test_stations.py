@@ -299,7 +299,7 @@ def test_merge_writes_one_cloud_and_a_page(tmp_path, rig, monkeypatch, capsys):
 
 def grey_cloud(session, rig, number):
     """A station without its images, which another rig took."""
-    station = Station(number, session.sweep(number), [])
+    station = Station(session.sweep(number), [])
     return with_sigma(join(colored_blocks(session, rig, station)), rig)
 
 

@@ -111,10 +111,6 @@ def _still(sweep):
     closing = closing_of(sweep)
     if closing is None:
         return Light("stood still", "warn", "not known: too little came back to compare")
-    text = (
-        f"back at a pitch that it had, ranges differ by {1000 * closing.apart:.0f} mm, "
-        f"by {1000 * closing.expected:.0f} mm between neighbouring scan lines"
-    )
     if closing.moved:
-        return Light("stood still", "bad", f"{text}: it moved, record it again")
-    return Light("stood still", "ok", text)
+        return Light("stood still", "bad", f"{closing}: it moved, record it again")
+    return Light("stood still", "ok", str(closing))

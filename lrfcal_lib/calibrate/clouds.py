@@ -126,16 +126,19 @@ def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]
     records = session.images(placement=placement)
     views = []
     for record in records:
-        camera = rig.cameras.get(record.camera)
-        if camera is None or (camera.mount == "head" and not np.isfinite(record.pitch)):
+        if record.camera not in rig.cameras:
             continue
-        pitch = float(rig.corrections.pitch(placement, record.pitch))
-        number = session.image_records.index(record)
-        T_camera_platform = rig.camera_at(record.camera, pitch)
-        image = session.read_image(record)
-        views.append(
-            View(number, record.camera, T_camera_platform, camera.model, image, pitch)
-        )
+        camera = rig.cameras[record.camera]
+        pitch = 0.0
+        if camera.mount == "head":
+            pitch = float(rig.corrections.pitch(placement, record.pitch))
+        if np.isfinite(pitch):
+            number = session.image_records.index(record)
+            T_camera_platform = rig.camera_at(record.camera, pitch)
+            image = session.read_image(record)
+            views.append(
+                View(number, record.camera, T_camera_platform, camera.model, image, pitch)
+            )
     if records and not views:
         raise ValueError(
             f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; "

@@ -4,7 +4,9 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
@@ -34,7 +36,7 @@ class View:
     image : ndarray of uint8, shape (height, width, 3)
         Blue, green, red as OpenCV reads it. ValueError if it has another size than the model.
     pitch : float
-        Of the head, radians.
+        Of the head, radians; 0 for a camera on the base.
     """
 
     number: int
@@ -52,6 +54,11 @@ class View:
                 f"camera '{self.camera}' has {model.width} x {model.height} pixels, its image "
                 f"{width} x {height}: intrinsics hold for one image size only"
             )
+
+    @cached_property
+    def grey(self) -> np.ndarray:
+        """The image in grey, (height, width), float32."""
+        return cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
 
 
 class Painter:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
@@ -84,8 +85,8 @@ class CalibratedRig:
         """Without what single sweeps of a board were off by, which is of no other sweep."""
         return replace(self, corrections=replace(self.corrections, sweeps={}))
 
-    def camera_at(self, name: str, pitch: float) -> RigidTransform:
-        """``T_camera_platform`` of a camera at a true pitch (radians)."""
+    def camera_at(self, name: str, pitch: ArrayLike) -> RigidTransform:
+        """``T_camera_platform`` of a camera at a true pitch (radians), or at several."""
         camera = self.cameras[name]
         return camera_at(camera.T_camera, camera.mount, self.T_head_lrf, pitch)
 

@@ -65,14 +65,14 @@ def sums_by(group: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    group : ndarray, shape (n,) or (n, k)
-        The same number, or row of numbers, for those of one group.
+    group : ndarray, shape (n,)
+        The same number for those of one group.
     rows : ndarray, shape (n, m)
 
     Returns
     -------
     ndarray, shape (g, m)
     """
-    groups, place = np.unique(group, axis=0, return_inverse=True)
+    groups, place = np.unique(group, return_inverse=True)
     one_each = np.ones(len(place)), place, np.arange(len(place) + 1)
     return csr_array(one_each, (len(place), len(groups))).T @ rows

@@ -51,7 +51,7 @@ def write_clouds(folder: str | Path, calibration: Calibration, method: str) -> l
         file is whole, or as it was before.
     """
     written = spread(operator.call, cloud_tasks(folder, calibration, method))
-    return [file for files in reversed(written) for file in files]
+    return sum(reversed(written), [])
 
 
 def cloud_tasks(

@@ -201,34 +201,28 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
         first = _without_lens(first)
         second = _without_lens(second)
     second_there = in_gauge_of(first, second)
-    tested = _tested(first, second_there, shared)
+    steps = _steps(first, second_there, shared)
+    tested = _tested(first, second_there, pd.concat(steps.values()))
     images = {name: shifts(first, second_there, name) for name in shared}
-    groups = {
-        "axis": {"turn": [*AXIS_NAMES[:2]], "shift": [*AXIS_NAMES[2:]]},
-        "sensor": {"scale": ["pitch_scale"], "shift": ["range_offset"]},
-    }
-    for name in shared:
-        pose = [f"{name}_{part}" for part in POSE_NAMES]
-        groups[name] = {"turn": pose[:3], "shift": pose[3:]}
-    parts = [_part(name, of_part, tested, images) for name, of_part in groups.items()]
+    parts = [_part(name, step.index, tested, images) for name, step in steps.items()]
     cloud = shifts(first, second_there)
     moved = (cloud.amount("mm in the cloud", 1000),)
     whole = Part("everything", moved, *tested.chi2(tested.table.index), 1.0)
     return Comparison(first, second, tuple(parts), whole, images, cloud, one_lens)
 
 
-def _part(name, groups, tested, images):
-    """The Part of some differences: turns, shifts, a scale, and pixels of a camera."""
+def _part(name, names, tested, images):
+    """The Part of some differences: turns or a scale, as many shifts, and pixels of a camera."""
     amounts = []
-    for what, members in groups.items():
+    kinds = ("scale" if name == "sensor" else "turn", "shift")
+    for what, members in zip(kinds, np.split(names, 2), strict=True):
         scale, unit = UNITS[what]
         value, claimed = scale * np.linalg.norm(tested.table.loc[members], axis=0)
         amounts.append(Amount(what, value, claimed, unit))
     if name in images:
         amounts.append(images[name].amount("px"))
-    mine = sum(groups.values(), [])
-    *_, p_of_others = tested.chi2(tested.table.index.difference(mine))
-    return Part(name, tuple(amounts), *tested.chi2(mine), p_of_others)
+    *_, p_of_others = tested.chi2(tested.table.index.difference(names))
+    return Part(name, tuple(amounts), *tested.chi2(names), p_of_others)
 
 
 def _without_lens(rig):
@@ -282,9 +276,8 @@ def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
     return replace(second, axis=axis, cameras=cameras)
 
 
-def _tested(first, second, shared) -> _Tested:
-    """The _Tested of increments from the first rig to the second: radians, metres, a fraction."""
-    step = _steps(first, second, shared)
+def _tested(first, second, step) -> _Tested:
+    """The _Tested of increments from the first rig to the second, a Series."""
     covariance = _covariance(first) + _covariance(second)  # NaN for what only one estimated
     covariance = covariance.reindex(index=step.index, columns=step.index)
     sigma = pd.Series(np.sqrt(np.diag(covariance)), step.index)
@@ -295,15 +288,21 @@ def _tested(first, second, shared) -> _Tested:
 
 
 def _steps(first, second, shared):
-    """Increments from the first rig to the second by name: radians, metres, a fraction."""
+    """Increments from the first rig to the second: radians, metres, a fraction, by part and name.
+
+    Turns or a scale, then as many shifts.
+    """
     by_axis = pose_step(first.T_head_lrf, second.T_head_lrf)[AXIS_COLUMNS]
-    steps = dict(zip(AXIS_NAMES, by_axis, strict=True))
+    scale = second.corrections.pitch_scale - first.corrections.pitch_scale
+    offset = second.corrections.range_offset - first.corrections.range_offset
+    steps = {
+        "axis": pd.Series(by_axis, AXIS_NAMES),
+        "sensor": pd.Series({"pitch_scale": scale, "range_offset": offset}),
+    }
     for name in shared:
         step = pose_step(first.cameras[name].T_camera, second.cameras[name].T_camera)
-        steps |= zip([f"{name}_{pose}" for pose in POSE_NAMES], step, strict=True)
-    steps["range_offset"] = second.corrections.range_offset - first.corrections.range_offset
-    steps["pitch_scale"] = second.corrections.pitch_scale - first.corrections.pitch_scale
-    return pd.Series(steps)
+        steps[name] = pd.Series(step, [f"{name}_{pose}" for pose in POSE_NAMES])
+    return steps
 
 
 def _covariance(rig):

@@ -9,8 +9,10 @@ from itertools import combinations
 import numpy as np
 
 from lrfcal_lib.calibrate.cloud import Cloud
+from lrfcal_lib.calibrate.painting import View
+from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.features import SYSTEMATIC, Feature
-from lrfcal_lib.measure.pulls import Pull, View
+from lrfcal_lib.measure.pulls import Pull, seen
 from lrfcal_lib.measure.surfaces import BENT, LIMIT
 from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
 from lrfcal_lib.model.geometry import unit_vector
@@ -65,9 +67,7 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
     -------
     Creases
     """
-    points = [np.zeros((0, 3))]
-    along = [np.zeros((0, 3))]
-    off = [np.zeros((0, 2, 3))]
+    creases = [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)))]
     surfaces = [(plane, cloud.points[of_point == k]) for k, plane in enumerate(planes)]
     for pair in combinations(surfaces, 2):
         (first, _), (second, _) = pair
@@ -92,10 +92,10 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
             _sigma(plane, places, np.hypot(rim, lift / 2))
             for plane, lift in zip((first, second), lifts, strict=True)
         ]
-        points.append(places)
-        along.append(np.tile(way, (len(common), 1)))
-        off.append(np.einsum("kn,ik->nki", sigma, by_height[:, :2]))
-    return Creases(np.concatenate(points), np.concatenate(along), np.concatenate(off))
+        along = np.tile(way, (len(common), 1))
+        off = np.einsum("kn,ik->nki", sigma, by_height[:, :2])
+        creases.append((places, along, off))
+    return Creases(*map(np.concatenate, zip(*creases, strict=True)))
 
 
 def _beside(points, plane, way):
@@ -184,13 +184,15 @@ class Sights:
         return likely / (others + likely.sum(axis=1))[:, None], miss, sigma
 
 
-def sights(creases: Creases, view: View) -> Sights:
+def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
     """Look in an image for edges near creases.
 
     Parameters
     ----------
     creases : Creases
     view : View
+    rig : CalibratedRig
+        That knows its uncertainty.
 
     Returns
     -------
@@ -198,7 +200,7 @@ def sights(creases: Creases, view: View) -> Sights:
         Of places inside the image.
     """
     model = view.model
-    points, J = view.carried(creases.points)
+    points, J = seen(creases.points, view, rig)
     reach = REACH * model.width
     recorded = project(points, model)
     inside = model.shows(recorded, reach)
@@ -206,7 +208,7 @@ def sights(creases: Creases, view: View) -> Sights:
     R = view.T_camera_platform.rotation.as_matrix()
     way = creases.along[inside] @ R.T
     tangent = unit_vector(np.matvec(by_point, way))
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    normal = tangent[:, ::-1] * [-1, 1]
     across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
     by_place = np.vecmat(normal, by_point) / reach
     off = np.matvec(creases.off[inside] @ R.T, by_place)

@@ -2,8 +2,8 @@
 
 import errno
 import uuid
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import cv2
@@ -20,16 +20,19 @@ QUALITY = 95  # of JPEG
 WIDER = 1.15  # times as wide and high as the recorded one is an image without distortion
 COLORS = ("colorRed", "colorGreen", "colorBlue")
 COLOR_LIMITS = {
-    f"{name}{end}": level
-    for name in COLORS
-    for end, level in (("Minimum", 0), ("Maximum", 255))
+    "colorRedMinimum": 0,
+    "colorRedMaximum": 255,
+    "colorGreenMinimum": 0,
+    "colorGreenMaximum": 255,
+    "colorBlueMinimum": 0,
+    "colorBlueMaximum": 255,
 }
 POINT = ("cartesianX", "cartesianY", "cartesianZ")
 # E57 looks along -z, y up; ours along z, y down
 E57_FROM_OPENCV = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0.0, 0.0]))
 
 
-class E57Writer:
+class E57Writer(AbstractContextManager):
     """Writes an E57 file scan by scan, each scan block by block; a context manager.
 
     Parameters
@@ -53,9 +56,6 @@ class E57Writer:
         self._image_file = self._file.image_file
         self._nodes = libe57
 
-    def __enter__(self):
-        return self
-
     def __exit__(self, kind, error, trace):
         try:
             self._image_file.close()
@@ -64,11 +64,15 @@ class E57Writer:
         if isinstance(error, self._nodes.E57Exception):
             raise OSError(errno.EIO, f"E57: {error}") from error
 
-    @contextmanager
     def scan(
-        self, name: str, guid: str, T_file_scan: RigidTransform, intensity: bool
-    ) -> Iterator[Callable[[Cloud], None]]:
-        """Append a scan.
+        self,
+        name: str,
+        guid: str,
+        T_file_scan: RigidTransform,
+        intensity: bool,
+        clouds: Iterable[Cloud],
+    ) -> Iterator[Cloud]:
+        """Append a scan, block by block.
 
         Parameters
         ----------
@@ -78,13 +82,21 @@ class E57Writer:
             Its pose.
         intensity
             Whether its points have one.
+        clouds
+            Its points in its own frame.
 
         Yields
         ------
-        callable
-            ``write(cloud)`` appends points in the scan's own frame.
+        Cloud
+            Each of the blocks once it is written.
         """
-        arrays, prototype, buffers = self._columns(intensity)
+        fields = [*POINT, *COLORS, "intensity"] if intensity else [*POINT, *COLORS]
+        prototype = self._nodes.StructureNode(self._image_file)
+        for field in fields:
+            node = self._nodes.FloatNode(self._image_file, 0.0, self._nodes.E57_SINGLE)
+            if field in COLORS:
+                node = self._nodes.IntegerNode(self._image_file, 0, 0, 255)
+            prototype.set(field, node)
         codecs = self._nodes.VectorNode(self._image_file, True)
         points = self._nodes.CompressedVectorNode(self._image_file, prototype, codecs)
         scan = {
@@ -96,34 +108,19 @@ class E57Writer:
             "points": points,
         }
         self._file.data3d.append(self._node(scan))
+        arrays, buffers = self._file.make_buffers(fields, AT_ONCE)
         writer = points.writer(buffers)
-
-        def write(cloud):
-            """Hand over what fits into the buffers."""
-            columns = _values(cloud)
-            for start in range(0, len(cloud.points), AT_ONCE):
-                part = slice(start, start + AT_ONCE)
-                for field, array in arrays.items():
-                    values = columns[field][part]
-                    array[: len(values)] = values
-                writer.write(len(values))
-
         try:
-            yield write
+            for cloud in clouds:
+                columns = (*cloud.points.T, *cloud.colors.T, cloud.intensity)
+                for start in range(0, len(cloud.points), AT_ONCE):
+                    for array, column in zip(arrays.values(), columns, strict=False):
+                        part = column[start : start + AT_ONCE]
+                        array[: len(part)] = part
+                    writer.write(len(part))
+                yield cloud
         finally:
             writer.close()
-
-    def _columns(self, intensity):
-        """Arrays by field, with the library's statement of their types and its view of them."""
-        fields = [*POINT, *COLORS, "intensity"] if intensity else [*POINT, *COLORS]
-        prototype = self._nodes.StructureNode(self._image_file)
-        for field in fields:
-            node = self._nodes.FloatNode(self._image_file, 0.0, self._nodes.E57_SINGLE)
-            if field in COLORS:
-                node = self._nodes.IntegerNode(self._image_file, 0, 0, 255)
-            prototype.set(field, node)
-        arrays, buffers = self._file.make_buffers(fields, AT_ONCE)
-        return arrays, prototype, buffers
 
     def image(
         self, name: str, scan: str, T_file_camera: RigidTransform, view: View
@@ -176,18 +173,13 @@ class E57Writer:
         return value
 
 
-def _values(cloud):
-    """Values of the points by their names in the file."""
-    columns = dict(zip(POINT, cloud.points.T, strict=True))
-    columns |= dict(zip(COLORS, cloud.colors.T, strict=True))
-    return columns | {"intensity": cloud.intensity}
-
-
 def _pose(T):
     """A RigidTransform as a structure."""
-    x, y, z, w = T.rotation.as_quat(canonical=True).tolist()
-    translation = dict(zip("xyz", T.translation.tolist(), strict=True))
-    return {"rotation": {"w": w, "x": x, "y": y, "z": z}, "translation": translation}
+    turn = T.rotation.as_quat(canonical=True, scalar_first=True).tolist()
+    return {
+        "rotation": dict(zip("wxyz", turn, strict=True)),
+        "translation": dict(zip("xyz", T.translation.tolist(), strict=True)),
+    }
 
 
 def _pinhole(matrix, size):

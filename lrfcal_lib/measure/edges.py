@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.measure.features import Feature, Kind, beams_moved
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import pose_array, unit_vector
 from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, refine_edge
 from lrfcal_lib.session.workers import spread
@@ -56,42 +55,31 @@ def edges_of(
     -------
     list of Feature
     """
-    of_views = spread(partial(_edges_in, cloud, surfaces, views), views)
-    return [edge for of_view in of_views for edge in of_view]
+    return sum(spread(partial(_edges_in, cloud, surfaces, views), views), [])
 
 
 def _edges_in(cloud, surfaces, views, view):
     """The edges at planes of a cloud that one image shows."""
     planes, of_point = surfaces
     segments = _segments(view)
+    pose = pose_array(view.T_camera_platform.inv())
     # what one image of a camera sees, all of them see that have it in view
     of_camera = [other.number for other in views if other.camera == view.camera]
     p_camera = view.T_camera_platform.apply(cloud.points)
     uv = pinhole(p_camera, view.model)
     size = view.model.size
     near = np.isin(cloud.image, of_camera) & (np.abs(uv - size / 2) < size).all(axis=1)
-    points = _Beside(uv[near], p_camera[near, 2], of_point[near], cloud.image[near])
+    points = np.column_stack([uv, p_camera[:, 2], of_point, cloud.image])[near]
     reach = np.linalg.norm(np.diff(segments, axis=1), axis=-1)[:, 0] / 2 + BESIDE_PX[1]
-    about = KDTree(points.uv).query_ball_point(segments.mean(axis=1), reach)
+    about = KDTree(points[:, :2]).query_ball_point(segments.mean(axis=1), reach)
     edges = []
     for ends, rows in zip(segments, about, strict=True):
-        beside = _Beside(*(column[rows] for column in points))
-        plane = _surface_at(ends, beside, planes, view)
+        plane = _surface_at(ends, points[rows], planes, view, pose)
         if plane is not None:
             with suppress(EdgeNotSeen):
-                edges.append(_on_plane(plane, _refined(view, ends, segments), view))
+                line = _refined(view, ends, segments)
+                edges.append(_on_plane(plane, line, view, pose))
     return edges
-
-
-class _Beside(NamedTuple):
-    """Points that a camera sees, a row each: undistorted pixels of an image, depth, numbers of the
-    surface and of the image that counts most.
-    """
-
-    uv: np.ndarray
-    depth: np.ndarray
-    plane: np.ndarray
-    image: np.ndarray
 
 
 def _segments(view):
@@ -108,7 +96,7 @@ def _segments(view):
 def _refined(view, ends, segments):
     """The line of an image near a segment (2, 2), less certain where another one is beside it."""
     first, last = ends
-    normal = np.array([last[1] - first[1], first[0] - last[0]])
+    normal = (last - first)[::-1] * [1, -1]
     line = refine_edge(view.image, view.model, "", first, last, normal, HALF_WIDTH_PX)
     off = segments - line.centre
     away = np.abs(off @ line.line[:2]).max(axis=1)
@@ -119,32 +107,35 @@ def _refined(view, ends, segments):
     return replace(line, covariance=line.covariance + np.diag([PULLED_PX**2, 0.0]))
 
 
-def _surface_at(ends, points, planes, view):
+def _surface_at(ends, points, planes, view, pose):
     """The surface that ends at a segment (2, 2) of an image, or that it is on; None for none.
 
-    Of `points` about it.
+    Of points (n, 5) about it: undistorted pixels of the image, depth, numbers of the surface and of
+    the image that counts most.
     """
     first, last = ends
     length = np.linalg.norm(last - first)
     along = (last - first) / length
-    s = (points.uv - first) @ along
-    t = (points.uv - first) @ [along[1], -along[0]]
+    off = points[:, :2] - first
+    s = off @ along
+    t = off @ [along[1], -along[0]]
     near, far = BESIDE_PX
     # depth, whether it is no flat surface, less the points of it, its number, points of the image
     sides = []
     for away in (t, -t):
-        rows = np.flatnonzero((s > 0) & (s < length) & (away > near) & (away < far))
-        if len(rows) < FEWEST:
+        beside = (s > 0) & (s < length) & (away > near) & (away < far)
+        depths, surface, image = points[beside, 2:].T
+        if len(depths) < FEWEST:
             continue
-        counts = np.bincount(points.plane[rows] + 1)  # of none first
+        counts = np.bincount(surface.astype(int) + 1)  # of none first
         number = int(np.argmax(counts)) - 1
-        depth = np.median(points.depth[rows])
-        if number >= 0 and counts.max() > LEAST_SHARE * len(rows):
-            _, (depth,) = _where_seen(view, planes[number], ends.mean(axis=0)[None])
+        depth = np.median(depths)
+        if number >= 0 and counts.max() > LEAST_SHARE * len(depths):
+            _, (depth,) = _where_seen(view, pose, planes[number], ends.mean(axis=0)[None])
             depth = depth if depth > 0 else np.inf  # behind the camera
         else:
             number = -1
-        own = np.sum(points.image[rows] == view.number)
+        own = np.sum(image == view.number)
         sides.append((depth, number < 0, -counts.max(), number, own))
     sides.sort()
     step = STEP if any(side[1] for side in sides) else PLANES_APART
@@ -155,27 +146,27 @@ def _surface_at(ends, points, planes, view):
     return planes[sides[0][3]]
 
 
-def _where_seen(view, plane, pixels):
-    """Where the sights through undistorted pixels (k, 2) meet a plane: places (k, 3), platform
-    frame, and how deep in the image these are (k,), metres.
+def _where_seen(view, pose, plane, pixels):
+    """Where the sights through undistorted pixels (k, 2) of a camera with this pose (3, 4) in the
+    platform meet a plane: places (k, 3), platform frame, and how deep these are (k,), metres.
     """
-    T = view.T_camera_platform.inv()
-    rays = T.rotation.apply(view.model.sights(pixels))
-    depth = plane.axis @ (plane.centre - T.translation) / (rays @ plane.axis)
-    return T.translation + depth[:, None] * rays, depth
+    rays = view.model.sights(pixels) @ pose[:, :3].T
+    eye = pose[:, 3]
+    depth = plane.axis @ (plane.centre - eye) / (rays @ plane.axis)
+    return eye + depth[:, None] * rays, depth
 
 
-def _on_plane(plane, line, view):
+def _on_plane(plane, line, view, pose):
     """The edge of a scene that a line of an image shows, on its plane."""
     rig = plane.rig
-    ends, depth = _where_seen(view, plane, line.ends)
+    ends, depth = _where_seen(view, pose, plane, line.ends)
     way = ends[1] - ends[0]
     direction = unit_vector(way)
 
     # the plane of sight: what it misses a point of the camera's frame by, its gradient, pixels a
     # metre
     sight = line.line @ view.model.matrix / depth[:, None]
-    gradient = sight @ view.T_camera_platform.rotation.as_matrix()
+    gradient = sight @ pose[:, :3].T
     across = np.cross(plane.axis, direction)
     by_offset = across / (gradient @ across)[:, None]  # metres a pixel
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+from scipy.linalg import block_diag, null_space
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -18,11 +19,12 @@ from lrfcal_lib.judge.uncertainty import (
     uncertainty_of,
 )
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, unit_vector
+from lrfcal_lib.preprocess.prepared import PitchNoise
 
 AT_ONCE = 1 << 16  # points
 ALIKE = np.radians(15.0)  # between normals of one plane
+FACING = np.cos(ALIKE)
 SURE = 1e-12  # a variance of what has none
-STEP = 1e-6  # of numerical derivatives: metres, radians
 # metres by which a surface may be off as a whole, for every station alike: what lies on it, and
 # slanted spots beside things (the table and the seat of the shipped session)
 SYSTEMATIC = 0.001
@@ -51,7 +53,7 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
     """
     chain = chain_of(rig)
     noise = range_noise(rig)
-    offset, stretch = chain.sweep_sigma
+    sweep_noise = PitchNoise(*chain.sweep_sigma)
     sigma = np.zeros(len(cloud.points))
     for rows in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
         part = cloud.rows(rows)
@@ -60,9 +62,9 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
         beams = -J[..., COLUMNS.index("range_offset")]
         normals = np.where(np.isfinite(normals), normals, beams)
         calibration = spread(chain, normals[:, None] @ J)
-        sweep = np.hypot(offset, stretch * part.pitch) * np.vecdot(normals, by_pitch)
+        sweep = sweep_noise.sigma(part.pitch, 0.0) * np.vecdot(normals, by_pitch)
         reading = np.maximum(np.abs(noise * np.vecdot(normals, beams)), part.sigma)
-        sigma[rows] = np.sqrt(calibration**2 + sweep**2 + reading**2)
+        sigma[rows] = np.linalg.norm([calibration, sweep, reading], axis=0)
     return replace(cloud, sigma=sigma)
 
 
@@ -86,7 +88,7 @@ def largest_plane(cloud: Cloud, tolerance: float = 0.04) -> np.ndarray:
     points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
     (*normal, offset), _ = points.segment_plane(tolerance, 3, 500)
     near = np.abs(cloud.points @ normal + offset) < tolerance
-    return near & (np.abs(cloud.normals @ normal) > np.cos(ALIKE))
+    return near & (np.abs(cloud.normals @ normal) > FACING)
 
 
 def flatness(points: np.ndarray, together: int = PATCH) -> tuple[np.ndarray, float]:
@@ -108,8 +110,7 @@ def flatness(points: np.ndarray, together: int = PATCH) -> tuple[np.ndarray, flo
     """
     normal, offset, _ = fit_plane(points)
     miss = points @ normal - offset
-    across = np.linalg.svd(normal[None])[2][1:]
-    flat = (points - points.mean(axis=0)) @ across.T
+    flat = (points - points.mean(axis=0)) @ null_space(normal[None])
     side = np.sqrt(together * np.prod(np.ptp(flat, axis=0)) / len(points))
     cells = np.rint(flat / side).astype(int)
     _, patch, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
@@ -168,7 +169,7 @@ class Feature:
 
     def lies_along(self, axis: np.ndarray | None) -> bool:
         """Whether its axis is parallel to another one (3,) to 15 deg; None is to all."""
-        return axis is None or abs(self.axis @ axis) > np.cos(ALIKE)
+        return axis is None or abs(self.axis @ axis) > FACING
 
     def foot(self, place: np.ndarray) -> np.ndarray:
         """The places (..., 3) on the plane or the line of an edge that are nearest to others."""
@@ -226,7 +227,7 @@ def mean_length(lengths: Sequence[Length]) -> Length:
     return Length(
         metres=float(weight @ [length.metres for length in lengths]),
         noise=float(weight**2 @ [length.noise for length in lengths]),
-        shared=weight @ np.array([length.shared for length in lengths]),
+        shared=weight @ [length.shared for length in lengths],
         rig=lengths[0].rig,
     )
 
@@ -255,17 +256,17 @@ def beams_moved(
     camera : str, optional
         In whose frame the ends are, with the head at `image_pitch`; the platform's unless given.
     image_pitch : float
-        Radians.
+        Radians; 0 for a camera on the base.
     """
     chain = chain_of(rig, camera)
     _, by_link, by_pitch = carried(chain, *beams, image_pitch)
     moved = by_link @ selection(uncertainty_of(rig).names, camera)
-    turn = beams[1][..., None]
-    nothing = np.zeros_like(by_pitch)
-    sweep = [by_pitch, turn * by_pitch, nothing]
+    by_offset = by_pitch
     if camera and chain.on_head:  # the offset is that of the image, too
-        sweep = [nothing, (turn - image_pitch) * by_pitch, nothing]
-    moved = np.concatenate([moved, np.stack(sweep, axis=-1)], axis=-1)
+        by_offset = 0 * by_pitch
+    by_stretch = (beams[1] - image_pitch)[..., None] * by_pitch
+    sweep = np.stack([by_offset, by_stretch, 0 * by_pitch], axis=-1)
+    moved = np.concatenate([moved, sweep], axis=-1)
     return moved if camera else chain.head[:, :3] @ moved
 
 
@@ -299,27 +300,26 @@ def fit_feature(
     moved = beams_moved(rig, (part.bearing, part.pitch, part.range))
     centre = part.points.mean(axis=0)
     normal = np.zeros(3)
-    noise = np.zeros((6, 6))
-    jacobian = np.zeros((6, moved.shape[-1]))
-    jacobian[:3] = moved.mean(axis=0)
+    by_shared = moved.mean(axis=0)
+    turning = np.zeros_like(by_shared)
     if plane:
         normal, _, rough = fit_plane(part.points)
         size, axes = np.linalg.eigh(np.cov(part.points.T, bias=True))
         # of the normal by the mean of products of places and heights
         turned = -(axes[:, 1:] / size[1:]) @ axes[:, 1:].T
-        jacobian[3:] = turned @ (part.points - centre).T @ (normal @ moved) / count
-        jacobian[:3, -1] = normal
-        noise[:3, :3] = rough**2 / count * np.outer(normal, normal)
-        noise[3:, 3:] = -(rough**2) / count * turned
+        turning = turned @ (part.points - centre).T @ (normal @ moved) / count
+        by_shared[:, -1] = normal
+        noise = rough**2 / count * block_diag(np.outer(normal, normal), -turned)
     else:
         beams = unit_vector(part.points)
-        noise[:3, :3] = range_noise(rig) ** 2 * beams.T @ beams / count**2
+        of_ranges = range_noise(rig) ** 2 * beams.T @ beams / count**2
+        noise = block_diag(of_ranges, np.zeros((3, 3)))
     return Feature(
         kind=Kind.PLANE if plane else Kind.POINT,
         centre=centre,
         axis=normal,
         noise=noise,
-        jacobian=jacobian,
+        jacobian=np.concatenate([by_shared, turning]),
         rig=rig,
         placement=int(part.placement[0]),
         ends=np.array([centre, centre]),
@@ -353,10 +353,23 @@ def length_between(first: Feature, second: Feature) -> Length:
         )
     _refuse_askew(first, second)
     kind, weights = _axes(first, second)
-    place = np.concatenate([first.centre, first.axis, second.centre, second.axis])
-    steps = STEP * np.eye(12)
-    change = _length(place + steps, kind, weights) - _length(place - steps, kind, weights)
-    by_first, by_second = np.split(change / (2 * STEP), 2)
+    along = weights @ [first.axis, second.axis]
+    size = max(np.linalg.norm(along), SURE)
+    along /= size
+    way = second.centre - first.centre
+    height = along @ way
+    across = way - height * along
+    # by the second centre, and by the weighted sum of axes
+    if kind == Kind.PLANE:
+        metres = abs(height)
+        by_place = np.sign(height) * along
+        by_axis = np.sign(height) * across / size
+    else:
+        metres = np.linalg.norm(across)
+        by_place = across / metres
+        by_axis = -height * by_place / size
+    by_first = np.append(-by_place, weights[0] * by_axis)
+    by_second = np.append(by_place, weights[1] * by_axis)
     noise = by_first @ first.noise @ by_first + by_second @ second.noise @ by_second
     moved = np.array([by_first @ first.jacobian, by_second @ second.jacobian])
     by_sweep = moved[:, -3:-1]
@@ -364,7 +377,7 @@ def length_between(first: Feature, second: Feature) -> Length:
         by_sweep = by_sweep.sum(axis=0)
     noise += np.sum((by_sweep * uncertainty_of(first.rig).sweep_sigma) ** 2)
     return Length(
-        metres=float(_length(place, kind, weights)),
+        metres=float(metres),
         noise=float(noise),
         shared=np.append(moved[:, :-3].sum(axis=0), moved[:, -1]),
         rig=first.rig,
@@ -396,15 +409,3 @@ def _axes(first, second):
     if first.axis @ second.axis < 0:
         weights[1] *= -1
     return kind, weights
-
-
-def _length(place, kind, weights):
-    """Lengths (...) between two features with these centres and axes (..., 12)."""
-    first, first_axis, second, second_axis = np.split(place, 4, axis=-1)
-    way = second - first
-    along = weights[0] * first_axis + weights[1] * second_axis
-    along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), SURE)
-    height = np.vecdot(along, way)
-    if kind == Kind.PLANE:
-        return np.abs(height)
-    return np.linalg.norm(way - height[..., None] * along, axis=-1)

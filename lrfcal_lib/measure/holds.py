@@ -10,13 +10,13 @@ from scipy.interpolate import interp1d
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.cloud import join as join_clouds
-from lrfcal_lib.calibrate.clouds import sweep_blocks
+from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
+from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
 from lrfcal_lib.measure.creases import creases_of, sights
 from lrfcal_lib.measure.features import flatness, largest_plane
 from lrfcal_lib.measure.image_pairs import pairs_pull
-from lrfcal_lib.measure.pulls import views_of_station
 from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.measure.suspects import (
     WANTED,
@@ -196,11 +196,9 @@ class Held:
             f"from {self.creases / 4:.0f} m of creases, where surfaces meet, against edges of "
             f"images, and {self.regions:.0f} regions of surfaces that two images show{on_head}"
         )
-        lines = [f"{name}: {first[self.answer]}"]
-        lines += [shift.sentence() for shift in self.shifts]
-        lines += [wall.sentence() for wall in self.walls]
-        lines += [passes.sentence() for passes in self.passes]
-        return [*lines, basis]
+        found: tuple[Shift | Wall | Passes, ...] = (*self.shifts, *self.walls, *self.passes)
+        sentences = [each.sentence() for each in found]
+        return [f"{name}: {first[self.answer]}", *sentences, basis]
 
 
 def holds(session: Session, rig: CalibratedRig) -> Held:
@@ -220,7 +218,8 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     ------
     ValueError
         If the rig does not say how well it is known, or the session has no sweep, no image, no
-        camera of the rig, or images of another size.
+        camera of the rig, a station whose images are all of an unknown pitch, or images of another
+        size.
     """
     uncertainty_of(rig)
     of_creases = []
@@ -233,14 +232,17 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         wall = cloud.rows(largest_plane(cloud))
         if len(wall.points) > FEWEST_POINTS:
             walls.append(wall_of(wall, rig, placement))
-        views = views_of_station(session, rig, placement)
+        views: dict[tuple[str, float], View] = {}
+        for view in views_of(session, rig.for_scenes, placement):
+            # a camera on the base sees the same again
+            views.setdefault((view.camera, view.pitch), view)
         creases = creases_of(cloud, planes, of_point)
-        of_creases += [sights(creases, view) for view in views]
+        of_creases += [sights(creases, view, rig) for view in views.values()]
         moved, of_flat = flattened(cloud, planes, of_point)
-        stations.append((moved, of_flat, views))
+        stations.append((moved, of_flat, list(views.values())))
     start = likeliest_change(of_creases, rig)
-    of_pairs = [pairs_pull(*station, start) for station in stations]
-    of_pairs = [pull for pull in of_pairs if pull is not None]
+    pulls = [pairs_pull(*station, rig, start) for station in stations]
+    of_pairs = [pull for pull in pulls if pull is not None]
     shifts = suspects(of_creases, of_pairs, rig)
     nothing = np.zeros_like(start)
     return Held(
@@ -259,14 +261,18 @@ def _stations(session, rig):
     """Placements with a sweep and images of the rig's cameras."""
     require_same_rig(rig, session)
     shown = {r.placement for r in session.image_records if r.camera in rig.cameras}
-    swept = scanned(session.scans)
-    stations = [p for p in session.placements if p in shown & swept]
+    stations = [p for p in _swept(session) if p in shown]
     if not stations:
         raise ValueError(
             f"{session.name}: no placement has both a sweep and an image of "
             f"{', '.join(rig.cameras) or 'a calibrated camera'}"
         )
     return stations
+
+
+def _swept(session):
+    """Placements of which a range came back, in order."""
+    return [p for p in session.placements if p in scanned(session.scans)]
 
 
 def flattened(cloud, planes, of_point):
@@ -316,8 +322,7 @@ def passes_of(session: Session) -> list[Passes]:
     session : Session
     """
     passes = []
-    swept = [p for p in session.placements if (session.scans["placement"] == p).any()]
-    for pair in pairwise(swept):
+    for pair in pairwise(_swept(session)):
         one, other = (session.sweep(placement) for placement in pair)
         if session.sweep_direction(pair[0]) * session.sweep_direction(pair[1]) < 0:
             slip = _slip_between(one, other, session.lrf.sigma_range)

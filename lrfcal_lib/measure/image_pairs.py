@@ -10,13 +10,15 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from lrfcal_lib.calibrate.cloud import Cloud
+from lrfcal_lib.calibrate.painting import View
+from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.pulls import (
     PITCH_NOISE,
     SPREAD,
     Pull,
-    View,
     poses_of,
     pull_of_groups,
+    seen,
     without,
 )
 from lrfcal_lib.measure.surfaces import BENT
@@ -53,7 +55,11 @@ class _Pair:
 
 
 def pairs_pull(
-    cloud: Cloud, of_point: np.ndarray, views: list[View], start: np.ndarray
+    cloud: Cloud,
+    of_point: np.ndarray,
+    views: list[View],
+    rig: CalibratedRig,
+    start: np.ndarray,
 ) -> Pull | None:
     """What pairs of images say about a rig; None where they show too little.
 
@@ -67,25 +73,27 @@ def pairs_pull(
         The number of the surface, -1 for none.
     views : list of View
         Images of the station.
+    rig : CalibratedRig
+        That knows its uncertainty.
     start : ndarray, shape (c,)
         Change of the unknowns that creases ask for: pairs leave open what moves both images alike.
     """
     patches = np.flatnonzero(of_point >= 0)[::EVERY]
     surfaces = of_point[patches, None] == np.unique(of_point[patches])
-    clear = {id(view): clear_places(cloud, view)[patches] for view in views}
-    stops = np.unique([view.pitch for view in views if not view.fixed])
+    clear = {view.number: clear_places(cloud, view, rig)[patches] for view in views}
+    stops = np.unique([view.pitch for view in views])
     pairs = []
     for first, second in combinations(views, 2):
         turned = abs(first.pitch - second.pitch)
         same = first.camera == second.camera
         if turned < (NEAR_PITCH if same else 1e-3):
-            both = clear[id(first)] & clear[id(second)]
+            both = clear[first.number] & clear[second.number]
             rows = cloud.rows(patches[both])
-            pairs.append(_pair(rows, surfaces[both], first, second, stops))
+            pairs.append(_pair(rows, surfaces[both], first, second, rig, stops))
     if sum(len(pair.cell) for pair in pairs) < FEWEST:
         return None
     cameras = dict.fromkeys(view.camera for view in views)
-    poses = np.concatenate([poses_of(views[0].rig, camera) for camera in cameras])
+    poses = np.concatenate([poses_of(rig, camera) for camera in cameras])
     noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
     x = np.pad(start, (0, len(noise)))
     fitted = np.r_[poses, len(start) : len(x)]
@@ -93,7 +101,7 @@ def pairs_pull(
     # what moves both images alike stays where creases have it
     prior = np.diag(np.r_[np.tile(SPREAD / 4, len(cameras)), noise] ** -2.0)
     for blur in BLURS:
-        sharp = {id(view): cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
+        sharp = {view.number: cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
         parts = [_compared(pair, sharp, x) for pair in pairs]
         H, b, D = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
@@ -106,7 +114,7 @@ def pairs_pull(
     return replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())
 
 
-def clear_places(cloud, view):
+def clear_places(cloud, view, rig):
     """Which points (n,) a view shows with nothing nearer or farther beside them: of a plane the
     inverse of the depth is linear in the pixels.
     """
@@ -119,7 +127,7 @@ def clear_places(cloud, view):
     nearness = 1 / p_camera[:, 2]
     normals = view.T_camera_platform.rotation.apply(cloud.normals[clear])
     slope = np.linalg.norm(normals[:, :2], axis=1) / np.abs(np.vecdot(normals, p_camera))
-    noise = BEFORE * view.rig.lrf.sigma_range * nearness**2
+    noise = BEFORE * rig.lrf.sigma_range * nearness**2
     off = REACH * slope / model.fx + noise
     alone = np.ones(len(nearness), bool)
     for side in (1, -1):  # what is nearer, then what is farther
@@ -130,10 +138,10 @@ def clear_places(cloud, view):
     return clear
 
 
-def _pair(patches, surfaces, first, second, stops):
+def _pair(patches, surfaces, first, second, rig, stops):
     """The clearest patches that two images show, each of one of some surfaces (n, s)."""
-    p_first, J_first = _carried(first, patches, surfaces, stops)
-    p_second, J_second = _carried(second, patches, surfaces, stops)
+    p_first, J_first = _carried(first, rig, patches, surfaces, stops)
+    p_second, J_second = _carried(second, rig, patches, surfaces, stops)
     spacing = SPACING * p_first[:, 2] / first.model.fx
     a, inside = _samples(patches.normals, first, p_first, spacing)
     b, also = _samples(patches.normals, second, p_second, spacing)
@@ -153,12 +161,13 @@ def _pair(patches, surfaces, first, second, stops):
     )
 
 
-def _carried(view, patches, surfaces, stops):
+def _carried(view, rig, patches, surfaces, stops):
     """Patches (n, 3) in the camera frame, and their derivatives by the unknowns of a Pull, by the
     pitch at which the head stopped, and by the height of each surface.
     """
-    p_camera, J = view.carried(patches.points)
-    here = (stops == view.pitch) & (not view.fixed)
+    p_camera, J = seen(patches.points, view, rig)
+    on_head = rig.cameras[view.camera].mount == "head"
+    here = on_head & (stops == view.pitch)
     raised = view.T_camera_platform.rotation.apply(patches.normals)
     # an image pitched more sees what a sweep pitched less shows
     parts = [J, -J[..., -1:] * here, raised[..., None] * surfaces[:, None]]
@@ -173,10 +182,8 @@ def _samples(normals, view, middle, spacing):
     right[np.linalg.norm(right, axis=1) < 0.1] = [1.0, 0.0, 0.0]
     right = unit_vector(right)
     down = np.cross(normals, right)
-    sides = view.T_camera_platform.rotation.apply(
-        np.stack([right, down], axis=1).reshape(-1, 3)
-    )
-    sides = sides.reshape(-1, 2, 3) * spacing[:, None, None]
+    R = view.T_camera_platform.rotation.as_matrix()
+    sides = np.stack([right, down], axis=1) @ R.T * spacing[:, None, None]
     steps = np.indices((2 * HALF + 1,) * 2).reshape(2, -1) - HALF
     points = middle[:, None] + np.einsum("is,nij->nsj", steps, sides)
     inside = view.model.shows(project(points, view.model), BORDER).all(axis=1)
@@ -185,18 +192,16 @@ def _samples(normals, view, middle, spacing):
 
 def _compared(pair, sharp, x):
     """Of each patch of a pair: tensor (2, 2), slope (2,), derivatives (2, c)."""
-    values = []
-    gradients = []
-    for view, uv, J in zip(pair.views, pair.uv, pair.by_unknown, strict=True):
-        patch, gradient = _normalised(sharp[id(view)], view.model, uv + (J @ x)[:, None])
-        values.append(patch)
-        gradients.append(gradient)
-    alike = np.mean(values[0] * values[1], axis=1)
+    (first, of_first), (second, of_second) = (
+        _normalised(sharp[view.number], view.model, uv + (J @ x)[:, None])
+        for view, uv, J in zip(pair.views, pair.uv, pair.by_unknown, strict=True)
+    )
+    alike = np.mean(first * second, axis=1)
     weight = np.clip((alike - ALIKE) / (1 - ALIKE), 0, None) ** 2
-    gradient = np.mean(gradients, axis=0)
+    gradient = (of_first + of_second) / 2
     weighted = gradient * weight[:, None, None]
     tensor = np.einsum("nsi,nsj->nij", weighted, gradient)
-    slope = np.vecmat(values[1] - values[0], weighted)
+    slope = np.vecmat(second - first, weighted)
     by_first, by_second = pair.by_unknown
     return np.nan_to_num(tensor), np.nan_to_num(slope), by_second - by_first
 

@@ -104,7 +104,7 @@ def nearest_edge(
     """The edge that passes closest to a place (3,), and how close, metres."""
     if not edges:
         return None, np.inf
-    first, last = np.moveaxis(np.array([edge.ends for edge in edges]), 1, 0)
+    first, last = np.stack([edge.ends for edge in edges], axis=1)
     way = last - first
     along = np.vecdot(place - first, way) / np.vecdot(way, way)
     foot = first + np.clip(along, 0, 1)[:, None] * way
@@ -206,14 +206,7 @@ def measure(
 
 def _lengths(scenes, poses, row) -> dict[int, Length]:
     """A row of picks as each station measures it that shows both places."""
-    ends = []
-    for number in (1, 2):
-        place = np.array([row[f"{axis}_m_{number}"] for axis in PLACE], float)
-        try:
-            ends.append(_shown(scenes, poses, row[f"kind_{number}"], place))
-        except DegenerateGeometry as problem:
-            raise DegenerateGeometry(f"place {number}: {problem}") from None
-    first, second = ends
+    first, second = (_shown(scenes, poses, row, number) for number in (1, 2))
     both = [station for station in first if station in second]
     if not both:
         raise DegenerateGeometry(
@@ -224,26 +217,31 @@ def _lengths(scenes, poses, row) -> dict[int, Length]:
     return {s: length_between(first[s], second[s]) for s in apart or both}
 
 
-def _shown(scenes, poses, kind, place) -> dict[int, Feature]:
-    """The features that stations show at a place; a point is of the station that is nearest."""
+def _shown(scenes, poses, row, number) -> dict[int, Feature]:
+    """The features that stations show at one of the places of a row of picks; a point is of the
+    station that is nearest.
+    """
+    kind = row[f"kind_{number}"]
+    place = np.array([row[f"{axis}_m_{number}"] for axis in PLACE], float)
     near = {n: s.at(kind, poses[n].inv().apply(place)) for n, s in scenes.items()}
-    clicked = min(near, key=lambda number: near[number][1])
+    clicked = min(near, key=lambda station: near[station][1])
     feature, away = near[clicked]
     reach = ON_IT if kind == Kind.EDGE else REACH
     if away > reach:
         raise DegenerateGeometry(
-            f"no {kind} within {1000 * reach:.0f} mm of it: pick another place, or a point"
+            f"place {number}: no {kind} within {1000 * reach:.0f} mm of it: pick another place, "
+            "or a point"
         )
     if kind == Kind.POINT:
         return {clicked: feature}
     foot = feature.foot(poses[clicked].inv().apply(place))
     shown = {clicked: feature}
-    for number, scene in scenes.items():
-        T = poses[number].inv() * poses[clicked]
+    for station, scene in scenes.items():
+        T = poses[station].inv() * poses[clicked]
         there = T.apply(foot)
         other, away = scene.at(kind, there, T.rotation.apply(feature.axis))
         if away < REACH and np.linalg.norm(other.foot(there) - there) < ON_IT:
-            shown.setdefault(number, other)
+            shown.setdefault(station, other)
     return shown
 
 
@@ -291,8 +289,7 @@ def read_picks(path: str | PathLike) -> "pd.DataFrame":
 
 
 def for_page(
-    scenes: Mapping[int, SceneFeatures],
-    poses: Mapping[int, RigidTransform] | None = None,
+    scenes: Mapping[int, SceneFeatures], poses: Mapping[int, RigidTransform]
 ) -> dict:
     """What a page needs to measure by clicks, see :func:`lrfcal_lib.plots.interactive.scene_page`.
 
@@ -303,7 +300,7 @@ def for_page(
     ----------
     scenes : dict of int to SceneFeatures
         Whose points, station by station, are those of the page.
-    poses : dict of int to RigidTransform, optional
+    poses : dict of int to RigidTransform
         As in :func:`measure`.
 
     Returns
@@ -311,7 +308,6 @@ def for_page(
     dict
         Of what JSON holds, and arrays.
     """
-    poses = poses or dict.fromkeys(scenes, IN_PLACE)
     features: list[Feature] = []
     of_point = []
     lines = []

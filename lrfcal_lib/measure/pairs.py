@@ -19,6 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.robust import biweight, robust_sigma, sums_by
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
 from lrfcal_lib.model.geometry import (
@@ -31,6 +32,7 @@ from lrfcal_lib.model.geometry import (
 # metres, side of the cells whose points make one patch of a surface: for a start, for the fit
 COARSE = 0.1
 FINE = 0.05
+IN_ONE = np.array([1e8, 1e4, 1.0])  # makes one number of the three of a cell
 FLAT = 0.97  # length of the mean normal of a patch; less has an edge in it
 DIRECTIONS = 8  # of walls, floor and furniture that make turns
 NEAR = np.cos(np.radians(8.0))  # between normals of one direction
@@ -48,7 +50,7 @@ STARTS = 10  # tried a pair
 WIDTHS = (0.4, 0.2)  # metres within which patches are taken for the same, one by one
 AROUND = 20  # patches that make a covariance
 # turn and metres: nearer together, two starts ended at the same pose
-SAME_POSE = (np.radians(3.0), 0.15)
+SAME_POSE = np.array([np.radians(3.0), 0.15])
 MATCHED = 0.1  # metres between patches of the same surface
 FACING = np.cos(np.radians(30.0))  # between normals of the same surface
 LOOK = np.radians(1.0)  # side of a cell of what a station saw
@@ -81,9 +83,31 @@ class Surface:
     sigma: np.ndarray
     moves: np.ndarray
     nearest: np.ndarray
-    gicp: small_gicp.PointCloud
-    gicp_tree: small_gicp.KdTree
     tree: KDTree
+
+    @cached_property
+    def gicp(self) -> tuple[small_gicp.PointCloud, small_gicp.KdTree]:
+        """The points with their covariances, and what finds neighbours, as GICP wants both."""
+        cloud = small_gicp.PointCloud(self.points)
+        tree = small_gicp.KdTree(cloud)
+        small_gicp.estimate_normals_covariances(cloud, tree, AROUND)
+        return cloud, tree
+
+    @cached_property
+    def directions(self) -> list[np.ndarray]:
+        """Directions (3,) in which many patches face, the most of them first."""
+        left = self.normals[:: max(1, len(self.normals) // 2000)]
+        least = FEW * len(left)
+        found: list[np.ndarray] = []
+        while len(found) < DIRECTIONS:
+            near = left @ left.T > NEAR
+            count = near.sum(axis=1)
+            if count.max(initial=0) < least:
+                break
+            mean = unit_vector(left[near[count.argmax()]].mean(axis=0))
+            found.append(mean)
+            left = left[left @ mean < NEAR]
+        return found
 
 
 def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> Surface:
@@ -109,25 +133,19 @@ def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> S
     whole = cloud.rows(np.isfinite(cloud.normals).all(axis=1))
     one = np.ones(len(whole.points))
     columns = [whole.points, whole.normals, _moves(whole, rig), whole.sigma**2, one]
-    sums = sums_by(np.floor(whole.points / size), np.column_stack(columns))
-    count = sums[:, -1:]
-    length = np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True)
-    flat = (length > FLAT * count)[:, 0]
+    sums = sums_by(np.floor(whole.points / size) @ IN_ONE, np.column_stack(columns))
+    means = sums / sums[:, -1:]
+    flat = np.linalg.norm(means[:, 3:6], axis=1) > FLAT
     if not flat.any():
         raise ValueError("no part of the cloud is a smooth surface")
-    means = (sums / count)[flat]
-    points, normals, moves, variance, _ = np.split(means, [3, 6, -2, -1], axis=1)
-    gicp = small_gicp.PointCloud(points)
-    gicp_tree = small_gicp.KdTree(gicp)
-    small_gicp.estimate_normals_covariances(gicp, gicp_tree, AROUND)
+    points, normals, moves, _ = np.split(means[flat], [3, 6, -2], axis=1)
+    variance, count = sums[flat, -2:].T
     return Surface(
         points=points,
         normals=unit_vector(normals),
-        sigma=np.sqrt(variance / count[flat])[:, 0],
+        sigma=np.sqrt(variance) / count,
         moves=moves,
         nearest=_look(cloud.points),
-        gicp=gicp,
-        gicp_tree=gicp_tree,
         tree=KDTree(points),
     )
 
@@ -160,7 +178,7 @@ def _look(points):
     nearest = np.full(shape, np.inf)
     np.minimum.at(nearest, cell, distance)
     nearest = minimum_filter(nearest, 3)
-    return np.nan_to_num(nearest, posinf=0.0, neginf=0.0)
+    return np.nan_to_num(nearest, posinf=0.0)
 
 
 @dataclass(frozen=True)
@@ -193,11 +211,23 @@ def candidates(first: Surface, second: Surface) -> list[Candidate]:
     list of Candidate
         All different.
     """
+    target, tree = first.gicp
+    source, _ = second.gicp
     ended: list[RigidTransform] = []
     for start in starts(first, second):
-        T = refined(first, second, start)
-        apart = [np.divide(transform_difference(T, other), SAME_POSE) for other in ended]
-        if all(max(parts) >= 1 for parts in apart):
+        matrix = start.as_matrix()
+        for width in WIDTHS:
+            matrix = small_gicp.align(
+                target,
+                source,
+                tree,
+                matrix,
+                registration_type="GICP",
+                max_correspondence_distance=width,
+                max_iterations=30,
+            ).T_target_source
+        T = RigidTransform.from_matrix(matrix)
+        if all(np.any(SAME_POSE <= transform_difference(T, other)) for other in ended):
             ended.append(T)
     found = [agreement(first, second, T) for T in ended]
     return sorted(found, key=lambda c: -c.overlap * (1 - c.against))
@@ -205,28 +235,13 @@ def candidates(first: Surface, second: Surface) -> list[Candidate]:
 
 def starts(first: Surface, second: Surface) -> list[RigidTransform]:
     """Rough poses of the second station in the frame of the first, the most likely first."""
+    here, low = _on_grid(first.points, first.normals)
+    blurred = gaussian_filter(here, 1.0, axes=GRID)
     found = []
-    for turn in _turns(_directions(first), _directions(second)):
-        found += _shifts(first, second, turn)
+    for turn in _turns(first.directions, second.directions):
+        found += _shifts(blurred, low, second, turn)
     found.sort(key=lambda scored: -scored[0])
     return [T for _, T in found[:STARTS]]
-
-
-def _directions(surface):
-    """Directions (3,) in which many patches face, the most of them first."""
-    every = max(1, len(surface.normals) // 2000)
-    left = surface.normals[::every]
-    least = FEW * len(left)
-    found = []
-    for _ in range(DIRECTIONS):
-        near = left @ left.T > NEAR
-        count = near.sum(axis=1)
-        if count.max(initial=0) < least:
-            break
-        mean = unit_vector(left[near[count.argmax()]].mean(axis=0))
-        found.append(mean)
-        left = left[left @ mean < NEAR]
-    return found
 
 
 def _turns(first, second):
@@ -236,9 +251,9 @@ def _turns(first, second):
         if abs(np.arccos(a @ b) - np.arccos(c @ d)) > SAME_ANGLE:
             continue
         turn = Rotation.align_vectors([a, b], [c, d])[0]
-        new = all((turn * other.inv()).magnitude() >= SAME_TURN for other in found)
-        if new and turn.as_matrix()[2, 2] > UPRIGHT:
-            found.append(turn)
+        if turn.as_matrix()[2, 2] > UPRIGHT:
+            if not any(turn.approx_equal(other, SAME_TURN) for other in found):
+                found.append(turn)
     return found
 
 
@@ -247,22 +262,19 @@ def _two_of(directions):
     return [(a, b) for a, b in permutations(directions, 2) if abs(a @ b) < FACING]
 
 
-def _shifts(first, second, turn):
+def _shifts(blurred, low, second, turn):
     """The best shifts of the second station after a turn: score and pose of each.
 
-    The correlation of normals on a grid: surfaces count that face the same way.
+    The correlation of normals on a grid, that of the first station blurred: surfaces count that
+    face the same way.
     """
-    here, low = _on_grid(first.points, first.normals)
     there, low_moved = _on_grid(turn.apply(second.points), turn.apply(second.normals))
-    blurred = gaussian_filter(here, 1.0, axes=GRID)
     score = fftconvolve(blurred, np.flip(there, GRID), axes=GRID).sum(axis=0)
     top = np.where(score == maximum_filter(score, 5), score, 0.0)
-    found = []
-    for place in np.argsort(top, axis=None)[::-1][:PEAKS]:
-        cell = np.unravel_index(place, top.shape) - np.array(there.shape[1:]) + 1
-        shift = cell * CELL + low - low_moved
-        found.append((top.flat[place], RigidTransform.from_components(shift, turn)))
-    return found
+    best = np.argpartition(top, -PEAKS, axis=None)[-PEAKS:]
+    cells = np.transpose(np.unravel_index(best, top.shape)) - there.shape[1:] + 1
+    shifts = cells * CELL + low - low_moved
+    return zip(top.flat[best], RigidTransform.from_components(shifts, turn), strict=True)
 
 
 def _on_grid(points, values):
@@ -274,22 +286,6 @@ def _on_grid(points, values):
     grid = np.zeros((3, *cells.max(axis=0) + ROOM + 1))
     np.add.at(grid, (slice(None), *cells.T), values.T)
     return grid, low
-
-
-def refined(first: Surface, second: Surface, start: RigidTransform) -> RigidTransform:
-    """A rough pose of the second station after GICP in shrinking widths."""
-    T = start.as_matrix()
-    for width in WIDTHS:
-        T = small_gicp.align(
-            first.gicp,
-            second.gicp,
-            first.gicp_tree,
-            T,
-            registration_type="GICP",
-            max_correspondence_distance=width,
-            max_iterations=30,
-        ).T_target_source
-    return RigidTransform.from_matrix(T)
 
 
 def agreement(first: Surface, second: Surface, T: RigidTransform) -> Candidate:
@@ -354,7 +350,7 @@ class Pair:
     @cached_property
     def whiten(self) -> np.ndarray:
         """What makes a miss one of unit covariance, (6, 6)."""
-        return np.linalg.cholesky(np.linalg.inv(self.covariance)).T
+        return inverse_root(self.covariance)
 
     def miss(self, poses: Mapping[int, RigidTransform]) -> np.ndarray:
         """Turn and shift (6,) by which poses of the stations differ from it."""
@@ -387,7 +383,11 @@ def fitted(
     T = start
     for width in CLOSER:
         here, there = matches(first, second, T, width)
-        J, r = _distances(first, second, T, here, there)
+        turned = T.rotation.apply(second.points[there])
+        across = first.normals[here] + T.rotation.apply(second.normals[there])
+        normals = unit_vector(across)
+        r = np.vecdot(normals, turned + T.translation - first.points[here])
+        J = gradient_by_pose(turned, normals)
         sigma = np.sqrt(first.sigma[here] ** 2 + second.sigma[there] ** 2 + COMMON**2)
         sigma *= robust_sigma(r / sigma, least=1.0)
         weight = biweight(r, sigma) / sigma**2
@@ -397,7 +397,7 @@ def fitted(
         step = gain @ r
         T = moved(T, step)
     pulls = weighted * (r + J @ step)[:, None]
-    sums = sums_by(np.floor(first.points[here] / NEIGHBOURS), pulls)
+    sums = sums_by(np.floor(first.points[here] / NEIGHBOURS) @ IN_ONE, pulls)
     by_first = gain @ first.moves[here]
     by_second = gain @ second.moves[there]
     by_sweeps = np.hstack([by_first[:, -2:], by_second[:, -2:]])
@@ -413,14 +413,6 @@ def fitted(
         loose=loose,
         held=float(np.mean(np.abs(J[:, 3:] @ loose) > ACROSS)),
     )
-
-
-def _distances(first, second, T, here, there):
-    """Distances (m,) of matched patches along the normal, by turn and shift (m, 6)."""
-    turned = T.rotation.apply(second.points[there])
-    normals = unit_vector(first.normals[here] + T.rotation.apply(second.normals[there]))
-    r = np.vecdot(normals, turned + T.translation - first.points[here])
-    return gradient_by_pose(turned, normals), r
 
 
 def moved(T: RigidTransform, step: np.ndarray) -> RigidTransform:

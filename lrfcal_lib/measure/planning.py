@@ -6,7 +6,12 @@ import numpy as np
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.model.camera import fold, project
-from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.model.geometry import (
+    apply_pose,
+    lrf_to_platform,
+    polar_to_points,
+    pose_array,
+)
 
 DISTANCES = (1.0, 2.0, 4.0)  # metres, to the walls of a room
 GRID = np.radians(
@@ -82,12 +87,12 @@ def seen_at(
     turns = rig.corrections.pitch(NEW, _grid(first, last))
     points = lrf_to_platform(p_lrf, turns[:, None], rig.T_head_lrf).reshape(-1, 3)
     visible = np.zeros((len(pitches), len(points)), bool)
-    for row, pitch in zip(visible, rig.corrections.pitch(NEW, pitches), strict=True):
-        for name, camera in rig.cameras.items():
-            p_camera = rig.camera_at(name, pitch).apply(points)
-            uv = project(p_camera, camera.model)
-            squared = np.sum(p_camera[:, :2] ** 2, axis=1) / p_camera[:, 2] ** 2
-            row |= camera.model.shows(uv) & (squared < fold(camera.model))
+    for name, camera in rig.cameras.items():
+        T_camera_platform = rig.camera_at(name, rig.corrections.pitch(NEW, pitches))
+        p_camera = apply_pose(pose_array(T_camera_platform), points)
+        uv = project(p_camera, camera.model)
+        squared = np.sum(p_camera[..., :2] ** 2, axis=-1) / p_camera[..., 2] ** 2
+        visible |= camera.model.shows(uv) & (squared < fold(camera.model))
     return visible
 
 

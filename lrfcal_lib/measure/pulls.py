@@ -1,70 +1,19 @@
 """What observations say about all unknowns of a calibrated rig: a slope, and its information."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
-import cv2
 import numpy as np
 
+from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of, selection
 from lrfcal_lib.fit.robust import sums_by
 from lrfcal_lib.judge.uncertainty import carried, chain_of
 from lrfcal_lib.model.kinematics import beams_to
-from lrfcal_lib.session.read import Session
 
 # a camera's likely changes, radians and metres of its pose
 SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
 PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
-
-
-@dataclass(frozen=True)
-class View:
-    """An image and how a calibrated rig sees it.
-
-    Attributes
-    ----------
-    rig : CalibratedRig
-    camera : str
-    pitch : float
-        True one of the head, radians; 0 for a camera on the base.
-    image : ndarray of uint8, shape (h, w, 3)
-    """
-
-    rig: CalibratedRig
-    camera: str
-    pitch: float
-    image: np.ndarray
-
-    @property
-    def model(self):
-        """Of the camera."""
-        return self.rig.cameras[self.camera].model
-
-    @property
-    def fixed(self):
-        """Whether the camera stands on the base."""
-        return self.rig.cameras[self.camera].mount == "platform"
-
-    @property
-    def T_camera_platform(self):
-        """Pose of the platform in the camera."""
-        return self.rig.camera_at(self.camera, self.pitch)
-
-    @cached_property
-    def grey(self):
-        """The image in grey, (h, w), float."""
-        return cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
-
-    def carried(self, points):
-        """Scanned points (n, 3) in the camera frame, and their derivatives (n, 3, c) by the
-        unknowns of a Pull.
-        """
-        beams = beams_to(points, self.rig.T_head_lrf)
-        chain = chain_of(self.rig, self.camera)
-        p_camera, by_link, by_pitch = carried(chain, *beams, self.pitch)
-        by_rig = by_link @ selection(self.rig.uncertainty.names, self.camera)
-        return p_camera, np.concatenate([by_rig, by_pitch[..., None]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -95,28 +44,31 @@ def poses_of(rig: CalibratedRig, camera: str) -> np.ndarray:
     return columns_of(rig.uncertainty.names, camera)[4:10]
 
 
-def views_of_station(session: Session, rig: CalibratedRig, placement: int) -> list[View]:
-    """The images of a placement as a calibrated rig sees them.
+def seen(
+    points: np.ndarray, view: View, rig: CalibratedRig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scanned points as a camera of a calibrated rig sees them.
 
     Parameters
     ----------
-    session : Session
+    points : ndarray, shape (n, 3)
+        Platform frame, metres.
+    view : View
     rig : CalibratedRig
         That knows its uncertainty.
-    placement : int
+
+    Returns
+    -------
+    p_camera : ndarray, shape (n, 3)
+        Camera frame, metres.
+    by_unknown : ndarray, shape (n, 3, c)
+        Their derivatives by the unknowns of a Pull.
     """
-    views = {}
-    for record in session.images(placement=placement):
-        if record.camera not in rig.cameras:
-            continue
-        pitch = record.pitch * (1 + rig.corrections.pitch_scale)
-        if rig.cameras[record.camera].mount == "platform":
-            pitch = 0.0
-        # a camera on the base sees the same again
-        if np.isfinite(pitch) and (record.camera, pitch) not in views:
-            image = session.read_image(record)
-            views[record.camera, pitch] = View(rig, record.camera, pitch, image)
-    return list(views.values())
+    beams = beams_to(points, rig.T_head_lrf)
+    chain = chain_of(rig, view.camera)
+    p_camera, by_link, by_pitch = carried(chain, *beams, view.pitch)
+    by_rig = by_link @ selection(rig.uncertainty.names, view.camera)
+    return p_camera, np.concatenate([by_rig, by_pitch[..., None]], axis=-1)
 
 
 def pull_of_groups(

@@ -4,7 +4,6 @@ A station is one place where the rig stood: a sweep and the images taken there.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from lrfcal_lib.measure.cloud_files import write_pcd
 from lrfcal_lib.measure.e57 import E57Writer, new_guid
 from lrfcal_lib.measure.features import with_sigma
 from lrfcal_lib.measure.lengths import SceneFeatures, features_of, for_page
-from lrfcal_lib.measure.stations import Joined, placed
+from lrfcal_lib.measure.stations import Joined, joined_cloud, placed
 from lrfcal_lib.plots.interactive import MOST_POINTS, rig_lines, scene_page
 from lrfcal_lib.preprocess.closing_scan import closing_of, without_closing
 from lrfcal_lib.session.faults import repeated_scans
@@ -29,7 +28,6 @@ DARKEST = 48  # grey of the weakest echo among points that no image saw
 BRIGHTEST = 208
 COMPARED = 100_000  # echoes that tell which are weak and strong
 AT_REST_S = 0.1  # no head moves on, settles and is scanned again in less
-Told = Callable[[int], object]
 
 
 @dataclass(frozen=True)
@@ -38,14 +36,11 @@ class Station:
 
     Attributes
     ----------
-    number : int
-        Of the placement.
     sweep : Sweep
         Without the scan that closed it.
     views : list of View
     """
 
-    number: int
     sweep: Sweep
     views: list[View]
 
@@ -88,9 +83,7 @@ def _refuse_moved(session, number):
     closing = closing_of(sweep)
     if closing is not None and closing.moved:
         raise ValueError(
-            f"{session.path}: station {number} moved while it was recorded: back at a pitch "
-            f"that it had, ranges differ by {1000 * closing.apart:.0f} mm, by "
-            f"{1000 * closing.expected:.0f} mm between neighbouring scan lines: {again}"
+            f"{session.path}: station {number} moved while it was recorded: {closing}: {again}"
         )
     steps = np.abs(np.diff(sweep.time_s))[np.diff(sweep.pitch) != 0]
     if not session.continuous and len(steps) and np.nanmedian(steps) < AT_REST_S:
@@ -122,7 +115,7 @@ def station_of(session: Session, rig: CalibratedRig, number: int) -> Station:
         For a sweep without a range, or images that the rig cannot pose or that have another size.
     """
     sweep, _ = without_closing(session.sweep(number))
-    return Station(number, sweep, views_of(session, rig.for_scenes, number))
+    return Station(sweep, views_of(session, rig.for_scenes, number))
 
 
 def colored_blocks(
@@ -182,7 +175,7 @@ def write_scene(
     rig: CalibratedRig,
     joined: Joined,
     about: str,
-    told: Told = lambda count: None,
+    told: Callable[[int], object] = lambda count: None,
     clouds: Mapping[int, Cloud] | None = None,
 ) -> list[Path]:
     """Write stations as ``scene.ply``, ``scene.pcd``, ``scene.e57`` and ``scene.html``.
@@ -216,36 +209,27 @@ def write_scene(
     )
     scenes: dict[int, SceneFeatures] = {}
     poses = joined.T_world_station
-    with ExitStack() as stack:
-        page_draft, e57_draft = (stack.enter_context(whole(file)) for file in (page, e57))
-        writer = E57Writer(e57_draft, about)
-        with writer:
+    with whole(page) as page_draft, whole(e57) as e57_draft:
+        with E57Writer(e57_draft, about) as writer:
             blocks = _written(writer, session, rig, joined, told, clouds or {}, scenes)
             write_ply(ply, blocks, [about])
         write_pcd(pcd, ply, [about])
-        title = f"{session.name}, station {', '.join(map(str, poses))}"
-        _measuring_page(page_draft, rig, scenes, poses, title, about)
+        cameras = {
+            name: (rig.camera_at(name, 0.0), camera.model)
+            for name, camera in rig.cameras.items()
+        }
+        shown = joined_cloud({n: scene.cloud for n, scene in scenes.items()}, joined)
+        scene_page(
+            page_draft,
+            shown.points,
+            shown.colors,
+            shown.seen,
+            rig_lines(rig.T_head_lrf, cameras),
+            note=about,
+            title=f"{session.name}, station {', '.join(map(str, poses))}",
+            measuring=for_page(scenes, poses),
+        )
     return [ply, pcd, e57, page]
-
-
-def _measuring_page(path, rig, scenes, poses, title, note):
-    """Write the page on which two clicks give a length: SceneFeatures and poses by station."""
-    cameras = {
-        name: (rig.camera_at(name, 0.0), camera.model)
-        for name, camera in rig.cameras.items()
-    }
-    points = [poses[number].apply(scene.cloud.points) for number, scene in scenes.items()]
-    shown = join(scene.cloud for scene in scenes.values())
-    scene_page(
-        path,
-        np.concatenate(points),
-        shown.colors,
-        shown.seen,
-        rig_lines(rig.T_head_lrf, cameras),
-        note=note,
-        title=title,
-        measuring=for_page(scenes, poses),
-    )
 
 
 def _written(writer, session, rig, joined, told, clouds, scenes):
@@ -264,12 +248,10 @@ def _written(writer, session, rig, joined, told, clouds, scenes):
         guid = new_guid()
         intensity = station.sweep.intensities is not None
         thinned = []
-        with writer.scan(f"station {number}", guid, pose, intensity) as write:
-            for cloud in blocks:
-                write(cloud)
-                thinned.append(cloud.rows(slice(None, None, every)))
-                told(len(cloud.points))
-                yield placed(cloud, pose, joined.covariance_of(number))
+        for cloud in writer.scan(f"station {number}", guid, pose, intensity, blocks):
+            thinned.append(cloud.rows(slice(None, None, every)))
+            told(len(cloud.points))
+            yield placed(cloud, pose, joined.covariance_of(number))
         scenes[number] = features_of(join(thinned), rig, station.views)
         for view in station.views:
             name = f"station {number}, {view.camera}, image {view.number}"

@@ -40,7 +40,6 @@ MOST_AGAINST = 0.02
 RIVAL = 0.3  # share of the best overlap from which another pose may be the right one
 DOUBTFUL = 0.03  # against a rival
 LEAST_HELD = 0.03  # share of patches that hold a station in its loosest direction
-TURN, SHIFT = slice(0, 3), slice(3, 6)  # of the increments of a pair
 MOST_SIGMA = (np.radians(0.3), 0.015)  # of the turn and shift of a pair that is joined
 GREATEST_MISS = 5.0  # sigma of a pair in a loop
 ALLOWED_MISS = (np.radians(0.2), 0.01)  # and at least, of turn and shift
@@ -67,14 +66,13 @@ class Joined:
     pairs: tuple[Pair, ...]
     problems: tuple[Problem, ...]
 
-    def miss(self, pair: Pair) -> tuple[float, float]:
-        """Turn (radians) and shift (metres) by which a pair differs from the poses of all.
+    def miss(self, pair: Pair) -> np.ndarray:
+        """Turn (radians) and shift (metres), (2,), by which a pair differs from the poses of all.
 
         That is the error which loops through it leave there; 0 without loops.
         """
         miss = pair.miss(self.T_world_station).reshape(2, 3)
-        turn, shift = np.linalg.norm(miss, axis=1)
-        return float(turn), float(shift)
+        return np.linalg.norm(miss, axis=1)
 
     def covariance_of(self, station: int) -> np.ndarray:
         """Of turn and shift of a station, (6, 6)."""
@@ -172,7 +170,8 @@ def join_pair(
                 "repeats itself or is symmetric",
             )
     pair = fitted(names, fine[first], fine[second], best.T_first_second)
-    variance = [np.linalg.eigvalsh(pair.covariance[k, k])[-1] for k in (TURN, SHIFT)]
+    turn_and_shift = [pair.covariance[:3, :3], pair.covariance[3:, 3:]]
+    variance = np.linalg.eigvalsh(turn_and_shift)[:, -1]
     if pair.held < LEAST_HELD or np.any(np.sqrt(variance) > MOST_SIGMA):
         x, y, z = pair.loose
         return _problem(

@@ -4,12 +4,13 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import null_space
 from scipy.ndimage import binary_erosion, label
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.robust import TUKEY, robust_sigma
-from lrfcal_lib.measure.features import ALIKE, Feature, fit_feature
+from lrfcal_lib.measure.features import FACING, Feature, fit_feature
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane
 
 SEED = 0.15  # metres about a point, where a plane begins
@@ -48,7 +49,7 @@ def planes_of(cloud: Cloud, rig: CalibratedRig) -> tuple[list[Feature], np.ndarr
         if of_point[seed] >= 0:
             continue
         place = cloud.points[seed]
-        rows = np.flatnonzero(left.normals @ cloud.normals[seed] > np.cos(ALIKE))
+        rows = np.flatnonzero(left.normals @ cloud.normals[seed] > FACING)
         rows = rows[np.linalg.norm(left.points[rows] - place, axis=1) <= SEED]
         surface = free[_grown(left.points, left.normals, rows, place)]
         if len(surface) >= FEWEST:
@@ -70,7 +71,7 @@ def _grown(points, normals, surface, seed):
             sigma = robust_sigma(inner @ normal - offset)
             miss = points @ normal - offset
             near = np.flatnonzero(np.abs(miss) < TUKEY * sigma)
-            near = near[np.abs(normals[near] @ normal) > np.cos(ALIKE)]
+            near = near[np.abs(normals[near] @ normal) > FACING]
             with_seed = np.vstack([points[near], seed])
             before = len(surface)
             surface = near[_connected(with_seed, normal, miss[near], sigma)]
@@ -119,8 +120,7 @@ def _cells(points, normal):
     """Numbers (n,) of the cells of points (n, 3) along a plane, and how many cells there are in
     both directions.
     """
-    across = np.linalg.svd(normal[None])[2][1:]
-    cell = np.rint(points @ across.T / CELL).astype(int)
+    cell = np.rint(points @ null_space(normal[None]) / CELL).astype(int)
     cell -= cell.min(axis=0)
     shape = tuple(cell.max(axis=0) + 1)
     return np.ravel_multi_index(tuple(cell.T), shape), shape

@@ -12,7 +12,7 @@ from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.measure.creases import Sights
 from lrfcal_lib.measure.pulls import PITCH_NOISE, SPREAD, Pull, poses_of
 from lrfcal_lib.model.camera import pinhole_jacobian
-from lrfcal_lib.model.geometry import hat
+from lrfcal_lib.model.geometry import gradient_by_pose
 
 # what no covariance of a calibration knows, radians and metres of a camera's pose: lens and light,
 # of one camera; and what all on the head have in common, whose pitch is never quite what is
@@ -238,8 +238,9 @@ def _shift(camera, columns, fit, evidence, rig):
     change = covariance @ score
     motion = np.full((2, len(columns)), np.nan)
     if camera:
-        by_point = pinhole_jacobian([0.0, 0.0, AWAY], rig.cameras[camera].model)
-        motion = by_point @ np.hstack([-hat([0.0, 0.0, AWAY]), np.eye(3)])
+        ahead = np.array([0.0, 0.0, AWAY])
+        by_point = pinhole_jacobian(ahead, rig.cameras[camera].model)
+        motion = gradient_by_pose(ahead, by_point)
     return Shift(
         camera=camera,
         change=change,

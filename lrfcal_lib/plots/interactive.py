@@ -18,10 +18,8 @@ from lrfcal_lib.plots.colors import AXES_RGB, FIT, PLATFORM, closed, color_of
 MOST_POINTS = 150_000  # that browsers turn smoothly
 PAGE = {"xref": "paper", "yref": "paper", "xanchor": "left", "yanchor": "bottom"}
 SCRIPT = Path(__file__).with_name("scene.js")
-PLOT = "document.getElementById('scene')"
 EYE = (-0.3, -1.5, 0.55)  # where one looks from at first, in widths of the scene
 GAP = np.full((1, 3), np.nan)  # where a line breaks
-Line = tuple[str, np.ndarray]
 
 
 def scene_page(
@@ -29,7 +27,7 @@ def scene_page(
     points: np.ndarray,
     colors: np.ndarray,
     seen: np.ndarray,
-    lines: Mapping[str, Line],
+    lines: Mapping[str, tuple[str, np.ndarray]],
     note: str = "",
     title: str = "",
     measuring: Mapping[str, Any] | None = None,
@@ -68,26 +66,32 @@ def scene_page(
         looks = {"color": color, "width": 4}
         visible = "legendonly" if name == "boards" else True
         traces.append(_trace(name, line, "lines", line=looks, visible=visible))
-    data = "null"
+    data = None
     if measuring is not None:
-        data = _in_script(_packed(measuring, list(shown.values()), len(traces)))
-        traces += _measured_traces(measuring["lines"])
+        data = dict(measuring)
+        for name in ("plane_of_point", "station_of_point"):
+            data[name] = [measuring[name][rows] for rows in shown.values()]
+        data["edges_trace"] = len(traces)
+        data["lengths_trace"] = len(traces) + 1
+        traces += _measured_traces(data.pop("lines"))
     options = {"scrollZoom": False, "responsive": True}
     plot = _in_script([traces, _layout(title, note), options])
     page = (
         '<html><head><meta charset="utf-8"></head><body>\n'
         f"<script>{_plotly_js()}</script>\n"
         '<div id="scene" style="height:100vh"></div>\n'
-        f"<script>Plotly.newPlot({PLOT}, ...{plot}).then(() => {{\n"
-        f"{SCRIPT.read_text()}\nslowWheel({PLOT}); panel({PLOT}, {data});\n}});</script>\n"
+        f"<script>Plotly.newPlot('scene', ...{plot}).then((scene) => {{\n"
+        f"{SCRIPT.read_text()}\nslowWheel(scene);\n"
+        f"panel(scene, {_in_script(data)});\n}});</script>\n"
         "</body></html>\n"
     )
     Path(path).write_text(page, encoding="utf-8")
 
 
 def _in_script(data):
-    """As JSON; no text in it ends the script that it stands in."""
-    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    """As JSON, arrays of numbers as text; no text in it ends the script that it stands in."""
+    packed = json.dumps(data, separators=(",", ":"), default=_text)
+    return packed.replace("<", "\\u003c")
 
 
 def _plotly_js():
@@ -121,20 +125,6 @@ def _layout(title, note):
     }
 
 
-def _packed(measuring, shown, first_trace):
-    """What scene.js needs, as JSON holds it: arrays of numbers as text."""
-    data = dict(measuring) | {
-        "features": _text(measuring["features"]),
-        "covariances": [_text(C) for C in measuring["covariances"]],
-        "edges_trace": first_trace,
-        "lengths_trace": first_trace + 1,
-    }
-    del data["lines"]
-    for name in ("plane_of_point", "station_of_point"):
-        data[name] = [_text(measuring[name][rows]) for rows in shown]
-    return data
-
-
 def _measured_traces(lines):
     """Edges (n, 2, 3) that can be picked, and the lengths that were."""
     red = "#d00"
@@ -162,14 +152,14 @@ def _measured_traces(lines):
 def _trace(name, points, mode, **style):
     """Points (n, 3) as plotly draws them; the coordinates packed."""
     trace = {"type": "scatter3d", "name": name, "mode": mode, **style}
-    for axis, values in zip("xyz", np.asarray(points, "<f4").T, strict=True):
-        trace[axis] = {"dtype": "f4", "bdata": _text(values)}
+    for axis, values in zip("xyz", points.T, strict=True):
+        trace[axis] = {"dtype": "f4", "bdata": values}
     return trace
 
 
 def _text(values):
-    """Numbers as the text of single-precision bytes."""
-    return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
+    """An array of numbers as the text of single-precision bytes."""
+    return base64.b64encode(values.astype("<f4", order="C")).decode()
 
 
 def rig_lines(
@@ -177,7 +167,7 @@ def rig_lines(
     cameras: Mapping[str, tuple[RigidTransform, CameraModel]],
     boards: Mapping[str, np.ndarray] | None = None,
     size: float = 0.15,
-) -> dict[str, Line]:
+) -> dict[str, tuple[str, np.ndarray]]:
     """Lines of :func:`scene_page` that show a rig and boards in the platform frame.
 
     Parameters
@@ -198,16 +188,11 @@ def rig_lines(
         arrows = [np.vstack([T.apply([0 * axis, axis]), GAP]) for T in frames.values()]
         lines[f"{letter} of {', '.join(frames)}"] = (color, np.vstack(arrows))
     for name, (_, model) in cameras.items():
-        frustum = frames[name].apply(_frustum(model, 3 * size))
-        lines[f"view of {name}"] = (color_of(name), frustum)
+        rim = 3 * size * model.sights(model.size * UNIT_SQUARE)
+        legs = [np.vstack([np.zeros(3), corner, GAP]) for corner in rim]
+        frustum = np.vstack([closed(rim), GAP, *legs])
+        lines[f"view of {name}"] = (color_of(name), frames[name].apply(frustum))
     if boards:
         outlines = [np.vstack([closed(corners), GAP]) for corners in boards.values()]
         lines["boards"] = (FIT, np.vstack(outlines))
     return lines
-
-
-def _frustum(model, depth):
-    """The edges of what a camera sees up to a depth, metres, in its own frame."""
-    rim = depth * model.sights(model.size * UNIT_SQUARE)
-    legs = [np.vstack([np.zeros(3), corner, GAP]) for corner in rim]
-    return np.vstack([closed(rim), GAP, *legs])

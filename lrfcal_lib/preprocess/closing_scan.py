@@ -41,6 +41,12 @@ class Closing:
         """Whether the rig, or the head beyond its play, was elsewhere at the end."""
         return self.apart > MOVED * max(self.expected, FINEST)
 
+    def __str__(self):
+        return (
+            f"back at a pitch that it had, ranges differ by {1000 * self.apart:.0f} mm, by "
+            f"{1000 * self.expected:.0f} mm between neighbouring scan lines"
+        )
+
 
 def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
     """A sweep on its way, and the scan lines that close it where there are any.

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.evaluate.truth import Truth, read_truth
+from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.measure.features import SYSTEMATIC
 from lrfcal_lib.measure.lengths import IN_PLACE, ON_IT, PLACE, SceneFeatures
 from lrfcal_lib.model.geometry import tilt
@@ -61,7 +61,9 @@ def true_picks(
             look = _on_face if kind == "plane" else _on_edge
             by_station = {}
             for station, scene in scenes.items():
-                corners = _in_station(truth, rig, session, station, np.array(end))
+                turn, shift = truth.gauge(rig, station, session.sweep(station).pitch)
+                in_room = truth.stations[station].inv().apply(end)
+                corners = tilt(in_room - shift, -turn)
                 by_station[station] = poses[station].apply(look(scene, corners))
             nothing = poses[station].apply(corners.mean(axis=0))
             shown.append((by_station, nothing))
@@ -75,14 +77,6 @@ def true_picks(
             row |= zip([f"{axis}_m_{number}" for axis in PLACE], place, strict=True)
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _in_station(
-    truth: Truth, rig: CalibratedRig, session: Session, station: int, end: np.ndarray
-) -> np.ndarray:
-    """Corners (n, 3) in the room as the platform frame of a station has them."""
-    turn, shift = truth.gauge(rig, station, session.sweep(station).pitch)
-    return tilt(truth.stations[station].inv().apply(end) - shift, -turn)
 
 
 def _on_face(scene, corners):
