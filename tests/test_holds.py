@@ -24,6 +24,7 @@ from lrfcal_lib.measure.features import largest_plane
 from lrfcal_lib.measure.holds import (
     Answer,
     Passes,
+    _stations,
     flattened,
     holds,
     passes_of,
@@ -189,6 +190,22 @@ def test_a_column_does_not_pass_for_a_wall(seen):
         assert set(of_flat) == passing
         np.testing.assert_allclose(moved.points[of_point == 0, 1], 3.0)
         np.testing.assert_array_equal(moved.points[of_point == -1], points[of_point == -1])
+
+
+def test_a_station_whose_images_have_no_pitch_is_left_out(seen):
+    """The others tell; where there are none, it is said."""
+    records = [
+        replace(record, pitch=np.nan) if record.placement == 3 else record
+        for record in seen.image_records
+    ]
+    session = replace(seen, image_records=tuple(records))
+    assert _stations(session, true_rig(seen)) == [1]
+    unknown = replace(seen, image_records=tuple(r for r in records if r.placement == 3))
+    with pytest.raises(ValueError, match="at a known pitch"):
+        holds(unknown, true_rig(seen))
+    cameras = {n: replace(c, mount="platform") for n, c in seen.cameras.items()}
+    fixed = replace(unknown, cameras=cameras)
+    assert _stations(fixed, on_base(true_rig(seen), 0.0)) == [3]
 
 
 def test_images_of_no_camera_of_the_rig_are_refused(seen):

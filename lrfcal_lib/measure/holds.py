@@ -218,8 +218,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     ------
     ValueError
         If the rig does not say how well it is known, or the session has no sweep, no image, no
-        camera of the rig, a station whose images are all of an unknown pitch, or images of another
-        size.
+        camera of the rig at a known pitch, or images of another size.
     """
     uncertainty_of(rig)
     of_creases = []
@@ -258,14 +257,20 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
 
 
 def _stations(session, rig):
-    """Placements with a sweep and images of the rig's cameras."""
+    """Placements with a sweep and images of the rig's cameras, of which one can be posed."""
     require_same_rig(rig, session)
-    shown = {r.placement for r in session.image_records if r.camera in rig.cameras}
+    fixed = [name for name, camera in rig.cameras.items() if camera.mount == "platform"]
+    shown = {
+        record.placement
+        for record in session.image_records
+        if record.camera in fixed
+        or (record.camera in rig.cameras and np.isfinite(record.pitch))
+    }
     stations = [p for p in _swept(session) if p in shown]
     if not stations:
         raise ValueError(
             f"{session.name}: no placement has both a sweep and an image of "
-            f"{', '.join(rig.cameras) or 'a calibrated camera'}"
+            f"{', '.join(rig.cameras) or 'a calibrated camera'} at a known pitch"
         )
     return stations
 
