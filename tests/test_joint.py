@@ -81,6 +81,20 @@ def test_the_order_of_placements_and_rows_changes_nothing(mount):
         )
 
 
+def test_a_camera_is_not_taken_for_one_whose_name_begins_like_its_own():
+    obs, *_ = draw(rng(), 8, mount="head")
+    first, second = obs.cameras
+    names = {first: "left", second: "left_2"}
+    known = solve_joint(obs)
+    found = solve_joint(replace(obs, cameras=tuple(names.values())))
+    for before, now in names.items():
+        assert found.columns(now) == known.columns(before)
+        assert found.covariance(now).shape == (6, 6)
+        np.testing.assert_array_equal(
+            found.camera(now).parameters, known.camera(before).parameters
+        )
+
+
 @MOUNTS
 @pytest.mark.parametrize("change", [pitch_from_elsewhere, another_platform_stated])
 def test_what_only_turns_the_frame_of_the_platform_changes_nothing_else(change, mount):

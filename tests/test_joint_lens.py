@@ -75,7 +75,7 @@ def test_a_known_error_moves_the_estimate_as_the_covariance_says(mount):
     change = np.r_[
         (two.rotation * one.rotation.inv()).as_rotvec(), two.translation - one.translation
     ]
-    columns = known.columns(f"{name}_")
+    columns = known.columns(name)
     predicted = np.sqrt(np.diag(told.lens))[columns]
     # less moves by as little as two minima differ
     large = predicted > 0.035 * known.solution.sigma[columns]

@@ -26,6 +26,7 @@ from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.emulators.rig import EmulatedRig
 from lrfcal_lib.fit.axis_chart import chart_parameters
+from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.measure.features import flatness, largest_plane
 from lrfcal_lib.measure.scene import station_cloud
 from lrfcal_lib.model.geometry import pose_array
@@ -134,7 +135,7 @@ def test_the_recording_calibrates_to_the_truth_within_what_it_says(recorded_sess
     axis, true = (
         chart_parameters(pose_array(head)) for head in (solution.T_head_lrf, rig.T_head_lrf)
     )
-    assert nees(axis - true, solution.covariance("axis_", "offset_")) < chi2.ppf(0.999, 4)
+    assert nees(axis - true, solution.covariance(*AXIS_NAMES)) < chi2.ppf(0.999, 4)
 
 
 def typed(verb, *more):

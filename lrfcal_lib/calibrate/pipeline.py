@@ -27,7 +27,7 @@ from lrfcal_lib.calibrate.observe import (
 )
 from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig, joint_rig
 from lrfcal_lib.calibrate.rig_uncertainty import uncertainty_one_by_one
-from lrfcal_lib.fit.result import PlatformPrior, Solution
+from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior, Solution
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.kinematics import AS_RECORDED
@@ -445,7 +445,7 @@ def with_joint(calibration: Calibration, joint: JointCalibration | Problem) -> C
         solutions[camera, "joint"] = joint.solution.camera(camera)
     covariance = stated_covariance(platform.stated_sigma)
     if joint.settings["axis"]:  # scan lines of one pitch say nothing about it
-        covariance = joint.solution.covariance("axis_", "offset_")
+        covariance = joint.solution.covariance(*AXIS_NAMES)
     axes = platform.axes | {"joint": KnownAxis(joint.solution.T_head_lrf, covariance)}
     return replace(
         calibration,

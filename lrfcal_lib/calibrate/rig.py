@@ -8,6 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.rig_uncertainty import RigUncertainty, joint_uncertainty
+from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.model.kinematics import Corrections, SourceFrame, camera_at
@@ -136,7 +137,7 @@ def joint_rig(solution: JointSolution, models: dict[str, CameraModel]) -> Calibr
     }
     return CalibratedRig(
         method="joint",
-        axis=KnownAxis(solution.T_head_lrf, solution.covariance("axis_", "offset_")),
+        axis=KnownAxis(solution.T_head_lrf, solution.covariance(*AXIS_NAMES)),
         corrections=solution.corrections,
         cameras=cameras,
         uncertainty=joint_uncertainty(solution),

@@ -11,6 +11,7 @@ from lrfcal_lib.evaluate.tables import parameter_table
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
 from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
 from lrfcal_lib.fit.residuals import edge_residuals_px
+from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.next_placement import board_middle
 from lrfcal_lib.model.camera import CameraModel, project
@@ -248,7 +249,7 @@ def _predicted(solution, camera):
     """
     common = np.diag(solution.lens) + solution.step**2
     variances = solution.camera(camera).trusted_sigma ** 2
-    variances -= common[solution.columns(f"{camera}_")]
+    variances -= common[solution.columns(camera)]
     return 2 * np.sqrt(np.maximum(variances, 0.0).reshape(2, 3).sum(axis=1))
 
 
@@ -269,7 +270,7 @@ def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:
     solution = joint.solution
     rows = []
     if joint.settings["axis"]:
-        axis = KnownAxis(solution.T_head_lrf, solution.covariance("axis_", "offset_"))
+        axis = KnownAxis(solution.T_head_lrf, solution.covariance(*AXIS_NAMES))
         rows.append({"what": "tilt axis"} | axis_errors(axis, truth))
     for camera in solution.transforms:
         errors = camera_errors(solution.camera(camera), truth, camera)

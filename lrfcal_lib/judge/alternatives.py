@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtr, stdtrit
 
 from lrfcal_lib.fit.covariance import sigma_turn_shift
+from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import Kind, by_sign
 from lrfcal_lib.model.geometry import (
     axis_difference,
@@ -338,7 +339,7 @@ def far_axis(joint) -> Iterator[Fault]:
     if session.T_head_lrf is None or not joint.settings["axis"]:
         return
     apart = axis_difference(solution.axis, axis_of(session.T_head_lrf))
-    known = sigma_turn_shift(solution.covariance("axis_", "offset_"))
+    known = sigma_turn_shift(solution.covariance(*AXIS_NAMES))
     if np.any(apart > FAR * np.hypot(session.platform_sigma, known)):
         where = f"{_apart(*apart)} from where session.json states it"
         yield _far(f"the tilt axis lies {where}: {CHECK}", apart[0])

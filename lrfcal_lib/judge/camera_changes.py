@@ -149,7 +149,7 @@ def with_change(obs, step, camera, prepared, settings):
     with suppress(DegenerateGeometry):
         solution = solve_joint(with_two_poses(obs, step, later), required=False, **settings)
         both = {first, later} <= solution.transforms.keys()
-        if both and np.isfinite(solution.covariance(f"{first}_", f"{later}_")).all():
+        if both and np.isfinite(solution.covariance(first, later)).all():
             change = change_between(solution, first, later, camera, prepared)
             if change.moved or change.zoomed:
                 return solution, change
@@ -167,7 +167,7 @@ def likeliest_step(solution):
 
     tested = []
     for camera, name in enumerate(obs.cameras):
-        columns = solution.columns(f"{name}_")
+        columns = solution.columns(name)
         shown = np.unique(obs.view_placement[obs.view_camera == camera])
         for row in range(len(obs.placements)):
             before = np.searchsorted(shown, row)
@@ -235,7 +235,7 @@ def change_between(solution, first, later, camera, prepared):
     model = prepared.models[camera]
     index = obs.cameras.index(later)
     change = solution.transforms[later] * solution.transforms[first].inv()
-    both = solution.covariance(f"{first}_", f"{later}_")
+    both = solution.covariance(first, later)
     later_less_first = np.hstack([-np.eye(POSE), np.eye(POSE)])
     spread = later_less_first @ both @ later_less_first.T
     step = pose_step(solution.transforms[first], solution.transforms[later])

@@ -177,9 +177,9 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
         Of 'axis' and of each camera, as far as they were unknown.
     """
     variance = np.linalg.diagonal(covariance) / scales_of(solution) ** 2
-    columns = {"axis": solution.columns("axis_", "offset_")}
+    columns = {"axis": solution.columns(*AXIS_NAMES)}
     for camera in solution.transforms:
-        columns[camera] = solution.columns(f"{camera}_")
+        columns[camera] = solution.columns(camera)
     return {
         name: np.sqrt(variance[..., index].sum(axis=-1))
         for name, index in columns.items()

@@ -15,7 +15,7 @@ from lrfcal_lib.fit.edge_likelihood import disc_edge
 from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import pose_transform
+from lrfcal_lib.model.geometry import POSE_NAMES, pose_transform
 from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
@@ -233,18 +233,14 @@ class JointSolution:
             self._by_placement(sweeps),
         )
 
-    def columns(self, *prefixes: str) -> list[int]:
-        """Indices of the shared unknowns whose names begin so, or so."""
-        return [
-            i for i, name in enumerate(self.solution.names) if name.startswith(prefixes)
-        ]
+    def columns(self, *names: str) -> list[int]:
+        """Indices of the shared unknowns with these names, and of the cameras with these names."""
+        wanted = {*names, *(f"{name}_{part}" for name in names for part in POSE_NAMES)}
+        return [i for i, name in enumerate(self.solution.names) if name in wanted]
 
-    def covariance(self, *prefixes: str) -> np.ndarray:
-        """Covariance to rely on of groups of shared unknowns, e.g. 'left_' or 'axis'.
-
-        See `Solution.trusted`.
-        """
-        index = self.columns(*prefixes)
+    def covariance(self, *names: str) -> np.ndarray:
+        """Covariance to rely on of shared unknowns and of cameras, see `Solution.trusted`."""
+        index = self.columns(*names)
         return self.solution.trusted[np.ix_(index, index)]
 
     def camera_at(self, name: str, pitch: ArrayLike) -> RigidTransform:
@@ -256,7 +252,7 @@ class JointSolution:
 
     def camera(self, name: str) -> Solution:
         """The pose of one camera as a `Solution` like those of the other methods."""
-        index = self.columns(f"{name}_")
+        index = self.columns(name)
         both = np.ix_(index, index)
         whole = self.solution
         by_placements = whole.covariance_placements
@@ -266,7 +262,7 @@ class JointSolution:
             whole,
             transform=self.transforms[name],
             parameters=whole.parameters[index],
-            names=geometry.POSE_NAMES,
+            names=POSE_NAMES,
             jacobian=whole.jacobian[..., index],
             covariance=whole.covariance[both],
             covariance_placements=by_placements,
@@ -353,7 +349,7 @@ def joint_words(
     large = np.abs(direction) > NAMED
     words = []
     for camera in cameras:
-        index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
+        index = np.isin(names, [f"{camera}_{part}" for part in POSE_NAMES])
         if large[index].any():
             words.append(motion_words(direction[index], camera))
     words += [WORDS[name] for name in np.array(names)[large] if name in WORDS]
