@@ -146,6 +146,7 @@ def test_nothing_runs_in_a_report_and_all_of_it_can_be_read(hostile, page, tmp_p
 def test_nothing_runs_in_the_panel(page):
     light = Light(HOSTILE, "warn", HOSTILE)
     task = SimpleNamespace(title=HOSTILE, guidance=HOSTILE)
+    collector = SimpleNamespace(connected=True, emulated=True, finished=(1,))
     vector = ((0.0,) * 3,) * 4
     result = SimpleNamespace(
         answer="no",
@@ -163,7 +164,7 @@ def test_nothing_runs_in_the_panel(page):
         panel.HTML.notes([HOSTILE]),
         panel.HTML.lights(HOSTILE, [light]),
     ]
-    said += [panel.HTML.task(task, True, (1,)), panel.HTML.result(result)]
+    said += [panel.HTML.task(collector, task), panel.HTML.result(result)]
     page.goto("about:blank")
     page.set_content("".join(f"<div>{part}</div>" for part in said))
     assert seen(page).count(HOSTILE) == 15
