@@ -103,7 +103,10 @@ def scanned(
     flat = [values.ravel() for values in grid]
     ideal = ideal_readings(beam, there, *flat, setup.rig.T_head_lrf)
     ranges, reasons = measured(beam, ideal, rng)
-    ranges = np.where(reasons == 0, np.round(ranges, 3), np.nan).reshape(grid[0].shape)
+    ranges = np.round(ranges, 3)
+    # 0 is no range, as a session reads it
+    good = (reasons == 0) & (ranges > 0)
+    ranges = np.where(good, ranges, np.nan).reshape(grid[0].shape)
     corrections = Corrections(range_offset=beam.systematic)
     T_head_lrf = setup.rig.T_head_lrf
     pitch = true

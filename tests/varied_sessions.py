@@ -464,8 +464,8 @@ def _image(
     writer, truth, camera, imagers, scene, pose, T_camera_board, rng, true=0.0, **own
 ):
     """One picture of a session, and what only the simulator knows of it."""
-    writer.add_image(camera.name, _photo(imagers[camera.name], scene, pose, rng), **own)
-    file = f"images/{camera.name}/{writer.shots[camera.name]:04d}.jpg"
+    picture = _photo(imagers[camera.name], scene, pose, rng)
+    file = writer.add_image(camera.name, picture, **own)
     truth["images"][file] = {
         "pitch_rad": true,
         "T_camera_board": transform_to_json(T_camera_board),

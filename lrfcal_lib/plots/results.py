@@ -129,6 +129,7 @@ def parameter_comparison(
             value, row, xerr=sigma, fmt="o", color=series(row), capsize=2.5, markersize=4.5
         )
     rows_of(ax, values, label)
+    ax.locator_params(axis="x", nbins=4)  # of four digits and a sign, too
 
 
 def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
