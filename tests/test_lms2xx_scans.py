@@ -5,7 +5,7 @@ import pytest
 from telegrams import encode_scan
 from virtual import INDEXED, lms
 
-from lrfcal_lib.drivers.lms2xx import LMS2xx
+from lrfcal_lib.drivers.lms2xx import KEPT, LMS2xx
 from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.drivers.lms2xx_scans import Assembler, ScanClock, interval_s, transfer_s
 from lrfcal_lib.model.kinematics import MIRROR_TURN
@@ -51,6 +51,17 @@ def test_interlaced_scans_carry_the_instants_of_the_mirror():
         [begun[r.telegrams[0]] for r in readings], abs=5e-4
     )
     assert all(len(r.ranges) == 721 for r in readings) and driver.variant == (100, 0.25)
+
+
+def test_more_scans_can_be_taken_than_are_kept():
+    device = lms(baudrate=500000, configuration=INDEXED)
+    with LMS2xx(device.path, host=device.host) as driver:
+        driver.start()
+        readings = driver.take(2 * KEPT, timeout=60)
+        driver.stop()
+    number = {record.telegram: record.number for record in device.scans}
+    numbers = [number[reading.telegrams[0]] for reading in readings]
+    assert numbers == [*range(numbers[0], numbers[0] + 2 * KEPT)]
 
 
 def read_late(device, rng):

@@ -34,7 +34,7 @@ FINE = (100, 0.25)  # variant that interlaced scans need, deg
 USUAL_RATE = 38400  # Bd; where a device is looked for first
 AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
-KEPT = 1024  # scans that can be asked for by their instant
+KEPT = 256  # scans that can be asked for by their instant
 LEAST_QUIET_S = 0.6  # of a stream, before it is taken for silent
 # one attempt to find a lost device; there are more until the stream is stopped
 RECOVERY_S = 8.0
@@ -461,13 +461,13 @@ class LMS2xx(Closed):
     ) -> list[Reading]:
         """Consecutive scans of the stream.
 
-        The last 1024 scans are kept, so that with the instant of the last scan of one call the next
+        The last 256 scans are kept, so that with the instant of the last scan of one call the next
         call goes on without a gap.
 
         Parameters
         ----------
         count
-            Of the scans, not more than are kept.
+            Of the scans.
         after
             Date of the host, s, later than which they are; by default that of the call.
         timeout
@@ -488,12 +488,15 @@ class LMS2xx(Closed):
         if after is None:
             after = host.time()
         end = host.now() + timeout
+        readings: list[Reading] = []
         while True:
             self._news.clear()
             alive = self._thread.is_alive()
-            readings = [reading for reading in self._readings if reading.time_s > after]
+            readings += [reading for reading in self._readings if reading.time_s > after]
             if len(readings) >= count:
                 return readings[:count]
+            if readings:
+                after = readings[-1].time_s
             left = end - host.now()
             if left <= 0 or not alive:
                 trouble = self._trouble or "the stream is silent"
