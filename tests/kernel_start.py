@@ -7,6 +7,5 @@ from lrfcal_lib.report import notebook as _notebook
 get_ipython().display_formatter.formatters["image/png"].enabled = False  # noqa: F821 (nbval compares none)
 _file = _notebook.report_file
 _notebook.save = _checks.checked(_notebook.save)
-_notebook.report_file = lambda name: (
-    _file(name) if name.startswith(("tables/", "scene")) else None
-)
+_written = ("tables/", "scene", "room", "calibration")
+_notebook.report_file = lambda name: _file(name) if name.startswith(_written) else None

@@ -101,12 +101,12 @@ def run_plainly(path, session, folder, report, *, drawn=True):
     """Run the cells of a notebook on a session in this process, without a kernel; what it printed.
 
     After them the solutions of its exercises. Its figures, if they are
-    drawn, must be legible, with titles and units. Of its files only the tables are written.
+    drawn, must be legible, with titles and units. All its files but the figures are written.
     """
     complaints = []
 
-    def tables_only(name):
-        return report_file(name) if name.startswith("tables/") else None
+    def without_figures(name):
+        return None if name.startswith("figures/") else report_file(name)
 
     told, names = io.StringIO(), {"display": lambda shown: None}
     with (
@@ -128,7 +128,7 @@ def run_plainly(path, session, folder, report, *, drawn=True):
         )
         patch.setattr("lrfcal_lib.report.notebook._lacking", set())
         patch.setattr("lrfcal_lib.report.notebook.save", shown)
-        patch.setattr("lrfcal_lib.report.notebook.report_file", tables_only)
+        patch.setattr("lrfcal_lib.report.notebook.report_file", without_figures)
         codes = {
             f"code cell {n}": cell.source for n, cell in enumerate(code_cells(read(path)))
         }
