@@ -331,7 +331,9 @@ def side_columns(J, edge, state, case):
     outward = state.lines[:, :2] @ R[:, :2].T
     arm = case.middle @ R[:, :2].T
     by_shift = np.vecdot(shift, outward[edge])
-    by_turn = np.vecdot(turn, R[:, 2]) - np.vecdot(shift, np.cross(R[:, 2], arm)[edge])
+    normal = R[:, 2]
+    along = np.cross(normal, arm)  # the way of a side's middle as it turns
+    by_turn = np.vecdot(turn, normal) - np.vecdot(shift, along[edge])
     by_both = np.stack([by_shift, by_turn], axis=-1)
     mine = edge[..., None] == np.arange(len(arm))
     columns = np.where(mine[..., None], by_both[..., None, :], 0.0)
