@@ -1,8 +1,8 @@
 """What the first screen of a report shows: verdict, picture, numbers, the poses to use."""
 
 import json
+from contextlib import suppress
 
-import numpy as np
 import pandas as pd
 
 from lrfcal_lib.model.geometry import POSE_UNITS
@@ -16,40 +16,40 @@ PICTURES = (
 # of rotation vector, degrees, and translation, millimetres
 POSE_DIGITS = (2, 2, 2, 1, 1, 1)
 MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way first
+NO_VERDICT = {"sentences": [], "record": {}}
 
 
-def main_verdict(verdicts):
-    """The verdict that stands first: one with a record, else any; None without."""
-    return max(verdicts, key=lambda entry: entry["record"] is not None, default=None)
-
-
-def sentences_below(verdict):
-    """Sentences of a verdict that the first screen does not tell in numbers."""
-    if verdict is None:
-        return []
-    errors = (verdict["record"] or {}).get("expected_error_at_m", {})
-    # the answer comes first, then a sentence for each distance
-    return verdict["sentences"][1 + len(errors) :]
-
-
-def first_picture(drawn):
-    """The figure of the first screen, as HTML; '' where no notebook drew one of them."""
+def first_screen(out, verdicts, drawn):
+    """What the first screen of a report in a folder shows, by the names of its template."""
+    # the one with a record, else any
+    main = max(verdicts, key=lambda entry: bool(entry["record"]), default=NO_VERDICT)
+    errors = main["record"].get("expected_error_at_m", {})
     figures = {}
     for of_notebook, _ in drawn.values():
         figures |= of_notebook
-    return next(filter(None, map(figures.get, PICTURES)), "")
+    return {
+        "main": main,
+        # the answer comes first, then a sentence for each distance, which numbers tell
+        "rest": main["sentences"][1 + len(errors) :],
+        "picture": next(filter(None, map(figures.get, PICTURES)), ""),
+        "headline": headline(out / "tables", errors),
+        "handed": handed_over(out / "calibration.json"),
+    }
 
 
-def headline(out, verdict):
-    """Numbers of the first screen as far as there are any, by kind: expected errors, edges."""
+def headline(tables, errors):
+    """Numbers as far as there are any, by kind: expected errors, by distance, and edges."""
     numbers = {}
-    if verdict and verdict["record"] and verdict["record"]["expected_error_at_m"]:
-        errors = pd.DataFrame(verdict["record"]["expected_error_at_m"])
-        numbers["cloud"] = dict(errors.loc["cloud_mm"])
-        numbers["image"] = dict(errors.drop("cloud_mm").max())
-        numbers["known"] = _known_share(out / "tables" / "placements.csv")
-    if (out / "tables" / "edge_lengths.csv").is_file():
-        numbers["edges"] = _edge_numbers(pd.read_csv(out / "tables" / "edge_lengths.csv"))
+    if errors:
+        expected = pd.DataFrame(errors)
+        numbers["cloud"] = dict(expected.loc["cloud_mm"])
+        numbers["image"] = dict(expected.drop("cloud_mm").max())
+        with suppress(FileNotFoundError):
+            used = pd.read_csv(tables / "placements.csv").used.sum()
+            if used > 1:  # to this part n placements tell a standard deviation
+                numbers["known"] = (2 * (used - 1)) ** -0.5
+    with suppress(FileNotFoundError):
+        numbers["edges"] = _edge_numbers(pd.read_csv(tables / "edge_lengths.csv"))
     return numbers
 
 
@@ -61,7 +61,7 @@ def handed_over(file):
     poses = {}
     for name, camera in record["cameras"].items():
         values = POSE_UNITS * [*camera["rotvec_rad"], *camera["translation_m"]]
-        sigmas = POSE_UNITS * np.array(list(camera["sigma"].values()), float)
+        sigmas = POSE_UNITS * pd.Series(camera["sigma"], dtype=float)
         poses[name] = [
             f"{value:z.{n}f} ± {sigma:.{n}f}"
             for value, sigma, n in zip(values, sigmas, POSE_DIGITS, strict=True)
@@ -70,27 +70,18 @@ def handed_over(file):
     return {"method": record["method"], "poses": poses, "sources": sorted(sources)}
 
 
-def _known_share(file):
-    """How well a standard deviation from n placements is known: to one part in sqrt(2 (n - 1))."""
-    used = 0
-    if file.is_file():
-        used = pd.read_csv(file).used.sum()
-    return (2 * (used - 1)) ** -0.5 if used > 1 else 0.0
-
-
 def _edge_numbers(lengths):
     """Number, mean absolute error and its scatter of measured edges, the best way; {} without.
 
     Those of all edges too, where some have an end that no image shows, and those of the paper's
     rule.
     """
-    lengths = lengths.dropna(subset="error_mm")
-    lengths = lengths.assign(error=lengths.error_mm.abs())
-    own = lengths[lengths.source != "paper"]
-    best = next((way for way in MEASURED if (own.variant == way).any()), None)
-    if best is None:
+    lengths = lengths.assign(error=lengths.error_mm.abs()).dropna(subset="error")
+    of_paper = lengths.source == "paper"
+    own = lengths[~of_paper]
+    if own.empty:
         return {}
-    every = own[own.variant == best]
+    every = own[own.variant == min(own.variant, key=MEASURED.index)]
     part = every[every.ends == "image"]
     if part.empty:
         part = every
@@ -103,5 +94,5 @@ def _edge_numbers(lengths):
         "every": every.error.mean(),
         "rule_n": len(by_paper),
         "rule": by_paper.error.mean(),
-        "paper": lengths[lengths.source == "paper"].error.mean(),
+        "paper": lengths[of_paper].error.mean(),
     }

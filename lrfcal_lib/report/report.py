@@ -26,13 +26,7 @@ from nbclient.exceptions import CellControlSignal, DeadKernelError
 from nbconvert.filters import strip_ansi
 from tqdm import tqdm
 
-from lrfcal_lib.report.first_screen import (
-    first_picture,
-    handed_over,
-    headline,
-    main_verdict,
-    sentences_below,
-)
+from lrfcal_lib.report.first_screen import first_screen
 from lrfcal_lib.report.notebook import ROOT, SHIPPED
 from lrfcal_lib.report.page import TEMPLATES, render
 from lrfcal_lib.session.cache import VARIABLE as CACHE
@@ -416,7 +410,6 @@ def write_pages(out, session, runs, found, seconds):
     ]
     (out / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
-    main = main_verdict(verdicts)
     _write_page(
         out / "index.html",
         "report.html.jinja",
@@ -429,13 +422,9 @@ def write_pages(out, session, runs, found, seconds):
         drawn=drawn,
         verdicts=verdicts,
         told={entry["key"]: entry for entry in findings},
-        main=main,
-        headline=headline(out, main),
-        handed=handed_over(out / "calibration.json"),
-        rest=sentences_below(main),
-        picture=first_picture(drawn),
         files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
+        **first_screen(out, verdicts, drawn),
     )
 
 
