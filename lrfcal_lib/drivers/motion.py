@@ -203,7 +203,7 @@ class Motion:
         with self.line.lock:
             if self.abort.is_set():
                 raise Stopped(STOPPED)
-            return self.line.command(frame)
+            return self.line.exchange(frame).sent
 
     def stop(self):
         """Stop; its instant."""

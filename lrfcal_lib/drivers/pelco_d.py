@@ -55,6 +55,7 @@ class Received:
     acknowledged: bool = False
     echoed: int = 0  # bytes of the own frame that a two-wire adapter handed back
     skipped: int = 0  # bytes that belong to nothing
+    sent: float = 0.0  # instant of the host at which the frame was sent
 
 
 def encode_frame(
@@ -243,7 +244,6 @@ class HeadLine:
         self.lock = host.lock()
         self._stop = encode_frame(settings.address)
         self._free = 0.0  # when the next frame may be sent
-        self._sent = 0.0  # when the last one was
         self._late = False  # the reply to the last query did not come in time
         self._acknowledges = False
         self._port = host.port(path, settings.baudrate, timeout=READ_S)
@@ -266,35 +266,27 @@ class HeadLine:
             with self.lock:
                 suspect = self._late
                 begun = self.host.now()
-                tilts = self._exchange(query, self.settings.reply_s).tilts
+                tilts = self.exchange(query, self.settings.reply_s).tilts
                 self._late = not tilts
             if tilts and not suspect:
                 halfway = (begun + self.host.now()) / 2
                 return self.settings.pitch(decode_tilt(tilts[-1])), halfway
         return None
 
-    def command(self, frame):
-        """Send a frame that a head may acknowledge; the host's instant at which it was sent.
-
-        Who calls holds the lock.
-        """
-        self._exchange(frame)
-        return self._sent
-
     def stop(self):
         """Send the stop until it is acknowledged; the instant of the first one.
 
         To heads that acknowledge nothing it is sent at least twice.
         """
-        sent = []
+        sent = None
         for _ in range(2 + self.settings.retries * self._acknowledges):
             with self.lock:
-                acknowledged = self._exchange(self._stop).acknowledged
-                sent.append(self._sent)
-            if acknowledged:
+                received = self.exchange(self._stop)
+            sent = sent or received.sent
+            if received.acknowledged:
                 self._acknowledges = True
                 break
-        return sent[0]
+        return sent
 
     def blurt_stop(self):
         """Send the stop at once, whatever another thread does on the line; errors are logged."""
@@ -309,7 +301,7 @@ class HeadLine:
             if held:
                 self.lock.release()
 
-    def _exchange(self, frame, wait_s=None):
+    def exchange(self, frame, wait_s=None):
         """Send a frame, and collect what is Received until a reply.
 
         The wait (by default that of an acknowledgement) counts from the end of the transmission of
@@ -317,32 +309,28 @@ class HeadLine:
         """
         gap_s = self.settings.gap_s
         self.host.sleep(self._free - self.host.now())
+        data = b""
+        received = Received()
         try:
             with line_lost(self.path):
                 port = self.opened()
                 port.reset_input_buffer()
                 port.write(frame)
-                self._sent = self.host.now()
-                end = self._sent + self.wire_s(2 * FRAME) + (wait_s or gap_s)
-                received = self._collect(port, frame, end)
+                sent = self.host.now()
+                end = sent + self.wire_s(2 * FRAME) + (wait_s or gap_s)
+                while self.host.now() < end and len(data) < MOST:
+                    data += port.read(max(1, min(port.in_waiting, MOST)))
+                    received = split_replies(data, frame)
+                    if received.tilts or received.acknowledged:
+                        break
         except LineLost:
             self.close()
             raise
-        self._free = max(self.host.now(), self._sent + self.wire_s()) + gap_s
+        self._free = max(self.host.now(), sent + self.wire_s()) + gap_s
         self.frames += 1
         self.echoed += received.echoed
         self.skipped += received.skipped
-        return received
-
-    def _collect(self, port, frame, end):
-        """What is Received until a reply, or an instant."""
-        data = b""
-        received = Received()
-        while not (received.tilts or received.acknowledged):
-            if self.host.now() >= end or len(data) >= MOST:
-                break
-            data += port.read(max(1, min(port.in_waiting, MOST)))
-            received = split_replies(data, frame)
+        received.sent = sent
         return received
 
     # --------------------------------------------------------------------------------------- port
@@ -362,10 +350,10 @@ class HeadLine:
                 if self.host.now() >= deadline:
                     raise LineLost(f"the head's line is lost: {error}") from error
                 self.host.sleep(AGAIN_S)
-                continue
-            LOG.warning("the line %s to the head is back", self.path)
-            self._port.write(self._stop * 2)
-            self.host.sleep(self.wire_s(2 * FRAME) + self.settings.gap_s)
+            else:
+                LOG.warning("the line %s to the head is back", self.path)
+                self._port.write(self._stop * 2)
+                self.host.sleep(self.wire_s(2 * FRAME) + self.settings.gap_s)
         return self._port
 
     def close(self):
