@@ -283,7 +283,7 @@ def _scan(v, rig, scene, pitch, rng):
     """Ranges (L, B) at the true pitch of every line, metres, NaN without an echo."""
     beam = rig.beam
     bearings = rig.beam.bearings()
-    disc = spot_pattern(beam.rings)
+    disc = spot_pattern(beam.rings)[:, 1:]
     up, bearing = (part.ravel() for part in np.meshgrid(pitch, bearings, indexing="ij"))
     across = np.stack([-np.sin(bearing), np.cos(bearing), 0 * bearing], axis=-1)
     shift = disc[:, :1] * across[:, None] + disc[:, 1:] * np.array([0.0, 0.0, 1.0])

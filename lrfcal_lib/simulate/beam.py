@@ -6,9 +6,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt
 from pydantic.dataclasses import dataclass
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import polar_to_points, tilt, unit_vector
+from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array, unit_vector
 from lrfcal_lib.session.lms2xx_codec import (
     REASONS,
     VARIANTS,
@@ -114,7 +114,7 @@ LMS221 = Beam()
 
 
 def spot_pattern(rings: int) -> np.ndarray:
-    """Points that stand for equal parts of the unit disc: one in the middle, 6 k on ring k.
+    """Points for equal parts of the unit disc across x: one in the middle, 6 k on ring k.
 
     Turning the pattern by 60 deg changes nothing: its centre and its moments of inertia are those
     of the disc.
@@ -125,14 +125,14 @@ def spot_pattern(rings: int) -> np.ndarray:
 
     Returns
     -------
-    ndarray, shape (K, 2)
+    ndarray, shape (K, 3)
     """
     count = np.r_[1, 6 * np.arange(1, rings + 1)]
     inside = np.cumsum(count)
     radius = np.sqrt((inside - count / 2) / inside[-1])
     radius[0] = 0.0
     turn = np.concatenate([2 * np.pi * np.arange(n) / n for n in count])
-    return polar_to_points(np.repeat(radius, count), turn)[:, :2]
+    return np.roll(polar_to_points(np.repeat(radius, count), turn), 1, axis=1)
 
 
 def echo(
@@ -160,15 +160,14 @@ def echo(
     left = distance
     places = []
     strengths = []
-    while not places or np.isfinite(left).any():
-        near = left.min(axis=1, keepdims=True)
-        group = np.isfinite(left) & (left <= near + beam.pulse)
-        part = np.where(group, energy, 0.0)
-        strengths.append(part.sum(axis=1))
-        mean = np.sum(part * np.where(group, distance, 0.0), axis=1)
-        with np.errstate(invalid="ignore"):
-            places.append(mean / strengths[-1])
-        left = np.where(group, np.inf, left)
+    with np.errstate(invalid="ignore"):  # of what ends nowhere, and of groups without a ray
+        moments = energy * distance
+        while not places or np.isfinite(left).any():
+            near = left.min(axis=1, keepdims=True)
+            group = np.isfinite(left) & (left <= near + beam.pulse)
+            strengths.append(energy.sum(axis=1, where=group))
+            places.append(moments.sum(axis=1, where=group) / strengths[-1])
+            left = np.where(group, np.inf, left)
     best = np.max(strengths, axis=0)
     threshold = np.maximum(beam.least_energy, beam.least_share * best)
     good = [strength >= threshold for strength in strengths]
@@ -211,28 +210,17 @@ def ideal_readings(
     cosine of incidence over squared distance (a Lambertian surface). The nearer part of a spot on a
     slanted plane is therefore brighter: at 45 deg the reading is 0.09 mm short.
     """
-    origins, directions = _sub_rays(beam, bearings)
-    *shape, _ = directions.shape
-    rotation = T_head_lrf.rotation.as_matrix().T
-    origins = tilt(origins @ rotation + T_head_lrf.translation, pitch[:, None])
-    origins = origins.reshape(-1, 3)
-    directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
-    hits = world.cast(origins, directions)
+    disc = spot_pattern(beam.rings)
+    turn = RigidTransform.from_rotation(Rotation.from_euler("z", bearings[:, None]))
+    tilted = RigidTransform.from_rotation(Rotation.from_euler("x", pitch[:, None]))
+    pose = pose_array(tilted * T_head_lrf * turn)
+    ahead = unit_vector([1.0, 0.0, 0.0] + beam.divergence / 2 * disc)
+    origins = apply_pose(pose, beam.spot_exit / 2 * disc)
+    hits = world.cast(origins, ahead @ pose[..., :3].mT)
     reflected = world.infrared(hits.points, hits.thing) * hits.cosine
-    energy = reflected / hits.distance**2 / shape[1]
-    reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
-    dazzled = world.dazzling[hits.thing].reshape(shape).any(axis=1)
-    return Readings(reading, total, dazzled)
-
-
-def _sub_rays(beam, bearings):
-    """Origins and unit directions of the sub-rays of spots in the LRF frame, shape (n, K, 3)."""
-    right, over = np.split(spot_pattern(beam.rings), 2, axis=1)
-    up = np.array([0.0, 0.0, 1.0])
-    middle = polar_to_points(1.0, bearings)
-    shift = right * np.cross(up, middle)[:, None] + over * up
-    directions = unit_vector(middle[:, None] + beam.divergence / 2 * shift)
-    return beam.spot_exit / 2 * shift, directions
+    energy = reflected / hits.distance**2 / len(disc)
+    reading, total = echo(beam, hits.distance, energy)
+    return Readings(reading, total, world.dazzling[hits.thing].any(axis=1))
 
 
 def measured(
@@ -252,11 +240,9 @@ def measured(
     ranges, reasons : ndarray
         Metres, and why there is none: index into REASONS.
     """
-    noise = beam.sigma_range * rng.standard_normal(ideal.reading.shape)
-    ranges = ideal.reading + beam.systematic + noise
-    read = np.isfinite(ideal.reading)
-    known = [ideal.dazzled, read, ideal.total > 0]
-    return np.clip(ranges, 0, None), np.select(known, [DAZZLED, 0, WEAK], NOT_VALID)
+    ranges = rng.normal(ideal.reading + beam.systematic, beam.sigma_range)
+    known = [ideal.dazzled, np.isfinite(ideal.reading), ideal.total > 0]
+    return np.maximum(ranges, 0), np.select(known, [DAZZLED, 0, WEAK], NOT_VALID)
 
 
 def scan(
@@ -282,11 +268,9 @@ def scan(
     ndarray of uint16, shape (L, B)
         Words of 13 bits.
     """
-    bearings, pitch = np.broadcast_arrays(beam.bearings(), pitch)
-    lines = [
-        ideal_readings(beam, world, *line, T_head_lrf)
-        for line in zip(bearings, pitch, strict=True)
-    ]
-    ideal = Readings(*map(np.stack, zip(*lines, strict=True)))
-    ranges, reasons = measured(beam, ideal, rng)
-    return encode_values(ranges, unit=beam.unit_name, reasons=reasons)
+    words = []
+    for line in zip(*np.broadcast_arrays(beam.bearings(), pitch), strict=True):
+        ideal = ideal_readings(beam, world, *line, T_head_lrf)
+        ranges, reasons = measured(beam, ideal, rng)
+        words.append(encode_values(ranges, unit=beam.unit_name, reasons=reasons))
+    return np.array(words)

@@ -80,12 +80,12 @@ class Lights:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where n rays end, and what is there."""
+    """Where rays end, and what is there."""
 
     distance: np.ndarray  # metres, inf: nowhere
-    points: np.ndarray  # (n, 3), metres; their origin for those that end nowhere
+    points: np.ndarray  # (..., 3), metres; their origin for those that end nowhere
     thing: np.ndarray  # its number, -1: none
-    normal: np.ndarray  # (n, 3), of its surface, on the side that the ray comes from
+    normal: np.ndarray  # (..., 3), of its surface, on the side that the ray comes from
     cosine: np.ndarray  # of the angle between the two
 
 
@@ -132,7 +132,7 @@ class World:
         Parameters
         ----------
         origins, directions
-            Metres and unit vectors in the platform frame, shape (n, 3).
+            Metres and unit vectors in the platform frame, shape (..., 3).
         """
         origins, directions = np.broadcast_arrays(origins, directions)
         rays = _rays(origins, directions)
@@ -142,18 +142,18 @@ class World:
         normal = self.normals[face]
         along = np.vecdot(normal, directions)
         height = self.offsets[face] - np.vecdot(normal, origins)
-        reach = np.divide(height, along, out=np.zeros(len(face)), where=seen)
+        reach = np.divide(height, along, out=np.zeros(face.shape), where=seen)
         return Hits(
             distance=np.where(seen, reach, np.inf),
-            points=origins + reach[:, None] * directions,
+            points=origins + reach[..., None] * directions,
             thing=np.where(seen, self.thing_of[face], -1),
-            normal=-np.sign(along)[:, None] * normal,
+            normal=-np.sign(along)[..., None] * normal,
             cosine=np.abs(along),
         )
 
     def albedo(self, points: np.ndarray, thing: np.ndarray) -> np.ndarray:
-        """Albedo (n, 3) of points (n, 3) on things of these numbers (n,)."""
-        out = np.zeros((len(points), 3))
+        """Albedo (..., 3) of points (..., 3) on things of these numbers (...)."""
+        out = np.zeros_like(points)
         for number in np.unique(thing):
             rows = thing == number
             item = self.things[number]
@@ -167,16 +167,16 @@ class World:
         Parameters
         ----------
         points
-            In the platform frame, metres, shape (n, 3).
+            In the platform frame, metres, shape (..., 3).
         thing
-            Numbers of the things that they are on, shape (n,).
+            Numbers of the things that they are on, shape (...).
 
         Returns
         -------
-        ndarray, shape (n,)
+        ndarray, shape (...)
         """
         stated = np.array([t.infrared for t in self.things], float)  # NaN for None
-        red = self.albedo(points, thing)[:, 0]
+        red = self.albedo(points, thing)[..., 0]
         return np.where(np.isnan(stated[thing]), red, stated[thing])
 
     def radiance(self, hits: Hits) -> np.ndarray:
@@ -209,8 +209,8 @@ class World:
 
 
 def _rays(origins, directions):
-    """Rays (n, 6) as Open3D takes them."""
-    return o3d.core.Tensor(np.concatenate([origins, directions], axis=1, dtype=np.float32))
+    """Rays (..., 6) as Open3D takes them."""
+    return o3d.core.Tensor(np.concatenate([origins, directions], axis=-1, dtype=np.float32))
 
 
 def furnished(*parts: str) -> list[Thing]:
