@@ -9,6 +9,7 @@ from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array, unit_vector
+from lrfcal_lib.model.kinematics import platform_from_head
 from lrfcal_lib.session.lms2xx_codec import (
     REASONS,
     VARIANTS,
@@ -212,8 +213,7 @@ def ideal_readings(
     """
     disc = spot_pattern(beam.rings)
     turn = RigidTransform.from_rotation(Rotation.from_euler("z", bearings[:, None]))
-    tilted = RigidTransform.from_rotation(Rotation.from_euler("x", pitch[:, None]))
-    pose = pose_array(tilted * T_head_lrf * turn)
+    pose = pose_array(platform_from_head(pitch) * T_head_lrf * turn)
     ahead = unit_vector([1.0, 0.0, 0.0] + beam.divergence / 2 * disc)
     origins = apply_pose(pose, beam.spot_exit / 2 * disc)
     hits = world.cast(origins, ahead @ pose[..., :3].mT)
