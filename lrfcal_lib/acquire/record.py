@@ -343,8 +343,7 @@ class View:
                 self.rows |= zip(event.pitch, event.readings, strict=True)
                 self.pitch = event.pitch[-1]
                 self.reading = event.readings[-1]
-                if math.isfinite(event.share):
-                    self.share = event.share
+                self.share = event.share
             case Photographed():
                 self.images += 1
                 self.frames[event.camera] = event.frame

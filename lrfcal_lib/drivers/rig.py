@@ -39,6 +39,7 @@ SAME_STOP = 1e-3  # radians; an image and a scan this near share a stop
 FEWEST_SCANS = 8
 LEAST_SWEEP = math.radians(10)
 STILL = 1.9  # mean ratio of von Neumann; 2 of scans that differ by noise alone
+LEAST_SPREAD = 1e-12  # square metres; what is always the same is taken for noise
 CLOSE = -1  # placement of images of the board held close
 
 
@@ -62,7 +63,7 @@ class Scanned:
     placement: int
     readings: tuple[Reading, ...]
     pitch: np.ndarray  # radians
-    share: float  # what is done of a continuous sweep; NaN at a stop
+    share: float  # of the sweep that is done, at a stop before it
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,17 +293,23 @@ class Rig(Closed):
             Also after a sweep with a head that tells nothing if the scans are all alike: it did not
             move.
         """
-        sweep = self._stop_and_go
+        stops = placement.pitch.tolist()
+        sweep = self._at_stops(placement, stops, placement.image_pitch)
         if self.stated.plan.mode == "continuous":
-            sweep = self._continuous
+            sweep = self._continuous(placement)
         scans = []  # of a head that tells nothing
         try:
-            for event in sweep(placement):
+            if self.stated.devices.lrf.interlaced:  # in a stream, others one by one
+                self.lrf.start(interlaced=True)
+            for event in sweep:
                 if isinstance(event, Scanned) and not self.head.has_feedback:
                     scans += [reading.ranges for reading in event.readings]
                 yield event
             if placement.closing:
-                yield from self._close(placement)
+                # as level as it was in the first half: walls show most
+                level = min(stops[: len(stops) // 2 + 1], key=abs)
+                yield from self._at_stops(placement, [level])
+            self.lrf.stop()
             wide = np.ptp(placement.pitch) >= LEAST_SWEEP
             if wide and len(scans) >= FEWEST_SCANS and unchanged(scans):
                 head = self.stated.devices.head
@@ -328,11 +335,13 @@ class Rig(Closed):
         DeviceError
             As :meth:`acquire`.
         """
+        close = Placement(CLOSE, np.zeros(1), (), "intrinsics")
         try:
-            return next(self._photograph([camera], self._move(CLOSE, 0.0), "intrinsics"))
+            _, photo = self._at_stops(close, images=[0.0], cameras=[camera])
         except BaseException:
             self.halt()
             raise
+        return photo
 
     def halt(self) -> None:
         """Stop the head and the scans; what cannot be stopped is logged, with what to do."""
@@ -340,42 +349,28 @@ class Rig(Closed):
             with stopping(name):
                 device.stop()
 
-    def _stop_and_go(self, placement):
-        scans = placement.pitch
-        images = placement.image_pitch
-        alone = [image for image in images if np.abs(scans - image).min() >= SAME_STOP]
-        stops = sorted([*scans.tolist(), *alone], reverse=placement.direction < 0)
-        self._begin_scans()
+    def _at_stops(self, placement, scans=(), images=(), cameras=None):
+        """Scan and take images (of all cameras by default) at pitches, each at rest."""
+        alone = [
+            image
+            for image in images
+            if not np.isclose(scans, image, rtol=0, atol=SAME_STOP).any()
+        ]
+        stops = sorted([*scans, *alone], reverse=placement.direction < 0)
         for number, pitch in enumerate(stops, 1):
             moved = self._move(placement.number, pitch, number, len(stops))
             yield moved
             if pitch not in alone:
-                yield self._scanned(moved)
-            if any(abs(pitch - image) < SAME_STOP for image in images):
-                yield from self._photograph(self.cameras, moved, placement.purpose)
-        self.lrf.stop()
-
-    def _close(self, placement):
-        """Scan again in the first half of a sweep, as level as it was there: walls show most."""
-        half = placement.pitch[: len(placement.pitch) // 2 + 1]
-        level = min(half.tolist(), key=abs)
-        moved = self._move(placement.number, level)
-        yield moved
-        self._begin_scans()
-        yield self._scanned(moved, share=1.0)
-        self.lrf.stop()
-
-    def _begin_scans(self):
-        """Interlaced scans come in a stream, others one by one."""
-        if self.stated.devices.lrf.interlaced:
-            self.lrf.start(interlaced=True)
-
-    def _scanned(self, moved, share=math.nan):
-        """What is scanned at a stop."""
-        readings = tuple(self._scans(moved.time_s))
-        return Scanned(
-            moved.placement, readings, np.full(len(readings), moved.pitch), share
-        )
+                readings = tuple(self._scans(moved.time_s))
+                pitches = np.full(len(readings), moved.pitch)
+                before = (number - 1) / len(stops)
+                yield Scanned(placement.number, readings, pitches, before)
+            if np.isclose(images, pitch, rtol=0, atol=SAME_STOP).any():
+                for name in cameras or self.cameras:
+                    frame = self.cameras[name].newest(after=moved.time_s, timeout=IMAGE_S)
+                    yield Photographed(
+                        placement.number, name, frame, moved.pitch, placement.purpose
+                    )
 
     def _scans(self, after):
         """Scans of a stream, or one by one, later than an instant.
@@ -383,11 +378,12 @@ class Rig(Closed):
         A line that was lost has one chance to come back.
         """
         count = self.stated.plan.scans_per_stop
+        wait_s = SCAN_S * count
         if self.stated.devices.lrf.interlaced:
-            return self.lrf.take(count, after=after, timeout=SCAN_S * count)
+            return self.lrf.take(count, after=after, timeout=wait_s)
         readings = []
         mended = False
-        end = self._now() + SCAN_S
+        end = self._now() + wait_s
         while len(readings) < count:
             try:
                 reading = self.lrf.request()
@@ -401,10 +397,9 @@ class Rig(Closed):
             if reading.time_s > after:
                 readings.append(reading)
                 after = reading.time_s
-                end = self._now() + SCAN_S
             elif self._now() > end:
                 raise NoReply(
-                    f"the laser range finder gives no scan later than the stop in {SCAN_S:g} s"
+                    f"the laser range finder gives no scan later than the stop in {wait_s:g} s"
                 )
         return readings
 
@@ -414,19 +409,10 @@ class Rig(Closed):
             placement, self.clock(), pitch, reached, self.head.has_feedback, number, of
         )
 
-    def _photograph(self, cameras, moved, purpose):
-        for name in cameras:
-            frame = self.cameras[name].newest(after=moved.time_s, timeout=IMAGE_S)
-            yield Photographed(moved.placement, name, frame, moved.pitch, purpose)
-
     def _continuous(self, placement):
         first, last = placement.pitch[[0, -1]].tolist()
-        images = sorted(placement.image_pitch, reverse=placement.direction < 0)
-        for number, pitch in enumerate([*images, first], 1):
-            moved = self._move(placement.number, pitch, number, len(images) + 1)
-            yield moved
-            if number <= len(images):
-                yield from self._photograph(self.cameras, moved, placement.purpose)
+        yield from self._at_stops(placement, images=placement.image_pitch)
+        yield self._move(placement.number, first)
         self.lrf.start()
         held = self.lrf.take(1, timeout=SCAN_S)  # readings whose pitch is not known yet
         newest = held[-1].time_s
@@ -436,10 +422,12 @@ class Rig(Closed):
             moving = self.head.moving()
             if not moving:
                 self.head.finish_sweep()
-            fresh = self._since(newest)
-            if fresh:
-                newest = fresh[-1].time_s
-            elif self.clock() - newest > GAP_S:
+            end = self._now() + BATCH_S
+            with contextlib.suppress(NoReply):
+                while self._now() < end:
+                    held += self.lrf.take(1, after=newest, timeout=BATCH_S)
+                    newest = held[-1].time_s
+            if self.clock() - newest > GAP_S:
                 raise NoReply(
                     f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range "
                     "finder"
@@ -448,24 +436,12 @@ class Rig(Closed):
             if moving and self.head.has_feedback:
                 # what is not measured may change until the next reading
                 track = [point for point in track if point[2]]
-            readings, pitch, held = placed(held + fresh, track)
+            readings, pitch, held = placed(held, track)
             if readings:
-                share = 1.0
-                if moving:
-                    share = float(np.clip((pitch[-1] - first) / (last - first), 0, 1))
+                share = np.clip((pitch[-1] - first) / (last - first), 0, 1)
                 yield Scanned(placement.number, readings, pitch, share)
         self.lrf.stop()
         yield Tracked(placement.number, last, tuple(track))
-
-    def _since(self, instant):
-        """All scans after an instant that come within the time of a batch."""
-        end = self._now() + BATCH_S
-        readings = []
-        with contextlib.suppress(NoReply):
-            while self._now() < end:
-                readings += self.lrf.take(1, after=instant, timeout=BATCH_S)
-                instant = readings[-1].time_s
-        return readings
 
 
 def placed(
@@ -493,8 +469,7 @@ def placed(
         return (), np.empty(0), readings
     times, pitch = np.array([point[:2] for point in track]).T
     middle = np.array([np.mean(reading.beam_times_s[[0, -1]]) for reading in readings])
-    begin = np.searchsorted(middle, times[0])
-    end = np.searchsorted(middle, times[-1], side="right")
+    begin, end = np.searchsorted(middle, times[[0, -1]], side="right")
     known = np.interp(middle[begin:end], times, pitch)
     return tuple(readings[begin:end]), known, readings[end:]
 
@@ -521,8 +496,7 @@ def unchanged(scans: Iterable[np.ndarray]) -> bool:
     ranges = ranges[:, np.isfinite(ranges).all(axis=0)]
     steps = (np.diff(ranges, axis=0) ** 2).sum(axis=0)
     spread = len(ranges) * ranges.var(axis=0)
-    noise = np.full(len(steps), 2.0)
-    ratio = np.divide(steps, spread, out=noise, where=steps > 0)
+    ratio = (steps + 2 * LEAST_SPREAD) / (spread + LEAST_SPREAD)
     return bool(ratio.sum() > STILL * ratio.size)
 
 
