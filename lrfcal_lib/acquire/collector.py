@@ -350,7 +350,7 @@ class Collector(Closed):
         if self._devices.acquire(blocking=False):
             try:
                 view.pitch, view.measured = rig.head.pitch()
-                view.reading = _scan(rig.lrf)
+                view.reading = rig.scan(RECONNECT_S, LineLost)
             except DeviceError as error:
                 troubles.append(str(error))
             finally:
@@ -474,12 +474,3 @@ def _stated(rig, stack):
         devices = stack.enter_context(emulated(str(rig)))
         return rig_of(devices.rig_file(), Path(f"emulated {rig}"))
     return read_rig_file(rig)
-
-
-def _scan(lrf):
-    """A Reading, after a reconnection where the line was lost."""
-    try:
-        return lrf.request()
-    except LineLost:
-        lrf.reconnect(RECONNECT_S)
-        return lrf.request()

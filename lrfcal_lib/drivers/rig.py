@@ -343,6 +343,32 @@ class Rig(Closed):
             raise
         return photo
 
+    def scan(
+        self,
+        reconnect_s: float = 10.0,
+        errors: type[Exception] | tuple = (LineLost, NoReply),
+    ) -> Reading:
+        """Ask for one scan; a laser range finder that was lost has one chance to come back.
+
+        Parameters
+        ----------
+        reconnect_s
+            Seconds that it may take to find it again.
+        errors
+            After which it is looked for.
+
+        Raises
+        ------
+        DeviceError
+            As :meth:`acquire`.
+        """
+        try:
+            return self.lrf.request()
+        except errors as error:
+            LOG.warning("%s; looking for the laser range finder", error)
+            self.lrf.reconnect(reconnect_s)
+        return self.lrf.request()
+
     def halt(self) -> None:
         """Stop the head and the scans; what cannot be stopped is logged, with what to do."""
         for name, device in (("head", self.head), ("laser range finder", self.lrf)):
@@ -373,27 +399,15 @@ class Rig(Closed):
                     )
 
     def _scans(self, after):
-        """Scans of a stream, or one by one, later than an instant.
-
-        A line that was lost has one chance to come back.
-        """
+        """Scans of a stream, or one by one, later than an instant."""
         count = self.stated.plan.scans_per_stop
         wait_s = SCAN_S * count
         if self.stated.devices.lrf.interlaced:
             return self.lrf.take(count, after=after, timeout=wait_s)
         readings = []
-        mended = False
         end = self._now() + wait_s
         while len(readings) < count:
-            try:
-                reading = self.lrf.request()
-            except (LineLost, NoReply) as error:
-                if mended:
-                    raise
-                LOG.warning("%s; looking for the laser range finder", error)
-                self.lrf.reconnect()
-                mended = True
-                continue
+            reading = self.scan()
             if reading.time_s > after:
                 readings.append(reading)
                 after = reading.time_s
