@@ -108,7 +108,7 @@ def check_scans(scans: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
     ----------
     scans
         By name: ranges (N, B), metres; bearings (B,) and pitch (N,), radians; placement (N,);
-        time_s (N,); intensities (N, B) where there are any.
+        time_s (N,); intensities (N, B), or None.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def check_scans(scans: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
         "pitch": (lines,),
         "time_s": (lines,),
     }
-    if "intensities" in scans:
+    if scans.get("intensities") is not None:
         shapes["intensities"] = ranges.shape
     checked = {"ranges": ranges}
     for key, shape in shapes.items():

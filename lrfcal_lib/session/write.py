@@ -23,7 +23,7 @@ from lrfcal_lib.session.scans import check_scans, parts_of, read_npz
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
-ABOUT = {"name": "", "licence": "", "source": "", "simulated": False, "reference": {}}
+ABOUT = {"name": "", "licence": "", "source": "", "simulated": False}
 RECORDINGS = "LRFCAL_RECORDINGS"  # environment variable: where new recordings go
 
 
@@ -45,11 +45,10 @@ class SessionWriter:
     ----------
     path
         Must not exist or be an empty folder.
-    board, lrf, cameras, T_head_lrf, platform_sigma, continuous
+    board, lrf, cameras, T_head_lrf, platform_sigma, continuous, reference
         See :class:`lrfcal_lib.session.read.Session`.
     **about
-        What a Session says besides its rig: name (by default that of its folder), licence, source,
-        simulated, reference.
+        What else a Session says: name (by default that of its folder), licence, source, simulated.
 
     Raises
     ------
@@ -72,6 +71,7 @@ class SessionWriter:
         *,
         platform_sigma: tuple[float, float] | None = None,
         continuous: bool = False,
+        reference: dict | None = None,
         **about,
     ):
         self.path = Path(path)
@@ -90,8 +90,8 @@ class SessionWriter:
                 lrf, T_head_lrf, self.cameras, platform_sigma, continuous
             ),
             "placements": [],
+            "reference": reference or {},  # last: it may be long
         }
-        self.data["reference"] = self.data.pop("reference")  # last: it may be long
         with naming(self.path):
             stated.parse_session(stated.plain(self.data))
         try:
@@ -192,9 +192,8 @@ class SessionWriter:
             "pitch": pitch,
             "time_s": time_s,
             "placement": np.full(len(ranges), placement),
+            "intensities": intensities,
         }
-        if intensities is not None:
-            recorded["intensities"] = intensities
         with naming(f"{self.path}: placement {placement}"):
             scans = check_scans(recorded)
             bearings = scans["bearings"]

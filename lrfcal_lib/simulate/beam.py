@@ -197,7 +197,7 @@ def ideal_readings(
     beam
     world
     bearings, pitch
-        Of the beams, radians, shape (n,).
+        Of the beams, radians, shape (n,), the pitch also (1,).
     T_head_lrf
 
     Returns
@@ -269,8 +269,9 @@ def scan(
         Words of 13 bits.
     """
     words = []
-    for line in zip(*np.broadcast_arrays(beam.bearings(), pitch), strict=True):
-        ideal = ideal_readings(beam, world, *line, T_head_lrf)
+    bearings = beam.bearings()
+    for pitches in pitch:
+        ideal = ideal_readings(beam, world, bearings, pitches, T_head_lrf)
         ranges, reasons = measured(beam, ideal, rng)
         words.append(encode_values(ranges, unit=beam.unit_name, reasons=reasons))
     return np.array(words)
