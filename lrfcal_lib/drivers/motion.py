@@ -106,7 +106,7 @@ class Motion:
         self._known_at = 0.0
         self._misses = 0
         self._tolerance = math.radians(settings.tolerance_deg)
-        self._shortest_s = 2 * line.wire_s() + settings.gap_s  # of a motion and its stop
+        self._shortest_s = 2 * line.frame_s + settings.gap_s  # of a motion and its stop
 
     # -------------------------------------------------------------------------------------------
     # what is known
@@ -269,7 +269,7 @@ class Motion:
             """Seconds; after a reading the stop has to be on its way in time."""
             rest_s = (goal - self.estimate()) * way / self.speed(way, step)
             if self._known_at > begun:
-                rest_s -= line.wire_s()
+                rest_s -= line.frame_s
             return min(rest_s, begun + longest_s - self._now())
 
         try:

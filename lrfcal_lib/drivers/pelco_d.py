@@ -230,6 +230,8 @@ class HeadLine:
 
     Attributes
     ----------
+    frame_s : float
+        Seconds that a frame takes on the line.
     frames, echoed, skipped : int
         Frames sent, and bytes that came back as an echo or belong to nothing.
     """
@@ -242,15 +244,12 @@ class HeadLine:
         self.echoed = 0
         self.skipped = 0
         self.lock = host.lock()
+        self.frame_s = FRAME * 10 / settings.baudrate
         self._stop = encode_frame(settings.address)
         self._free = 0.0  # when the next frame may be sent
         self._late = False  # the reply to the last query did not come in time
         self._acknowledges = False
         self._port = host.port(path, settings.baudrate, timeout=READ_S)
-
-    def wire_s(self, count=FRAME):
-        """Seconds that bytes take on the line."""
-        return count * 10 / self.settings.baudrate
 
     # ------------------------------------------------------------------------------------- frames
 
@@ -296,7 +295,7 @@ class HeadLine:
             with stopping("head", Exception), line_lost(self.path):
                 for _ in range(2):
                     self.opened().write(self._stop)
-                    self.host.sleep(self.wire_s() + self.settings.gap_s)
+                    self.host.sleep(self.frame_s + self.settings.gap_s)
         finally:
             if held:
                 self.lock.release()
@@ -317,7 +316,7 @@ class HeadLine:
                 port.reset_input_buffer()
                 port.write(frame)
                 sent = self.host.now()
-                end = sent + self.wire_s(2 * FRAME) + (wait_s or gap_s)
+                end = sent + 2 * self.frame_s + (wait_s or gap_s)
                 while self.host.now() < end and len(data) < MOST:
                     data += port.read(max(1, min(port.in_waiting, MOST)))
                     received = split_replies(data, frame)
@@ -326,7 +325,7 @@ class HeadLine:
         except LineLost:
             self.close()
             raise
-        self._free = max(self.host.now(), sent + self.wire_s()) + gap_s
+        self._free = max(self.host.now(), sent + self.frame_s) + gap_s
         self.frames += 1
         self.echoed += received.echoed
         self.skipped += received.skipped
@@ -353,7 +352,7 @@ class HeadLine:
             else:
                 LOG.warning("the line %s to the head is back", self.path)
                 self._port.write(self._stop * 2)
-                self.host.sleep(self.wire_s(2 * FRAME) + self.settings.gap_s)
+                self.host.sleep(2 * self.frame_s + self.settings.gap_s)
         return self._port
 
     def close(self):

@@ -516,11 +516,10 @@ def unchanged(scans: Iterable[np.ndarray]) -> bool:
 
 def _camera(stated, name):
     """A camera that gives images of the size stated."""
-    device = stated.devices.cameras[name]
     info = stated.cameras[name]
     size = (info.width, info.height)
-    options = device.model_dump(exclude_none=True, exclude={"source", "size"})
-    camera = Camera(device.source, name=name, size=size, **options)
+    settings = stated.devices.cameras[name].model_dump(exclude_none=True) | {"size": size}
+    camera = Camera(name=name, **settings)
     if camera.size not in (None, size):
         camera.close()
         raise ValueError(

@@ -231,7 +231,7 @@ class SessionWriter:
             bytes, or a session that has scan lines already.
         """
         with naming(f"{self.path}: placement {placement}"):
-            lengths = [len(raw) for raw in telegrams]
+            lengths = list(map(len, telegrams))
             pitch = np.full(len(telegrams), pitch, float)
             time_s = np.full(len(telegrams), time_s, float)
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):

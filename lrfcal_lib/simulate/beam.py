@@ -171,7 +171,7 @@ def echo(
             left = np.where(group, np.inf, left)
     best = np.max(strengths, axis=0)
     threshold = np.maximum(beam.least_energy, beam.least_share * best)
-    good = [strength >= threshold for strength in strengths]
+    good = np.greater_equal(strengths, threshold)
     return np.select(good, places, np.nan), sum(strengths)
 
 
