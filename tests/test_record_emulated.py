@@ -95,9 +95,7 @@ def emulated_rig(setup, file):
 
         def opened(stated):
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(
-                    rig_module, "Camera", lambda _, name, **__: Still(emulated, name)
-                )
+                patch.setattr(rig_module, "Camera", lambda name, **_: Still(emulated, name))
                 return rig_module.Rig.open(stated, host=host)
 
         yield SimpleNamespace(open=opened)

@@ -33,7 +33,7 @@ def new_session_path() -> Path:
     return Path(folder, time.strftime("%Y-%m-%d_%H%M%S")).absolute()
 
 
-class SessionWriter:
+class SessionWriter(contextlib.AbstractContextManager):
     """Write a session so that a crash loses at most what was being written.
 
     Every sweep and every image is on the disk (fsync) before the table that names it is; at the
@@ -117,9 +117,6 @@ class SessionWriter:
             files.checked(self.path / name, self.path, make=True)
         if self.cameras:
             self._begin_table("images.csv", read.IMAGE_COLUMNS)
-
-    def __enter__(self):
-        return self
 
     def __exit__(self, kind, error, trace):
         with contextlib.closing(self):
@@ -302,8 +299,14 @@ class SessionWriter:
         name = f"images/{camera}/{number:04d}.{kind}"
         write_file(self.path, name, image)
         self._note_placement(placement)
-        angle = math.degrees(pitch)
-        row = [float(time_s), camera, name, number_cell(placement), angle, purpose]
+        row = (
+            float(time_s),
+            camera,
+            name,
+            number_cell(placement),
+            math.degrees(pitch),
+            purpose,
+        )
         self._append_rows("images.csv", [row])
         return name
 
