@@ -99,7 +99,7 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
 def _hidden(world, eye, points):
     """Which points (n, 3) something of a World hides from an eye (3,)."""
     way = points - eye
-    hits = world.cast(np.broadcast_to(eye, way.shape), unit_vector(way))
+    hits = world.cast(eye, unit_vector(way))
     return hits.distance < np.linalg.norm(way, axis=1) - CLEAR
 
 

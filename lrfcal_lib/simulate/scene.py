@@ -188,22 +188,22 @@ class World:
         Parameters
         ----------
         hits
-            Of n rays.
+            Of rays (...).
 
         Returns
         -------
-        ndarray, shape (n, 3)
+        ndarray, shape (..., 3)
         """
         light = np.array([t.glow for t in self.things])[hits.thing] + self.lights.ambient
         lamps = zip(self.lights.positions, self.lights.strengths, strict=True)
         for position, strength in lamps:
             way = position - hits.points
-            share = np.vecdot(hits.normal, way) / np.linalg.norm(way, axis=1) ** 3
+            share = np.vecdot(hits.normal, way) / np.linalg.norm(way, axis=-1) ** 3
             # 2 mm off, so that no surface shades itself
             rays = _rays(hits.points + 2e-3 * hits.normal, 0.999 * way)
             dark = self._scene.test_occlusions(rays, 0.0, 1.0).numpy()
             light += strength * np.where(dark | (share < 1e-3), 0.0, share)
-        out = self.albedo(hits.points, hits.thing) * light[:, None]
+        out = self.albedo(hits.points, hits.thing) * light[..., None]
         out[hits.thing < 0] = SKY
         return out
 
@@ -355,9 +355,9 @@ class Imager:
     def _trace(self, world, T_camera_platform, rays):
         """Light and thing along viewing rays (..., 3)."""
         back = T_camera_platform.inv()
-        directions = unit_vector(rays.reshape(-1, 3)) @ back.rotation.as_matrix().T
+        directions = unit_vector(rays) @ back.rotation.as_matrix().T
         hits = world.cast(back.translation, directions)
-        return world.radiance(hits).reshape(rays.shape), hits.thing.reshape(rays.shape[:-1])
+        return world.radiance(hits), hits.thing
 
 
 def _between(grid, row, column, down, across):
