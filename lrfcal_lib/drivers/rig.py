@@ -335,9 +335,11 @@ class Rig(Closed):
         DeviceError
             As :meth:`acquire`.
         """
-        close = Placement(CLOSE, np.zeros(1), (), "intrinsics")
+        close = Placement(
+            number=CLOSE, pitch=np.zeros(1), image_pitch=(0.0,), purpose="intrinsics"
+        )
         try:
-            _, photo = self._at_stops(close, images=[0.0], cameras=[camera])
+            _, photo = self._at_stops(close, images=close.image_pitch, cameras=[camera])
         except BaseException:
             self.halt()
             raise
