@@ -44,7 +44,6 @@ class SessionRecorder(SessionWriter):
             self._refuse(remedy)
         else:  # session.json comes first, so that a recording killed at once can go on
             self._state(unfinished=[])
-        self._make_folders()
         self._begin_table("platform.csv", read.PLATFORM_COLUMNS)
 
     def _go_on(self):

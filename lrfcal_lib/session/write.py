@@ -101,6 +101,7 @@ class SessionWriter(contextlib.AbstractContextManager):
         with contextlib.ExitStack() as stack:
             stack.enter_context(alone(self.path))
             self._create()
+            self._make_folders()
             self._held = stack.pop_all()
 
     def _refuse(self, remedy="choose another name or remove it first"):
@@ -109,7 +110,6 @@ class SessionWriter(contextlib.AbstractContextManager):
     def _create(self):
         if set(os.listdir(self.path)) - {LOCK}:
             self._refuse()
-        self._make_folders()
         self._state()
 
     def _make_folders(self):
