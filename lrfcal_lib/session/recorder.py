@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 from lrfcal_lib.session import files, read, stated
 from lrfcal_lib.session.files import SessionError, naming, short
-from lrfcal_lib.session.lock import LOCK
 from lrfcal_lib.session.tables import read_table
 from lrfcal_lib.session.write import SessionWriter, as_lines, mend_tables, write_file
 
@@ -35,15 +34,13 @@ class SessionRecorder(SessionWriter):
         super().__init__(*rig, **about)
 
     def _create(self):
+        remedy = "record with --resume to go on with it, or choose another"
+        if self._resume:
+            remedy = "choose another name"
         if self._resume and os.path.lexists(self.path / "session.json"):
             self._go_on()
-        elif set(os.listdir(self.path)) - {"session.json.draft", LOCK}:
-            remedy = "record with --resume to go on with it, or choose another"
-            if self._resume:
-                remedy = "choose another name"
-            self._refuse(remedy)
         else:  # session.json comes first, so that a recording killed at once can go on
-            self._state(unfinished=[])
+            super()._create(remedy, unfinished=[])
         self._begin_table("platform.csv", read.PLATFORM_COLUMNS)
 
     def _go_on(self):

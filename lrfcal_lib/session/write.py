@@ -107,10 +107,11 @@ class SessionWriter(contextlib.AbstractContextManager):
     def _refuse(self, remedy="choose another name or remove it first"):
         raise SessionError(f"{self.path}: exists already; {remedy}")
 
-    def _create(self):
-        if set(os.listdir(self.path)) - {LOCK}:
-            self._refuse()
-        self._state()
+    def _create(self, *remedy, **first):
+        """Write session.json, with what it says at first, into a folder that holds nothing yet."""
+        if set(os.listdir(self.path)) - {"session.json.draft", LOCK}:
+            self._refuse(*remedy)
+        self._state(**first)
 
     def _make_folders(self):
         for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
