@@ -16,14 +16,14 @@ PICTURES = (
 # of rotation vector, degrees, and translation, millimetres
 POSE_DIGITS = (2, 2, 2, 1, 1, 1)
 MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way first
-NO_VERDICT = {"sentences": [], "record": {}}
+NO_VERDICT = {"sentences": [], "record": None}
 
 
 def first_screen(out, verdicts, drawn):
     """What the first screen of a report in a folder shows, by the names of its template."""
     # the one with a record, else any
     main = max(verdicts, key=lambda entry: bool(entry["record"]), default=NO_VERDICT)
-    errors = main["record"].get("expected_error_at_m", {})
+    errors = (main["record"] or {}).get("expected_error_at_m", {})
     figures = {}
     for of_notebook, _ in drawn.values():
         figures |= of_notebook

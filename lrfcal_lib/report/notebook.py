@@ -260,9 +260,7 @@ def verdict(title: str, sentences: Sequence[str], record: dict | None = None) ->
         f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences
     ]
     _record(
-        "verdicts",
-        "verdict",
-        {"title": title, "sentences": sentences, "record": record or {}},
+        "verdicts", "verdict", {"title": title, "sentences": sentences, "record": record}
     )
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
