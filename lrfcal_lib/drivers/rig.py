@@ -63,7 +63,7 @@ class Scanned:
     placement: int
     readings: tuple[Reading, ...]
     pitch: np.ndarray  # radians
-    share: float  # of the sweep that is done, at a stop before it
+    share: float  # of the sweep that is done
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,8 +391,7 @@ class Rig(Closed):
             if pitch not in alone:
                 readings = tuple(self._scans(moved.time_s))
                 pitches = np.full(len(readings), moved.pitch)
-                before = (number - 1) / len(stops)
-                yield Scanned(placement.number, readings, pitches, before)
+                yield Scanned(placement.number, readings, pitches, number / len(stops))
             if np.isclose(images, pitch, rtol=0, atol=SAME_STOP).any():
                 for name in cameras or self.cameras:
                     frame = self.cameras[name].newest(after=moved.time_s, timeout=IMAGE_S)
