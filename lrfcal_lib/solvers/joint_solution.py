@@ -255,9 +255,6 @@ class JointSolution:
         index = self.columns(name)
         both = np.ix_(index, index)
         whole = self.solution
-        by_placements = whole.covariance_placements
-        if by_placements is not None:
-            by_placements = by_placements[both]
         return replace(
             whole,
             transform=self.transforms[name],
@@ -265,7 +262,7 @@ class JointSolution:
             names=POSE_NAMES,
             jacobian=whole.jacobian[..., index],
             covariance=whole.covariance[both],
-            covariance_placements=by_placements,
+            covariance_placements=whole.covariance_placements[both],
         )
 
     @cached_property
