@@ -74,17 +74,6 @@ def settled(before: Levels, after: Levels) -> bool:
     return bool(np.all(np.abs(np.diff(np.log(compared), axis=0)) < SETTLED))
 
 
-def face_points(state: JointState, data: JointData) -> np.ndarray:
-    """Measured face points in the platform frame, shape (p, n, 3)."""
-    ray = rays(state, data, data.face)
-    return ray.origin + (data.face["range"] - state.sensor[0])[..., None] * ray.direction
-
-
-def heights(points: np.ndarray, boards: np.ndarray) -> np.ndarray:
-    """Of points (p, n, 3) over their boards (p, 3, 4), metres, shape (p, n)."""
-    return np.vecdot(points - boards[:, None, :, 3], boards[:, None, :, 2])
-
-
 def face_levels(state, data, block, shared, spread):
     """Scale of the ranges' noise, and the share of independent errors, from what ranges have in
     common over a board and over parts of it.

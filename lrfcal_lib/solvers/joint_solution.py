@@ -27,8 +27,7 @@ from lrfcal_lib.solvers.joint_model import (
     Unknowns,
     gather,
 )
-from lrfcal_lib.solvers.joint_noise import face_points, heights
-from lrfcal_lib.solvers.joint_residuals import named_blocks
+from lrfcal_lib.solvers.joint_residuals import face_heights, named_blocks
 
 WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "range_offset": "the range offset",
@@ -291,8 +290,8 @@ class JointSolution:
 
     def face_heights(self) -> np.ndarray:
         """Heights of the measured points over their boards, metres, placement by placement."""
-        points = face_points(self.state, self.data)
-        return heights(points, self.state.boards)[self.data.face["used"]]
+        heights = face_heights(self.state, self.data, self.state.boards)
+        return heights[self.data.face["used"]]
 
     def with_levels(self, **changed) -> "JointSolution":
         """The same estimate at other noise levels, fields of

@@ -1,5 +1,6 @@
 """Cameras from lines (equations 16 to 21), after Wasielewski and Strauss, and after Bauermann."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -100,7 +101,7 @@ def estimate_pose(
     -------
     Solution
     """
-    problem = partial(residual, obs=obs)
+    problem: Callable = partial(residual, obs=obs)
     if not weighted:
         equally = partial(_equally, problem)
         problem, pose = minimise_in_rounds(equally, pose, move_pose, 2, **options)
