@@ -335,12 +335,11 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
         )
         if change.zoomed:
             kind = "camera zoomed"
-            size = f"{100 * abs(change.zoom):.2f} +- {100 * change.zoom_sigma:.2f} %"
             words = (
-                f"the images of camera '{change.camera}' are {size} "
-                f"{by_sign(change.zoom, 'larger', 'smaller')} from placement {change.after} on, "
-                f"{change.corner_px:.1f} px at their corners: zoom, focus or image size were "
-                "changed"
+                f"the images of camera '{change.camera}' are {100 * abs(change.zoom):.2f} +- "
+                f"{100 * change.zoom_sigma:.2f} % {by_sign(change.zoom, 'larger', 'smaller')} "
+                f"from placement {change.after} on, {change.corner_px:.1f} px at their corners: "
+                "zoom, focus or image size were changed"
             )
         elif steps.count(change.after) == len(cameras):
             words += " (or the range finder was: all cameras changed at once)"

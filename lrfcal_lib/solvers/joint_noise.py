@@ -183,7 +183,8 @@ def with_view_levels(data, block, hessian, gradient, shared):
     other's cost.
     """
     views, view_gradient, *_ = linearise([block])
-    others = hessian - views, gradient - view_gradient
+    others = hessian - views
+    other_gradient = gradient - view_gradient
     rows = 6 * data.view["used"].sum()
     levels = PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]
     costs = []
@@ -192,7 +193,7 @@ def with_view_levels(data, block, hessian, gradient, shared):
     for sigma in levels:
         trial = replace(block, sigma_pitch=sigma)
         for _ in range(SCALE_ROUNDS):
-            cost, factor = judged(trial, factor, others, rows, shared)
+            cost, factor = judged(trial, factor, others, other_gradient, rows, shared)
         costs.append(cost)
         factors.append(factor)
     best = np.argmin(costs)
@@ -206,19 +207,19 @@ def with_view_levels(data, block, hessian, gradient, shared):
     return data.with_levels(view_scale=scale, sigma_pitch=sigma * factor)
 
 
-def judged(block, factor, others, rows, shared):
+def judged(block, factor, others, other_gradient, rows, shared):
     """Negative log likelihood of views with an error of the pitch and a factor on both their
     scales; a better factor.
 
-    `others` are the normal equations of all that is no view, `rows` the number of residuals. One
-    row more is believed to be as large as the factor says: where nothing else shows the scale, it
-    stays as it is.
+    `others` and `other_gradient` are the normal equations of all that is no view, `rows` the number
+    of residuals. One row more is believed to be as large as the factor says: where nothing else
+    shows the scale, it stays as it is.
     """
     c = shared
     f2 = factor**2
     hessian, gradient, half_square = linearise([block])
-    whole = others[0] + hessian / f2
-    right = others[1] + gradient / f2
+    whole = others + hessian / f2
+    right = other_gradient + gradient / f2
     size = np.linalg.trace(whole)[:, None, None]
     whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
     moved, covariance = likeliest(whole, right, c)
