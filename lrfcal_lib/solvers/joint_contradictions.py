@@ -99,8 +99,6 @@ def without_contradictions(obs, state, data):
     heights = face_heights(state, data, boards, place)
     misses = medians(np.abs(heights), data.face["used"][place])
     wrong = misses > max(LAST_MISS, FAR_MISS * np.median(misses))
-    if not wrong.any():
-        return obs, state, []
     good, first = np.unique(place[~wrong], return_index=True)
     out = np.setdiff1d(place, good)
     single = wrong & np.isin(place, good)

@@ -201,7 +201,8 @@ def with_view_levels(data, block, hessian, gradient, shared):
     if 1 < best < len(costs) - 1:  # between the levels: a parabola through three of them
         near = slice(best - 1, best + 2)
         bend, slope, _ = np.polyfit(np.log(levels[near] / sigma), costs[near], 2)
-        sigma *= np.exp(-slope / (2 * bend))
+        if bend > 0:  # not where the likelihood overflows
+            sigma *= np.exp(-slope / (2 * bend))
     factor = factors[best]
     scale = np.clip(data.levels.view_scale * factor, *SCALE_LIMITS)
     return data.with_levels(view_scale=scale, sigma_pitch=sigma * factor)
@@ -231,7 +232,7 @@ def judged(block, factor, others, other_gradient, rows, shared):
     cost = half_square / f2 + 0.5 * (
         np.vecdot(moved, right).sum() + rows * np.log(f2) + block.log_determinant + freedom
     )
-    better = (left + f2) / (rows - taken / f2 + 1)
+    better = (left + f2) / (max(rows - taken / f2, 0.0) + 1)
     return cost, np.sqrt(better)
 
 
@@ -247,15 +248,14 @@ def with_sweep_levels(sweeps, data, hessian, gradient, shared):
     number = sweeps.shape[1]
     places = shared + 6 + np.arange(number)  # behind the board's pose
     usual = USUAL_SWEEP[:number] ** 2
-    before = np.square(data.levels.sweep_sigma[:number])
+    before = np.square(data.levels.sweep_sigma)
     variance = before
     for _ in range(SWEEP_ROUNDS):
         more = 1 / variance - 1 / before
         square, unknown = expecting(more, sweeps, places, hessian, gradient, shared)
-        told = 1 - unknown / variance
+        told = np.maximum(1 - unknown / variance, 0.0)
         variance = (np.sum(square, axis=0) + usual) / (np.sum(told, axis=0) + 1)
-    sigma = (*np.sqrt(variance).tolist(), *data.levels.sweep_sigma[number:])
-    return data.with_levels(sweep_sigma=sigma)
+    return data.with_levels(sweep_sigma=np.sqrt(variance).tolist())
 
 
 def expecting(more, values, places, hessian, gradient, shared):

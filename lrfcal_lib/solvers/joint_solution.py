@@ -21,7 +21,6 @@ from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_model import (
     SENSOR,
-    SWEEPS,
     JointData,
     JointState,
     Unknowns,
@@ -36,7 +35,6 @@ WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "pitch_scale": "the scale of the pitch",
     "pitch_by_direction": "the pitch offset by sweep direction",
 }
-SWEEP_HELD = (0.0, 0.0)  # standard deviations of what is not unknown
 NAMED = 0.3  # share of a direction's largest component from which an unknown is named
 
 
@@ -174,8 +172,7 @@ class JointSolution:
         """Standard deviations of the pitch's offset (radians) and stretch of every sweep; 0 where
         held.
         """
-        number = SWEEPS[self.unknowns.sweep]
-        offset, stretch = (*self.data.levels.sweep_sigma[:number], *SWEEP_HELD[number:])
+        offset, stretch, *_ = (*self.data.levels.sweep_sigma, 0.0, 0.0)
         return offset, stretch
 
     @property
