@@ -189,10 +189,10 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     prepared
     """
     session = prepared.session
+    numbers = np.array(session.board_placements)
     # also placements that images contradict are left out, of which scans show the board
-    if 2 * len(prepared.problems_of(ProblemKind.NO_BOARD)) >= len(session.board_placements):
-        numbers = session.board_placements
-        looked_at = thin(np.array(numbers), LOOKED_AT)
+    if 2 * len(prepared.problems_of(ProblemKind.NO_BOARD)) >= len(numbers):
+        looked_at = thin(numbers, LOOKED_AT)
         for reading in UNITS:
             if len(boards_in(session, looked_at, reading)) > len(looked_at) / 2:
                 return [Fault(reading.kind, reading.words, severe=True)]

@@ -192,8 +192,7 @@ def with_view_levels(data, block, hessian, gradient, shared):
     factor = 1.0
     for sigma in levels:
         trial = replace(block, sigma_pitch=sigma)
-        for _ in range(SCALE_ROUNDS):
-            cost, factor = judged(trial, factor, others, other_gradient, rows, shared)
+        cost, factor = judged(trial, factor, others, other_gradient, rows, shared)
         costs.append(cost)
         factors.append(factor)
     best = np.argmin(costs)
@@ -210,30 +209,33 @@ def with_view_levels(data, block, hessian, gradient, shared):
 
 def judged(block, factor, others, other_gradient, rows, shared):
     """Negative log likelihood of views with an error of the pitch and a factor on both their
-    scales; a better factor.
+    scales, and a factor that is better than the one it begins with.
 
     `others` and `other_gradient` are the normal equations of all that is no view, `rows` the number
     of residuals. One row more is believed to be as large as the factor says: where nothing else
     shows the scale, it stays as it is.
     """
-    c = shared
-    f2 = factor**2
     hessian, gradient, half_square = linearise([block])
-    whole = others + hessian / f2
-    right = other_gradient + gradient / f2
-    size = np.linalg.trace(whole)[:, None, None]
-    whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
-    moved, covariance = likeliest(whole, right, c)
-    left = np.sum((block.white + np.matvec(block.white_jacobian, moved)) ** 2)
-    # share of the views in what is known of the unknowns: rows that these take up
-    taken = np.sum(covariance * hessian)
-    own = np.linalg.slogdet(whole[:, c:, c:])[1].sum()
-    freedom = own - np.linalg.slogdet(covariance[0, :c, :c])[1]
-    cost = half_square / f2 + 0.5 * (
-        np.vecdot(moved, right).sum() + rows * np.log(f2) + block.log_determinant + freedom
-    )
-    better = (left + f2) / (max(rows - taken / f2, 0.0) + 1)
-    return cost, np.sqrt(better)
+    for _ in range(SCALE_ROUNDS):
+        f2 = factor**2
+        whole = others + hessian / f2
+        right = other_gradient + gradient / f2
+        size = np.linalg.trace(whole)[:, None, None]
+        whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
+        moved, covariance = likeliest(whole, right, shared)
+        left = np.sum((block.white + np.matvec(block.white_jacobian, moved)) ** 2)
+        # share of the views in what is known of the unknowns: rows that these take up
+        taken = np.sum(covariance * hessian)
+        own = np.linalg.slogdet(whole[:, shared:, shared:])[1].sum()
+        freedom = own - np.linalg.slogdet(covariance[0, :shared, :shared])[1]
+        cost = half_square / f2 + 0.5 * (
+            np.vecdot(moved, right).sum()
+            + rows * np.log(f2)
+            + block.log_determinant
+            + freedom
+        )
+        factor = np.sqrt((left + f2) / (max(rows - taken / f2, 0.0) + 1))
+    return cost, factor
 
 
 def with_sweep_levels(sweeps, data, hessian, gradient, shared):

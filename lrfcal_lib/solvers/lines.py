@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
@@ -26,11 +26,12 @@ from lrfcal_lib.model.geometry import (
     rotate_and_move,
 )
 from lrfcal_lib.model.observations import CameraObservations
-from lrfcal_lib.solvers.plane_start import shifted, sizes_of_minima, start_rotations
+from lrfcal_lib.solvers.plane_start import on_planes, sizes_of_minima
 from lrfcal_lib.solvers.planes import pose_unknowns
 
 # metres, of a crossing from its plane of sight, for the search of a start value
 START_SIGMA = 0.005
+ROTATIONS = 200  # random ones, beside the 24 of a cube
 AHEAD = 0.8  # of the points at least lie before the camera
 
 
@@ -132,9 +133,9 @@ def start_from_lines(obs: CameraObservations) -> RigidTransform:
     obs.require("crossing")
     points = obs.crossing_points
     normals = sight_normals(obs.crossing_lines, obs.model)
-    rotations = start_rotations()
-    offsets = -np.vecdot(normals, points @ rotations.mT)
-    poses = shifted(rotations, normals, offsets)
+    drawn = Rotation.random(ROTATIONS, rng=np.random.default_rng(0))
+    rotations = Rotation.concatenate([Rotation.create_group("O"), drawn])
+    poses = on_planes(rotations.as_matrix(), normals, 0.0, points)
 
     def evaluate(pose):
         return sight_block(pose, points, normals / START_SIGMA)
