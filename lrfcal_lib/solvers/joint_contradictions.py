@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
+from scipy import ndimage
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.padding import medians
@@ -69,13 +69,16 @@ def refuse_contradiction(
     Placements that were left out for that already count with them.
     """
     place = obs.view_placement
+    if not len(place):
+        return
     boards = boards_in_images(obs, state.head, state.cameras)
     misses = np.linalg.norm(boards[..., 3] - state.boards[place, :, 3], axis=1)
     stated = np.sqrt(np.linalg.trace(obs.view_covariance[:, 3:, 3:]))
     before = sum(p.kind == CONTRADICTS and p.camera is None for p in left_out)
-    usual = pd.DataFrame({"miss": misses, "stated": stated}).groupby(place).median()
-    wrong = np.sum(usual.miss > np.maximum(most, MOST_SIGMA * usual.stated))
-    every = len(usual) + before
+    shown = np.unique(place)
+    limit = np.maximum(most, MOST_SIGMA * ndimage.median(stated, place, shown))
+    wrong = np.sum(ndimage.median(misses, place, shown) > limit)
+    every = len(shown) + before
     if wrong and 3 * (wrong + before) > every:
         raise DegenerateGeometry(
             f"images and scans contradict each other: for {wrong + before} of {every} placements "
