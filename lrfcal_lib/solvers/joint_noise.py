@@ -96,8 +96,8 @@ def with_face_levels(state, data, block, shared, spread):
 
 
 def independent_share(modes, residuals, by_own, share, spread, usual=1.0):
-    """What of the scatter of modes of boards or edges independent errors explain, where chance does
-    not explain it all; NaN where nothing tells it.
+    """Share of independent errors, from how much more than by these modes of boards or edges
+    scatter, as far as chance does not explain it; NaN where nothing tells it.
 
     Placements' own unknowns take a part t of a mode. What is left of its score has the part
     ``(1 - t)^2`` of the variance asked for and, from all else that the estimate weighs against it,

@@ -29,8 +29,6 @@ from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.plane_start import on_planes, sizes_of_minima
 from lrfcal_lib.solvers.planes import pose_unknowns
 
-# metres, of a crossing from its plane of sight, for the search of a start value
-START_SIGMA = 0.005
 ROTATIONS = 200  # random ones, beside the 24 of a cube
 AHEAD = 0.8  # of the points at least lie before the camera
 
@@ -138,7 +136,7 @@ def start_from_lines(obs: CameraObservations) -> RigidTransform:
     poses = on_planes(rotations.as_matrix(), normals, 0.0, points)
 
     def evaluate(pose):
-        return sight_block(pose, points, normals / START_SIGMA)
+        return sight_block(pose, points, normals)
 
     for robust in (False, True):
         poses = minimise(evaluate, poses, move_pose, robust=robust, max_iterations=40).state
@@ -149,5 +147,5 @@ def start_from_lines(obs: CameraObservations) -> RigidTransform:
             f"camera '{obs.camera}': no pose puts the {len(points)} points in front of the camera"
         )
     poses = poses[ahead]
-    sines = sight_block(poses, points, normals).residuals / depth[ahead]
+    sines = evaluate(poses).residuals / depth[ahead]
     return pose_transform(poses[np.argmin(sizes_of_minima(sines**2))])
