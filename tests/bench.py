@@ -182,7 +182,7 @@ def with_gtsam(count):
     obs = none(problem(count), "beam")
     data = gather(obs)
     unknowns = Unknowns(2, 3, sensor=("range_offset",))
-    start = next(start_states(obs))[0]
+    start = next(start_states(obs, axis=True))[0]
     c = unknowns.shared
     pieces = [(start.of_placements([p]), data_of_placement(data, p)) for p in range(count)]
 

@@ -10,7 +10,7 @@ from joint_draws import draw, rng
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Levels
-from lrfcal_lib.solvers.joint_noise import beam_share, side_levels
+from lrfcal_lib.solvers.joint_noise import with_beam_share, with_side_levels
 from lrfcal_lib.solvers.joint_residuals import SIDE_FREEDOM, named_blocks
 
 FINE = np.radians(0.5)
@@ -84,9 +84,10 @@ def test_sides_that_beams_hardly_show_do_not_pull_their_scale_down(true, start):
         # the last is of what sides have in common: known to be nothing
         own = [np.ones((200, 6)), known + prior, np.full((200, 1), 1e9)]
         hessian[:, range(10), range(10)] = np.concatenate(own, axis=1)
-        told = SimpleNamespace(levels=Levels(side_sigma=level), beam=used)
+        told = SimpleNamespace(levels=Levels(side_sigma=level), beam=used, with_levels=dict)
         gradient = np.zeros((200, 10))
-        level, _ = side_levels(np.pad(x, [(0, 0), (0, 1)]), told, hessian, gradient)
+        sides = np.pad(x, [(0, 0), (0, 1)])
+        level = with_side_levels(sides, told, hessian, gradient)["side_sigma"]
     assert level == pytest.approx(true, rel=0.15)
 
 
@@ -146,6 +147,6 @@ def test_beams_that_all_contradict_their_edges_still_have_a_share():
     cost = np.full(block.cost.shape, 4.0)
     own = np.zeros((6, *[block.jacobian.shape[-1] - found.unknowns.shared] * 2))
     contradicted = replace(block, residuals=np.sqrt(2 * cost), cost=cost)
-    assert (
-        0 < beam_share(found.state, data, contradicted, found.unknowns.shared, own) < 0.01
-    )
+    shared = found.unknowns.shared
+    estimated = with_beam_share(found.state, data, contradicted, shared, own)
+    assert 0 < estimated.levels.beam_share < 0.01

@@ -167,14 +167,14 @@ def test_noise_alone_scatters_over_placements_as_it_is_stated(placements):
 @pytest.mark.parametrize("groups", [np.zeros(40, int), np.arange(40) // 20])
 def test_no_placement_covariance_from_too_few_placements(data, groups):
     found = fit(line_problem(*data), np.zeros(2), groups=groups)
-    assert found.covariance_placements is None and np.isnan(found.sigma_placements).all()
+    assert np.isnan(found.covariance_placements).all()
 
 
 NOISE = np.array([[4.0, 1.8], [1.8, 1.0]])
 
 
 @pytest.mark.parametrize(("noise", "scatter", "sigma"), [
-    (NOISE, None, [2, 1]),
+    (NOISE, np.full((2, 2), np.nan), [2, 1]),
     (NOISE, np.diag([1.0, 9.0]), [2, 3]),  # one by one: neither matrix as a whole
     (NOISE, np.diag([16.0, 0.25]), [4, 1]),
     (np.diag([np.inf, 1.0]), np.diag([1.0, 9.0]), [np.inf, 3]),

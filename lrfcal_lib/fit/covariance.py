@@ -168,7 +168,7 @@ def name_words(direction: np.ndarray, names: Sequence[str], share: float = PARTA
 
 def placement_covariance(
     hessians: np.ndarray, scores: np.ndarray
-) -> tuple[np.ndarray | None, np.ndarray | None]:
+) -> tuple[np.ndarray, np.ndarray | None]:
     """First-order jackknife over g placements, from what each adds to the normal equations.
 
     Parameters
@@ -181,8 +181,8 @@ def placement_covariance(
     -------
     covariance : ndarray, shape (..., k, k)
     changes : ndarray, shape (..., g, k)
-        Of the estimate when that placement is left out. Both are None with fewer than three
-        placements, or where the others do not determine the estimate.
+        Of the estimate when that placement is left out. With fewer than three placements, or where
+        the others do not determine the estimate, the first is NaN and this one None.
 
     Notes
     -----
@@ -195,12 +195,13 @@ def placement_covariance(
     diagonal = np.sqrt(np.maximum(np.linalg.diagonal(total), 1e-300))
     outer = dyads(diagonal)
     scaled = (total - hessians) / outer
+    unknown = np.full_like(hessians[..., 0, :, :], np.nan)
     try:  # squared pivots: what the others say about one unknown more
         pivots = np.linalg.diagonal(np.linalg.cholesky(scaled))
     except np.linalg.LinAlgError:
-        return None, None
+        return unknown, None
     if hessians.shape[-3] < FEWEST or pivots.min() < 1e-6:
-        return None, None
+        return unknown, None
     without = np.linalg.inv(scaled)
     shifts = np.matvec(without, scores / diagonal) / diagonal
     squares = shifts.mT @ shifts

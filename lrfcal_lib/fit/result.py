@@ -80,11 +80,11 @@ class Solution:
         Of the increments, from the propagated noise. Where chi-square is above its 99.9 % limit the
         stated noise is too small, and the covariance is multiplied by `inflation`, chi-square per
         degree of freedom; never shrunk below 1.
-    covariance_placements : ndarray, shape (..., k, k), or None
+    covariance_placements : ndarray, shape (..., k, k)
         Clustered by placement: the jackknife to first order, ``(G - 1)/G sum_g d_g d_g^T`` where
         ``d_g`` is the change of the estimate when placement g is left out, scaled so that noise
         alone gives the variances of `covariance` in the mean. Model errors are
-        common to one placement, which the first covariance cannot know. None where one placement
+        common to one placement, which the first covariance cannot know. NaN where one placement
         alone carries an unknown, or with fewer than three placements.
     n_placements : int
         G.
@@ -111,7 +111,7 @@ class Solution:
     residuals: np.ndarray
     jacobian: np.ndarray
     covariance: np.ndarray
-    covariance_placements: np.ndarray | None
+    covariance_placements: np.ndarray
     n_placements: int
     unobservable: tuple[str, ...]
     method: str
@@ -131,8 +131,7 @@ class Solution:
     @property
     def sigma_placements(self):
         """Standard deviations from `covariance_placements`, shape (..., k); NaN without."""
-        found = self.covariance_placements
-        return np.full_like(self.sigma, np.nan) if found is None else sigma_of(found)
+        return sigma_of(self.covariance_placements)
 
     @property
     def trusted(self):
@@ -146,22 +145,18 @@ class Solution:
 
         What n placements leave to chance is taken off, see :func:`beyond_chance`.
         """
-        known = (self.sigma > 0) & np.isfinite(self.sigma)
-        ratio = np.divide(
-            self.sigma_placements, self.sigma, out=np.ones_like(self.sigma), where=known
-        )
+        ratio = self.sigma_placements / np.maximum(self.sigma, 1e-300)  # never 0 / 0
         excess = 2 * np.log(np.fmax(ratio, 1.0))
         h = np.sqrt(np.expm1(beyond_chance(excess, self.n_placements - 1)))
-        finite = np.nan_to_num(self.covariance, posinf=0.0, neginf=0.0)
-        return self.covariance + finite * dyads(h)
+        return self.covariance * (1 + dyads(h))
 
     def widened(self, by_noise: np.ndarray, by_placements: np.ndarray) -> "Solution":
         """The same with covariances (k, k) added, to that of the noise and that by placement."""
-        scatter = self.covariance_placements
-        if scatter is not None:
-            scatter = scatter + by_placements
-        covariance = self.covariance + by_noise
-        return replace(self, covariance=covariance, covariance_placements=scatter)
+        return replace(
+            self,
+            covariance=self.covariance + by_noise,
+            covariance_placements=self.covariance_placements + by_placements,
+        )
 
     @property
     def trusted_sigma(self):
@@ -169,8 +164,8 @@ class Solution:
         return sigma_of(self.trusted)
 
     def __repr__(self):
-        state = (
-            f"{'converged' if np.all(self.converged) else 'NOT converged'} after "
-            f"{self.iterations} iterations"
+        converged = "converged" if np.all(self.converged) else "NOT converged"
+        return (
+            f"Solution({self.method}: {converged} after {self.iterations} iterations, "
+            f"{self.n_observations} observations)"
         )
-        return f"Solution({self.method}: {state}, {self.n_observations} observations)"

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,12 +17,12 @@ from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.judge.alternatives import distance, far_axis, guesses_of
 from lrfcal_lib.judge.camera_changes import camera_changes, explains
 from lrfcal_lib.judge.findings import by_sign
-from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model.geometry import (
     POSE,
     DegenerateGeometry,
     lrf_to_platform,
 )
+from lrfcal_lib.model.observations import thin
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -84,12 +85,6 @@ class Reading:
     def pitch(self, placement, recorded):
         """The recorded pitch of a placement, read this way."""
         return self.turn * recorded
-
-    def view(self, view):
-        """A BoardView, read this way: the mirror image of a chessboard is one."""
-        mirror = np.diag([self.image_across, 1.0, 1.0, 1.0])
-        pose = RigidTransform.from_matrix(mirror @ view.T_camera_board.as_matrix() @ mirror)
-        return replace(view, pitch=self.image_turn * view.pitch, T_camera_board=pose)
 
 
 AS_STATED = Reading("", "")
@@ -194,10 +189,10 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
     prepared
     """
     session = prepared.session
+    numbers = np.array(session.board_placements)
     # also placements that images contradict are left out, of which scans show the board
-    if 2 * len(prepared.problems_of(ProblemKind.NO_BOARD)) >= len(session.board_placements):
-        numbers = session.board_placements
-        looked_at = numbers[:: max(len(numbers) // LOOKED_AT, 1)][:LOOKED_AT]
+    if 2 * len(prepared.problems_of(ProblemKind.NO_BOARD)) >= len(numbers):
+        looked_at = thin(numbers, LOOKED_AT)
         for reading in UNITS:
             if len(boards_in(session, looked_at, reading)) > len(looked_at) / 2:
                 return [Fault(reading.kind, reading.words, severe=True)]
@@ -224,15 +219,17 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
         return mirrored
 
     for group in (SENSES, IMAGES, UNITS):
-        misses = {reading: board_misses(prepared, reading) for reading in group}
-        fitting = {reading: miss for reading, miss in misses.items() if _fits(miss, stated)}
+        fitting = {}
+        for reading in group:
+            misses = board_misses(prepared, reading)
+            if _fits(misses, stated):
+                fitting[reading] = misses
         if fitting:
             return [_misread(prepared, fitting, stated)]
     return []
 
 
-@dataclass(frozen=True)
-class BoardMiss:
+class BoardMiss(NamedTuple):
     """How far scans lie off boards in images at a camera's best pose: metres, without noise.
 
     `planes` is the number of placements that tell it.
@@ -242,18 +239,14 @@ class BoardMiss:
     transform: RigidTransform
     planes: int
 
-    @property
-    def much_better(self):
-        """How many times smaller another miss has to be: few planes fit whatever is read."""
-        freedom = max(PLANE * self.planes - POSE, 1)
-        return max(BETTER, np.sqrt(fdtri(freedom, freedom, CHANCE)))
-
 
 def _fits(found, stated):
     """Whether the BoardMisses of all cameras are good, and far better than as stated."""
     if found.keys() != stated.keys():
         return False
-    much_better = max(miss.much_better for miss in found.values())
+    fewest = min(miss.planes for miss in found.values())  # few fit whatever is read
+    freedom = max(PLANE * fewest - POSE, 1)
+    much_better = max(BETTER, np.sqrt(fdtri(freedom, freedom, CHANCE)))
     return _worst(found) < GOOD and much_better * _worst(found) < _worst(stated)
 
 
@@ -268,11 +261,14 @@ def board_misses(prepared, reading):
     noise = np.median([scan.sigma_range for scan in prepared.scans.values()])
     for camera in prepared.views:
         views = {
-            placement - reading.ahead: reading.view(view)
+            placement - reading.ahead: replace(view, pitch=reading.image_turn * view.pitch)
             for placement, view in prepared.posed(camera).items()
         }
         read = replace(prepared, views={camera: views}, names={})
         obs = observe(read, camera, corrections=reading, faces=POINTS)
+        # the mirror image of a chessboard is one
+        mirror = np.diag([reading.image_across, 1.0, 1.0, 1.0])
+        obs = replace(obs, board_poses=mirror @ obs.board_poses @ mirror)
         with suppress(DegenerateGeometry, np.linalg.LinAlgError):
             transform = solve_camera(obs, "zhang_pless_printed").transform
             residuals = pd.Series(np.abs(plane_residuals_m(obs, transform)))
@@ -303,11 +299,12 @@ def boards_in(session, placements, reading):
 
 def _misread(prepared, fitting, stated):
     """The Fault of a recording that fits with some Readings (BoardMisses of each), likely first."""
-    worst = {reading: _worst(misses) for reading, misses in fitting.items()}
-    best = min(worst.values())
-    likely = [reading for reading, miss in worst.items() if miss < AS_GOOD * best]
-    # a mirrored cloud fits mirrored images: only where the cameras are said to be can tell
-    likely.sort(key=lambda r: (_far_from_guess(prepared, fitting[r]), worst[r]))
+    worst = pd.Series({reading: _worst(misses) for reading, misses in fitting.items()})
+    likely = sorted(
+        worst.index[worst < AS_GOOD * worst.min()],
+        # a mirrored cloud fits mirrored images: only where the cameras are said to be can tell
+        key=lambda reading: (_far_from_guess(prepared, fitting[reading]), worst[reading]),
+    )
     causes = "; or ".join(reading.words for reading in likely)
     return Fault(
         likely[0].kind,
@@ -338,12 +335,11 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
         )
         if change.zoomed:
             kind = "camera zoomed"
-            size = f"{100 * abs(change.zoom):.2f} +- {100 * change.zoom_sigma:.2f} %"
             words = (
-                f"the images of camera '{change.camera}' are {size} "
-                f"{by_sign(change.zoom, 'larger', 'smaller')} from placement {change.after} on, "
-                f"{change.corner_px:.1f} px at their corners: zoom, focus or image size were "
-                "changed"
+                f"the images of camera '{change.camera}' are {100 * abs(change.zoom):.2f} +- "
+                f"{100 * change.zoom_sigma:.2f} % {by_sign(change.zoom, 'larger', 'smaller')} "
+                f"from placement {change.after} on, {change.corner_px:.1f} px at their corners: "
+                "zoom, focus or image size were changed"
             )
         elif steps.count(change.after) == len(cameras):
             words += " (or the range finder was: all cameras changed at once)"
@@ -360,10 +356,9 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
 def exchanged_placements(calibration) -> Iterator[Fault]:
     """Pairs of placements that are left out, and whose images fit the scans of each other."""
     prepared = calibration.prepared
-    session = prepared.session
     excluded = calibration.joint.solution.excluded_placements
-    lost = [p for p in session.board_placements if p in prepared.left_out | excluded]
-    scans = boards_in(session, lost[:MOST_LOST], AS_STATED)
+    lost = sorted(prepared.left_out | excluded)
+    scans = boards_in(prepared.session, lost[:MOST_LOST], AS_STATED)
 
     strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
     for first, second in combinations(strange, 2):
@@ -383,16 +378,17 @@ def _same_board(calibration, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
     prepared = calibration.prepared
     solution = calibration.joint.solution
-    middle = outline(solution).mean(axis=0)
+    middle = solution.observations.corners.mean(axis=0)
     p_lrf, pitch, _ = face_points(scan, POINTS)
     p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
     agree = []
     for camera in solution.transforms:
         view = prepared.posed(camera).get(placement)
         if view is not None:
-            p_camera = solution.camera_at(camera, view.pitch).apply(p_platform)
-            on_board = view.T_camera_board.inv().apply(p_camera)
-            beside = (on_board.mean(axis=0) - middle)[:2]
+            T_camera_platform = solution.camera_at(camera, view.pitch)
+            T_board_platform = view.T_camera_board.inv() * T_camera_platform
+            on_board = T_board_platform.apply(p_platform)
+            beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
             away = np.median(np.abs(on_board[:, 2]))
-            agree.append(away < GOOD and np.linalg.norm(beside) < BESIDE)
+            agree.append(away < GOOD and beside < BESIDE)
     return bool(agree) and all(agree)

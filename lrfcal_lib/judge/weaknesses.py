@@ -168,11 +168,8 @@ def large_residuals(solution) -> Iterator[Fault]:
 
 def scatter_over_placements(solution):
     """Scatter of axis and cameras over placements, in standard deviations of the noise."""
-    clustered = solution.solution.covariance_placements
-    if clustered is None:
-        return {"axis": 0.0}
     noise = group_sigma(solution.solution.covariance, solution)
-    scatter = group_sigma(clustered, solution)
+    scatter = group_sigma(solution.solution.covariance_placements, solution)
     return {name: scatter[name] / max(sigma, 1e-12) for name, sigma in noise.items()}
 
 

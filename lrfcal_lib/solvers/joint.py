@@ -4,6 +4,7 @@ angles.
 Equations (4) to (6) and (16) to (19) at once, every board's pose unknown and eliminated.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -31,6 +32,7 @@ from lrfcal_lib.solvers.joint_contradictions import (
 from lrfcal_lib.solvers.joint_lens import lens_share
 from lrfcal_lib.solvers.joint_model import (
     SENSOR,
+    SWEEPS,
     JointState,
     Levels,
     Unknowns,
@@ -98,7 +100,7 @@ class JointSettings:
     sensor: tuple[str, ...] = SENSOR[:3]
     sides: bool = False
     sweep: str = "none"
-    sweep_sigma: tuple[float, float] = Levels.sweep_sigma
+    sweep_sigma: Sequence[float] = Levels.sweep_sigma
     lapse: float = 0.0
     step_sigma: float = 0.0
     noise: str = "stated"
@@ -149,7 +151,9 @@ def solve_joint(
         sweep=chosen.sweep,
         sides=chosen.sides,
     )
-    levels = Levels(sweep_sigma=chosen.sweep_sigma, step_sigma=chosen.step_sigma)
+    levels = Levels(
+        sweep_sigma=chosen.sweep_sigma[: SWEEPS[chosen.sweep]], step_sigma=chosen.step_sigma
+    )
     arrived = False
     if start is None:
         obs, lost = without_lost_placements(obs)

@@ -15,7 +15,7 @@ from lrfcal_lib.model.geometry import POSE, DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.solvers.joint_model import JointData, JointState
-from lrfcal_lib.solvers.joint_noise import face_points, heights
+from lrfcal_lib.solvers.joint_residuals import face_heights
 from lrfcal_lib.solvers.joint_start import boards_in_images
 
 CONTRADICTS = ProblemKind.CONTRADICTS
@@ -25,20 +25,9 @@ MOST_SIGMA = 4.0  # by which images may put a board elsewhere, of what is stated
 FAR_MISS = 5.0  # times the usual miss: an image puts the board elsewhere
 
 
-def of_placement(obs, row, kind, why):
-    """The Problem of a placement (index)."""
-    return Problem(
-        Stage.JOINT, kind, f"{why}; left out", placement=int(obs.placements[row])
-    )
-
-
-def of_image(obs, row, why):
-    """The Problem of a view (index)."""
-    number = int(obs.placements[obs.view_placement[row]])
-    camera = obs.cameras[obs.view_camera[row]]
-    pitch = np.degrees(obs.view_pitch[row])
-    words = f"image of '{camera}' at {pitch:.1f} deg: {why}; the image is left out"
-    return Problem(Stage.JOINT, CONTRADICTS, words, placement=number, camera=camera)
+def of_placement(number, kind, why):
+    """The Problem of a placement."""
+    return Problem(Stage.JOINT, kind, f"{why}; left out", placement=int(number))
 
 
 def left_out_share(obs: JointObservations, left_out: list[Problem]) -> float:
@@ -51,28 +40,24 @@ def left_out_share(obs: JointObservations, left_out: list[Problem]) -> float:
 def without_blind_cameras(obs, required):
     """Leave out cameras that never see a board; refuse them where everything is required."""
     why = "it never sees the board, its pose stays open"
-    blind = np.setdiff1d(np.arange(len(obs.cameras)), obs.view_camera)
+    blind = np.delete(obs.cameras, obs.view_camera).tolist()
     left_out = [
-        Problem(Stage.JOINT, ProblemKind.NO_IMAGES, why, camera=obs.cameras[number])
-        for number in blind
+        Problem(Stage.JOINT, ProblemKind.NO_IMAGES, why, camera=camera) for camera in blind
     ]
     if required and left_out:
         words = "; ".join(map(str, left_out))
         raise DegenerateGeometry(f"{words}; leave it out with obs.with_cameras")
-    return obs.with_cameras(np.delete(obs.cameras, blind)), left_out
+    return obs.with_cameras(np.setdiff1d(obs.cameras, blind)), left_out
 
 
 def without_lost_placements(obs):
     """Leave out placements that no image shows: nothing says where their board is at the start."""
-    shown = np.isin(np.arange(len(obs.placements)), obs.view_placement)
+    lost = np.delete(obs.placements, obs.view_placement)
     why = "no image shows the board"
-    left_out = [
-        of_placement(obs, row, ProblemKind.TOO_LITTLE, why)
-        for row in np.flatnonzero(~shown)
-    ]
-    if not shown.any():
+    left_out = [of_placement(number, ProblemKind.TOO_LITTLE, why) for number in lost]
+    if not len(obs.view_placement):
         raise DegenerateGeometry("; ".join(map(str, left_out)))
-    return obs.select(obs.placements[shown]), left_out
+    return obs.select(np.setdiff1d(obs.placements, lost)), left_out
 
 
 def refuse_contradiction(
@@ -104,13 +89,8 @@ def refuse_contradiction(
 
 def face_miss(state: JointState, data: JointData) -> float:
     """By how much a state puts the scanned points off their boards, metres (median)."""
-    misses = _misses(face_points(state, data), state.boards, data.face["used"])
-    return float(np.median(misses))
-
-
-def _misses(points, boards, used):
-    """How far points (p, n, 3) are off their boards (p, 3, 4), metres (medians)."""
-    return medians(np.abs(heights(points, boards)), used)
+    heights = face_heights(state, data, state.boards)
+    return float(np.median(medians(np.abs(heights), data.face["used"])))
 
 
 def without_contradictions(obs, state, data):
@@ -119,10 +99,9 @@ def without_contradictions(obs, state, data):
     """
     place = obs.view_placement
     boards = boards_in_images(obs, state.head, state.cameras)
-    misses = _misses(face_points(state, data)[place], boards, data.face["used"][place])
+    heights = face_heights(state, data, boards, place)
+    misses = medians(np.abs(heights), data.face["used"][place])
     wrong = misses > max(LAST_MISS, FAR_MISS * np.median(misses))
-    if not wrong.any():
-        return obs, state, []
     good, first = np.unique(place[~wrong], return_index=True)
     out = np.setdiff1d(place, good)
     single = wrong & np.isin(place, good)
@@ -130,10 +109,15 @@ def without_contradictions(obs, state, data):
     for row in out:
         miss = 1000 * misses[place == row].min()
         why = f"the scan is {miss:.0f} mm off where its image puts the board"
-        left_out.append(of_placement(obs, row, CONTRADICTS, why))
+        left_out.append(of_placement(obs.placements[row], CONTRADICTS, why))
     for view in np.flatnonzero(single):
-        why = f"it puts the board {1000 * misses[view]:.0f} mm off the scan"
-        left_out.append(of_image(obs, view, why))
+        number = int(obs.placements[place[view]])
+        camera = obs.cameras[obs.view_camera[view]]
+        words = (
+            f"image of '{camera}' at {np.degrees(obs.view_pitch[view]):.1f} deg: it puts the board "
+            f"{1000 * misses[view]:.0f} mm off the scan; the image is left out"
+        )
+        left_out.append(Problem(Stage.JOINT, CONTRADICTS, words, number, camera))
     rest = obs.keep(view=~single).select(obs.placements[good])
     return rest, replace(state.of_placements(good), boards=boards[~wrong][first]), left_out
 
@@ -144,9 +128,10 @@ def misfits(blocks: dict[str, Block], data: JointData) -> np.ndarray:
     1 is what the noise explains, (p,).
     """
     count = data.face["used"].sum(axis=1) + POSE * data.view["used"].sum(axis=1)
-    total = np.zeros(len(count))
-    if "face" in blocks:
-        total += np.sum(blocks["face"].white ** 2, axis=1) / data.levels.face_share
-    if "view" in blocks:
-        total += np.sum(blocks["view"].white ** 2, axis=1)
-    return total / np.maximum(count - POSE, 1)
+    shares = {"face": data.levels.face_share, "view": 1.0}
+    squares = [
+        np.sum(blocks[name].white ** 2, axis=1) / share
+        for name, share in shares.items()
+        if name in blocks
+    ]
+    return sum(squares) / np.maximum(count - POSE, 1)

@@ -3,6 +3,7 @@
 Poses of equations (4) to (6) and (16); residuals are in :mod:`lrfcal_lib.solvers.joint_residuals`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, compress, pairwise, starmap
@@ -142,8 +143,8 @@ class Levels:
         Share of independent errors per observation, below one where neighbours repeat each other's.
     lapse : float
         Share of beams that say nothing, see :func:`lrfcal_lib.fit.edge_likelihood.beam_terms`.
-    sweep_sigma : tuple of float
-        Of the sweeps' own offset (radians) and stretch.
+    sweep_sigma : sequence of float
+        Of the sweeps' own offset (radians) and stretch, as far as they are unknown.
     side_sigma : float
         Scale of the sides' deviations of the log odds, Student's t.
     background_sigma : float
@@ -160,7 +161,7 @@ class Levels:
     face_share: float = 1.0
     beam_share: float = 1.0
     lapse: float = 0.0
-    sweep_sigma: tuple[float, float] = (np.radians(0.5), 0.05)
+    sweep_sigma: Sequence[float] = (np.radians(0.5), 0.05)
     side_sigma: float = 0.35
     background_sigma: float = 0.35
     prior: PlatformPrior | None = None

@@ -42,27 +42,18 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
     c = unknowns.shared
     own = hessian[:, c:, c:]
     spread = pseudo_inverse(own)  # shared ones held
-    levels = data.levels
-    changed = {}
     if "face" in blocks:
-        changed["face_scale"], changed["face_share"] = face_levels(
-            state, data, blocks["face"], c, spread
-        )
+        data = with_face_levels(state, data, blocks["face"], c, spread)
     if "beam" in blocks:
-        changed["beam_share"] = beam_share(state, data, blocks["beam"], c, spread)
+        data = with_beam_share(state, data, blocks["beam"], c, spread)
     if "view" in blocks:
-        factor, sigma = view_levels(data, blocks["view"], hessian, gradient, c)
-        changed["view_scale"] = np.clip(levels.view_scale * factor, *SCALE_LIMITS)
-        changed["sigma_pitch"] = sigma
-    if "side" in blocks and "beam" in blocks:
-        changed["side_sigma"], changed["background_sigma"] = side_levels(
-            state.sides, data, own, gradient[:, c:]
-        )
+        data = with_view_levels(data, blocks["view"], hessian, gradient, c)
+    if "side" in blocks:
+        data = with_side_levels(state.sides, data, own, gradient[:, c:])
     if "sweep" in blocks:
-        number = SWEEPS[unknowns.sweep]
-        scatter = sweep_levels(state.sweeps[:, :number], data, hessian, gradient, c)
-        changed["sweep_sigma"] = (*scatter.tolist(), *levels.sweep_sigma[number:])
-    return data.with_levels(**changed)
+        sweeps = state.sweeps[:, : SWEEPS[unknowns.sweep]]
+        data = with_sweep_levels(sweeps, data, hessian, gradient, c)
+    return data
 
 
 def settled(before: Levels, after: Levels) -> bool:
@@ -71,33 +62,21 @@ def settled(before: Levels, after: Levels) -> bool:
         [at.face_scale, at.face_share, at.beam_share, at.view_scale, *at.sweep_sigma]
         for at in (before, after)
     ]
-    return bool(np.all(np.abs(np.diff(np.log(compared), axis=0)) < SETTLED))
+    return bool(np.ptp(np.log(compared), axis=0).max() < SETTLED)
 
 
-def face_points(state: JointState, data: JointData) -> np.ndarray:
-    """Measured face points in the platform frame, shape (p, n, 3)."""
-    ray = rays(state, data, data.face)
-    return ray.origin + (data.face["range"] - state.sensor[0])[..., None] * ray.direction
-
-
-def heights(points: np.ndarray, boards: np.ndarray) -> np.ndarray:
-    """Of points (p, n, 3) over their boards (p, 3, 4), metres, shape (p, n)."""
-    return np.vecdot(points - boards[:, None, :, 3], boards[:, None, :, 2])
-
-
-def face_levels(state, data, block, shared, spread):
-    """Scale of the ranges' noise, and the share of independent errors, from what ranges have in
-    common over a board and over parts of it.
+def with_face_levels(state, data, block, shared, spread):
+    """The JointData with the scale of the ranges' noise, and the share of independent errors, from
+    what ranges have in common over a board and over parts of it.
 
     What board poses take up of the residuals is told by `spread` (p, k, k), the covariance of a
     placement's own unknowns, which follow the `shared` ones: three numbers of a plane where only
     the scan shows it, next to nothing where images do. These three carry all that ranges say, so
     that errors in them count, however small a part of the scatter they are.
     """
-    levels = data.levels
+    before = data.levels.face_share
     used = data.face["used"]
-    weight = data.face["weight"]
-    z = weight * block.residuals
+    z = data.face["weight"] * block.residuals
     by_own = block.white_jacobian[..., shared:]
     taken = np.sum(by_own * (by_own @ spread))
     scale = np.sqrt(np.sum(z**2) / max(used.sum() - taken, 1))
@@ -108,18 +87,17 @@ def face_levels(state, data, block, shared, spread):
     parts = np.eye(PARTS**2)[part] * used[..., None]
     planes = np.linalg.qr(np.stack([used, x * used, y * used], axis=-1))[0]
     planes *= used[..., None]  # of a placement without ranges it makes something else
-    excess = [
-        common_errors(modes, z / scale, by_own, levels.face_share, spread)
+    shares = [
+        independent_share(modes, z / scale, by_own, before, spread)
         for modes in (parts, planes)
     ]
-    most = np.fmax(*excess)
-    share = levels.face_share if np.isnan(most) else np.exp(-most)
-    return scale, share
+    share = np.nan_to_num(np.fmin(*shares), nan=before)
+    return data.with_levels(face_scale=scale, face_share=share)
 
 
-def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
-    """Logarithm of how much more modes of boards or edges scatter than by independent errors, as
-    far as chance does not explain it; NaN where nothing tells it.
+def independent_share(modes, residuals, by_own, share, spread, usual=1.0):
+    """Share of independent errors, from how much more than by these modes of boards or edges
+    scatter, as far as chance does not explain it; NaN where nothing tells it.
 
     Placements' own unknowns take a part t of a mode. What is left of its score has the part
     ``(1 - t)^2`` of the variance asked for and, from all else that the estimate weighs against it,
@@ -138,7 +116,7 @@ def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
     spread : ndarray, shape (p, k, k)
         Covariance of own unknowns.
     usual : float
-        Variance of independent errors.
+        Variance of independent errors, and the largest share.
     """
     counted = np.sum(modes**2, axis=1)
     score = np.vecmat(residuals, modes)
@@ -150,7 +128,7 @@ def common_errors(modes, residuals, by_own, share, spread, usual=1.0):
         return np.nan
     square = np.sum(score[there] ** 2 / counted[there])
     variance = (square - np.sum(taken * (1 - taken)) / share) / told
-    return beyond_chance(np.log(max(variance / usual, 1.0)), told)
+    return usual * np.exp(-beyond_chance(np.log(max(variance / usual, 1.0)), told))
 
 
 def _part(values, used):
@@ -160,8 +138,9 @@ def _part(values, used):
     return np.sum(values[None] > limits[..., None], axis=0)
 
 
-def beam_share(state, data, block, shared, spread):
-    """Share of independent errors among neighbouring beams, from the scores of every edge's slope.
+def with_beam_share(state, data, block, shared, spread):
+    """The JointData with the share of independent errors among neighbouring beams, from the scores
+    of every edge's slope.
 
     Slopes carry most of what beams say, and a background that changes along a side turns it. What
     board and sides take up of the scores is told by `spread` (p, k, k), the covariance of a
@@ -175,27 +154,25 @@ def beam_share(state, data, block, shared, spread):
     the spacing of the beams says.
     """
     before = data.levels.beam_share
-    used = data.beam["used"]
     by_own = block.white_jacobian[..., shared:]
-    root = used * np.linalg.norm(by_own[..., 3:6], axis=-1)  # root information
-    lapsed = data.levels.lapse * np.exp(np.where(used, block.cost, 0.0) / before)
-    curvature = root**2 * (1 - block.residuals**2 * lapsed / (1 - lapsed))
-    gain = max(np.sum(curvature) / np.sum(root**2), LEAST_CURVATURE)
+    root = np.linalg.norm(by_own[..., 3:6], axis=-1)  # root information
+    lapsed = data.levels.lapse * np.exp(block.cost / before)
+    bent = (root * block.residuals) ** 2 * lapsed / (1 - lapsed)
+    gain = max(1 - np.sum(bent) / np.sum(root**2), LEAST_CURVATURE)
     ray = rays(state, data, data.beam)
     sides = edge_distance(state, data, data.beam, ray)
-    places = np.vecdot(meeting(state, ray).point, sides.along)  # metres
-    along = np.where(used, places, 0.0)[..., None]
+    along = np.vecdot(meeting(state, ray).point, sides.along)[..., None]  # metres
     edges = np.eye(len(data.lines))[data.beam["edge"]] * root[..., None]
     information = np.maximum(np.sum(edges**2, axis=1, keepdims=True), 1e-300)
     middle = np.sum(edges**2 * along, axis=1, keepdims=True) / information
     slopes = edges * (along - middle)
-    excess = common_errors(slopes, block.residuals, by_own, before, spread, gain)
-    return before if np.isnan(excess) else gain * np.exp(-excess)
+    share = independent_share(slopes, block.residuals, by_own, before, spread, gain)
+    return data.with_levels(beam_share=np.nan_to_num(share, nan=before))
 
 
-def view_levels(data, block, hessian, gradient, shared):
-    """Factor on the scale of the pose errors in images and error of the pitch at a stop: the most
-    likely pair.
+def with_view_levels(data, block, hessian, gradient, shared):
+    """The JointData with the scale of the pose errors in images and the error of the pitch at a
+    stop: the most likely pair.
 
     The likelihood is the restricted one: what the unknowns take up of the residuals is no sign of
     small errors. A board that moves with its images hides what all of them share, so that stops of
@@ -206,7 +183,8 @@ def view_levels(data, block, hessian, gradient, shared):
     other's cost.
     """
     views, view_gradient, *_ = linearise([block])
-    others = hessian - views, gradient - view_gradient
+    others = hessian - views
+    other_gradient = gradient - view_gradient
     rows = 6 * data.view["used"].sum()
     levels = PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]
     costs = []
@@ -214,8 +192,7 @@ def view_levels(data, block, hessian, gradient, shared):
     factor = 1.0
     for sigma in levels:
         trial = replace(block, sigma_pitch=sigma)
-        for _ in range(SCALE_ROUNDS):
-            cost, factor = judged(trial, factor, others, rows, shared)
+        cost, factor = judged(trial, factor, others, other_gradient, rows, shared)
         costs.append(cost)
         factors.append(factor)
     best = np.argmin(costs)
@@ -223,41 +200,47 @@ def view_levels(data, block, hessian, gradient, shared):
     if 1 < best < len(costs) - 1:  # between the levels: a parabola through three of them
         near = slice(best - 1, best + 2)
         bend, slope, _ = np.polyfit(np.log(levels[near] / sigma), costs[near], 2)
-        if bend > 0:
+        if bend > 0:  # not where the likelihood overflows
             sigma *= np.exp(-slope / (2 * bend))
-    return factors[best], sigma * factors[best]
+    factor = factors[best]
+    scale = np.clip(data.levels.view_scale * factor, *SCALE_LIMITS)
+    return data.with_levels(view_scale=scale, sigma_pitch=sigma * factor)
 
 
-def judged(block, factor, others, rows, shared):
+def judged(block, factor, others, other_gradient, rows, shared):
     """Negative log likelihood of views with an error of the pitch and a factor on both their
-    scales; a better factor.
+    scales, and a factor that is better than the one it begins with.
 
-    `others` are the normal equations of all that is no view, `rows` the number of residuals. One
-    row more is believed to be as large as the factor says: where nothing else shows the scale, it
-    stays as it is.
+    `others` and `other_gradient` are the normal equations of all that is no view, `rows` the number
+    of residuals. One row more is believed to be as large as the factor says: where nothing else
+    shows the scale, it stays as it is.
     """
-    c = shared
-    f2 = factor**2
     hessian, gradient, half_square = linearise([block])
-    whole = others[0] + hessian / f2
-    right = others[1] + gradient / f2
-    size = np.linalg.trace(whole)[:, None, None]
-    whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
-    moved, covariance = likeliest(whole, right, c)
-    left = np.sum((block.white + np.matvec(block.white_jacobian, moved)) ** 2)
-    # share of the views in what is known of the unknowns: rows that these take up
-    taken = np.sum(covariance * hessian)
-    own = np.linalg.slogdet(whole[:, c:, c:])[1].sum()
-    freedom = own - np.linalg.slogdet(covariance[0, :c, :c])[1]
-    cost = half_square / f2 + 0.5 * (
-        np.vecdot(moved, right).sum() + rows * np.log(f2) + block.log_determinant + freedom
-    )
-    better = (left + f2) / (max(rows - taken / f2, 0.0) + 1)
-    return cost, np.sqrt(better)
+    for _ in range(SCALE_ROUNDS):
+        f2 = factor**2
+        whole = others + hessian / f2
+        right = other_gradient + gradient / f2
+        size = np.linalg.trace(whole)[:, None, None]
+        whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
+        moved, covariance = likeliest(whole, right, shared)
+        left = np.sum((block.white + np.matvec(block.white_jacobian, moved)) ** 2)
+        # share of the views in what is known of the unknowns: rows that these take up
+        taken = np.sum(covariance * hessian)
+        own = np.linalg.slogdet(whole[:, shared:, shared:])[1].sum()
+        freedom = own - np.linalg.slogdet(covariance[0, :shared, :shared])[1]
+        cost = half_square / f2 + 0.5 * (
+            np.vecdot(moved, right).sum()
+            + rows * np.log(f2)
+            + block.log_determinant
+            + freedom
+        )
+        factor = np.sqrt((left + f2) / (max(rows - taken / f2, 0.0) + 1))
+    return cost, factor
 
 
-def sweep_levels(sweeps, data, hessian, gradient, shared):
-    """Standard deviations of the sweeps' own errors (p, n) of the pitch, by restricted likelihood.
+def with_sweep_levels(sweeps, data, hessian, gradient, shared):
+    """The JointData with the standard deviations of the sweeps' own errors (p, n) of the pitch, by
+    restricted likelihood.
 
     Each variance is the sum of the squared errors over the number of errors that the data tell
     (MacKay's rule): what they do not tell has no say, or a first guess would stay for ever. One
@@ -267,14 +250,14 @@ def sweep_levels(sweeps, data, hessian, gradient, shared):
     number = sweeps.shape[1]
     places = shared + 6 + np.arange(number)  # behind the board's pose
     usual = USUAL_SWEEP[:number] ** 2
-    before = np.square(data.levels.sweep_sigma[:number])
+    before = np.square(data.levels.sweep_sigma)
     variance = before
     for _ in range(SWEEP_ROUNDS):
         more = 1 / variance - 1 / before
         square, unknown = expecting(more, sweeps, places, hessian, gradient, shared)
         told = np.maximum(1 - unknown / variance, 0.0)
         variance = (np.sum(square, axis=0) + usual) / (np.sum(told, axis=0) + 1)
-    return np.sqrt(variance)
+    return data.with_levels(sweep_sigma=np.sqrt(variance).tolist())
 
 
 def expecting(more, values, places, hessian, gradient, shared):
@@ -289,9 +272,9 @@ def expecting(more, values, places, hessian, gradient, shared):
     return (values + steps[:, places]) ** 2, covariance[:, places, places]
 
 
-def side_levels(sides, data, hessian, gradient):
-    """Scales of the sides' deviations and of what those of a placement have in common, Student's t,
-    by expectation and maximisation.
+def with_side_levels(sides, data, hessian, gradient):
+    """The JointData with the scales of the sides' deviations and of what those of a placement have
+    in common, Student's t, by expectation and maximisation.
 
     Student's t is a normal distribution whose precision varies from side to side; what is expected
     of it hangs on the whole expected square of a deviation. A side that the beams hardly show is as
@@ -307,7 +290,7 @@ def side_levels(sides, data, hessian, gradient):
     counted = np.add.reduceat(np.sum(shown, axis=0), kinds)
     usual = np.square([Levels.side_sigma, Levels.background_sigma])
     prior = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM * sigma2 + sides**2)  # as in `side_block`
-    last = np.arange(hessian.shape[-1])[-edges - 1 :]
+    last = np.arange(-edges - 1, 0)
     weight = prior * sigma2
     for _ in range(SIDE_ROUNDS):
         more = weight / sigma2 - prior
@@ -316,4 +299,5 @@ def side_levels(sides, data, hessian, gradient):
         total = np.add.reduceat(np.sum(weight * square * shown, axis=0), kinds)
         both = np.clip((total + usual) / (counted + 1), *np.square(SIDE_LIMITS))
         sigma2 = np.repeat(both, [edges, 1])
-    return np.sqrt(both).tolist()
+    side, background = np.sqrt(both).tolist()
+    return data.with_levels(side_sigma=side, background_sigma=background)

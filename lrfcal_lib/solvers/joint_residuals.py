@@ -4,6 +4,7 @@ Ranges by equations (4) to (6) and (17), edges by the likelihood of
 :mod:`lrfcal_lib.fit.edge_likelihood`, poses in images by equation (16).
 """
 
+from types import EllipsisType
 from typing import NamedTuple
 
 import numpy as np
@@ -177,6 +178,19 @@ def face_block(state, data, unknowns):
     residuals = r[..., 0] + state.sensor[0] - group["range"]
     root = np.sqrt(data.levels.face_share) / data.levels.face_scale
     return Block(residuals, J, root * group["weight"])
+
+
+def face_heights(
+    state: JointState,
+    data: JointData,
+    boards: np.ndarray,
+    rows: np.ndarray | EllipsisType = ...,
+) -> np.ndarray:
+    """Of the measured face points over boards (v, 3, 4) of placements, metres, shape (v, n)."""
+    ray = rays(state, data, data.face)
+    reach = data.face["range"] - state.sensor[0]
+    points = ray.origin + reach[..., None] * ray.direction
+    return np.vecdot(points[rows] - boards[:, None, :, 3], boards[:, None, :, 2])
 
 
 class EdgeDistance(NamedTuple):

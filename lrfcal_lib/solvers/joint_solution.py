@@ -21,14 +21,12 @@ from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_model import (
     SENSOR,
-    SWEEPS,
     JointData,
     JointState,
     Unknowns,
     gather,
 )
-from lrfcal_lib.solvers.joint_noise import face_points, heights
-from lrfcal_lib.solvers.joint_residuals import named_blocks
+from lrfcal_lib.solvers.joint_residuals import face_heights, named_blocks
 
 WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "range_offset": "the range offset",
@@ -37,7 +35,6 @@ WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "pitch_scale": "the scale of the pitch",
     "pitch_by_direction": "the pitch offset by sweep direction",
 }
-SWEEP_HELD = (0.0, 0.0)  # standard deviations of what is not unknown
 NAMED = 0.3  # share of a direction's largest component from which an unknown is named
 
 
@@ -175,8 +172,7 @@ class JointSolution:
         """Standard deviations of the pitch's offset (radians) and stretch of every sweep; 0 where
         held.
         """
-        number = SWEEPS[self.unknowns.sweep]
-        offset, stretch = (*self.data.levels.sweep_sigma[:number], *SWEEP_HELD[number:])
+        offset, stretch, *_ = (*self.data.levels.sweep_sigma, 0.0, 0.0)
         return offset, stretch
 
     @property
@@ -255,9 +251,6 @@ class JointSolution:
         index = self.columns(name)
         both = np.ix_(index, index)
         whole = self.solution
-        by_placements = whole.covariance_placements
-        if by_placements is not None:
-            by_placements = by_placements[both]
         return replace(
             whole,
             transform=self.transforms[name],
@@ -265,7 +258,7 @@ class JointSolution:
             names=POSE_NAMES,
             jacobian=whole.jacobian[..., index],
             covariance=whole.covariance[both],
-            covariance_placements=by_placements,
+            covariance_placements=whole.covariance_placements[both],
         )
 
     @cached_property
@@ -294,8 +287,8 @@ class JointSolution:
 
     def face_heights(self) -> np.ndarray:
         """Heights of the measured points over their boards, metres, placement by placement."""
-        points = face_points(self.state, self.data)
-        return heights(points, self.state.boards)[self.data.face["used"]]
+        heights = face_heights(self.state, self.data, self.state.boards)
+        return heights[self.data.face["used"]]
 
     def with_levels(self, **changed) -> "JointSolution":
         """The same estimate at other noise levels, fields of

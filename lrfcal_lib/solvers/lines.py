@@ -1,12 +1,13 @@
 """Cameras from lines (equations 16 to 21), after Wasielewski and Strauss, and after Bauermann."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.fit.covariance import inverse_root, solve_each
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import (
     moved_noise,
@@ -25,13 +26,11 @@ from lrfcal_lib.model.geometry import (
     rotate_and_move,
 )
 from lrfcal_lib.model.observations import CameraObservations
-from lrfcal_lib.solvers.plane_start import shifted, start_rotations
+from lrfcal_lib.solvers.plane_start import on_planes, sizes_of_minima
 from lrfcal_lib.solvers.planes import pose_unknowns
 
-# metres, of a crossing from its plane of sight, for the search of a start value
-START_SIGMA = 0.005
+ROTATIONS = 200  # random ones, beside the 24 of a cube
 AHEAD = 0.8  # of the points at least lie before the camera
-AGREEING = 0.75  # of the points tell the best start value; others may be wrong
 
 
 def distance_block(pose: np.ndarray, obs: CameraObservations) -> Block:
@@ -56,21 +55,19 @@ def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     together.
     """
     rotated, moved = rotate_and_move(pose, obs.scene_points)
-    by_point = pinhole_jacobian(moved, obs.model)
     errors = mirrored(moved, obs.model) - obs.scene_pixels
+    by_point = pinhole_jacobian(moved, obs.model)
 
-    by_source = by_point @ pose[..., None, :, :3]  # by the point in the source frame
-    pulled = obs.scene_covariance @ by_source.mT
-    noise = by_source @ pulled + obs.scene_sigma_px[..., None, None] ** 2 * np.eye(2)
-    force = solve_each(noise, errors)
-    shift = np.matvec(pulled, force) @ pose[..., :3].mT
-
-    rotated = rotated[..., None, :]  # u and v, two scalars of one point
+    # u and v, two scalars of one point
+    rotated = rotated[..., None, :]
+    moved = moved[..., None, :]
+    covariance = obs.scene_covariance[..., None, :, :]
+    pulled = moved_noise(pose[..., None, :, :], by_point, covariance)
+    noise = by_point @ pulled.mT + obs.scene_sigma_px[..., None, None] ** 2 * np.eye(2)
+    shift = np.linalg.solve(noise, errors[..., None]).mT @ pulled
     jacobian = gradient_by_pose(rotated, by_point)
-    corrected = jacobian - noise_correction(
-        rotated, moved[..., None, :], by_point, shift[..., None, :]
-    )
-    return Block.of_groups(errors, jacobian, inverse_root(noise), corrected)
+    correction = noise_correction(rotated, moved, by_point, shift)
+    return Block.of_groups(errors, jacobian, inverse_root(noise), jacobian - correction)
 
 
 def estimate_pose(
@@ -103,33 +100,27 @@ def estimate_pose(
     -------
     Solution
     """
-
-    def freeze(pose, _):
-        """The residuals; without weights of their own with that of their mean at a pose."""
-        if weighted:
-            return partial(residual, obs=obs)
-        weight = np.mean(_variances(residual(pose, obs)), axis=-1, keepdims=True) ** -0.5
-
-        def plain(pose):
-            block = residual(pose, obs)
-            return Block(block.residuals, block.jacobian, weight)
-
-        return plain
-
-    rounds = 0 if weighted else 2
-    problem, pose = minimise_in_rounds(freeze, pose, move_pose, rounds, **options)
+    problem: Callable = partial(residual, obs=obs)
+    if not weighted:
+        equally = partial(_equally, problem)
+        problem, pose = minimise_in_rounds(equally, pose, move_pose, 2, **options)
     placements = getattr(obs, f"{uses}_placement")
     unknowns = pose_unknowns(method, obs.camera)
     return solve(problem, pose, move_pose, groups=placements, **unknowns, **options)
 
 
-def _variances(block):
-    """Variance of every residual, from its whitener."""
-    if block.whitener.ndim == block.residuals.ndim:
-        return block.whitener**-2.0
-    return np.sum(np.linalg.inv(block.whitener) ** 2, axis=-1).reshape(
-        block.residuals.shape
-    )
+def _equally(problem, pose, _):
+    """The problem with one weight for all residuals, that of their mean variance at a pose."""
+    start = problem(pose)
+    *trials, n = start.residuals.shape
+    roots = np.linalg.inv(start.whitener.reshape(*trials, -1, start.size, start.size))
+    variance = np.sum(roots**2, axis=(-3, -2, -1)) / n
+
+    def plain(pose):
+        block = problem(pose)
+        return Block(block.residuals, block.jacobian, variance[..., None] ** -0.5)
+
+    return plain
 
 
 def start_from_lines(obs: CameraObservations) -> RigidTransform:
@@ -140,12 +131,12 @@ def start_from_lines(obs: CameraObservations) -> RigidTransform:
     obs.require("crossing")
     points = obs.crossing_points
     normals = sight_normals(obs.crossing_lines, obs.model)
-    rotations = start_rotations()
-    offsets = -np.vecdot(normals, points @ rotations.mT)
-    poses = shifted(rotations, normals, offsets)
+    drawn = Rotation.random(ROTATIONS, rng=np.random.default_rng(0))
+    rotations = Rotation.concatenate([Rotation.create_group("O"), drawn])
+    poses = on_planes(rotations.as_matrix(), normals, 0.0, points)
 
     def evaluate(pose):
-        return sight_block(pose, points, normals / START_SIGMA)
+        return sight_block(pose, points, normals)
 
     for robust in (False, True):
         poses = minimise(evaluate, poses, move_pose, robust=robust, max_iterations=40).state
@@ -156,6 +147,5 @@ def start_from_lines(obs: CameraObservations) -> RigidTransform:
             f"camera '{obs.camera}': no pose puts the {len(points)} points in front of the camera"
         )
     poses = poses[ahead]
-    angle = np.abs(sight_block(poses, points, normals).residuals) / np.abs(depth[ahead])
-    best = np.sort(angle, axis=1)[:, : max(6, int(AGREEING * len(points)))]
-    return pose_transform(poses[np.argmin(np.sum(best**2, axis=1))])
+    sines = evaluate(poses).residuals / depth[ahead]
+    return pose_transform(poses[np.argmin(sizes_of_minima(sines**2))])

@@ -8,7 +8,7 @@ from itertools import combinations
 from math import comb
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import minimise
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR
@@ -35,7 +35,6 @@ ROUGH_SIGMA = 0.005  # metres, of a point from its plane, for the search
 CAPPED = 16.0
 NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
 SEEN = 0.8  # of the placements: a few may be wrong
-ROTATIONS = 200  # random ones, beside the 24 of a cube
 FEWEST_PLANES = 5  # that judge a candidate
 FEWEST_LINES = 7  # the same, where placements are single scan lines
 # which of the ten products of three coordinates x, y, 1 each one is, (3, 3, 3, 10)
@@ -167,7 +166,7 @@ def closed_form(triangles: np.ndarray, boards: np.ndarray, rows: np.ndarray) -> 
     outward = np.vecdot(normal, boards[..., 3]) >= 0
     camera = np.where(outward[..., None], normal, -normal)
     across = camera[rows].mT @ source[rows]
-    return _on_planes(across, normal[rows], boards[rows, :, 3], centre[rows])
+    return on_planes(across, normal[rows], boards[rows, :, 3], centre[rows])
 
 
 def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
@@ -204,27 +203,32 @@ def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
     rotation = np.stack([x, y, np.cross(x, y)], axis=-1)
     rotation /= np.maximum(np.linalg.norm(x, axis=-1), 1e-12)[..., None, None]
     each = (..., None, slice(None), slice(None))  # of the eight
-    return _on_planes(rotation, normal[each], boards[..., 3][each], centre[each])
+    return on_planes(rotation, normal[each], boards[..., 3][each], centre[each])
 
 
-def shifted(rotation: np.ndarray, normal: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Poses (..., 3, 4) of rotations with the translation for which ``n . t = right`` fits best.
+def on_planes(
+    rotation: np.ndarray,
+    normal: np.ndarray,
+    point: np.ndarray | float,
+    centre: np.ndarray,
+) -> np.ndarray:
+    """Poses (..., 3, 4) with the proper rotations nearest to some matrices that put points on
+    planes as well as they can.
 
     Parameters
     ----------
     rotation : ndarray, shape (..., 3, 3)
-    normal : ndarray, shape (..., k, 3)
-    right : ndarray, shape (..., k)
-        Metres.
+    normal, point : ndarray, shape (..., k, 3)
+        Of the planes, camera frame, metres.
+    centre : ndarray, shape (..., k, 3)
+        The points, source frame, metres.
     """
-    shift = np.linalg.pinv(normal) @ right[..., None]
+    u, _, vt = np.linalg.svd(rotation)
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    rotation = u @ vt
+    away = np.vecdot(normal, point - centre @ rotation.mT)
+    shift = np.linalg.pinv(normal) @ away[..., None]
     return np.concatenate([rotation, shift], axis=-1)
-
-
-def start_rotations() -> np.ndarray:
-    """The 24 rotations of a cube and random ones, shape (n, 3, 3)."""
-    drawn = Rotation.random(ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
-    return np.concatenate([Rotation.create_group("O").as_matrix(), drawn])
 
 
 def _threes(p):
@@ -260,17 +264,6 @@ def _centred(triangles):
     """
     turned = np.linalg.qr(np.roll(triangles, 1, axis=-1), mode="r")
     return turned[..., 1:, 1:], turned[..., 0, 1:] / turned[..., 0, :1]
-
-
-def _on_planes(rotation, normal, point, centre):
-    """Poses with the proper rotations nearest to some matrices that put centroids on planes as
-    well as they can.
-    """
-    u, _, vt = np.linalg.svd(rotation)
-    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
-    rotation = u @ vt
-    moved = centre @ rotation.mT
-    return shifted(rotation, normal, np.vecdot(normal, point - moved))
 
 
 @np.errstate(all="ignore")
