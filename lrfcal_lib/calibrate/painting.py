@@ -102,7 +102,7 @@ class Painter:
 
         def work(rows, worker):
             """Some points, into the depth buffers of one thread."""
-            part = _single(points[rows])
+            part = _single(points[rows].T)
             for eye in self.eyes:
                 colouring.hide(part, eye, worker)
 
@@ -136,10 +136,10 @@ class Painter:
 
         def work(rows, _):
             """Some points, seen by all images."""
-            part = _single(points[rows])
+            part = _single(points[rows].T)
             facing = _single(normals[rows])
-            sums = np.zeros((len(part), 4), np.float32)
-            best = np.zeros(len(part), np.float32)
+            sums = np.zeros((len(facing), 4), np.float32)
+            best = np.zeros(len(facing), np.float32)
             for eye in self.eyes[only]:
                 colouring.paint(part, facing, eye, sums, best, source[rows])
             weight = sums[:, 3:]
