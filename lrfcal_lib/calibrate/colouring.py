@@ -82,7 +82,7 @@ def hide(points, eye, worker):
 def paint(points, normals, eye, sums, best, source):
     """Add what one image says about the colours of points (3, n) to `sums` (n, 4).
 
-    `sums` are weighted red, green and blue in the exposure of all images together, and the weight:
+    `sums` are weighted blue, green and red in the exposure of all images together, and the weight:
     the cosine of incidence by the squared distance, next to nothing where the image is too dark or
     too bright. `source` becomes the number of the image where its weight is above `best`. A point
     is seen unless it lies behind the nearest one of its cell by more than the noise and the slant
@@ -171,7 +171,7 @@ def _locate(points, eye):
 
 @njit(**COMPILED)
 def _tone(image, u, v, tone):
-    """Fill `tone` with red, green and blue of a pixel between four, and return the brightest."""
+    """Fill `tone` with blue, green and red of a pixel between four, and return the brightest."""
     height, width, _ = image.shape
     u0 = min(max(u, 0.0), width - 1.0)
     v0 = min(max(v, 0.0), height - 1.0)
@@ -181,10 +181,8 @@ def _tone(image, u, v, tone):
     g = v0 - row
     brightest = 0.0
     for j in range(3):
-        above = (1 - f) * image[row, column, 2 - j] + f * image[row, column + 1, 2 - j]
-        below = (1 - f) * image[row + 1, column, 2 - j] + f * image[
-            row + 1, column + 1, 2 - j
-        ]
+        above = (1 - f) * image[row, column, j] + f * image[row, column + 1, j]
+        below = (1 - f) * image[row + 1, column, j] + f * image[row + 1, column + 1, j]
         tone[j] = (1 - g) * above + g * below
         brightest = max(brightest, tone[j])
     return brightest

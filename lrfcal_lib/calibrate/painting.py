@@ -143,7 +143,7 @@ class Painter:
             for eye in self.eyes[only]:
                 colouring.paint(part, facing, eye, sums, best, source[rows])
             weight = sums[:, 3:]
-            np.divide(sums[:, :3], weight, out=colors[rows], where=weight > 0)
+            np.divide(sums[:, 2::-1], weight, out=colors[rows], where=weight > 0)
 
         _share(work, n)
         return colors, ~np.isnan(colors[:, 0]), source

@@ -218,10 +218,9 @@ def _joined(numbers, pairs, problems, of_rig):
 
 def _excess(joined, pair):
     """By how much a pair misses the poses of all, as a share of what is allowed."""
-    miss = pair.miss(joined.T_world_station)
-    allowed = GREATEST_MISS * sigma_of(pair.covariance)
-    allowed = np.maximum(allowed, np.repeat(ALLOWED_MISS, 3))
-    return np.max(np.abs(miss) / allowed)
+    expected = GREATEST_MISS * sigma_of(pair.covariance)
+    allowed = np.maximum(expected, np.repeat(ALLOWED_MISS, 3))
+    return np.max(np.abs(pair.miss(joined.T_world_station)) / allowed)
 
 
 def advice(joined: Joined) -> list[str]:

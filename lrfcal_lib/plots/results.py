@@ -148,7 +148,14 @@ def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
         color = series(row)
         height = row + 0.5 * _side_by_side(values)
         ax.plot(values, height, "o", color=color, markersize=3.5, alpha=0.8)
-        ax.vlines(np.mean(values), row - 0.36, row + 0.36, color, linewidth=2.5, capstyle="projecting")
+        ax.vlines(
+            np.mean(values),
+            row - 0.36,
+            row + 0.36,
+            color,
+            linewidth=2.5,
+            capstyle="projecting",
+        )
     ax.axvline(0, color=TRUTH, linewidth=0.8)
     ax.grid(False, axis="y")
     rows_of(ax, errors, "measured - true length [mm]")
