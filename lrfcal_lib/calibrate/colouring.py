@@ -55,6 +55,8 @@ class Eye(NamedTuple):
     exposure : ndarray, shape (2,)
         Logarithms of gain, and of fall-off at the squared distance 1 from the middle.
     number : int
+    corner : float
+        Squared distance of a corner from the middle, pixels.
     """
 
     pose: np.ndarray
@@ -66,6 +68,7 @@ class Eye(NamedTuple):
     noise: float
     exposure: np.ndarray
     number: int
+    corner: float
 
 
 @njit(**COMPILED)
@@ -90,8 +93,6 @@ def paint(points, normals, eye, sums, best, source):
     """
     lens = eye.lens
     nearest = eye.nearest[0]
-    height, width, _ = eye.image.shape
-    corner = 0.25 * (width * width + height * height)  # squared pixels from the middle
     slant = eye.cell / lens[0]  # of a cell, metres at a distance of one
     centre = eye.centre
     tone = np.empty(3)
@@ -112,7 +113,7 @@ def paint(points, normals, eye, sums, best, source):
         weight = cosine / (distance * distance)
         if not DARK <= brightest <= BRIGHT:
             weight *= CLIPPED
-        radius = ((u[i] - lens[2]) ** 2 + (v[i] - lens[3]) ** 2) / corner
+        radius = ((u[i] - lens[2]) ** 2 + (v[i] - lens[3]) ** 2) / eye.corner
         scale = weight * math.exp(-eye.exposure[0] - eye.exposure[1] * radius)
         for j in range(3):
             sums[i, j] += scale * tone[j]

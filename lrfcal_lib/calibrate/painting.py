@@ -94,6 +94,7 @@ class Painter:
                     noise=noise,
                     exposure=exposure,
                     number=view.number,
+                    corner=np.sum(view.model.size**2) / 4,
                 )
             )
 
