@@ -44,7 +44,8 @@ def folder(session, rig, tmp_path_factory):
     """The files of the scene, whose station has a pose."""
     folder = tmp_path_factory.mktemp("scene")
     counts = []
-    posed = Joined({stations_of(session)[0]: POSE}, SHIFT**2 * SHIFTS, (), ())
+    (number,) = stations_of(session)
+    posed = Joined({number: POSE}, {number: SHIFT**2 * SHIFTS}, (), ())
     files = write_scene(folder, session, rig, posed, ABOUT, counts.append)
     assert sorted(files) == sorted(folder.iterdir())
     assert sum(counts) == len(ply_points(folder))

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.ndimage import find_objects, maximum_filter
 
 from lrfcal_lib.calibrate.cloud import Cloud, join
 from lrfcal_lib.calibrate.painting import View
@@ -77,10 +78,8 @@ def cloud_blocks(
         if mask is None:
             sweep, _ = without_closing(sweep)
         else:
-            lines, beams = (
-                slice(max(0, shown.min() - MARGIN), shown.max() + MARGIN + 1)
-                for shown in np.nonzero(mask)
-            )
+            about = maximum_filter(mask.astype(int), 2 * MARGIN + 1)
+            ((lines, beams),) = find_objects(about)
             sweep = sweep.part(lines, beams)
             mask = mask[lines, beams]
         yield from sweep_blocks(session, rig, sweep, views, mask)
@@ -124,36 +123,35 @@ def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]
         Where there are images and none of them can be posed.
     """
     records = session.images(placement=placement)
+    of_rig = [record for record in records if record.camera in rig.cameras]
     views = []
-    for record in records:
-        if record.camera not in rig.cameras:
-            continue
+    for record in of_rig:
         camera = rig.cameras[record.camera]
         pitch = 0.0
         if camera.mount == "head":
             pitch = float(rig.corrections.pitch(placement, record.pitch))
         if np.isfinite(pitch):
-            number = session.image_records.index(record)
-            T_camera_platform = rig.camera_at(record.camera, pitch)
-            image = session.read_image(record)
             views.append(
-                View(number, record.camera, T_camera_platform, camera.model, image, pitch)
+                View(
+                    number=session.image_records.index(record),
+                    camera=record.camera,
+                    T_camera_platform=rig.camera_at(record.camera, pitch),
+                    model=camera.model,
+                    image=session.read_image(record),
+                    pitch=pitch,
+                )
             )
     if records and not views:
+        why = "the pitch of none is known: state pitch_deg in images.csv"
+        if not of_rig:
+            cameras = ", ".join(sorted({record.camera for record in records}))
+            known = ", ".join(rig.cameras) or "no camera"
+            why = (
+                f"they are of {cameras}, the calibration by '{rig.method}' poses {known}: take "
+                "that of the same rig"
+            )
         raise ValueError(
             f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; "
-            f"{_why_unposed(records, rig)}"
+            f"{why}"
         )
     return views
-
-
-def _why_unposed(records, rig):
-    """Why a rig poses none of these images."""
-    of = {record.camera for record in records}
-    if of & set(rig.cameras):
-        return "the pitch of none is known: state pitch_deg in images.csv"
-    known = ", ".join(rig.cameras) or "no camera"
-    return (
-        f"they are of {', '.join(sorted(of))}, the calibration by '{rig.method}' poses {known}: "
-        "take that of the same rig"
-    )

@@ -1,8 +1,7 @@
 """The inner loops of colouring, compiled by numba once and kept.
 
-Points pass in tiles that stay in the processor's cache: the pixels of a whole tile without a
-branch, in single precision and column by column, so that the compiler takes many at once; then what
-the few in the image need.
+First the pixels of all points without a branch, in single precision and coordinate by coordinate,
+so that the compiler takes many at once; then what the few in the image need.
 """
 
 import math
@@ -19,11 +18,7 @@ COMPILED = {
     "error_model": "numpy",
     "nogil": True,
 }
-TILE = 1024  # points
 LEAST_COSINE = 0.1  # of incidence
-STEEPEST = (
-    math.sqrt(1 - LEAST_COSINE**2) / LEAST_COSINE
-)  # slant of a surface that is coloured
 # levels: below and above these a brightness is clipped, and next to nothing worth
 DARK = 6.0
 BRIGHT = 248.0
@@ -60,6 +55,8 @@ class Eye(NamedTuple):
     exposure : ndarray, shape (2,)
         Logarithms of gain, and of fall-off at the squared distance 1 from the middle.
     number : int
+    corner : float
+        Squared distance of a corner from the middle, pixels.
     """
 
     pose: np.ndarray
@@ -71,95 +68,74 @@ class Eye(NamedTuple):
     noise: float
     exposure: np.ndarray
     number: int
+    corner: float
 
 
 @njit(**COMPILED)
 def hide(points, eye, worker):
-    """Write the distances (metres) of points (n, 3) into a depth buffer of an Eye."""
-    rows = np.empty((6, TILE), np.float32)
-    at = np.empty(TILE, np.int32)
-    far = rows[5]
+    """Write the distances (metres) of points (3, n) into a depth buffer of an Eye."""
+    _, _, far, at = _locate(points, eye)
     nearest = eye.nearest[worker]
-    for start in range(0, len(points), TILE):
-        tile = points[start : start + TILE]
-        _locate(tile, eye, rows, at)
-        for i in range(len(tile)):
-            if at[i] >= 0:
-                nearest[at[i]] = min(nearest[at[i]], far[i])
+    for i in range(len(at)):
+        if at[i] >= 0:
+            nearest[at[i]] = min(nearest[at[i]], far[i])
 
 
 @njit(**COMPILED)
 def paint(points, normals, eye, sums, best, source):
-    """Add what one image says about the colours of points (n, 3) to `sums` (n, 4).
+    """Add what one image says about the colours of points (3, n) to `sums` (n, 4).
 
-    `sums` are weighted red, green and blue in the exposure of all images together, and the weight:
+    `sums` are weighted blue, green and red in the exposure of all images together, and the weight:
     the cosine of incidence by the squared distance, next to nothing where the image is too dark or
     too bright. `source` becomes the number of the image where its weight is above `best`. A point
     is seen unless it lies behind the nearest one of its cell by more than the noise and the slant
-    of its surface over a cell.
+    of its surface over a cell. `normals` are rows, (n, 3).
     """
     lens = eye.lens
     nearest = eye.nearest[0]
-    height, width, _ = eye.image.shape
-    corner = 0.25 * (width * width + height * height)  # squared pixels from the middle
     slant = eye.cell / lens[0]  # of a cell, metres at a distance of one
     centre = eye.centre
-    rows = np.empty((6, TILE), np.float32)
-    at = np.empty(TILE, np.int32)
-    chosen = np.empty(TILE, np.int32)
     tone = np.empty(3)
-    slack = np.float32(eye.noise)
-    least = np.float32(1 - slant * STEEPEST)
-    x, y, z, us, vs, far = rows
-    for start in range(0, len(points), TILE):
-        tile = points[start : start + TILE]
-        few = 0
-        _locate(tile, eye, rows, at)
-        # those that some incidence would let be seen, counted without a branch
-        for i in range(len(tile)):
-            chosen[few] = i
-            few += (at[i] >= 0) & (far[i] * least <= nearest[max(at[i], 0)] + slack)
-        for i in chosen[:few]:
-            k = start + i
-            distance = far[i]
-            way = (x[i] - centre[0], y[i] - centre[1], z[i] - centre[2])
-            along = normals[k, 0] * way[0] + normals[k, 1] * way[1] + normals[k, 2] * way[2]
-            cosine = abs(along) / distance
-            cosine = min(cosine, 1.0) if cosine > LEAST_COSINE else LEAST_COSINE  # NaN too
-            rise = slant * distance * math.sqrt(1 - cosine * cosine) / cosine
-            if distance > nearest[at[i]] + eye.noise + rise:
-                continue
-            brightest = _tone(eye.image, us[i], vs[i], tone)
-            weight = cosine / (distance * distance)
-            if not DARK <= brightest <= BRIGHT:
-                weight *= CLIPPED
-            radius = ((us[i] - lens[2]) ** 2 + (vs[i] - lens[3]) ** 2) / corner
-            scale = weight * math.exp(-eye.exposure[0] - eye.exposure[1] * radius)
-            for j in range(3):
-                sums[k, j] += scale * tone[j]
-            sums[k, 3] += weight
-            if weight > best[k]:
-                best[k] = weight
-                source[k] = eye.number
+    u, v, far, at = _locate(points, eye)
+    for i in range(len(at)):
+        if at[i] < 0:
+            continue
+        distance = far[i]
+        along = 0.0
+        for j in range(3):
+            along += normals[i, j] * (points[j, i] - centre[j])
+        cosine = abs(along) / distance
+        cosine = min(cosine, 1.0) if cosine > LEAST_COSINE else LEAST_COSINE  # NaN too
+        rise = slant * distance * math.sqrt(1 - cosine * cosine) / cosine
+        if distance > nearest[at[i]] + eye.noise + rise:
+            continue
+        brightest = _tone(eye.image, u[i], v[i], tone)
+        weight = cosine / (distance * distance)
+        if not DARK <= brightest <= BRIGHT:
+            weight *= CLIPPED
+        radius = ((u[i] - lens[2]) ** 2 + (v[i] - lens[3]) ** 2) / eye.corner
+        scale = weight * math.exp(-eye.exposure[0] - eye.exposure[1] * radius)
+        for j in range(3):
+            sums[i, j] += scale * tone[j]
+        sums[i, 3] += weight
+        if weight > best[i]:
+            best[i] = weight
+            source[i] = eye.number
 
 
 @njit(**COMPILED)
-def _locate(points, eye, rows, at):
-    """Fill `rows` with x, y, z of a tile of platform points, their pixels and distances, `at` with
-    their cells.
+def _locate(points, eye):
+    """Pixels u and v, distances and cells, each (n,), of platform points (3, n).
 
     The cell is -1 behind the camera, beyond the fold of its lens and outside the image.
     """
-    x = rows[0]
-    y = rows[1]
-    z = rows[2]
-    u = rows[3]
-    v = rows[4]
-    far = rows[5]
-    for i in range(len(points)):
-        x[i] = points[i, 0]
-        y[i] = points[i, 1]
-        z[i] = points[i, 2]
+    x = points[0]
+    y = points[1]
+    z = points[2]
+    u = np.empty_like(x)
+    v = np.empty_like(x)
+    far = np.empty_like(x)
+    at = np.empty(len(x), np.int32)
     r00, r01, r02, t0 = eye.pose[0]
     r10, r11, r12, t1 = eye.pose[1]
     r20, r21, r22, t2 = eye.pose[2]
@@ -169,7 +145,7 @@ def _locate(points, eye, rows, at):
     right = np.float32(width)
     low = np.float32(height)
     columns = np.int32(width / eye.cell + 1)
-    for i in range(len(points)):
+    for i in range(len(x)):
         a = r00 * x[i] + r01 * y[i] + r02 * z[i] + t0
         b = r10 * x[i] + r11 * y[i] + r12 * z[i] + t1
         c = r20 * x[i] + r21 * y[i] + r22 * z[i] + t2
@@ -189,15 +165,14 @@ def _locate(points, eye, rows, at):
             & (row >= ZERO)
             & (row < low)
         )
-        column = column if inside else ZERO
-        row = row if inside else ZERO
-        cell_of_it = np.int32(row * share) * columns + np.int32(column * share)
-        at[i] = cell_of_it if inside else np.int32(-1)
+        cell = np.int32(row * share) * columns + np.int32(column * share)
+        at[i] = cell if inside else np.int32(-1)
+    return u, v, far, at
 
 
 @njit(**COMPILED)
 def _tone(image, u, v, tone):
-    """Fill `tone` with red, green and blue of a pixel between four, and return the brightest."""
+    """Fill `tone` with blue, green and red of a pixel between four, and return the brightest."""
     height, width, _ = image.shape
     u0 = min(max(u, 0.0), width - 1.0)
     v0 = min(max(v, 0.0), height - 1.0)
@@ -207,10 +182,8 @@ def _tone(image, u, v, tone):
     g = v0 - row
     brightest = 0.0
     for j in range(3):
-        above = (1 - f) * image[row, column, 2 - j] + f * image[row, column + 1, 2 - j]
-        below = (1 - f) * image[row + 1, column, 2 - j] + f * image[
-            row + 1, column + 1, 2 - j
-        ]
+        above = (1 - f) * image[row, column, j] + f * image[row, column + 1, j]
+        below = (1 - f) * image[row + 1, column, j] + f * image[row + 1, column + 1, j]
         tone[j] = (1 - g) * above + g * below
         brightest = max(brightest, tone[j])
     return brightest

@@ -94,6 +94,7 @@ class Painter:
                     noise=noise,
                     exposure=exposure,
                     number=view.number,
+                    corner=np.sum(view.model.size**2) / 4,
                 )
             )
 
@@ -102,7 +103,7 @@ class Painter:
 
         def work(rows, worker):
             """Some points, into the depth buffers of one thread."""
-            part = _single(points[rows])
+            part = _single(points[rows].T)
             for eye in self.eyes:
                 colouring.hide(part, eye, worker)
 
@@ -136,14 +137,14 @@ class Painter:
 
         def work(rows, _):
             """Some points, seen by all images."""
-            part = _single(points[rows])
+            part = _single(points[rows].T)
             facing = _single(normals[rows])
-            sums = np.zeros((len(part), 4), np.float32)
-            best = np.zeros(len(part), np.float32)
+            sums = np.zeros((len(facing), 4), np.float32)
+            best = np.zeros(len(facing), np.float32)
             for eye in self.eyes[only]:
                 colouring.paint(part, facing, eye, sums, best, source[rows])
             weight = sums[:, 3:]
-            np.divide(sums[:, :3], weight, out=colors[rows], where=weight > 0)
+            np.divide(sums[:, 2::-1], weight, out=colors[rows], where=weight > 0)
 
         _share(work, n)
         return colors, ~np.isnan(colors[:, 0]), source

@@ -24,7 +24,10 @@ from lrfcal_lib.fit.robust import biweight, robust_sigma, sums_by
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
+    move_pose,
+    pose_array,
     pose_step,
+    pose_transform,
     transform_difference,
     unit_vector,
 )
@@ -420,5 +423,4 @@ def fitted(
 
 def moved(T: RigidTransform, step: np.ndarray) -> RigidTransform:
     """A pose after a turn and a shift (6,): R <- exp(w) R, t <- t + v."""
-    turn = Rotation.from_rotvec(step[:3]) * T.rotation
-    return RigidTransform.from_components(T.translation + step[3:], turn)
+    return pose_transform(move_pose(pose_array(T), step))

@@ -34,24 +34,25 @@ def connected(pairs: Collection[Pair], station: int) -> dict[int, RigidTransform
     return start | dict(sorted(poses.items()))
 
 
-def solved(pairs: list[Pair], station: int) -> tuple[dict[int, RigidTransform], np.ndarray]:
+def solved(
+    pairs: list[Pair], start: dict[int, RigidTransform]
+) -> tuple[dict[int, RigidTransform], np.ndarray]:
     """The poses that make the misses of all pairs small, each by its covariance.
 
     Parameters
     ----------
     pairs : list of Pair
         One or more, between stations that they connect.
-    station : int
-        Whose frame the poses are in.
+    start : dict of int to RigidTransform
+        Of :func:`connected`; the first one stays.
 
     Returns
     -------
     poses : dict of int to RigidTransform
-    response : ndarray, shape (6 n, 6 e)
-        Of turn and shift of each, in the order of `poses`, to those of the pairs; zeros for
-        `station`.
+    response : ndarray, shape (n, 6, 6 e)
+        Of turn and shift of each, in the order of `poses`, to those of the pairs; zeros for the
+        first.
     """
-    start = connected(pairs, station)
     size = 6 * len(start) - 6
 
     def after(steps):
@@ -66,4 +67,5 @@ def solved(pairs: list[Pair], station: int) -> tuple[dict[int, RigidTransform], 
     best = least_squares(residuals, np.zeros(size), jac="3-point", x_scale="jac")
     whiten = block_diag(*(pair.whiten for pair in pairs))
     response = np.linalg.pinv(best.jac) @ whiten
-    return after(best.x), np.pad(response, ((6, 0), (0, 0)))
+    of_others = response.reshape(-1, 6, 6 * len(pairs))
+    return after(best.x), np.pad(of_others, ((1, 0), (0, 0), (0, 0)))

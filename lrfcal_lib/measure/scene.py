@@ -251,7 +251,7 @@ def _written(writer, session, rig, joined, told, clouds, scenes):
         for cloud in writer.scan(f"station {number}", guid, pose, intensity, blocks):
             thinned.append(cloud.rows(slice(None, None, every)))
             told(len(cloud.points))
-            yield placed(cloud, pose, joined.covariance_of(number))
+            yield placed(cloud, pose, joined.covariance[number])
         scenes[number] = features_of(join(thinned), rig, station.views)
         for view in station.views:
             name = f"station {number}, {view.camera}, image {view.number}"

@@ -53,8 +53,8 @@ class Joined:
     ----------
     T_world_station : dict of int to RigidTransform
         Of all stations that could be joined. The world is the platform frame of the first of them.
-    covariance : ndarray, shape (6 n, 6 n)
-        Of turn and shift of each in the order of `T_world_station`; zeros for the first.
+    covariance : dict of int to ndarray, shape (6, 6)
+        Of turn and shift of each; zeros for the first.
     pairs : tuple of Pair
         That were used.
     problems : tuple of Problem
@@ -62,7 +62,7 @@ class Joined:
     """
 
     T_world_station: dict[int, RigidTransform]
-    covariance: np.ndarray
+    covariance: dict[int, np.ndarray]
     pairs: tuple[Pair, ...]
     problems: tuple[Problem, ...]
 
@@ -74,15 +74,10 @@ class Joined:
         miss = pair.miss(self.T_world_station).reshape(2, 3)
         return np.linalg.norm(miss, axis=1)
 
-    def covariance_of(self, station: int) -> np.ndarray:
-        """Of turn and shift of a station, (6, 6)."""
-        place = 6 * list(self.T_world_station).index(station)
-        return self.covariance[place : place + 6, place : place + 6]
-
 
 def alone(station: int) -> Joined:
     """One station in its own frame."""
-    return Joined({station: RigidTransform.identity()}, np.zeros((6, 6)), (), ())
+    return Joined({station: RigidTransform.identity()}, {station: np.zeros((6, 6))}, (), ())
 
 
 def join_stations(clouds: Mapping[int, Cloud], rig: CalibratedRig | None = None) -> Joined:
@@ -145,18 +140,16 @@ def join_pair(
     first, second = names
     tried = candidates(coarse[first], coarse[second])
     good = [c for c in tried if c.overlap > LEAST_OVERLAP and c.against < MOST_AGAINST]
-    if not tried:
-        words = "they have no two directions of walls in common"
-        return _problem(names, ProblemKind.NO_OVERLAP, words)
     if not good:
-        best = max(tried, key=lambda c: c.overlap)
-        return _problem(
-            names,
-            ProblemKind.NO_OVERLAP,
-            f"they do not overlap enough: at best {100 * best.overlap:.0f} % of the surfaces fall "
-            f"together, while {100 * best.against:.0f} % of what one saw stands where the other "
-            "looked through",
-        )
+        words = "they have no two directions of walls in common"
+        if tried:
+            best = max(tried, key=lambda c: c.overlap)
+            words = (
+                f"they do not overlap enough: at best {100 * best.overlap:.0f} % of the surfaces "
+                f"fall together, while {100 * best.against:.0f} % of what one saw stands where the "
+                "other looked through"
+            )
+        return _problem(names, ProblemKind.NO_OVERLAP, words)
     best = good[0]
     for other in tried:
         as_much = other.overlap > RIVAL * best.overlap and other.against < DOUBTFUL
@@ -171,13 +164,13 @@ def join_pair(
             )
     pair = fitted(names, fine[first], fine[second], best.T_first_second)
     turn_and_shift = [pair.covariance[:3, :3], pair.covariance[3:, 3:]]
-    variance = np.linalg.eigvalsh(turn_and_shift)[:, -1]
+    variance = np.linalg.norm(turn_and_shift, 2, axis=(1, 2))  # in the worst direction
     if pair.held < LEAST_HELD or np.any(np.sqrt(variance) > MOST_SIGMA):
-        x, y, z = pair.loose
+        loose = "({:.2f}, {:.2f}, {:.2f})".format(*pair.loose)
         return _problem(
             names,
             ProblemKind.AMBIGUOUS,
-            f"nothing holds the second along ({x:.2f}, {y:.2f}, {z:.2f}) of the first, where "
+            f"nothing holds the second along {loose} of the first, where "
             f"{100 * pair.held:.1f} % of the surfaces stand across: a corridor, or too little of "
             "both in view",
         )
@@ -185,8 +178,7 @@ def join_pair(
 
 
 def _problem(names, kind, words):
-    first, second = names
-    return Problem(Stage.STATIONS, kind, f"stations {first} and {second}: {words}")
+    return Problem(Stage.STATIONS, kind, "stations {} and {}: {}".format(*names, words))
 
 
 def _joined(numbers, pairs, problems, of_rig):
@@ -196,12 +188,13 @@ def _joined(numbers, pairs, problems, of_rig):
     pairs = [pair for pair in pairs if pair.first in largest]
     joined = alone(reference)
     if pairs:
-        poses, response = solved(pairs, reference)
+        poses, response = solved(pairs, largest)
         # noise of each pair, and the calibration, common to all
         noise = block_diag(*(pair.covariance for pair in pairs))
         by_rig = response @ np.vstack([pair.by_rig for pair in pairs])
-        covariance = response @ noise @ response.T + by_rig @ of_rig @ by_rig.T
-        joined = Joined(poses, covariance, tuple(pairs), ())
+        covariance = response @ noise @ response.mT + by_rig @ of_rig @ by_rig.mT
+        of_each = dict(zip(poses, covariance, strict=True))
+        joined = Joined(poses, of_each, tuple(pairs), ())
         worst = max(pairs, key=partial(_excess, joined))
         if _excess(joined, worst) >= 1.0:
             turn, shift = joined.miss(worst)
@@ -225,10 +218,9 @@ def _joined(numbers, pairs, problems, of_rig):
 
 def _excess(joined, pair):
     """By how much a pair misses the poses of all, as a share of what is allowed."""
-    miss = pair.miss(joined.T_world_station)
-    allowed = GREATEST_MISS * sigma_of(pair.covariance)
-    allowed = np.maximum(allowed, np.repeat(ALLOWED_MISS, 3))
-    return float(np.max(np.abs(miss) / allowed))
+    expected = GREATEST_MISS * sigma_of(pair.covariance)
+    allowed = np.maximum(expected, np.repeat(ALLOWED_MISS, 3))
+    return np.max(np.abs(pair.miss(joined.T_world_station)) / allowed)
 
 
 def advice(joined: Joined) -> list[str]:
@@ -269,7 +261,7 @@ def joined_cloud(clouds: Mapping[int, Cloud], joined: Joined) -> Cloud:
         With the sigma of the stations' poses added to that of the points.
     """
     return join(
-        placed(clouds[number], T, joined.covariance_of(number))
+        placed(clouds[number], T, joined.covariance[number])
         for number, T in joined.T_world_station.items()
     )
 

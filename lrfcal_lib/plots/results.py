@@ -18,21 +18,20 @@ WORST = 4.0  # times the median: a placement that fits so badly is an outlier
 
 def by_placement(ax: Axes, names: Sequence | np.ndarray, label: str) -> None:
     """Ticks and labels of an axis of placements; the zero of what is drawn over them."""
-    ax.set(
-        xlabel="placement", ylabel=label, xticks=np.arange(len(names)), xticklabels=names
-    )
+    ax.set(xlabel="placement", ylabel=label, xticks=range(len(names)), xticklabels=names)
     ax.grid(False, axis="x")
     ax.axhline(0, color=TRUTH, linewidth=0.8)
 
 
 def rows_of(ax: Axes, names: Sequence | Mapping, label: str) -> None:
     """Ticks of rows from above to below, and what they are drawn over."""
-    ax.set_yticks(range(len(names)), names)
-    ax.set(xlabel=label, ylim=(len(names) - 0.5, -0.5))
+    rows = len(names)
+    ax.set(xlabel=label, yticks=range(rows), yticklabels=names, ylim=(rows - 0.5, -0.5))
 
 
-def _side_by_side(count):
-    """Places of so many dots in a strip from -0.5 to 0.5."""
+def _side_by_side(values):
+    """Places of the dots of values in a strip from -0.5 to 0.5."""
+    count = len(values)
     return (np.arange(count) + 0.5) / count - 0.5
 
 
@@ -55,14 +54,13 @@ def residual_strips(
         The quantity with its unit.
     color
     """
-    names, columns = np.unique(placement, return_inverse=True)
-    for column in range(len(names)):
-        values = residuals[columns == column]
+    groups = pd.Series(residuals).groupby(placement)
+    for column, (_, values) in enumerate(groups):
         rms = _rms(values)
         ax.bar(column, 2 * rms, 0.8, -rms, color=color, alpha=0.2, linewidth=0)
-        at = column + 0.6 * _side_by_side(len(values))
+        at = column + 0.6 * _side_by_side(values)
         ax.plot(at, values, ".", color=color, markersize=2.5)
-    by_placement(ax, names.tolist(), label)
+    by_placement(ax, list(groups.groups), label)
 
 
 def pitch_offsets(
@@ -70,7 +68,7 @@ def pitch_offsets(
     placement: Sequence[int],
     offset: ArrayLike,
     sigma: ArrayLike,
-    direction: ArrayLike,
+    direction: np.ndarray,
 ) -> None:
     """Pitch offset of each sweep, coloured by direction.
 
@@ -88,7 +86,7 @@ def pitch_offsets(
     sigma = np.degrees(sigma)
     kinds = {1: "upwards", -1: "downwards", 0: "unknown"}
     for index, (sign, label) in enumerate(kinds.items()):
-        rows = np.flatnonzero(np.equal(direction, sign))
+        rows = np.flatnonzero(direction == sign)
         ax.bar(
             rows,
             offset[rows],
@@ -124,9 +122,14 @@ def parameter_comparison(
     if true is not None:
         ax.axvline(true, color=TRUTH, linestyle="--", linewidth=1, zorder=0)
     for row, (method, value) in enumerate(values.items()):
-        sigma = sigmas[method] if np.isfinite(sigmas[method]) else None
         ax.errorbar(
-            value, row, xerr=sigma, fmt="o", color=series(row), capsize=2.5, markersize=4.5
+            value,
+            row,
+            xerr=sigmas[method],
+            fmt="o",
+            color=series(row),
+            capsize=2.5,
+            markersize=4.5,
         )
     rows_of(ax, values, label)
     ax.locator_params(axis="x", nbins=4)  # of four digits and a sign, too
@@ -143,10 +146,16 @@ def edge_errors(ax: Axes, errors: Mapping[str, Sequence[float]]) -> None:
     """
     for row, values in enumerate(errors.values()):
         color = series(row)
-        height = row + 0.5 * _side_by_side(len(values))
+        height = row + 0.5 * _side_by_side(values)
         ax.plot(values, height, "o", color=color, markersize=3.5, alpha=0.8)
-        mean = np.mean(values)
-        ax.plot([mean, mean], [row - 0.36, row + 0.36], color=color, linewidth=2.5)
+        ax.vlines(
+            np.mean(values),
+            row - 0.36,
+            row + 0.36,
+            color,
+            linewidth=2.5,
+            capstyle="projecting",
+        )
     ax.axvline(0, color=TRUTH, linewidth=0.8)
     ax.grid(False, axis="y")
     rows_of(ax, errors, "measured - true length [mm]")
@@ -165,8 +174,7 @@ def method_bars(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
     label
         Of its values, with their unit.
     """
-    values = table.pivot(index="method", columns="camera", values=column)
-    values = values.loc[table.method.unique(), table.camera.unique()]
+    values = table.pivot_table(column, "method", "camera", dropna=False, sort=False)
     colors = [color_of(camera, i) for i, camera in enumerate(values)]
     values.plot.barh(ax=ax, width=0.8, color=colors, xlabel=label, ylabel="")
     ax.invert_yaxis()
@@ -201,7 +209,7 @@ def misfit_bars(ax: Axes, misfit: Mapping[int, float]) -> None:
     ax.set(xlabel="placement", ylabel="chi-square per degree of freedom", title=title)
 
 
-def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> None:
+def residuals_by_range(ax: Axes, distance: np.ndarray, residual: np.ndarray) -> None:
     """Range residuals over distance, with means and their standard errors in bins.
 
     Noise scatters, a model error bends; see ``joint_tables.range_residuals``.
@@ -212,7 +220,7 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: ArrayLike) -> N
     distance, residual
         Metres, shape (n,).
     """
-    points = pd.DataFrame({"distance": distance, "residual": 1000 * np.asarray(residual)})
+    points = pd.DataFrame({"distance": distance, "residual": 1000 * residual})
     ax.plot(points.distance, points.residual, ",", color=RAW, zorder=0)
     bins = points.groupby(pd.qcut(points.distance, BINS, duplicates="drop"), observed=True)
     means = bins.mean()
@@ -297,11 +305,9 @@ def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollecti
     if np.nanmin(values, initial=0.0) < 0:
         shades = "RdBu_r"
         low = -limit
-    bearing = np.degrees(cloud.bearing)
-    pitch = np.degrees(cloud.pitch)
     drawn = ax.scatter(
-        bearing,
-        pitch,
+        np.degrees(cloud.bearing),
+        np.degrees(cloud.pitch),
         2.5,
         values,
         marker="s",
@@ -310,12 +316,9 @@ def over_view(ax: Axes, cloud, values: np.ndarray, limit: float) -> PathCollecti
         cmap=shades,
         vmin=low,
         vmax=limit,
+        plotnonfinite=True,  # unseen, they count for the limits
     )
-    ax.set(
-        xlabel="bearing [deg]",
-        ylabel="pitch [deg]",
-        aspect="equal",
-        xlim=(bearing.max(), bearing.min()),
-        ylim=(pitch.min(), pitch.max()),
-    )
+    ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
+    ax.margins(0)
+    ax.invert_xaxis()
     return drawn

@@ -257,7 +257,7 @@ def _sides(image, board, model, ends):
     if set(ends) == set(board.edges):
         inner = np.mean(list(ends.values()), axis=(0, 1))
         return [picked_edge(name, ends[name], inner) for name in board.edges][::-1]
-    corners = undistort(find_polygon(image, len(board.known_corners())), model)
+    corners = undistort(find_polygon(image, len(board.edges), model), model)
     middle = corners.mean(axis=0)
     return [
         refine_edge(image, model, "", a, b, (a + b) / 2 - middle, SEARCH_PX)

@@ -24,13 +24,15 @@ EXACT_CHI2 = 16  # a corner
 SAME_POSE = 1e-3  # radians
 
 
-def find_polygon(image: np.ndarray, n_corners: int) -> np.ndarray:
+def find_polygon(image: np.ndarray, n_corners: int, model: CameraModel) -> np.ndarray:
     """Corners of the largest dark convex polygon, to about a pixel.
 
     Parameters
     ----------
     image : ndarray of uint8, shape (h, w) or (h, w, 3)
     n_corners : int
+    model : CameraModel
+        Says how large the image is.
 
     Returns
     -------
@@ -48,23 +50,20 @@ def find_polygon(image: np.ndarray, n_corners: int) -> np.ndarray:
     for threshold in DARKNESS * level:
         dark = (picture < threshold).astype(np.uint8)
         contours += cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-    last = np.array(picture.shape[::-1]) - 2
-    cut = False
+    why = (
+        f"no dark region with {n_corners} straight edges in the image: the board must stand out "
+        "from the rest"
+    )
     for contour in sorted(contours, key=cv2.contourArea, reverse=True):
         if cv2.contourArea(contour) <= LEAST_AREA_SHARE * picture.size:
             break
         corners = _polygon(contour, n_corners)
         if corners is None:
             continue
-        if np.all((contour > 1) & (contour < last)):
+        if model.shows(contour, 1).all():
             return corners
-        cut = True
-    if cut:
-        raise EdgeNotSeen("the dark board is cut by the image border")
-    raise EdgeNotSeen(
-        f"no dark region with {n_corners} straight edges in the image: the board must stand out "
-        "from the rest"
-    )
+        why = "the dark board is cut by the image border"
+    raise EdgeNotSeen(why)
 
 
 def outline_poses(edges, board: Board, model: CameraModel, view) -> list:
@@ -100,9 +99,13 @@ def outline_poses(edges, board: Board, model: CameraModel, view) -> list:
         named = tuple(
             replace(edge, name=name) for edge, name in zip(turned, board.edges, strict=True)
         )
-        corners = np.ascontiguousarray(corners_of_lines([edge.line for edge in named]))
-        for start in _starts(flat, corners, model):
-            if start.translation[2] <= 0 or frontal(start) <= 0:
+        corners = corners_of_lines([edge.line for edge in named])
+        # three corners have up to four poses
+        _, *solved = cv2.solveP3P(
+            flat[:3], corners[:3], model.matrix, None, cv2.SOLVEPNP_P3P
+        )
+        for start in opencv_poses(*solved):
+            if frontal(start) <= 0:
                 continue
             try:
                 pose, covariance, chi2 = pose_from_edges(named, board, model, start)
@@ -114,7 +117,7 @@ def outline_poses(edges, board: Board, model: CameraModel, view) -> list:
                 pose.rotation.approx_equal(other.T_camera_board.rotation, SAME_POSE)
                 for other in views
             )
-            if exact and frontal(pose) > 0 and not known:
+            if exact and not known:
                 explained = replace(
                     view, T_camera_board=pose, covariance=covariance, edges=named
                 )
@@ -133,29 +136,16 @@ def frontal(pose: RigidTransform) -> float:
 
 def _polygon(contour, n_corners):
     """The polygon around a contour; None where the region does not fill it or has other corners."""
-    least = cv2.contourArea(contour) / LEAST_FILL
+    most = cv2.contourArea(contour) / LEAST_FILL
     hull = cv2.convexHull(contour)
-    if cv2.contourArea(hull) > least or len(hull) < n_corners:
+    if cv2.contourArea(hull) > most or len(hull) < n_corners:
         return None
     if n_corners == 3:
         corners = cv2.minEnclosingTriangle(hull)[1]
     else:
         corners = cv2.approxPolyN(hull, n_corners, None, -1.0, True)
-    if corners is None or corners.size != 2 * n_corners:
-        return None
-    corners = corners.reshape(-1, 2).astype(np.float32)
     area = cv2.contourArea(corners, True)  # above 0 clockwise
-    if abs(area) > least:
+    if abs(area) > most:
         return None
-    return (corners if area > 0 else corners[::-1]).astype(float)
-
-
-def _starts(flat, corners, model):
-    """Poses by OpenCV that put the corners (n, 3) of a board near pixels (n, 2)."""
-    if len(flat) == 3:
-        solved = cv2.solveP3P(flat, corners, model.matrix, None, cv2.SOLVEPNP_P3P)
-    else:
-        solved = cv2.solvePnPGeneric(
-            flat, corners, model.matrix, None, flags=cv2.SOLVEPNP_IPPE
-        )
-    return opencv_poses(*solved[1:3])
+    corners = corners.reshape(-1, 2)
+    return corners if area > 0 else corners[::-1]

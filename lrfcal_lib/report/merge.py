@@ -94,7 +94,7 @@ def stations_table(joined: Joined) -> pd.DataFrame:
     """Where the stations stood in the joined frame, and how well that is known."""
     rows = []
     for number, T in joined.T_world_station.items():
-        turn, shift = sigma_turn_shift(joined.covariance_of(number))
+        turn, shift = sigma_turn_shift(joined.covariance[number])
         yaw = T.rotation.as_euler("ZYX", degrees=True)[0]
         rows.append([number, *T.translation, yaw, 1000 * shift, np.degrees(turn)])
     names = ["station", "x_m", "y_m", "z_m", "yaw_deg", "sigma_mm", "sigma_deg"]
