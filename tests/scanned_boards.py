@@ -21,11 +21,12 @@ TRIANGLE = triangle_board()
 
 
 def edge_points(scan):
-    return crossings(scan)[0]["half_step"]
+    return crossings(scan, False, {})[0]["half_step"]
 
 
 def sweep_edges(scan):
-    return crossings(scan, True, crossings(scan)[1])[0]["half_step"]
+    sides = crossings(scan, False, {})[1]
+    return crossings(scan, True, sides)[0]["half_step"]
 
 
 def facing(distance=1.6, roll=8.0, tilt=20.0, centre=(0.4, 0.35), x=0.0):

@@ -1,6 +1,7 @@
 """Is what was just recorded any good? Lights for one placement, from what is on the disk."""
 
 import math
+from collections import ChainMap
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
@@ -156,7 +157,7 @@ def check_scan(
 def _check_sides(scan):
     """How many straight sides of the board the scans cross, and how."""
     ways = all_crossings(scan)["half_step"]
-    by_number = {side.side: side for way in reversed(ways) for side in way.sides}
+    by_number = ChainMap(*(way.sides for way in ways))
     good = [side for side in by_number.values() if side.n_points >= FEWEST_CROSSINGS]
     if not good:
         return Light("edges", "bad", NO_SIDE)

@@ -226,9 +226,11 @@ def _ends_of_lines(ranges, setup, last_beam):
     if not last_beam:
         ends = ends + np.array([-0.5, 0.5]) * setup.step
     of_line = np.linalg.inv(information) * setup.sigma_range**2
-    found = crossings_of(lines.repeat(2, axis=0), of_line.repeat(2, axis=0), ends.ravel())
-    points = found.points.reshape(sessions, placements, -1, 3)
-    covariance = found.covariance(setup.step * UNIFORM)
+    points, noise, by_bearing = crossings_of(
+        lines.repeat(2, axis=0), of_line.repeat(2, axis=0), ends.ravel()
+    )
+    points = points.reshape(sessions, placements, -1, 3)
+    covariance = dyads(noise) + dyads(by_bearing * setup.step * UNIFORM)
     return points, covariance.reshape(*points.shape, 3)
 
 

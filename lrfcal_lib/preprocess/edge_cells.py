@@ -15,8 +15,7 @@ from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
     MIXING,
     ScanEdges,
-    background_odds,
-    beyond,
+    background_of,
     plane_range,
     within,
 )
@@ -61,19 +60,18 @@ def edge_cells(scan: BoardScan, ways: Sequence[ScanEdges], lrf: LrfInfo) -> np.r
     board, cosine = plane_range(scan, rays, sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
     radius = lrf.spot_radius(board)
-    here = board[tuple(cell.T)]
-    behind = beyond(scan, cell, step)
-    visible = np.isfinite(behind)
-    mixed = behind - here < MIXING
+    gap, odds = background_of(scan, board, cell, step)
+    visible = np.isfinite(gap)
+    mixed = gap < MIXING
     close = 2 * visible.sum() < len(visible) or 2 * mixed.sum() >= len(mixed)
-    odds = np.where(close, 0.0, background_odds(here, behind))
+    odds = np.where(close, 0.0, odds)
     usable = np.flatnonzero(close | (visible & ~mixed))
 
     row, k, line, beam = _neighbours(usable, cell, step, scan.mask.shape)
     cells = line, beam
     gaps = median_step(sweep.pitch), median_step(sweep.bearings)
     hit, keep = _readings(scan, cells, k, board, radius, gaps, close)
-    sides = [s for edges in ways for s in edges.sides]
+    sides = [numbered for edges in ways for numbered in edges.sides.items()]
     side = side[row, 0]
     reach = (CORNER * radius / np.abs(cosine))[cells]
     keep &= _on_one_side(scan, cells, board, reach, sides, side)
@@ -152,14 +150,14 @@ def _on_one_side(scan, cells, board, reach, sides, side):
     line, beam = cells
     p_lrf = polar_to_points(board[cells], scan.sweep.bearings[beam])
     flat = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf) @ axes.T
-    keep = ~np.isin(side, [s.side for s in sides])
+    keep = ~np.isin(side, [number for number, _ in sides])
     alone = np.ones(len(side), bool)
-    for s in sides:
+    for number, s in sides:
         first, last = s.ends @ axes.T
         x, y = unit_vector(last - first)
         along = (flat - first) @ [x, y]
         apart = np.abs((flat - first) @ [-y, x])
-        mine = side == s.side
+        mine = side == number
         keep |= mine & (along > 0) & (along < s.length)
         alone &= mine | ~(apart < reach)
     return keep & alone

@@ -236,7 +236,7 @@ def all_crossings(scan: BoardScan) -> dict[str, list[ScanEdges]]:
     dict of str to list of ScanEdges
         By edge-point variant.
     """
-    along, sides = crossings(scan)
+    along, sides = crossings(scan, False, {})
     ways = [along]
     if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
         ways.append(crossings(scan, True, sides)[0])
