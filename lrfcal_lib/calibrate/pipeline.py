@@ -38,10 +38,9 @@ from lrfcal_lib.preprocess.prepared import (
     VARIANTS,
     PitchNoise,
     Prepared,
-    prepare_images,
     prepare_scans,
 )
-from lrfcal_lib.preprocess.survey import all_views
+from lrfcal_lib.preprocess.survey import all_views, prepare_images
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.workers import spread

@@ -17,19 +17,17 @@ ROOM_PX = 60  # edges are looked for 40 px beside their prediction
 class Part:
     """The part of an image around the board.
 
-    `shape` is that of the image, `left` and `top` tell where the part begins.
+    `shape` is that of the image, `place` are the rows and columns of the part.
     """
 
     shape: tuple
-    left: int
-    top: int
+    place: tuple[slice, slice]
     pixels: np.ndarray
 
     def image(self) -> np.ndarray:
         """The image, black where nothing of the board can be."""
-        height, width = self.pixels.shape[:2]
         image = np.zeros(self.shape, np.uint8)
-        image[self.top : self.top + height, self.left : self.left + width] = self.pixels
+        image[self.place] = self.pixels
         return image
 
 
@@ -52,11 +50,12 @@ def part_around(image: np.ndarray, corners: np.ndarray, board) -> Part:
     beyond = FARTHEST + ALONG  # squares
     if board.corners is not None:
         grid = pattern.points()[:, :2]
-        low = np.max(grid.min(axis=0) - board.corners)
-        high = np.max(board.corners - grid.max(axis=0))
-        beyond = max(low, high) / pattern.square
+        before = grid.min(axis=0) - board.corners
+        behind = board.corners - grid.max(axis=0)
+        beyond = np.maximum(before, behind).max() / pattern.square
     sides = np.linalg.norm(square_axes(pattern.grid(corners)), axis=-2)
     room = NEARER * beyond * sides.max() + ROOM_PX
     left, top = np.maximum(corners.min(axis=0) - room, 0).astype(int)
     right, bottom = (corners.max(axis=0) + room + 1).astype(int)
-    return Part(image.shape, left, top, image[top:bottom, left:right].copy())
+    place = np.s_[top:bottom, left:right]
+    return Part(image.shape, place, image[place].copy())

@@ -46,10 +46,6 @@ OPPOSITE = [2, 3, 0, 1]
 SIDE_NORMALS = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
 
 
-class OutlineNotSeen(ValueError):
-    """The images do not show where a board ends: a sheet on a wall, a background as bright."""
-
-
 @dataclass(frozen=True)
 class Outline:
     """The outer edges of a board, measured in the scale of its pattern.
@@ -145,7 +141,7 @@ def turned_views(votes: np.ndarray, up: np.ndarray, leader: Sequence[int]) -> np
     return turned if np.mean(upright) >= 0.5 else ~turned
 
 
-def common_lines(votes: np.ndarray, board) -> np.ndarray:
+def common_lines(votes: np.ndarray, board) -> tuple[np.ndarray | None, str]:
     """Sides of a board that views turned alike agree on.
 
     Parameters
@@ -157,13 +153,11 @@ def common_lines(votes: np.ndarray, board) -> np.ndarray:
 
     Returns
     -------
-    ndarray, shape (4, 3)
+    lines : ndarray, shape (4, 3), or None
         Board-frame lines, unit normals out of the board.
-
-    Raises
-    ------
-    OutlineNotSeen
-        Names the first edge that they do not agree on.
+    unseen : str
+        Names the first edge that they do not agree on, as with a sheet on a wall, or a background
+        as bright.
     """
     wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), MOVES_BETWEEN, axis=-1)
     visible = wide >= 0
@@ -174,12 +168,12 @@ def common_lines(votes: np.ndarray, board) -> np.ndarray:
     for name, of_side in zip(SIDES, gaussian_filter1d(mean, 1.0), strict=True):
         place = _outer_peak(of_side)
         if place is None:
-            raise OutlineNotSeen(
+            return None, (
                 f"the images do not agree on the {name} edge of board '{board.name}': give the "
                 "corners of the board or pick edges by hand"
             )
         places.append(place)
-    return side_lines(board.pattern, _distances(board.pattern)[places])
+    return side_lines(board.pattern, _distances(board.pattern)[places]), ""
 
 
 def side_lines(pattern: Chessboard, distances) -> np.ndarray:

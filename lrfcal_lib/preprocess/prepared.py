@@ -1,19 +1,17 @@
 """A session after preprocessing: the board in every sweep and image, and what could not be used."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.problem import LEAVES_OUT, Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, BoardScan, find_board
 from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, ScanEdges, crossings
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.outline_in_images import Outline
-from lrfcal_lib.preprocess.survey import small_squares, survey
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session
@@ -241,46 +239,3 @@ def all_crossings(scan: BoardScan) -> dict[str, list[ScanEdges]]:
     if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
         ways.append(crossings(scan, True, sides)[0])
     return {variant: [way[variant] for way in ways] for variant in VARIANTS}
-
-
-def prepare_images(prepared: Prepared) -> Prepared:
-    """The same with the cameras of the session.
-
-    Parameters
-    ----------
-    prepared : Prepared
-        Of :func:`prepare_scans`.
-
-    Returns
-    -------
-    Prepared
-        With the board in every image, the cameras' intrinsics, and the board's outline.
-    """
-    try:
-        surveyed = survey(prepared.session)
-    except DegenerateGeometry as error:  # what remains is a session without cameras
-        words = f"no image can be used: {error}"
-        lost = Problem(Stage.IMAGES, ProblemKind.NO_IMAGES, words)
-        return replace(prepared, problems=(*prepared.problems, lost))
-    views = {}
-    for camera, of_camera in surveyed.views.items():
-        ordered = sorted(of_camera, key=lambda view: view.placement)
-        # an image that belongs to no placement is left out
-        views[camera] = {v.placement: v for v in ordered if v.placement >= 0}
-    problems = list(prepared.problems)
-    if surveyed.unseen:
-        words = f"faces of the board only: {surveyed.unseen}"
-        problems.append(Problem(Stage.IMAGES, ProblemKind.NO_OUTLINE, words))
-    for camera, words in small_squares(views, surveyed.board.pattern).items():
-        problems.append(
-            Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera)
-        )
-    return replace(
-        prepared,
-        models=surveyed.models,
-        views=views,
-        board=surveyed.board,
-        outline=surveyed.outline,
-        relief=surveyed.relief,
-        problems=tuple(problems),
-    )

@@ -7,9 +7,8 @@ from itertools import compress
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
 from lrfcal_lib.preprocess.intrinsics import (
     board_pose,
@@ -20,8 +19,6 @@ from lrfcal_lib.preprocess.intrinsics import (
 from lrfcal_lib.preprocess.kept_images import Part, part_around
 from lrfcal_lib.preprocess.outline_in_images import (
     OPPOSITE,
-    Outline,
-    OutlineNotSeen,
     common_lines,
     edge_votes,
     measure_outline,
@@ -36,9 +33,10 @@ from lrfcal_lib.preprocess.pattern_in_image import (
     spread_views,
     square_px,
 )
+from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.preprocess.turns import alike, decide, turned_boards
 from lrfcal_lib.session.files import short
-from lrfcal_lib.session.read import ImageRecord, Session
+from lrfcal_lib.session.read import ImageRecord
 from lrfcal_lib.session.workers import spread
 
 LEAST_VIEWS_FOR_RELIEF = 8
@@ -47,34 +45,6 @@ VIEWS_FOR_INTRINSICS = 25
 # cosine between the normals of poses of which one is the other turned in its plane
 SAME_PLANE = 0.9999
 KEPT_BYTES = 800_000_000  # of all images: half of each of 40 with 12 megapixels
-
-
-@dataclass(frozen=True)
-class Survey:
-    """The board in all images of a session.
-
-    Attributes
-    ----------
-    views : dict of str to list of BoardView
-        By camera.
-    models : dict of str to CameraModel
-        By camera.
-    outline : Outline or None
-        None where the board is known, has no pattern, or does not show where it ends.
-    board : Board
-        With its corners, unless the images do not show them.
-    relief : ndarray, shape (k,), or None
-        Heights of the pattern's corners over the sheet's mean plane, metres.
-    unseen : str
-        Why the outline of the board is not known; its views have poses then and no edges.
-    """
-
-    views: dict[str, list[BoardView]]
-    models: dict[str, CameraModel]
-    outline: Outline | None
-    board: Board
-    relief: np.ndarray | None = None
-    unseen: str = ""
 
 
 @dataclass(frozen=True)
@@ -95,7 +65,29 @@ class Shot:
         return read(self.record) if self.part is None else self.part.image()
 
 
-def survey(session: Session) -> Survey:
+def prepare_images(prepared: Prepared) -> Prepared:
+    """The same with the cameras of the session.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        Of :func:`lrfcal_lib.preprocess.prepared.prepare_scans`.
+
+    Returns
+    -------
+    Prepared
+        With the board in every image, the cameras' intrinsics, and the board's outline; as it was,
+        with a problem more, where no image can be used.
+    """
+    try:
+        return survey(prepared)
+    except DegenerateGeometry as error:  # what remains is a session without cameras
+        words = f"no image can be used: {error}"
+        lost = Problem(Stage.IMAGES, ProblemKind.NO_IMAGES, words)
+        return replace(prepared, problems=(*prepared.problems, lost))
+
+
+def survey(prepared: Prepared) -> Prepared:
     """Find the board in the images of all cameras, one of each camera and placement.
 
     Of those that show the board it is the one whose pitch is nearest to the middle of the
@@ -103,25 +95,26 @@ def survey(session: Session) -> Survey:
 
     Parameters
     ----------
-    session : Session
-        A camera without a model asks for an estimate from these images.
+    prepared : Prepared
+        A camera of its session without a model asks for an estimate from these images.
 
     Returns
     -------
-    Survey
+    Prepared
 
     Raises
     ------
     ValueError
         If a camera has no intrinsics and the board no pattern, or too few images show it.
     """
+    session = prepared.session
     board = session.board
     stated = {name: camera.model for name, camera in session.cameras.items()}
     unknown = [name for name, model in stated.items() if model is None]
     read = session.read_image
     look = partial(_look, read=read, board=board, picks=session.picks)
     if board.pattern is None:
-        return _survey_plain(session, look, stated, unknown)
+        return _survey_plain(prepared, look, stated, unknown)
 
     groups = _choices(session, {"board", "intrinsics"})
     finder = PatternFinder(board.pattern)
@@ -146,14 +139,27 @@ def survey(session: Session) -> Survey:
         outline = measure_outline(views, board, models)
         board = outline.board
     lost = [shot.view for shot in begun if shot.reason]
-    return Survey(
-        views=_by_camera(models, views + lost),
-        models=models,
-        outline=outline,
-        board=board,
-        relief=relief,
-        unseen=unseen,
-    )
+    surveyed = replace(prepared, models=models, board=board, outline=outline, relief=relief)
+    return _with_views(surveyed, views + lost, unseen)
+
+
+def _with_views(prepared, views, unseen=""):
+    """With the views of placements, and with what may be wrong with them: small squares; `unseen`,
+    why the outline of the board is not known.
+    """
+    by_camera: dict = {camera: {} for camera in prepared.models}
+    for view in sorted(views, key=lambda view: view.placement):
+        if view.placement >= 0:
+            by_camera[view.camera][view.placement] = view
+    problems = list(prepared.problems)
+    if unseen:
+        words = f"faces of the board only: {unseen}"
+        problems.append(Problem(Stage.IMAGES, ProblemKind.NO_OUTLINE, words))
+    for camera, words in small_squares(by_camera, prepared.board.pattern).items():
+        problems.append(
+            Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera)
+        )
+    return replace(prepared, views=by_camera, problems=tuple(problems))
 
 
 def all_views(prepared) -> dict[str, list[BoardView]]:
@@ -182,7 +188,8 @@ def all_views(prepared) -> dict[str, list[BoardView]]:
         return {camera: list(views.values()) for camera, views in known.items()}
     finder = PatternFinder(prepared.board.pattern)
     look = partial(_like_prepared, prepared=prepared, finder=finder)
-    return _by_camera(known, spread(look, records))
+    views = spread(look, records)
+    return {camera: [view for view in views if view.camera == camera] for camera in known}
 
 
 def _like_prepared(record, prepared, finder):
@@ -274,10 +281,6 @@ def _with_pixels(shot, pixels):
     return replace(shot, view=replace(shot.view, pixels=pixels))
 
 
-def _by_camera(cameras, views):
-    return {camera: [view for view in views if view.camera == camera] for camera in cameras}
-
-
 def _choices(session, purposes):
     """Shots in lists of those of which one is to be used, the best first."""
     groups = {}
@@ -306,17 +309,17 @@ def _first(group, begin):
     return begun[0]
 
 
-def _survey_plain(session, look, models, unknown):
+def _survey_plain(prepared, look, models, unknown):
     """The survey of a board without pattern."""
-    board = session.board
+    session = prepared.session
     if unknown:
         raise ValueError(
-            f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find "
-            "them with: state them"
+            f"camera '{unknown[0]}' has no intrinsics and board '{session.board.name}' no pattern "
+            "to find them with: state them"
         )
     first = partial(_first, begin=partial(look, models=models))
     views = _turned_alike(spread(first, _choices(session, {"board"})))
-    return Survey(_by_camera(models, views), models, None, board)
+    return _with_views(replace(prepared, models=models), views)
 
 
 def _begin(shot, read, board, finder, count):
@@ -415,11 +418,7 @@ def _ordered(shots, read, board, models):
         turned = turned_views(votes, up, leader)
         votes[turned] = votes[turned][:, OPPOSITE]
         chosen = turned.astype(int)
-        try:
-            lines = common_lines(votes, board)
-        except OutlineNotSeen as error:
-            lines = None
-            unseen = str(error)
+        lines, unseen = common_lines(votes, board)
     ordered = [
         _with_pixels(shot, orders[column])
         for shot, orders, column in zip(shots, corners, chosen, strict=True)
