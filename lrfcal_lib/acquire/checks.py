@@ -8,7 +8,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import unit_vector
@@ -19,7 +18,7 @@ from lrfcal_lib.preprocess.prepared import all_crossings
 from lrfcal_lib.session.faults import DARK, brightness, repeated_images, repeated_scans
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session, Sweep
-from lrfcal_lib.session.stated import LrfInfo
+from lrfcal_lib.session.stated import StatedRig
 
 STATES = ("ok", "warn", "bad")
 FEWEST_CROSSINGS = 6  # of a side, below which a straight line says little about it
@@ -74,7 +73,7 @@ def check_placement(session: Session, placement: int) -> list[Light]:
     scene = placement in session.scene_placements
     if scene and sweep is not None:
         return [check_scene(sweep)]
-    lights = check_scan(sweep, session.board, session.T_head_lrf, session.lrf)
+    lights = check_scan(sweep, session)
     lights += [
         Light("recording", "bad", fault.words)
         for fault in (*repeated_images(session), *repeated_scans(session))
@@ -116,25 +115,20 @@ def _together(name, lights):
     return Light(name, state, f"{len(good)} of {len(lights)} images: {worst.text}")
 
 
-def check_scan(
-    sweep: Sweep | None,
-    board: Board,
-    T_head_lrf: RigidTransform | None = None,
-    lrf: LrfInfo | None = None,
-) -> list[Light]:
+def check_scan(sweep: Sweep | None, rig: StatedRig) -> list[Light]:
     """Lights of a sweep: 'scan' and, where the board was found, 'edges'.
 
     Parameters
     ----------
     sweep
         None where there is no range at all.
-    board, T_head_lrf, lrf
-        As the session states them.
+    rig
+        As the session states it.
     """
     if sweep is None:
         return [Light("scan", "bad", NO_RANGE)]
     try:
-        scan = find_board(sweep, board, T_head_lrf, lrf)
+        scan = find_board(sweep, rig)
     except BoardNotFound as error:
         return [
             Light("scan", "bad", f"no board: {error}; sweep over all of it, free of walls")

@@ -93,7 +93,7 @@ def view_board(
     picks=None,
     *,
     lines: np.ndarray | None = None,
-    relief: np.ndarray | None = None,
+    relief: np.ndarray | float = 0.0,
 ) -> BoardView:
     """Find the board, its pose and its straight edges in one image.
 

@@ -22,7 +22,8 @@ from lrfcal_lib.preprocess.edges_in_scan import (
 from lrfcal_lib.preprocess.surfaces import DEPTH_NOISE
 from lrfcal_lib.session.stated import LrfInfo
 
-REACH = 2  # beams (or scan lines) on either side of a boundary
+# from the last cell on the board: two on either side of the boundary, the nearest first
+STEPS = (0, 1, -1, 2)
 CORNER = 1.0  # spot radii: a spot nearer than this to a second edge may reach over it
 SURE = 5.0  # standard deviations of a range: what is nearer to the board's plane read the board
 
@@ -61,11 +62,9 @@ def edge_cells(scan: BoardScan, ways: Sequence[ScanEdges], lrf: LrfInfo) -> np.r
     board[~(board > 0)] = np.nan
     radius = lrf.spot_radius(board)
     gap, odds = background_of(scan, board, cell, step)
-    visible = np.isfinite(gap)
-    mixed = gap < MIXING
-    close = 2 * visible.sum() < len(visible) or 2 * mixed.sum() >= len(mixed)
-    odds = np.where(close, 0.0, odds)
-    usable = np.flatnonzero(close | (visible & ~mixed))
+    few = 2 * np.isfinite(gap).sum() < len(gap)
+    close = few or 2 * np.sum(gap < MIXING) >= len(gap)
+    usable = np.flatnonzero(close | (odds < 0))
 
     row, k, line, beam = _neighbours(usable, cell, step, scan.mask.shape)
     cells = line, beam
@@ -85,7 +84,7 @@ def edge_cells(scan: BoardScan, ways: Sequence[ScanEdges], lrf: LrfInfo) -> np.r
         "side": side,
         "range_m": board[cells],
         "radius": radius[cells],
-        "background": odds[row],
+        "background": np.where(close, 0.0, odds[row]),
         "across": across,
         "step": np.where(across, *gaps),
     }
@@ -105,17 +104,16 @@ def _readings(scan, cells, k, board, radius, gaps, close):
     miss = sweep.ranges - board
     excess = miss[cells]
     hit = scan.mask[cells]
-    with np.errstate(invalid="ignore"):
-        if not close:  # also beams that noise takes off the plane read the board
-            hit = hit | (np.abs(excess) < near)
-        # without what hides the board, and without holes: nothing, or something near, read inside
-        # the boundary
-        hides = excess < -near
-        keep = hit | (~hides & ((excess > MIXING) | (k > 0)))
-        if not close:
-            mixing = (np.abs(miss) > near) & (miss < MIXING)
-            size = np.nanmedian((radius / board)[scan.mask])
-            keep &= ~_within_a_spot(mixing, size, gaps)[cells]
+    if not close:  # also beams that noise takes off the plane read the board
+        hit = hit | (np.abs(excess) < near)
+    # without what hides the board, and without holes: nothing, or something near, read inside
+    # the boundary
+    hides = excess < -near
+    keep = hit | (~hides & ((excess > MIXING) | (k > 0)))
+    if not close:
+        mixing = (np.abs(miss) > near) & (miss < MIXING)
+        size = np.nanmedian((radius / board)[scan.mask])
+        keep &= ~_within_a_spot(mixing, size, gaps)[cells]
     return hit, keep
 
 
@@ -132,9 +130,8 @@ def _within_a_spot(mixing, size, gaps):
 
 def _neighbours(usable, cell, step, shape):
     """Cells about boundaries, each once: number of the nearest, step k from it, line and beam."""
-    steps = sorted(range(1 - REACH, REACH + 1), key=lambda k: abs(k - 0.5))
-    k = np.repeat(steps, len(usable))
-    row = np.tile(usable, len(steps))
+    k = np.repeat(STEPS, len(usable))
+    row = np.tile(usable, len(STEPS))
     near = cell[row] + k[:, None] * step[row]
     rows = np.column_stack([row, k, near])[within(near, step[row], shape)]
     _, first = np.unique(rows[:, 2:], axis=0, return_index=True)

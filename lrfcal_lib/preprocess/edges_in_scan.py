@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lrfcal_lib.fit.covariance import dyads
+from lrfcal_lib.fit.padding import medians
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     fit_line,
@@ -274,8 +275,7 @@ def _ends(scan, across):
     cell = np.column_stack([place, row] if across else [row, place])
     end = np.repeat([-1, 1], len(rows))
     step = np.outer(end, [across, not across])
-    order = np.arange(len(sweep.pitch))
-    if across and np.polyfit(order, sweep.pitch, 1)[0] <= 0:  # a sweep downwards
+    if across and sweep.moved <= 0:  # a sweep downwards
         end = -end
     inside = within(cell, step, scan.mask.shape) & np.isfinite(scan.lines[cell[:, 0], 0])
     cell, step, end = cell[inside], step[inside], end[inside]
@@ -360,15 +360,13 @@ def _warp(scan, cell, step):
     misses = np.where(scan.mask, scan.sweep.ranges - scan.fitted, np.nan)
     misses = _read_along(misses, cell, step, -inwards)
     misses[inwards >= count[:, None]] = np.nan  # an eighth of a line never leaves the view
-    middle = np.nanmedian(misses, axis=1)
+    known = np.isfinite(misses)
+    middle = medians(misses, known)
     # of a median: pi / 2 times that of a mean
-    noise = np.pi / 2 * scan.sigma_range**2 / np.isfinite(misses).sum(axis=1)
-    excess = np.zeros(len(noise))
-    ways = step[:, 1]
-    for way in np.unique(ways):
-        rows = ways == way
-        variance = np.median(middle[rows] ** 2) / MEDIAN_CHI2
-        excess[rows] = max(variance - np.median(noise[rows]), 0.0)
+    noise = np.pi / 2 * scan.sigma_range**2 / known.sum(axis=1)
+    on_hand = step[:, 1] == np.array([[-1], [1]])
+    variance = medians(middle**2, on_hand) / MEDIAN_CHI2
+    excess = np.maximum(variance - medians(noise, on_hand), 0.0) @ on_hand
     share = excess / (excess + noise)
     return middle * share, np.sqrt(noise * share)
 

@@ -155,7 +155,7 @@ def board_pose(
     pixels,
     pattern: Chessboard,
     model: CameraModel,
-    relief: np.ndarray | None = None,
+    relief: np.ndarray | float = 0.0,
 ) -> tuple[RigidTransform, np.ndarray, np.ndarray]:
     """Pose of a chessboard in one image.
 
@@ -239,13 +239,13 @@ def scale_covariance(pose: RigidTransform, pixels, pattern: Chessboard) -> np.nd
     return dyads(away)
 
 
-def raised_points(pattern: Chessboard, relief: np.ndarray | None = None) -> np.ndarray:
+def raised_points(pattern: Chessboard, relief: np.ndarray | float) -> np.ndarray:
     """Corners of a pattern on a wavy sheet.
 
     Parameters
     ----------
     pattern : Chessboard
-    relief : ndarray, shape (k,), optional
+    relief : ndarray, shape (k,), or float
         Heights, metres.
 
     Returns
@@ -253,9 +253,7 @@ def raised_points(pattern: Chessboard, relief: np.ndarray | None = None) -> np.n
     ndarray, shape (k, 3)
         Board frame, metres.
     """
-    if relief is None:
-        return pattern.points()
-    return pattern.points() + relief[:, None] * UP
+    return pattern.points() + np.multiply.outer(relief, UP)
 
 
 def _rough(views, points, size):

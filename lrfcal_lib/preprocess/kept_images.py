@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lrfcal_lib.preprocess.outline_in_images import FARTHEST
-from lrfcal_lib.preprocess.pattern_in_image import square_axes
+from lrfcal_lib.preprocess.pattern_in_image import around, square_axes
 
 ALONG = 1.0  # beyond the farthest distance at which edges are looked for, squares
 # times as large as the largest square of the pattern: what is nearer to the camera
@@ -49,13 +49,11 @@ def part_around(image: np.ndarray, corners: np.ndarray, board) -> Part:
     pattern = board.pattern
     beyond = FARTHEST + ALONG  # squares
     if board.corners is not None:
-        grid = pattern.points()[:, :2]
-        before = grid.min(axis=0) - board.corners
-        behind = board.corners - grid.max(axis=0)
+        printed = pattern.points()[:, :2]
+        before = printed.min(axis=0) - board.corners
+        behind = board.corners - printed.max(axis=0)
         beyond = np.maximum(before, behind).max() / pattern.square
-    sides = np.linalg.norm(square_axes(pattern.grid(corners)), axis=-2)
-    room = NEARER * beyond * sides.max() + ROOM_PX
-    left, top = np.maximum(corners.min(axis=0) - room, 0).astype(int)
-    right, bottom = (corners.max(axis=0) + room + 1).astype(int)
-    place = np.s_[top:bottom, left:right]
+    grid = pattern.grid(corners)
+    sides = np.linalg.norm(square_axes(grid), axis=-2)
+    _, place = around(grid, NEARER * beyond * sides.max() + ROOM_PX)
     return Part(image.shape, place, image[place].copy())

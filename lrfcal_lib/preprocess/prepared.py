@@ -72,10 +72,14 @@ class DroppedSide:
     def words(self):
         """Why it is not used."""
         if self.turn:
-            turned = f"turned by {np.rad2deg(self.turn):.1f} deg against the board"
-            return f"the scan's side '{self.edge}' is {turned}: not used"
-        off = f"{1000 * self.distance:.0f} mm from the edge '{self.edge}'"
-        return f"a side of the scan is {off}: not used"
+            return (
+                f"the scan's side '{self.edge}' is turned by {np.rad2deg(self.turn):.1f} deg "
+                "against the board: not used"
+            )
+        return (
+            f"a side of the scan is {1000 * self.distance:.0f} mm from the edge '{self.edge}': "
+            "not used"
+        )
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ class Prepared:
         By camera and placement; where there are images at several pitch angles, the one with most
         edges.
     outline : Outline or None
-    relief : ndarray or None
+    relief : ndarray, shape (k,), or 0.0
         Heights of the pattern's corners over the sheet's mean plane, metres (see the survey of the
         images).
     names : dict of int to dict of int to str
@@ -119,7 +123,7 @@ class Prepared:
     models: dict = field(default_factory=dict)
     views: dict = field(default_factory=dict)
     outline: Outline | None = None
-    relief: np.ndarray | None = None
+    relief: np.ndarray | float = 0.0
     names: dict = field(default_factory=dict)
     dropped: dict = field(default_factory=dict)
     pitch_noise: PitchNoise = PitchNoise()
@@ -160,7 +164,7 @@ class Prepared:
     def patterned(self, camera: str) -> dict[int, BoardView]:
         """The usable views of a camera that show the printed pattern, by placement."""
         views = self.views[camera].items()
-        return {p: view for p, view in views if view.pixels is not None and not view.reason}
+        return {p: view for p, view in views if view.pixels is not None}
 
     def seen(self, camera, placement):
         """The board in an image of a placement, and the very image that it was found in: there may
@@ -211,15 +215,13 @@ def prepare_scans(session: Session) -> Prepared:
 def _crossed(session, placement):
     """The board and its crossings in one sweep, or why not."""
     try:
-        sweep = session.sweep(placement)
-        scan = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
+        scan = find_board(session.sweep(placement), session)
+        return scan, all_crossings(scan)
     except SessionError:
-        return Problem(
-            Stage.SCANS, ProblemKind.NO_BOARD, "no range in any scan line", placement
-        )
+        words = "no range in any scan line"
     except BoardNotFound as error:
-        return Problem(Stage.SCANS, ProblemKind.NO_BOARD, str(error), placement)
-    return scan, all_crossings(scan)
+        words = str(error)
+    return Problem(Stage.SCANS, ProblemKind.NO_BOARD, words, placement)
 
 
 def all_crossings(scan: BoardScan) -> dict[str, list[ScanEdges]]:

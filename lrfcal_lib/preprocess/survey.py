@@ -184,7 +184,7 @@ def all_views(prepared) -> dict[str, list[BoardView]]:
         for record in prepared.session.images(purpose="board")
         if record.placement in known.get(record.camera, {})
     ]
-    if prepared.board.pattern is None or len(records) <= sum(map(len, known.values())):
+    if prepared.board.pattern is None:
         return {camera: list(views.values()) for camera, views in known.items()}
     finder = PatternFinder(prepared.board.pattern)
     look = partial(_like_prepared, prepared=prepared, finder=finder)
@@ -257,7 +257,7 @@ def _view(record):
     return BoardView(record.camera, record.file.name, placement, record.pitch)
 
 
-def _look(shot, models, *, read, board, picks, lines=None, relief=None):
+def _look(shot, models, *, read, board, picks, lines=None, relief=0.0):
     """The board in one image, with what was picked in it by hand."""
     record = shot.record
     ends = {
@@ -359,7 +359,7 @@ def _corners(shots, camera):
 def _adjusted(cameras, models, shots, session, relief=False):
     """Models by camera, some of them estimated anew, and the heights of the sheet (k,), metres.
 
-    For the heights the corners are in one order; there are none without cameras.
+    For the heights the corners are in one order; the sheet is flat without cameras.
     """
     estimate = partial(_adjustment, shots=shots, session=session, relief=relief)
     adjusted = dict(models)
@@ -367,7 +367,7 @@ def _adjusted(cameras, models, shots, session, relief=False):
     for camera, adjustment in zip(cameras, spread(estimate, cameras), strict=True):
         adjusted[camera] = adjustment.models[0]
         reliefs.append(adjustment.relief)
-    return adjusted, np.mean(reliefs, axis=0) if reliefs else None
+    return adjusted, np.mean(reliefs or [0.0], axis=0)
 
 
 def _adjustment(name, shots, session, relief):
@@ -419,11 +419,8 @@ def _ordered(shots, read, board, models):
         votes[turned] = votes[turned][:, OPPOSITE]
         chosen = turned.astype(int)
         lines, unseen = common_lines(votes, board)
-    ordered = [
-        _with_pixels(shot, orders[column])
-        for shot, orders, column in zip(shots, corners, chosen, strict=True)
-    ]
-    return ordered, lines, unseen
+    pixels = corners[np.arange(len(shots)), chosen]
+    return list(map(_with_pixels, shots, pixels)), lines, unseen
 
 
 def _votes(shots, corners, read, pattern, models):

@@ -222,6 +222,12 @@ class Sweep:
     time_s: np.ndarray
     intensities: np.ndarray | None = None
 
+    @property
+    def moved(self) -> float:
+        """From the first to the last quarter of the sweep, radians: positive upwards."""
+        quarter = len(self.pitch) // 4 + 1
+        return np.median(self.pitch[-quarter:]) - np.median(self.pitch[:quarter])
+
     def part(self, lines, beams=slice(None)) -> "Sweep":
         """Some of the scan lines, and of their beams.
 
@@ -387,9 +393,7 @@ class Session(StatedRig):
         int
             +1 upwards, -1 downwards, 0 for scans at one pitch.
         """
-        pitch = self.sweep(placement).pitch
-        quarter = len(pitch) // 4 + 1
-        moved = np.nanmedian(pitch[-quarter:]) - np.nanmedian(pitch[:quarter])
+        moved = self.sweep(placement).moved
         if not abs(moved) > SMALLEST_MOVE:
             return 0
         return int(np.sign(moved))
