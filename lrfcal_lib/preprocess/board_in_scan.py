@@ -115,7 +115,7 @@ def find_board(
     lines, covariance = fit_lines(filtered, sweep.bearings)
     rays = polar_to_points(1.0, sweep.bearings)[:, :2]
     fitted = np.where(_span(mask), _line_ranges(lines, rays), np.nan)
-    residuals = np.where(mask, sweep.ranges - fitted, np.nan)
+    residuals = (sweep.ranges - fitted)[mask]
     residuals = residuals[np.abs(residuals) <= PLANE_NOISE * 2]
     if not residuals.size:
         raise BoardNotFound(f"no scan line has {FEWEST_BEAMS} beams on the board")

@@ -5,12 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from lrfcal_lib.model.geometry import (
-    lrf_to_platform,
-    plane_axes,
-    polar_to_points,
-    unit_vector,
-)
+from lrfcal_lib.model.geometry import cross, lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
     MIXING,
@@ -88,8 +83,8 @@ def edge_cells(scan: BoardScan, ways: Sequence[ScanEdges], lrf: LrfInfo) -> np.r
         "across": across,
         "step": np.where(across, *gaps),
     }
-    arrays = [column[keep] for column in columns.values()]
-    return np.rec.fromarrays(arrays, names=list(columns))  # type: ignore[call-overload]
+    arrays = list(columns.values())
+    return np.rec.fromarrays(arrays, names=list(columns))[keep]  # type: ignore[call-overload]
 
 
 def _readings(scan, cells, k, board, radius, gaps, close):
@@ -143,17 +138,15 @@ def _on_one_side(scan, cells, board, reach, sides, side):
 
     All of them where sides are not known.
     """
-    axes = plane_axes(scan.normal)
     line, beam = cells
     p_lrf = polar_to_points(board[cells], scan.sweep.bearings[beam])
-    flat = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf) @ axes.T
+    points = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf)
     keep = ~np.isin(side, [number for number, _ in sides])
     alone = np.ones(len(side), bool)
     for number, s in sides:
-        first, last = s.ends @ axes.T
-        x, y = unit_vector(last - first)
-        along = (flat - first) @ [x, y]
-        apart = np.abs((flat - first) @ [-y, x])
+        away = points - s.ends[0]
+        along = away @ s.direction
+        apart = np.linalg.norm(cross(away, s.direction), axis=1)
         mine = side == number
         keep |= mine & (along > 0) & (along < s.length)
         alone &= mine | ~(apart < reach)

@@ -150,9 +150,14 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     """
     length = np.linalg.norm(ends[1] - ends[0])
     centre = ends.mean(axis=0)
-    line = outward_line(ends[0], ends[1], centre - inner)
-    covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
-    return ImageEdge(name, line, covariance, centre, ends, n_points=2)
+    return ImageEdge(
+        name=name,
+        line=outward_line(*ends, centre - inner),
+        covariance=PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2]),
+        centre=centre,
+        ends=ends,
+        n_points=2,
+    )
 
 
 def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:

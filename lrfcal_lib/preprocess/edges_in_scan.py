@@ -312,9 +312,8 @@ def _at(scan, cell, step, places, across):
     there, _ = plane_range(scan, rays, pitch)
     here, _ = plane_range(scan, rays, scan.sweep.pitch[line])
     points = points + (there - here)[..., None] * rays
-    head = scan.T_head_lrf
-    rotation = head.rotation.as_matrix()
-    turned = np.cross([1.0, 0.0, 0.0], head.apply(points)) @ rotation
+    rotation = scan.T_head_lrf.rotation.as_matrix()
+    turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation
     normal = tilt(scan.normal, -pitch) @ rotation
     return points, dyads(noise), _slid(turned, normal, rays)
 
@@ -394,14 +393,12 @@ def _group(scan, points, pitch, order, end, mixed, known):
     are left out, unless most of the board's outline lies before something close (a wall), which
     moves all of it alike.
     """
-    if np.ptp(scan.sweep.pitch) < SAME_PITCH:
+    if not len(end) or np.ptp(scan.sweep.pitch) < SAME_PITCH:
         return (end + 1) // 2, {}  # scans at one pitch show one point a side
     axes = plane_axes(scan.normal)
     flat = lrf_to_platform(points, pitch, scan.T_head_lrf) @ axes.T
     side = np.full(len(flat), -1)
     sides: dict = {}
-    if len(flat) == 0:
-        return side, sides
     tolerance = max(_spacing(scan), EDGE_SCATTER)
     shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0))
     usable = ~mixed | (2 * mixed.sum() >= len(flat))

@@ -133,10 +133,7 @@ def turned_views(votes: np.ndarray, up: np.ndarray, leader: Sequence[int]) -> np
     for _ in range(TURN_ROUNDS):
         mean = np.where(turned[:, None, None], opposite, wide).mean(axis=0)
         gain = np.sum((opposite - wide) * mean, axis=(1, 2))
-        before = turned
         turned = np.bincount(leader, gain)[leader] > 0
-        if np.array_equal(turned, before):
-            break
     upright = np.where(turned, -up, up) > 0
     return turned if np.mean(upright) >= 0.5 else ~turned
 
@@ -204,6 +201,7 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     Parameters
     ----------
     views : sequence of BoardView
+        That show the board.
     board : Board
     models : dict of str to CameraModel
         By camera.
@@ -217,9 +215,8 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     DegenerateGeometry
         Names an edge that was found in no image.
     """
-    visible = [view for view in views if not view.reason]
-    lines = np.full((len(visible), len(board.edges), 3), np.nan)
-    for of_view, view in zip(lines, visible, strict=True):
+    lines = np.full((len(views), len(board.edges), 3), np.nan)
+    for of_view, view in zip(lines, views, strict=True):
         pose = view.T_camera_board.as_matrix()
         pixels_of_board = models[view.camera].matrix @ pose[:3, [0, 1, 3]]
         for edge in view.edges:
@@ -229,7 +226,7 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     if unseen.any():
         raise DegenerateGeometry(
             f"edge '{board.edges[unseen.argmax()]}' of board '{board.name}' was found in none of "
-            f"{len(visible)} images: pick it by hand in edges.csv or give the corners of the board"
+            f"{len(views)} images: pick it by hand in edges.csv or give the corners of the board"
         )
     ends = side_ends(corners_of_lines(np.nanmedian(lines, axis=0)))
     normals = unit_vector(np.nanmedian(lines[..., :2], axis=0))

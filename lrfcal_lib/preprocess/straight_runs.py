@@ -60,9 +60,9 @@ def straight_runs(
 def _without_gaps(run, order):
     """The largest part of a run without a gap of more than a tenth of it (five steps at least)."""
     along = run[np.argsort(order[run], kind="stable")]
-    steps = np.diff(order[along], prepend=order[along[:1]])
-    part = np.cumsum(steps > max(LONGEST_GAP, 0.1 * len(run)))
-    return np.sort(along[part == np.bincount(part, minlength=1).argmax()])
+    gaps = np.diff(order[along]) > max(LONGEST_GAP, 0.1 * len(run))
+    parts = np.split(along, np.flatnonzero(gaps) + 1)
+    return np.sort(max(parts, key=len))
 
 
 def _consensus(points, tolerance, apart, rng):

@@ -172,8 +172,9 @@ def planar_surface(
             elif LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest:
                 fault = ""
             if fault:
-                size = f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m"
-                rejected.append(size + fault)
+                rejected.append(
+                    f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m{fault}"
+                )
             elif reach < best_reach:
                 best = part
                 best_reach = reach
@@ -187,8 +188,7 @@ def _upright(sweep, T_head_lrf):
     """The normal at right angles to the scan plane, where all scan lines have one pitch."""
     if np.ptp(sweep.pitch) > SAME_PITCH:
         return None
-    across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
-    return tilt(across_scan, sweep.pitch[0])
+    return tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), sweep.pitch[0])
 
 
 def best_plane(points, upright, rng) -> tuple[np.ndarray, float]:

@@ -155,10 +155,7 @@ def _with_views(prepared, views, unseen=""):
     if unseen:
         words = f"faces of the board only: {unseen}"
         problems.append(Problem(Stage.IMAGES, ProblemKind.NO_OUTLINE, words))
-    for camera, words in small_squares(by_camera, prepared.board.pattern).items():
-        problems.append(
-            Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera)
-        )
+    problems += small_squares(by_camera, prepared.board.pattern)
     return replace(prepared, views=by_camera, problems=tuple(problems))
 
 
@@ -216,8 +213,8 @@ def _like_prepared(record, prepared, finder):
     )
 
 
-def small_squares(views, pattern) -> dict[str, str]:
-    """In which images squares are so small that corners may be biased, in words.
+def small_squares(views, pattern) -> list[Problem]:
+    """In which images squares are so small that corners may be biased.
 
     Parameters
     ----------
@@ -227,10 +224,10 @@ def small_squares(views, pattern) -> dict[str, str]:
 
     Returns
     -------
-    dict of str to str
-        By camera; those that have such images.
+    list of Problem
+        One a camera that has such images.
     """
-    words: dict[str, str] = {}
+    problems = []
     for camera, of_camera in views.items():
         sides = {
             placement: square_px(pattern.grid(view.pixels))
@@ -240,13 +237,16 @@ def small_squares(views, pattern) -> dict[str, str]:
         small = [p for p, side in sides.items() if side < SMALL_SQUARE_PX]
         if small:
             least = min(sides.values())
-            words[camera] = (
+            words = (
                 f"squares are less than {SMALL_SQUARE_PX:.0f} px wide in {len(small)} of "
                 f"{len(sides)} images (placements {short(small)}), {least:.1f} px at least: "
                 f"distances may be off by {100 * scale_error(least):.2g} %, more if the image is "
                 "blurred; go nearer, or print larger squares"
             )
-    return words
+            problems.append(
+                Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera)
+            )
+    return problems
 
 
 def _view(record):
