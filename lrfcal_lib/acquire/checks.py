@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
@@ -159,8 +158,8 @@ def _check_sides(scan):
         f"{side.n_points} crossings at {np.degrees(side.angle):.0f} deg" for side in good
     ]
     text = f"{len(good)} sides: {', '.join(each)}"
-    ways = unit_vector(np.array([np.subtract(*side.ends) for side in good]))
-    if np.abs(ways @ ways.T).min() < PARALLEL:
+    directions = np.array([side.direction for side in good])
+    if np.abs(directions @ directions.T).min() < PARALLEL:
         return Light("edges", "ok", text)
     return Light("edges", "warn", f"{text}; turn the board to show another side")
 

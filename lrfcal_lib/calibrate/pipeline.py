@@ -299,7 +299,7 @@ def find_pitch_errors(prepared: Prepared) -> PitchErrors | None:
     fixed = [c for c in prepared.views if session.cameras[c].mount == "platform"]
     if not fixed or not prepared.scans:
         return None
-    direction = {p: session.sweep_direction(p) for p in prepared.scans}
+    direction = {p: scan.sweep.direction for p, scan in prepared.scans.items()}
     middle = {p: np.mean(scan.sweep.pitch) for p, scan in prepared.scans.items()}
     observations = {c: observe(prepared, c, faces=PITCH_POINTS) for c in fixed}
     with suppress(DegenerateGeometry):

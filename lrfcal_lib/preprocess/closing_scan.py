@@ -60,7 +60,7 @@ def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
     sweep, closing : Sweep, Sweep or None
     """
     pitch = sweep.pitch
-    turn = np.argmax(np.sign(sweep.moved) * pitch) + 1
+    turn = np.argmax(sweep.direction * pitch) + 1
     far = np.abs(pitch[turn:] - pitch[0]) < FIRST * np.ptp(pitch)
     if not far.any() or len(far) > max(1, FEW * len(pitch)):
         return sweep, None

@@ -275,7 +275,7 @@ def _ends(scan, across):
     cell = np.column_stack([place, row] if across else [row, place])
     end = np.repeat([-1, 1], len(rows))
     step = np.outer(end, [across, not across])
-    if across and sweep.moved <= 0:  # a sweep downwards
+    if across and sweep.direction < 0:  # a sweep downwards
         end = -end
     inside = within(cell, step, scan.mask.shape) & np.isfinite(scan.lines[cell[:, 0], 0])
     cell, step, end = cell[inside], step[inside], end[inside]

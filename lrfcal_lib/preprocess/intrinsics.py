@@ -165,7 +165,7 @@ def board_pose(
 
     Parameters
     ----------
-    pixels : array_like, shape (k, 2)
+    pixels : ndarray, shape (k, 2)
         In the order of ``pattern.points()``, NaN where a corner is not to be used; glaring ones are
         left out.
     pattern : Chessboard
@@ -187,7 +187,6 @@ def board_pose(
     ValueError
         With fewer than four corners, or when they do not determine a pose.
     """
-    pixels = np.asarray(pixels, float)
     points = raised_points(pattern, relief)
     count = np.isfinite(pixels).all(axis=1).sum()
     if count < FEWEST_CORNERS:

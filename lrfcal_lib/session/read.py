@@ -223,10 +223,13 @@ class Sweep:
     intensities: np.ndarray | None = None
 
     @property
-    def moved(self) -> float:
-        """From the first to the last quarter of the sweep, radians: positive upwards."""
+    def direction(self) -> int:
+        """Sign of the pitch motion: +1 upwards, -1 downwards, 0 for scans at one pitch."""
         quarter = len(self.pitch) // 4 + 1
-        return np.median(self.pitch[-quarter:]) - np.median(self.pitch[:quarter])
+        moved = np.median(self.pitch[-quarter:]) - np.median(self.pitch[:quarter])
+        if abs(moved) <= SMALLEST_MOVE:
+            return 0
+        return int(np.sign(moved))
 
     def part(self, lines, beams=slice(None)) -> "Sweep":
         """Some of the scan lines, and of their beams.
@@ -380,23 +383,6 @@ class Session(StatedRig):
         """All other placements."""
         scenes = self.scene_placements
         return tuple(p for p in self.placements if p not in scenes)
-
-    def sweep_direction(self, placement: int) -> int:
-        """Sign of the pitch motion over a sweep.
-
-        Parameters
-        ----------
-        placement
-
-        Returns
-        -------
-        int
-            +1 upwards, -1 downwards, 0 for scans at one pitch.
-        """
-        moved = self.sweep(placement).moved
-        if not abs(moved) > SMALLEST_MOVE:
-            return 0
-        return int(np.sign(moved))
 
 
 def open_session(path: str | os.PathLike) -> Session:
