@@ -115,7 +115,7 @@ def first_pose(
     Returns
     -------
     RigidTransform
-        ``T_camera_board``.
+        A stack of one ``T_camera_board``.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def first_pose(
         raise ValueError(f"{why} (OpenCV: {error.err})") from error
     if not solved or not np.isfinite(shift).all() or shift[2, 0] <= 0:
         raise ValueError(why)
-    return opencv_poses(turn, shift)[0]
+    return opencv_poses(turn, shift)
 
 
 def opencv_poses(turns, shifts) -> RigidTransform:
@@ -193,8 +193,7 @@ def board_pose(
         raise ValueError(f"a pose needs four corners of the pattern or more, got {count}")
 
     def settled(used):
-        rough = first_pose(points, np.where(used, pixels, np.nan), model)
-        poses = RigidTransform.concatenate([rough])
+        poses = first_pose(points, np.where(used, pixels, np.nan), model)
         return adjust_robust(pixels[None, None], points, [model], poses, lens=0)
 
     result = settled(True)
