@@ -219,7 +219,7 @@ def adjust(
         return Block(misses, jacobian[visible] * unknown)
 
     bundle = minimise(evaluate, start, Bundle.moved).state
-    adjusted = _adjusted(bundle, pixels, points, basis, unknown, models)
+    adjusted = _adjusted(bundle, evaluate(bundle), pixels, points, basis, unknown, models)
     return adjusted if lens else replace(adjusted, models=tuple(models))
 
 
@@ -272,16 +272,14 @@ def better(result: Adjustment, points, **options) -> Adjustment:
     return other if other.bic < result.bic else result
 
 
-def _adjusted(bundle, pixels, points, basis, unknown, models):
+def _adjusted(bundle, block, pixels, points, basis, unknown, models):
     """The Adjustment that a solved bundle is."""
-    predicted, jacobian = bundle.predict(points, basis)
+    predicted = bundle.predict(points, basis)[0]
     residuals = pixels - predicted
-    visible = np.isfinite(residuals)
-    misses = residuals[visible]
-    count = len(misses)
-    error = misses @ misses
+    count = len(block.residuals)
+    error = block.residuals @ block.residuals
     variance = max(error / max(count - unknown.sum(), 1), 1e-18)
-    lens, mount, pose = _covariances(bundle, variance, jacobian[visible] * unknown)
+    lens, mount, pose = _covariances(bundle, variance, block.jacobian)
     rms = np.sqrt(2 * np.nanmean(residuals**2, axis=(1, 2, 3)))  # as OpenCV counts it
     adjusted = zip(models, bundle.lenses, lens, rms.tolist(), strict=True)
     return Adjustment(

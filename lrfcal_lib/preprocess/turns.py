@@ -110,8 +110,9 @@ def decide(scores: np.ndarray, leader: np.ndarray) -> np.ndarray:
     """
     total = np.zeros(scores.shape)
     np.add.at(total, leader, scores)
-    halves = total.reshape(len(total), 2, -1)
-    usual, mirrored = halves.max(axis=2).sum(axis=0)
-    chosen = int(mirrored >= CLEARLY * usual)
-    best = halves[:, chosen].argmax(axis=1) + chosen * halves.shape[2]
+    usual, mirrored = np.split(total, 2, axis=1)
+    if mirrored.max(axis=1).sum() < CLEARLY * usual.max(axis=1).sum():
+        best = usual.argmax(axis=1)
+    else:
+        best = usual.shape[1] + mirrored.argmax(axis=1)
     return best[leader]
