@@ -25,6 +25,7 @@ import pandas as pd
 import rooms
 from distributed import LocalCluster
 from joint_draws import draw, none
+from rendered_boards import surveyed
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
@@ -37,7 +38,6 @@ from lrfcal_lib.measure.stations import join_stations
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
-from lrfcal_lib.preprocess.survey import survey
 from lrfcal_lib.session.cluster import workers_at
 from lrfcal_lib.session.lms2xx_codec import (
     decode_scan,
@@ -324,7 +324,7 @@ def images(size):
     """Large images decoded and the board found in them, as JPEG the corners alone: nothing else does the same."""
     session = open_session(ROOT / "data" / "sim_quick")
     record = session.images("left", purpose="board")[0]
-    model = survey(session).models["left"]
+    model = surveyed(session).models["left"]
     board = session.board
     small = session.read_image(record)
     times = np.sqrt(size["pixels"] / (small.shape[0] * small.shape[1]))
@@ -344,7 +344,7 @@ def images(size):
         records = [
             replace(record, placement=i, file=Path(f"{i}.png")) for i in range(SURVEYED)
         ]
-        return survey(
+        return surveyed(
             SimpleNamespace(
                 image_records=records,
                 read_image=lambda r: cv2.imdecode(png, cv2.IMREAD_COLOR),

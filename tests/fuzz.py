@@ -36,6 +36,7 @@ from lrfcal_lib.evaluate.export import file_hashes
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.preprocess.survey import survey
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.importers import import_lasersetero
@@ -562,7 +563,8 @@ OWN = {
 
 
 def _survey(path):
-    survey(read_all(path))
+    session = read_all(path)
+    survey(Prepared(session, session.board, {}, {}))
 
 
 def read_all(path):

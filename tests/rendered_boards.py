@@ -15,6 +15,7 @@ from lrfcal_lib.preprocess import survey
 from lrfcal_lib.preprocess.pattern_in_image import (
     PatternFinder,
 )
+from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.read import ImageRecord
 from lrfcal_lib.session.stated import CameraInfo
 
@@ -188,11 +189,16 @@ def up_to_a_turn(corners, exact):
     )
 
 
+def surveyed(session):
+    """The survey of all images of a session, without its scans."""
+    return survey.survey(Prepared(session, session.board, {}, {}))
+
+
 def seen(picture, board=SHEET, picks=()):
     """The view of a single image."""
     records = [record("left", "a.png", 3, 0.1)]
     session = seen_by({"left": MODEL}, records, lambda r: picture, board, picks)
-    return survey.survey(session).views["left"][0]
+    return surveyed(session).views["left"][3]
 
 
 def pixels_of_squares(side):

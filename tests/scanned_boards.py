@@ -1,6 +1,7 @@
 """Scans of boards made by intersecting rays with planes."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 from matplotlib.path import Path as Polygon
@@ -11,6 +12,7 @@ from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import find_board
 from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.session.read import Sweep
+from lrfcal_lib.session.stated import LrfInfo
 
 HEAD = RigidTransform.from_components(
     [0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03])
@@ -18,14 +20,16 @@ HEAD = RigidTransform.from_components(
 SQUARE = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.8, 0], [0.8, 0.7], [0, 0.7]]), None,
                ("left", "top"))  # fmt: skip
 TRIANGLE = triangle_board()
+LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005)
 
 
 def edge_points(scan):
-    return crossings(scan)[0]["half_step"]
+    return crossings(scan, False, {})[0]["half_step"]
 
 
 def sweep_edges(scan):
-    return crossings(scan, True, crossings(scan)[1])[0]["half_step"]
+    sides = crossings(scan, False, {})[1]
+    return crossings(scan, True, sides)[0]["half_step"]
 
 
 def facing(distance=1.6, roll=8.0, tilt=20.0, centre=(0.4, 0.35), x=0.0):
@@ -130,7 +134,12 @@ def spoiled(s, ranges):
 
 
 def found(s):
-    return find_board(s.sweep, s.board, HEAD)
+    return find_board(s.sweep, rig_of(s.board))
+
+
+def rig_of(board, lrf=LRF):
+    """What a rig states that is needed to find a board."""
+    return SimpleNamespace(board=board, T_head_lrf=HEAD, lrf=lrf)
 
 
 def noisy_triangle(seed=0, roll=25.0, **options):

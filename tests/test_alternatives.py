@@ -176,7 +176,7 @@ def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named):
     pixels = fisheye_views(field_deg, 15, rng(3))
     model = estimate_intrinsics(pixels, PATTERN, (640, 480)).models[0]
     model = model.with_parameters(model.parameters * np.r_[[scale] * 4, [1.0] * 5])
-    views = {i: SimpleNamespace(pixels=uv, T_camera_board=first_pose(PATTERN.points(), uv, model), reason="")
+    views = {i: SimpleNamespace(pixels=uv, T_camera_board=first_pose(PATTERN.points(), uv, model)[0], reason="")
              for i, uv in enumerate(pixels)}  # fmt: skip
     prepared = Prepared(
         session=None,

@@ -47,7 +47,7 @@ def seen(name, placement):
         (at @ lines[:, :2].T + lines[:, 2]).max(axis=1).reshape(pitch.shape),
         np.inf,
     )
-    return find_board(sweep, session.board, session.T_head_lrf), beyond, ranges
+    return find_board(sweep, session), beyond, ranges
 
 
 @pytest.mark.parametrize(("name", "placement"), PLACEMENTS)
@@ -67,7 +67,5 @@ def test_the_board_and_hardly_anything_else_is_found(name, placement):
 @pytest.mark.parametrize("seed", range(6))
 def test_a_board_that_hangs_together_with_the_room_is_found_by_any_sample(seed):
     session, (expected, _, _) = opened("sim_lms221")[0], seen("sim_lms221", 2)
-    board = find_board(
-        session.sweep(2), session.board, session.T_head_lrf, rng=np.random.default_rng(seed)
-    )
+    board = find_board(session.sweep(2), session, np.random.default_rng(seed))
     assert np.sum(board.mask != expected.mask) < 0.03 * expected.mask.sum()

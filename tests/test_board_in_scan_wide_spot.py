@@ -1,6 +1,7 @@
 """A wide spot reads a board while it only touches it: the board looks larger, and its rim less slanted than it is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ WIDE = {"spot_exit": 0.030, "divergence": 0.015}
 LRF = LrfInfo(
     "wide", (0.0, np.pi), np.radians(0.5), 0.003, spot_exit=0.030, spot_divergence=0.015
 )
+RIG = SimpleNamespace(board=BOARD, T_head_lrf=HEAD, lrf=LRF)
 
 
 @pytest.fixture(scope="module")
@@ -52,19 +54,19 @@ def lean_of(scan):
 
 
 def test_a_board_grown_by_the_stated_spot_is_found(sweep):
-    scan = find_board(sweep, BOARD, HEAD, LRF)
+    scan = find_board(sweep, RIG)
     points = lrf_to_platform(
         polar_to_points(sweep.ranges, sweep.bearings), sweep.pitch[:, None], HEAD
     )[scan.mask]
     assert np.abs(points[:, 1] - 1.6).max() < 0.3
     with pytest.raises(BoardNotFound, match="no flat surface of the board's size"):
-        find_board(
-            sweep, BOARD, HEAD
-        )  # nobody says how wide the spot is: too large for the board
+        # of a narrow spot it would be too large for the board
+        narrow = replace(LRF, spot_exit=0.001, spot_divergence=0.0)
+        find_board(sweep, SimpleNamespace(board=BOARD, T_head_lrf=HEAD, lrf=narrow))
 
 
 def test_spots_that_reach_over_the_edge_do_not_straighten_the_board(sweep):
-    scan = find_board(sweep, BOARD, HEAD, LRF)
+    scan = find_board(sweep, RIG)
     assert lean_of(scan) == pytest.approx(LEAN, abs=np.radians(0.35))
     assert LEAN - lean_of(replace(scan, spot=0.0)) > np.radians(
         0.5

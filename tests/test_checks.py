@@ -61,5 +61,5 @@ def test_images_that_are_blurred_dark_bright_or_empty_are_seen(quick, change, st
     (lambda sweep: some(sweep, slice(0, None, 10)), "warn", "take a smaller step"),
 ])  # fmt: skip
 def test_the_board_missing_cut_off_or_hardly_hit_is_seen(quick, change, state, text):
-    first, *rest = check_scan(change(quick.sweep(2)), quick.board, quick.T_head_lrf)
+    first, *rest = check_scan(change(quick.sweep(2)), quick)
     assert first.state == state and text in first.text and bool(rest) == (state == "warn")

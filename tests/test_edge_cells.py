@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scanned_boards import HEAD, edge_points, scene, sweep_edges
+from scanned_boards import HEAD, edge_points, rig_of, scene, sweep_edges
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
@@ -22,7 +22,7 @@ def cells_of(made, change=None):
         if change is None
         else replace(made.sweep, ranges=change(made.sweep.ranges.copy()))
     )
-    board = board_in_scan.find_board(sweep, made.board, HEAD)
+    board = board_in_scan.find_board(sweep, rig_of(made.board))
     along = edge_points(board)
     swept = sweep_edges(board)
     return board, edge_cells(board, [along, swept], LRF)

@@ -56,7 +56,7 @@ def test_half_step_is_unbiased_and_last_beam_lies_half_a_step_inside(across):
     rolls = [3.0] if across else np.linspace(5, 14, 7)
     for s in (scene(pose=facing(roll=roll)) for roll in rolls):
         for variant, own in errors.items():
-            e = crossings(found(s), across)[0][variant]
+            e = crossings(found(s), across, {})[0][variant]
             own.append(s.outwards(e) / spacing)
     last, half = (np.concatenate(own) for own in errors.values())
     assert abs(half.mean()) < 0.1 and -0.65 < last.mean() < -0.35
@@ -89,9 +89,7 @@ def test_four_sides_are_found_and_named_alike_by_lines_and_columns_in_both_varia
     b = found(s)
     lines = edge_points(b)
     columns = sweep_edges(b)
-    assert len(lines.sides) == 4 and {x.side for x in lines.sides} == {
-        x.side for x in columns.sides
-    }
+    assert len(lines.sides) == 4 and lines.sides.keys() == columns.sides.keys()
     names = [
         [np.bincount(s.edge_errors(e)[1][e.side == k]).argmax() for k in range(4)]
         for e in (lines, columns)
@@ -99,7 +97,7 @@ def test_four_sides_are_found_and_named_alike_by_lines_and_columns_in_both_varia
     assert (
         names[0] == names[1] and sorted(names[0]) == [0, 1, 2, 3] and s.worst(lines) < 0.008
     )
-    along, sides = crossings(b)
+    along, sides = crossings(b, False, {})
     for e, last in (
         (lines, along["last_beam"]),
         (columns, crossings(b, True, sides)[0]["last_beam"]),
@@ -112,8 +110,8 @@ def directions(s, e):
     edge = s.edge_errors(e)[1]
     lines = s.board.lines()
     p = s.pose.inv().apply(lrf_to_platform(e.points, e.pitch, HEAD))[:, :2]
-    for side in e.sides:
-        mine = e.side == side.side
+    for number, side in e.sides.items():
+        mine = e.side == number
         along = np.linalg.svd(p[mine] - p[mine].mean(axis=0))[2][0]
         yield (
             side,

@@ -7,7 +7,8 @@ from scipy.ndimage import map_coordinates
 from tiny_sessions import record, rectangle
 
 from lrfcal_lib.plots import recording
-from lrfcal_lib.preprocess.prepared import Prepared, prepare_images
+from lrfcal_lib.preprocess.prepared import Prepared
+from lrfcal_lib.preprocess.survey import prepare_images
 from lrfcal_lib.session.read import open_session
 
 

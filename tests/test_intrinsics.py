@@ -44,11 +44,11 @@ def test_small_squares_widen_the_covariance_and_are_named():
             np.sqrt(np.trace(added)), least * np.linalg.norm(middle), rtol=0.05, atol=2e-6
         )
         assert np.all(np.diag(covariance) > np.diag(added))
-        words = survey.small_squares(
+        problems = survey.small_squares(
             {"left": {4: BoardView(pixels=pixels), 7: BoardView()}}, PATTERN
         )
-        assert ("left" in words) == (side < 9)
-    assert words == {} == survey.small_squares({"left": {4: BoardView()}}, None)
+        assert [problem.camera for problem in problems] == ["left"] * (side < 9)
+    assert problems == [] == survey.small_squares({"left": {4: BoardView()}}, None)
     assert scale_error(np.nan) == 0.01  # no two neighbours are left
 
 

@@ -4,25 +4,38 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rendered_boards import SHEET, pixels_of_squares
+from rendered_boards import (
+    BLANK,
+    MODEL,
+    SHEET,
+    pixels_of_squares,
+    record,
+    seen_by,
+    surveyed,
+)
 
 from lrfcal_lib.calibrate import naming
 from lrfcal_lib.model.problem import ProblemKind
-from lrfcal_lib.preprocess import prepared, survey
+from lrfcal_lib.preprocess import survey
 from lrfcal_lib.preprocess.board_in_image import (
     BoardView,
 )
 
 
 def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
-    views = {
-        "left": [BoardView("left", placement=4, pixels=pixels_of_squares(7.0))],
-        "right": [BoardView("right", placement=4, pixels=pixels_of_squares(12.0))],
-    }
-    seen = survey.Survey(views, {}, None, SHEET)
-    monkeypatch.setattr(prepared, "survey", lambda session, **options: seen)
-    problems = prepared.prepare_images(prepared.Prepared(None, SHEET, {}, {})).problems
-    (problem,) = problems
+    pictures = {"left": BLANK, "right": BLANK + 1}
+    monkeypatch.setattr(
+        survey,
+        "PatternFinder",
+        lambda pattern: lambda image: pixels_of_squares(12.0 if image.any() else 7.0),
+    )
+    session = seen_by(
+        dict.fromkeys(pictures, MODEL),
+        [record(camera, f"{camera}.png", 4) for camera in pictures],
+        lambda r: pictures[r.camera],
+        SHEET,
+    )
+    (problem,) = surveyed(session).problems
     assert problem.kind == ProblemKind.SMALL_SQUARES and problem.camera == "left"
     assert "placements 4), 7.0 px at least" in problem.words and str(problem).startswith(
         "camera 'left': squares"

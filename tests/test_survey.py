@@ -18,9 +18,11 @@ from rendered_boards import (
     turned,
     view_poses,
 )
+from rendered_boards import (
+    surveyed as survey,
+)
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.preprocess import survey
 from lrfcal_lib.preprocess.outline_in_images import measure_outline
 
 
@@ -49,12 +51,12 @@ def session():
 def surveyed(session):
     _, records, read = session
     models = {"left": MODEL, "right": MODEL}
-    return survey.survey(seen_by(models, records, read, UNKNOWN))
+    return survey(seen_by(models, records, read, UNKNOWN))
 
 
 def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed):
     # the truth up to a turn of the whole board, which nothing can tell
-    views = [v for group in surveyed.views.values() for v in group]
+    views = [v for group in surveyed.views.values() for v in group.values()]
     over = {turned(v.T_camera_board, session[0][v.camera, v.placement]) > 1 for v in views}
     assert len(over) == 1 and {len(group) for group in surveyed.views.values()} == {7}
     truth = np.roll(np.array([0.25, 0.15]) - CORNERS, -2, axis=0) if over.pop() else CORNERS
@@ -67,7 +69,7 @@ def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed
             length == pytest.approx(expected[name], abs=0.001)
             and outline.length_sd[name] < 0.003
         )
-    alone = measure_outline(surveyed.views["left"][:1], UNKNOWN, surveyed.models)
+    alone = measure_outline([surveyed.views["left"][0]], UNKNOWN, surveyed.models)
     assert np.isnan([*alone.line_sd, *alone.length_sd.values()]).all()
 
 
@@ -96,9 +98,11 @@ def test_surveys_that_cannot_work(session, surveyed):
     ):
         with pytest.raises(ValueError, match=message):
             own = [each for each in records[:count] if each.camera in models]
-            survey.survey(seen_by(models, own, see, board))
+            survey(seen_by(models, own, see, board))
     views = [
-        replace(v, edges=v.edges[:1]) for group in surveyed.views.values() for v in group
+        replace(v, edges=v.edges[:1])
+        for group in surveyed.views.values()
+        for v in group.values()
     ]
     with pytest.raises(
         ValueError, match="edge '.*' of board 'sheet' was found in none of 14 images"

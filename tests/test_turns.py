@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from rendered_boards import surveyed
 from scipy.spatial.transform import RigidTransform, Rotation
 from tiny_sessions import CAMERAS, MODEL, record, rectangle
 
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.preprocess import survey
 from lrfcal_lib.session.read import ImageRecord, open_session
 from lrfcal_lib.session.stated import TransformStated, from_json
 
@@ -37,10 +37,12 @@ def centred(tmp_path_factory):
 )
 def test_a_centred_chessboard_is_turned_alike_in_all_images_of_a_placement(centred, stated):
     board = centred.board if stated else replace(centred.board, corners=None)
-    found = survey.survey(replace(centred, board=board))
+    found = surveyed(replace(centred, board=board))
     truth = json.loads((centred.path / "truth.json").read_text())["images"]
     turns = {}
-    for view in (v for views in found.views.values() for v in views if not v.reason):
+    for view in (
+        v for views in found.views.values() for v in views.values() if not v.reason
+    ):
         true = from_json(
             TransformStated, truth[f"images/{view.camera}/{view.file}"]["T_camera_board"]
         ).made()
@@ -88,9 +90,9 @@ def test_a_plain_rectangle_is_turned_alike_in_both_cameras():
         cameras=dict.fromkeys(CAMERAS, SimpleNamespace(model=MODEL)),
         picks=(),
     )
-    views = survey.survey(session).views
+    views = surveyed(session).views
     off = [
-        [true[c, v.placement].inv() * v.T_camera_board.rotation for v in views[c]]
+        [true[c, v.placement].inv() * v.T_camera_board.rotation for v in views[c].values()]
         for c in CAMERAS
     ]
     assert max((a.inv() * b).magnitude() for a, b in zip(*off, strict=True)) < 0.1

@@ -1,16 +1,15 @@
 """Is what was just recorded any good? Lights for one placement, from what is on the disk."""
 
 import math
+from collections import ChainMap
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
@@ -18,7 +17,7 @@ from lrfcal_lib.preprocess.prepared import all_crossings
 from lrfcal_lib.session.faults import DARK, brightness, repeated_images, repeated_scans
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session, Sweep
-from lrfcal_lib.session.stated import LrfInfo
+from lrfcal_lib.session.stated import StatedRig
 
 STATES = ("ok", "warn", "bad")
 FEWEST_CROSSINGS = 6  # of a side, below which a straight line says little about it
@@ -73,7 +72,7 @@ def check_placement(session: Session, placement: int) -> list[Light]:
     scene = placement in session.scene_placements
     if scene and sweep is not None:
         return [check_scene(sweep)]
-    lights = check_scan(sweep, session.board, session.T_head_lrf, session.lrf)
+    lights = check_scan(sweep, session)
     lights += [
         Light("recording", "bad", fault.words)
         for fault in (*repeated_images(session), *repeated_scans(session))
@@ -115,25 +114,20 @@ def _together(name, lights):
     return Light(name, state, f"{len(good)} of {len(lights)} images: {worst.text}")
 
 
-def check_scan(
-    sweep: Sweep | None,
-    board: Board,
-    T_head_lrf: RigidTransform | None = None,
-    lrf: LrfInfo | None = None,
-) -> list[Light]:
+def check_scan(sweep: Sweep | None, rig: StatedRig) -> list[Light]:
     """Lights of a sweep: 'scan' and, where the board was found, 'edges'.
 
     Parameters
     ----------
     sweep
         None where there is no range at all.
-    board, T_head_lrf, lrf
-        As the session states them.
+    rig
+        As the session states it.
     """
     if sweep is None:
         return [Light("scan", "bad", NO_RANGE)]
     try:
-        scan = find_board(sweep, board, T_head_lrf, lrf)
+        scan = find_board(sweep, rig)
     except BoardNotFound as error:
         return [
             Light("scan", "bad", f"no board: {error}; sweep over all of it, free of walls")
@@ -156,7 +150,7 @@ def check_scan(
 def _check_sides(scan):
     """How many straight sides of the board the scans cross, and how."""
     ways = all_crossings(scan)["half_step"]
-    by_number = {side.side: side for way in reversed(ways) for side in way.sides}
+    by_number = ChainMap(*(way.sides for way in ways))
     good = [side for side in by_number.values() if side.n_points >= FEWEST_CROSSINGS]
     if not good:
         return Light("edges", "bad", NO_SIDE)
@@ -164,8 +158,8 @@ def _check_sides(scan):
         f"{side.n_points} crossings at {np.degrees(side.angle):.0f} deg" for side in good
     ]
     text = f"{len(good)} sides: {', '.join(each)}"
-    ways = unit_vector(np.array([np.subtract(*side.ends) for side in good]))
-    if np.abs(ways @ ways.T).min() < PARALLEL:
+    directions = np.array([side.direction for side in good])
+    if np.abs(directions @ directions.T).min() < PARALLEL:
         return Light("edges", "ok", text)
     return Light("edges", "warn", f"{text}; turn the board to show another side")
 

@@ -38,7 +38,7 @@ def observe_joint(
             lens_covariance[number] = known
     return JointObservations(
         placements=np.array(list(scans), int),
-        direction=np.array([session.sweep_direction(p) for p in scans], int),
+        direction=np.array([scan.sweep.direction for scan in scans.values()], int),
         middle=np.array([np.mean(scan.sweep.pitch) for scan in scans.values()]),
         edges=tuple(prepared.board.edges),
         # where nobody knows them, no beam is named after the sides of the printed squares

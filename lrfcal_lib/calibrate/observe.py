@@ -308,7 +308,6 @@ def sides_of(
     names = prepared.names.get(placement, {})
     known = {-1}
     for across, edges in enumerate(prepared.edges[placement][variant]):
-        straight = {side.side: side for side in edges.sides}
         for number in sorted(set(edges.side.tolist()) - known):
             known.add(number)
             yield SweepSide(
@@ -317,7 +316,7 @@ def sides_of(
                 edges=edges,
                 rows=np.flatnonzero(edges.side == number),
                 across=bool(across),
-                straight=straight.get(number),
+                straight=edges.sides.get(number),
             )
 
 

@@ -38,10 +38,9 @@ from lrfcal_lib.preprocess.prepared import (
     VARIANTS,
     PitchNoise,
     Prepared,
-    prepare_images,
     prepare_scans,
 )
-from lrfcal_lib.preprocess.survey import all_views
+from lrfcal_lib.preprocess.survey import all_views, prepare_images
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.workers import spread
@@ -300,7 +299,7 @@ def find_pitch_errors(prepared: Prepared) -> PitchErrors | None:
     fixed = [c for c in prepared.views if session.cameras[c].mount == "platform"]
     if not fixed or not prepared.scans:
         return None
-    direction = {p: session.sweep_direction(p) for p in prepared.scans}
+    direction = {p: scan.sweep.direction for p, scan in prepared.scans.items()}
     middle = {p: np.mean(scan.sweep.pitch) for p, scan in prepared.scans.items()}
     observations = {c: observe(prepared, c, faces=PITCH_POINTS) for c in fixed}
     with suppress(DegenerateGeometry):

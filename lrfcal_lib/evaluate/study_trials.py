@@ -221,14 +221,16 @@ def _ends_of_lines(ranges, setup, last_beam):
     bearings = setup.bearings()
     sessions, placements, _, beams = ranges.shape
     ranges = ranges.reshape(-1, beams)
-    lines, information = fit_lines(ranges, bearings)
+    lines, of_line = fit_lines(ranges, bearings)
     ends = bearings[row_ends(np.isfinite(ranges))[1]]
     if not last_beam:
         ends = ends + np.array([-0.5, 0.5]) * setup.step
-    of_line = np.linalg.inv(information) * setup.sigma_range**2
-    found = crossings_of(lines.repeat(2, axis=0), of_line.repeat(2, axis=0), ends.ravel())
-    points = found.points.reshape(sessions, placements, -1, 3)
-    covariance = found.covariance(setup.step * UNIFORM)
+    of_line *= setup.sigma_range**2
+    points, noise, by_bearing = crossings_of(
+        lines.repeat(2, axis=0), of_line.repeat(2, axis=0), ends.ravel()
+    )
+    points = points.reshape(sessions, placements, -1, 3)
+    covariance = dyads(noise) + dyads(by_bearing * setup.step * UNIFORM)
     return points, covariance.reshape(*points.shape, 3)
 
 

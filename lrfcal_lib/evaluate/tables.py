@@ -243,7 +243,7 @@ def sweeps_table(session: Session) -> pd.DataFrame:
                 "pitch_from_deg": pitch[0],
                 "pitch_to_deg": pitch[-1],
                 "pitch_step_deg": step,
-                "direction": session.sweep_direction(placement),
+                "direction": sweep.direction,
                 "n_images": len(session.images(placement=placement)),
             }
         )

@@ -291,9 +291,7 @@ def boards_in(session, placements, reading):
                 ranges=reading.length * sweep.ranges,
                 pitch=reading.turn * sweep.pitch,
             )
-            scans[placement] = find_board(
-                read, session.board, session.T_head_lrf, session.lrf
-            )
+            scans[placement] = find_board(read, session)
     return scans
 
 

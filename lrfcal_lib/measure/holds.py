@@ -329,7 +329,7 @@ def passes_of(session: Session) -> list[Passes]:
     passes = []
     for pair in pairwise(_swept(session)):
         one, other = (session.sweep(placement) for placement in pair)
-        if session.sweep_direction(pair[0]) * session.sweep_direction(pair[1]) < 0:
+        if one.direction * other.direction < 0:
             slip = _slip_between(one, other, session.lrf.sigma_range)
             if slip is not None:
                 passes.append(Passes(pair, *slip))

@@ -93,7 +93,7 @@ def view_board(
     picks=None,
     *,
     lines: np.ndarray | None = None,
-    relief: np.ndarray | None = None,
+    relief: np.ndarray | float = 0.0,
 ) -> BoardView:
     """Find the board, its pose and its straight edges in one image.
 
@@ -118,10 +118,10 @@ def view_board(
     BoardView
         An image that cannot be used is no error: `reason` says why.
     """
-    picks = picks or {}
+    picked = {name: undistort(ends, model) for name, ends in (picks or {}).items()}
     if board.pattern is None:
-        return _view_plain(view, image, board, model, picks)
-    view = _view_pattern(view, image, board, model, picks, lines, relief)
+        return _view_plain(view, image, board, model, picked)
+    view = _view_pattern(view, image, board, model, picked, lines, relief)
     if board.corners is None:
         return view
     pose, covariance = pose_with_edges(view, board, model)
@@ -196,7 +196,7 @@ def pose_with_edges(view, board, model: CameraModel) -> tuple[RigidTransform, np
     return pose_from_edges(agreeing, board, model, pose, covariance)[:2]
 
 
-def _view_pattern(view, image, board, model, picks, lines, relief):
+def _view_pattern(view, image, board, model, picked, lines, relief):
     """The view with the pose from the pattern's corners, and the edges near it."""
     pose, covariance, used = board_pose(view.pixels, board.pattern, model, relief)
     pixels = np.where(used[:, None], view.pixels, np.nan)
@@ -209,8 +209,8 @@ def _view_pattern(view, image, board, model, picks, lines, relief):
     edges = []
     rejected = []
     for name, line, (start, end) in zip(board.edges, lines, ends, strict=True):
-        if name in picks:
-            edges.append(picked_edge(name, undistort(picks[name], model), inner))
+        if name in picked:
+            edges.append(picked_edge(name, picked[name], inner))
             continue
         middle = (start + end) / 2
         beside = middle + WINDOW * line[:2]
@@ -227,21 +227,20 @@ def _view_pattern(view, image, board, model, picks, lines, relief):
     return replace(view, edges=tuple(edges), rejected=tuple(rejected))
 
 
-def _view_plain(view, image, board, model, picks):
+def _view_plain(view, image, board, model, picked):
     """The view of a dark board without pattern, with a view for every other pose."""
-    ends = {name: undistort(uv, model) for name, uv in picks.items()}
     try:
-        sides = _sides(image, board, model, ends)
+        sides = _sides(image, board, model, picked)
     except EdgeNotSeen as error:
         return replace(view, reason=str(error))
     views = []
     for found in outline_poses(sides, board, model, view):
         inner = np.mean([edge.centre for edge in found.edges], axis=0)
         edges = {edge.name: edge for edge in found.edges}
-        off = [line_distance(uv, edges[name].line) for name, uv in ends.items()]
+        off = [line_distance(ends, edges[name].line) for name, ends in picked.items()]
         if np.abs(off).max(initial=0.0) >= SAME_NAMES_PX:
             continue
-        edges |= {name: picked_edge(name, uv, inner) for name, uv in ends.items()}
+        edges |= {name: picked_edge(name, ends, inner) for name, ends in picked.items()}
         views.append(replace(found, edges=tuple(edges.values())))
     if not views:
         reason = f"no pose of board '{board.name}' explains the outline in the image"
@@ -249,14 +248,14 @@ def _view_plain(view, image, board, model, picks):
     return replace(views[0], alternatives=tuple(views[1:]))
 
 
-def _sides(image, board, model, ends):
+def _sides(image, board, model, picked):
     """Sides of a plain board in the turning sense of the image, from picks of all or the detector.
 
-    `ends` of picked edges by name, undistorted pixels.
+    `picked` are ends by name, undistorted pixels.
     """
-    if set(ends) == set(board.edges):
-        inner = np.mean(list(ends.values()), axis=(0, 1))
-        return [picked_edge(name, ends[name], inner) for name in board.edges][::-1]
+    if set(picked) == set(board.edges):
+        inner = np.mean(list(picked.values()), axis=(0, 1))
+        return [picked_edge(name, picked[name], inner) for name in board.edges][::-1]
     corners = undistort(find_polygon(image, len(board.edges), model), model)
     middle = corners.mean(axis=0)
     return [

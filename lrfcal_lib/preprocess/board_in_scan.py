@@ -7,7 +7,6 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import dyads, solve_each
 from lrfcal_lib.fit.robust import NORMAL, biweight, rms
-from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import polar_covariance, polar_to_points
 from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.surfaces import (
@@ -18,7 +17,7 @@ from lrfcal_lib.preprocess.surfaces import (
     segments,
 )
 from lrfcal_lib.session.read import Sweep
-from lrfcal_lib.session.stated import LrfInfo
+from lrfcal_lib.session.stated import StatedRig
 
 MEDIAN_WIDTH = 5  # beams
 FEWEST_BEAMS = 4  # on a scan line, for a straight line with a covariance
@@ -83,24 +82,16 @@ class BoardScan:
 
 
 def find_board(
-    sweep: Sweep,
-    board: Board,
-    T_head_lrf: RigidTransform | None = None,
-    lrf: LrfInfo | None = None,
-    *,
-    rng: np.random.Generator | None = None,
+    sweep: Sweep, rig: StatedRig, rng: np.random.Generator | None = None
 ) -> BoardScan:
     """Find the board in a sweep, filter its ranges and fit a straight line to each scan line.
 
     Parameters
     ----------
     sweep : Sweep
-    board : Board
-        Tells the size by its outline, else by its pattern.
-    T_head_lrf : RigidTransform, optional
-        Roughly known platform; without it the tilt axis is taken to be the x axis of the LRF.
-    lrf : LrfInfo, optional
-        States the spot.
+    rig : StatedRig
+        Its board tells the size by its outline, else by its pattern, its LRF the spot; the platform
+        may be roughly known, without one the tilt axis is taken to be the x axis of the LRF.
     rng : numpy.random.Generator, optional
         For the random sampling; by default always the same.
 
@@ -113,25 +104,26 @@ def find_board(
     BoardNotFound
         If no flat surface has the board's size.
     """
+    T_head_lrf = rig.T_head_lrf
     if T_head_lrf is None:
         T_head_lrf = RigidTransform.identity()
     if rng is None:
         rng = np.random.default_rng(0)
-    surface = planar_surface(sweep, T_head_lrf, board, rng, lrf)
+    surface = planar_surface(sweep, T_head_lrf, rig, rng)
     mask = surface.mask
     filtered = median_filter(sweep.ranges, mask)
-    lines, information = fit_lines(filtered, sweep.bearings)
+    lines, covariance = fit_lines(filtered, sweep.bearings)
     rays = polar_to_points(1.0, sweep.bearings)[:, :2]
     fitted = np.where(_span(mask), _line_ranges(lines, rays), np.nan)
-    residuals = np.where(mask, sweep.ranges - fitted, np.nan)
+    residuals = (sweep.ranges - fitted)[mask]
     residuals = residuals[np.abs(residuals) <= PLANE_NOISE * 2]
     if not residuals.size:
         raise BoardNotFound(f"no scan line has {FEWEST_BEAMS} beams on the board")
     sigma = rms(residuals)
     spot = 0.0
-    if lrf is not None and lrf.spot_exit is not None:
+    if rig.lrf.spot_exit is not None:
         reach = np.nanmedian(fitted)
-        spot = lrf.spot_radius(reach) / reach
+        spot = rig.lrf.spot_radius(reach) / reach
     return BoardScan(
         placement=sweep.placement,
         sweep=sweep,
@@ -140,7 +132,7 @@ def find_board(
         filtered=filtered,
         fitted=fitted,
         lines=lines,
-        lines_covariance=np.linalg.inv(information) * sigma**2,
+        lines_covariance=covariance * sigma**2,
         normal=surface.normal,
         distance=surface.distance,
         sigma_range=sigma,
@@ -199,9 +191,8 @@ def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.
     -------
     lines : ndarray, shape (L, 2)
         ``u`` with ``u . (x, y) = 1``; NaN with fewer than four beams.
-    information : ndarray, shape (L, 2, 2)
-        Inverse covariance for ranges with a standard deviation of 1 m; NaN with fewer than four
-        beams.
+    covariance : ndarray, shape (L, 2, 2)
+        For ranges with a standard deviation of 1 m; NaN with fewer than four beams.
     """
     rays = polar_to_points(1.0, bearings)[:, :2]
     products = dyads(rays)
@@ -217,9 +208,10 @@ def fit_lines(ranges: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, np.
         misses = np.where(valid, np.abs(r - _line_ranges(lines, rays)), np.nan)
         sigma = np.maximum(NORMAL * np.nanmedian(misses, axis=1), LEAST_SIGMA)[:, None]
         weights = np.nan_to_num(base * biweight(misses, sigma))
+    covariance = np.linalg.inv(information)
     lines[few] = np.nan
-    information[few] = np.nan
-    return lines, information
+    covariance[few] = np.nan
+    return lines, covariance
 
 
 def jump_points(ranges: np.ndarray, fitted: np.ndarray, sigma_range: float) -> np.ndarray:

@@ -267,8 +267,8 @@ def better(result: Adjustment, points, **options) -> Adjustment:
     -------
     Adjustment
     """
-    pixels = result.predicted + result.residuals
-    other = adjust(pixels, points, result.models, result.poses, **options)
+    corners = result.predicted + result.residuals
+    other = adjust(corners, points, result.models, result.poses, **options)
     return other if other.bic < result.bic else result
 
 
@@ -282,7 +282,6 @@ def _adjusted(bundle, block, pixels, points, basis, unknown, models):
     lens, mount, pose = _covariances(bundle, variance, block.jacobian)
     rms = np.sqrt(2 * np.nanmean(residuals**2, axis=(1, 2, 3)))  # as OpenCV counts it
     adjusted = zip(models, bundle.lenses, lens, rms.tolist(), strict=True)
-    penalty = unknown.sum() * np.log(count)
     return Adjustment(
         models=tuple(model.with_parameters(*values) for model, *values in adjusted),
         mounting=pose_transform(bundle.mounting),
@@ -293,7 +292,7 @@ def _adjusted(bundle, block, pixels, points, basis, unknown, models):
         predicted=predicted,
         residuals=residuals,
         sigma_px=np.sqrt(variance),
-        bic=count * np.log(max(error, 1e-300) / count) + penalty,
+        bic=count * np.log(max(error, 1e-300) / count) + unknown.sum() * np.log(count),
     )
 
 

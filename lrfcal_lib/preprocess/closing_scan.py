@@ -60,12 +60,9 @@ def without_closing(sweep: Sweep) -> tuple[Sweep, Sweep | None]:
     sweep, closing : Sweep, Sweep or None
     """
     pitch = sweep.pitch
-    count = len(pitch)
-    quarter = count // 4 + 1
-    way = np.sign(np.median(pitch[-quarter:]) - np.median(pitch[:quarter]))
-    turn = np.argmax(way * pitch) + 1
+    turn = np.argmax(sweep.direction * pitch) + 1
     far = np.abs(pitch[turn:] - pitch[0]) < FIRST * np.ptp(pitch)
-    if not far.any() or len(far) > max(1, FEW * count):
+    if not far.any() or len(far) > max(1, FEW * len(pitch)):
         return sweep, None
     return sweep.part(slice(0, turn)), sweep.part(turn + np.flatnonzero(far))
 

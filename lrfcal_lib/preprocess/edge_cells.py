@@ -5,25 +5,20 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from lrfcal_lib.model.geometry import (
-    lrf_to_platform,
-    plane_axes,
-    polar_to_points,
-    unit_vector,
-)
+from lrfcal_lib.model.geometry import cross, lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
     MIXING,
     ScanEdges,
-    background_odds,
-    beyond,
+    background_of,
     plane_range,
     within,
 )
 from lrfcal_lib.preprocess.surfaces import DEPTH_NOISE
 from lrfcal_lib.session.stated import LrfInfo
 
-REACH = 2  # beams (or scan lines) on either side of a boundary
+# from the last cell on the board: two on either side of the boundary, the nearest first
+STEPS = (0, 1, -1, 2)
 CORNER = 1.0  # spot radii: a spot nearer than this to a second edge may reach over it
 SURE = 5.0  # standard deviations of a range: what is nearer to the board's plane read the board
 
@@ -61,19 +56,16 @@ def edge_cells(scan: BoardScan, ways: Sequence[ScanEdges], lrf: LrfInfo) -> np.r
     board, cosine = plane_range(scan, rays, sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
     radius = lrf.spot_radius(board)
-    here = board[tuple(cell.T)]
-    behind = beyond(scan, cell, step)
-    visible = np.isfinite(behind)
-    mixed = behind - here < MIXING
-    close = 2 * visible.sum() < len(visible) or 2 * mixed.sum() >= len(mixed)
-    odds = np.where(close, 0.0, background_odds(here, behind))
-    usable = np.flatnonzero(close | (visible & ~mixed))
+    gap, odds = background_of(scan, board, cell, step)
+    few = 2 * np.isfinite(gap).sum() < len(gap)
+    close = few or 2 * np.sum(gap < MIXING) >= len(gap)
+    usable = np.flatnonzero(close | (odds < 0))
 
     row, k, line, beam = _neighbours(usable, cell, step, scan.mask.shape)
     cells = line, beam
     gaps = median_step(sweep.pitch), median_step(sweep.bearings)
     hit, keep = _readings(scan, cells, k, board, radius, gaps, close)
-    sides = [s for edges in ways for s in edges.sides]
+    sides = [numbered for edges in ways for numbered in edges.sides.items()]
     side = side[row, 0]
     reach = (CORNER * radius / np.abs(cosine))[cells]
     keep &= _on_one_side(scan, cells, board, reach, sides, side)
@@ -87,12 +79,12 @@ def edge_cells(scan: BoardScan, ways: Sequence[ScanEdges], lrf: LrfInfo) -> np.r
         "side": side,
         "range_m": board[cells],
         "radius": radius[cells],
-        "background": odds[row],
+        "background": np.where(close, 0.0, odds[row]),
         "across": across,
         "step": np.where(across, *gaps),
     }
-    arrays = [column[keep] for column in columns.values()]
-    return np.rec.fromarrays(arrays, names=list(columns))  # type: ignore[call-overload]
+    arrays = list(columns.values())
+    return np.rec.fromarrays(arrays, names=list(columns))[keep]  # type: ignore[call-overload]
 
 
 def _readings(scan, cells, k, board, radius, gaps, close):
@@ -107,17 +99,16 @@ def _readings(scan, cells, k, board, radius, gaps, close):
     miss = sweep.ranges - board
     excess = miss[cells]
     hit = scan.mask[cells]
-    with np.errstate(invalid="ignore"):
-        if not close:  # also beams that noise takes off the plane read the board
-            hit = hit | (np.abs(excess) < near)
-        # without what hides the board, and without holes: nothing, or something near, read inside
-        # the boundary
-        hides = excess < -near
-        keep = hit | (~hides & ((excess > MIXING) | (k > 0)))
-        if not close:
-            mixing = (np.abs(miss) > near) & (miss < MIXING)
-            size = np.nanmedian((radius / board)[scan.mask])
-            keep &= ~_within_a_spot(mixing, size, gaps)[cells]
+    if not close:  # also beams that noise takes off the plane read the board
+        hit = hit | (np.abs(excess) < near)
+    # without what hides the board, and without holes: nothing, or something near, read inside
+    # the boundary
+    hides = excess < -near
+    keep = hit | (~hides & ((excess > MIXING) | (k > 0)))
+    if not close:
+        mixing = (np.abs(miss) > near) & (miss < MIXING)
+        size = np.nanmedian((radius / board)[scan.mask])
+        keep &= ~_within_a_spot(mixing, size, gaps)[cells]
     return hit, keep
 
 
@@ -134,9 +125,8 @@ def _within_a_spot(mixing, size, gaps):
 
 def _neighbours(usable, cell, step, shape):
     """Cells about boundaries, each once: number of the nearest, step k from it, line and beam."""
-    steps = sorted(range(1 - REACH, REACH + 1), key=lambda k: abs(k - 0.5))
-    k = np.repeat(steps, len(usable))
-    row = np.tile(usable, len(steps))
+    k = np.repeat(STEPS, len(usable))
+    row = np.tile(usable, len(STEPS))
     near = cell[row] + k[:, None] * step[row]
     rows = np.column_stack([row, k, near])[within(near, step[row], shape)]
     _, first = np.unique(rows[:, 2:], axis=0, return_index=True)
@@ -148,18 +138,16 @@ def _on_one_side(scan, cells, board, reach, sides, side):
 
     All of them where sides are not known.
     """
-    axes = plane_axes(scan.normal)
     line, beam = cells
     p_lrf = polar_to_points(board[cells], scan.sweep.bearings[beam])
-    flat = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf) @ axes.T
-    keep = ~np.isin(side, [s.side for s in sides])
+    points = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf)
+    keep = ~np.isin(side, [number for number, _ in sides])
     alone = np.ones(len(side), bool)
-    for s in sides:
-        first, last = s.ends @ axes.T
-        x, y = unit_vector(last - first)
-        along = (flat - first) @ [x, y]
-        apart = np.abs((flat - first) @ [-y, x])
-        mine = side == s.side
+    for number, s in sides:
+        away = points - s.ends[0]
+        along = away @ s.direction
+        apart = np.linalg.norm(cross(away, s.direction), axis=1)
+        mine = side == number
         keep |= mine & (along > 0) & (along < s.length)
         alone &= mine | ~(apart < reach)
     return keep & alone

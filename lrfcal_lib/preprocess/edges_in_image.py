@@ -12,6 +12,7 @@ from lrfcal_lib.model.camera import CameraModel, line_through, pinhole, redistor
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
 SMOOTH_PX = 1.0  # of the derivative of a Gaussian across the edge
+MARGIN_PX = 4.0  # beyond where an edge is looked for: what its smooth derivative needs
 LEAST_CONTRAST = 6.0  # grey levels (norm over the colours) that make a step
 LEAST_SUPPORT = 0.45  # share of the profiles that must agree on one line
 LEAST_SHARE = 0.2  # of the edge that must lie inside the image
@@ -111,8 +112,8 @@ def refine_edge(
     along = (end - start) / length
     normal = outward_line(start, end, outward)[:2]
     columns = np.arange(int(length) + 1)
-    pad = 3 * SMOOTH_PX + 1
-    across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
+    reach = half_width + MARGIN_PX
+    across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
     on_edge = start + columns[None, :, None] * along
     strip = sample(image, model, on_edge + across[:, None, None] * normal)
     visible = np.isfinite(strip[np.abs(across) <= NEAR_PX, :, 0]).all(axis=0).sum()
@@ -149,9 +150,14 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     """
     length = np.linalg.norm(ends[1] - ends[0])
     centre = ends.mean(axis=0)
-    line = outward_line(ends[0], ends[1], centre - inner)
-    covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
-    return ImageEdge(name, line, covariance, centre, ends, n_points=2)
+    return ImageEdge(
+        name=name,
+        line=outward_line(ends[0], ends[1], centre - inner),
+        covariance=PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2]),
+        centre=centre,
+        ends=ends,
+        n_points=2,
+    )
 
 
 def sample(image: np.ndarray, model: CameraModel, uv: np.ndarray) -> np.ndarray:

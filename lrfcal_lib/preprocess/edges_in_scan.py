@@ -1,9 +1,12 @@
 """Where the board's edges cross the scan: edge points with covariance, sides, background."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
+from lrfcal_lib.fit.covariance import dyads
+from lrfcal_lib.fit.padding import medians
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     fit_line,
@@ -41,8 +44,6 @@ class ScanSide:
 
     Attributes
     ----------
-    side : int
-        Number within the placement; the same in all variants, along and across.
     n_points : int
     length : float
         Of the stretch with points, metres.
@@ -55,7 +56,6 @@ class ScanSide:
         Of the stretch, nominal platform frame, metres.
     """
 
-    side: int
     n_points: int
     length: float
     rms: float
@@ -96,10 +96,11 @@ class ScanEdges:
         low pitch, +1 at high pitch.
     side : ndarray of int, shape (n,)
         Number of the straight side; -1 for outliers.
-    sides : tuple of ScanSide
+    sides : dict of int to ScanSide
+        By number within the placement; the same in all variants, along and across.
     background : ndarray, shape (n,)
         What the distance of the background adds to the log odds at which readings flip
-        (:func:`background_odds`).
+        (:func:`background_of`).
     """
 
     variant: str
@@ -110,7 +111,7 @@ class ScanEdges:
     step: np.ndarray
     end: np.ndarray
     side: np.ndarray
-    sides: tuple[ScanSide, ...]
+    sides: dict[int, ScanSide]
     background: np.ndarray
 
     @property
@@ -119,76 +120,37 @@ class ScanEdges:
         return self.cell[:, 0]
 
 
-@dataclass(frozen=True)
-class Crossings:
-    """Where lines (or columns) of the board end, LRF frame.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3)
-        Metres.
-    by_angle : ndarray, shape (n, 3)
-        Their derivative by bearing (or pitch).
-    range_sigma : ndarray, shape (n,)
-        Standard deviation of the fitted range, metres.
-    pitch : ndarray, shape (n,), or None
-        Where the head moves, radians.
-    """
-
-    points: np.ndarray
-    by_angle: np.ndarray
-    range_sigma: np.ndarray
-    pitch: np.ndarray | None = None
-
-    def covariance(self, sigma, warp_sigma: float = 0.0) -> np.ndarray:
-        """Of the points, (n, 3, 3), metres^2: along their rays, and by the angle at which they lie.
-
-        Parameters
-        ----------
-        sigma : float or ndarray, shape (n,)
-            Standard deviation of that angle, radians.
-        warp_sigma : float
-            Of the range, beside that of the fit, metres.
-        """
-        rays = unit_vector(self.points)
-        noise = rays * np.hypot(self.range_sigma, warp_sigma)[:, None]
-        place = self.by_angle * np.reshape(sigma, (-1, 1))
-        axes = np.stack([noise, place], axis=-1)
-        return axes @ axes.mT
-
-
 def crossings_of(
     lines: np.ndarray, covariance: np.ndarray, bearings: np.ndarray
-) -> Crossings:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where rays meet the straight lines fitted to scan lines.
 
     Parameters
     ----------
     lines, covariance : ndarray, shapes (n, 2), (n, 2, 2)
         As :func:`lrfcal_lib.preprocess.board_in_scan.fit_lines` has them.
-    bearings : ndarray, shape (n,)
+    bearings : ndarray, shape (..., n)
         Of the rays, radians.
 
     Returns
     -------
-    Crossings
+    points, noise, by_bearing : ndarray, shape (..., n, 3)
+        LRF frame, metres; along the rays by one standard deviation of the fitted range; and the
+        derivatives by the bearing.
     """
     rays = polar_to_points(1.0, bearings)
-    flat = rays[:, :2]
-    fitted = 1 / np.vecdot(lines, flat)
-    variance = np.einsum("ni,nij,nj->n", flat, covariance, flat)
-    points = fitted[:, None] * rays
+    flat = rays[..., :2]
+    fitted = 1 / np.vecdot(lines, flat)[..., None]
+    variance = np.vecdot(flat, np.matvec(covariance, flat))
+    points = fitted * rays
+    noise = np.sqrt(variance)[..., None] * fitted * points
     normal = np.insert(lines, 2, 0.0, axis=1)
-    return Crossings(
-        points=points,
-        by_angle=_slid(np.cross([0.0, 0.0, 1.0], points), normal, rays),
-        range_sigma=np.sqrt(variance) * fitted**2,
-    )
+    return points, noise, _slid(np.cross([0.0, 0.0, 1.0], points), normal, rays)
 
 
 def crossings(
-    scan: BoardScan, across: bool = False, known=()
-) -> tuple[dict[str, ScanEdges], tuple[ScanSide, ...]]:
+    scan: BoardScan, across: bool, known: Mapping[int, ScanSide]
+) -> tuple[dict[str, ScanEdges], dict[int, ScanSide]]:
     """Where scan lines (with `across`, columns of the range image) cross the board's edges.
 
     A column is one beam over the pitch. One rule, step (iii) of the paper's preprocessing, in which
@@ -199,7 +161,7 @@ def crossings(
     scan : BoardScan
     across : bool
         Edges nearly parallel to the scan lines are found here.
-    known : sequence of ScanSide
+    known : dict of int to ScanSide
         Found the other way: a side that is one of them gets its number.
 
     Returns
@@ -214,76 +176,72 @@ def crossings(
         the beam spacing (uniform over one step), the line fit and warp, and what a side scatters
         more than that. Sides at less than 20 deg to the scan lines (to the columns) are left out
         (side -1): there the pitch (the bearing) decides where a line ends.
-    sides : tuple of ScanSide
+    sides : dict of int to ScanSide
         All of them, with those left out.
     """
     cell, step, end = _ends(scan, across)
-    shift = 0.0
-    warp_sigma = 0.0
-    if not across:
-        shift, warp_sigma = _warp(scan, cell, step)
     inner = _place(scan, cell)
     outer = _place(scan, cell + step)
-    last = _at(scan, cell[:, 0], inner, across, shift)
-    middle = _at(scan, cell[:, 0], (inner + outer) / 2, across, shift)
-    here = scan.fitted[tuple(cell.T)]
-    behind = beyond(scan, cell, step)
-    side, every = _group(
-        scan, middle, cell[:, int(across)], end, behind - here < MIXING, known
-    )
+    places = np.stack([inner, (inner + outer) / 2], axis=1)
+    points, noise, by_angle = _at(scan, cell, step, places, across)
+    gap, odds = background_of(scan, scan.fitted, cell, step)
+    pitch = places[0]
+    order = cell[:, int(across)]
+    side, every = _group(scan, points[1], pitch[1], order, end, gap < MIXING, known)
     # the pitch is read in steps, it may seem to stand still
     least = median_step(scan.sweep.pitch if across else scan.sweep.bearings)
     sigma = np.maximum(np.abs(outer - inner).sum(axis=0), least) * UNIFORM
-    by_angle = _to_platform(scan, middle.by_angle, middle.pitch)
-    sigma = sigma * _inflation(by_angle, sigma, side, every)
+    turned = _to_platform(scan, by_angle[1], pitch[1])
+    sigma = sigma * _inflation(turned, sigma, side, every)
+    covariance = noise + dyads(by_angle * sigma[:, None])
     # to the scan lines: of sides along the lines (the columns), whose ends tell nothing of them
     unseen = np.pi / 2 if across else 0.0
-    sides = tuple(s for s in every if abs(s.angle - unseen) >= LEAST_ANGLE)
+    sides = {n: s for n, s in every.items() if abs(s.angle - unseen) >= LEAST_ANGLE}
     if every:  # scans at one pitch have no sides, and keep all points
-        side = np.where(np.isin(side, [s.side for s in sides]), side, -1)
+        side = np.where(np.isin(side, list(sides)), side, -1)
     edges = {}
-    for variant, crossing in zip(VARIANTS, (last, middle), strict=True):
+    for row, variant in enumerate(VARIANTS):
         edges[variant] = ScanEdges(
             variant=variant,
-            points=crossing.points,
-            covariance=crossing.covariance(sigma, warp_sigma),
-            pitch=crossing.pitch,
+            points=points[row],
+            covariance=covariance[row],
+            pitch=pitch[row],
             cell=cell,
             step=step,
             end=end,
             side=side,
             sides=sides,
-            background=background_odds(here, behind),
+            background=odds,
         )
     return edges, every
 
 
-def beyond(scan, cell, step):
-    """Range behind ends of the board, metres: a median of three cells, or inf.
+def background_of(scan, board, cell, step):
+    """What stands behind ends of the board.
 
     Parameters
     ----------
     scan : BoardScan
+    board : ndarray, shape (L, B)
+        Ranges of the board, metres.
     cell, step : ndarray of int, shape (n, 2)
         As in `ScanEdges`.
 
     Returns
     -------
-    ndarray, shape (n,)
+    gap, odds : ndarray, shape (n,)
+        How far behind the board it is, metres, by a median of three cells; inf without anything.
+        What it adds to the log odds of the board's share at which readings flip:
+        ``2 ln(here / behind)``, the inverse square law; 0 with nothing behind, or so close that
+        both give one echo.
     """
     away = np.arange(1, CELLS_BEHIND + 1)
     ranges = _read_along(scan.sweep.ranges, cell, step, away)
-    return np.median(np.nan_to_num(ranges, nan=np.inf), axis=1)
-
-
-def background_odds(here, behind):
-    """What the background adds to the log odds of the board's share at which readings flip.
-
-    ``2 ln(here / behind)``, the inverse square law; 0 with nothing behind, or so close that both
-    give one echo.
-    """
-    apart = np.isfinite(behind) & (behind - here >= MIXING)
-    return 2 * np.log(np.where(apart, here / behind, 1.0))
+    behind = np.median(np.nan_to_num(ranges, nan=np.inf), axis=1)
+    here = board[tuple(cell.T)]
+    gap = behind - here
+    apart = np.isfinite(gap) & (gap >= MIXING)
+    return gap, 2 * np.log(np.where(apart, here / behind, 1.0))
 
 
 def plane_range(scan, rays, pitch) -> tuple[np.ndarray, np.ndarray]:
@@ -311,15 +269,13 @@ def plane_range(scan, rays, pitch) -> tuple[np.ndarray, np.ndarray]:
 def _ends(scan, across):
     """Ends of lines (columns) that may be edges: cell, step and end, as in `ScanEdges`."""
     sweep = scan.sweep
-    mask = scan.mask.T if across else scan.mask
-    angles = sweep.pitch if across else sweep.bearings
-    rows, ends = row_ends(mask)
+    rows, ends = row_ends(scan.mask.T if across else scan.mask)
     row = np.tile(rows, 2)
     place = ends.T.ravel()
     cell = np.column_stack([place, row] if across else [row, place])
     end = np.repeat([-1, 1], len(rows))
     step = np.outer(end, [across, not across])
-    if np.polyfit(np.arange(len(angles)), angles, 1)[0] <= 0:  # a sweep downwards
+    if across and sweep.direction < 0:  # a sweep downwards
         end = -end
     inside = within(cell, step, scan.mask.shape) & np.isfinite(scan.lines[cell[:, 0], 0])
     cell, step, end = cell[inside], step[inside], end[inside]
@@ -337,25 +293,29 @@ def _place(scan, cell):
     return np.stack([scan.sweep.pitch[line], scan.sweep.bearings[beam]])
 
 
-def _at(scan, line, place, across, shift):
-    """Crossings of fitted lines with the rays of places (2, n), moved by `shift` (metres) along
-    the ray.
+def _at(scan, cell, step, places, across):
+    """Crossings of fitted lines with the rays of places (2, v, n): points, their covariance by the
+    range, and their derivatives by the bearing (the pitch), (v, n, ...).
 
-    At another pitch than that of the line changed as the board's plane predicts.
+    At another pitch than that of the line changed as the board's plane predicts; at its own moved
+    by what the warp of the board asks for.
     """
-    pitch, bearing = place
-    found = crossings_of(scan.lines[line], scan.lines_covariance[line], bearing)
+    pitch, bearing = places
+    line = cell[:, 0]
+    lines = scan.lines[line]
+    points, noise, by_angle = crossings_of(lines, scan.lines_covariance[line], bearing)
     rays = polar_to_points(1.0, bearing)
+    if not across:
+        shift, sigma = _warp(scan, cell, step)
+        warp = sigma[:, None] * rays
+        return points + shift[:, None] * rays, dyads(noise) + dyads(warp), by_angle
     there, _ = plane_range(scan, rays, pitch)
     here, _ = plane_range(scan, rays, scan.sweep.pitch[line])
-    points = found.points + (there - here + shift)[:, None] * rays
-    found = replace(found, points=points, pitch=pitch)
-    if not across:
-        return found
+    points = points + (there - here)[..., None] * rays
     rotation = scan.T_head_lrf.rotation.as_matrix()
     turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation
     normal = tilt(scan.normal, -pitch) @ rotation
-    return replace(found, by_angle=_slid(turned, normal, rays))
+    return points, dyads(noise), _slid(turned, normal, rays)
 
 
 def _read_along(values, cell, step, count):
@@ -376,9 +336,9 @@ def within(cell, step, shape):
 
 
 def _slid(turned, normal, rays):
-    """How points on a surface with these normals move when their rays turn, all (n, 3)."""
+    """How points on a surface with these normals move when their rays turn, all (..., n, 3)."""
     slide = np.vecdot(normal, turned) / np.vecdot(normal, rays)
-    return turned - slide[:, None] * rays
+    return turned - slide[..., None] * rays
 
 
 def _to_platform(scan, vectors, pitch):
@@ -399,15 +359,13 @@ def _warp(scan, cell, step):
     misses = np.where(scan.mask, scan.sweep.ranges - scan.fitted, np.nan)
     misses = _read_along(misses, cell, step, -inwards)
     misses[inwards >= count[:, None]] = np.nan  # an eighth of a line never leaves the view
-    middle = np.nanmedian(misses, axis=1)
+    known = np.isfinite(misses)
+    middle = medians(misses, known)
     # of a median: pi / 2 times that of a mean
-    noise = np.pi / 2 * scan.sigma_range**2 / np.isfinite(misses).sum(axis=1)
-    excess = np.zeros(len(noise))
-    ways = step[:, 1]
-    for way in np.unique(ways):
-        rows = ways == way
-        variance = np.median(middle[rows] ** 2) / MEDIAN_CHI2
-        excess[rows] = max(variance - np.median(noise[rows]), 0.0)
+    noise = np.pi / 2 * scan.sigma_range**2 / known.sum(axis=1)
+    on_hand = step[:, 1] == np.array([[-1], [1]])
+    variance = medians(middle**2, on_hand) / MEDIAN_CHI2
+    excess = np.maximum(variance - medians(noise, on_hand), 0.0) @ on_hand
     share = excess / (excess + noise)
     return middle * share, np.sqrt(noise * share)
 
@@ -418,8 +376,8 @@ def _inflation(by_angle, sigma, side, sides):
     The spacing is along `by_angle`.
     """
     factor = np.ones(len(side))
-    for s in sides:
-        rows = side == s.side
+    for number, s in sides.items():
+        rows = side == number
         away = np.cross(by_angle[rows], s.direction)
         expected = rms(sigma[rows] * np.linalg.norm(away, axis=1))
         if expected > 0:
@@ -427,36 +385,35 @@ def _inflation(by_angle, sigma, side, sides):
     return factor
 
 
-def _group(scan, crossing, order, end, mixed, known):
-    """The straight sides in the board's plane: the side of each point (-1 for none), and the sides.
+def _group(scan, points, pitch, order, end, mixed, known):
+    """The straight sides in the board's plane: the side of each point (-1 for none), and the sides
+    by number.
 
     Where a post or an easel stands close behind a board, its edge is bent: such (`mixed`) points
     are left out, unless most of the board's outline lies before something close (a wall), which
     moves all of it alike.
     """
-    if np.ptp(scan.sweep.pitch) < SAME_PITCH:
-        return (end + 1) // 2, ()  # scans at one pitch show one point a side
+    if not len(end) or np.ptp(scan.sweep.pitch) < SAME_PITCH:
+        return (end + 1) // 2, {}  # scans at one pitch show one point a side
     axes = plane_axes(scan.normal)
-    flat = lrf_to_platform(crossing.points, crossing.pitch, scan.T_head_lrf) @ axes.T
+    flat = lrf_to_platform(points, pitch, scan.T_head_lrf) @ axes.T
     side = np.full(len(flat), -1)
-    if len(flat) == 0:
-        return side, ()
+    sides: dict = {}
     tolerance = max(_spacing(scan), EDGE_SCATTER)
     shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0))
     usable = ~mixed | (2 * mixed.sum() >= len(flat))
-    sides = []
     for hand in (-1, 1):
         candidates = np.flatnonzero((end == hand) & usable)
         left_out = np.unique(order[(end == hand) & ~usable])  # makes no gap
         place = order[candidates] - np.searchsorted(left_out, order[candidates])
         for run in straight_runs(flat[candidates], place, tolerance, shortest):
             rows = candidates[run]
-            new = _side_through(scan, flat[rows], axes, np.mean(crossing.pitch[rows]))
-            same = (s.side for s in known if s.is_same(new))
+            new = _side_through(scan, flat[rows], axes, np.mean(pitch[rows]))
+            same = (number for number, s in known.items() if s.is_same(new))
             number = next(same, len(known) + len(sides))
             side[rows] = number
-            sides.append(replace(new, side=number))
-    return side, tuple(sides)
+            sides[number] = new
+    return side, sides
 
 
 def _spacing(scan):
@@ -464,13 +421,13 @@ def _spacing(scan):
     row, ends = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
     line = np.repeat(row, 2)
     bearing = scan.sweep.bearings[ends.ravel()]
-    ends = crossings_of(scan.lines[line], scan.lines_covariance[line], bearing)
-    apart = np.median(np.linalg.norm(ends.by_angle, axis=1))
-    return apart * median_step(scan.sweep.bearings)
+    _, _, apart = crossings_of(scan.lines[line], scan.lines_covariance[line], bearing)
+    spacing = np.median(np.linalg.norm(apart, axis=1))
+    return spacing * median_step(scan.sweep.bearings)
 
 
 def _side_through(scan, flat, axes, pitch):
-    """The ScanSide, without its number, through points (n, 2) of the board's plane."""
+    """The ScanSide through points (n, 2) of the board's plane."""
     centre, direction, miss = fit_line(flat)
     along = (flat - centre) @ direction
     ends = centre + np.outer([along.min(), along.max()], direction)
@@ -478,7 +435,6 @@ def _side_through(scan, flat, axes, pitch):
     level = np.cross(scan_normal, scan.normal)  # of the scan line on the board
     cosine = abs(unit_vector(level) @ (direction @ axes))
     return ScanSide(
-        side=-1,
         n_points=len(flat),
         length=np.ptp(along),
         rms=miss * np.sqrt(len(flat) / (len(flat) - 2)),

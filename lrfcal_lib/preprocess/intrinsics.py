@@ -115,7 +115,7 @@ def first_pose(
     Returns
     -------
     RigidTransform
-        ``T_camera_board``.
+        A stack of one ``T_camera_board``.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def first_pose(
         raise ValueError(f"{why} (OpenCV: {error.err})") from error
     if not solved or not np.isfinite(shift).all() or shift[2, 0] <= 0:
         raise ValueError(why)
-    return opencv_poses(turn, shift)[0]
+    return opencv_poses(turn, shift)
 
 
 def opencv_poses(turns, shifts) -> RigidTransform:
@@ -155,7 +155,7 @@ def board_pose(
     pixels,
     pattern: Chessboard,
     model: CameraModel,
-    relief: np.ndarray | None = None,
+    relief: np.ndarray | float = 0.0,
 ) -> tuple[RigidTransform, np.ndarray, np.ndarray]:
     """Pose of a chessboard in one image.
 
@@ -165,7 +165,7 @@ def board_pose(
 
     Parameters
     ----------
-    pixels : array_like, shape (k, 2)
+    pixels : ndarray, shape (k, 2)
         In the order of ``pattern.points()``, NaN where a corner is not to be used; glaring ones are
         left out.
     pattern : Chessboard
@@ -187,15 +187,13 @@ def board_pose(
     ValueError
         With fewer than four corners, or when they do not determine a pose.
     """
-    pixels = np.asarray(pixels, float)
     points = raised_points(pattern, relief)
     count = np.isfinite(pixels).all(axis=1).sum()
     if count < FEWEST_CORNERS:
         raise ValueError(f"a pose needs four corners of the pattern or more, got {count}")
 
     def settled(used):
-        rough = first_pose(points, np.where(used, pixels, np.nan), model)
-        poses = RigidTransform.concatenate([rough])
+        poses = first_pose(points, np.where(used, pixels, np.nan), model)
         return adjust_robust(pixels[None, None], points, [model], poses, lens=0)
 
     result = settled(True)
@@ -239,13 +237,13 @@ def scale_covariance(pose: RigidTransform, pixels, pattern: Chessboard) -> np.nd
     return dyads(away)
 
 
-def raised_points(pattern: Chessboard, relief: np.ndarray | None = None) -> np.ndarray:
+def raised_points(pattern: Chessboard, relief: np.ndarray | float) -> np.ndarray:
     """Corners of a pattern on a wavy sheet.
 
     Parameters
     ----------
     pattern : Chessboard
-    relief : ndarray, shape (k,), optional
+    relief : ndarray, shape (k,), or float
         Heights, metres.
 
     Returns
@@ -253,9 +251,7 @@ def raised_points(pattern: Chessboard, relief: np.ndarray | None = None) -> np.n
     ndarray, shape (k, 3)
         Board frame, metres.
     """
-    if relief is None:
-        return pattern.points()
-    return pattern.points() + relief[:, None] * UP
+    return pattern.points() + np.multiply.outer(relief, UP)
 
 
 def _rough(views, points, size):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lrfcal_lib.preprocess.outline_in_images import FARTHEST
-from lrfcal_lib.preprocess.pattern_in_image import square_axes
+from lrfcal_lib.preprocess.pattern_in_image import around, square_axes
 
 ALONG = 1.0  # beyond the farthest distance at which edges are looked for, squares
 # times as large as the largest square of the pattern: what is nearer to the camera
@@ -17,19 +17,17 @@ ROOM_PX = 60  # edges are looked for 40 px beside their prediction
 class Part:
     """The part of an image around the board.
 
-    `shape` is that of the image, `left` and `top` tell where the part begins.
+    `shape` is that of the image, `place` are the rows and columns of the part.
     """
 
     shape: tuple
-    left: int
-    top: int
+    place: tuple[slice, slice]
     pixels: np.ndarray
 
     def image(self) -> np.ndarray:
         """The image, black where nothing of the board can be."""
-        height, width = self.pixels.shape[:2]
         image = np.zeros(self.shape, np.uint8)
-        image[self.top : self.top + height, self.left : self.left + width] = self.pixels
+        image[self.place] = self.pixels
         return image
 
 
@@ -51,12 +49,11 @@ def part_around(image: np.ndarray, corners: np.ndarray, board) -> Part:
     pattern = board.pattern
     beyond = FARTHEST + ALONG  # squares
     if board.corners is not None:
-        grid = pattern.points()[:, :2]
-        low = np.max(grid.min(axis=0) - board.corners)
-        high = np.max(board.corners - grid.max(axis=0))
-        beyond = max(low, high) / pattern.square
-    sides = np.linalg.norm(square_axes(pattern.grid(corners)), axis=-2)
-    room = NEARER * beyond * sides.max() + ROOM_PX
-    left, top = np.maximum(corners.min(axis=0) - room, 0).astype(int)
-    right, bottom = (corners.max(axis=0) + room + 1).astype(int)
-    return Part(image.shape, left, top, image[top:bottom, left:right].copy())
+        printed = pattern.points()[:, :2]
+        before = printed.min(axis=0) - board.corners
+        behind = board.corners - printed.max(axis=0)
+        beyond = np.maximum(before, behind).max() / pattern.square
+    grid = pattern.grid(corners)
+    sides = np.linalg.norm(square_axes(grid), axis=-2)
+    _, place = around(grid, NEARER * beyond * sides.max() + ROOM_PX)
+    return Part(image.shape, place, image[place].copy())

@@ -46,10 +46,6 @@ OPPOSITE = [2, 3, 0, 1]
 SIDE_NORMALS = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
 
 
-class OutlineNotSeen(ValueError):
-    """The images do not show where a board ends: a sheet on a wall, a background as bright."""
-
-
 @dataclass(frozen=True)
 class Outline:
     """The outer edges of a board, measured in the scale of its pattern.
@@ -137,15 +133,12 @@ def turned_views(votes: np.ndarray, up: np.ndarray, leader: Sequence[int]) -> np
     for _ in range(TURN_ROUNDS):
         mean = np.where(turned[:, None, None], opposite, wide).mean(axis=0)
         gain = np.sum((opposite - wide) * mean, axis=(1, 2))
-        before = turned
         turned = np.bincount(leader, gain)[leader] > 0
-        if np.array_equal(turned, before):
-            break
     upright = np.where(turned, -up, up) > 0
     return turned if np.mean(upright) >= 0.5 else ~turned
 
 
-def common_lines(votes: np.ndarray, board) -> np.ndarray:
+def common_lines(votes: np.ndarray, board) -> tuple[np.ndarray | None, str]:
     """Sides of a board that views turned alike agree on.
 
     Parameters
@@ -157,13 +150,11 @@ def common_lines(votes: np.ndarray, board) -> np.ndarray:
 
     Returns
     -------
-    ndarray, shape (4, 3)
+    lines : ndarray, shape (4, 3), or None
         Board-frame lines, unit normals out of the board.
-
-    Raises
-    ------
-    OutlineNotSeen
-        Names the first edge that they do not agree on.
+    unseen : str
+        Names the first edge that they do not agree on, as with a sheet on a wall, or a background
+        as bright.
     """
     wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), MOVES_BETWEEN, axis=-1)
     visible = wide >= 0
@@ -174,12 +165,12 @@ def common_lines(votes: np.ndarray, board) -> np.ndarray:
     for name, of_side in zip(SIDES, gaussian_filter1d(mean, 1.0), strict=True):
         place = _outer_peak(of_side)
         if place is None:
-            raise OutlineNotSeen(
+            return None, (
                 f"the images do not agree on the {name} edge of board '{board.name}': give the "
                 "corners of the board or pick edges by hand"
             )
         places.append(place)
-    return side_lines(board.pattern, _distances(board.pattern)[places])
+    return side_lines(board.pattern, _distances(board.pattern)[places]), ""
 
 
 def side_lines(pattern: Chessboard, distances) -> np.ndarray:
@@ -210,6 +201,7 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     Parameters
     ----------
     views : sequence of BoardView
+        That show the board.
     board : Board
     models : dict of str to CameraModel
         By camera.
@@ -223,9 +215,8 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     DegenerateGeometry
         Names an edge that was found in no image.
     """
-    visible = [view for view in views if not view.reason]
-    lines = np.full((len(visible), len(board.edges), 3), np.nan)
-    for of_view, view in zip(lines, visible, strict=True):
+    lines = np.full((len(views), len(board.edges), 3), np.nan)
+    for of_view, view in zip(lines, views, strict=True):
         pose = view.T_camera_board.as_matrix()
         pixels_of_board = models[view.camera].matrix @ pose[:3, [0, 1, 3]]
         for edge in view.edges:
@@ -235,7 +226,7 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     if unseen.any():
         raise DegenerateGeometry(
             f"edge '{board.edges[unseen.argmax()]}' of board '{board.name}' was found in none of "
-            f"{len(visible)} images: pick it by hand in edges.csv or give the corners of the board"
+            f"{len(views)} images: pick it by hand in edges.csv or give the corners of the board"
         )
     ends = side_ends(corners_of_lines(np.nanmedian(lines, axis=0)))
     normals = unit_vector(np.nanmedian(lines[..., :2], axis=0))

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.polynomial.polynomial import polyvander2d
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial.distance import cdist
 
@@ -204,14 +203,22 @@ def _smoothest(picture, rough):
     refined = refine_corners(picture, rough)
     if grid_noise(refined) < SMOOTH_ENOUGH_PX:
         return refined
-    margin = AROUND * np.ptp(rough, axis=(0, 1)) + AROUND_PX
-    left, top = np.maximum(rough.min(axis=(0, 1)) - margin, 0).astype(int)
-    right, bottom = (rough.max(axis=(0, 1)) + margin).astype(int)
-    part = np.ascontiguousarray(picture[top:bottom, left:right])
+    low, place = around(rough, AROUND * np.ptp(rough, axis=(0, 1)) + AROUND_PX)
+    part = np.ascontiguousarray(picture[place])
     start = sectors(part, rough.shape[1::-1], 0)
     if start is None:
         return refined
-    return min(refined, refine_corners(picture, start + [left, top]), key=grid_noise)
+    return min(refined, refine_corners(picture, start + low), key=grid_noise)
+
+
+def around(corners, margin):
+    """The part of an image about corners (rows, columns, 2) with a margin in pixels: its first
+    pixel (2,), and its rows and columns.
+    """
+    low = np.maximum(corners.min(axis=(0, 1)) - margin, 0).astype(int)
+    high = (corners.max(axis=(0, 1)) + margin).astype(int)
+    columns, rows = map(slice, low, high)
+    return low, (rows, columns)
 
 
 def grid_noise(grid):
@@ -223,15 +230,14 @@ def grid_noise(grid):
     rows, columns, _ = grid.shape
     row, column = np.mgrid[:rows, :columns].reshape(2, -1)
     last = max(rows, columns) - 1
-    x = column / last * 2 - 1
-    y = row / last * 2 - 1
-    flat = np.column_stack([x, y])
+    flat = np.column_stack([column, row]) / last * 2 - 1
     corners = grid.reshape(-1, 2)
     order = 3 if len(flat) >= 16 else 2
     homography = cv2.findHomography(flat, corners)[0]
     left = corners - cv2.perspectiveTransform(flat[None], homography)[0]
-    powers = np.indices((order + 1, order + 1)).sum(axis=0).ravel()
-    design = polyvander2d(x, y, [order, order])[:, powers <= order]
+    x, y = flat.T
+    powers = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
+    design = np.column_stack([x**i * y**j for i, j in powers])
     noise = left - design @ np.linalg.lstsq(design, left, rcond=None)[0]
     return rms(np.linalg.norm(noise, axis=1))
 
@@ -258,10 +264,8 @@ def refine_corners(picture, start):
     side = np.linalg.norm(square_axes(start), axis=-2)  # (rows, columns, 2), pixels
     longest = side.max(axis=-1, keepdims=True)
     reach = np.clip(WIDEST_WINDOW_PX / longest, LEAST_REACH, REACH)  # squares
-    around = int(MARGIN * np.max(reach * longest)) + 3
-    low = np.maximum(start.min(axis=(0, 1)).astype(int) - around, 0)
-    high = start.max(axis=(0, 1)).astype(int) + around
-    part = picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    low, place = around(start, int(MARGIN * np.max(reach * longest)) + 3)
+    part = picture[place].astype(np.float32)
     half_window = np.median(reach * side)
     kept = start - low
     for look in (ROUGHLY, FINELY):
@@ -279,16 +283,18 @@ def symmetric_points(picture, points, reach, look):
     offsets = np.stack(np.meshgrid(half, place)).reshape(2, -1)
     weight = np.prod((1 - offsets**2) ** 2, axis=0)
     spline = spline_filter(picture, look.order, np.float32) if look.order > 1 else picture
-    slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-    slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
+    slopes = [
+        cv2.Sobel(picture, cv2.CV_32F, 1 - down, down, ksize=1, scale=0.5)
+        for down in (0, 1)
+    ]
     for _ in range(REFINE_ROUNDS):
         axes = square_axes(points) * reach[..., None]
         arms = (axes @ offsets).mT  # (rows, columns, m, 2)
         middle = points[..., None, :]
         pairs = np.stack([middle + arms, middle - arms])
         differs = np.subtract(*interpolated(spline, pairs, look.order))
-        slopes = [np.subtract(*interpolated(slope, pairs)) for slope in (slope_u, slope_v)]
-        jacobian = np.stack(slopes, axis=-1)
+        by_place = [np.subtract(*interpolated(slope, pairs)) for slope in slopes]
+        jacobian = np.stack(by_place, axis=-1)
         weighted = (weight[:, None] * jacobian).mT
         inverse = np.linalg.pinv(weighted @ jacobian, hermitian=True)
         step = -np.matvec(inverse, np.matvec(weighted, differs))

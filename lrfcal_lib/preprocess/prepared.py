@@ -1,19 +1,17 @@
 """A session after preprocessing: the board in every sweep and image, and what could not be used."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.problem import LEAVES_OUT, Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, BoardScan, find_board
 from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, ScanEdges, crossings
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.outline_in_images import Outline
-from lrfcal_lib.preprocess.survey import small_squares, survey
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session
@@ -74,10 +72,14 @@ class DroppedSide:
     def words(self):
         """Why it is not used."""
         if self.turn:
-            turned = f"turned by {np.rad2deg(self.turn):.1f} deg against the board"
-            return f"the scan's side '{self.edge}' is {turned}: not used"
-        off = f"{1000 * self.distance:.0f} mm from the edge '{self.edge}'"
-        return f"a side of the scan is {off}: not used"
+            return (
+                f"the scan's side '{self.edge}' is turned by {np.rad2deg(self.turn):.1f} deg "
+                "against the board: not used"
+            )
+        return (
+            f"a side of the scan is {1000 * self.distance:.0f} mm from the edge '{self.edge}': "
+            "not used"
+        )
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class Prepared:
         By camera and placement; where there are images at several pitch angles, the one with most
         edges.
     outline : Outline or None
-    relief : ndarray or None
+    relief : ndarray, shape (k,), or 0.0
         Heights of the pattern's corners over the sheet's mean plane, metres (see the survey of the
         images).
     names : dict of int to dict of int to str
@@ -121,7 +123,7 @@ class Prepared:
     models: dict = field(default_factory=dict)
     views: dict = field(default_factory=dict)
     outline: Outline | None = None
-    relief: np.ndarray | None = None
+    relief: np.ndarray | float = 0.0
     names: dict = field(default_factory=dict)
     dropped: dict = field(default_factory=dict)
     pitch_noise: PitchNoise = PitchNoise()
@@ -162,7 +164,7 @@ class Prepared:
     def patterned(self, camera: str) -> dict[int, BoardView]:
         """The usable views of a camera that show the printed pattern, by placement."""
         views = self.views[camera].items()
-        return {p: view for p, view in views if view.pixels is not None and not view.reason}
+        return {p: view for p, view in views if view.pixels is not None}
 
     def seen(self, camera, placement):
         """The board in an image of a placement, and the very image that it was found in: there may
@@ -213,15 +215,13 @@ def prepare_scans(session: Session) -> Prepared:
 def _crossed(session, placement):
     """The board and its crossings in one sweep, or why not."""
     try:
-        sweep = session.sweep(placement)
-        scan = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
+        scan = find_board(session.sweep(placement), session)
+        return scan, all_crossings(scan)
     except SessionError:
-        return Problem(
-            Stage.SCANS, ProblemKind.NO_BOARD, "no range in any scan line", placement
-        )
+        words = "no range in any scan line"
     except BoardNotFound as error:
-        return Problem(Stage.SCANS, ProblemKind.NO_BOARD, str(error), placement)
-    return scan, all_crossings(scan)
+        words = str(error)
+    return Problem(Stage.SCANS, ProblemKind.NO_BOARD, words, placement)
 
 
 def all_crossings(scan: BoardScan) -> dict[str, list[ScanEdges]]:
@@ -236,51 +236,8 @@ def all_crossings(scan: BoardScan) -> dict[str, list[ScanEdges]]:
     dict of str to list of ScanEdges
         By edge-point variant.
     """
-    along, sides = crossings(scan)
+    along, sides = crossings(scan, False, {})
     ways = [along]
     if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
         ways.append(crossings(scan, True, sides)[0])
     return {variant: [way[variant] for way in ways] for variant in VARIANTS}
-
-
-def prepare_images(prepared: Prepared) -> Prepared:
-    """The same with the cameras of the session.
-
-    Parameters
-    ----------
-    prepared : Prepared
-        Of :func:`prepare_scans`.
-
-    Returns
-    -------
-    Prepared
-        With the board in every image, the cameras' intrinsics, and the board's outline.
-    """
-    try:
-        surveyed = survey(prepared.session)
-    except DegenerateGeometry as error:  # what remains is a session without cameras
-        words = f"no image can be used: {error}"
-        lost = Problem(Stage.IMAGES, ProblemKind.NO_IMAGES, words)
-        return replace(prepared, problems=(*prepared.problems, lost))
-    views = {}
-    for camera, of_camera in surveyed.views.items():
-        ordered = sorted(of_camera, key=lambda view: view.placement)
-        # an image that belongs to no placement is left out
-        views[camera] = {v.placement: v for v in ordered if v.placement >= 0}
-    problems = list(prepared.problems)
-    if surveyed.unseen:
-        words = f"faces of the board only: {surveyed.unseen}"
-        problems.append(Problem(Stage.IMAGES, ProblemKind.NO_OUTLINE, words))
-    for camera, words in small_squares(views, surveyed.board.pattern).items():
-        problems.append(
-            Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera)
-        )
-    return replace(
-        prepared,
-        models=surveyed.models,
-        views=views,
-        board=surveyed.board,
-        outline=surveyed.outline,
-        relief=surveyed.relief,
-        problems=tuple(problems),
-    )

@@ -60,22 +60,20 @@ def straight_runs(
 def _without_gaps(run, order):
     """The largest part of a run without a gap of more than a tenth of it (five steps at least)."""
     along = run[np.argsort(order[run], kind="stable")]
-    steps = np.diff(order[along], prepend=order[along[:1]])
-    part = np.cumsum(steps > max(LONGEST_GAP, 0.1 * len(run)))
-    return np.sort(along[part == np.bincount(part, minlength=1).argmax()])
+    gaps = np.diff(order[along]) > max(LONGEST_GAP, 0.1 * len(run))
+    parts = np.split(along, np.flatnonzero(gaps) + 1)
+    return np.sort(max(parts, key=len))
 
 
 def _consensus(points, tolerance, apart, rng):
     """Which points lie near the line that most agree with, after two least-squares refinements."""
-    a = points[rng.integers(len(points), size=TRIALS)]
-    b = points[rng.integers(len(points), size=TRIALS)]
-    far = np.linalg.norm(b - a, axis=1) > apart
+    a, b = points[rng.integers(len(points), size=(2, TRIALS))]
+    along = b - a
+    far = np.linalg.norm(along, axis=1) > apart
     if not far.any():
         return np.zeros(len(points), bool)
-    a = a[far]
-    along = b[far] - a
-    normal = unit_vector(along[:, ::-1] * [-1, 1])
-    distance = normal @ points.T - np.vecdot(normal, a)[:, None]
+    normal = unit_vector(along[far, ::-1] * [-1, 1])
+    distance = normal @ points.T - np.vecdot(normal, a[far])[:, None]
     # The sum of truncated squares ranks lines through the middle of a trace above those along its
     # rim.
     best = np.minimum((distance / tolerance) ** 2, 1).sum(axis=1).argmin()

@@ -11,8 +11,8 @@ from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.robust import robust_sigma
-from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
     fit_plane,
     lrf_to_platform,
     plane_axes,
@@ -21,7 +21,7 @@ from lrfcal_lib.model.geometry import (
     unit_vector,
 )
 from lrfcal_lib.session.read import Sweep
-from lrfcal_lib.session.stated import LrfInfo
+from lrfcal_lib.session.stated import StatedRig
 
 # a face seen at a flatter angle than 10 deg is taken for a depth jump
 STEEPEST = np.tan(np.radians(80))
@@ -89,41 +89,37 @@ def segments(ranges, *, jump=DEPTH_NOISE, bridge=0) -> np.ndarray:
     bridge = np.broadcast_to(bridge, ranges.shape)[valid]
     gap = np.diff(beam, prepend=0)
     change = np.abs(np.diff(ranges[valid], prepend=0.0))
-    broken = np.diff(line, prepend=-1) != 0
+    broken = np.diff(line, prepend=-1) != 0  # as the first return
     broken |= (gap - 1 > bridge) | (change > gap * jump)
     labels = np.full(ranges.shape, -1)
-    broken[:1] = True
     labels[valid] = np.cumsum(broken) - 1
     return labels
 
 
-def surfaces(ranges: np.ndarray, bearings: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-    """Connected surfaces of a range image: numbers (L, B) of pieces joined across the lines.
-
-    -1 without a return.
+def surfaces(sweep, ranges) -> tuple[np.ndarray, np.ndarray]:
+    """Connected surfaces of some ranges (L, B) of a sweep: numbers (L, B) of pieces joined across
+    the lines, -1 without a return; and how many cells each has.
     """
-    step = np.median(np.diff(bearings))
+    step = np.median(np.diff(sweep.bearings))
     near = np.where(np.isfinite(ranges), ranges, 1.0)
     bridge = (LONGEST_HOLE / (near * step)).astype(int)
     pieces = segments(ranges, jump=depth_jump(near, step), bridge=bridge)
-    if not np.any(pieces >= 0):
-        return pieces
-    turned = np.diff(pitch)[:, None]
+    turned = np.diff(sweep.pitch)[:, None]
     close = np.abs(np.diff(ranges, axis=0)) < depth_jump(near[1:], turned)
     above = pieces[:-1][close]
     below = pieces[1:][close]
     n = pieces.max() + 1
     graph = coo_array((np.ones(len(above)), (above, below)), shape=(n, n))
     joined = connected_components(graph, directed=False)[1]
-    return np.where(pieces >= 0, joined[pieces], -1)
+    labels = np.where(pieces >= 0, joined[pieces], -1)
+    return labels, np.bincount(labels[labels >= 0])
 
 
 def planar_surface(
     sweep: Sweep,
     T_head_lrf: RigidTransform,
-    board: Board,
+    rig: StatedRig,
     rng: np.random.Generator,
-    lrf: LrfInfo | None,
 ) -> Surface:
     """The nearest flat connected surface of a board's size.
 
@@ -135,12 +131,11 @@ def planar_surface(
     sweep : Sweep
     T_head_lrf : RigidTransform
         Only nominal.
-    board : Board
-        Tells the size.
+    rig : StatedRig
+        Its board tells the size; a spot of its LRF that reads the board while it only touches it
+        makes it larger by its radius.
     rng : numpy.random.Generator
         For the random sampling.
-    lrf : LrfInfo or None
-        A spot that reads the board while it only touches it makes it larger by its radius.
 
     Returns
     -------
@@ -165,8 +160,7 @@ def planar_surface(
             break
         for part in _planes(sweep, points, mask, upright, rng):
             reach = np.median(ranges[part.mask])
-            grown = 0.0 if lrf is None else lrf.spot_radius(reach)
-            limits = _size_limits(board, grown)
+            limits = _size_limits(rig.board, rig.lrf.spot_radius(reach))
             if upright is None:
                 part = _trimmed(part, points, limits)
             area, length = plane_size(points[part.mask], part.normal)
@@ -178,8 +172,9 @@ def planar_surface(
             elif LEAST_LENGTH * np.sqrt(limits.least) < length < limits.longest:
                 fault = ""
             if fault:
-                size = f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m"
-                rejected.append(size + fault)
+                rejected.append(
+                    f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m{fault}"
+                )
             elif reach < best_reach:
                 best = part
                 best_reach = reach
@@ -193,11 +188,10 @@ def _upright(sweep, T_head_lrf):
     """The normal at right angles to the scan plane, where all scan lines have one pitch."""
     if np.ptp(sweep.pitch) > SAME_PITCH:
         return None
-    across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
-    return tilt(across_scan, sweep.pitch[0])
+    return tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), sweep.pitch[0])
 
 
-def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
+def best_plane(points, upright, rng) -> tuple[np.ndarray, float]:
     """Random sample consensus over neighbours, then least squares over all that agree.
 
     Parameters
@@ -210,8 +204,13 @@ def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
 
     Returns
     -------
-    (normal, distance) or None
-        None where the points do not determine a plane.
+    normal : ndarray, shape (3,)
+    distance : float
+
+    Raises
+    ------
+    DegenerateGeometry
+        Where too few points agree, or all on one line.
     """
     sample = points[rng.permutation(len(points))[:SAMPLE]]
     seeds = sample[rng.integers(len(sample), size=TRIALS)]
@@ -232,10 +231,7 @@ def best_plane(points, upright, rng) -> tuple[np.ndarray, float] | None:
         on = points[np.abs(points @ normal - distance) < PLANE_NOISE]
         if upright is not None:
             on = np.concatenate([on + 0.1 * upright, on - 0.1 * upright])
-        try:
-            normal, distance = fit_plane(on)[:2]
-        except ValueError:  # too few points, or all on one line
-            return None
+        normal, distance = fit_plane(on)[:2]
     return normal, distance
 
 
@@ -267,8 +263,7 @@ def row_ends(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _by_distance(sweep):
     """Smallest range and cells (L, B) of the connected surfaces of a sweep, the nearest first."""
-    labels = surfaces(sweep.ranges, sweep.bearings, sweep.pitch)
-    count = np.bincount(labels[labels >= 0])
+    labels, count = surfaces(sweep, sweep.ranges)
     numbers = np.flatnonzero(count >= FEWEST_POINTS)
     nearest = ndimage.minimum(sweep.ranges, labels, numbers)
     for k in np.argsort(nearest):
@@ -281,13 +276,12 @@ def _planes(sweep, points, mask, upright, rng):
     for _ in range(MOST_PLANES):
         if left.sum() < FEWEST_POINTS:
             return
-        plane = best_plane(points[left], upright, rng)
-        if plane is None:
+        try:
+            normal, distance = best_plane(points[left], upright, rng)
+        except DegenerateGeometry:
             return
-        normal, distance = plane
         on = left & (np.abs(points @ normal - distance) < PLANE_NOISE)
-        labels = surfaces(np.where(on, sweep.ranges, np.nan), sweep.bearings, sweep.pitch)
-        count = np.bincount(labels[labels >= 0])
+        labels, count = surfaces(sweep, np.where(on, sweep.ranges, np.nan))
         for label in np.flatnonzero(count >= max(FEWEST_POINTS, SMALL_PART * count.max())):
             yield Surface(labels == label, normal, distance)
         left &= ~on

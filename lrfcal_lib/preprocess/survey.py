@@ -7,9 +7,8 @@ from itertools import compress
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
 from lrfcal_lib.preprocess.intrinsics import (
     board_pose,
@@ -20,8 +19,6 @@ from lrfcal_lib.preprocess.intrinsics import (
 from lrfcal_lib.preprocess.kept_images import Part, part_around
 from lrfcal_lib.preprocess.outline_in_images import (
     OPPOSITE,
-    Outline,
-    OutlineNotSeen,
     common_lines,
     edge_votes,
     measure_outline,
@@ -36,9 +33,10 @@ from lrfcal_lib.preprocess.pattern_in_image import (
     spread_views,
     square_px,
 )
+from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.preprocess.turns import alike, decide, turned_boards
 from lrfcal_lib.session.files import short
-from lrfcal_lib.session.read import ImageRecord, Session
+from lrfcal_lib.session.read import ImageRecord
 from lrfcal_lib.session.workers import spread
 
 LEAST_VIEWS_FOR_RELIEF = 8
@@ -47,34 +45,6 @@ VIEWS_FOR_INTRINSICS = 25
 # cosine between the normals of poses of which one is the other turned in its plane
 SAME_PLANE = 0.9999
 KEPT_BYTES = 800_000_000  # of all images: half of each of 40 with 12 megapixels
-
-
-@dataclass(frozen=True)
-class Survey:
-    """The board in all images of a session.
-
-    Attributes
-    ----------
-    views : dict of str to list of BoardView
-        By camera.
-    models : dict of str to CameraModel
-        By camera.
-    outline : Outline or None
-        None where the board is known, has no pattern, or does not show where it ends.
-    board : Board
-        With its corners, unless the images do not show them.
-    relief : ndarray, shape (k,), or None
-        Heights of the pattern's corners over the sheet's mean plane, metres.
-    unseen : str
-        Why the outline of the board is not known; its views have poses then and no edges.
-    """
-
-    views: dict[str, list[BoardView]]
-    models: dict[str, CameraModel]
-    outline: Outline | None
-    board: Board
-    relief: np.ndarray | None = None
-    unseen: str = ""
 
 
 @dataclass(frozen=True)
@@ -95,7 +65,29 @@ class Shot:
         return read(self.record) if self.part is None else self.part.image()
 
 
-def survey(session: Session) -> Survey:
+def prepare_images(prepared: Prepared) -> Prepared:
+    """The same with the cameras of the session.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        Of :func:`lrfcal_lib.preprocess.prepared.prepare_scans`.
+
+    Returns
+    -------
+    Prepared
+        With the board in every image, the cameras' intrinsics, and the board's outline; as it was,
+        with a problem more, where no image can be used.
+    """
+    try:
+        return survey(prepared)
+    except DegenerateGeometry as error:  # what remains is a session without cameras
+        words = f"no image can be used: {error}"
+        lost = Problem(Stage.IMAGES, ProblemKind.NO_IMAGES, words)
+        return replace(prepared, problems=(*prepared.problems, lost))
+
+
+def survey(prepared: Prepared) -> Prepared:
     """Find the board in the images of all cameras, one of each camera and placement.
 
     Of those that show the board it is the one whose pitch is nearest to the middle of the
@@ -103,25 +95,26 @@ def survey(session: Session) -> Survey:
 
     Parameters
     ----------
-    session : Session
-        A camera without a model asks for an estimate from these images.
+    prepared : Prepared
+        A camera of its session without a model asks for an estimate from these images.
 
     Returns
     -------
-    Survey
+    Prepared
 
     Raises
     ------
     ValueError
         If a camera has no intrinsics and the board no pattern, or too few images show it.
     """
+    session = prepared.session
     board = session.board
     stated = {name: camera.model for name, camera in session.cameras.items()}
     unknown = [name for name, model in stated.items() if model is None]
     read = session.read_image
     look = partial(_look, read=read, board=board, picks=session.picks)
     if board.pattern is None:
-        return _survey_plain(session, look, stated, unknown)
+        return _survey_plain(prepared, look, stated, unknown)
 
     groups = _choices(session, {"board", "intrinsics"})
     finder = PatternFinder(board.pattern)
@@ -146,14 +139,24 @@ def survey(session: Session) -> Survey:
         outline = measure_outline(views, board, models)
         board = outline.board
     lost = [shot.view for shot in begun if shot.reason]
-    return Survey(
-        views=_by_camera(models, views + lost),
-        models=models,
-        outline=outline,
-        board=board,
-        relief=relief,
-        unseen=unseen,
-    )
+    surveyed = replace(prepared, models=models, board=board, outline=outline, relief=relief)
+    return _with_views(surveyed, views + lost, unseen)
+
+
+def _with_views(prepared, views, unseen=""):
+    """With the views of placements, and with what may be wrong with them: small squares; `unseen`,
+    why the outline of the board is not known.
+    """
+    by_camera: dict = {camera: {} for camera in prepared.models}
+    for view in sorted(views, key=lambda view: view.placement):
+        if view.placement >= 0:
+            by_camera[view.camera][view.placement] = view
+    problems = list(prepared.problems)
+    if unseen:
+        words = f"faces of the board only: {unseen}"
+        problems.append(Problem(Stage.IMAGES, ProblemKind.NO_OUTLINE, words))
+    problems += small_squares(by_camera, prepared.board.pattern)
+    return replace(prepared, views=by_camera, problems=tuple(problems))
 
 
 def all_views(prepared) -> dict[str, list[BoardView]]:
@@ -178,11 +181,12 @@ def all_views(prepared) -> dict[str, list[BoardView]]:
         for record in prepared.session.images(purpose="board")
         if record.placement in known.get(record.camera, {})
     ]
-    if prepared.board.pattern is None or len(records) <= sum(map(len, known.values())):
+    if prepared.board.pattern is None:
         return {camera: list(views.values()) for camera, views in known.items()}
     finder = PatternFinder(prepared.board.pattern)
     look = partial(_like_prepared, prepared=prepared, finder=finder)
-    return _by_camera(known, spread(look, records))
+    views = spread(look, records)
+    return {camera: [view for view in views if view.camera == camera] for camera in known}
 
 
 def _like_prepared(record, prepared, finder):
@@ -209,8 +213,8 @@ def _like_prepared(record, prepared, finder):
     )
 
 
-def small_squares(views, pattern) -> dict[str, str]:
-    """In which images squares are so small that corners may be biased, in words.
+def small_squares(views, pattern) -> list[Problem]:
+    """In which images squares are so small that corners may be biased.
 
     Parameters
     ----------
@@ -220,10 +224,10 @@ def small_squares(views, pattern) -> dict[str, str]:
 
     Returns
     -------
-    dict of str to str
-        By camera; those that have such images.
+    list of Problem
+        One a camera that has such images.
     """
-    words: dict[str, str] = {}
+    problems = []
     for camera, of_camera in views.items():
         sides = {
             placement: square_px(pattern.grid(view.pixels))
@@ -233,13 +237,16 @@ def small_squares(views, pattern) -> dict[str, str]:
         small = [p for p, side in sides.items() if side < SMALL_SQUARE_PX]
         if small:
             least = min(sides.values())
-            words[camera] = (
+            words = (
                 f"squares are less than {SMALL_SQUARE_PX:.0f} px wide in {len(small)} of "
                 f"{len(sides)} images (placements {short(small)}), {least:.1f} px at least: "
                 f"distances may be off by {100 * scale_error(least):.2g} %, more if the image is "
                 "blurred; go nearer, or print larger squares"
             )
-    return words
+            problems.append(
+                Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera)
+            )
+    return problems
 
 
 def _view(record):
@@ -250,7 +257,7 @@ def _view(record):
     return BoardView(record.camera, record.file.name, placement, record.pitch)
 
 
-def _look(shot, models, *, read, board, picks, lines=None, relief=None):
+def _look(shot, models, *, read, board, picks, lines=None, relief=0.0):
     """The board in one image, with what was picked in it by hand."""
     record = shot.record
     ends = {
@@ -272,10 +279,6 @@ def _look(shot, models, *, read, board, picks, lines=None, relief=None):
 def _with_pixels(shot, pixels):
     """The shot with corners of the pattern."""
     return replace(shot, view=replace(shot.view, pixels=pixels))
-
-
-def _by_camera(cameras, views):
-    return {camera: [view for view in views if view.camera == camera] for camera in cameras}
 
 
 def _choices(session, purposes):
@@ -306,17 +309,17 @@ def _first(group, begin):
     return begun[0]
 
 
-def _survey_plain(session, look, models, unknown):
+def _survey_plain(prepared, look, models, unknown):
     """The survey of a board without pattern."""
-    board = session.board
+    session = prepared.session
     if unknown:
         raise ValueError(
-            f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find "
-            "them with: state them"
+            f"camera '{unknown[0]}' has no intrinsics and board '{session.board.name}' no pattern "
+            "to find them with: state them"
         )
     first = partial(_first, begin=partial(look, models=models))
     views = _turned_alike(spread(first, _choices(session, {"board"})))
-    return Survey(_by_camera(models, views), models, None, board)
+    return _with_views(replace(prepared, models=models), views)
 
 
 def _begin(shot, read, board, finder, count):
@@ -356,7 +359,7 @@ def _corners(shots, camera):
 def _adjusted(cameras, models, shots, session, relief=False):
     """Models by camera, some of them estimated anew, and the heights of the sheet (k,), metres.
 
-    For the heights the corners are in one order; there are none without cameras.
+    For the heights the corners are in one order; the sheet is flat without cameras.
     """
     estimate = partial(_adjustment, shots=shots, session=session, relief=relief)
     adjusted = dict(models)
@@ -364,7 +367,7 @@ def _adjusted(cameras, models, shots, session, relief=False):
     for camera, adjustment in zip(cameras, spread(estimate, cameras), strict=True):
         adjusted[camera] = adjustment.models[0]
         reliefs.append(adjustment.relief)
-    return adjusted, np.mean(reliefs, axis=0) if reliefs else None
+    return adjusted, np.mean(reliefs or [0.0], axis=0)
 
 
 def _adjustment(name, shots, session, relief):
@@ -415,16 +418,9 @@ def _ordered(shots, read, board, models):
         turned = turned_views(votes, up, leader)
         votes[turned] = votes[turned][:, OPPOSITE]
         chosen = turned.astype(int)
-        try:
-            lines = common_lines(votes, board)
-        except OutlineNotSeen as error:
-            lines = None
-            unseen = str(error)
-    ordered = [
-        _with_pixels(shot, orders[column])
-        for shot, orders, column in zip(shots, corners, chosen, strict=True)
-    ]
-    return ordered, lines, unseen
+        lines, unseen = common_lines(votes, board)
+    pixels = corners[np.arange(len(shots)), chosen]
+    return list(map(_with_pixels, shots, pixels)), lines, unseen
 
 
 def _votes(shots, corners, read, pattern, models):

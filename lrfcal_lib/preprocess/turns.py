@@ -31,8 +31,7 @@ def turned_boards(pattern: Chessboard, orders: np.ndarray) -> RigidTransform:
     middle = points.mean(axis=0)
     offsets = points - middle
     turns = [Rotation.align_vectors(offsets[order], offsets)[0] for order in orders]
-    rotation = Rotation.concatenate(turns)
-    return carry(rotation, middle, middle)
+    return carry(Rotation.concatenate(turns), middle, middle)
 
 
 def alike(rotations, views) -> tuple[list[int], list[np.ndarray]]:

@@ -222,6 +222,15 @@ class Sweep:
     time_s: np.ndarray
     intensities: np.ndarray | None = None
 
+    @property
+    def direction(self) -> int:
+        """Sign of the pitch motion: +1 upwards, -1 downwards, 0 for scans at one pitch."""
+        quarter = len(self.pitch) // 4 + 1
+        moved = np.median(self.pitch[-quarter:]) - np.median(self.pitch[:quarter])
+        if abs(moved) <= SMALLEST_MOVE:
+            return 0
+        return int(np.sign(moved))
+
     def part(self, lines, beams=slice(None)) -> "Sweep":
         """Some of the scan lines, and of their beams.
 
@@ -374,25 +383,6 @@ class Session(StatedRig):
         """All other placements."""
         scenes = self.scene_placements
         return tuple(p for p in self.placements if p not in scenes)
-
-    def sweep_direction(self, placement: int) -> int:
-        """Sign of the pitch motion over a sweep.
-
-        Parameters
-        ----------
-        placement
-
-        Returns
-        -------
-        int
-            +1 upwards, -1 downwards, 0 for scans at one pitch.
-        """
-        pitch = self.sweep(placement).pitch
-        quarter = len(pitch) // 4 + 1
-        moved = np.nanmedian(pitch[-quarter:]) - np.nanmedian(pitch[:quarter])
-        if not abs(moved) > SMALLEST_MOVE:
-            return 0
-        return int(np.sign(moved))
 
 
 def open_session(path: str | os.PathLike) -> Session:
