@@ -190,39 +190,58 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
     """
     require_same_rig(first, second)
     shared = [name for name in first.cameras if name in second.cameras]
-    # intrinsics from the same place are equal to the last bit
-    one_lens = all(
-        np.array_equal(
-            first.cameras[name].model.parameters, second.cameras[name].model.parameters
-        )
-        for name in shared
-    )
+    lenses = [
+        [rig.cameras[name].model.parameters for name in shared] for rig in (first, second)
+    ]
+    one_lens = np.array_equal(*lenses)  # from the same place, to the last bit
     if one_lens:
         first = _without_lens(first)
         second = _without_lens(second)
     second_there = in_gauge_of(first, second)
     steps = _steps(first, second_there, shared)
-    tested = _tested(first, second_there, pd.concat(steps.values()))
+    step = pd.concat(steps.values())
+    covariance = _covariance(first) + _covariance(second)
+    # nothing bounds what only one estimated
+    covariance = covariance.reindex(index=step.index, columns=step.index).fillna(np.inf)
     images = {name: shifts(first, second_there, name) for name in shared}
-    parts = [_part(name, step.index, tested, images) for name, step in steps.items()]
+    parts = [
+        _part(name, of_part.index, step, covariance, images)
+        for name, of_part in steps.items()
+    ]
     cloud = shifts(first, second_there)
     moved = (cloud.amount("mm in the cloud", 1000),)
-    whole = Part("everything", moved, *tested.chi2(tested.table.index), 1.0)
+    whole = Part("everything", moved, *_chi2(step, covariance, step.index), 1.0)
     return Comparison(first, second, tuple(parts), whole, images, cloud, one_lens)
 
 
-def _part(name, names, tested, images):
+def _part(name, names, step, covariance, images):
     """The Part of some differences: turns or a scale, as many shifts, and pixels of a camera."""
     amounts = []
     kinds = ("scale" if name == "sensor" else "turn", "shift")
     for what, members in zip(kinds, np.split(names, 2), strict=True):
         scale, unit = UNITS[what]
-        value, claimed = scale * np.linalg.norm(tested.table.loc[members], axis=0)
-        amounts.append(Amount(what, value, claimed, unit))
+        value = np.linalg.norm(step[members])
+        claimed = np.sqrt(np.trace(covariance.loc[members, members]))
+        amounts.append(Amount(what, scale * value, scale * claimed, unit))
     if name in images:
         amounts.append(images[name].amount("px"))
-    *_, p_of_others = tested.chi2(tested.table.index.difference(names))
-    return Part(name, tuple(amounts), *tested.chi2(names), p_of_others)
+    *_, p_of_others = _chi2(step, covariance, step.index.difference(names))
+    return Part(name, tuple(amounts), *_chi2(step, covariance, names), p_of_others)
+
+
+def _chi2(step, covariance, names):
+    """Chi-square of some differences, its degrees of freedom, and how often chance exceeds it."""
+    covariance = covariance.loc[names, names]
+    sigma = np.sqrt(np.diag(covariance))
+    correlation = covariance.div(sigma, axis=0) / sigma
+    # NaN for what nothing bounds, or one of the two took as it is
+    known = np.diag(correlation) > 0
+    if not known.any():
+        return 0.0, 0, 1.0
+    inverse, freedom = pinvh(correlation.loc[known, known], rtol=TOLD, return_rank=True)
+    z = (step[names] / sigma)[known]
+    chi2 = z @ inverse @ z
+    return chi2, freedom, chdtrc(freedom, chi2)
 
 
 def _without_lens(rig):
@@ -231,29 +250,6 @@ def _without_lens(rig):
     trusted = known.trusted - known.lens
     known = replace(known, covariance=known.covariance - known.lens, trusted=trusted)
     return replace(rig, uncertainty=known)
-
-
-@dataclass(frozen=True)
-class _Tested:
-    """Differences with their standard deviations by name, and what of these can be tested.
-
-    The correlation is without what nothing bounds, or one of the two took as it is.
-    """
-
-    table: pd.DataFrame
-    correlation: pd.DataFrame
-
-    def chi2(self, names) -> tuple[float, int, float]:
-        """Chi-square of differences, its degrees of freedom, and how often chance exceeds it."""
-        names = self.correlation.index.intersection(names)
-        if names.empty:
-            return 0.0, 0, 1.0
-        inverse, freedom = pinvh(
-            self.correlation.loc[names, names], rtol=TOLD, return_rank=True
-        )
-        z = self.table.step[names] / self.table.sigma[names]
-        chi2 = z @ inverse @ z
-        return chi2, freedom, chdtrc(freedom, chi2)
 
 
 def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
@@ -274,17 +270,6 @@ def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
         cameras[name] = camera
     axis = replace(second.axis, T_head_lrf=gauge * second.T_head_lrf)
     return replace(second, axis=axis, cameras=cameras)
-
-
-def _tested(first, second, step) -> _Tested:
-    """The _Tested of increments from the first rig to the second, a Series."""
-    covariance = _covariance(first) + _covariance(second)  # NaN for what only one estimated
-    covariance = covariance.reindex(index=step.index, columns=step.index)
-    sigma = pd.Series(np.sqrt(np.diag(covariance)), step.index)
-    known = step.index[np.isfinite(sigma) & (sigma > 0)]
-    correlation = covariance.loc[known, known] / np.outer(sigma[known], sigma[known])
-    table = pd.DataFrame({"step": step, "sigma": sigma.fillna(np.inf)})
-    return _Tested(table, correlation)
 
 
 def _steps(first, second, shared):
