@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.model.camera import fold, project
+from lrfcal_lib.model.camera import pinhole, redistort
 from lrfcal_lib.model.geometry import (
     apply_pose,
     lrf_to_platform,
@@ -90,9 +90,8 @@ def seen_at(
     for name, camera in rig.cameras.items():
         T_camera_platform = rig.camera_at(name, rig.corrections.pitch(NEW, pitches))
         p_camera = apply_pose(pose_array(T_camera_platform), points)
-        uv = project(p_camera, camera.model)
-        squared = np.sum(p_camera[..., :2] ** 2, axis=-1) / p_camera[..., 2] ** 2
-        visible |= camera.model.shows(uv) & (squared < fold(camera.model))
+        uv = redistort(pinhole(p_camera, camera.model), camera.model)
+        visible |= camera.model.shows(uv)
     return visible
 
 
