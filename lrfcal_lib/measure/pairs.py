@@ -24,7 +24,10 @@ from lrfcal_lib.fit.robust import biweight, robust_sigma, sums_by
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
+    move_pose,
+    pose_array,
     pose_step,
+    pose_transform,
     transform_difference,
     unit_vector,
 )
@@ -398,7 +401,7 @@ def fitted(
         inverse = np.linalg.pinv(J.T @ weighted, rcond=1e-12)
         gain = -inverse @ weighted.T
         step = gain @ r
-        T = moved(T, step)
+        T = pose_transform(move_pose(pose_array(T), step))
     pulls = weighted * (r + J @ step)[:, None]
     sums = sums_by(np.floor(first.points[here] / NEIGHBOURS) @ IN_ONE, pulls)
     by_first = gain @ first.moves[here]
@@ -416,9 +419,3 @@ def fitted(
         loose=loose,
         held=float(np.mean(np.abs(J[:, 3:] @ loose) > ACROSS)),
     )
-
-
-def moved(T: RigidTransform, step: np.ndarray) -> RigidTransform:
-    """A pose after a turn and a shift (6,): R <- exp(w) R, t <- t + v."""
-    turn = Rotation.from_rotvec(step[:3]) * T.rotation
-    return RigidTransform.from_components(T.translation + step[3:], turn)
