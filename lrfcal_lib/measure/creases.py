@@ -76,10 +76,10 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
         if sine < LEAST_SINE:
             continue
         way /= sine
-        by_height = np.linalg.inv([first.axis, second.axis, way])
-        middle = (first.centre + second.centre) / 2
-        heights = [first.axis @ first.centre, second.axis @ second.centre, way @ middle]
-        origin = by_height @ heights
+        normals = [first.axis, second.axis, way]
+        by_height = np.linalg.inv(normals)
+        centres = [first.centre, second.centre, (first.centre + second.centre) / 2]
+        origin = by_height @ np.vecdot(normals, centres)
         beside = [_beside(readings - origin, plane, way) for plane, readings in pair]
         numbers, lifts = zip(*beside, strict=True)
         common = np.intersect1d(*numbers)

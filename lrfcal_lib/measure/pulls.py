@@ -38,6 +38,14 @@ class Pull:
     groups: float
     alike: float = 1.0
 
+    def pull(self, change: np.ndarray, width: float) -> "Pull":
+        """The same, wherever it is asked; see :class:`lrfcal_lib.measure.creases.Sights`."""
+        return self
+
+    def explained(self, change: np.ndarray) -> float:
+        """Logarithm of the likelihood of a change (c,), beside none."""
+        return self.slope @ change - change @ self.information @ change / 2
+
 
 def poses_of(rig: CalibratedRig, camera: str) -> np.ndarray:
     """Where the pose of a camera stands among the unknowns, (6,)."""

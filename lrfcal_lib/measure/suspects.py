@@ -141,7 +141,7 @@ def suspects(seen: list[Sights], pairs: list[Pull], rig: CalibratedRig) -> list[
     list of Shift
         Empty where nothing was observed.
     """
-    nothing, asked = _asked(seen, pairs, rig)
+    nothing, asked = _asked([*seen, *pairs], rig)
     if not nothing.information.any():
         return []
     return [
@@ -159,12 +159,12 @@ def likeliest_change(seen: list[Sights], rig: CalibratedRig) -> np.ndarray:
         Of all images.
     rig : CalibratedRig
     """
-    nothing, asked = _asked(seen, [], rig)
+    nothing, asked = _asked(seen, rig)
     fits = [nothing, *(fit for _, _, fit in asked)]
     return max(fits, key=lambda fit: fit.evidence).change
 
 
-def _asked(seen, pairs, rig):
+def _asked(seen, rig):
     """The Fit where nothing has moved; and of each suspect the camera, None for the head, columns
     of the unknowns that it moves by, and the likeliest Fit.
     """
@@ -176,12 +176,12 @@ def _asked(seen, pairs, rig):
         moves.append((None, np.array([-1]), [SLIP]))
     asked = []
     for camera, columns, ways in moves:
-        fits = [_fitted(seen, pairs, C, columns, likely) for likely in ways]
+        fits = [_fitted(seen, C, columns, likely) for likely in ways]
         asked.append((camera, columns, max(fits, key=lambda fit: fit.evidence)))
-    return _fitted(seen, pairs, C, [], 0.0), asked
+    return _fitted(seen, C, [], 0.0), asked
 
 
-def _fitted(seen, pairs, C, columns, likely):
+def _fitted(seen, C, columns, likely):
     """The Fit of changes that are likely to a covariance C (c, c), and in some columns to standard
     deviations besides: expectation and maximisation, with edges that are sought nearer and nearer,
     and Laplace's approximation of the evidence.
@@ -192,14 +192,13 @@ def _fitted(seen, pairs, C, columns, likely):
     for width in WIDTHS:
         information = np.zeros_like(C)
         slope = np.zeros(len(C))
-        for pull in [*pairs, *(sights.pull(change, width) for sights in seen)]:
+        for each in seen:
+            pull = each.pull(change, width)
             information += pull.information
             slope += pull.slope
         shares = np.eye(len(C)) + C @ information
         change = np.linalg.solve(shares, C @ slope)
-    evidence = sum(sights.explained(change) for sights in seen)
-    for pull in pairs:
-        evidence += pull.slope @ change - change @ pull.information @ change / 2
+    evidence = sum(each.explained(change) for each in seen)
     cost = change @ (slope - information @ change) + np.linalg.slogdet(shares)[1]
     return _Fit(change, slope, information, float(evidence - cost / 2))
 
