@@ -18,7 +18,7 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.measure.features import Feature, Kind, beams_moved
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import pose_array, unit_vector
+from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, refine_edge
 from lrfcal_lib.session.workers import spread
@@ -62,7 +62,6 @@ def _edges_in(cloud, surfaces, views, view):
     """The edges at planes of a cloud that one image shows."""
     planes, of_point = surfaces
     segments = _segments(view)
-    pose = pose_array(view.T_camera_platform.inv())
     # what one image of a camera sees, all of them see that have it in view
     of_camera = [other.number for other in views if other.camera == view.camera]
     p_camera = view.T_camera_platform.apply(cloud.points)
@@ -70,15 +69,15 @@ def _edges_in(cloud, surfaces, views, view):
     size = view.model.size
     near = np.isin(cloud.image, of_camera) & (np.abs(uv - size / 2) < size).all(axis=1)
     points = np.column_stack([uv, p_camera[:, 2], of_point, cloud.image])[near]
-    reach = np.linalg.norm(np.diff(segments, axis=1), axis=-1)[:, 0] / 2 + BESIDE_PX[1]
+    reach = np.linalg.norm(np.ptp(segments, axis=1), axis=1) / 2 + BESIDE_PX[1]
     about = KDTree(points[:, :2]).query_ball_point(segments.mean(axis=1), reach)
     edges = []
     for ends, rows in zip(segments, about, strict=True):
-        plane = _surface_at(ends, points[rows], planes, view, pose)
+        plane = _surface_at(ends, points[rows], planes, view)
         if plane is not None:
             with suppress(EdgeNotSeen):
                 line = _refined(view, ends, segments)
-                edges.append(_on_plane(plane, line, view, pose))
+                edges.append(_on_plane(plane, line, view))
     return edges
 
 
@@ -90,7 +89,7 @@ def _segments(view):
     if lines is None:
         return np.zeros((0, 2, 2))
     ends = lines.reshape(-1, 2, 2).astype(float)
-    return ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= SHORTEST_PX]
+    return ends[np.linalg.norm(np.ptp(ends, axis=1), axis=1) >= SHORTEST_PX]
 
 
 def _refined(view, ends, segments):
@@ -107,7 +106,7 @@ def _refined(view, ends, segments):
     return replace(line, covariance=line.covariance + np.diag([PULLED_PX**2, 0.0]))
 
 
-def _surface_at(ends, points, planes, view, pose):
+def _surface_at(ends, points, planes, view):
     """The surface that ends at a segment (2, 2) of an image, or that it is on; None for none.
 
     Of points (n, 5) about it: undistorted pixels of the image, depth, numbers of the surface and of
@@ -120,7 +119,7 @@ def _surface_at(ends, points, planes, view, pose):
     s = off @ along
     t = off @ [along[1], -along[0]]
     near, far = BESIDE_PX
-    # depth, whether it is no flat surface, less the points of it, its number, points of the image
+    # depth, whether it is no flat surface, less the points of it, its number, those of the image
     sides = []
     for away in (t, -t):
         beside = (s > 0) & (s < length) & (away > near) & (away < far)
@@ -130,48 +129,48 @@ def _surface_at(ends, points, planes, view, pose):
         counts = np.bincount(surface.astype(int) + 1)  # of none first
         number = int(np.argmax(counts)) - 1
         depth = np.median(depths)
-        if number >= 0 and counts.max() > LEAST_SHARE * len(depths):
-            _, (depth,) = _where_seen(view, pose, planes[number], ends.mean(axis=0)[None])
+        rough = number < 0 or counts.max() <= LEAST_SHARE * len(depths)
+        if not rough:
+            _, (depth,) = _where_seen(view, planes[number], ends.mean(axis=0)[None])
             depth = depth if depth > 0 else np.inf  # behind the camera
-        else:
-            number = -1
         own = np.sum(image == view.number)
-        sides.append((depth, number < 0, -counts.max(), number, own))
-    sides.sort()
-    step = STEP if any(side[1] for side in sides) else PLANES_APART
-    if len(sides) == 2 and sides[1][0] - sides[0][0] < step:
-        sides.sort(key=lambda side: side[1:])
-    if not sides or sides[0][-1] < LEAST_OWN or sides[0][3] < 0:
+        sides.append((depth, rough, -counts.max(), number, own))
+    if not sides:
         return None
-    return planes[sides[0][3]]
+    step = STEP if any(side[1] for side in sides) else PLANES_APART
+    reach = min(sides)[0] + step
+    nearest = [side for side in sides if side[0] <= reach]
+    _, rough, _, number, own = min(nearest, key=lambda side: side[1:])
+    return None if rough or own < LEAST_OWN else planes[number]
 
 
-def _where_seen(view, pose, plane, pixels):
-    """Where the sights through undistorted pixels (k, 2) of a camera with this pose (3, 4) in the
-    platform meet a plane: places (k, 3), platform frame, and how deep these are (k,), metres.
+def _where_seen(view, plane, pixels):
+    """Where the sights through undistorted pixels (k, 2) of an image meet a plane: places (k, 3),
+    platform frame, and how deep these are (k,), metres.
     """
-    rays = view.model.sights(pixels) @ pose[:, :3].T
-    eye = pose[:, 3]
+    T_platform_camera = view.T_camera_platform.inv()
+    rays = T_platform_camera.rotation.apply(view.model.sights(pixels))
+    eye = T_platform_camera.translation
     depth = plane.axis @ (plane.centre - eye) / (rays @ plane.axis)
     return eye + depth[:, None] * rays, depth
 
 
-def _on_plane(plane, line, view, pose):
+def _on_plane(plane, line, view):
     """The edge of a scene that a line of an image shows, on its plane."""
     rig = plane.rig
-    ends, depth = _where_seen(view, pose, plane, line.ends)
+    ends, depth = _where_seen(view, plane, line.ends)
     way = ends[1] - ends[0]
     direction = unit_vector(way)
 
     # the plane of sight: what it misses a point of the camera's frame by, its gradient, pixels a
     # metre
     sight = line.line @ view.model.matrix / depth[:, None]
-    gradient = sight @ pose[:, :3].T
-    across = np.cross(plane.axis, direction)
-    by_offset = across / (gradient @ across)[:, None]  # metres a pixel
+    gradient = view.T_camera_platform.rotation.apply(sight, inverse=True)
+    # metres a metre of the plane's height and metres a pixel, not along the edge
+    across = [np.linalg.inv([plane.axis, row, direction])[:, :2].T for row in gradient]
+    by_height, by_offset = np.stack(across, axis=1)
 
     # ends by the plane's height and turn, and by the line's offset and turn
-    by_height = plane.axis - by_offset * (gradient @ plane.axis)[:, None]
     by_plane = -by_height[..., None] * (ends - plane.centre)[:, None]
     stretch = (line.ends - line.centre) @ [-line.line[1], line.line[0]]
     by_line = -by_offset * stretch[:, None]
