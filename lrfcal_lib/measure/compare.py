@@ -190,10 +190,10 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
     """
     require_same_rig(first, second)
     shared = [name for name in first.cameras if name in second.cameras]
-    lenses = [
+    lens, other_lens = (
         [rig.cameras[name].model.parameters for name in shared] for rig in (first, second)
-    ]
-    one_lens = np.array_equal(*lenses)  # from the same place, to the last bit
+    )
+    one_lens = np.array_equal(lens, other_lens)  # from one place, equal to the last bit
     if one_lens:
         first = _without_lens(first)
         second = _without_lens(second)
@@ -229,7 +229,7 @@ def _part(name, names, step, covariance, images):
     return Part(name, tuple(amounts), *_chi2(step, covariance, names), p_of_others)
 
 
-def _chi2(step, covariance, names):
+def _chi2(step, covariance, names) -> tuple[float, int, float]:
     """Chi-square of some differences, its degrees of freedom, and how often chance exceeds it."""
     covariance = covariance.loc[names, names]
     sigma = np.sqrt(np.diag(covariance))

@@ -358,16 +358,15 @@ def length_between(first: Feature, second: Feature) -> Length:
     along /= size
     way = second.centre - first.centre
     height = along @ way
-    across = way - height * along
+    upright = height * along
+    across = way - upright
+    measured = upright if kind == Kind.PLANE else across
+    metres = np.linalg.norm(measured)
     # by the second centre, and by the weighted sum of axes
-    if kind == Kind.PLANE:
-        metres = abs(height)
-        by_place = np.sign(height) * along
-        by_axis = np.sign(height) * across / size
-    else:
-        metres = np.linalg.norm(across)
-        by_place = across / metres
-        by_axis = -height * by_place / size
+    by_place = measured / metres
+    by_axis = height * across / size / metres
+    if kind != Kind.PLANE:
+        by_axis *= -1
     by_first = np.append(-by_place, weights[0] * by_axis)
     by_second = np.append(by_place, weights[1] * by_axis)
     noise = by_first @ first.noise @ by_first + by_second @ second.noise @ by_second
@@ -401,10 +400,9 @@ def _refuse_askew(first, second):
 def _axes(first, second):
     """Which kind of axes a length goes by, and their weights, which turn them to one side."""
     kind = max(first.kind, second.kind, key=list(Kind).index)
-    weights = np.zeros(2)
-    for number, feature in enumerate((first, second)):
-        if feature.kind == kind:
-            weights[number] = 1 / max(np.trace(feature.noise[3:, 3:]), SURE)
+    weights = np.array(
+        [(f.kind == kind) / max(np.trace(f.noise[3:, 3:]), SURE) for f in (first, second)]
+    )
     weights /= weights.sum()
     if first.axis @ second.axis < 0:
         weights[1] *= -1

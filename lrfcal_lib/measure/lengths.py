@@ -315,10 +315,10 @@ def for_page(
         of_point.append(np.where(scene.of_point < 0, -1, scene.of_point + len(features)))
         features += [*scene.planes, *scene.edges]
         lines += [poses[number].apply(edge.ends) for edge in scene.edges]
-    rows = []
-    for f in features:
-        parts = (f.centre, f.axis, f.ends, f.noise, f.jacobian)
-        rows.append(np.concatenate(parts, axis=None))
+    rows = [
+        np.concatenate((f.centre, f.axis, f.ends, f.noise, f.jacobian), axis=None)
+        for f in features
+    ]
     frames = {
         number: {"R": T.rotation.as_matrix().tolist(), "t": T.translation.tolist()}
         for number, T in poses.items()
