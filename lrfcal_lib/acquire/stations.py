@@ -98,7 +98,7 @@ class Stations(Boards):
         if self.rig is not None:
             require_same_rig(self.rig, session)
             station = station_of(session, self.rig, number)
-            seen = [cloud.seen for cloud in colored_blocks(session, self.rig, station)]
+            seen = [cloud.seen for cloud in colored_blocks(session, self.rig, *station)]
             share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
             text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
             state = "ok" if share > EXPECTED * self.share else "warn"
