@@ -68,7 +68,7 @@ class Part:
     ----------
     name : str
         'axis', 'sensor', or a camera's.
-    amounts : tuple of Amount
+    amounts : list of Amount
     chi2 : float
         Of its parameters by both covariances.
     freedom : int
@@ -79,7 +79,7 @@ class Part:
     """
 
     name: str
-    amounts: tuple[Amount, ...]
+    amounts: list[Amount]
     chi2: float
     freedom: int
     p: float
@@ -123,7 +123,7 @@ class Comparison:
     Attributes
     ----------
     first, second : CalibratedRig
-    parts : tuple of Part
+    parts : list of Part
         Axis, sensor and every camera.
     whole : Part
         All their parameters, and the cloud.
@@ -137,7 +137,7 @@ class Comparison:
 
     first: CalibratedRig
     second: CalibratedRig
-    parts: tuple[Part, ...]
+    parts: list[Part]
     whole: Part
     images: dict[str, Shifts]
     cloud: Shifts
@@ -209,9 +209,9 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
         for name, of_part in steps.items()
     ]
     cloud = shifts(first, second_there)
-    moved = (cloud.amount("mm in the cloud", 1000),)
+    moved = [cloud.amount("mm in the cloud", 1000)]
     whole = Part("everything", moved, *_chi2(step, covariance, step.index), 1.0)
-    return Comparison(first, second, tuple(parts), whole, images, cloud, one_lens)
+    return Comparison(first, second, parts, whole, images, cloud, one_lens)
 
 
 def _part(name, names, step, covariance, images):
@@ -226,7 +226,7 @@ def _part(name, names, step, covariance, images):
     if name in images:
         amounts.append(images[name].amount("px"))
     *_, p_of_others = _chi2(step, covariance, step.index.difference(names))
-    return Part(name, tuple(amounts), *_chi2(step, covariance, names), p_of_others)
+    return Part(name, amounts, *_chi2(step, covariance, names), p_of_others)
 
 
 def _chi2(step, covariance, names) -> tuple[float, int, float]:

@@ -173,7 +173,7 @@ class Sights:
         change : ndarray, shape (c,)
         """
         share, _, _ = self._shares(change, 0.0)
-        return -float(np.log(1 - share.sum(axis=1)).sum() / PLACES)
+        return -np.log(1 - share.sum(axis=1)).sum() / PLACES
 
     def _shares(self, change, width):
         """What each edge has of its place (n, k), how far off it is, and how far it may be (n,)."""
@@ -202,8 +202,7 @@ def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
     model = view.model
     points, J = seen(creases.points, view, rig)
     reach = REACH * model.width
-    recorded = project(points, model)
-    inside = model.shows(recorded, reach)
+    inside = model.shows(project(points, model), reach)
     by_point = pinhole_jacobian(points[inside], model)
     R = view.T_camera_platform.rotation.as_matrix()
     way = creases.along[inside] @ R.T

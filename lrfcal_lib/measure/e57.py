@@ -164,12 +164,14 @@ class E57Writer(AbstractContextManager):
             for key, child in value.items():
                 structure.set(key, self._node(child))
             return structure
-        if isinstance(value, str):
-            return self._nodes.StringNode(self._image_file, value)
-        if isinstance(value, int):
-            return self._nodes.IntegerNode(self._image_file, value)
-        if isinstance(value, float):
-            return self._nodes.FloatNode(self._image_file, value)
+        plain = {
+            str: self._nodes.StringNode,
+            int: self._nodes.IntegerNode,
+            float: self._nodes.FloatNode,
+        }
+        for kind, node in plain.items():
+            if isinstance(value, kind):
+                return node(self._image_file, value)
         return value
 
 

@@ -83,7 +83,7 @@ def _edges_in(cloud, surfaces, views, view):
 
 def _segments(view):
     """Straight segments (n, 2, 2) of an image, undistorted pixels."""
-    grey = cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY)
+    grey = view.grey.astype(np.uint8)
     flat = cv2.undistort(grey, view.model.matrix, view.model.distortion)
     lines = cv2.createLineSegmentDetector(scale=1.0).detect(flat)[0]
     if lines is None:
@@ -127,7 +127,7 @@ def _surface_at(ends, points, planes, view):
         if len(depths) < FEWEST:
             continue
         counts = np.bincount(surface.astype(int) + 1)  # of none first
-        number = int(np.argmax(counts)) - 1
+        number = np.argmax(counts) - 1
         depth = np.median(depths)
         rough = number < 0 or counts.max() <= LEAST_SHARE * len(depths)
         if not rough:

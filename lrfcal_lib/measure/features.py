@@ -117,7 +117,7 @@ def flatness(points: np.ndarray, together: int = PATCH) -> tuple[np.ndarray, flo
     mean = np.bincount(patch, miss) / count
     noise = np.var(miss - mean[patch]) / together
     square = np.mean(mean[count >= together / 2] ** 2)
-    return miss, float(np.sqrt(max(square - noise, 0.0)))
+    return miss, np.sqrt(max(square - noise, 0.0))
 
 
 class Kind(StrEnum):
@@ -205,7 +205,7 @@ class Length:
         by_rig, by_surfaces = np.split(self.shared, [-2])
         of_rig = max(by_rig @ C @ by_rig for C in shared_covariances(self.rig))
         of_surfaces = SYSTEMATIC**2 * by_surfaces @ by_surfaces
-        return float(np.sqrt(self.noise + of_rig + of_surfaces))
+        return np.sqrt(self.noise + of_rig + of_surfaces)
 
 
 def mean_length(lengths: Sequence[Length]) -> Length:
@@ -313,7 +313,7 @@ def fit_feature(
     else:
         beams = unit_vector(part.points)
         of_ranges = range_noise(rig) ** 2 * beams.T @ beams / count**2
-        noise = block_diag(of_ranges, np.zeros((3, 3)))
+        noise = np.pad(of_ranges, (0, 3))
     return Feature(
         kind=Kind.PLANE if plane else Kind.POINT,
         centre=centre,
@@ -377,7 +377,7 @@ def length_between(first: Feature, second: Feature) -> Length:
     noise += np.sum((by_sweep * uncertainty_of(first.rig).sweep_sigma) ** 2)
     return Length(
         metres=float(metres),
-        noise=float(noise),
+        noise=noise,
         shared=np.append(moved[:, :-3].sum(axis=0), moved[:, -1]),
         rig=first.rig,
     )

@@ -104,14 +104,11 @@ class Held:
 
     Attributes
     ----------
-    culprits : tuple of Shift
-        The camera, or the head under cameras on the base, that has moved, the most likely first;
-        several where any of them explains what is seen.
-    shifts : tuple of Shift
+    shifts : list of Shift
         Of all cameras, and of the head where cameras stand on the base.
-    walls : tuple of Wall
+    walls : list of Wall
         Of stations with one.
-    passes : tuple of Passes
+    passes : list of Passes
     creases, regions : float
         That told it: quarter metres of creases that have an edge, in all images, and regions of
         surfaces that two images show.
@@ -121,14 +118,20 @@ class Held:
         A slip of the head would only turn the whole cloud.
     """
 
-    culprits: tuple[Shift, ...]
-    shifts: tuple[Shift, ...]
-    walls: tuple[Wall, ...]
-    passes: tuple[Passes, ...]
+    shifts: list[Shift]
+    walls: list[Wall]
+    passes: list[Passes]
     creases: float
     regions: float
     alike: float
     all_on_head: bool
+
+    @property
+    def culprits(self) -> list[Shift]:
+        """The camera, or the head under cameras on the base, that has moved, the most likely first;
+        several where any of them explains what is seen.
+        """
+        return most_likely(self.shifts)
 
     @property
     def moved(self) -> tuple[str, ...]:
@@ -196,7 +199,7 @@ class Held:
             f"from {self.creases / 4:.0f} m of creases, where surfaces meet, against edges of "
             f"images, and {self.regions:.0f} regions of surfaces that two images show{on_head}"
         )
-        found: tuple[Shift | Wall | Passes, ...] = (*self.shifts, *self.walls, *self.passes)
+        found: list[Shift | Wall | Passes] = [*self.shifts, *self.walls, *self.passes]
         sentences = [each.sentence() for each in found]
         return [f"{name}: {first[self.answer]}", *sentences, basis]
 
@@ -242,13 +245,11 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     start = likeliest_change(of_creases, rig)
     pulls = [pairs_pull(*station, rig, start) for station in stations]
     of_pairs = [pull for pull in pulls if pull is not None]
-    shifts = suspects(of_creases, of_pairs, rig)
     nothing = np.zeros_like(start)
     return Held(
-        culprits=tuple(most_likely(shifts)),
-        shifts=tuple(shifts),
-        walls=tuple(walls),
-        passes=tuple(passes_of(session)),
+        shifts=suspects(of_creases, of_pairs, rig),
+        walls=walls,
+        passes=passes_of(session),
         creases=sum(seen.pull(nothing, NEAR).groups for seen in of_creases),
         regions=sum(pull.groups for pull in of_pairs),
         alike=min((pull.alike for pull in of_pairs), default=1.0),
@@ -259,12 +260,11 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
 def _stations(session, rig):
     """Placements with a sweep and images of the rig's cameras, of which one can be posed."""
     require_same_rig(rig, session)
-    fixed = [name for name, camera in rig.cameras.items() if camera.mount == "platform"]
     shown = {
         record.placement
         for record in session.image_records
-        if record.camera in fixed
-        or (record.camera in rig.cameras and np.isfinite(record.pitch))
+        if record.camera in rig.cameras
+        and (rig.cameras[record.camera].mount == "platform" or np.isfinite(record.pitch))
     }
     stations = [p for p in _swept(session) if p in shown]
     if not stations:
@@ -312,9 +312,9 @@ def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
     # a plane turns and shifts with the errors: only what bends it shows
     plane = np.insert(wall.points - wall.points.mean(axis=0), 0, 1.0, axis=1)
     by_link -= plane @ np.linalg.lstsq(plane, by_link, rcond=None)[0]
-    squares = [np.mean(np.vecdot(by_link @ C, by_link)) for C in chain.covariances]
-    allowed = np.sqrt(max(squares) + UNEVEN**2)
-    return Wall(placement, flatness(wall.points)[1], float(allowed))
+    squares = np.vecdot(by_link @ chain.covariances, by_link)
+    allowed = np.sqrt(squares.mean(axis=1).max() + UNEVEN**2)
+    return Wall(placement, flatness(wall.points)[1], allowed)
 
 
 def passes_of(session: Session) -> list[Passes]:
@@ -352,4 +352,4 @@ def _slip_between(one, other, noise):
     slope = growth[smooth]
     slip = slope @ miss[smooth] / (slope @ slope)
     rough = max(np.std(miss[smooth] - slip * slope), noise)
-    return -float(slip), float(rough / np.sqrt(slope @ slope))
+    return -slip, rough / np.sqrt(slope @ slope)

@@ -37,6 +37,7 @@ BLURS = (6.0, 4.0, 2.5, 1.5, 1.0, 1.0)  # pixels, round by round
 ALIKE = 0.7  # correlation below which patches do not show the same
 CELL = np.radians(6.0)  # patches nearer together err together
 BORDER = 20  # pixels
+STILL = 1e-12  # radians or metres, of what is not fitted
 APART = 12.0  # pixels, side of cells: a patch is alone in its own and in those about it
 REACH = 2**1.5 * APART  # pixels, to their farthest corner
 BEFORE = 4.0  # standard deviations of a range by which something else is nearer or farther
@@ -95,21 +96,22 @@ def pairs_pull(
     cameras = dict.fromkeys(view.camera for view in views)
     poses = np.concatenate([poses_of(rig, camera) for camera in cameras])
     noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
-    x = np.pad(start, (0, len(noise)))
-    fitted = np.r_[poses, len(start) : len(x)]
-    begun = x[fitted]
-    # what moves both images alike stays where creases have it
-    prior = np.diag(np.r_[np.tile(SPREAD / 4, len(cameras)), noise] ** -2.0)
+    # what moves both images alike stays where creases have it, and all else that is no pose
+    sigma = np.full(len(start), STILL)
+    sigma[poses] = np.tile(SPREAD / 4, len(cameras))
+    prior = np.r_[sigma, noise] ** -2.0
+    begun = np.pad(start, (0, len(noise)))
+    step = np.zeros_like(begun)
     for blur in BLURS:
         sharp = {view.number: cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
+        x = begun + step
         parts = [_compared(pair, sharp, x) for pair in pairs]
         H, b, D, cell = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
         by_row = np.vecmat(-b, D)
-        left = by_row.sum(axis=0)[fitted] - prior @ (x[fitted] - begun)
-        compared_at = x.copy()
-        x[fitted] += np.linalg.solve(information[np.ix_(fitted, fitted)] + prior, left)
-    pull = pull_of_groups(information, by_row, cell, compared_at, poses)
+        left = by_row.sum(axis=0) - prior * step
+        step += np.linalg.solve(information + np.diag(prior), left)
+    pull = pull_of_groups(information, by_row, cell, x, poses)
     return replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())
 
 

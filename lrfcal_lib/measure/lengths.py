@@ -42,9 +42,8 @@ REACH = (
 ON_IT = 0.01  # metres from a place on a feature of one station to the same one of another
 ABOUT = 9  # points whose middle a picked point is, and that show which plane is picked
 PLACE = ("x", "y", "z")
-PICKED = tuple(
-    f"{what}_{number}" for number in (1, 2) for what in ("kind", "x_m", "y_m", "z_m")
-)
+END = ("kind", "x_m", "y_m", "z_m")
+PICKED = tuple(f"{what}_{number}" for number in (1, 2) for what in END)
 IN_PLACE = RigidTransform.identity()
 
 
@@ -110,7 +109,7 @@ def nearest_edge(
     foot = first + np.clip(along, 0, 1)[:, None] * way
     away = np.linalg.norm(foot - place, axis=1)
     nearest = int(np.argmin(away))
-    return edges[nearest], float(away[nearest])
+    return edges[nearest], away[nearest]
 
 
 def features_of(cloud: Cloud, rig: CalibratedRig, views: Sequence[View]) -> SceneFeatures:
@@ -221,8 +220,7 @@ def _shown(scenes, poses, row, number) -> dict[int, Feature]:
     """The features that stations show at one of the places of a row of picks; a point is of the
     station that is nearest.
     """
-    kind = row[f"kind_{number}"]
-    place = np.array([row[f"{axis}_m_{number}"] for axis in PLACE], float)
+    kind, *place = (row[f"{what}_{number}"] for what in END)
     near = {n: s.at(kind, poses[n].inv().apply(place)) for n, s in scenes.items()}
     clicked = min(near, key=lambda station: near[station][1])
     feature, away = near[clicked]

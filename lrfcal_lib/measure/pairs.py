@@ -19,7 +19,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.robust import biweight, robust_sigma, sums_by
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
 from lrfcal_lib.model.geometry import (
@@ -102,7 +101,7 @@ class Surface:
         left = self.normals[:: max(1, len(self.normals) // 2000)]
         least = FEW * len(left)
         found: list[np.ndarray] = []
-        while len(found) < DIRECTIONS:
+        for _ in range(DIRECTIONS):
             near = left @ left.T > NEAR
             count = near.sum(axis=1)
             if count.max(initial=0) < least:
@@ -318,7 +317,7 @@ def matches(first: Surface, second: Surface, T: RigidTransform, width: float = M
 def _before(surface, points):
     """How many points (n, 3) stand where a station looked through."""
     cell, distance = _cells(points)
-    return int(np.sum(distance < surface.nearest[cell] - CLEAR))
+    return np.sum(distance < surface.nearest[cell] - CLEAR)
 
 
 @dataclass(frozen=True)
@@ -352,11 +351,6 @@ class Pair:
     rms: float
     loose: np.ndarray
     held: float
-
-    @cached_property
-    def whiten(self) -> np.ndarray:
-        """What makes a miss one of unit covariance, (6, 6)."""
-        return inverse_root(self.covariance)
 
     def miss(self, poses: Mapping[int, RigidTransform]) -> np.ndarray:
         """Turn and shift (6,) by which poses of the stations differ from it."""
@@ -394,7 +388,7 @@ def fitted(
         normals = unit_vector(across)
         r = np.vecdot(normals, turned + T.translation - first.points[here])
         J = gradient_by_pose(turned, normals)
-        sigma = np.sqrt(first.sigma[here] ** 2 + second.sigma[there] ** 2 + COMMON**2)
+        sigma = np.hypot(np.hypot(first.sigma[here], second.sigma[there]), COMMON)
         sigma *= robust_sigma(r / sigma, least=1.0)
         weight = biweight(r, sigma) / sigma**2
         weighted = J * weight[:, None]
@@ -415,7 +409,7 @@ def fitted(
         covariance=inverse @ (sums.T @ sums) @ inverse + by_sweeps @ by_sweeps.T,
         by_rig=(by_second - by_first)[:, :-2],
         overlap=agreement(first, second, T).overlap,
-        rms=float(np.sqrt(np.average(r**2, weights=weight))),
+        rms=np.sqrt(np.average(r**2, weights=weight)),
         loose=loose,
-        held=float(np.mean(np.abs(J[:, 3:] @ loose) > ACROSS)),
+        held=np.mean(np.abs(J[:, 3:] @ loose) > ACROSS),
     )

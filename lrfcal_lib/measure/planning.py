@@ -51,7 +51,7 @@ def plan_images(
     visible = seen_at(rig, sweep, candidates)
     left = np.ones(visible.shape[1], bool)
     chosen: list[int] = []
-    while len(chosen) < MOST:
+    for _ in range(MOST):
         gains = np.mean(visible & left, axis=1)
         best = int(np.argmax(gains))
         if gains[best] < WORTH:
@@ -60,7 +60,7 @@ def plan_images(
         left &= ~visible[best]
     return ImagePlan(
         pitch=tuple(np.sort(candidates[chosen]).tolist()),
-        share=float(1 - left.mean()),
+        share=1 - left.mean(),
     )
 
 

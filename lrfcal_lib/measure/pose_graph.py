@@ -7,6 +7,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.measure.pairs import Pair
 from lrfcal_lib.model.geometry import POSE, move_pose, pose_array, pose_transform
 
@@ -62,10 +63,10 @@ def solved(pairs: list[Pair], station: int) -> tuple[dict[int, RigidTransform], 
 
     def residuals(steps):
         poses = after(steps)
-        return np.concatenate([pair.whiten @ pair.miss(poses) for pair in pairs])
+        return whiten @ np.concatenate([pair.miss(poses) for pair in pairs])
 
+    whiten = block_diag(*(inverse_root(pair.covariance) for pair in pairs))
     nothing = np.zeros(POSE * len(start) - POSE)
     best = least_squares(residuals, nothing, jac="3-point", x_scale="jac")
-    whiten = block_diag(*(pair.whiten for pair in pairs))
     response = np.linalg.pinv(best.jac) @ whiten
     return after(best.x), np.pad(response, ((POSE, 0), (0, 0)))

@@ -3,6 +3,7 @@
 A station is one place where the rig stood: a sweep and the images taken there.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -228,7 +229,7 @@ def _written(writer, session, rig, joined, told, clouds, scenes):
     """
     poses = joined.T_world_station
     count = sum(np.isfinite(session.sweep(number).ranges).sum() for number in poses)
-    every = int(-(-count // MOST_POINTS))
+    every = math.ceil(count / MOST_POINTS)
     for number, pose in poses.items():
         sweep, views = station_of(session, rig, number)
         blocks = (with_sigma(b, rig) for b in colored_blocks(session, rig, sweep, views))

@@ -48,7 +48,7 @@ class Shift:
     evidence : float
         Logarithm of the odds that it turned, moved or both against that nothing has moved, where
         either was as likely before.
-    shows : tuple of float
+    shows : list of float
         The least turn (radians), and the least move of a camera (metres), that raise an alarm in 9
         of 10 cases, whichever way they go.
     """
@@ -59,7 +59,7 @@ class Shift:
     pixels: np.ndarray
     pixels_sigma: np.ndarray
     evidence: float
-    shows: tuple[float, ...]
+    shows: list[float]
 
     @property
     def name(self) -> str:
@@ -200,19 +200,19 @@ def _fitted(seen, C, columns, likely):
         change = np.linalg.solve(shares, C @ slope)
     evidence = sum(each.explained(change) for each in seen)
     cost = change @ (slope - information @ change) + np.linalg.slogdet(shares)[1]
-    return _Fit(change, slope, information, float(evidence - cost / 2))
+    return _Fit(change, slope, information, evidence - cost / 2)
 
 
 def _allowed(rig):
     """Covariance (c, c) of the unknowns where nothing has moved, the pitch of sweeps last."""
     known = rig.uncertainty
-    C = np.pad(np.where(np.isfinite(known.trusted), known.trusted, 0.0), (0, 1))
+    C = np.pad(np.nan_to_num(known.trusted, posinf=0.0, neginf=0.0), (0, 1))
     common = np.zeros((len(C), 6))
     for name, camera in rig.cameras.items():
         columns = poses_of(rig, name)
         C[columns, columns] += OWN**2
         if camera.mount == "head":
-            common[columns, np.arange(6)] = COMMON
+            common[columns] = np.diag(COMMON)
     C[-1, -1] = known.sweep_sigma[0] ** 2 + PITCH_NOISE**2
     return C + common @ common.T
 
@@ -247,5 +247,5 @@ def _shift(camera, columns, fit, evidence, rig):
         pixels=motion @ change,
         pixels_sigma=sigma_of(motion @ covariance @ motion.T),
         evidence=evidence,
-        shows=tuple(shows),
+        shows=shows,
     )
