@@ -87,8 +87,7 @@ class Part:
 
     def __str__(self):
         amounts = ", ".join(map(str, self.amounts))
-        test = f"chi2 {self.chi2:.1f} of {self.freedom}, p = {self.p:.2g}"
-        return f"{self.name}: {amounts}; {test}"
+        return f"{self.name}: {amounts}; chi2 {self.chi2:.1f} of {self.freedom}, p = {self.p:.2g}"
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ class Shifts:
     off : ndarray, shape (rows, columns, k)
         Pixels (k = 2), or metres (k = 3).
     claimed : ndarray, shape (rows, columns)
-        Standard deviation as both claim, root of the sum over k.
+        Standard deviation as both claim, root of the sum over k; NaN where no beam gets.
     """
 
     at: np.ndarray
@@ -111,9 +110,12 @@ class Shifts:
 
     def amount(self, unit: str, scale: float = 1.0) -> Amount:
         """Root mean squares as an Amount, times `scale`."""
-        value = rms(np.linalg.norm(self.off, axis=-1))
-        claimed = root_mean_square(self.claimed[np.isfinite(self.off[..., 0])])
-        return Amount(f"at {DISTANCE:g} m", scale * value, scale * claimed, unit)
+        return Amount(
+            what=f"at {DISTANCE:g} m",
+            value=scale * rms(np.linalg.norm(self.off, axis=-1)),
+            claimed=scale * root_mean_square(self.claimed),
+            unit=unit,
+        )
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ class Comparison:
         share = float(f"{100 * self.whole.p:.2g}")  # 100, not 1e+02
         odds = f"honest calibrations differ more in {share:g} % of cases"
         if self.one_lens:
-            odds = f"{odds}; both use the same intrinsics, whose errors do not count"
+            odds += "; both use the same intrinsics, whose errors do not count"
         names = f"'{self.first.session}' and '{self.second.session}'"
         if self.within:
             return f"{names} differ within what both claim ({odds})."
@@ -220,9 +222,13 @@ def _part(name, names, step, covariance, images):
     kinds = ("scale" if name == "sensor" else "turn", "shift")
     for what, members in zip(kinds, np.split(names, 2), strict=True):
         scale, unit = UNITS[what]
-        value = np.linalg.norm(step[members])
-        claimed = np.sqrt(np.trace(covariance.loc[members, members]))
-        amounts.append(Amount(what, scale * value, scale * claimed, unit))
+        amount = Amount(
+            what=what,
+            value=scale * np.linalg.norm(step[members]),
+            claimed=scale * np.sqrt(np.trace(covariance.loc[members, members])),
+            unit=unit,
+        )
+        amounts.append(amount)
     if name in images:
         amounts.append(images[name].amount("px"))
     *_, p_of_others = _chi2(step, covariance, step.index.difference(names))
@@ -247,8 +253,11 @@ def _chi2(step, covariance, names) -> tuple[float, int, float]:
 def _without_lens(rig):
     """A rig whose intrinsics are exact."""
     known = uncertainty_of(rig)
-    trusted = known.trusted - known.lens
-    known = replace(known, covariance=known.covariance - known.lens, trusted=trusted)
+    known = replace(
+        known,
+        covariance=known.covariance - known.lens,
+        trusted=known.trusted - known.lens,
+    )
     return replace(rig, uncertainty=known)
 
 
@@ -263,13 +272,13 @@ def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
     step = pose_step(second.T_head_lrf, first.T_head_lrf)
     step[AXIS_COLUMNS] = 0  # what is left turns about x, and shifts along it
     gauge = RigidTransform.from_exp_coords(step)
-    cameras = {}
-    for name, camera in second.cameras.items():
-        if camera.mount == "platform":
-            camera = replace(camera, T_camera=camera.T_camera * gauge.inv())
-        cameras[name] = camera
+    on_base = {
+        name: replace(camera, T_camera=camera.T_camera * gauge.inv())
+        for name, camera in second.cameras.items()
+        if camera.mount == "platform"
+    }
     axis = replace(second.axis, T_head_lrf=gauge * second.T_head_lrf)
-    return replace(second, axis=axis, cameras=cameras)
+    return replace(second, axis=axis, cameras=second.cameras | on_base)
 
 
 def _steps(first, second, shared):

@@ -208,7 +208,7 @@ def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
     way = creases.along[inside] @ R.T
     tangent = unit_vector(np.matvec(by_point, way))
     normal = tangent[:, ::-1] * [-1, 1]
-    across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
+    across, clear = _edges(view, reach, pinhole(points[inside], model), tangent, normal)
     by_place = np.vecmat(normal, by_point) / reach
     off = np.matvec(creases.off[inside] @ R.T, by_place)
     return Sights(
@@ -219,11 +219,10 @@ def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
     )
 
 
-def _edges(view, places, tangent, normal):
-    """Offsets (n, k) of edges in pixels from pixels (n, 2) along their normals (n, 2), and how
-    clear each is, 0 to 1.
+def _edges(view, reach, places, tangent, normal):
+    """Offsets (n, k) of edges, up to some pixels, from pixels (n, 2) along their normals (n, 2),
+    and how clear each is, 0 to 1.
     """
-    reach = REACH * view.model.width
     grid = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
     across = np.tile(grid, (len(places), 1))
     clear = np.zeros_like(across)

@@ -137,11 +137,10 @@ class E57Writer(AbstractContextManager):
         view
             Its pixels and intrinsics.
         """
-        size = (view.model.width, view.model.height)
         lens = (view.model.matrix, view.model.distortion)
         # all of the image, and room for it
-        wide = tuple(round(WIDER * side) for side in size)
-        matrix, _ = cv2.getOptimalNewCameraMatrix(*lens, size, 1.0, wide)
+        wide = np.rint(WIDER * view.model.size).astype(int).tolist()
+        matrix, _ = cv2.getOptimalNewCameraMatrix(*lens, view.model.size, 1.0, wide)
         maps = cv2.initUndistortRectifyMap(*lens, None, matrix, wide, cv2.CV_32FC2)[0]
         flat = cv2.remap(view.image, maps, None, cv2.INTER_LINEAR)
         jpeg = bytearray(encode_jpeg(flat, QUALITY))

@@ -52,7 +52,6 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
     Cloud
     """
     chain = chain_of(rig)
-    noise = range_noise(rig)
     sweep_noise = PitchNoise(*chain.sweep_sigma)
     sigma = np.zeros(len(cloud.points))
     for rows in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
@@ -63,7 +62,8 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
         normals = np.where(np.isfinite(normals), normals, beams)
         calibration = spread(chain, normals[:, None] @ J)
         sweep = sweep_noise.sigma(part.pitch, 0.0) * np.vecdot(normals, by_pitch)
-        reading = np.maximum(np.abs(noise * np.vecdot(normals, beams)), part.sigma)
+        noise = range_noise(rig) * np.vecdot(normals, beams)
+        reading = np.maximum(np.abs(noise), part.sigma)
         sigma[rows] = np.linalg.norm([calibration, sweep, reading], axis=0)
     return replace(cloud, sigma=sigma)
 

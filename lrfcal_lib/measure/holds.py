@@ -134,7 +134,7 @@ class Held:
         return most_likely(self.shifts)
 
     @property
-    def moved(self) -> tuple[str, ...]:
+    def moved(self) -> list[str]:
         """What is no longer where the calibration has it."""
         moved = []
         if self.culprits:
@@ -144,7 +144,7 @@ class Held:
         # one wall alone may bend
         if self.walls and all(wall.bent for wall in self.walls):
             moved.append("the range finder on the axis of the head (or no wall is flat)")
-        return tuple(moved)
+        return moved
 
     @property
     def answer(self) -> Answer:
@@ -172,8 +172,10 @@ class Held:
         if doubtful:
             return f"{' or '.join(doubtful)} may have moved, or not; {more}"
         if max(self.creases, self.regions) < FEWEST_GROUPS:
-            number = f"{self.creases / 4:.0f} m of creases and {self.regions:.0f} regions"
-            return f"{number} are too few; {FURNITURE}"
+            return (
+                f"{self.creases / 4:.0f} m of creases and {self.regions:.0f} regions are too few; "
+                f"{FURNITURE}"
+            )
         return ""
 
     def sentences(self, name: str = "the calibration") -> list[str]:
@@ -195,13 +197,14 @@ class Held:
                 "; all cameras are on the head: a slip of the head only turns the whole cloud, "
                 "nothing here can show it"
             )
-        basis = (
-            f"from {self.creases / 4:.0f} m of creases, where surfaces meet, against edges of "
-            f"images, and {self.regions:.0f} regions of surfaces that two images show{on_head}"
-        )
         found: list[Shift | Wall | Passes] = [*self.shifts, *self.walls, *self.passes]
         sentences = [each.sentence() for each in found]
-        return [f"{name}: {first[self.answer]}", *sentences, basis]
+        return [
+            f"{name}: {first[self.answer]}",
+            *sentences,
+            f"from {self.creases / 4:.0f} m of creases, where surfaces meet, against edges of "
+            f"images, and {self.regions:.0f} regions of surfaces that two images show{on_head}",
+        ]
 
 
 def holds(session: Session, rig: CalibratedRig) -> Held:
@@ -243,8 +246,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         moved, of_flat = flattened(cloud, planes, of_point)
         stations.append((moved, of_flat, list(views.values())))
     start = likeliest_change(of_creases, rig)
-    pulls = [pairs_pull(*station, rig, start) for station in stations]
-    of_pairs = [pull for pull in pulls if pull is not None]
+    of_pairs = sum((pairs_pull(*station, rig, start) for station in stations), [])
     nothing = np.zeros_like(start)
     return Held(
         shifts=suspects(of_creases, of_pairs, rig),
@@ -330,26 +332,21 @@ def passes_of(session: Session) -> list[Passes]:
     for pair in pairwise(_swept(session)):
         one, other = (session.sweep(placement) for placement in pair)
         if session.sweep_direction(pair[0]) * session.sweep_direction(pair[1]) < 0:
-            slip = _slip_between(one, other, session.lrf.sigma_range)
-            if slip is not None:
-                passes.append(Passes(pair, *slip))
+            passes += _over_one_place(pair, one, other, session.lrf.sigma_range)
     return passes
 
 
-def _slip_between(one, other, noise):
-    """By how much more the second of two sweeps says its pitch is than the first, and sigma,
-    radians; None where they are of different places.
-    """
+def _over_one_place(placements, one, other, noise):
+    """The Passes of two sweeps; none where they are of different places."""
     if min(len(one.pitch), len(other.pitch)) < 2:
-        return None
+        return []
     at_pitch = interp1d(other.pitch, other.ranges, axis=0, bounds_error=False)
     miss = at_pitch(one.pitch) - one.ranges
     growth = np.gradient(one.ranges, one.pitch, axis=0)
-    with np.errstate(invalid="ignore"):
-        smooth = (np.abs(growth) < STEEP) & (np.abs(miss) < STEEP * WANTED * 3)
+    smooth = (np.abs(growth) < STEEP) & (np.abs(miss) < STEEP * WANTED * 3)
     if smooth.sum() < max(FEWEST_POINTS, SAME_PLACE * np.isfinite(miss).sum()):
-        return None
+        return []
     slope = growth[smooth]
     slip = slope @ miss[smooth] / (slope @ slope)
     rough = max(np.std(miss[smooth] - slip * slope), noise)
-    return -slip, rough / np.sqrt(slope @ slope)
+    return [Passes(placements, -slip, rough / np.sqrt(slope @ slope))]

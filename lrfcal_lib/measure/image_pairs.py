@@ -61,8 +61,8 @@ def pairs_pull(
     views: list[View],
     rig: CalibratedRig,
     start: np.ndarray,
-) -> Pull | None:
-    """What pairs of images say about a rig; None where they show too little.
+) -> list[Pull]:
+    """What pairs of images say about a rig, one Pull; none where they show too little.
 
     Every camera's pose is found by Gauss-Newton from blurred to sharp images.
 
@@ -85,14 +85,13 @@ def pairs_pull(
     stops = np.unique([view.pitch for view in views])
     pairs = []
     for first, second in combinations(views, 2):
-        turned = abs(first.pitch - second.pitch)
-        same = first.camera == second.camera
-        if turned < (NEAR_PITCH if same else 1e-3):
+        near = NEAR_PITCH if first.camera == second.camera else 1e-3
+        if abs(first.pitch - second.pitch) < near:
             both = clear[first.number] & clear[second.number]
             rows = cloud.rows(patches[both])
             pairs.append(_pair(rows, surfaces[both], (first, second), rig, stops))
     if sum(len(pair.cell) for pair in pairs) < FEWEST:
-        return None
+        return []
     cameras = dict.fromkeys(view.camera for view in views)
     poses = np.concatenate([poses_of(rig, camera) for camera in cameras])
     noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
@@ -112,7 +111,7 @@ def pairs_pull(
         left = by_row.sum(axis=0) - prior * step
         step += np.linalg.solve(information + np.diag(prior), left)
     pull = pull_of_groups(information, by_row, cell, x, poses)
-    return replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())
+    return [replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())]
 
 
 def clear_places(cloud, view, rig):

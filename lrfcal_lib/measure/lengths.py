@@ -317,10 +317,6 @@ def for_page(
         np.concatenate((f.centre, f.axis, f.ends, f.noise, f.jacobian), axis=None)
         for f in features
     ]
-    frames = {
-        number: {"R": T.rotation.as_matrix().tolist(), "t": T.translation.tolist()}
-        for number, T in poses.items()
-    }
     rig = next(iter(scenes.values())).rig
     known = uncertainty_of(rig)
     return {
@@ -330,7 +326,10 @@ def for_page(
         "lines": np.array(lines).reshape(-1, 2, 3),
         "plane_of_point": np.concatenate(of_point),
         "station_of_point": np.concatenate([s.cloud.placement for s in scenes.values()]),
-        "poses": frames,
+        "poses": {
+            number: {"R": T.rotation.as_matrix().tolist(), "t": T.translation.tolist()}
+            for number, T in poses.items()
+        },
         "unknowns": len(known.names),
         "columns": columns_of(known.names).tolist(),
         "covariances": shared_covariances(rig),

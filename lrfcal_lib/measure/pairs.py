@@ -56,6 +56,7 @@ SAME_POSE = np.array([np.radians(3.0), 0.15])
 MATCHED = 0.1  # metres between patches of the same surface
 FACING = np.cos(np.radians(30.0))  # between normals of the same surface
 LOOK = np.radians(1.0)  # side of a cell of what a station saw
+ALL_ABOUT = (361, 181)  # of these, in azimuth and height
 CLEAR = 0.15  # metres before a surface; a patch there stands where the other looked through
 CLOSER = (0.1, 0.05, 0.05, 0.05)  # metres within which a fit takes patches for the same
 COMMON = 0.002  # metres, error of a patch that its neighbours have too
@@ -176,8 +177,7 @@ def _cells(points):
 def _look(points):
     """Nearest range in every cell of the view of a platform and the cells about it, or 0."""
     cell, distance = _cells(points)
-    shape = (int(2 * np.pi / LOOK) + 1, int(np.pi / LOOK) + 1)
-    nearest = np.full(shape, np.inf)
+    nearest = np.full(ALL_ABOUT, np.inf)
     np.minimum.at(nearest, cell, distance)
     nearest = minimum_filter(nearest, 3)
     return np.nan_to_num(nearest, posinf=0.0)
@@ -215,7 +215,7 @@ def candidates(first: Surface, second: Surface) -> list[Candidate]:
     """
     target, tree = first.gicp
     source, _ = second.gicp
-    ended: list[RigidTransform] = []
+    found: list[Candidate] = []
     for start in starts(first, second):
         matrix = start.as_matrix()
         for width in WIDTHS:
@@ -229,9 +229,11 @@ def candidates(first: Surface, second: Surface) -> list[Candidate]:
                 max_iterations=30,
             ).T_target_source
         T = RigidTransform.from_matrix(matrix)
-        if all(np.any(SAME_POSE <= transform_difference(T, other)) for other in ended):
-            ended.append(T)
-    found = [agreement(first, second, T) for T in ended]
+        if all(
+            np.any(SAME_POSE <= transform_difference(T, other.T_first_second))
+            for other in found
+        ):
+            found.append(agreement(first, second, T))
     return sorted(found, key=lambda c: -c.overlap * (1 - c.against))
 
 
@@ -299,9 +301,11 @@ def agreement(first: Surface, second: Surface, T: RigidTransform) -> Candidate:
     both = (len(np.unique(here)), len(there))
     conflicts = _before(first, T.apply(second.points))
     conflicts += _before(second, T.inv().apply(first.points))
-    fewer = min(len(first.points), len(second.points))
-    against = conflicts / max(conflicts + sum(both), 1)
-    return Candidate(T, min(both) / fewer, against)
+    return Candidate(
+        T,
+        overlap=min(both) / min(len(first.points), len(second.points)),
+        against=conflicts / max(conflicts + sum(both), 1),
+    )
 
 
 def matches(first: Surface, second: Surface, T: RigidTransform, width: float = MATCHED):
@@ -384,8 +388,7 @@ def fitted(
     for width in CLOSER:
         here, there = matches(first, second, T, width)
         turned = T.rotation.apply(second.points[there])
-        across = first.normals[here] + T.rotation.apply(second.normals[there])
-        normals = unit_vector(across)
+        normals = unit_vector(first.normals[here] + T.rotation.apply(second.normals[there]))
         r = np.vecdot(normals, turned + T.translation - first.points[here])
         J = gradient_by_pose(turned, normals)
         sigma = np.hypot(np.hypot(first.sigma[here], second.sigma[there]), COMMON)

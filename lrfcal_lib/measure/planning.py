@@ -26,7 +26,7 @@ NEW = -1  # a placement of which no sweep was calibrated
 class ImagePlan:
     """Pitch angles of images, radians, ascending, and the share of the cloud that they colour."""
 
-    pitch: tuple[float, ...]
+    pitch: np.ndarray
     share: float
 
 
@@ -59,7 +59,7 @@ def plan_images(
         chosen.append(best)
         left &= ~visible[best]
     return ImagePlan(
-        pitch=tuple(np.sort(candidates[chosen]).tolist()),
+        pitch=np.sort(candidates[chosen]),
         share=1 - left.mean(),
     )
 
@@ -81,10 +81,9 @@ def seen_at(
     ndarray of bool, shape (p, n)
         By pitch; beams of all `DISTANCES`.
     """
-    first, last = np.sort(sweep)
     bearings = _grid(*rig.lrf.field_of_view)
     p_lrf = polar_to_points(np.reshape(DISTANCES, (-1, 1)), bearings).reshape(-1, 3)
-    turns = rig.corrections.pitch(NEW, _grid(first, last))
+    turns = rig.corrections.pitch(NEW, _grid(*np.sort(sweep)))
     points = lrf_to_platform(p_lrf, turns[:, None], rig.T_head_lrf).reshape(-1, 3)
     visible = np.zeros((len(pitches), len(points)), bool)
     for name, camera in rig.cameras.items():

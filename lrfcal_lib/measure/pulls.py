@@ -100,9 +100,8 @@ def pull_of_groups(
     fitted : ndarray of int, shape (f,)
         Which of them were fitted: by their slopes groups scatter.
     """
-    size = np.linalg.norm(by_row, axis=1)
     sums = sums_by(group, by_row[:, fitted])
-    load = sums_by(group, size)
+    load = sums_by(group, np.linalg.norm(by_row, axis=1))
     groups = load.sum() ** 2 / max(load @ load, 1e-300)
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
     excess = np.trace(own @ sums.T @ sums) / max(len(fitted), 1)

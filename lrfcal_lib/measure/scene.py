@@ -131,14 +131,13 @@ def colored_blocks(
         return blocks
     subset = intensities.ravel()[:: 1 + intensities.size // COMPARED]
     levels = np.nanpercentile(subset, [2, 98])
-    return (_shaded(cloud, *levels) for cloud in blocks)
+    return (_shaded(cloud, levels) for cloud in blocks)
 
 
-def _shaded(cloud, weak, strong):
+def _shaded(cloud, levels):
     """A Cloud whose points that no image saw are as bright as their echoes."""
-    share = np.clip((cloud.intensity - weak) / max(strong - weak, 1e-9), 0, 1)
-    grey = np.nan_to_num(DARKEST + (BRIGHTEST - DARKEST) * share, nan=DARKEST)
-    shades = np.repeat(grey[:, None].astype(np.uint8), 3, axis=1)
+    grey = np.interp(cloud.intensity, levels, [DARKEST, BRIGHTEST])
+    shades = np.nan_to_num(grey, nan=DARKEST)[:, None].astype(np.uint8)
     return replace(cloud, colors=np.where(cloud.seen[:, None], cloud.colors, shades))
 
 

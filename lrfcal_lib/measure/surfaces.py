@@ -117,5 +117,5 @@ def _cells(points, normal):
     """
     cell = np.rint(points @ null_space(normal[None]) / CELL).astype(int)
     cell -= cell.min(axis=0)
-    shape = tuple(cell.max(axis=0) + 1)
-    return np.ravel_multi_index(tuple(cell.T), shape), shape
+    shape = cell.max(axis=0) + 1
+    return np.ravel_multi_index(cell.T, shape), shape

@@ -87,9 +87,10 @@ class Shift:
         odds = f"odds of 10^{self.evidence / np.log(10):+.1f} that it has"
         turn, sigma = np.degrees([self.change, sigma_of(self.covariance)])
         if self.camera is None:
-            amount = f"by {turn[0]:+.2f} +- {sigma[0]:.2f} deg"
-            least = f"slips from {np.degrees(self.shows[0]):.2f} deg on show"
-            return f"{self.name}, if only it slipped: {amount}; {odds}; {least}"
+            return (
+                f"{self.name}, if only it slipped: by {turn[0]:+.2f} +- {sigma[0]:.2f} deg; "
+                f"{odds}; slips from {np.degrees(self.shows[0]):.2f} deg on show"
+            )
         (right, down), (of_right, of_down) = self.pixels, self.pixels_sigma
         return (
             f"{self.name}, if only it moved: image {right:+.2f} +- {of_right:.2f} px to the right, "
