@@ -287,15 +287,18 @@ def _steps(first, second, shared):
     Turns or a scale, then as many shifts.
     """
     by_axis = pose_step(first.T_head_lrf, second.T_head_lrf)[AXIS_COLUMNS]
-    scale = second.corrections.pitch_scale - first.corrections.pitch_scale
-    offset = second.corrections.range_offset - first.corrections.range_offset
-    steps = {
-        "axis": pd.Series(by_axis, AXIS_NAMES),
-        "sensor": pd.Series({"pitch_scale": scale, "range_offset": offset}),
+    before = first.corrections
+    after = second.corrections
+    sensor = {
+        "pitch_scale": after.pitch_scale - before.pitch_scale,
+        "range_offset": after.range_offset - before.range_offset,
     }
+    steps = {"axis": pd.Series(by_axis, AXIS_NAMES), "sensor": pd.Series(sensor)}
     for name in shared:
-        step = pose_step(first.cameras[name].T_camera, second.cameras[name].T_camera)
-        steps[name] = pd.Series(step, [f"{name}_{pose}" for pose in POSE_NAMES])
+        steps[name] = pd.Series(
+            pose_step(first.cameras[name].T_camera, second.cameras[name].T_camera),
+            [f"{name}_{pose}" for pose in POSE_NAMES],
+        )
     return steps
 
 
@@ -322,14 +325,14 @@ def shifts(
     Shifts
     """
     if camera is None:
-        bearings = np.linspace(*first.lrf.field_of_view, BEARINGS)
-        bearing, pitch = np.meshgrid(bearings, PITCHES)
+        bearing, pitch = np.meshgrid(
+            np.linspace(*first.lrf.field_of_view, BEARINGS), PITCHES
+        )
         at = np.stack([bearing, pitch], axis=-1)
     else:
         model = first.cameras[camera].model
         at = pixel_grid(model, PIXELS)
-        chain = chain_of(first, camera)
-        bearing, pitch = beams_of_pixels(chain, model, at, DISTANCE, 0.0)
+        bearing, pitch = beams_of_pixels(chain_of(first, camera), model, at, DISTANCE, 0.0)
     recorded = pitch / (1 + first.corrections.pitch_scale)
     ends = []
     sigma = np.zeros_like(bearing)

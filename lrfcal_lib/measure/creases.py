@@ -92,9 +92,8 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
             _sigma(plane, places, np.hypot(rim, lift / 2))
             for plane, lift in zip((first, second), lifts, strict=True)
         ]
-        along = np.tile(way, (len(common), 1))
         off = np.einsum("kn,ik->nki", sigma, by_height[:, :2])
-        creases.append((places, along, off))
+        creases.append((places, np.tile(way, (len(common), 1)), off))
     return Creases(*map(np.concatenate, zip(*creases, strict=True)))
 
 

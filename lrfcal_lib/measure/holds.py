@@ -70,8 +70,7 @@ class Wall:
         """Whether the axis or the ranges are not what the calibration says, or the wall bends."""
         return self.bend > BENT * self.allowed
 
-    def sentence(self) -> str:
-        """What was found."""
+    def __str__(self):
         return (
             f"placement {self.placement}: the largest plane is flat to {1000 * self.bend:.1f} mm "
             f"({1000 * self.allowed:.1f} mm are allowed)"
@@ -91,8 +90,7 @@ class Passes:
         """Whether the head hangs back or slips, by more than chance and more than nothing."""
         return abs(self.slip) > max(SURE * self.sigma, WANTED / 2)
 
-    def sentence(self) -> str:
-        """What was found."""
+    def __str__(self):
         first, second = self.placements
         slip, sigma = np.degrees([self.slip, self.sigma])
         return f"placements {first} and {second}, up and down: {slip:+.3f} +- {sigma:.3f} deg apart"
@@ -197,11 +195,9 @@ class Held:
                 "; all cameras are on the head: a slip of the head only turns the whole cloud, "
                 "nothing here can show it"
             )
-        found: list[Shift | Wall | Passes] = [*self.shifts, *self.walls, *self.passes]
-        sentences = [each.sentence() for each in found]
         return [
             f"{name}: {first[self.answer]}",
-            *sentences,
+            *map(str, [*self.shifts, *self.walls, *self.passes]),
             f"from {self.creases / 4:.0f} m of creases, where surfaces meet, against edges of "
             f"images, and {self.regions:.0f} regions of surfaces that two images show{on_head}",
         ]

@@ -134,8 +134,13 @@ def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> S
         If no part of it is smooth.
     """
     whole = cloud.rows(np.isfinite(cloud.normals).all(axis=1))
-    one = np.ones(len(whole.points))
-    columns = [whole.points, whole.normals, _moves(whole, rig), whole.sigma**2, one]
+    columns = [
+        whole.points,
+        whole.normals,
+        _moves(whole, rig),
+        whole.sigma**2,
+        np.ones(len(whole.points)),
+    ]
     sums = sums_by(np.floor(whole.points / size) @ IN_ONE, np.column_stack(columns))
     means = sums / sums[:, -1:]
     flat = np.linalg.norm(means[:, 3:6], axis=1) > FLAT

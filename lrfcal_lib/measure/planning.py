@@ -1,7 +1,5 @@
 """At which pitch angles images colour what the laser range finder sees."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -22,17 +20,9 @@ MOST = 12  # pitch angles
 NEW = -1  # a placement of which no sweep was calibrated
 
 
-@dataclass(frozen=True)
-class ImagePlan:
-    """Pitch angles of images, radians, ascending, and the share of the cloud that they colour."""
-
-    pitch: np.ndarray
-    share: float
-
-
 def plan_images(
     rig: CalibratedRig, sweep: tuple[float, float], limits: tuple[float, float]
-) -> ImagePlan:
+) -> tuple[np.ndarray, float]:
     """Choose pitch angles for images, the one that colours most of what is left first.
 
     Parameters
@@ -45,7 +35,10 @@ def plan_images(
 
     Returns
     -------
-    ImagePlan
+    pitch : ndarray, shape (k,)
+        Of the images, radians, ascending.
+    share : float
+        Of the cloud, that they colour.
     """
     candidates = _grid(*limits)
     visible = seen_at(rig, sweep, candidates)
@@ -58,10 +51,7 @@ def plan_images(
             break
         chosen.append(best)
         left &= ~visible[best]
-    return ImagePlan(
-        pitch=np.sort(candidates[chosen]),
-        share=1 - left.mean(),
-    )
+    return np.sort(candidates[chosen]), 1 - left.mean()
 
 
 def seen_at(
@@ -81,8 +71,8 @@ def seen_at(
     ndarray of bool, shape (p, n)
         By pitch; beams of all `DISTANCES`.
     """
-    bearings = _grid(*rig.lrf.field_of_view)
-    p_lrf = polar_to_points(np.reshape(DISTANCES, (-1, 1)), bearings).reshape(-1, 3)
+    away = np.reshape(DISTANCES, (-1, 1))
+    p_lrf = polar_to_points(away, _grid(*rig.lrf.field_of_view)).reshape(-1, 3)
     turns = rig.corrections.pitch(NEW, _grid(*np.sort(sweep)))
     points = lrf_to_platform(p_lrf, turns[:, None], rig.T_head_lrf).reshape(-1, 3)
     visible = np.zeros((len(pitches), len(points)), bool)

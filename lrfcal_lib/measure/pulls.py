@@ -104,7 +104,7 @@ def pull_of_groups(
     load = sums_by(group, np.linalg.norm(by_row, axis=1))
     groups = load.sum() ** 2 / max(load @ load, 1e-300)
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
-    excess = np.trace(own @ sums.T @ sums) / max(len(fitted), 1)
+    excess = np.trace(own @ sums.T @ sums) / len(fitted)
     few = groups / max(groups - len(fitted), 1.0)
     scale = 1 / max(excess * few, 1e-12)
     return Pull(scale * information, scale * (information @ x + by_row.sum(axis=0)), groups)

@@ -43,8 +43,9 @@ class Shift:
         calibration errs by, if nothing else has moved.
     covariance : ndarray, shape (6, 6) or (1, 1)
         Of the change.
-    pixels, pixels_sigma : ndarray, shape (2,)
-        To the right and down in the middle of the image, 3 m away; NaN for the head.
+    motion : ndarray, shape (2, 6), or None
+        Pixels to the right and down by the change, in the middle of the image, 3 m away; None for
+        the head.
     evidence : float
         Logarithm of the odds that it turned, moved or both against that nothing has moved, where
         either was as likely before.
@@ -56,8 +57,7 @@ class Shift:
     camera: str | None
     change: np.ndarray
     covariance: np.ndarray
-    pixels: np.ndarray
-    pixels_sigma: np.ndarray
+    motion: np.ndarray | None
     evidence: float
     shows: list[float]
 
@@ -82,8 +82,7 @@ class Shift:
             return -np.inf
         return self.evidence
 
-    def sentence(self) -> str:
-        """What was found."""
+    def __str__(self):
         odds = f"odds of 10^{self.evidence / np.log(10):+.1f} that it has"
         turn, sigma = np.degrees([self.change, sigma_of(self.covariance)])
         if self.camera is None:
@@ -91,7 +90,8 @@ class Shift:
                 f"{self.name}, if only it slipped: by {turn[0]:+.2f} +- {sigma[0]:.2f} deg; "
                 f"{odds}; slips from {np.degrees(self.shows[0]):.2f} deg on show"
             )
-        (right, down), (of_right, of_down) = self.pixels, self.pixels_sigma
+        right, down = self.motion @ self.change
+        of_right, of_down = sigma_of(self.motion @ self.covariance @ self.motion.T)
         return (
             f"{self.name}, if only it moved: image {right:+.2f} +- {of_right:.2f} px to the right, "
             f"{down:+.2f} +- {of_down:.2f} px down (3 m away), turned by {turn[2]:+.2f} +- "
@@ -235,18 +235,16 @@ def _shift(camera, columns, fit, evidence, rig):
             wanted = np.sqrt(2 * SURE + np.linalg.slogdet(shares)[1])
             shows.append((wanted + IN_9_OF_10) * sigma)
     covariance = np.linalg.inv(known + np.diag(likely**-2.0))
-    change = covariance @ score
-    motion = np.full((2, len(columns)), np.nan)
+    motion = None
     if camera:
         ahead = np.array([0.0, 0.0, AWAY])
         by_point = pinhole_jacobian(ahead, rig.cameras[camera].model)
         motion = gradient_by_pose(ahead, by_point)
     return Shift(
         camera=camera,
-        change=change,
+        change=covariance @ score,
         covariance=covariance,
-        pixels=motion @ change,
-        pixels_sigma=sigma_of(motion @ covariance @ motion.T),
+        motion=motion,
         evidence=evidence,
         shows=shows,
     )
