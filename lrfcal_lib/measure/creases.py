@@ -114,10 +114,8 @@ def _sigma(plane, points, systematic):
     """How well the height of a plane is known at points (n, 3), with what all have in common,
     metres.
     """
-    away = points - plane.centre
-    tilted = np.vecdot(away @ plane.noise[3:, 3:], away)
-    level = plane.axis @ plane.noise[:3, :3] @ plane.axis
-    return np.sqrt(level + tilted + systematic**2)
+    by_plane = plane.height_by(points)
+    return np.sqrt(np.vecdot(by_plane @ plane.noise, by_plane) + systematic**2)
 
 
 @dataclass(frozen=True)

@@ -66,8 +66,8 @@ def _edges_in(cloud, surfaces, views, view):
     of_camera = [other.number for other in views if other.camera == view.camera]
     p_camera = view.T_camera_platform.apply(cloud.points)
     uv = pinhole(p_camera, view.model)
-    size = view.model.size
-    near = np.isin(cloud.image, of_camera) & (np.abs(uv - size / 2) < size).all(axis=1)
+    about_image = view.model.shows(uv, -view.model.width / 2)
+    near = about_image & np.isin(cloud.image, of_camera)
     points = np.column_stack([uv, p_camera[:, 2], of_point, cloud.image])[near]
     reach = np.linalg.norm(np.ptp(segments, axis=1), axis=1) / 2 + BESIDE_PX[1]
     about = KDTree(points[:, :2]).query_ball_point(segments.mean(axis=1), reach)
@@ -167,16 +167,15 @@ def _on_plane(plane, line, view):
     sight = line.line @ view.model.matrix / depth[:, None]
     gradient = view.T_camera_platform.rotation.apply(sight, inverse=True)
     # metres a metre of the plane's height and metres a pixel, not along the edge
-    across = [np.linalg.inv([plane.axis, row, direction])[:, :2].T for row in gradient]
-    by_height, by_offset = np.stack(across, axis=1)
+    across = np.linalg.inv([[plane.axis, row, direction] for row in gradient])
+    by_height, by_offset, _ = np.moveaxis(across, -1, 0)
 
-    # ends by the plane's height and turn, and by the line's offset and turn
-    by_plane = -by_height[..., None] * (ends - plane.centre)[:, None]
+    # ends by the plane's centre and axis, and by the line's offset and turn
+    by_plane = by_height[..., None] * plane.height_by(ends)[:, None]
     stretch = (line.ends - line.centre) @ [-line.line[1], line.line[0]]
     by_line = -by_offset * stretch[:, None]
-    by_noise = np.dstack([by_height, by_plane, by_offset, by_line])
-    height = plane.axis @ plane.noise[:3, :3] @ plane.axis
-    noise = block_diag(height, plane.noise[3:, 3:], line.covariance)
+    by_noise = np.dstack([by_plane, by_offset, by_line])
+    noise = block_diag(plane.noise, line.covariance)
 
     beams = beams_to(ends, rig.T_head_lrf)
     by_sight = sight[:, None] @ beams_moved(rig, beams, view.camera, view.pitch)

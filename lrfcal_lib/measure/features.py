@@ -178,6 +178,11 @@ class Feature:
             return place - along
         return self.centre + along
 
+    def height_by(self, places: np.ndarray) -> np.ndarray:
+        """Derivatives (n, 6) of the height of a plane at places (n, 3) by its centre and axis."""
+        normals = np.broadcast_to(self.axis, places.shape)
+        return np.column_stack([normals, self.centre - places])
+
 
 @dataclass(frozen=True)
 class Length:

@@ -93,11 +93,11 @@ def pairs_pull(
     if sum(len(pair.cell) for pair in pairs) < FEWEST:
         return []
     cameras = dict.fromkeys(view.camera for view in views)
-    poses = np.concatenate([poses_of(rig, camera) for camera in cameras])
+    poses = np.array([poses_of(rig, camera) for camera in cameras])
     noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
     # what moves both images alike stays where creases have it, and all else that is no pose
     sigma = np.full(len(start), STILL)
-    sigma[poses] = np.tile(SPREAD / 4, len(cameras))
+    sigma[poses] = SPREAD / 4
     prior = np.r_[sigma, noise] ** -2.0
     begun = np.pad(start, (0, len(noise)))
     step = np.zeros_like(begun)
@@ -110,7 +110,7 @@ def pairs_pull(
         by_row = np.vecmat(-b, D)
         left = by_row.sum(axis=0) - prior * step
         step += np.linalg.solve(information + np.diag(prior), left)
-    pull = pull_of_groups(information, by_row, cell, x, poses)
+    pull = pull_of_groups(information, by_row, cell, x, poses.ravel())
     return [replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())]
 
 
