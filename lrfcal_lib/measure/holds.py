@@ -8,8 +8,7 @@ import numpy as np
 from scipy.interpolate import interp1d
 
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
-from lrfcal_lib.calibrate.cloud import Cloud
-from lrfcal_lib.calibrate.cloud import join as join_clouds
+from lrfcal_lib.calibrate.cloud import Cloud, join
 from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -227,8 +226,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     stations = []
     walls = []
     for placement in _stations(session, rig):
-        sweep = session.sweep(placement)
-        cloud = join_clouds(sweep_blocks(session, rig.for_scenes, sweep, []))
+        cloud = join(sweep_blocks(session, rig.for_scenes, session.sweep(placement), []))
         planes, of_point = planes_of(cloud, rig)
         wall = cloud.rows(largest_plane(cloud))
         if len(wall.points) > FEWEST_POINTS:

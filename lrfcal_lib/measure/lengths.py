@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud, join
@@ -33,15 +33,11 @@ from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 REACH = (
     0.1  # metres from a picked place to points of its plane, and from a click to its edge
 )
 ON_IT = 0.01  # metres from a place on a feature of one station to the same one of another
 ABOUT = 9  # points whose middle a picked point is, and that show which plane is picked
-PLACE = ("x", "y", "z")
 END = ("kind", "x_m", "y_m", "z_m")
 PICKED = tuple(f"{what}_{number}" for number in (1, 2) for what in END)
 IN_PLACE = RigidTransform.identity()
@@ -153,9 +149,9 @@ def features_of_station(session: Session, rig: CalibratedRig, number: int) -> Sc
 
 def measure(
     scenes: Mapping[int, SceneFeatures],
-    picks: "pd.DataFrame",
+    picks: pd.DataFrame,
     poses: Mapping[int, RigidTransform] | None = None,
-) -> "pd.DataFrame":
+) -> pd.DataFrame:
     """Lengths between pairs of picked places.
 
     A length that several stations show is one: the mean of theirs, each weighted by how well it
@@ -177,8 +173,6 @@ def measure(
         The same, with length_m, sigma_m, the ends of the 90 % interval, low_m and high_m, the
         stations, and problem: why there is no length, NaN then, or ''.
     """
-    import pandas as pd  # a third of a second
-
     poses = poses or dict.fromkeys(scenes, IN_PLACE)
     rows = []
     for row in picks.to_dict("records"):
@@ -243,7 +237,7 @@ def _shown(scenes, poses, row, number) -> dict[int, Feature]:
     return shown
 
 
-def read_picks(path: str | PathLike) -> "pd.DataFrame":
+def read_picks(path: str | PathLike) -> pd.DataFrame:
     """Read the list that ``scene.html`` saves.
 
     Parameters
@@ -260,8 +254,6 @@ def read_picks(path: str | PathLike) -> "pd.DataFrame":
     ValueError
         If the file is no such list; it names file, row and remedy.
     """
-    import pandas as pd
-
     remedy = "save it from scene.html again"
     try:
         table = pd.read_csv(path)

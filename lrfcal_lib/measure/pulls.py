@@ -12,7 +12,7 @@ from lrfcal_lib.judge.uncertainty import carried, chain_of
 from lrfcal_lib.model.kinematics import beams_to
 
 # a camera's likely changes, radians and metres of its pose
-SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
+SPREAD = np.repeat([np.radians(1.0), 0.02], 3)
 PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
 
 

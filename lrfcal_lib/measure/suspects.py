@@ -17,8 +17,8 @@ from lrfcal_lib.model.geometry import gradient_by_pose
 # what no covariance of a calibration knows, radians and metres of a camera's pose: lens and light,
 # of one camera; and what all on the head have in common, whose pitch is never quite what is
 # recorded (true rigs in three simulated rooms: 0.02 deg, 1 mm)
-OWN = np.array([*np.radians([0.02, 0.02, 0.02]), 0.0005, 0.0005, 0.0005])
-COMMON = np.array([*np.radians([0.02, 0.02, 0.02]), 0.001, 0.001, 0.001])
+OWN = np.repeat([np.radians(0.02), 0.0005], 3)
+COMMON = np.repeat([np.radians(0.02), 0.001], 3)
 SURE = np.log(20.0)  # of odds: below, nothing may have moved, or the other suspect
 IN_9_OF_10 = 1.28  # standard deviations
 SLIP = np.radians([1.0])  # a likely one of the head
