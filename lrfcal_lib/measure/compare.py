@@ -1,8 +1,6 @@
 """Two calibrations of one rig: how far they differ, beside what both claim to know."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -222,13 +220,14 @@ def _part(name, names, step, covariance, images):
     kinds = ("scale" if name == "sensor" else "turn", "shift")
     for what, members in zip(kinds, np.split(names, 2), strict=True):
         scale, unit = UNITS[what]
-        amount = Amount(
-            what=what,
-            value=scale * np.linalg.norm(step[members]),
-            claimed=scale * np.sqrt(np.trace(covariance.loc[members, members])),
-            unit=unit,
+        amounts.append(
+            Amount(
+                what=what,
+                value=scale * np.linalg.norm(step[members]),
+                claimed=scale * np.sqrt(np.trace(covariance.loc[members, members])),
+                unit=unit,
+            )
         )
-        amounts.append(amount)
     if name in images:
         amounts.append(images[name].amount("px"))
     *_, p_of_others = _chi2(step, covariance, step.index.difference(names))
@@ -371,13 +370,3 @@ def rig_at(path: str | Path) -> CalibratedRig:
             raise ValueError(f"{path}: cannot be calibrated; 'calibrate' says why")
         return calibration.rig(method)
     return load_calibration(path)
-
-
-def history(rigs: Sequence[CalibratedRig]) -> list[Comparison]:
-    """Every calibration of a rig beside the one before it.
-
-    Parameters
-    ----------
-    rigs : sequence of CalibratedRig
-    """
-    return [compare(*pair) for pair in pairwise(rigs)]

@@ -18,7 +18,7 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.measure.features import Feature, Kind, beams_moved
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import pose_array, unit_vector
 from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, refine_edge
 from lrfcal_lib.session.workers import spread
@@ -62,6 +62,7 @@ def _edges_in(cloud, surfaces, views, view):
     """The edges at planes of a cloud that one image shows."""
     planes, of_point = surfaces
     segments = _segments(view)
+    pose = pose_array(view.T_camera_platform.inv())
     # what one image of a camera sees, all of them see that have it in view
     of_camera = [other.number for other in views if other.camera == view.camera]
     p_camera = view.T_camera_platform.apply(cloud.points)
@@ -73,11 +74,11 @@ def _edges_in(cloud, surfaces, views, view):
     about = KDTree(points[:, :2]).query_ball_point(segments.mean(axis=1), reach)
     edges = []
     for ends, rows in zip(segments, about, strict=True):
-        plane = _surface_at(ends, points[rows], planes, view)
+        plane = _surface_at(ends, points[rows], planes, view, pose)
         if plane is not None:
             with suppress(EdgeNotSeen):
                 line = _refined(view, ends, segments)
-                edges.append(_on_plane(plane, line, view))
+                edges.append(_on_plane(plane, line, view, pose))
     return edges
 
 
@@ -106,7 +107,7 @@ def _refined(view, ends, segments):
     return replace(line, covariance=line.covariance + np.diag([PULLED_PX**2, 0.0]))
 
 
-def _surface_at(ends, points, planes, view):
+def _surface_at(ends, points, planes, view, pose):
     """The surface that ends at a segment (2, 2) of an image, or that it is on; None for none.
 
     Of points (n, 5) about it: undistorted pixels of the image, depth, numbers of the surface and of
@@ -131,7 +132,7 @@ def _surface_at(ends, points, planes, view):
         depth = np.median(depths)
         rough = number < 0 or counts.max() <= LEAST_SHARE * len(depths)
         if not rough:
-            _, (depth,) = _where_seen(view, planes[number], ends.mean(axis=0)[None])
+            _, (depth,) = _where_seen(view, pose, planes[number], ends.mean(axis=0)[None])
             depth = depth if depth > 0 else np.inf  # behind the camera
         own = np.sum(image == view.number)
         sides.append((depth, rough, -counts.max(), number, own))
@@ -144,28 +145,27 @@ def _surface_at(ends, points, planes, view):
     return None if rough or own < LEAST_OWN else planes[number]
 
 
-def _where_seen(view, plane, pixels):
-    """Where the sights through undistorted pixels (k, 2) of an image meet a plane: places (k, 3),
-    platform frame, and how deep these are (k,), metres.
+def _where_seen(view, pose, plane, pixels):
+    """Where the sights through undistorted pixels (k, 2) of a camera with this pose (3, 4) in the
+    platform meet a plane: places (k, 3), platform frame, and how deep these are (k,), metres.
     """
-    T_platform_camera = view.T_camera_platform.inv()
-    rays = T_platform_camera.rotation.apply(view.model.sights(pixels))
-    eye = T_platform_camera.translation
+    rays = view.model.sights(pixels) @ pose[:, :3].T
+    eye = pose[:, 3]
     depth = plane.axis @ (plane.centre - eye) / (rays @ plane.axis)
     return eye + depth[:, None] * rays, depth
 
 
-def _on_plane(plane, line, view):
+def _on_plane(plane, line, view, pose):
     """The edge of a scene that a line of an image shows, on its plane."""
     rig = plane.rig
-    ends, depth = _where_seen(view, plane, line.ends)
+    ends, depth = _where_seen(view, pose, plane, line.ends)
     way = ends[1] - ends[0]
     direction = unit_vector(way)
 
     # the plane of sight: what it misses a point of the camera's frame by, its gradient, pixels a
     # metre
     sight = line.line @ view.model.matrix / depth[:, None]
-    gradient = view.T_camera_platform.rotation.apply(sight, inverse=True)
+    gradient = sight @ pose[:, :3].T
     # metres a metre of the plane's height and metres a pixel, not along the edge
     across = np.linalg.inv([[plane.axis, row, direction] for row in gradient])
     by_height, by_offset, _ = np.moveaxis(across, -1, 0)

@@ -123,8 +123,9 @@ def features_of(cloud: Cloud, rig: CalibratedRig, views: Sequence[View]) -> Scen
     SceneFeatures
     """
     planes, of_point = planes_of(cloud, rig)
-    edges = edges_of(cloud, (planes, of_point), views)
-    return SceneFeatures(cloud, rig, planes, of_point, edges)
+    return SceneFeatures(
+        cloud, rig, planes, of_point, edges=edges_of(cloud, (planes, of_point), views)
+    )
 
 
 @cached
