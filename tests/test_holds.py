@@ -60,7 +60,7 @@ def test_what_would_not_show_is_not_called_holding(held):
     """The least turn and move that show are said, and more than 0.3 deg or 8 mm is not enough."""
     left, right = held.shifts
     assert left.shows[0] < TURN and left.shows[1] < MOVE
-    assert "moves from" in left.sentence()
+    assert "moves from" in str(left)
     for shows, words in (
         ((left.shows[0], 0.011), "a move of 8 mm of camera 'left' (11 mm would)"),
         ((2 * TURN, 0.001), "a turn of 0.3 deg of camera 'left' (0.6 deg would)"),

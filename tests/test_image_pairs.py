@@ -90,7 +90,7 @@ def evidence_of(rig, columns):
         for number, camera in enumerate(rig.cameras)
     ]
     cloud = scanned(columns)
-    pull = pairs_pull(
+    (pull,) = pairs_pull(
         cloud,
         np.zeros(len(cloud.points), int),
         views,

@@ -17,6 +17,7 @@ from lrfcal_lib.measure.edges import edges_of
 from lrfcal_lib.measure.lengths import nearest_edge
 from lrfcal_lib.measure.scene import stations_of
 from lrfcal_lib.measure.stations import join_stations
+from lrfcal_lib.model.kinematics import SweepPitch
 from lrfcal_lib.report.true_lengths import true_picks
 from lrfcal_lib.session.read import open_session
 
@@ -83,6 +84,17 @@ def test_points_of_one_scan_err_together(scene):
     free = replace(whole[1], jacobian=np.zeros_like(whole[1].jacobian))
     apart = features.length_between(whole[0], free).sigma
     assert 0 < together < 0.01 and 0 < apart < 0.1
+
+
+def test_what_a_sweep_of_a_board_was_off_by_is_of_no_scene(quick, scene):
+    """Though the placements of both have the same number."""
+    session = quick.prepared.session
+    rig = quick.rig("joint")
+    number = session.scene_placements[0]
+    off = {number: SweepPitch(offset=0.02, stretch=0.0, middle=0.0)}
+    rig = replace(rig, corrections=replace(rig.corrections, sweeps=off))
+    again = lengths.features_of_station(session, rig, number)
+    np.testing.assert_array_equal(again.cloud.points, scene.cloud.points)
 
 
 def test_derivatives_of_an_edge_are_those_of_the_edge_of_a_moved_camera(quick, scene):

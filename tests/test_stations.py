@@ -12,7 +12,7 @@ from shared import DATA
 from lrfcal_lib.calibrate.cloud import join
 from lrfcal_lib.measure.features import flatness, with_sigma
 from lrfcal_lib.measure.pose_graph import connected, solved
-from lrfcal_lib.measure.scene import Station, colored_blocks
+from lrfcal_lib.measure.scene import colored_blocks
 from lrfcal_lib.measure.stations import (
     Pair,
     _joined,
@@ -300,8 +300,7 @@ def test_merge_writes_one_cloud_and_a_page(tmp_path, rig, monkeypatch, capsys):
 
 def grey_cloud(session, rig, number):
     """A station without its images, which another rig took."""
-    station = Station(session.sweep(number), [])
-    return with_sigma(join(colored_blocks(session, rig, station)), rig)
+    return with_sigma(join(colored_blocks(session, rig, session.sweep(number), [])), rig)
 
 
 def lonely():

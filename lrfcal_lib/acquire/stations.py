@@ -74,13 +74,11 @@ class Stations(Boards):
 
     def _images(self, sweep, limits):
         """Pitch angles of the images, degrees; prints them."""
-        best = plan_images(self.rig, np.radians(sweep[:2]), np.radians(limits))
-        self.share = best.share
-        images = tuple(np.degrees(best.pitch).round(2).tolist())
-        where = ", ".join(f"{pitch:g}" for pitch in images)
-        print(
-            f"images at {where} deg: {100 * best.share:.0f} % of the cloud can get a colour"
-        )
+        pitch, share = plan_images(self.rig, np.radians(sweep[:2]), np.radians(limits))
+        self.share = share
+        images = tuple(np.degrees(pitch).round(2).tolist())
+        where = ", ".join(f"{angle:g}" for angle in images)
+        print(f"images at {where} deg: {100 * share:.0f} % of the cloud can get a colour")
         return images
 
     def place_of(self, placement: Placement) -> int | str:
@@ -98,7 +96,7 @@ class Stations(Boards):
         if self.rig is not None:
             require_same_rig(self.rig, session)
             station = station_of(session, self.rig, number)
-            seen = [cloud.seen for cloud in colored_blocks(session, self.rig, station)]
+            seen = [cloud.seen for cloud in colored_blocks(session, self.rig, *station)]
             share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
             text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
             state = "ok" if share > EXPECTED * self.share else "warn"

@@ -121,17 +121,16 @@ def _pcd_header(count, comments):
     types = []
     for kind, names in PCD_COLUMNS.values():
         types += [np.dtype(kind)] * len(names.split())
-    lines = (
-        *(f"# {words}" for words in comments),
-        "VERSION 0.7",
-        f"FIELDS {' '.join(names for _, names in PCD_COLUMNS.values())}",
-        f"SIZE {' '.join(str(kind.itemsize) for kind in types)}",
-        f"TYPE {' '.join(kind.kind.upper() for kind in types)}",
-        f"COUNT {' '.join('1' for _ in types)}",
-        f"WIDTH {count}",
-        "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {count}",
-        "DATA binary\n",
+    told = "".join(f"# {words}\n" for words in comments)
+    return (
+        f"{told}VERSION 0.7\n"
+        f"FIELDS {' '.join(names for _, names in PCD_COLUMNS.values())}\n"
+        f"SIZE {' '.join(str(kind.itemsize) for kind in types)}\n"
+        f"TYPE {' '.join(kind.kind.upper() for kind in types)}\n"
+        f"COUNT{' 1' * len(types)}\n"
+        f"WIDTH {count}\n"
+        "HEIGHT 1\n"
+        "VIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {count}\n"
+        "DATA binary\n"
     )
-    return "\n".join(lines)

@@ -1,8 +1,6 @@
 """Two calibrations of one rig: how far they differ, beside what both claim to know."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +66,7 @@ class Part:
     ----------
     name : str
         'axis', 'sensor', or a camera's.
-    amounts : tuple of Amount
+    amounts : list of Amount
     chi2 : float
         Of its parameters by both covariances.
     freedom : int
@@ -79,7 +77,7 @@ class Part:
     """
 
     name: str
-    amounts: tuple[Amount, ...]
+    amounts: list[Amount]
     chi2: float
     freedom: int
     p: float
@@ -87,8 +85,7 @@ class Part:
 
     def __str__(self):
         amounts = ", ".join(map(str, self.amounts))
-        test = f"chi2 {self.chi2:.1f} of {self.freedom}, p = {self.p:.2g}"
-        return f"{self.name}: {amounts}; {test}"
+        return f"{self.name}: {amounts}; chi2 {self.chi2:.1f} of {self.freedom}, p = {self.p:.2g}"
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,7 @@ class Shifts:
     off : ndarray, shape (rows, columns, k)
         Pixels (k = 2), or metres (k = 3).
     claimed : ndarray, shape (rows, columns)
-        Standard deviation as both claim, root of the sum over k.
+        Standard deviation as both claim, root of the sum over k; NaN where no beam gets.
     """
 
     at: np.ndarray
@@ -111,9 +108,12 @@ class Shifts:
 
     def amount(self, unit: str, scale: float = 1.0) -> Amount:
         """Root mean squares as an Amount, times `scale`."""
-        value = rms(np.linalg.norm(self.off, axis=-1))
-        claimed = root_mean_square(self.claimed[np.isfinite(self.off[..., 0])])
-        return Amount(f"at {DISTANCE:g} m", scale * value, scale * claimed, unit)
+        return Amount(
+            what=f"at {DISTANCE:g} m",
+            value=scale * rms(np.linalg.norm(self.off, axis=-1)),
+            claimed=scale * root_mean_square(self.claimed),
+            unit=unit,
+        )
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Comparison:
     Attributes
     ----------
     first, second : CalibratedRig
-    parts : tuple of Part
+    parts : list of Part
         Axis, sensor and every camera.
     whole : Part
         All their parameters, and the cloud.
@@ -137,7 +137,7 @@ class Comparison:
 
     first: CalibratedRig
     second: CalibratedRig
-    parts: tuple[Part, ...]
+    parts: list[Part]
     whole: Part
     images: dict[str, Shifts]
     cloud: Shifts
@@ -153,7 +153,7 @@ class Comparison:
         share = float(f"{100 * self.whole.p:.2g}")  # 100, not 1e+02
         odds = f"honest calibrations differ more in {share:g} % of cases"
         if self.one_lens:
-            odds = f"{odds}; both use the same intrinsics, whose errors do not count"
+            odds += "; both use the same intrinsics, whose errors do not count"
         names = f"'{self.first.session}' and '{self.second.session}'"
         if self.within:
             return f"{names} differ within what both claim ({odds})."
@@ -190,70 +190,74 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
     """
     require_same_rig(first, second)
     shared = [name for name in first.cameras if name in second.cameras]
-    # intrinsics from the same place are equal to the last bit
-    one_lens = all(
-        np.array_equal(
-            first.cameras[name].model.parameters, second.cameras[name].model.parameters
-        )
-        for name in shared
+    lens, other_lens = (
+        [rig.cameras[name].model.parameters for name in shared] for rig in (first, second)
     )
+    one_lens = np.array_equal(lens, other_lens)  # from one place, equal to the last bit
     if one_lens:
         first = _without_lens(first)
         second = _without_lens(second)
     second_there = in_gauge_of(first, second)
     steps = _steps(first, second_there, shared)
-    tested = _tested(first, second_there, pd.concat(steps.values()))
+    step = pd.concat(steps.values())
+    covariance = _covariance(first) + _covariance(second)
+    # nothing bounds what only one estimated
+    covariance = covariance.reindex(index=step.index, columns=step.index).fillna(np.inf)
     images = {name: shifts(first, second_there, name) for name in shared}
-    parts = [_part(name, step.index, tested, images) for name, step in steps.items()]
+    parts = [
+        _part(name, of_part.index, step, covariance, images)
+        for name, of_part in steps.items()
+    ]
     cloud = shifts(first, second_there)
-    moved = (cloud.amount("mm in the cloud", 1000),)
-    whole = Part("everything", moved, *tested.chi2(tested.table.index), 1.0)
-    return Comparison(first, second, tuple(parts), whole, images, cloud, one_lens)
+    moved = [cloud.amount("mm in the cloud", 1000)]
+    whole = Part("everything", moved, *_chi2(step, covariance, step.index), 1.0)
+    return Comparison(first, second, parts, whole, images, cloud, one_lens)
 
 
-def _part(name, names, tested, images):
+def _part(name, names, step, covariance, images):
     """The Part of some differences: turns or a scale, as many shifts, and pixels of a camera."""
     amounts = []
     kinds = ("scale" if name == "sensor" else "turn", "shift")
     for what, members in zip(kinds, np.split(names, 2), strict=True):
         scale, unit = UNITS[what]
-        value, claimed = scale * np.linalg.norm(tested.table.loc[members], axis=0)
-        amounts.append(Amount(what, value, claimed, unit))
+        amounts.append(
+            Amount(
+                what=what,
+                value=scale * np.linalg.norm(step[members]),
+                claimed=scale * np.sqrt(np.trace(covariance.loc[members, members])),
+                unit=unit,
+            )
+        )
     if name in images:
         amounts.append(images[name].amount("px"))
-    *_, p_of_others = tested.chi2(tested.table.index.difference(names))
-    return Part(name, tuple(amounts), *tested.chi2(names), p_of_others)
+    *_, p_of_others = _chi2(step, covariance, step.index.difference(names))
+    return Part(name, amounts, *_chi2(step, covariance, names), p_of_others)
+
+
+def _chi2(step, covariance, names) -> tuple[float, int, float]:
+    """Chi-square of some differences, its degrees of freedom, and how often chance exceeds it."""
+    covariance = covariance.loc[names, names]
+    sigma = np.sqrt(np.diag(covariance))
+    correlation = covariance.div(sigma, axis=0) / sigma
+    # NaN for what nothing bounds, or one of the two took as it is
+    known = np.diag(correlation) > 0
+    if not known.any():
+        return 0.0, 0, 1.0
+    inverse, freedom = pinvh(correlation.loc[known, known], rtol=TOLD, return_rank=True)
+    z = (step[names] / sigma)[known]
+    chi2 = z @ inverse @ z
+    return chi2, freedom, chdtrc(freedom, chi2)
 
 
 def _without_lens(rig):
     """A rig whose intrinsics are exact."""
     known = uncertainty_of(rig)
-    trusted = known.trusted - known.lens
-    known = replace(known, covariance=known.covariance - known.lens, trusted=trusted)
+    known = replace(
+        known,
+        covariance=known.covariance - known.lens,
+        trusted=known.trusted - known.lens,
+    )
     return replace(rig, uncertainty=known)
-
-
-@dataclass(frozen=True)
-class _Tested:
-    """Differences with their standard deviations by name, and what of these can be tested.
-
-    The correlation is without what nothing bounds, or one of the two took as it is.
-    """
-
-    table: pd.DataFrame
-    correlation: pd.DataFrame
-
-    def chi2(self, names) -> tuple[float, int, float]:
-        """Chi-square of differences, its degrees of freedom, and how often chance exceeds it."""
-        names = self.correlation.index.intersection(names)
-        if names.empty:
-            return 0.0, 0, 1.0
-        inverse, freedom = pinvh(
-            self.correlation.loc[names, names], rtol=TOLD, return_rank=True
-        )
-        z = self.table.step[names] / self.table.sigma[names]
-        chi2 = z @ inverse @ z
-        return chi2, freedom, chdtrc(freedom, chi2)
 
 
 def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
@@ -267,24 +271,13 @@ def in_gauge_of(first: CalibratedRig, second: CalibratedRig) -> CalibratedRig:
     step = pose_step(second.T_head_lrf, first.T_head_lrf)
     step[AXIS_COLUMNS] = 0  # what is left turns about x, and shifts along it
     gauge = RigidTransform.from_exp_coords(step)
-    cameras = {}
-    for name, camera in second.cameras.items():
-        if camera.mount == "platform":
-            camera = replace(camera, T_camera=camera.T_camera * gauge.inv())
-        cameras[name] = camera
+    on_base = {
+        name: replace(camera, T_camera=camera.T_camera * gauge.inv())
+        for name, camera in second.cameras.items()
+        if camera.mount == "platform"
+    }
     axis = replace(second.axis, T_head_lrf=gauge * second.T_head_lrf)
-    return replace(second, axis=axis, cameras=cameras)
-
-
-def _tested(first, second, step) -> _Tested:
-    """The _Tested of increments from the first rig to the second, a Series."""
-    covariance = _covariance(first) + _covariance(second)  # NaN for what only one estimated
-    covariance = covariance.reindex(index=step.index, columns=step.index)
-    sigma = pd.Series(np.sqrt(np.diag(covariance)), step.index)
-    known = step.index[np.isfinite(sigma) & (sigma > 0)]
-    correlation = covariance.loc[known, known] / np.outer(sigma[known], sigma[known])
-    table = pd.DataFrame({"step": step, "sigma": sigma.fillna(np.inf)})
-    return _Tested(table, correlation)
+    return replace(second, axis=axis, cameras=second.cameras | on_base)
 
 
 def _steps(first, second, shared):
@@ -293,15 +286,18 @@ def _steps(first, second, shared):
     Turns or a scale, then as many shifts.
     """
     by_axis = pose_step(first.T_head_lrf, second.T_head_lrf)[AXIS_COLUMNS]
-    scale = second.corrections.pitch_scale - first.corrections.pitch_scale
-    offset = second.corrections.range_offset - first.corrections.range_offset
-    steps = {
-        "axis": pd.Series(by_axis, AXIS_NAMES),
-        "sensor": pd.Series({"pitch_scale": scale, "range_offset": offset}),
+    before = first.corrections
+    after = second.corrections
+    sensor = {
+        "pitch_scale": after.pitch_scale - before.pitch_scale,
+        "range_offset": after.range_offset - before.range_offset,
     }
+    steps = {"axis": pd.Series(by_axis, AXIS_NAMES), "sensor": pd.Series(sensor)}
     for name in shared:
-        step = pose_step(first.cameras[name].T_camera, second.cameras[name].T_camera)
-        steps[name] = pd.Series(step, [f"{name}_{pose}" for pose in POSE_NAMES])
+        steps[name] = pd.Series(
+            pose_step(first.cameras[name].T_camera, second.cameras[name].T_camera),
+            [f"{name}_{pose}" for pose in POSE_NAMES],
+        )
     return steps
 
 
@@ -328,14 +324,14 @@ def shifts(
     Shifts
     """
     if camera is None:
-        bearings = np.linspace(*first.lrf.field_of_view, BEARINGS)
-        bearing, pitch = np.meshgrid(bearings, PITCHES)
+        bearing, pitch = np.meshgrid(
+            np.linspace(*first.lrf.field_of_view, BEARINGS), PITCHES
+        )
         at = np.stack([bearing, pitch], axis=-1)
     else:
         model = first.cameras[camera].model
         at = pixel_grid(model, PIXELS)
-        chain = chain_of(first, camera)
-        bearing, pitch = beams_of_pixels(chain, model, at, DISTANCE, 0.0)
+        bearing, pitch = beams_of_pixels(chain_of(first, camera), model, at, DISTANCE, 0.0)
     recorded = pitch / (1 + first.corrections.pitch_scale)
     ends = []
     sigma = np.zeros_like(bearing)
@@ -374,13 +370,3 @@ def rig_at(path: str | Path) -> CalibratedRig:
             raise ValueError(f"{path}: cannot be calibrated; 'calibrate' says why")
         return calibration.rig(method)
     return load_calibration(path)
-
-
-def history(rigs: Sequence[CalibratedRig]) -> list[Comparison]:
-    """Every calibration of a rig beside the one before it.
-
-    Parameters
-    ----------
-    rigs : sequence of CalibratedRig
-    """
-    return [compare(*pair) for pair in pairwise(rigs)]

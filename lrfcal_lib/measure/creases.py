@@ -76,10 +76,10 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
         if sine < LEAST_SINE:
             continue
         way /= sine
-        by_height = np.linalg.inv([first.axis, second.axis, way])
-        middle = (first.centre + second.centre) / 2
-        heights = [first.axis @ first.centre, second.axis @ second.centre, way @ middle]
-        origin = by_height @ heights
+        normals = [first.axis, second.axis, way]
+        by_height = np.linalg.inv(normals)
+        centres = [first.centre, second.centre, (first.centre + second.centre) / 2]
+        origin = by_height @ np.vecdot(normals, centres)
         beside = [_beside(readings - origin, plane, way) for plane, readings in pair]
         numbers, lifts = zip(*beside, strict=True)
         common = np.intersect1d(*numbers)
@@ -92,9 +92,8 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
             _sigma(plane, places, np.hypot(rim, lift / 2))
             for plane, lift in zip((first, second), lifts, strict=True)
         ]
-        along = np.tile(way, (len(common), 1))
         off = np.einsum("kn,ik->nki", sigma, by_height[:, :2])
-        creases.append((places, along, off))
+        creases.append((places, np.tile(way, (len(common), 1)), off))
     return Creases(*map(np.concatenate, zip(*creases, strict=True)))
 
 
@@ -115,10 +114,8 @@ def _sigma(plane, points, systematic):
     """How well the height of a plane is known at points (n, 3), with what all have in common,
     metres.
     """
-    away = points - plane.centre
-    tilted = np.vecdot(away @ plane.noise[3:, 3:], away)
-    level = plane.axis @ plane.noise[:3, :3] @ plane.axis
-    return np.sqrt(level + tilted + systematic**2)
+    by_plane = plane.height_by(points)
+    return np.sqrt(np.vecdot(by_plane @ plane.noise, by_plane) + systematic**2)
 
 
 @dataclass(frozen=True)
@@ -173,7 +170,7 @@ class Sights:
         change : ndarray, shape (c,)
         """
         share, _, _ = self._shares(change, 0.0)
-        return -float(np.log(1 - share.sum(axis=1)).sum() / PLACES)
+        return -np.log(1 - share.sum(axis=1)).sum() / PLACES
 
     def _shares(self, change, width):
         """What each edge has of its place (n, k), how far off it is, and how far it may be (n,)."""
@@ -202,14 +199,13 @@ def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
     model = view.model
     points, J = seen(creases.points, view, rig)
     reach = REACH * model.width
-    recorded = project(points, model)
-    inside = model.shows(recorded, reach)
+    inside = model.shows(project(points, model), reach)
     by_point = pinhole_jacobian(points[inside], model)
     R = view.T_camera_platform.rotation.as_matrix()
     way = creases.along[inside] @ R.T
     tangent = unit_vector(np.matvec(by_point, way))
     normal = tangent[:, ::-1] * [-1, 1]
-    across, clear = _edges(view, pinhole(points[inside], model), tangent, normal)
+    across, clear = _edges(view, reach, pinhole(points[inside], model), tangent, normal)
     by_place = np.vecmat(normal, by_point) / reach
     off = np.matvec(creases.off[inside] @ R.T, by_place)
     return Sights(
@@ -220,11 +216,10 @@ def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
     )
 
 
-def _edges(view, places, tangent, normal):
-    """Offsets (n, k) of edges in pixels from pixels (n, 2) along their normals (n, 2), and how
-    clear each is, 0 to 1.
+def _edges(view, reach, places, tangent, normal):
+    """Offsets (n, k) of edges, up to some pixels, from pixels (n, 2) along their normals (n, 2),
+    and how clear each is, 0 to 1.
     """
-    reach = REACH * view.model.width
     grid = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
     across = np.tile(grid, (len(places), 1))
     clear = np.zeros_like(across)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from pye57 import E57, libe57
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
@@ -49,19 +50,16 @@ class E57Writer(AbstractContextManager):
     """
 
     def __init__(self, path: Path, about: str):
-        from pye57 import E57, libe57
-
         self.about = about
         self._file = E57(str(path), "w")
         self._image_file = self._file.image_file
-        self._nodes = libe57
 
     def __exit__(self, kind, error, trace):
         try:
             self._image_file.close()
-        except self._nodes.E57Exception as failed:
+        except libe57.E57Exception as failed:
             error = error or failed
-        if isinstance(error, self._nodes.E57Exception):
+        if isinstance(error, libe57.E57Exception):
             raise OSError(errno.EIO, f"E57: {error}") from error
 
     def scan(
@@ -91,14 +89,14 @@ class E57Writer(AbstractContextManager):
             Each of the blocks once it is written.
         """
         fields = [*POINT, *COLORS, "intensity"] if intensity else [*POINT, *COLORS]
-        prototype = self._nodes.StructureNode(self._image_file)
+        prototype = libe57.StructureNode(self._image_file)
         for field in fields:
-            node = self._nodes.FloatNode(self._image_file, 0.0, self._nodes.E57_SINGLE)
+            node = libe57.FloatNode(self._image_file, 0.0, libe57.E57_SINGLE)
             if field in COLORS:
-                node = self._nodes.IntegerNode(self._image_file, 0, 0, 255)
+                node = libe57.IntegerNode(self._image_file, 0, 0, 255)
             prototype.set(field, node)
-        codecs = self._nodes.VectorNode(self._image_file, True)
-        points = self._nodes.CompressedVectorNode(self._image_file, prototype, codecs)
+        codecs = libe57.VectorNode(self._image_file, True)
+        points = libe57.CompressedVectorNode(self._image_file, prototype, codecs)
         scan = {
             "guid": guid,
             "name": name,
@@ -137,15 +135,14 @@ class E57Writer(AbstractContextManager):
         view
             Its pixels and intrinsics.
         """
-        size = (view.model.width, view.model.height)
         lens = (view.model.matrix, view.model.distortion)
         # all of the image, and room for it
-        wide = tuple(round(WIDER * side) for side in size)
-        matrix, _ = cv2.getOptimalNewCameraMatrix(*lens, size, 1.0, wide)
+        wide = np.rint(WIDER * view.model.size).astype(int).tolist()
+        matrix, _ = cv2.getOptimalNewCameraMatrix(*lens, view.model.size, 1.0, wide)
         maps = cv2.initUndistortRectifyMap(*lens, None, matrix, wide, cv2.CV_32FC2)[0]
         flat = cv2.remap(view.image, maps, None, cv2.INTER_LINEAR)
         jpeg = bytearray(encode_jpeg(flat, QUALITY))
-        blob = self._nodes.BlobNode(self._image_file, len(jpeg))
+        blob = libe57.BlobNode(self._image_file, len(jpeg))
         image = {
             "guid": new_guid(),
             "name": name,
@@ -160,16 +157,18 @@ class E57Writer(AbstractContextManager):
     def _node(self, value):
         """A value as a node; mappings become structures, nodes stay."""
         if isinstance(value, Mapping):
-            structure = self._nodes.StructureNode(self._image_file)
+            structure = libe57.StructureNode(self._image_file)
             for key, child in value.items():
                 structure.set(key, self._node(child))
             return structure
-        if isinstance(value, str):
-            return self._nodes.StringNode(self._image_file, value)
-        if isinstance(value, int):
-            return self._nodes.IntegerNode(self._image_file, value)
-        if isinstance(value, float):
-            return self._nodes.FloatNode(self._image_file, value)
+        plain = {
+            str: libe57.StringNode,
+            int: libe57.IntegerNode,
+            float: libe57.FloatNode,
+        }
+        for kind, node in plain.items():
+            if isinstance(value, kind):
+                return node(self._image_file, value)
         return value
 
 

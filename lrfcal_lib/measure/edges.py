@@ -67,10 +67,10 @@ def _edges_in(cloud, surfaces, views, view):
     of_camera = [other.number for other in views if other.camera == view.camera]
     p_camera = view.T_camera_platform.apply(cloud.points)
     uv = pinhole(p_camera, view.model)
-    size = view.model.size
-    near = np.isin(cloud.image, of_camera) & (np.abs(uv - size / 2) < size).all(axis=1)
+    about_image = view.model.shows(uv, -view.model.width / 2)
+    near = about_image & np.isin(cloud.image, of_camera)
     points = np.column_stack([uv, p_camera[:, 2], of_point, cloud.image])[near]
-    reach = np.linalg.norm(np.diff(segments, axis=1), axis=-1)[:, 0] / 2 + BESIDE_PX[1]
+    reach = np.linalg.norm(np.ptp(segments, axis=1), axis=1) / 2 + BESIDE_PX[1]
     about = KDTree(points[:, :2]).query_ball_point(segments.mean(axis=1), reach)
     edges = []
     for ends, rows in zip(segments, about, strict=True):
@@ -84,13 +84,13 @@ def _edges_in(cloud, surfaces, views, view):
 
 def _segments(view):
     """Straight segments (n, 2, 2) of an image, undistorted pixels."""
-    grey = cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY)
+    grey = view.grey.astype(np.uint8)
     flat = cv2.undistort(grey, view.model.matrix, view.model.distortion)
     lines = cv2.createLineSegmentDetector(scale=1.0).detect(flat)[0]
     if lines is None:
         return np.zeros((0, 2, 2))
     ends = lines.reshape(-1, 2, 2).astype(float)
-    return ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= SHORTEST_PX]
+    return ends[np.linalg.norm(np.ptp(ends, axis=1), axis=1) >= SHORTEST_PX]
 
 
 def _refined(view, ends, segments):
@@ -120,7 +120,7 @@ def _surface_at(ends, points, planes, view, pose):
     s = off @ along
     t = off @ [along[1], -along[0]]
     near, far = BESIDE_PX
-    # depth, whether it is no flat surface, less the points of it, its number, points of the image
+    # depth, whether it is no flat surface, less the points of it, its number, those of the image
     sides = []
     for away in (t, -t):
         beside = (s > 0) & (s < length) & (away > near) & (away < far)
@@ -128,22 +128,21 @@ def _surface_at(ends, points, planes, view, pose):
         if len(depths) < FEWEST:
             continue
         counts = np.bincount(surface.astype(int) + 1)  # of none first
-        number = int(np.argmax(counts)) - 1
+        number = np.argmax(counts) - 1
         depth = np.median(depths)
-        if number >= 0 and counts.max() > LEAST_SHARE * len(depths):
+        rough = number < 0 or counts.max() <= LEAST_SHARE * len(depths)
+        if not rough:
             _, (depth,) = _where_seen(view, pose, planes[number], ends.mean(axis=0)[None])
             depth = depth if depth > 0 else np.inf  # behind the camera
-        else:
-            number = -1
         own = np.sum(image == view.number)
-        sides.append((depth, number < 0, -counts.max(), number, own))
-    sides.sort()
-    step = STEP if any(side[1] for side in sides) else PLANES_APART
-    if len(sides) == 2 and sides[1][0] - sides[0][0] < step:
-        sides.sort(key=lambda side: side[1:])
-    if not sides or sides[0][-1] < LEAST_OWN or sides[0][3] < 0:
+        sides.append((depth, rough, -counts.max(), number, own))
+    if not sides:
         return None
-    return planes[sides[0][3]]
+    step = STEP if any(side[1] for side in sides) else PLANES_APART
+    reach = min(sides)[0] + step
+    nearest = [side for side in sides if side[0] <= reach]
+    _, rough, _, number, own = min(nearest, key=lambda side: side[1:])
+    return None if rough or own < LEAST_OWN else planes[number]
 
 
 def _where_seen(view, pose, plane, pixels):
@@ -167,17 +166,16 @@ def _on_plane(plane, line, view, pose):
     # metre
     sight = line.line @ view.model.matrix / depth[:, None]
     gradient = sight @ pose[:, :3].T
-    across = np.cross(plane.axis, direction)
-    by_offset = across / (gradient @ across)[:, None]  # metres a pixel
+    # metres a metre of the plane's height and metres a pixel, not along the edge
+    across = np.linalg.inv([[plane.axis, row, direction] for row in gradient])
+    by_height, by_offset, _ = np.moveaxis(across, -1, 0)
 
-    # ends by the plane's height and turn, and by the line's offset and turn
-    by_height = plane.axis - by_offset * (gradient @ plane.axis)[:, None]
-    by_plane = -by_height[..., None] * (ends - plane.centre)[:, None]
+    # ends by the plane's centre and axis, and by the line's offset and turn
+    by_plane = by_height[..., None] * plane.height_by(ends)[:, None]
     stretch = (line.ends - line.centre) @ [-line.line[1], line.line[0]]
     by_line = -by_offset * stretch[:, None]
-    by_noise = np.dstack([by_height, by_plane, by_offset, by_line])
-    height = plane.axis @ plane.noise[:3, :3] @ plane.axis
-    noise = block_diag(height, plane.noise[3:, 3:], line.covariance)
+    by_noise = np.dstack([by_plane, by_offset, by_line])
+    noise = block_diag(plane.noise, line.covariance)
 
     beams = beams_to(ends, rig.T_head_lrf)
     by_sight = sight[:, None] @ beams_moved(rig, beams, view.camera, view.pitch)

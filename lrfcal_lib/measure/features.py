@@ -52,7 +52,6 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
     Cloud
     """
     chain = chain_of(rig)
-    noise = range_noise(rig)
     sweep_noise = PitchNoise(*chain.sweep_sigma)
     sigma = np.zeros(len(cloud.points))
     for rows in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
@@ -63,7 +62,8 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
         normals = np.where(np.isfinite(normals), normals, beams)
         calibration = spread(chain, normals[:, None] @ J)
         sweep = sweep_noise.sigma(part.pitch, 0.0) * np.vecdot(normals, by_pitch)
-        reading = np.maximum(np.abs(noise * np.vecdot(normals, beams)), part.sigma)
+        noise = range_noise(rig) * np.vecdot(normals, beams)
+        reading = np.maximum(np.abs(noise), part.sigma)
         sigma[rows] = np.linalg.norm([calibration, sweep, reading], axis=0)
     return replace(cloud, sigma=sigma)
 
@@ -117,7 +117,7 @@ def flatness(points: np.ndarray, together: int = PATCH) -> tuple[np.ndarray, flo
     mean = np.bincount(patch, miss) / count
     noise = np.var(miss - mean[patch]) / together
     square = np.mean(mean[count >= together / 2] ** 2)
-    return miss, float(np.sqrt(max(square - noise, 0.0)))
+    return miss, np.sqrt(max(square - noise, 0.0))
 
 
 class Kind(StrEnum):
@@ -178,6 +178,11 @@ class Feature:
             return place - along
         return self.centre + along
 
+    def height_by(self, places: np.ndarray) -> np.ndarray:
+        """Derivatives (n, 6) of the height of a plane at places (n, 3) by its centre and axis."""
+        normals = np.broadcast_to(self.axis, places.shape)
+        return np.column_stack([normals, self.centre - places])
+
 
 @dataclass(frozen=True)
 class Length:
@@ -205,7 +210,7 @@ class Length:
         by_rig, by_surfaces = np.split(self.shared, [-2])
         of_rig = max(by_rig @ C @ by_rig for C in shared_covariances(self.rig))
         of_surfaces = SYSTEMATIC**2 * by_surfaces @ by_surfaces
-        return float(np.sqrt(self.noise + of_rig + of_surfaces))
+        return np.sqrt(self.noise + of_rig + of_surfaces)
 
 
 def mean_length(lengths: Sequence[Length]) -> Length:
@@ -313,7 +318,7 @@ def fit_feature(
     else:
         beams = unit_vector(part.points)
         of_ranges = range_noise(rig) ** 2 * beams.T @ beams / count**2
-        noise = block_diag(of_ranges, np.zeros((3, 3)))
+        noise = np.pad(of_ranges, (0, 3))
     return Feature(
         kind=Kind.PLANE if plane else Kind.POINT,
         centre=centre,
@@ -358,16 +363,15 @@ def length_between(first: Feature, second: Feature) -> Length:
     along /= size
     way = second.centre - first.centre
     height = along @ way
-    across = way - height * along
+    upright = height * along
+    across = way - upright
+    measured = upright if kind == Kind.PLANE else across
+    metres = np.linalg.norm(measured)
     # by the second centre, and by the weighted sum of axes
-    if kind == Kind.PLANE:
-        metres = abs(height)
-        by_place = np.sign(height) * along
-        by_axis = np.sign(height) * across / size
-    else:
-        metres = np.linalg.norm(across)
-        by_place = across / metres
-        by_axis = -height * by_place / size
+    by_place = measured / metres
+    by_axis = height * across / size / metres
+    if kind != Kind.PLANE:
+        by_axis *= -1
     by_first = np.append(-by_place, weights[0] * by_axis)
     by_second = np.append(by_place, weights[1] * by_axis)
     noise = by_first @ first.noise @ by_first + by_second @ second.noise @ by_second
@@ -378,7 +382,7 @@ def length_between(first: Feature, second: Feature) -> Length:
     noise += np.sum((by_sweep * uncertainty_of(first.rig).sweep_sigma) ** 2)
     return Length(
         metres=float(metres),
-        noise=float(noise),
+        noise=noise,
         shared=np.append(moved[:, :-3].sum(axis=0), moved[:, -1]),
         rig=first.rig,
     )
@@ -401,10 +405,9 @@ def _refuse_askew(first, second):
 def _axes(first, second):
     """Which kind of axes a length goes by, and their weights, which turn them to one side."""
     kind = max(first.kind, second.kind, key=list(Kind).index)
-    weights = np.zeros(2)
-    for number, feature in enumerate((first, second)):
-        if feature.kind == kind:
-            weights[number] = 1 / max(np.trace(feature.noise[3:, 3:]), SURE)
+    weights = np.array(
+        [(f.kind == kind) / max(np.trace(f.noise[3:, 3:]), SURE) for f in (first, second)]
+    )
     weights /= weights.sum()
     if first.axis @ second.axis < 0:
         weights[1] *= -1

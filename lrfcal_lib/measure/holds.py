@@ -8,8 +8,7 @@ import numpy as np
 from scipy.interpolate import interp1d
 
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
-from lrfcal_lib.calibrate.cloud import Cloud
-from lrfcal_lib.calibrate.cloud import join as join_clouds
+from lrfcal_lib.calibrate.cloud import Cloud, join
 from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
@@ -70,8 +69,7 @@ class Wall:
         """Whether the axis or the ranges are not what the calibration says, or the wall bends."""
         return self.bend > BENT * self.allowed
 
-    def sentence(self) -> str:
-        """What was found."""
+    def __str__(self):
         return (
             f"placement {self.placement}: the largest plane is flat to {1000 * self.bend:.1f} mm "
             f"({1000 * self.allowed:.1f} mm are allowed)"
@@ -91,8 +89,7 @@ class Passes:
         """Whether the head hangs back or slips, by more than chance and more than nothing."""
         return abs(self.slip) > max(SURE * self.sigma, WANTED / 2)
 
-    def sentence(self) -> str:
-        """What was found."""
+    def __str__(self):
         first, second = self.placements
         slip, sigma = np.degrees([self.slip, self.sigma])
         return f"placements {first} and {second}, up and down: {slip:+.3f} +- {sigma:.3f} deg apart"
@@ -104,14 +101,11 @@ class Held:
 
     Attributes
     ----------
-    culprits : tuple of Shift
-        The camera, or the head under cameras on the base, that has moved, the most likely first;
-        several where any of them explains what is seen.
-    shifts : tuple of Shift
+    shifts : list of Shift
         Of all cameras, and of the head where cameras stand on the base.
-    walls : tuple of Wall
+    walls : list of Wall
         Of stations with one.
-    passes : tuple of Passes
+    passes : list of Passes
     creases, regions : float
         That told it: quarter metres of creases that have an edge, in all images, and regions of
         surfaces that two images show.
@@ -121,17 +115,23 @@ class Held:
         A slip of the head would only turn the whole cloud.
     """
 
-    culprits: tuple[Shift, ...]
-    shifts: tuple[Shift, ...]
-    walls: tuple[Wall, ...]
-    passes: tuple[Passes, ...]
+    shifts: list[Shift]
+    walls: list[Wall]
+    passes: list[Passes]
     creases: float
     regions: float
     alike: float
     all_on_head: bool
 
     @property
-    def moved(self) -> tuple[str, ...]:
+    def culprits(self) -> list[Shift]:
+        """The camera, or the head under cameras on the base, that has moved, the most likely first;
+        several where any of them explains what is seen.
+        """
+        return most_likely(self.shifts)
+
+    @property
+    def moved(self) -> list[str]:
         """What is no longer where the calibration has it."""
         moved = []
         if self.culprits:
@@ -141,7 +141,7 @@ class Held:
         # one wall alone may bend
         if self.walls and all(wall.bent for wall in self.walls):
             moved.append("the range finder on the axis of the head (or no wall is flat)")
-        return tuple(moved)
+        return moved
 
     @property
     def answer(self) -> Answer:
@@ -169,8 +169,10 @@ class Held:
         if doubtful:
             return f"{' or '.join(doubtful)} may have moved, or not; {more}"
         if max(self.creases, self.regions) < FEWEST_GROUPS:
-            number = f"{self.creases / 4:.0f} m of creases and {self.regions:.0f} regions"
-            return f"{number} are too few; {FURNITURE}"
+            return (
+                f"{self.creases / 4:.0f} m of creases and {self.regions:.0f} regions are too few; "
+                f"{FURNITURE}"
+            )
         return ""
 
     def sentences(self, name: str = "the calibration") -> list[str]:
@@ -192,13 +194,12 @@ class Held:
                 "; all cameras are on the head: a slip of the head only turns the whole cloud, "
                 "nothing here can show it"
             )
-        basis = (
+        return [
+            f"{name}: {first[self.answer]}",
+            *map(str, [*self.shifts, *self.walls, *self.passes]),
             f"from {self.creases / 4:.0f} m of creases, where surfaces meet, against edges of "
-            f"images, and {self.regions:.0f} regions of surfaces that two images show{on_head}"
-        )
-        found: tuple[Shift | Wall | Passes, ...] = (*self.shifts, *self.walls, *self.passes)
-        sentences = [each.sentence() for each in found]
-        return [f"{name}: {first[self.answer]}", *sentences, basis]
+            f"images, and {self.regions:.0f} regions of surfaces that two images show{on_head}",
+        ]
 
 
 def holds(session: Session, rig: CalibratedRig) -> Held:
@@ -225,8 +226,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     stations = []
     walls = []
     for placement in _stations(session, rig):
-        sweep = session.sweep(placement)
-        cloud = join_clouds(sweep_blocks(session, rig.for_scenes, sweep, []))
+        cloud = join(sweep_blocks(session, rig.for_scenes, session.sweep(placement), []))
         planes, of_point = planes_of(cloud, rig)
         wall = cloud.rows(largest_plane(cloud))
         if len(wall.points) > FEWEST_POINTS:
@@ -240,15 +240,12 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         moved, of_flat = flattened(cloud, planes, of_point)
         stations.append((moved, of_flat, list(views.values())))
     start = likeliest_change(of_creases, rig)
-    pulls = [pairs_pull(*station, rig, start) for station in stations]
-    of_pairs = [pull for pull in pulls if pull is not None]
-    shifts = suspects(of_creases, of_pairs, rig)
+    of_pairs = sum((pairs_pull(*station, rig, start) for station in stations), [])
     nothing = np.zeros_like(start)
     return Held(
-        culprits=tuple(most_likely(shifts)),
-        shifts=tuple(shifts),
-        walls=tuple(walls),
-        passes=tuple(passes_of(session)),
+        shifts=suspects(of_creases, of_pairs, rig),
+        walls=walls,
+        passes=passes_of(session),
         creases=sum(seen.pull(nothing, NEAR).groups for seen in of_creases),
         regions=sum(pull.groups for pull in of_pairs),
         alike=min((pull.alike for pull in of_pairs), default=1.0),
@@ -259,12 +256,11 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
 def _stations(session, rig):
     """Placements with a sweep and images of the rig's cameras, of which one can be posed."""
     require_same_rig(rig, session)
-    fixed = [name for name, camera in rig.cameras.items() if camera.mount == "platform"]
     shown = {
         record.placement
         for record in session.image_records
-        if record.camera in fixed
-        or (record.camera in rig.cameras and np.isfinite(record.pitch))
+        if record.camera in rig.cameras
+        and (rig.cameras[record.camera].mount == "platform" or np.isfinite(record.pitch))
     }
     stations = [p for p in _swept(session) if p in shown]
     if not stations:
@@ -312,9 +308,9 @@ def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
     # a plane turns and shifts with the errors: only what bends it shows
     plane = np.insert(wall.points - wall.points.mean(axis=0), 0, 1.0, axis=1)
     by_link -= plane @ np.linalg.lstsq(plane, by_link, rcond=None)[0]
-    squares = [np.mean(np.vecdot(by_link @ C, by_link)) for C in chain.covariances]
-    allowed = np.sqrt(max(squares) + UNEVEN**2)
-    return Wall(placement, flatness(wall.points)[1], float(allowed))
+    squares = np.vecdot(by_link @ chain.covariances, by_link)
+    allowed = np.sqrt(squares.mean(axis=1).max() + UNEVEN**2)
+    return Wall(placement, flatness(wall.points)[1], allowed)
 
 
 def passes_of(session: Session) -> list[Passes]:
@@ -330,26 +326,21 @@ def passes_of(session: Session) -> list[Passes]:
     for pair in pairwise(_swept(session)):
         one, other = (session.sweep(placement) for placement in pair)
         if one.direction * other.direction < 0:
-            slip = _slip_between(one, other, session.lrf.sigma_range)
-            if slip is not None:
-                passes.append(Passes(pair, *slip))
+            passes += _over_one_place(pair, one, other, session.lrf.sigma_range)
     return passes
 
 
-def _slip_between(one, other, noise):
-    """By how much more the second of two sweeps says its pitch is than the first, and sigma,
-    radians; None where they are of different places.
-    """
+def _over_one_place(placements, one, other, noise):
+    """The Passes of two sweeps; none where they are of different places."""
     if min(len(one.pitch), len(other.pitch)) < 2:
-        return None
+        return []
     at_pitch = interp1d(other.pitch, other.ranges, axis=0, bounds_error=False)
     miss = at_pitch(one.pitch) - one.ranges
     growth = np.gradient(one.ranges, one.pitch, axis=0)
-    with np.errstate(invalid="ignore"):
-        smooth = (np.abs(growth) < STEEP) & (np.abs(miss) < STEEP * WANTED * 3)
+    smooth = (np.abs(growth) < STEEP) & (np.abs(miss) < STEEP * WANTED * 3)
     if smooth.sum() < max(FEWEST_POINTS, SAME_PLACE * np.isfinite(miss).sum()):
-        return None
+        return []
     slope = growth[smooth]
     slip = slope @ miss[smooth] / (slope @ slope)
     rough = max(np.std(miss[smooth] - slip * slope), noise)
-    return -float(slip), float(rough / np.sqrt(slope @ slope))
+    return [Passes(placements, -slip, rough / np.sqrt(slope @ slope))]

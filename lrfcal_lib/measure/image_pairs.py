@@ -37,6 +37,7 @@ BLURS = (6.0, 4.0, 2.5, 1.5, 1.0, 1.0)  # pixels, round by round
 ALIKE = 0.7  # correlation below which patches do not show the same
 CELL = np.radians(6.0)  # patches nearer together err together
 BORDER = 20  # pixels
+STILL = 1e-12  # radians or metres, of what is not fitted
 APART = 12.0  # pixels, side of cells: a patch is alone in its own and in those about it
 REACH = 2**1.5 * APART  # pixels, to their farthest corner
 BEFORE = 4.0  # standard deviations of a range by which something else is nearer or farther
@@ -45,12 +46,12 @@ BEFORE = 4.0  # standard deviations of a range by which something else is nearer
 @dataclass(frozen=True)
 class _Pair:
     """Patches that two images show, a row each: samples (n, s, 2) in both, by how much a change of
-    the unknowns shifts one against the other (n, 2, c) and each, and cells (n,).
+    the unknowns shifts each (n, 2, c), and cells (n,).
     """
 
     views: tuple[View, View]
-    uv: tuple[np.ndarray, np.ndarray]
-    by_unknown: tuple[np.ndarray, np.ndarray]
+    uv: list[np.ndarray]
+    by_unknown: list[np.ndarray]
     cell: np.ndarray
 
 
@@ -60,8 +61,8 @@ def pairs_pull(
     views: list[View],
     rig: CalibratedRig,
     start: np.ndarray,
-) -> Pull | None:
-    """What pairs of images say about a rig; None where they show too little.
+) -> list[Pull]:
+    """What pairs of images say about a rig, one Pull; none where they show too little.
 
     Every camera's pose is found by Gauss-Newton from blurred to sharp images.
 
@@ -84,34 +85,33 @@ def pairs_pull(
     stops = np.unique([view.pitch for view in views])
     pairs = []
     for first, second in combinations(views, 2):
-        turned = abs(first.pitch - second.pitch)
-        same = first.camera == second.camera
-        if turned < (NEAR_PITCH if same else 1e-3):
+        near = NEAR_PITCH if first.camera == second.camera else 1e-3
+        if abs(first.pitch - second.pitch) < near:
             both = clear[first.number] & clear[second.number]
             rows = cloud.rows(patches[both])
-            pairs.append(_pair(rows, surfaces[both], first, second, rig, stops))
+            pairs.append(_pair(rows, surfaces[both], (first, second), rig, stops))
     if sum(len(pair.cell) for pair in pairs) < FEWEST:
-        return None
+        return []
     cameras = dict.fromkeys(view.camera for view in views)
-    poses = np.concatenate([poses_of(rig, camera) for camera in cameras])
+    poses = np.array([poses_of(rig, camera) for camera in cameras])
     noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
-    x = np.pad(start, (0, len(noise)))
-    fitted = np.r_[poses, len(start) : len(x)]
-    begun = x[fitted]
-    # what moves both images alike stays where creases have it
-    prior = np.diag(np.r_[np.tile(SPREAD / 4, len(cameras)), noise] ** -2.0)
+    # what moves both images alike stays where creases have it, and all else that is no pose
+    sigma = np.full(len(start), STILL)
+    sigma[poses] = SPREAD / 4
+    prior = np.r_[sigma, noise] ** -2.0
+    begun = np.pad(start, (0, len(noise)))
+    step = np.zeros_like(begun)
     for blur in BLURS:
         sharp = {view.number: cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
+        x = begun + step
         parts = [_compared(pair, sharp, x) for pair in pairs]
-        H, b, D = (np.concatenate(part) for part in zip(*parts, strict=True))
+        H, b, D, cell = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
-        by_row = np.einsum("nia,ni->na", D, -b)
-        left = by_row.sum(axis=0)[fitted] - prior @ (x[fitted] - begun)
-        compared_at = x.copy()
-        x[fitted] += np.linalg.solve(information[np.ix_(fitted, fitted)] + prior, left)
-    cell = np.concatenate([pair.cell for pair in pairs])
-    pull = pull_of_groups(information, by_row, cell, compared_at, poses)
-    return replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())
+        by_row = np.vecmat(-b, D)
+        left = by_row.sum(axis=0) - prior * step
+        step += np.linalg.solve(information + np.diag(prior), left)
+    pull = pull_of_groups(information, by_row, cell, x, poses.ravel())
+    return [replace(without(pull, noise), alike=H.any(axis=(1, 2)).mean())]
 
 
 def clear_places(cloud, view, rig):
@@ -138,32 +138,43 @@ def clear_places(cloud, view, rig):
     return clear
 
 
-def _pair(patches, surfaces, first, second, rig, stops):
+def _pair(patches, surfaces, views, rig, stops):
     """The clearest patches that two images show, each of one of some surfaces (n, s)."""
-    p_first, J_first = _carried(first, rig, patches, surfaces, stops)
-    p_second, J_second = _carried(second, rig, patches, surfaces, stops)
-    spacing = SPACING * p_first[:, 2] / first.model.fx
-    a, inside = _samples(patches.normals, first, p_first, spacing)
-    b, also = _samples(patches.normals, second, p_second, spacing)
-    rows = np.flatnonzero(inside & also)
-    texture = sample(first.grey, first.model, a[rows])[..., 0].std(axis=1)
+    first = views[0]
+    points = _samples(patches, first)
+    inside = np.ones(len(points), bool)
+    uv = []
+    for view in views:
+        p_camera = view.T_camera_platform.apply(points)
+        inside &= view.model.shows(project(p_camera, view.model), BORDER).all(axis=1)
+        uv.append(pinhole(p_camera, view.model))
+    texture = inside * sample(first.grey, first.model, uv[0])[..., 0].std(axis=1)
     order = np.argsort(-texture)[:CLEAREST]
-    rows = rows[order[texture[order] > LEAST_TEXTURE]]
-    cell = np.floor(patches.bearing / CELL) + 1000 * np.floor(patches.pitch / CELL)
+    rows = order[texture[order] > LEAST_TEXTURE]
+    patches = patches.rows(rows)
     return _Pair(
-        views=(first, second),
-        uv=(a[rows], b[rows]),
-        by_unknown=(
-            pinhole_jacobian(p_first[rows], first.model) @ J_first[rows],
-            pinhole_jacobian(p_second[rows], second.model) @ J_second[rows],
-        ),
-        cell=cell[rows],
+        views=views,
+        uv=[pixels[rows] for pixels in uv],
+        by_unknown=[_shifted(view, rig, patches, surfaces[rows], stops) for view in views],
+        cell=np.floor(patches.bearing / CELL) + 1000 * np.floor(patches.pitch / CELL),
     )
 
 
-def _carried(view, rig, patches, surfaces, stops):
-    """Patches (n, 3) in the camera frame, and their derivatives by the unknowns of a Pull, by the
-    pitch at which the head stopped, and by the height of each surface.
+def _samples(patches, view):
+    """Points (n, s, 3) of patches, `SPACING` pixels of an image apart; platform frame."""
+    right = np.cross(patches.normals, [0.0, 0.0, 1.0])
+    right[np.linalg.norm(right, axis=1) < 0.1] = [1.0, 0.0, 0.0]
+    right = unit_vector(right)
+    down = np.cross(patches.normals, right)
+    depth = view.T_camera_platform.apply(patches.points)[:, 2]
+    sides = np.stack([right, down], axis=1) * depth[:, None, None]
+    steps = np.indices((2 * HALF + 1,) * 2).reshape(2, -1).T - HALF
+    return patches.points[:, None] + SPACING / view.model.fx * steps @ sides
+
+
+def _shifted(view, rig, patches, surfaces, stops):
+    """Derivatives (n, 2, c) of the pixels of patches by the unknowns of a Pull, by the pitch at
+    which the head stopped, and by the height of each surface.
     """
     p_camera, J = seen(patches.points, view, rig)
     on_head = rig.cameras[view.camera].mount == "head"
@@ -171,27 +182,11 @@ def _carried(view, rig, patches, surfaces, stops):
     raised = view.T_camera_platform.rotation.apply(patches.normals)
     # an image pitched more sees what a sweep pitched less shows
     parts = [J, -J[..., -1:] * here, raised[..., None] * surfaces[:, None]]
-    return p_camera, np.concatenate(parts, axis=-1)
-
-
-def _samples(normals, view, middle, spacing):
-    """Pixels (n, s, 2) of samples of patches, `spacing` (n,) metres apart, about their middles
-    (n, 3) in a camera, and which are inside of its image.
-    """
-    right = np.cross(normals, [0.0, 0.0, 1.0])
-    right[np.linalg.norm(right, axis=1) < 0.1] = [1.0, 0.0, 0.0]
-    right = unit_vector(right)
-    down = np.cross(normals, right)
-    R = view.T_camera_platform.rotation.as_matrix()
-    sides = np.stack([right, down], axis=1) @ R.T * spacing[:, None, None]
-    steps = np.indices((2 * HALF + 1,) * 2).reshape(2, -1) - HALF
-    points = middle[:, None] + np.einsum("is,nij->nsj", steps, sides)
-    inside = view.model.shows(project(points, view.model), BORDER).all(axis=1)
-    return pinhole(points, view.model), inside
+    return pinhole_jacobian(p_camera, view.model) @ np.concatenate(parts, axis=-1)
 
 
 def _compared(pair, sharp, x):
-    """Of each patch of a pair: tensor (2, 2), slope (2,), derivatives (2, c)."""
+    """Of each patch of a pair: tensor (2, 2), slope (2,), derivatives (2, c), and its cell."""
     (first, of_first), (second, of_second) = (
         _normalised(sharp[view.number], view.model, uv + (J @ x)[:, None])
         for view, uv, J in zip(pair.views, pair.uv, pair.by_unknown, strict=True)
@@ -200,19 +195,19 @@ def _compared(pair, sharp, x):
     weight = np.clip((alike - ALIKE) / (1 - ALIKE), 0, None) ** 2
     gradient = (of_first + of_second) / 2
     weighted = gradient * weight[:, None, None]
-    tensor = np.einsum("nsi,nsj->nij", weighted, gradient)
+    tensor = weighted.mT @ gradient
     slope = np.vecmat(second - first, weighted)
     by_first, by_second = pair.by_unknown
-    return np.nan_to_num(tensor), np.nan_to_num(slope), by_second - by_first
+    return np.nan_to_num(tensor), np.nan_to_num(slope), by_second - by_first, pair.cell
 
 
 def _normalised(image, model, uv):
     """Patches (n, s) of mean 0 and standard deviation 1, and their gradients (n, s, 2)."""
-    values = sample(image, model, uv)[..., 0]
-    spread = np.maximum(values.std(axis=1), 1.0)[:, None]
-    gradient = []
-    for step in np.eye(2) / 2:
-        change = sample(image, model, uv + step) - sample(image, model, uv - step)
-        gradient.append(change[..., 0] - change[..., 0].mean(axis=1, keepdims=True))
-    normal = (values - values.mean(axis=1, keepdims=True)) / spread
-    return normal, np.stack(gradient, axis=-1) / spread[..., None]
+    # in the middle, half a pixel to the right and to the left, below and above
+    places = uv + np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[:, None, None] / 2
+    values = sample(image, model, places)[..., 0]
+    values -= values.mean(axis=-1, keepdims=True)
+    middle, right, left, below, above = values
+    spread = np.maximum(middle.std(axis=1), 1.0)[:, None]
+    gradient = np.stack([right - left, below - above], axis=-1)
+    return middle / spread, gradient / spread[..., None]

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud, join
@@ -33,18 +33,13 @@ from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 REACH = (
     0.1  # metres from a picked place to points of its plane, and from a click to its edge
 )
 ON_IT = 0.01  # metres from a place on a feature of one station to the same one of another
 ABOUT = 9  # points whose middle a picked point is, and that show which plane is picked
-PLACE = ("x", "y", "z")
-PICKED = tuple(
-    f"{what}_{number}" for number in (1, 2) for what in ("kind", "x_m", "y_m", "z_m")
-)
+END = ("kind", "x_m", "y_m", "z_m")
+PICKED = tuple(f"{what}_{number}" for number in (1, 2) for what in END)
 IN_PLACE = RigidTransform.identity()
 
 
@@ -110,7 +105,7 @@ def nearest_edge(
     foot = first + np.clip(along, 0, 1)[:, None] * way
     away = np.linalg.norm(foot - place, axis=1)
     nearest = int(np.argmin(away))
-    return edges[nearest], float(away[nearest])
+    return edges[nearest], away[nearest]
 
 
 def features_of(cloud: Cloud, rig: CalibratedRig, views: Sequence[View]) -> SceneFeatures:
@@ -128,8 +123,9 @@ def features_of(cloud: Cloud, rig: CalibratedRig, views: Sequence[View]) -> Scen
     SceneFeatures
     """
     planes, of_point = planes_of(cloud, rig)
-    edges = edges_of(cloud, (planes, of_point), views)
-    return SceneFeatures(cloud, rig, planes, of_point, edges)
+    return SceneFeatures(
+        cloud, rig, planes, of_point, edges=edges_of(cloud, (planes, of_point), views)
+    )
 
 
 @cached
@@ -147,6 +143,7 @@ def features_of_station(session: Session, rig: CalibratedRig, number: int) -> Sc
     -------
     SceneFeatures
     """
+    rig = rig.for_scenes
     views = views_of(session, rig, number)
     sweep, _ = without_closing(session.sweep(number))
     return features_of(join(sweep_blocks(session, rig, sweep, views)), rig, views)
@@ -154,9 +151,9 @@ def features_of_station(session: Session, rig: CalibratedRig, number: int) -> Sc
 
 def measure(
     scenes: Mapping[int, SceneFeatures],
-    picks: "pd.DataFrame",
+    picks: pd.DataFrame,
     poses: Mapping[int, RigidTransform] | None = None,
-) -> "pd.DataFrame":
+) -> pd.DataFrame:
     """Lengths between pairs of picked places.
 
     A length that several stations show is one: the mean of theirs, each weighted by how well it
@@ -178,8 +175,6 @@ def measure(
         The same, with length_m, sigma_m, the ends of the 90 % interval, low_m and high_m, the
         stations, and problem: why there is no length, NaN then, or ''.
     """
-    import pandas as pd  # a third of a second
-
     poses = poses or dict.fromkeys(scenes, IN_PLACE)
     rows = []
     for row in picks.to_dict("records"):
@@ -221,8 +216,7 @@ def _shown(scenes, poses, row, number) -> dict[int, Feature]:
     """The features that stations show at one of the places of a row of picks; a point is of the
     station that is nearest.
     """
-    kind = row[f"kind_{number}"]
-    place = np.array([row[f"{axis}_m_{number}"] for axis in PLACE], float)
+    kind, *place = (row[f"{what}_{number}"] for what in END)
     near = {n: s.at(kind, poses[n].inv().apply(place)) for n, s in scenes.items()}
     clicked = min(near, key=lambda station: near[station][1])
     feature, away = near[clicked]
@@ -245,7 +239,7 @@ def _shown(scenes, poses, row, number) -> dict[int, Feature]:
     return shown
 
 
-def read_picks(path: str | PathLike) -> "pd.DataFrame":
+def read_picks(path: str | PathLike) -> pd.DataFrame:
     """Read the list that ``scene.html`` saves.
 
     Parameters
@@ -262,8 +256,6 @@ def read_picks(path: str | PathLike) -> "pd.DataFrame":
     ValueError
         If the file is no such list; it names file, row and remedy.
     """
-    import pandas as pd
-
     remedy = "save it from scene.html again"
     try:
         table = pd.read_csv(path)
@@ -315,14 +307,10 @@ def for_page(
         of_point.append(np.where(scene.of_point < 0, -1, scene.of_point + len(features)))
         features += [*scene.planes, *scene.edges]
         lines += [poses[number].apply(edge.ends) for edge in scene.edges]
-    rows = []
-    for f in features:
-        parts = (f.centre, f.axis, f.ends, f.noise, f.jacobian)
-        rows.append(np.concatenate(parts, axis=None))
-    frames = {
-        number: {"R": T.rotation.as_matrix().tolist(), "t": T.translation.tolist()}
-        for number, T in poses.items()
-    }
+    rows = [
+        np.concatenate((f.centre, f.axis, f.ends, f.noise, f.jacobian), axis=None)
+        for f in features
+    ]
     rig = next(iter(scenes.values())).rig
     known = uncertainty_of(rig)
     return {
@@ -332,7 +320,10 @@ def for_page(
         "lines": np.array(lines).reshape(-1, 2, 3),
         "plane_of_point": np.concatenate(of_point),
         "station_of_point": np.concatenate([s.cloud.placement for s in scenes.values()]),
-        "poses": frames,
+        "poses": {
+            number: {"R": T.rotation.as_matrix().tolist(), "t": T.translation.tolist()}
+            for number, T in poses.items()
+        },
         "unknowns": len(known.names),
         "columns": columns_of(known.names).tolist(),
         "covariances": shared_covariances(rig),

@@ -19,7 +19,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.robust import biweight, robust_sigma, sums_by
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
 from lrfcal_lib.model.geometry import (
@@ -57,6 +56,7 @@ SAME_POSE = np.array([np.radians(3.0), 0.15])
 MATCHED = 0.1  # metres between patches of the same surface
 FACING = np.cos(np.radians(30.0))  # between normals of the same surface
 LOOK = np.radians(1.0)  # side of a cell of what a station saw
+ALL_ABOUT = (361, 181)  # of these, in azimuth and height
 CLEAR = 0.15  # metres before a surface; a patch there stands where the other looked through
 CLOSER = (0.1, 0.05, 0.05, 0.05)  # metres within which a fit takes patches for the same
 COMMON = 0.002  # metres, error of a patch that its neighbours have too
@@ -102,7 +102,7 @@ class Surface:
         left = self.normals[:: max(1, len(self.normals) // 2000)]
         least = FEW * len(left)
         found: list[np.ndarray] = []
-        while len(found) < DIRECTIONS:
+        for _ in range(DIRECTIONS):
             near = left @ left.T > NEAR
             count = near.sum(axis=1)
             if count.max(initial=0) < least:
@@ -134,8 +134,13 @@ def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> S
         If no part of it is smooth.
     """
     whole = cloud.rows(np.isfinite(cloud.normals).all(axis=1))
-    one = np.ones(len(whole.points))
-    columns = [whole.points, whole.normals, _moves(whole, rig), whole.sigma**2, one]
+    columns = [
+        whole.points,
+        whole.normals,
+        _moves(whole, rig),
+        whole.sigma**2,
+        np.ones(len(whole.points)),
+    ]
     sums = sums_by(np.floor(whole.points / size) @ IN_ONE, np.column_stack(columns))
     means = sums / sums[:, -1:]
     flat = np.linalg.norm(means[:, 3:6], axis=1) > FLAT
@@ -177,8 +182,7 @@ def _cells(points):
 def _look(points):
     """Nearest range in every cell of the view of a platform and the cells about it, or 0."""
     cell, distance = _cells(points)
-    shape = (int(2 * np.pi / LOOK) + 1, int(np.pi / LOOK) + 1)
-    nearest = np.full(shape, np.inf)
+    nearest = np.full(ALL_ABOUT, np.inf)
     np.minimum.at(nearest, cell, distance)
     nearest = minimum_filter(nearest, 3)
     return np.nan_to_num(nearest, posinf=0.0)
@@ -216,7 +220,7 @@ def candidates(first: Surface, second: Surface) -> list[Candidate]:
     """
     target, tree = first.gicp
     source, _ = second.gicp
-    ended: list[RigidTransform] = []
+    found: list[Candidate] = []
     for start in starts(first, second):
         matrix = start.as_matrix()
         for width in WIDTHS:
@@ -230,9 +234,11 @@ def candidates(first: Surface, second: Surface) -> list[Candidate]:
                 max_iterations=30,
             ).T_target_source
         T = RigidTransform.from_matrix(matrix)
-        if all(np.any(SAME_POSE <= transform_difference(T, other)) for other in ended):
-            ended.append(T)
-    found = [agreement(first, second, T) for T in ended]
+        if all(
+            np.any(SAME_POSE <= transform_difference(T, other.T_first_second))
+            for other in found
+        ):
+            found.append(agreement(first, second, T))
     return sorted(found, key=lambda c: -c.overlap * (1 - c.against))
 
 
@@ -300,9 +306,11 @@ def agreement(first: Surface, second: Surface, T: RigidTransform) -> Candidate:
     both = (len(np.unique(here)), len(there))
     conflicts = _before(first, T.apply(second.points))
     conflicts += _before(second, T.inv().apply(first.points))
-    fewer = min(len(first.points), len(second.points))
-    against = conflicts / max(conflicts + sum(both), 1)
-    return Candidate(T, min(both) / fewer, against)
+    return Candidate(
+        T,
+        overlap=min(both) / min(len(first.points), len(second.points)),
+        against=conflicts / max(conflicts + sum(both), 1),
+    )
 
 
 def matches(first: Surface, second: Surface, T: RigidTransform, width: float = MATCHED):
@@ -318,7 +326,7 @@ def matches(first: Surface, second: Surface, T: RigidTransform, width: float = M
 def _before(surface, points):
     """How many points (n, 3) stand where a station looked through."""
     cell, distance = _cells(points)
-    return int(np.sum(distance < surface.nearest[cell] - CLEAR))
+    return np.sum(distance < surface.nearest[cell] - CLEAR)
 
 
 @dataclass(frozen=True)
@@ -353,11 +361,6 @@ class Pair:
     loose: np.ndarray
     held: float
 
-    @cached_property
-    def whiten(self) -> np.ndarray:
-        """What makes a miss one of unit covariance, (6, 6)."""
-        return inverse_root(self.covariance)
-
     def miss(self, poses: Mapping[int, RigidTransform]) -> np.ndarray:
         """Turn and shift (6,) by which poses of the stations differ from it."""
         T = poses[self.first].inv() * poses[self.second]
@@ -390,18 +393,17 @@ def fitted(
     for width in CLOSER:
         here, there = matches(first, second, T, width)
         turned = T.rotation.apply(second.points[there])
-        across = first.normals[here] + T.rotation.apply(second.normals[there])
-        normals = unit_vector(across)
+        normals = unit_vector(first.normals[here] + T.rotation.apply(second.normals[there]))
         r = np.vecdot(normals, turned + T.translation - first.points[here])
         J = gradient_by_pose(turned, normals)
-        sigma = np.sqrt(first.sigma[here] ** 2 + second.sigma[there] ** 2 + COMMON**2)
+        sigma = np.hypot(np.hypot(first.sigma[here], second.sigma[there]), COMMON)
         sigma *= robust_sigma(r / sigma, least=1.0)
         weight = biweight(r, sigma) / sigma**2
         weighted = J * weight[:, None]
         inverse = np.linalg.pinv(J.T @ weighted, rcond=1e-12)
         gain = -inverse @ weighted.T
         step = gain @ r
-        T = moved(T, step)
+        T = pose_transform(move_pose(pose_array(T), step))
     pulls = weighted * (r + J @ step)[:, None]
     sums = sums_by(np.floor(first.points[here] / NEIGHBOURS) @ IN_ONE, pulls)
     by_first = gain @ first.moves[here]
@@ -415,12 +417,7 @@ def fitted(
         covariance=inverse @ (sums.T @ sums) @ inverse + by_sweeps @ by_sweeps.T,
         by_rig=(by_second - by_first)[:, :-2],
         overlap=agreement(first, second, T).overlap,
-        rms=float(np.sqrt(np.average(r**2, weights=weight))),
+        rms=np.sqrt(np.average(r**2, weights=weight)),
         loose=loose,
-        held=float(np.mean(np.abs(J[:, 3:] @ loose) > ACROSS)),
+        held=np.mean(np.abs(J[:, 3:] @ loose) > ACROSS),
     )
-
-
-def moved(T: RigidTransform, step: np.ndarray) -> RigidTransform:
-    """A pose after a turn and a shift (6,): R <- exp(w) R, t <- t + v."""
-    return pose_transform(move_pose(pose_array(T), step))

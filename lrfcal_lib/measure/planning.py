@@ -1,11 +1,9 @@
 """At which pitch angles images colour what the laser range finder sees."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.model.camera import fold, project
+from lrfcal_lib.model.camera import pinhole, redistort
 from lrfcal_lib.model.geometry import (
     apply_pose,
     lrf_to_platform,
@@ -22,17 +20,9 @@ MOST = 12  # pitch angles
 NEW = -1  # a placement of which no sweep was calibrated
 
 
-@dataclass(frozen=True)
-class ImagePlan:
-    """Pitch angles of images, radians, ascending, and the share of the cloud that they colour."""
-
-    pitch: tuple[float, ...]
-    share: float
-
-
 def plan_images(
     rig: CalibratedRig, sweep: tuple[float, float], limits: tuple[float, float]
-) -> ImagePlan:
+) -> tuple[np.ndarray, float]:
     """Choose pitch angles for images, the one that colours most of what is left first.
 
     Parameters
@@ -45,23 +35,23 @@ def plan_images(
 
     Returns
     -------
-    ImagePlan
+    pitch : ndarray, shape (k,)
+        Of the images, radians, ascending.
+    share : float
+        Of the cloud, that they colour.
     """
     candidates = _grid(*limits)
     visible = seen_at(rig, sweep, candidates)
     left = np.ones(visible.shape[1], bool)
     chosen: list[int] = []
-    while len(chosen) < MOST:
+    for _ in range(MOST):
         gains = np.mean(visible & left, axis=1)
         best = int(np.argmax(gains))
         if gains[best] < WORTH:
             break
         chosen.append(best)
         left &= ~visible[best]
-    return ImagePlan(
-        pitch=tuple(np.sort(candidates[chosen]).tolist()),
-        share=float(1 - left.mean()),
-    )
+    return np.sort(candidates[chosen]), 1 - left.mean()
 
 
 def seen_at(
@@ -81,18 +71,16 @@ def seen_at(
     ndarray of bool, shape (p, n)
         By pitch; beams of all `DISTANCES`.
     """
-    first, last = np.sort(sweep)
-    bearings = _grid(*rig.lrf.field_of_view)
-    p_lrf = polar_to_points(np.reshape(DISTANCES, (-1, 1)), bearings).reshape(-1, 3)
-    turns = rig.corrections.pitch(NEW, _grid(first, last))
+    away = np.reshape(DISTANCES, (-1, 1))
+    p_lrf = polar_to_points(away, _grid(*rig.lrf.field_of_view)).reshape(-1, 3)
+    turns = rig.corrections.pitch(NEW, _grid(*np.sort(sweep)))
     points = lrf_to_platform(p_lrf, turns[:, None], rig.T_head_lrf).reshape(-1, 3)
     visible = np.zeros((len(pitches), len(points)), bool)
     for name, camera in rig.cameras.items():
         T_camera_platform = rig.camera_at(name, rig.corrections.pitch(NEW, pitches))
         p_camera = apply_pose(pose_array(T_camera_platform), points)
-        uv = project(p_camera, camera.model)
-        squared = np.sum(p_camera[..., :2] ** 2, axis=-1) / p_camera[..., 2] ** 2
-        visible |= camera.model.shows(uv) & (squared < fold(camera.model))
+        uv = redistort(pinhole(p_camera, camera.model), camera.model)
+        visible |= camera.model.shows(uv)
     return visible
 
 

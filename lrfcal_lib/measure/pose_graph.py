@@ -7,7 +7,9 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.measure.pairs import Pair, moved
+from lrfcal_lib.fit.covariance import inverse_root
+from lrfcal_lib.measure.pairs import Pair
+from lrfcal_lib.model.geometry import POSE, move_pose, pose_array, pose_transform
 
 
 def connected(pairs: Collection[Pair], station: int) -> dict[int, RigidTransform]:
@@ -53,19 +55,20 @@ def solved(
         Of turn and shift of each, in the order of `poses`, to those of the pairs; zeros for the
         first.
     """
-    size = 6 * len(start) - 6
+    begun = np.array([pose_array(T) for T in start.values()])
 
     def after(steps):
         """The poses after turns and shifts of all but the first."""
-        parts = np.append(np.zeros(6), steps).reshape(-1, 6)
-        return {n: moved(start[n], part) for n, part in zip(start, parts, strict=True)}
+        moved = move_pose(begun, np.pad(steps, (POSE, 0)).reshape(-1, POSE))
+        return dict(zip(start, pose_transform(moved), strict=True))
 
     def residuals(steps):
         poses = after(steps)
-        return np.concatenate([pair.whiten @ pair.miss(poses) for pair in pairs])
+        return whiten @ np.concatenate([pair.miss(poses) for pair in pairs])
 
-    best = least_squares(residuals, np.zeros(size), jac="3-point", x_scale="jac")
-    whiten = block_diag(*(pair.whiten for pair in pairs))
+    whiten = block_diag(*(inverse_root(pair.covariance) for pair in pairs))
+    nothing = np.zeros(POSE * len(start) - POSE)
+    best = least_squares(residuals, nothing, jac="3-point", x_scale="jac")
     response = np.linalg.pinv(best.jac) @ whiten
-    of_others = response.reshape(-1, 6, 6 * len(pairs))
+    of_others = response.reshape(-1, POSE, POSE * len(pairs))
     return after(best.x), np.pad(of_others, ((1, 0), (0, 0), (0, 0)))

@@ -12,7 +12,7 @@ from lrfcal_lib.judge.uncertainty import carried, chain_of
 from lrfcal_lib.model.kinematics import beams_to
 
 # a camera's likely changes, radians and metres of its pose
-SPREAD = np.array([*np.radians([1.0, 1.0, 1.0]), 0.02, 0.02, 0.02])
+SPREAD = np.repeat([np.radians(1.0), 0.02], 3)
 PITCH_NOISE = np.radians(0.01)  # of a head at rest: what encoders resolve
 
 
@@ -37,6 +37,14 @@ class Pull:
     slope: np.ndarray
     groups: float
     alike: float = 1.0
+
+    def pull(self, change: np.ndarray, width: float) -> "Pull":
+        """The same, wherever it is asked; see :class:`lrfcal_lib.measure.creases.Sights`."""
+        return self
+
+    def explained(self, change: np.ndarray) -> float:
+        """Logarithm of the likelihood of a change (c,), beside none."""
+        return self.slope @ change - change @ self.information @ change / 2
 
 
 def poses_of(rig: CalibratedRig, camera: str) -> np.ndarray:
@@ -92,12 +100,11 @@ def pull_of_groups(
     fitted : ndarray of int, shape (f,)
         Which of them were fitted: by their slopes groups scatter.
     """
-    size = np.linalg.norm(by_row, axis=1)
     sums = sums_by(group, by_row[:, fitted])
-    load = sums_by(group, size)
+    load = sums_by(group, np.linalg.norm(by_row, axis=1))
     groups = load.sum() ** 2 / max(load @ load, 1e-300)
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
-    excess = np.trace(own @ sums.T @ sums) / max(len(fitted), 1)
+    excess = np.trace(own @ sums.T @ sums) / len(fitted)
     few = groups / max(groups - len(fitted), 1.0)
     scale = 1 / max(excess * few, 1e-12)
     return Pull(scale * information, scale * (information @ x + by_row.sum(axis=0)), groups)

@@ -3,8 +3,9 @@
 A station is one place where the rig stood: a sweep and the images taken there.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,21 +29,6 @@ DARKEST = 48  # grey of the weakest echo among points that no image saw
 BRIGHTEST = 208
 COMPARED = 100_000  # echoes that tell which are weak and strong
 AT_REST_S = 0.1  # no head moves on, settles and is scanned again in less
-
-
-@dataclass(frozen=True)
-class Station:
-    """A place where the rig stood.
-
-    Attributes
-    ----------
-    sweep : Sweep
-        Without the scan that closed it.
-    views : list of View
-    """
-
-    sweep: Sweep
-    views: list[View]
 
 
 def stations_of(session: Session) -> tuple[int, ...]:
@@ -94,8 +80,10 @@ def _refuse_moved(session, number):
         )
 
 
-def station_of(session: Session, rig: CalibratedRig, number: int) -> Station:
-    """A station with its images posed.
+def station_of(
+    session: Session, rig: CalibratedRig, number: int
+) -> tuple[Sweep, list[View]]:
+    """A place where the rig stood, with its images posed.
 
     Parameters
     ----------
@@ -107,7 +95,9 @@ def station_of(session: Session, rig: CalibratedRig, number: int) -> Station:
 
     Returns
     -------
-    Station
+    sweep : Sweep
+        Without the scan that closed it.
+    views : list of View
 
     Raises
     ------
@@ -115,11 +105,11 @@ def station_of(session: Session, rig: CalibratedRig, number: int) -> Station:
         For a sweep without a range, or images that the rig cannot pose or that have another size.
     """
     sweep, _ = without_closing(session.sweep(number))
-    return Station(sweep, views_of(session, rig.for_scenes, number))
+    return sweep, views_of(session, rig.for_scenes, number)
 
 
 def colored_blocks(
-    session: Session, rig: CalibratedRig, station: Station
+    session: Session, rig: CalibratedRig, sweep: Sweep, views: list[View]
 ) -> Iterator[Cloud]:
     """The coloured points of a station in its platform frame, block by block.
 
@@ -127,27 +117,27 @@ def colored_blocks(
     ----------
     session : Session
     rig : CalibratedRig
-    station : Station
+    sweep, views
+        Of :func:`station_of`.
 
     Returns
     -------
     iterator of Cloud
         Points that no image saw are grey, by intensity where the sensor has it.
     """
-    blocks = sweep_blocks(session, rig.for_scenes, station.sweep, station.views)
-    intensities = station.sweep.intensities
+    blocks = sweep_blocks(session, rig.for_scenes, sweep, views)
+    intensities = sweep.intensities
     if intensities is None:
         return blocks
     subset = intensities.ravel()[:: 1 + intensities.size // COMPARED]
     levels = np.nanpercentile(subset, [2, 98])
-    return (_shaded(cloud, *levels) for cloud in blocks)
+    return (_shaded(cloud, levels) for cloud in blocks)
 
 
-def _shaded(cloud, weak, strong):
+def _shaded(cloud, levels):
     """A Cloud whose points that no image saw are as bright as their echoes."""
-    share = np.clip((cloud.intensity - weak) / max(strong - weak, 1e-9), 0, 1)
-    grey = np.nan_to_num(DARKEST + (BRIGHTEST - DARKEST) * share, nan=DARKEST)
-    shades = np.repeat(grey[:, None].astype(np.uint8), 3, axis=1)
+    grey = np.interp(cloud.intensity, levels, [DARKEST, BRIGHTEST])
+    shades = np.nan_to_num(grey, nan=DARKEST)[:, None].astype(np.uint8)
     return replace(cloud, colors=np.where(cloud.seen[:, None], cloud.colors, shades))
 
 
@@ -164,8 +154,7 @@ def station_cloud(session: Session, rig: CalibratedRig, number: int) -> Cloud:
     -------
     Cloud
     """
-    station = station_of(session, rig, number)
-    blocks = colored_blocks(session, rig, station)
+    blocks = colored_blocks(session, rig, *station_of(session, rig, number))
     return join(with_sigma(cloud, rig) for cloud in blocks)
 
 
@@ -239,20 +228,20 @@ def _written(writer, session, rig, joined, told, clouds, scenes):
     """
     poses = joined.T_world_station
     count = sum(np.isfinite(session.sweep(number).ranges).sum() for number in poses)
-    every = int(-(-count // MOST_POINTS))
+    every = math.ceil(count / MOST_POINTS)
     for number, pose in poses.items():
-        station = station_of(session, rig, number)
-        blocks = (with_sigma(b, rig) for b in colored_blocks(session, rig, station))
+        sweep, views = station_of(session, rig, number)
+        blocks = (with_sigma(b, rig) for b in colored_blocks(session, rig, sweep, views))
         if number in clouds:
             blocks = [clouds[number]]
         guid = new_guid()
-        intensity = station.sweep.intensities is not None
+        intensity = sweep.intensities is not None
         thinned = []
         for cloud in writer.scan(f"station {number}", guid, pose, intensity, blocks):
             thinned.append(cloud.rows(slice(None, None, every)))
             told(len(cloud.points))
             yield placed(cloud, pose, joined.covariance[number])
-        scenes[number] = features_of(join(thinned), rig, station.views)
-        for view in station.views:
+        scenes[number] = features_of(join(thinned), rig, views)
+        for view in views:
             name = f"station {number}, {view.camera}, image {view.number}"
             writer.image(name, guid, pose * view.T_camera_platform.inv(), view)

@@ -54,7 +54,12 @@ def planes_of(cloud: Cloud, rig: CalibratedRig) -> tuple[list[Feature], np.ndarr
         surface = free[_grown(left.points, left.normals, rows, place)]
         if len(surface) >= FEWEST:
             of_point[surface] = len(planes)
-            planes.append(_fitted(cloud, surface, rig))
+            inner = _inner(cloud.points, surface)
+            plane = fit_feature(cloud, inner, rig)
+            if len(inner) == len(surface):  # all rim: less certain
+                rim = ALL_RIM**2 * np.outer(plane.axis, plane.axis)
+                plane = replace(plane, noise=plane.noise + np.pad(rim, (0, 3)))
+            planes.append(plane)
             free = free[of_point[free] < 0]
             left = cloud.rows(free)
     return planes, of_point
@@ -94,16 +99,6 @@ def _connected(points, normal, miss, sigma):
     return (part[:-1] == part[-1]) & (part[-1] > 0)
 
 
-def _fitted(cloud, surface, rig):
-    """The plane of a surface, less certain where it is all rim."""
-    inner = _inner(cloud.points, surface)
-    plane = fit_feature(cloud, inner, rig)
-    if len(inner) < len(surface):
-        return plane
-    rim = ALL_RIM**2 * np.outer(plane.axis, plane.axis)
-    return replace(plane, noise=plane.noise + np.pad(rim, (0, 3)))
-
-
 def _inner(points, surface):
     """Rows of a surface without the cells at its rim, where the spot meets what is beside it; all
     where little would be left.
@@ -122,5 +117,5 @@ def _cells(points, normal):
     """
     cell = np.rint(points @ null_space(normal[None]) / CELL).astype(int)
     cell -= cell.min(axis=0)
-    shape = tuple(cell.max(axis=0) + 1)
-    return np.ravel_multi_index(tuple(cell.T), shape), shape
+    shape = cell.max(axis=0) + 1
+    return np.ravel_multi_index(cell.T, shape), shape

@@ -17,8 +17,8 @@ from lrfcal_lib.model.geometry import gradient_by_pose
 # what no covariance of a calibration knows, radians and metres of a camera's pose: lens and light,
 # of one camera; and what all on the head have in common, whose pitch is never quite what is
 # recorded (true rigs in three simulated rooms: 0.02 deg, 1 mm)
-OWN = np.array([*np.radians([0.02, 0.02, 0.02]), 0.0005, 0.0005, 0.0005])
-COMMON = np.array([*np.radians([0.02, 0.02, 0.02]), 0.001, 0.001, 0.001])
+OWN = np.repeat([np.radians(0.02), 0.0005], 3)
+COMMON = np.repeat([np.radians(0.02), 0.001], 3)
 SURE = np.log(20.0)  # of odds: below, nothing may have moved, or the other suspect
 IN_9_OF_10 = 1.28  # standard deviations
 SLIP = np.radians([1.0])  # a likely one of the head
@@ -43,12 +43,13 @@ class Shift:
         calibration errs by, if nothing else has moved.
     covariance : ndarray, shape (6, 6) or (1, 1)
         Of the change.
-    pixels, pixels_sigma : ndarray, shape (2,)
-        To the right and down in the middle of the image, 3 m away; NaN for the head.
+    motion : ndarray, shape (2, 6), or None
+        Pixels to the right and down by the change, in the middle of the image, 3 m away; None for
+        the head.
     evidence : float
         Logarithm of the odds that it turned, moved or both against that nothing has moved, where
         either was as likely before.
-    shows : tuple of float
+    shows : list of float
         The least turn (radians), and the least move of a camera (metres), that raise an alarm in 9
         of 10 cases, whichever way they go.
     """
@@ -56,10 +57,9 @@ class Shift:
     camera: str | None
     change: np.ndarray
     covariance: np.ndarray
-    pixels: np.ndarray
-    pixels_sigma: np.ndarray
+    motion: np.ndarray | None
     evidence: float
-    shows: tuple[float, ...]
+    shows: list[float]
 
     @property
     def name(self) -> str:
@@ -82,15 +82,16 @@ class Shift:
             return -np.inf
         return self.evidence
 
-    def sentence(self) -> str:
-        """What was found."""
+    def __str__(self):
         odds = f"odds of 10^{self.evidence / np.log(10):+.1f} that it has"
         turn, sigma = np.degrees([self.change, sigma_of(self.covariance)])
         if self.camera is None:
-            amount = f"by {turn[0]:+.2f} +- {sigma[0]:.2f} deg"
-            least = f"slips from {np.degrees(self.shows[0]):.2f} deg on show"
-            return f"{self.name}, if only it slipped: {amount}; {odds}; {least}"
-        (right, down), (of_right, of_down) = self.pixels, self.pixels_sigma
+            return (
+                f"{self.name}, if only it slipped: by {turn[0]:+.2f} +- {sigma[0]:.2f} deg; "
+                f"{odds}; slips from {np.degrees(self.shows[0]):.2f} deg on show"
+            )
+        right, down = self.motion @ self.change
+        of_right, of_down = sigma_of(self.motion @ self.covariance @ self.motion.T)
         return (
             f"{self.name}, if only it moved: image {right:+.2f} +- {of_right:.2f} px to the right, "
             f"{down:+.2f} +- {of_down:.2f} px down (3 m away), turned by {turn[2]:+.2f} +- "
@@ -141,7 +142,7 @@ def suspects(seen: list[Sights], pairs: list[Pull], rig: CalibratedRig) -> list[
     list of Shift
         Empty where nothing was observed.
     """
-    nothing, asked = _asked(seen, pairs, rig)
+    nothing, asked = _asked([*seen, *pairs], rig)
     if not nothing.information.any():
         return []
     return [
@@ -159,12 +160,12 @@ def likeliest_change(seen: list[Sights], rig: CalibratedRig) -> np.ndarray:
         Of all images.
     rig : CalibratedRig
     """
-    nothing, asked = _asked(seen, [], rig)
+    nothing, asked = _asked(seen, rig)
     fits = [nothing, *(fit for _, _, fit in asked)]
     return max(fits, key=lambda fit: fit.evidence).change
 
 
-def _asked(seen, pairs, rig):
+def _asked(seen, rig):
     """The Fit where nothing has moved; and of each suspect the camera, None for the head, columns
     of the unknowns that it moves by, and the likeliest Fit.
     """
@@ -176,12 +177,12 @@ def _asked(seen, pairs, rig):
         moves.append((None, np.array([-1]), [SLIP]))
     asked = []
     for camera, columns, ways in moves:
-        fits = [_fitted(seen, pairs, C, columns, likely) for likely in ways]
+        fits = [_fitted(seen, C, columns, likely) for likely in ways]
         asked.append((camera, columns, max(fits, key=lambda fit: fit.evidence)))
-    return _fitted(seen, pairs, C, [], 0.0), asked
+    return _fitted(seen, C, [], 0.0), asked
 
 
-def _fitted(seen, pairs, C, columns, likely):
+def _fitted(seen, C, columns, likely):
     """The Fit of changes that are likely to a covariance C (c, c), and in some columns to standard
     deviations besides: expectation and maximisation, with edges that are sought nearer and nearer,
     and Laplace's approximation of the evidence.
@@ -192,28 +193,27 @@ def _fitted(seen, pairs, C, columns, likely):
     for width in WIDTHS:
         information = np.zeros_like(C)
         slope = np.zeros(len(C))
-        for pull in [*pairs, *(sights.pull(change, width) for sights in seen)]:
+        for each in seen:
+            pull = each.pull(change, width)
             information += pull.information
             slope += pull.slope
         shares = np.eye(len(C)) + C @ information
         change = np.linalg.solve(shares, C @ slope)
-    evidence = sum(sights.explained(change) for sights in seen)
-    for pull in pairs:
-        evidence += pull.slope @ change - change @ pull.information @ change / 2
+    evidence = sum(each.explained(change) for each in seen)
     cost = change @ (slope - information @ change) + np.linalg.slogdet(shares)[1]
-    return _Fit(change, slope, information, float(evidence - cost / 2))
+    return _Fit(change, slope, information, evidence - cost / 2)
 
 
 def _allowed(rig):
     """Covariance (c, c) of the unknowns where nothing has moved, the pitch of sweeps last."""
     known = rig.uncertainty
-    C = np.pad(np.where(np.isfinite(known.trusted), known.trusted, 0.0), (0, 1))
+    C = np.pad(np.nan_to_num(known.trusted, posinf=0.0, neginf=0.0), (0, 1))
     common = np.zeros((len(C), 6))
     for name, camera in rig.cameras.items():
         columns = poses_of(rig, name)
         C[columns, columns] += OWN**2
         if camera.mount == "head":
-            common[columns, np.arange(6)] = COMMON
+            common[columns] = np.diag(COMMON)
     C[-1, -1] = known.sweep_sigma[0] ** 2 + PITCH_NOISE**2
     return C + common @ common.T
 
@@ -235,18 +235,16 @@ def _shift(camera, columns, fit, evidence, rig):
             wanted = np.sqrt(2 * SURE + np.linalg.slogdet(shares)[1])
             shows.append((wanted + IN_9_OF_10) * sigma)
     covariance = np.linalg.inv(known + np.diag(likely**-2.0))
-    change = covariance @ score
-    motion = np.full((2, len(columns)), np.nan)
+    motion = None
     if camera:
         ahead = np.array([0.0, 0.0, AWAY])
         by_point = pinhole_jacobian(ahead, rig.cameras[camera].model)
         motion = gradient_by_pose(ahead, by_point)
     return Shift(
         camera=camera,
-        change=change,
+        change=covariance @ score,
         covariance=covariance,
-        pixels=motion @ change,
-        pixels_sigma=sigma_of(motion @ covariance @ motion.T),
+        motion=motion,
         evidence=evidence,
-        shows=tuple(shows),
+        shows=shows,
     )

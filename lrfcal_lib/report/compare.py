@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from lrfcal_lib.measure.compare import Comparison, history, rig_at
+from lrfcal_lib.measure.compare import Comparison, compare, rig_at
 from lrfcal_lib.plots.comparison import shift_map
 from lrfcal_lib.report.notebook import STYLE
 from lrfcal_lib.session.write import whole
@@ -38,7 +38,7 @@ def compare_files(paths: Sequence[str | Path], figure: str | Path | None = None)
     """
     if len(paths) < 2:
         raise ValueError(f"{len(paths)} calibration to compare: two or more are needed")
-    comparisons = history([rig_at(path) for path in paths])
+    comparisons = [compare(*pair) for pair in pairwise(map(rig_at, paths))]
     for (before, after), compared in zip(pairwise(paths), comparisons, strict=True):
         print(
             f"{before} ({_dated(compared.first)}) and {after} ({_dated(compared.second)}):"

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.measure.features import SYSTEMATIC
-from lrfcal_lib.measure.lengths import IN_PLACE, ON_IT, PLACE, SceneFeatures
+from lrfcal_lib.measure.lengths import END, IN_PLACE, ON_IT, SceneFeatures
 from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.session.read import Session
 
@@ -73,8 +73,7 @@ def true_picks(
             if len(picked):
                 away = np.linalg.norm(picked - picked.mean(axis=0), axis=1)
                 place = picked[np.argmin(away)]
-            row[f"kind_{number}"] = kind
-            row |= zip([f"{axis}_m_{number}" for axis in PLACE], place, strict=True)
+            row |= zip([f"{what}_{number}" for what in END], (kind, *place), strict=True)
         rows.append(row)
     return pd.DataFrame(rows)
 
