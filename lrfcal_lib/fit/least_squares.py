@@ -118,53 +118,37 @@ class Block:
 
 
 def _roots(block, axes):
-    """Roots of Cauchy's weights of residuals, or of groups of them, that are judged together."""
+    """Roots of Cauchy's weights of residuals, or of groups of them, that are judged together, in
+    their usual size: by the median of a trial. As factors of the whitener.
+    """
     if block.cost is not None:
         return np.ones(())
     groups = block.white.reshape(*block.white.shape[:-1], -1, block.size)
+    squares = np.vecdot(groups, groups)
     count = block.size if block.count is None else block.count
-    z = np.sqrt(np.vecdot(groups, groups) / count)
-    return (1 + (z / _level(z, count, block, axes) / CAUCHY) ** 2) ** -0.5
+    sizes = np.sqrt(squares / chdtri(count, 0.5))
+    trials = sizes.reshape(*sizes.shape[: -len(axes)], -1)
+    level = np.expand_dims(medians(trials, trials > 0), axes)
+    roots = (1 + squares / count / (CAUCHY * np.maximum(level, 1e-9)) ** 2) ** -0.5
+    return roots[..., None, None] if block.size > 1 else roots
 
 
-def _times(blocks, roots):
-    """Blocks with the roots of their weights in their whiteners."""
-    weighted = []
-    for block, root in zip(blocks, roots, strict=True):
-        factor = root[..., None, None] if block.size > 1 else root
-        weighted.append(replace(block, whitener=block.whitener * factor))
-    return weighted
-
-
-def _weighted(evaluate, robust, axes):
-    """A problem whose blocks have robust weights: given ones, or those of the state."""
-
-    def problem(state, roots=None):
-        """Blocks at a state, and the roots of their weights."""
-        blocks = _blocks(evaluate, state)
-        if not robust:
-            return blocks, None
-        if roots is None:
-            roots = [_roots(block, axes) for block in blocks]
-        return _times(blocks, roots), roots
-
-    return problem
-
-
-def _level(z, count, block, axes):
-    """Usual size of residuals z (..., n) in their standard deviations, by the median of a trial."""
-    inside = block.whitener != 0
-    if block.size > 1:
-        inside = inside.any(axis=(-1, -2))
-    usual = np.sqrt(chdtri(count, 0.5) / count)
-    wide = (*z.shape[: z.ndim + min(np.atleast_1d(axes))], -1)
-    level = medians((z / usual).reshape(wide), (inside & (z == z)).reshape(wide))
-    return np.maximum(np.expand_dims(level, axes), 1e-9)
+def _robust(blocks, axes, roots=None):
+    """Blocks with robust weights, given ones or those of their residuals; and the roots of
+    these.
+    """
+    if roots is None:
+        roots = [_roots(block, axes) for block in blocks]
+    weighted = [
+        replace(block, whitener=block.whitener * root)
+        for block, root in zip(blocks, roots, strict=True)
+    ]
+    return weighted, roots
 
 
 def _axes(shared):
     """What a cost is summed over: residuals of trials, or placements and residuals."""
-    return -1 if shared is None else (-2, -1)
+    return (-2, -1) if shared else (-1,)
 
 
 def _blocks(evaluate, state):
@@ -293,18 +277,18 @@ def _step(hessian, gradient, damping, shared):
     # what nobody sees stays where it is
     extra = extra + (1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300)
     damped = hessian + extra[..., None] * np.eye(hessian.shape[-1])
-    if shared is None:
-        step = whole = -solve_each(damped, gradient)
-    else:
+    if shared:
         reduced, right, back = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
         whole = _by_shared(back) @ np.append(common, 1.0)
         step = common, whole[:, shared:]
+    else:
+        step = whole = -solve_each(damped, gradient)
     length = np.vecdot(whole, np.matvec(hessian, whole))
     promised = -np.vecdot(whole, gradient) - 0.5 * length
-    if shared is None:
-        return step, length, promised
-    return step, np.sum(length), np.sum(promised)
+    if shared:
+        return step, np.sum(length), np.sum(promised)
+    return step, length, promised
 
 
 class Minimum(NamedTuple):
@@ -323,7 +307,7 @@ def minimise(
     state: Any,
     retract: Callable,
     *,
-    shared: int | None = None,
+    shared: int = 0,
     robust: bool = False,
     max_iterations: int = 60,
     tolerance: float = 1e-8,
@@ -337,8 +321,8 @@ def minimise(
     state : ndarray (leading trial axes) or, with `shared`, any object
     retract : callable
         ``(state, step) -> state``; with `shared` the step is the pair (common (c,), own (p, l)).
-    shared : int, optional
-        Number of unknowns common to all entries of the leading axis.
+    shared : int
+        Number of unknowns common to all entries of the leading axis; 0 for trials.
     robust : bool
         Cauchy's loss, in units of the median of the residuals in every iteration.
     max_iterations : int
@@ -347,12 +331,17 @@ def minimise(
         estimate.
     """
     axes = _axes(shared)
-    problem = _weighted(evaluate, robust, axes)
+
+    def problem(state, roots=None):
+        """Blocks at a state, and the roots of their weights: given ones, or those there."""
+        blocks = _blocks(evaluate, state)
+        return _robust(blocks, axes, roots) if robust else (blocks, None)
+
     blocks, roots = problem(state)
     at = linearise(blocks, axes)
     history = [at.cost]
-    converged = np.zeros(np.shape(at.cost), bool)
-    damping = np.full(np.shape(at.cost), FIRST_DAMPING)
+    converged = np.zeros_like(at.cost, bool)
+    damping = np.full_like(at.cost, FIRST_DAMPING)
     nowhere = min(LEADS_NOWHERE, NOWHERE_TOLERANCES * tolerance)
     while len(history) <= max_iterations and not converged.all():
         step, length, promised = _step(at.hessian, at.gradient, damping, shared)
@@ -365,8 +354,12 @@ def minimise(
         began = (1 + damping) ** 2 * length  # so long the step was before it was held
         arrived = np.where(held, began < nowhere**2, small)
         converged = converged | (arrived & np.isfinite(after))
-        gain = np.ones_like(at.cost)
-        np.divide(at.cost - after, promised, out=gain, where=promised > 3e-15 * at.cost)
+        gain = np.divide(
+            at.cost - after,
+            promised,
+            out=np.ones_like(at.cost),
+            where=promised > 3e-15 * at.cost,
+        )
         damping = _next_damping(damping, gain, accepted)
         if accepted.all():
             state = trial
@@ -479,7 +472,7 @@ def solve(
     start: Any,
     retract: Callable,
     *,
-    shared: int | None = None,
+    shared: int = 0,
     robust: bool = False,
     max_iterations: int = 60,
     tolerance: float = 1e-8,
@@ -519,7 +512,7 @@ def solve(
     blocks = _blocks(evaluate, minimum.state)
     weighted = blocks
     if robust:
-        weighted = _times(blocks, [_roots(block, _axes(shared)) for block in blocks])
+        weighted, _ = _robust(blocks, _axes(shared))
     return _solution(question, minimum, blocks, weighted, shared)
 
 
@@ -534,12 +527,11 @@ def _by_placement(r, J, groups, shared):
     apart).
     """
     transposed = J.mT
-    if shared is not None:
+    if shared:
         scores = np.matvec(transposed, r)
         return reduced_hessian(transposed @ J, shared), scores[:, :shared]
-    index = np.unique(groups, return_inverse=True)[1]
-    index = np.repeat(index, r.shape[-1] // len(index))
-    member = index == np.arange(index.max() + 1)[:, None]
+    member = np.unique(groups)[:, None] == groups
+    member = np.repeat(member, r.shape[-1] // len(groups), axis=1)
     transposed = transposed[..., None, :, :] * member[:, None]
     return transposed @ J[..., None, :, :], np.matvec(transposed, r[..., None, :])
 
@@ -555,9 +547,10 @@ def _solution(question, minimum, blocks, weighted, shared):
     chi2 = np.sum(weighted_r**2, axis=_axes(shared)) + question.chi2_rest
     freedom = question.freedom
     if freedom is None:
-        own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
-        freedom = r.size // chi2.size - own
-    too_large = (freedom > 0) & (chi2 > chdtri(max(freedom, 1), LARGE_CHI2))
+        own = J.shape[-1] - shared
+        groups = len(r) if shared else 1
+        freedom = r.size // chi2.size - shared - groups * own
+    too_large = chi2 > chdtri(freedom, LARGE_CHI2)  # without any freedom never
     inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
     transform, parameters = question.read(minimum.state)
     return Solution(
