@@ -42,8 +42,7 @@ class PlaneSets(NamedTuple):
     """Face points (..., p, n, 3) by placement, padded with zeros to the same number, source frame,
     metres.
 
-    `boards` (..., p, 3, 4) are ``T_camera_board``, `rows` (p,) those of the placements among the
-    observations' own, `number` (p,) that of each one's points.
+    `boards` (..., p, 3, 4) are ``T_camera_board``, `number` (p,) that of each one's points.
     """
 
     placements: np.ndarray
@@ -52,7 +51,6 @@ class PlaneSets(NamedTuple):
     used: np.ndarray
     boards: np.ndarray
     board_covariance: np.ndarray
-    rows: np.ndarray
     number: np.ndarray
 
 
@@ -132,27 +130,25 @@ def pose_unknowns(method: str, camera: str) -> dict:
     }
 
 
-def plane_sets(obs: CameraObservations) -> PlaneSets:
-    """Group the face points of the placements (three at least) whose board pose the camera
-    knows.
+def plane_sets(obs: CameraObservations, scanned: bool = True) -> PlaneSets:
+    """Group the face points of the placements (three at least) whose board pose the camera knows.
+
+    Without `scanned` also the placements that have none.
     """
     obs.require("plane")
-    placements, rows, _ = np.intersect1d(
-        obs.placements, obs.plane_placement, return_indices=True
-    )
-    mine = np.flatnonzero(np.isin(obs.plane_placement, placements))
-    where = np.searchsorted(placements, obs.plane_placement[mine])
-    padded = pad(where, len(placements), width=4, row=mine)
+    wanted = obs.plane_placement if scanned else obs.placements
+    rows = np.flatnonzero(np.isin(obs.placements, wanted))
+    where, mine = np.nonzero(obs.placements[rows, None] == obs.plane_placement)
+    padded = pad(where, len(rows), width=4, row=mine)
     index = padded["row"]
     used = padded["used"]
     return PlaneSets(
-        placements,
+        obs.placements[rows],
         points=np.where(used[..., None], obs.plane_points[..., index, :], 0.0),
         covariance=obs.plane_covariance[..., index, :, :],
         used=used,
         boards=obs.board_poses[..., rows, :3, :],
         board_covariance=obs.board_covariance[..., rows, :, :],
-        rows=rows,
         number=used.sum(axis=1),
     )
 
@@ -391,18 +387,12 @@ def _planes_at(obs, state, error):
     state, and what they do not see of chi-square.
     """
     pose, _, boards = state
-    sets = plane_sets(obs)
-    sets = sets._replace(boards=boards[sets.rows])
+    sets = plane_sets(obs, scanned=False)._replace(boards=boards)
     triangles, offset, rest = correct_and_compress(sets, pose)
     # of a board's pose: tilt over a lever, offset
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)
-    whitener = board_whitener(pose, triangles, sets.boards, common)
-    planes = []
-    for scanned in (triangles, offset, whitener):
-        every = np.zeros((len(boards), *scanned.shape[1:]))
-        every[sets.rows] = scanned
-        planes.append(every)
-    return planes, rest
+    whitener = board_whitener(pose, triangles, boards, common)
+    return (triangles, offset, whitener), rest
 
 
 def _move_with_lens(state, step):
