@@ -157,7 +157,7 @@ def check_normals(sets: PlaneSets, camera: str) -> None:
     """Refuse boards whose normals hardly spread some way, naming what stays open."""
     normals = sets.boards[:, :, 2]
     _, spread, axes = np.linalg.svd(normals)
-    spread = np.append(spread, np.zeros(3))[:3] / np.sqrt(len(normals))
+    spread = spread / np.sqrt(len(normals))
     directions = ["({:.2f}, {:.2f}, {:.2f})".format(*(axis + 0.0)) for axis in axes]
     if spread[1] < LEAST_SPREAD:
         raise DegenerateGeometry(
