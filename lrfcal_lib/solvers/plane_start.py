@@ -38,7 +38,9 @@ SEEN = 0.8  # of the placements: a few may be wrong
 ROTATIONS = 200  # random ones, beside the 24 of a cube
 FEWEST_PLANES = 5  # that judge a candidate
 FEWEST_LINES = 7  # the same, where placements are single scan lines
-SIGNS = np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1]])  # of roots of three squares
+SIGNS = np.array(
+    [[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1]]
+)  # of roots of three squares
 FLAT = 1e-3  # of its extent: what leaves a common plane less is a set of single scan lines
 
 

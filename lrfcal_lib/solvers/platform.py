@@ -293,17 +293,12 @@ def platform_blocks(state, edge, face, sigma_pitch):
     """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
     head, boards, bends = state
     p = len(boards)
-    lone = ~np.any(edge["second"], axis=1)
     tolerance = np.broadcast_to(np.eye(12)[10:], (p, 2, 12))
-    # a board seen with one edge may slide along it, which no point shows: it is held
-    slide = np.zeros((p, 1, 12))
-    slide[:, 0, 7:10] = boards[:, :, 0]
     stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))
     return [
         distance_block(state, edge, sigma_pitch, slice(0, 2)),
         distance_block(state, face, sigma_pitch, slice(1, 2)),
         Block(bends, tolerance, stiff),
-        Block(np.zeros((p, 1)), slide, lone[:, None] * 100.0),
     ]
 
 
