@@ -99,10 +99,8 @@ def tilt_axis():
     state = head, boards.poses, np.full((4, 2), 0.02)
 
     def blocks(s):
-        *derived, _ = platform.platform_blocks(
-            platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1)))), *data, 1e-3
-        )
-        return derived  # the last one holds what no point shows
+        moved = platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1))))
+        return platform.platform_blocks(moved, *data, 1e-3)
 
     for i, block in enumerate(blocks(np.zeros(12))):
         used = (

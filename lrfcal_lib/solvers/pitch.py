@@ -160,25 +160,27 @@ def estimate_pitch_errors(
     placements = _common_placements(cameras)
     turn = np.array([direction[p] for p in placements])
     rows = gather([obs.select(placements) for obs in cameras.values()])
-    each = np.eye(len(placements))[rows.placement]
     middles = np.array([middle[p] for p in placements])
     away = rows.pitch - middles[rows.placement]
-    # columns: by how much the unknowns of a model change the pitch of each row
-    columns = {"none": each[:, :0]}
+    each = np.eye(len(placements))
+    # offset of each placement by the unknowns of a model
+    offsets = {"none": each[:, :0]}
     if {-1, 1} <= set(turn):
-        columns["direction"] = turn[rows.placement, None]
-    columns["sweep"] = each
-    columns["sweep_stretch"] = np.concatenate([each, each * away[:, None]], axis=1)
+        offsets["direction"] = turn[:, None]
+    offsets |= {"sweep": each, "sweep_stretch": each}
 
     poses = np.array([pose_array(start_from_planes(obs))[0] for obs in cameras.values()])
     numbers = _count_numbers(rows, len(poses), len(placements))
     models = {}
     by_direction = (np.nan, np.nan)
-    for name, by_unknown in columns.items():
+    for name, by_offset in offsets.items():
+        by_unknown = by_offset[rows.placement]
+        if name == "sweep_stretch":
+            by_unknown = np.hstack([by_unknown, by_unknown * away[:, None]])
         solution = _solve(name, rows, by_unknown, poses)
-        model = _model(name, solution, rows, turn, numbers)
+        model = _model(name, solution, rows, by_offset, numbers)
         if name == "direction":
-            by_direction = (solution.parameters[-1], model.offset_sigma[0])
+            by_direction = (solution.parameters[-1], model.offset_sigma.max())
         if name == "none":
             wanted = before = model
         if model.tested(wanted, numbers).p_value < LEVEL:
@@ -308,13 +310,13 @@ def _solve(name, rows, by_unknown, poses):
     )
 
 
-def _model(name, solution, rows, turn, numbers):
-    """What a Solution says about the pitch.
+def _model(name, solution, rows, offsets, numbers):
+    """What a Solution says about the pitch; `offsets` (p, k) are those by the unknowns.
 
     The stated sigmas only weigh faces against edges, the level comes from the residuals.
     """
     poses, errors = solution.state
-    p = len(turn)
+    p, count = offsets.shape
     unit = SIGMA * np.sqrt(len(poses))  # metres, of a residual
     distances = solution.residuals[: len(rows.weight)] / rows.weight * unit
     # what a scan scatters about its own plane tells nothing of the pitch
@@ -322,25 +324,19 @@ def _model(name, solution, rows, turn, numbers):
     away = distances - np.vecdot(rows.normal, scatter)
     misfit = np.sum((rows.weight * away / unit) ** 2)
     free = len(errors)
-    if free >= p:  # the offset common to all sweeps goes with the cameras' poses
+    if count == p:  # the offset common to all sweeps goes with the cameras' poses
         free -= 1
+        offsets = offsets - 1 / p
     level = misfit / max(numbers - POSE - free, 1)
     known = replace(solution, covariance=level / solution.inflation * solution.covariance)
-    offset, sigma, stretch = np.zeros((3, p))
-    if name == "direction":
-        offset = errors * turn
-        sigma = np.full(p, known.trusted_sigma[-1])
-    elif name != "none":
-        centre = np.eye(p) - 1 / p
-        first = 6 * len(poses)
-        offset = centre @ errors[:p]
-        of_offsets = known.covariance[first : first + p, first : first + p]
-        sigma = sigma_of(centre @ of_offsets @ centre)
-        stretch[: len(errors) - p] = errors[p:]
+    own = POSE * len(poses) + np.arange(count)
+    of_unknowns = known.trusted[np.ix_(own, own)]
+    stretch = np.zeros(p)
+    stretch[: len(errors) - count] = errors[count:]
     return PitchModel(
         name,
-        offset=offset,
-        offset_sigma=sigma,
+        offset=offsets @ errors[:count],
+        offset_sigma=sigma_of(offsets @ of_unknowns @ offsets.T),
         stretch=stretch,
         misfit=misfit,
         plane_rms=rms(distances[rows.on_face]),
