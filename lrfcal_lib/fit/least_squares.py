@@ -561,7 +561,7 @@ def _solution(question, minimum, blocks, weighted, shared):
         residuals=r,
         jacobian=J,
         covariance=covariance_of(hessian, scales, motions) * inflation[..., None, None],
-        covariance_placements=placement_covariance(hessians, scores)[0],
+        covariance_placements=placement_covariance(hessians, scores),
         unobservable=motions,
         method=question.method,
         n_observations=question.n_observations or r.shape[-1],

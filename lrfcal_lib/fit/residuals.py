@@ -10,7 +10,6 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.result import Solution
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import (
     CameraModel,
     line_distance,
@@ -22,7 +21,11 @@ from lrfcal_lib.model.camera import (
 from lrfcal_lib.model.geometry import (
     cross,
     gradient_by_pose,
+    pose_array,
+    pose_parameters,
+    pose_transform,
     rotate_and_move,
+    unit_vector,
 )
 from lrfcal_lib.model.observations import CameraObservations
 
@@ -94,7 +97,7 @@ def sight_normals(lines: np.ndarray, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 3)
         Unit vectors, camera frame.
     """
-    return geometry.unit_vector(lines @ model.matrix)
+    return unit_vector(lines @ model.matrix)
 
 
 def edge_residuals_px(obs: CameraObservations, transform: RigidTransform) -> np.ndarray:
@@ -111,7 +114,7 @@ def edge_residuals_px(obs: CameraObservations, transform: RigidTransform) -> np.
     ndarray, shape (n,)
         Undistorted pixels; positive outside the board.
     """
-    return line_block(geometry.pose_array(transform), obs).residuals
+    return line_block(pose_array(transform), obs).residuals
 
 
 def plane_residuals_m(obs: CameraObservations, transform: RigidTransform) -> np.ndarray:
@@ -182,7 +185,7 @@ def read_pose(pose: np.ndarray) -> tuple[RigidTransform, np.ndarray]:
     parameters : ndarray, shape (..., 6)
         Rotation vector and translation, radians and metres.
     """
-    return geometry.pose_transform(pose, proper=True), geometry.pose_parameters(pose)
+    return pose_transform(pose, proper=True), pose_parameters(pose)
 
 
 def noise_correction(

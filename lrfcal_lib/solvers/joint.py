@@ -13,9 +13,10 @@ from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.fit.least_squares import solve
 from lrfcal_lib.fit.result import PlatformPrior
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
+    axis_of,
+    head_from_axis,
     pose_array,
     pose_parameters,
     pose_transform,
@@ -202,7 +203,7 @@ def in_stated_gauge(state: JointState, obs: JointObservations) -> JointState:
     them.
     """
     found = pose_transform(state.head)
-    head = geometry.head_from_axis(geometry.axis_of(found), obs.T_head_lrf)
+    head = head_from_axis(axis_of(found), obs.T_head_lrf)
     change = head * found.inv()
     cameras = state.cameras.copy()
     on_base = ~obs.on_head

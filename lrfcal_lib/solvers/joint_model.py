@@ -13,9 +13,12 @@ from lrfcal_lib.fit.axis_chart import move_head
 from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import outline_lines
-from lrfcal_lib.model.geometry import move_pose
+from lrfcal_lib.model.geometry import (
+    POSE_NAMES,
+    move_pose,
+    polar_to_points,
+)
 from lrfcal_lib.model.observations import JointObservations
 
 SENSOR = (
@@ -121,7 +124,7 @@ class Unknowns:
 
     def names(self, cameras) -> tuple[str, ...]:
         """Names of the shared unknowns, of cameras with these names."""
-        poses = [f"{camera}_{name}" for camera in cameras for name in geometry.POSE_NAMES]
+        poses = [f"{camera}_{name}" for camera in cameras for name in POSE_NAMES]
         return tuple(compress([*AXIS_NAMES, *poses, *SENSOR], self.mask))
 
 
@@ -235,7 +238,7 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
         lens=obs.view_lens,
     )
     for group in (face, beam):
-        group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
+        group["ray"] = polar_to_points(1.0, group["bearing"])
     view["pose"][~view["used"]] = np.eye(4)
     return JointData(
         face,

@@ -6,12 +6,8 @@ No equations of its own.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    pose_array,
-)
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_contradictions import (
@@ -67,13 +63,8 @@ def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> St
     """
     data = gather(obs, levels)
     tried = []
-    for states in start_states(obs):
+    for states in start_states(obs, unknowns.axis):
         for state in states:
-            if not unknowns.axis:
-                known = obs.T_head_lrf
-                if known is None:
-                    known = RigidTransform.identity()
-                state = replace(state, head=pose_array(known))
             tried.append(agreeing_start(obs, state, data, unknowns))
         best = min(tried, key=lambda start: start.badness)
         if best.badness < GOOD_START:

@@ -24,11 +24,12 @@ POINTS = 30  # a plane
 VIEWS = 24  # a camera; closed forms do not get much better with more
 
 
-def start_states(obs: JointObservations) -> Iterator[list[JointState]]:
+def start_states(obs: JointObservations, axis: bool = True) -> Iterator[list[JointState]]:
     """Start values to choose from, made one by one: each with those of the cameras' other minima.
 
     From the stated platform, then from an axis along x through the mirror, which may turn
-    backwards; with cameras from the planes of whole sweeps. Raises DegenerateGeometry when no
+    backwards; with cameras from the planes of whole sweeps. Where the axis is no unknown, only the
+    first. Raises DegenerateGeometry when no
     placement gives the pose of a board.
     """
     if len(obs.face_range) == 0:
@@ -39,6 +40,8 @@ def start_states(obs: JointObservations) -> Iterator[list[JointState]]:
     heads = [RigidTransform.identity(), RigidTransform.from_rotation(backwards)]
     if obs.T_head_lrf is not None:
         heads.insert(0, obs.T_head_lrf)
+    if not axis:
+        heads = heads[:1]
     reasons = []
     for head in heads:
         try:
@@ -56,13 +59,13 @@ def _states(obs, head):
     """
     minima = [_camera(obs, camera, head) for camera in range(len(obs.cameras))]
     best = np.array([poses[0] for poses in minima])
-    states = [state_of(obs, pose_array(head), best)]
+    choices = [best]
     for camera, poses in enumerate(minima):
         for pose in poses[1:]:
             other = best.copy()
             other[camera] = pose
-            states.append(state_of(obs, pose_array(head), other))
-    return states
+            choices.append(other)
+    return [state_of(obs, pose_array(head), cameras) for cameras in choices]
 
 
 def _camera(obs, camera, head):
