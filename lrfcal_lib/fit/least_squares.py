@@ -213,9 +213,8 @@ def eliminate(
     -------
     reduced : ndarray, shape (p, c, c)
     gradient : ndarray, shape (p, c)
-    back : ndarray, shape (p, k - c, c + 1)
-        A step x of the shared unknowns goes with ``-(back[..., c] + back[..., :c] x)`` of a
-        placement's own.
+    by_shared : ndarray, shape (p, k, c + 1)
+        The best step of all unknowns by that of the shared ones and a 1.
     """
     c = shared
     known = np.concatenate([hessian[:, c:, :c], gradient[:, c:, None]], axis=-1)
@@ -226,7 +225,9 @@ def eliminate(
         back = pseudo_inverse(own) @ known
     taken = hessian[:, :c, c:] @ back
     reduced = hessian[:, :c, :c] - taken[..., :c]
-    return reduced, gradient[:, :c] - taken[..., c], back
+    same = np.broadcast_to(np.eye(c, c + 1), reduced.shape[:1] + (c, c + 1))
+    by_shared = np.concatenate([same, -back], axis=1)
+    return reduced, gradient[:, :c] - taken[..., c], by_shared
 
 
 def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
@@ -245,21 +246,13 @@ def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
     return eliminate(hessian, np.zeros(hessian.shape[:2]), shared)[0]
 
 
-def _by_shared(back):
-    """The best step of all unknowns by that of the shared ones and a 1, (p, k, c + 1)."""
-    columns = back.shape[-1]
-    same = np.eye(columns - 1, columns)
-    return np.concatenate([np.broadcast_to(same, (len(back), *same.shape)), -back], axis=1)
-
-
 def likeliest(
     hessian: np.ndarray, gradient: np.ndarray, shared: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Steps (p, k) of all unknowns of every placement to the minimum, and their covariances (p, k,
     k), from normal equations as of :func:`eliminate`.
     """
-    reduced, right, back = eliminate(hessian, gradient, shared)
-    by_shared = _by_shared(back)
+    reduced, right, by_shared = eliminate(hessian, gradient, shared)
     inverse = pseudo_inverse(np.sum(reduced, axis=0))
     steps = by_shared @ np.append(-inverse @ np.sum(right, axis=0), 1.0)
     derivatives = by_shared[..., :-1]
@@ -278,9 +271,9 @@ def _step(hessian, gradient, damping, shared):
     extra = extra + (1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300)
     damped = hessian + extra[..., None] * np.eye(hessian.shape[-1])
     if shared:
-        reduced, right, back = eliminate(damped, gradient, shared, regular=True)
+        reduced, right, by_shared = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
-        whole = _by_shared(back) @ np.append(common, 1.0)
+        whole = by_shared @ np.append(common, 1.0)
         step = common, whole[:, shared:]
     else:
         step = whole = -solve_each(damped, gradient)

@@ -244,7 +244,7 @@ def _before_boards(poses, sets, centres):
 
 def _squares(poses, triangles, sets):
     """Mean squared distances (n, p) of each placement's points from its plane, at n poses."""
-    residuals = plane_residuals(poses[:, None], triangles, sets.boards)
+    residuals = plane_residuals(poses, triangles, sets.boards)
     return np.vecdot(residuals, residuals) / sets.number
 
 

@@ -174,11 +174,12 @@ def check_normals(sets: PlaneSets, camera: str) -> None:
 
 
 def source_planes(pose, boards):
-    """Planes of boards (..., 3, 4) in the source frame, ``plane . [P, 1] = 0``, shape (..., 4)."""
+    """Planes of boards (..., p, 3, 4) in the source frame of poses (..., 3, 4), ``plane . [P, 1] =
+    0``, shape (..., p, 4).
+    """
     normal = boards[..., 2]
-    across = np.matvec(pose[..., :3].mT, normal)
-    last = np.vecdot(normal, pose[..., 3] - boards[..., 3])
-    return np.concatenate([across, last[..., None]], axis=-1)
+    last = np.vecdot(normal, pose[..., None, :, 3] - boards[..., 3])
+    return np.concatenate([normal @ pose[..., :3], last[..., None]], axis=-1)
 
 
 def _with_one(points):
@@ -205,7 +206,7 @@ def equal_weights(sets, pose):
     """One common weight for all points: the root mean square of their noise (plain least
     squares), (..., 1, 1).
     """
-    _, variance = _noise_across(sets, source_planes(pose[..., None, :, :], sets.boards))
+    _, variance = _noise_across(sets, source_planes(pose, sets.boards))
     total = np.sum(variance * sets.used, axis=(-1, -2), keepdims=True)
     return np.sqrt(sets.used.sum() / total)
 
@@ -218,7 +219,7 @@ def correct_and_compress(sets: PlaneSets, pose: np.ndarray):
     p, 4, 4), an offset (..., p, 4) and a rest: residuals are ``A h + offset``, at the pose what the
     moved rows see of the raw distances; the rest is the chi-square of what they do not see.
     """
-    planes = source_planes(pose[..., None, :, :], sets.boards)
+    planes = source_planes(pose, sets.boards)
     pull, variance = _noise_across(sets, planes)
     weights = sets.used / np.sqrt(variance)
     distance = np.vecdot(_with_one(sets.points), planes[..., None, :])
@@ -237,7 +238,7 @@ def plane_block(pose, triangles, boards, whitener=None, count=None, offset=0.0) 
     `count` (p,) is the number of points of each placement, for losses on raw triangles. A loss
     judges a placement as a whole.
     """
-    residuals, by_pose, _ = plane_terms(pose[..., None, :, :], triangles, boards, offset)
+    residuals, by_pose, _ = plane_terms(pose, triangles, boards, offset)
     if whitener is None:
         whitener = np.eye(4)
     whitener = np.broadcast_to(whitener, residuals.shape + (4,))
@@ -248,27 +249,27 @@ def board_whitener(pose, triangles, boards, board_covariance):
     """Whiteners (..., p, 4, 4) for errors of the boards' poses, common to all points of a
     placement.
     """
-    _, _, by_board = plane_terms(pose[..., None, :, :], triangles, boards)
+    _, _, by_board = plane_terms(pose, triangles, boards)
     covariance = np.eye(4) + by_board @ board_covariance @ by_board.mT
     return inverse_root(covariance)
 
 
 def plane_terms(pose, triangles, boards, offset=0.0):
-    """Residuals ``A h + offset`` (..., 4) and their Jacobians (..., 4, 6) by the pose and by
+    """Residuals ``A h + offset`` (..., p, 4) and their Jacobians (..., p, 4, 6) by the pose and by
     the board's pose.
     """
     residuals = plane_residuals(pose, triangles, boards, offset)
     normal = boards[..., 2]
     by_pose = np.zeros(residuals.shape + (6,))  # of h
-    by_pose[..., :3, :3] = pose[..., :3].mT @ hat(normal)
+    by_pose[..., :3, :3] = pose[..., None, :, :3].mT @ hat(normal)
     by_pose[..., 3, 3:] = normal
     by_board = -by_pose
-    by_board[..., 3, :3] = cross(normal, pose[..., 3] - boards[..., 3])
+    by_board[..., 3, :3] = cross(normal, pose[..., None, :, 3] - boards[..., 3])
     return residuals, triangles @ by_pose, triangles @ by_board
 
 
 def plane_residuals(pose, triangles, boards, offset=0.0):
-    """Residuals ``A h + offset`` (..., 4), h the boards' planes in the source frame."""
+    """Residuals ``A h + offset`` (..., p, 4), h the boards' planes in the source frame."""
     return np.matvec(triangles, source_planes(pose, boards)) + offset
 
 
@@ -289,9 +290,9 @@ def planes_and_pattern(state, planes, obs: CameraObservations, lens) -> list[Blo
     """Residuals by placement of pose, intrinsics and board poses (p, 3, 4): point-plane distances,
     pattern corners.
 
-    `planes` are triangles, offsets and whiteners of :func:`plane_terms`; zero where nothing was
-    scanned. Unknowns: pose 6 and intrinsics (the first `lens`) are shared, the board's pose 6 is
-    the placement's own.
+    `planes` are triangles, offsets and whiteners of :func:`plane_terms`; triangles are zero where
+    nothing was scanned. Unknowns: pose 6 and intrinsics (the first `lens`) are shared, the board's
+    pose 6 is the placement's own.
     """
     pose, intrinsics, boards = state
     triangles, offset, whitener = planes
