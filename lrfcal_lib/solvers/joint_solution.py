@@ -123,8 +123,11 @@ class JointSolution:
     @property
     def excluded_placements(self) -> dict[int, str]:
         """Why placements are left out, in words, by their numbers."""
-        whole = [problem for problem in self.excluded if problem.camera is None]
-        return {problem.placement: str(problem) for problem in whole}
+        return {
+            problem.placement: str(problem)
+            for problem in self.excluded
+            if problem.camera is None
+        }
 
     @property
     def state(self) -> JointState:
@@ -175,13 +178,12 @@ class JointSolution:
         return dict(zip(self.observations.placements.tolist(), values, strict=True))
 
     @property
-    def sweep_sigma(self) -> tuple[float, float]:
+    def sweep_sigma(self) -> tuple[float, ...]:
         """Standard deviations of the pitch's offset (radians) and stretch of every sweep; 0 where
         held.
         """
         number = SWEEPS[self.unknowns.sweep]
-        offset, stretch = (*self.data.levels.sweep_sigma[:number], *SWEEP_HELD[number:])
-        return offset, stretch
+        return (*self.data.levels.sweep_sigma[:number], *SWEEP_HELD[number:])
 
     @property
     def side_odds(self) -> np.ndarray:

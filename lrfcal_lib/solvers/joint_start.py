@@ -75,23 +75,22 @@ def _camera(obs, camera, head):
     name = obs.cameras[camera]
     mine = np.flatnonzero(obs.view_camera == camera)
     first = mine[np.unique(obs.view_placement[mine], return_index=True)[1]]
-    views = []
-    points = []
-    for view in thin(first, VIEWS):
-        rows = thin(np.flatnonzero(obs.face_placement == obs.view_placement[view]), POINTS)
-        if len(rows) == 0:
-            continue
-        p = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
-        frame = SourceFrame(head, obs.mounts[camera], obs.view_pitch[view])
-        points.append(frame.points(p, obs.face_pitch[rows]))
-        views.append(view)
-    if not views:
+    views = thin(first, VIEWS)
+    placements = obs.view_placement[views]
+    rows = np.concatenate(
+        [thin(np.flatnonzero(obs.face_placement == p), POINTS) for p in placements]
+    )
+    if len(rows) == 0:
         raise DegenerateGeometry(f"camera '{name}' never sees a board that the scans hit")
+    image = views[np.searchsorted(placements, obs.face_placement[rows])]
+    frame = SourceFrame(head, obs.mounts[camera], obs.view_pitch[image])
+    p_lrf = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
     seen = CameraObservations(
         None,
         name,
-        plane_points=np.concatenate(points),
-        plane_placement=np.repeat(np.arange(len(views)), [len(p) for p in points]),
+        plane_points=frame.points(p_lrf, obs.face_pitch[rows]),
+        plane_placement=obs.face_placement[rows],
+        placements=placements,
         board_poses=obs.view_pose[views],
         board_covariance=obs.view_covariance[views],
     )
