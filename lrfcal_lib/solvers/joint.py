@@ -9,7 +9,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.fit.least_squares import solve
 from lrfcal_lib.fit.result import PlatformPrior
@@ -18,7 +17,6 @@ from lrfcal_lib.model.geometry import (
     axis_of,
     head_from_axis,
     pose_array,
-    pose_parameters,
     pose_transform,
 )
 from lrfcal_lib.model.observations import JointObservations
@@ -36,7 +34,6 @@ from lrfcal_lib.solvers.joint_model import (
     Levels,
     Unknowns,
     gather,
-    move_state,
 )
 from lrfcal_lib.solvers.joint_noise import estimate_noise, settled
 from lrfcal_lib.solvers.joint_residuals import MOST_STEPS, minimum, named_blocks
@@ -220,11 +217,11 @@ def finished(obs, state, data, unknowns, required, excluded):
     found = solve(
         lambda at: blocks(at).values(),
         in_stated_gauge(state, obs),
-        lambda at, step: move_state(at, step, unknowns),
+        unknowns.move,
         shared=unknowns.shared,
         names=names,
         method="joint",
-        read=lambda at: (None, parameters_of(at, unknowns)),
+        read=unknowns.read,
         scales=[SCALES.get(name, 1.0) for name in names],
         words=lambda direction: joint_words(direction, names, obs.cameras),
         freedom=0,
@@ -263,10 +260,3 @@ def with_step_error(solution: JointSolution) -> JointSolution:
     moved = -free @ pull.sum(axis=0) / STEP * sigma
     spread = dyads(moved)
     return replace(solution, solution=solution.solution.widened(spread, spread), step=moved)
-
-
-def parameters_of(state: JointState, unknowns: Unknowns) -> np.ndarray:
-    """The shared unknowns of a state, (c,): axis, poses of the cameras, sensor."""
-    poses = pose_parameters(state.cameras).ravel()
-    every = np.concatenate([chart_parameters(state.head), poses, state.sensor])
-    return every[unknowns.mask]

@@ -25,7 +25,6 @@ from lrfcal_lib.solvers.joint_model import (
     JointData,
     JointState,
     Unknowns,
-    move_state,
 )
 
 # what is usual of the sensor, and by how much it may differ: at the rim of the spot the odds say
@@ -77,7 +76,7 @@ def minimum(
     return minimise(
         lambda at: named_blocks(at, data, unknowns).values(),
         state,
-        lambda at, step: move_state(at, step, unknowns),
+        unknowns.move,
         shared=unknowns.shared,
         max_iterations=steps,
         tolerance=tolerance,

@@ -178,12 +178,13 @@ class JointSolution:
         return dict(zip(self.observations.placements.tolist(), values, strict=True))
 
     @property
-    def sweep_sigma(self) -> tuple[float, ...]:
+    def sweep_sigma(self) -> tuple[float, float]:
         """Standard deviations of the pitch's offset (radians) and stretch of every sweep; 0 where
         held.
         """
         number = SWEEPS[self.unknowns.sweep]
-        return (*self.data.levels.sweep_sigma[:number], *SWEEP_HELD[number:])
+        offset, stretch = (*self.data.levels.sweep_sigma[:number], *SWEEP_HELD[number:])
+        return offset, stretch
 
     @property
     def side_odds(self) -> np.ndarray:
