@@ -263,7 +263,7 @@ def view_block(state, data, unknowns):
     on_head = data.on_head[view["camera"]]
     moved = on_head[..., None, None]
     pitch, by_parts = true_pitch(state, data, view["pitch"])
-    pitch = np.where(on_head, pitch, 0.0)
+    pitch = pitch * on_head
     head = np.where(moved, state.head, np.eye(3, 4))
     board = state.boards[:, None]
     # T_camera_board = T_camera_lrf T_head_lrf^-1 Rx(-pitch) T_platform_board for a camera on the

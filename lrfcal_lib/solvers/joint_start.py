@@ -113,7 +113,7 @@ def boards_in_images(
     `head` and `cameras` as in JointState.
     """
     on_head = obs.on_head[obs.view_camera]
-    pitch = np.where(on_head, obs.view_pitch, 0.0)
+    pitch = obs.view_pitch * on_head
     T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
     T_platform_lrf = platform_from_head(pitch) * T_head_lrf
     T_platform_camera = T_platform_lrf * pose_transform(cameras[obs.view_camera]).inv()

@@ -170,7 +170,10 @@ def estimate_pitch_errors(
     offsets |= {"sweep": each, "sweep_stretch": each}
 
     poses = np.array([pose_array(start_from_planes(obs))[0] for obs in cameras.values()])
-    numbers = _count_numbers(rows, len(poses), len(placements))
+    # errors of the LRF are common to all cameras, and count once
+    squares = np.where(rows.on_face, 0.0, rows.weight**2)
+    edges = np.bincount(rows.camera, squares, minlength=len(poses)).max()
+    numbers = PLANE_NUMBERS * len(placements) + EDGE_NUMBERS * round(edges)
     models = {}
     by_direction = (np.nan, np.nan)
     for name, by_offset in offsets.items():
@@ -251,13 +254,6 @@ def _shares(part):
     """Weights of rows by the part they belong to: the squares of one part's sum up to 1."""
     _, index, count = np.unique(part, return_inverse=True, return_counts=True)
     return 1 / np.sqrt(count[index])
-
-
-def _count_numbers(rows, cameras, placements):
-    """Independent numbers; errors of the LRF are common to all cameras, and count once."""
-    squares = np.where(rows.on_face, 0.0, rows.weight**2)
-    edges = np.bincount(rows.camera, squares, minlength=cameras).max()
-    return PLANE_NUMBERS * placements + EDGE_NUMBERS * round(edges)
 
 
 def pitch_blocks(state, rows, by_unknown):

@@ -96,8 +96,10 @@ def estimate_from_planes(
 
     def freeze(pose, number):
         """The residuals with weights and compressed points as they are at a pose."""
-        if not (weighted and number):
-            triangles = compress(sets, equal_weights(sets, pose))
+        if not (weighted and number):  # one common weight: the mean of the points' noise
+            _, variance = _noise_across(sets, source_planes(pose, sets.boards))
+            total = np.sum(variance * sets.used, axis=(-1, -2), keepdims=True)
+            triangles = compress(sets, np.sqrt(sets.used.sum() / total))
             return lambda p: residual(p, triangles, sets.boards, None, sets.number)
         triangles, offset, _ = correct_and_compress(sets, pose)
         whitener = board_whitener(pose, triangles, sets.boards, sets.board_covariance)
@@ -144,7 +146,7 @@ def plane_sets(obs: CameraObservations, scanned: bool = True) -> PlaneSets:
     used = padded["used"]
     return PlaneSets(
         obs.placements[rows],
-        points=np.where(used[..., None], obs.plane_points[..., index, :], 0.0),
+        points=obs.plane_points[..., index, :] * used[..., None],
         covariance=obs.plane_covariance[..., index, :, :],
         used=used,
         boards=obs.board_poses[..., rows, :3, :],
@@ -200,15 +202,6 @@ def _noise_across(sets, planes):
     across = planes[..., :3]
     pull = np.matvec(sets.covariance, across[..., None, :])
     return pull, np.vecdot(pull, across[..., None, :]) + SIGMA_FLOOR**2
-
-
-def equal_weights(sets, pose):
-    """One common weight for all points: the root mean square of their noise (plain least
-    squares), (..., 1, 1).
-    """
-    _, variance = _noise_across(sets, source_planes(pose, sets.boards))
-    total = np.sum(variance * sets.used, axis=(-1, -2), keepdims=True)
-    return np.sqrt(sets.used.sum() / total)
 
 
 def correct_and_compress(sets: PlaneSets, pose: np.ndarray):
@@ -361,12 +354,17 @@ def estimate_with_lens(
         plane_block, obs, pose, method=method, uses=uses, **options
     )
     error = plane_error(obs, solution)
-    numbers = np.sum(plane_sets(obs).number) + visible.sum()
-    state = (pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3])
+    # of a board's pose: tilt over a lever, offset
+    common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)
+    sets = plane_sets(obs, scanned=False)
+    numbers = sets.number.sum() + visible.sum()
+    state = (pose_array(solution.transform), obs.model.parameters, sets.boards)
     for _ in range(2):
-        planes, rest = _planes_at(obs, state, error)
+        pose, _, boards = state
+        triangles, offset, rest = correct_and_compress(sets._replace(boards=boards), pose)
+        whitener = board_whitener(pose, triangles, boards, common)
         solution = solve(
-            lambda state, planes=planes: residual(state, planes, obs, lens),
+            partial(residual, planes=(triangles, offset, whitener), obs=obs, lens=lens),
             state,
             _move_with_lens,
             read=partial(_read_with_lens, lens=lens),
@@ -381,19 +379,6 @@ def estimate_with_lens(
         )
         state = solution.state
     return _with_refined_model(solution, obs, lens)
-
-
-def _planes_at(obs, state, error):
-    """Triangles, offsets and whiteners of all placements of which the camera knows the board, at a
-    state, and what they do not see of chi-square.
-    """
-    pose, _, boards = state
-    sets = plane_sets(obs, scanned=False)._replace(boards=boards)
-    triangles, offset, rest = correct_and_compress(sets, pose)
-    # of a board's pose: tilt over a lever, offset
-    common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)
-    whitener = board_whitener(pose, triangles, boards, common)
-    return (triangles, offset, whitener), rest
 
 
 def _move_with_lens(state, step):
