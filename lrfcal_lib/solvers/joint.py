@@ -178,7 +178,7 @@ def solve_again(obs: JointObservations, like: JointSolution) -> JointSolution:
     Raises DegenerateGeometry when these placements leave a motion open.
     """
     rows = np.flatnonzero(np.isin(like.observations.placements, obs.placements))
-    obs = obs.select(like.observations.placements[rows])
+    obs = obs.select(like.observations.placements)
     data = gather(obs, like.data.levels)
     state = minimum(like.state.of_placements(rows), data, like.unknowns, LAST_STEP).state
     return finished(obs, state, data, like.unknowns, required=True, excluded=like.excluded)

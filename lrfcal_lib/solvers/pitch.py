@@ -24,7 +24,6 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     tilt,
 )
-from lrfcal_lib.model.kinematics import TILT_AXIS
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.plane_start import start_from_planes
 
@@ -268,16 +267,15 @@ def pitch_blocks(state, rows, by_unknown):
     q = tilt(rows.points, by_unknown @ errors)
     R = pose[:, :, :3]
     rotated = np.matvec(R, q)
-    by_angle = np.matvec(R, cross(TILT_AXIS, q))
+    turn = cross(q, np.vecmat(rows.normal, R))[:, :1]  # about the tilt axis
     distances = np.vecdot(rows.normal, rotated + pose[:, :, 3]) - rows.distance
     of_camera = np.arange(6 * cameras) // 6 == rows.camera[:, None]
     by_pose = np.tile(gradient_by_pose(rotated, rows.normal), (1, cameras)) * of_camera
-    by_error = np.vecdot(rows.normal, by_angle)[:, None] * by_unknown
     weight = rows.weight / (SIGMA * np.sqrt(cameras))
     prior = np.repeat(PRIOR, rows.placement.max() + 1)[: len(errors)]
     columns = np.eye(6 * cameras + len(errors))[6 * cameras :]
     return [
-        Block(distances, np.concatenate([by_pose, by_error], axis=1), weight),
+        Block(distances, np.concatenate([by_pose, turn * by_unknown], axis=1), weight),
         Block(errors, columns, 1 / prior),
     ]
 

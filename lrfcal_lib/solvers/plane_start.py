@@ -24,6 +24,7 @@ from lrfcal_lib.solvers.planes import (
     plane_block,
     plane_residuals,
     plane_sets,
+    source_planes,
 )
 
 SUBSETS = 400  # of the placements, tried at most
@@ -232,11 +233,10 @@ def _before_boards(poses, sets, centres):
     """Poses that put (most of) the boards before the camera, and the range finder on the side
     that the camera sees.
     """
-    normal = sets.boards[..., 2]
-    point = sets.boards[..., 3]
-    lrf_side = np.vecdot(poses[:, None, :, 3] - point, normal)
+    lrf_side = source_planes(poses, sets.boards)[..., 3]
+    camera_side = -np.vecdot(sets.boards[..., 3], sets.boards[..., 2])
+    facing = lrf_side * camera_side > 0
     ahead = apply_pose(poses, centres)[..., 2] > 0
-    facing = lrf_side * -np.vecdot(point, normal) > 0
     share = np.mean(facing & ahead, axis=1)
     good = share >= min(SEEN, share.max())
     return poses[good & np.isfinite(poses).all(axis=(1, 2))]
