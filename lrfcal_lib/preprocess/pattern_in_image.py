@@ -232,7 +232,7 @@ def grid_noise(grid):
     left = corners - cv2.perspectiveTransform(flat[None], homography)[0]
     powers = np.indices((order + 1, order + 1)).sum(axis=0).ravel()
     design = polyvander2d(x, y, [order, order])[:, powers <= order]
-    noise = left - design @ np.linalg.lstsq(design, left, rcond=None)[0]
+    noise = left - design @ np.linalg.lstsq(design, left)[0]
     return rms(np.linalg.norm(noise, axis=1))
 
 

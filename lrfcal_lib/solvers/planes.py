@@ -17,6 +17,7 @@ from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, LENS, project, project_jacobians
 from lrfcal_lib.model.geometry import (
+    POSE,
     POSE_NAMES,
     DegenerateGeometry,
     apply_pose,
@@ -114,7 +115,7 @@ def estimate_from_planes(
         pose,
         move_pose,
         groups=sets.placements,
-        freedom=count - len(POSE_NAMES),
+        freedom=count - POSE,
         n_observations=count,
         chi2_rest=chi2_rest,
         **pose_unknowns(method, obs.camera),

@@ -379,7 +379,7 @@ def solve_projected(
             max_iterations=100,
         )
         freedom = max(len(solution.residuals) - 4, 1)
-        scatter = max(np.sqrt(solution.chi2 / freedom), LEAST_SCATTER)
+        scatter = max(np.sqrt(np.sum(solution.residuals**2) / freedom), LEAST_SCATTER)
         gauge = head_from_axis(axis_of(solution.transform))
     return PlatformSolution(solution, np.array(list(groups)), skipped)
 
