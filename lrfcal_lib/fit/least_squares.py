@@ -146,6 +146,17 @@ def _robust(blocks, axes, roots=None):
     return weighted, roots
 
 
+def _weighted(evaluate, robust, axes):
+    """A problem whose blocks may have robust weights."""
+
+    def problem(state, roots=None):
+        """Blocks at a state, and the roots of their weights: given ones, or those there."""
+        blocks = _blocks(evaluate, state)
+        return _robust(blocks, axes, roots) if robust else (blocks, None)
+
+    return problem
+
+
 def _axes(shared):
     """What a cost is summed over: residuals of trials, or placements and residuals."""
     return (-2, -1) if shared else (-1,)
@@ -324,12 +335,7 @@ def minimise(
         estimate.
     """
     axes = _axes(shared)
-
-    def problem(state, roots=None):
-        """Blocks at a state, and the roots of their weights: given ones, or those there."""
-        blocks = _blocks(evaluate, state)
-        return _robust(blocks, axes, roots) if robust else (blocks, None)
-
+    problem = _weighted(evaluate, robust, axes)
     blocks, roots = problem(state)
     at = linearise(blocks, axes)
     history = [at.cost]
@@ -347,12 +353,8 @@ def minimise(
         began = (1 + damping) ** 2 * length  # so long the step was before it was held
         arrived = np.where(held, began < nowhere**2, small)
         converged = converged | (arrived & np.isfinite(after))
-        gain = np.divide(
-            at.cost - after,
-            promised,
-            out=np.ones_like(at.cost),
-            where=promised > 3e-15 * at.cost,
-        )
+        gain = np.ones_like(at.cost)
+        np.divide(at.cost - after, promised, out=gain, where=promised > 3e-15 * at.cost)
         damping = _next_damping(damping, gain, accepted)
         if accepted.all():
             state = trial
