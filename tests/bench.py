@@ -49,7 +49,7 @@ from lrfcal_lib.session.lms2xx_frame import (
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.joint_model import Unknowns, gather, move_state
+from lrfcal_lib.solvers.joint_model import Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import minimum, named_blocks
 from lrfcal_lib.solvers.joint_start import start_states
 
@@ -188,7 +188,7 @@ def with_gtsam(count):
 
     def error(p, values, jacobians):
         at, piece = pieces[p]
-        moved = move_state(at, (values.atVector(0), values.atVector(p + 1)[None]), unknowns)
+        moved = unknowns.move(at, (values.atVector(0), values.atVector(p + 1)[None]))
         parts = [
             (b.white, b.white_jacobian)
             for b in named_blocks(moved, piece, unknowns).values()
@@ -218,7 +218,7 @@ def with_gtsam(count):
             graph, first, gtsam.LevenbergMarquardtParams()
         ).optimize()
         own = np.stack([found.atVector(p + 1) for p in range(count)])
-        return move_state(start, (found.atVector(0), own), unknowns)
+        return unknowns.move(start, (found.atVector(0), own))
 
     apart = np.abs(run().cameras - minimum(start, data, unknowns, 1e-4).state.cameras).max()
     assert apart < 1e-4, f"GTSAM and we end in different places, {apart}"

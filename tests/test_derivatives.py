@@ -18,7 +18,7 @@ from lrfcal_lib.model import camera
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.preprocess.bundle import Bundle, waves
 from lrfcal_lib.solvers import lines, pitch, planes, platform
-from lrfcal_lib.solvers.joint_model import SENSOR, Levels, Unknowns, gather, move_state
+from lrfcal_lib.solvers.joint_model import SENSOR, Levels, Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import named_blocks
 
 OFF = RigidTransform.from_components(
@@ -99,10 +99,8 @@ def tilt_axis():
     state = head, boards.poses, np.full((4, 2), 0.02)
 
     def blocks(s):
-        *derived, _ = platform.platform_blocks(
-            platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1)))), *data, 1e-3
-        )
-        return derived  # the last one holds what no point shows
+        moved = platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1))))
+        return platform.platform_blocks(moved, *data, 1e-3)
 
     for i, block in enumerate(blocks(np.zeros(12))):
         used = (
@@ -170,13 +168,13 @@ def joint_estimate():
             }
         )
         off = own.normal(0, 0.03, EVERY.shared), own.normal(0, 0.03, (3, EVERY.own))
-        state = move_state(truth, off, EVERY)
+        state = EVERY.move(truth, off)
         for lapse in (0, 0.05):
             data = gather(obs, Levels(lapse=lapse))
 
             def block(s):
                 step = s[: EVERY.shared], np.tile(s[EVERY.shared :], (3, 1))
-                return named_blocks(move_state(state, step, EVERY), data, EVERY)[name]
+                return named_blocks(EVERY.move(state, step), data, EVERY)[name]
 
             def costs(s):
                 found = block(s)

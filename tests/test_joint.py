@@ -18,7 +18,7 @@ from lrfcal_lib.model.geometry import (
     transform_difference,
 )
 from lrfcal_lib.solvers.joint import in_stated_gauge, solve_joint
-from lrfcal_lib.solvers.joint_model import Unknowns, gather, move_state
+from lrfcal_lib.solvers.joint_model import Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import named_blocks
 
 SAME = 3e-4  # rad and m: a hundredth of the standard deviations, what steps of the solver leave
@@ -202,9 +202,8 @@ def test_scipy_finds_the_same_rig(mount):
     options = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
 
     def moved(x):
-        return move_state(
-            truth, (x[: unknowns.shared], x[unknowns.shared :].reshape(6, -1)), unknowns
-        )
+        step = x[: unknowns.shared], x[unknowns.shared :].reshape(6, -1)
+        return unknowns.move(truth, step)
 
     theirs = least_squares(
         lambda x: misses_of(moved(x), obs),

@@ -13,7 +13,6 @@ from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
 from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
-from lrfcal_lib.solvers.joint_model import move_state
 
 CORNERS = np.array([[0.05 * i, 0.05 * j, 0.0] for i in range(5) for j in range(4)])
 MODEL = CameraModel(
@@ -110,7 +109,7 @@ def test_scipy_carries_the_lens_into_the_poses_alike(mount):
 
     def residuals(x):
         step = x[:shared], x[shared:].reshape(6, -1)
-        return misses_of(move_state(found.state, step, unknowns), obs)
+        return misses_of(unknowns.move(found.state, step), obs)
 
     def with_lens(error):
         moved = replace(obs, view_pose=obs.view_pose.copy())

@@ -134,14 +134,11 @@ def test_placement_covariance_is_the_jackknife():
         (A[groups == g].T @ A[groups == g], A[groups == g].T @ r[groups == g])
         for g in range(12)
     ]
-    covariance, shifts = placement_covariance(
-        *(np.array(x) for x in zip(*parts, strict=True))
-    )
+    covariance = placement_covariance(*(np.array(x) for x in zip(*parts, strict=True)))
     left_out = [
         np.linalg.lstsq(A[groups != g], y[groups != g], rcond=None)[0] - estimate
         for g in range(12)
     ]
-    np.testing.assert_allclose(shifts, left_out, atol=1e-12)
     plain = 11 / 12 * sum(np.outer(d, d) for d in left_out)
     factor = np.sqrt(np.diag(covariance) / np.diag(plain))
     np.testing.assert_allclose(covariance, plain * np.outer(factor, factor), atol=1e-12)
@@ -159,7 +156,7 @@ def test_noise_alone_scatters_over_placements_as_it_is_stated(placements):
     scores = np.einsum("gnj,tgn->tgj", A, noise)
     steps = scores.sum(axis=1) @ whole
     at_solution = scores - np.einsum("gij,tj->tgi", H, steps)
-    scatter = placement_covariance(np.broadcast_to(H, (20000, *H.shape)), at_solution)[0]
+    scatter = placement_covariance(np.broadcast_to(H, (20000, *H.shape)), at_solution)
     mean = np.diagonal(scatter, axis1=-2, axis2=-1).mean(axis=0)
     np.testing.assert_allclose(mean, np.diag(whole), rtol=0.03)
 

@@ -263,7 +263,7 @@ def moved(case, state, step):
     own = case.unknowns.own
     shared, each = step
     return State(
-        joint_model.move_state(state.joint, (shared, each[:, :own]), case.unknowns),
+        case.unknowns.move(state.joint, (shared, each[:, :own])),
         moved_lines(state.lines, case.middle, each[0, own:].reshape(-1, 2)),
         state.change + shared,
     )

@@ -8,8 +8,13 @@ from collections.abc import Callable
 import numpy as np
 
 from lrfcal_lib.fit.result import PlatformPrior
-from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import move_pose, pose_transform
+from lrfcal_lib.model.geometry import (
+    axis_of,
+    head_from_axis,
+    move_pose,
+    pose_array,
+    pose_transform,
+)
 
 PRIOR_FREEDOM = 3.0  # of Student's t: what is stated about the axis yields to the data
 # of the increments [w, v] of T_head_lrf: what the gauge leaves
@@ -30,7 +35,7 @@ def chart_parameters(head: np.ndarray) -> np.ndarray:
     ndarray, shape (4,)
         Angles out of and within the scan plane (radians), minus y and z of the axis' foot (metres).
     """
-    axis = geometry.axis_of(pose_transform(head))
+    axis = axis_of(pose_transform(head))
     x, y, z = axis.direction
     return np.r_[np.arctan2(z, x), np.arctan2(-y, x), -axis.foot[1:]]
 
@@ -53,8 +58,8 @@ def prior_terms(head: np.ndarray, prior: PlatformPrior) -> tuple[np.ndarray, np.
         Radians and metres.
     jacobian : ndarray, shape (4, 4)
     """
-    axis = geometry.axis_of(prior.T_head_lrf)
-    reference = geometry.pose_array(geometry.head_from_axis(axis))
+    axis = axis_of(prior.T_head_lrf)
+    reference = pose_array(head_from_axis(axis))
 
     def differences(heads):
         """Those of heads (k, 3, 4), shape (k, 4)."""

@@ -166,9 +166,7 @@ def name_words(direction: np.ndarray, names: Sequence[str], share: float = PARTA
     return " with ".join(np.asarray(names)[large])
 
 
-def placement_covariance(
-    hessians: np.ndarray, scores: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None]:
+def placement_covariance(hessians: np.ndarray, scores: np.ndarray) -> np.ndarray:
     """First-order jackknife over g placements, from what each adds to the normal equations.
 
     Parameters
@@ -179,17 +177,15 @@ def placement_covariance(
 
     Returns
     -------
-    covariance : ndarray, shape (..., k, k)
-    changes : ndarray, shape (..., g, k)
-        Of the estimate when that placement is left out. With fewer than three placements, or where
-        the others do not determine the estimate, the first is NaN and this one None.
+    ndarray, shape (..., k, k)
+        NaN with fewer than three placements, or where all but one do not determine the estimate.
 
     Notes
     -----
-    The sum of squared changes (CR3) is too large in the mean where placements carry unequal weight:
-    noise alone gives ``(g - 1) / g sum_g (inv(H - H_g) - inv(H))`` instead of ``inv(H)``. That
-    factor is taken off every unknown, so that scatter and noise can be compared; ``(g - 1) / g``
-    cancels.
+    The sum of squared changes of the estimate when a placement is left out (CR3) is too large in
+    the mean where placements carry unequal weight: noise alone gives ``(g - 1) / g sum_g (inv(H -
+    H_g) - inv(H))`` instead of ``inv(H)``. That factor is taken off every unknown, so that scatter
+    and noise can be compared; ``(g - 1) / g`` cancels.
     """
     total = np.sum(hessians, axis=-3, keepdims=True)
     diagonal = np.sqrt(np.maximum(np.linalg.diagonal(total), 1e-300))
@@ -199,16 +195,15 @@ def placement_covariance(
     try:  # squared pivots: what the others say about one unknown more
         pivots = np.linalg.diagonal(np.linalg.cholesky(scaled))
     except np.linalg.LinAlgError:
-        return unknown, None
+        return unknown
     if hessians.shape[-3] < FEWEST or pivots.min() < 1e-6:
-        return unknown, None
+        return unknown
     without = np.linalg.inv(scaled)
-    shifts = np.matvec(without, scores / diagonal) / diagonal
-    squares = shifts.mT @ shifts
+    changes = np.matvec(without, scores / diagonal) / diagonal
     whole = np.linalg.diagonal(np.linalg.inv(total / outer))
     gained = np.linalg.diagonal(without) - whole
     factor = np.sqrt(whole[..., 0, :] / gained.sum(axis=-2))
-    return squares * dyads(factor), shifts
+    return changes.mT @ changes * dyads(factor)
 
 
 def axis_words(direction):

@@ -43,10 +43,10 @@ def gauss_newton(
     path = []
     for _ in range(STEPS):
         r = residuals(x)
-        sides = [(move(x, d), move(x, -d)) for d in SMALL * np.eye(size)]
-        J = np.stack(
-            [(residuals(a) - residuals(b)) / (2 * SMALL) for a, b in sides], axis=1
-        )
+        differences = [
+            residuals(move(x, d)) - residuals(move(x, -d)) for d in SMALL * np.eye(size)
+        ]
+        J = np.stack(differences, axis=1) / (2 * SMALL)
         step = np.linalg.lstsq(J, -r)[0]
         cost = np.sum(r**2) / 2
         while (

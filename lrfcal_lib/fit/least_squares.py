@@ -118,53 +118,48 @@ class Block:
 
 
 def _roots(block, axes):
-    """Roots of Cauchy's weights of residuals, or of groups of them, that are judged together."""
+    """Roots of Cauchy's weights of residuals, or of groups of them, that are judged together, in
+    their usual size: by the median of a trial. As factors of the whitener.
+    """
     if block.cost is not None:
         return np.ones(())
     groups = block.white.reshape(*block.white.shape[:-1], -1, block.size)
+    squares = np.vecdot(groups, groups)
     count = block.size if block.count is None else block.count
-    z = np.sqrt(np.vecdot(groups, groups) / count)
-    return (1 + (z / _level(z, count, block, axes) / CAUCHY) ** 2) ** -0.5
+    sizes = np.sqrt(squares / chdtri(count, 0.5))
+    trials = sizes.reshape(*sizes.shape[: -len(axes)], -1)
+    level = np.expand_dims(medians(trials, trials > 0), axes)
+    roots = (1 + squares / count / (CAUCHY * np.maximum(level, 1e-9)) ** 2) ** -0.5
+    return roots[..., None, None] if block.size > 1 else roots
 
 
-def _times(blocks, roots):
-    """Blocks with the roots of their weights in their whiteners."""
-    weighted = []
-    for block, root in zip(blocks, roots, strict=True):
-        factor = root[..., None, None] if block.size > 1 else root
-        weighted.append(replace(block, whitener=block.whitener * factor))
-    return weighted
+def _robust(blocks, axes, roots=None):
+    """Blocks with robust weights, given ones or those of their residuals; and the roots of
+    these.
+    """
+    if roots is None:
+        roots = [_roots(block, axes) for block in blocks]
+    weighted = [
+        replace(block, whitener=block.whitener * root)
+        for block, root in zip(blocks, roots, strict=True)
+    ]
+    return weighted, roots
 
 
 def _weighted(evaluate, robust, axes):
-    """A problem whose blocks have robust weights: given ones, or those of the state."""
+    """A problem whose blocks may have robust weights."""
 
     def problem(state, roots=None):
-        """Blocks at a state, and the roots of their weights."""
+        """Blocks at a state, and the roots of their weights: given ones, or those there."""
         blocks = _blocks(evaluate, state)
-        if not robust:
-            return blocks, None
-        if roots is None:
-            roots = [_roots(block, axes) for block in blocks]
-        return _times(blocks, roots), roots
+        return _robust(blocks, axes, roots) if robust else (blocks, None)
 
     return problem
 
 
-def _level(z, count, block, axes):
-    """Usual size of residuals z (..., n) in their standard deviations, by the median of a trial."""
-    inside = block.whitener != 0
-    if block.size > 1:
-        inside = inside.any(axis=(-1, -2))
-    usual = np.sqrt(chdtri(count, 0.5) / count)
-    wide = (*z.shape[: z.ndim + min(np.atleast_1d(axes))], -1)
-    level = medians((z / usual).reshape(wide), (inside & (z == z)).reshape(wide))
-    return np.maximum(np.expand_dims(level, axes), 1e-9)
-
-
 def _axes(shared):
     """What a cost is summed over: residuals of trials, or placements and residuals."""
-    return -1 if shared is None else (-2, -1)
+    return (-2, -1) if shared else (-1,)
 
 
 def _blocks(evaluate, state):
@@ -229,9 +224,8 @@ def eliminate(
     -------
     reduced : ndarray, shape (p, c, c)
     gradient : ndarray, shape (p, c)
-    back : ndarray, shape (p, k - c, c + 1)
-        A step x of the shared unknowns goes with ``-(back[..., c] + back[..., :c] x)`` of a
-        placement's own.
+    by_shared : ndarray, shape (p, k, c + 1)
+        The best step of all unknowns by that of the shared ones and a 1.
     """
     c = shared
     known = np.concatenate([hessian[:, c:, :c], gradient[:, c:, None]], axis=-1)
@@ -242,7 +236,9 @@ def eliminate(
         back = pseudo_inverse(own) @ known
     taken = hessian[:, :c, c:] @ back
     reduced = hessian[:, :c, :c] - taken[..., :c]
-    return reduced, gradient[:, :c] - taken[..., c], back
+    same = np.broadcast_to(np.eye(c, c + 1), reduced.shape[:1] + (c, c + 1))
+    by_shared = np.concatenate([same, -back], axis=1)
+    return reduced, gradient[:, :c] - taken[..., c], by_shared
 
 
 def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
@@ -261,21 +257,13 @@ def reduced_hessian(hessian: np.ndarray, shared: int) -> np.ndarray:
     return eliminate(hessian, np.zeros(hessian.shape[:2]), shared)[0]
 
 
-def _by_shared(back):
-    """The best step of all unknowns by that of the shared ones and a 1, (p, k, c + 1)."""
-    columns = back.shape[-1]
-    same = np.eye(columns - 1, columns)
-    return np.concatenate([np.broadcast_to(same, (len(back), *same.shape)), -back], axis=1)
-
-
 def likeliest(
     hessian: np.ndarray, gradient: np.ndarray, shared: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Steps (p, k) of all unknowns of every placement to the minimum, and their covariances (p, k,
     k), from normal equations as of :func:`eliminate`.
     """
-    reduced, right, back = eliminate(hessian, gradient, shared)
-    by_shared = _by_shared(back)
+    reduced, right, by_shared = eliminate(hessian, gradient, shared)
     inverse = pseudo_inverse(np.sum(reduced, axis=0))
     steps = by_shared @ np.append(-inverse @ np.sum(right, axis=0), 1.0)
     derivatives = by_shared[..., :-1]
@@ -293,18 +281,18 @@ def _step(hessian, gradient, damping, shared):
     # what nobody sees stays where it is
     extra = extra + (1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300)
     damped = hessian + extra[..., None] * np.eye(hessian.shape[-1])
-    if shared is None:
-        step = whole = -solve_each(damped, gradient)
-    else:
-        reduced, right, back = eliminate(damped, gradient, shared, regular=True)
+    if shared:
+        reduced, right, by_shared = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
-        whole = _by_shared(back) @ np.append(common, 1.0)
+        whole = by_shared @ np.append(common, 1.0)
         step = common, whole[:, shared:]
+    else:
+        step = whole = -solve_each(damped, gradient)
     length = np.vecdot(whole, np.matvec(hessian, whole))
     promised = -np.vecdot(whole, gradient) - 0.5 * length
-    if shared is None:
-        return step, length, promised
-    return step, np.sum(length), np.sum(promised)
+    if shared:
+        return step, np.sum(length), np.sum(promised)
+    return step, length, promised
 
 
 class Minimum(NamedTuple):
@@ -323,7 +311,7 @@ def minimise(
     state: Any,
     retract: Callable,
     *,
-    shared: int | None = None,
+    shared: int = 0,
     robust: bool = False,
     max_iterations: int = 60,
     tolerance: float = 1e-8,
@@ -337,8 +325,8 @@ def minimise(
     state : ndarray (leading trial axes) or, with `shared`, any object
     retract : callable
         ``(state, step) -> state``; with `shared` the step is the pair (common (c,), own (p, l)).
-    shared : int, optional
-        Number of unknowns common to all entries of the leading axis.
+    shared : int
+        Number of unknowns common to all entries of the leading axis; 0 for trials.
     robust : bool
         Cauchy's loss, in units of the median of the residuals in every iteration.
     max_iterations : int
@@ -351,8 +339,8 @@ def minimise(
     blocks, roots = problem(state)
     at = linearise(blocks, axes)
     history = [at.cost]
-    converged = np.zeros(np.shape(at.cost), bool)
-    damping = np.full(np.shape(at.cost), FIRST_DAMPING)
+    converged = np.zeros_like(at.cost, bool)
+    damping = np.full_like(at.cost, FIRST_DAMPING)
     nowhere = min(LEADS_NOWHERE, NOWHERE_TOLERANCES * tolerance)
     while len(history) <= max_iterations and not converged.all():
         step, length, promised = _step(at.hessian, at.gradient, damping, shared)
@@ -479,7 +467,7 @@ def solve(
     start: Any,
     retract: Callable,
     *,
-    shared: int | None = None,
+    shared: int = 0,
     robust: bool = False,
     max_iterations: int = 60,
     tolerance: float = 1e-8,
@@ -519,7 +507,7 @@ def solve(
     blocks = _blocks(evaluate, minimum.state)
     weighted = blocks
     if robust:
-        weighted = _times(blocks, [_roots(block, _axes(shared)) for block in blocks])
+        weighted, _ = _robust(blocks, _axes(shared))
     return _solution(question, minimum, blocks, weighted, shared)
 
 
@@ -534,12 +522,11 @@ def _by_placement(r, J, groups, shared):
     apart).
     """
     transposed = J.mT
-    if shared is not None:
+    if shared:
         scores = np.matvec(transposed, r)
         return reduced_hessian(transposed @ J, shared), scores[:, :shared]
-    index = np.unique(groups, return_inverse=True)[1]
-    index = np.repeat(index, r.shape[-1] // len(index))
-    member = index == np.arange(index.max() + 1)[:, None]
+    member = np.unique(groups)[:, None] == groups
+    member = np.repeat(member, r.shape[-1] // len(groups), axis=1)
     transposed = transposed[..., None, :, :] * member[:, None]
     return transposed @ J[..., None, :, :], np.matvec(transposed, r[..., None, :])
 
@@ -555,9 +542,10 @@ def _solution(question, minimum, blocks, weighted, shared):
     chi2 = np.sum(weighted_r**2, axis=_axes(shared)) + question.chi2_rest
     freedom = question.freedom
     if freedom is None:
-        own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
-        freedom = r.size // chi2.size - own
-    too_large = (freedom > 0) & (chi2 > chdtri(max(freedom, 1), LARGE_CHI2))
+        own = J.shape[-1] - shared
+        groups = len(r) if shared else 1
+        freedom = r.size // chi2.size - shared - groups * own
+    too_large = chi2 > chdtri(freedom, LARGE_CHI2)  # without any freedom never
     inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
     transform, parameters = question.read(minimum.state)
     return Solution(
@@ -568,7 +556,7 @@ def _solution(question, minimum, blocks, weighted, shared):
         residuals=r,
         jacobian=J,
         covariance=covariance_of(hessian, scales, motions) * inflation[..., None, None],
-        covariance_placements=placement_covariance(hessians, scores)[0],
+        covariance_placements=placement_covariance(hessians, scores),
         unobservable=motions,
         method=question.method,
         n_observations=question.n_observations or r.shape[-1],

@@ -10,7 +10,6 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.result import Solution
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import (
     CameraModel,
     line_distance,
@@ -22,7 +21,11 @@ from lrfcal_lib.model.camera import (
 from lrfcal_lib.model.geometry import (
     cross,
     gradient_by_pose,
+    pose_array,
+    pose_parameters,
+    pose_transform,
     rotate_and_move,
+    unit_vector,
 )
 from lrfcal_lib.model.observations import CameraObservations
 
@@ -31,34 +34,13 @@ SIGMA_FLOOR = 1e-4
 FEWEST_CORNERS = 6  # of a pattern, for its pose
 
 
-def line_residuals(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) -> np.ndarray:
-    """Signed distances of projected points from image lines, equations (19) and (20).
-
-    Behind the camera, too, see :func:`lrfcal_lib.model.camera.mirrored`.
-
-    Parameters
-    ----------
-    moved : ndarray, shape (..., n, 3)
-        Points in the camera frame, equation (16), metres.
-    lines : ndarray, shape (..., n, 3)
-        ``(a, b, c)`` with ``a^2 + b^2 = 1``, undistorted pixels.
-    camera : CameraModel
-
-    Returns
-    -------
-    ndarray, shape (..., n)
-        Undistorted pixels; the sign is that of the line.
-    """
-    return line_distance(mirrored(moved, camera), lines)
-
-
 def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
-    """Distances d(e, ab) of projected crossings from their image lines: :func:`line_residuals` as a
-    Block.
+    """Distances d(e, ab) of projected crossings from their image lines, equations (19) and (20).
 
-    The whitener holds the crossing's covariance, projected, and the line's; `corrected` is the
-    Jacobian without what errors of the crossings put into it
-    (:func:`noise_correction`).
+    Undistorted pixels with the sign of the line; behind the camera, too, see
+    :func:`lrfcal_lib.model.camera.mirrored`. The whitener holds the crossing's covariance,
+    projected, and the line's; `corrected` is the Jacobian without what errors of the crossings put
+    into it (:func:`noise_correction`).
 
     Parameters
     ----------
@@ -66,10 +48,11 @@ def line_block(pose: np.ndarray, obs: CameraObservations) -> Block:
         ``T_camera_source``.
     obs : CameraObservations
     """
+    lines = obs.crossing_lines
     rotated, moved = rotate_and_move(pose, obs.crossing_points)  # (16)
-    residuals = line_residuals(moved, obs.crossing_lines, obs.model)
+    residuals = line_distance(mirrored(moved, obs.model), lines)
     # of l K q / z by the point q, pixels a metre
-    gradients = obs.crossing_lines @ obs.model.matrix / moved[..., 2:]
+    gradients = lines @ obs.model.matrix / moved[..., 2:]
     gradients[..., 2] -= residuals / moved[..., 2]
     jacobian = gradient_by_pose(rotated, gradients)
     noise = moved_noise(pose, gradients, obs.crossing_covariance)
@@ -114,7 +97,7 @@ def sight_normals(lines: np.ndarray, model: CameraModel) -> np.ndarray:
     ndarray, shape (..., 3)
         Unit vectors, camera frame.
     """
-    return geometry.unit_vector(lines @ model.matrix)
+    return unit_vector(lines @ model.matrix)
 
 
 def edge_residuals_px(obs: CameraObservations, transform: RigidTransform) -> np.ndarray:
@@ -131,7 +114,7 @@ def edge_residuals_px(obs: CameraObservations, transform: RigidTransform) -> np.
     ndarray, shape (n,)
         Undistorted pixels; positive outside the board.
     """
-    return line_block(geometry.pose_array(transform), obs).residuals
+    return line_block(pose_array(transform), obs).residuals
 
 
 def plane_residuals_m(obs: CameraObservations, transform: RigidTransform) -> np.ndarray:
@@ -202,7 +185,7 @@ def read_pose(pose: np.ndarray) -> tuple[RigidTransform, np.ndarray]:
     parameters : ndarray, shape (..., 6)
         Rotation vector and translation, radians and metres.
     """
-    return geometry.pose_transform(pose, proper=True), geometry.pose_parameters(pose)
+    return pose_transform(pose, proper=True), pose_parameters(pose)
 
 
 def noise_correction(

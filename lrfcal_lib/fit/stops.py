@@ -56,19 +56,14 @@ class ViewBlock(Block):
         g = np.matvec(self.whitener, self.by_pitch)
         return g, np.matvec(self.same, np.vecdot(g, g))
 
-    @cached_property
-    def shared_error(self):
-        """The vectors h (p, v, 6)."""
-        g, square = self.white_by_pitch
-        gain = 1 - 1 / np.sqrt(1 + self.sigma_pitch**2 * square)
-        return g * np.sqrt(gain / np.maximum(square, 1e-300))[..., None]
-
     def whitened(self, rows):
         """Rows (p, 6 v, k) in independent standard deviations."""
         white = super().whitened(rows)
         if self.sigma_pitch == 0:
             return white
-        h = self.shared_error[..., None]
+        g, square = self.white_by_pitch
+        gain = 1 - 1 / np.sqrt(1 + self.sigma_pitch**2 * square)
+        h = np.sqrt(gain / np.maximum(square, 1e-300))[..., None, None] * g[..., None]
         views = white.reshape(*h.shape[:-1], -1)
         common = self.same @ np.sum(h * views, axis=2)
         return (views - h * common[:, :, None]).reshape(white.shape)

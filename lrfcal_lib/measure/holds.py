@@ -307,7 +307,7 @@ def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
     by_link = normal @ chain.head[:, :3] @ J
     # a plane turns and shifts with the errors: only what bends it shows
     plane = np.insert(wall.points - wall.points.mean(axis=0), 0, 1.0, axis=1)
-    by_link -= plane @ np.linalg.lstsq(plane, by_link, rcond=None)[0]
+    by_link -= plane @ np.linalg.lstsq(plane, by_link)[0]
     squares = np.vecdot(by_link @ chain.covariances, by_link)
     allowed = np.sqrt(squares.mean(axis=1).max() + UNEVEN**2)
     return Wall(placement, flatness(wall.points)[1], allowed)

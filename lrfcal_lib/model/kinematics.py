@@ -82,8 +82,9 @@ class SourceFrame:
     T_head_lrf : RigidTransform
     mount : {'head', 'platform'}
         What the camera is fixed to.
-    image_pitch : float
-        Recorded when the image was taken, radians; it matters for a camera on the head only.
+    image_pitch : array_like
+        Recorded when the image, or that of each point, was taken, radians; it matters for a camera
+        on the head only.
     placement : int or None
         Of scans and image.
     corrections : Corrections
@@ -91,7 +92,7 @@ class SourceFrame:
 
     T_head_lrf: RigidTransform
     mount: str
-    image_pitch: float = 0.0
+    image_pitch: ArrayLike = 0.0
     placement: int | None = None
     corrections: Corrections = AS_RECORDED
 

@@ -238,7 +238,7 @@ def grid_noise(grid):
     x, y = flat.T
     powers = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
     design = np.column_stack([x**i * y**j for i, j in powers])
-    noise = left - design @ np.linalg.lstsq(design, left, rcond=None)[0]
+    noise = left - design @ np.linalg.lstsq(design, left)[0]
     return rms(np.linalg.norm(noise, axis=1))
 
 

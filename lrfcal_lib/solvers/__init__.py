@@ -253,7 +253,7 @@ def left_out(
     """
     for placement in judge.all_placements:
         with suppress(DegenerateGeometry):
-            rest = obs.select(obs.all_placements[obs.all_placements != placement])
+            rest = obs.select(np.setdiff1d(obs.all_placements, placement))
             yield (
                 judge.select([placement]),
                 solve_camera(rest, method, full.transform, search=False),

@@ -10,15 +10,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.fit.least_squares import solve
 from lrfcal_lib.fit.result import PlatformPrior
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
+    axis_of,
+    head_from_axis,
     pose_array,
-    pose_parameters,
     pose_transform,
 )
 from lrfcal_lib.model.observations import JointObservations
@@ -37,7 +36,6 @@ from lrfcal_lib.solvers.joint_model import (
     Levels,
     Unknowns,
     gather,
-    move_state,
 )
 from lrfcal_lib.solvers.joint_noise import estimate_noise, settled
 from lrfcal_lib.solvers.joint_residuals import MOST_STEPS, minimum, named_blocks
@@ -184,7 +182,7 @@ def solve_again(obs: JointObservations, like: JointSolution) -> JointSolution:
     Raises DegenerateGeometry when these placements leave a motion open.
     """
     rows = np.flatnonzero(np.isin(like.observations.placements, obs.placements))
-    obs = obs.select(like.observations.placements[rows])
+    obs = obs.select(like.observations.placements)
     data = gather(obs, like.data.levels)
     state = minimum(like.state.of_placements(rows), data, like.unknowns, LAST_STEP).state
     return finished(obs, state, data, like.unknowns, required=True, excluded=like.excluded)
@@ -206,7 +204,7 @@ def in_stated_gauge(state: JointState, obs: JointObservations) -> JointState:
     them.
     """
     found = pose_transform(state.head)
-    head = geometry.head_from_axis(geometry.axis_of(found), obs.T_head_lrf)
+    head = head_from_axis(axis_of(found), obs.T_head_lrf)
     change = head * found.inv()
     cameras = state.cameras.copy()
     on_base = ~obs.on_head
@@ -223,11 +221,11 @@ def finished(obs, state, data, unknowns, required, excluded):
     found = solve(
         lambda at: blocks(at).values(),
         in_stated_gauge(state, obs),
-        lambda at, step: move_state(at, step, unknowns),
+        unknowns.move,
         shared=unknowns.shared,
         names=names,
         method="joint",
-        read=lambda at: (None, parameters_of(at, unknowns)),
+        read=unknowns.read,
         scales=[SCALES.get(name, 1.0) for name in names],
         words=lambda direction: joint_words(direction, names, obs.cameras),
         freedom=0,
@@ -266,10 +264,3 @@ def with_step_error(solution: JointSolution) -> JointSolution:
     moved = -free @ pull.sum(axis=0) / STEP * sigma
     spread = dyads(moved)
     return replace(solution, solution=solution.solution.widened(spread, spread), step=moved)
-
-
-def parameters_of(state: JointState, unknowns: Unknowns) -> np.ndarray:
-    """The shared unknowns of a state, (c,): axis, poses of the cameras, sensor."""
-    poses = pose_parameters(state.cameras).ravel()
-    every = np.concatenate([chart_parameters(state.head), poses, state.sensor])
-    return every[unknowns.mask]

@@ -43,9 +43,7 @@ def pose_by_intrinsics(
     turned = T_camera_board.rotation.apply(corners)
     by_point, by_lens = project_jacobians(turned + T_camera_board.translation, model)
     by_pose = gradient_by_pose(turned[:, None], by_point)
-    return -np.linalg.lstsq(by_pose.reshape(-1, 6), by_lens.reshape(-1, LENS), rcond=None)[
-        0
-    ]
+    return -np.linalg.lstsq(by_pose.reshape(-1, 6), by_lens.reshape(-1, LENS))[0]
 
 
 class LensShare(NamedTuple):

@@ -10,13 +10,17 @@ from itertools import accumulate, compress, pairwise, starmap
 
 import numpy as np
 
-from lrfcal_lib.fit.axis_chart import move_head
+from lrfcal_lib.fit.axis_chart import chart_parameters, move_head
 from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import outline_lines
-from lrfcal_lib.model.geometry import move_pose
+from lrfcal_lib.model.geometry import (
+    POSE_NAMES,
+    move_pose,
+    polar_to_points,
+    pose_parameters,
+)
 from lrfcal_lib.model.observations import JointObservations
 
 SENSOR = (
@@ -122,8 +126,38 @@ class Unknowns:
 
     def names(self, cameras) -> tuple[str, ...]:
         """Names of the shared unknowns, of cameras with these names."""
-        poses = [f"{camera}_{name}" for camera in cameras for name in geometry.POSE_NAMES]
+        poses = [f"{camera}_{name}" for camera in cameras for name in POSE_NAMES]
         return tuple(compress([*AXIS_NAMES, *poses, *SENSOR], self.mask))
+
+    def read(self, state: JointState) -> tuple[None, np.ndarray]:
+        """No transform, and the shared unknowns of a state, (c,): axis, poses of the cameras,
+        sensor.
+        """
+        poses = pose_parameters(state.cameras).ravel()
+        every = np.concatenate([chart_parameters(state.head), poses, state.sensor])
+        return None, every[self.mask]
+
+    def move(self, state: JointState, step: tuple) -> JointState:
+        """Retraction of the joint estimate: shared increments (c,) and those of each placement (p,
+        l).
+        """
+        full = np.zeros(len(self.mask))
+        full[self.mask] = step[0]
+        axis, cameras, sensor = np.split(full, [4, len(full) - len(SENSOR)])
+        boards, sweep, sides = np.split(step[1], [6, 6 + SWEEPS[self.sweep]], axis=1)
+        sensor = state.sensor + sensor
+        sensor[1] = np.clip(sensor[1], -LARGEST_ODDS, LARGEST_ODDS)
+        sensor[2] = np.clip(sensor[2], *SOFTEST)
+        sweeps = state.sweeps.copy()
+        sweeps[:, : sweep.shape[1]] += sweep
+        return JointState(
+            head=move_head(state.head, axis),
+            cameras=move_pose(state.cameras, cameras.reshape(-1, 6)),
+            sensor=sensor,
+            boards=move_pose(state.boards, boards),
+            sweeps=sweeps,
+            sides=state.sides + sides if self.sides else state.sides,
+        )
 
 
 @dataclass(frozen=True)
@@ -236,7 +270,7 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
         lens=obs.view_lens,
     )
     for group in (face, beam):
-        group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
+        group["ray"] = polar_to_points(1.0, group["bearing"])
     view["pose"][~view["used"]] = np.eye(4)
     return JointData(
         face,
@@ -247,27 +281,4 @@ def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
         obs.direction,
         obs.on_head,
         levels,
-    )
-
-
-def move_state(state: JointState, step: tuple, unknowns: Unknowns) -> JointState:
-    """Retraction of the joint estimate: shared increments (c,) and those of each placement (p,
-    l).
-    """
-    full = np.zeros(len(unknowns.mask))
-    full[unknowns.mask] = step[0]
-    axis, cameras, sensor = np.split(full, [4, len(full) - len(SENSOR)])
-    boards, sweep, sides = np.split(step[1], [6, 6 + SWEEPS[unknowns.sweep]], axis=1)
-    sensor = state.sensor + sensor
-    sensor[1] = np.clip(sensor[1], -LARGEST_ODDS, LARGEST_ODDS)
-    sensor[2] = np.clip(sensor[2], *SOFTEST)
-    sweeps = state.sweeps.copy()
-    sweeps[:, : sweep.shape[1]] += sweep
-    return JointState(
-        head=move_head(state.head, axis),
-        cameras=move_pose(state.cameras, cameras.reshape(-1, 6)),
-        sensor=sensor,
-        boards=move_pose(state.boards, boards),
-        sweeps=sweeps,
-        sides=state.sides + sides if unknowns.sides else state.sides,
     )

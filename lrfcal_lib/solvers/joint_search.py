@@ -64,8 +64,7 @@ def best_start(obs: JointObservations, unknowns: Unknowns, levels: Levels) -> St
     data = gather(obs, levels)
     tried = []
     for states in start_states(obs, unknowns.axis):
-        for state in states:
-            tried.append(agreeing_start(obs, state, data, unknowns))
+        tried += [agreeing_start(obs, state, data, unknowns) for state in states]
         best = min(tried, key=lambda start: start.badness)
         if best.badness < GOOD_START:
             break

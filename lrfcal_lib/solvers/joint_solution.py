@@ -14,8 +14,12 @@ from lrfcal_lib.fit.covariance import motion_words, pseudo_inverse
 from lrfcal_lib.fit.edge_likelihood import disc_edge
 from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
-from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import POSE_NAMES, pose_transform
+from lrfcal_lib.model.geometry import (
+    POSE_NAMES,
+    TiltAxis,
+    axis_of,
+    pose_transform,
+)
 from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
@@ -116,8 +120,11 @@ class JointSolution:
     @property
     def excluded_placements(self) -> dict[int, str]:
         """Why placements are left out, in words, by their numbers."""
-        whole = [problem for problem in self.excluded if problem.camera is None]
-        return {problem.placement: str(problem) for problem in whole}
+        return {
+            problem.placement: str(problem)
+            for problem in self.excluded
+            if problem.camera is None
+        }
 
     @property
     def state(self) -> JointState:
@@ -197,9 +204,9 @@ class JointSolution:
         return {name: float(getattr(self.data.levels, name)) for name in names}
 
     @property
-    def axis(self) -> geometry.TiltAxis:
+    def axis(self) -> TiltAxis:
         """The tilt axis in the LRF frame."""
-        return geometry.axis_of(self.T_head_lrf)
+        return axis_of(self.T_head_lrf)
 
     @property
     def sigma(self) -> dict[str, float]:

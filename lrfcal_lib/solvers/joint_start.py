@@ -24,12 +24,12 @@ POINTS = 30  # a plane
 VIEWS = 24  # a camera; closed forms do not get much better with more
 
 
-def start_states(obs: JointObservations, axis: bool) -> Iterator[list[JointState]]:
+def start_states(obs: JointObservations, axis: bool = True) -> Iterator[list[JointState]]:
     """Start values to choose from, made one by one: each with those of the cameras' other minima.
 
     From the stated platform, then from an axis along x through the mirror, which may turn
-    backwards; from the first of these alone unless the `axis` is unknown. With cameras from the
-    planes of whole sweeps. Raises DegenerateGeometry when no
+    backwards; with cameras from the planes of whole sweeps. Where the axis is no unknown, only the
+    first. Raises DegenerateGeometry when no
     placement gives the pose of a board.
     """
     if len(obs.face_range) == 0:
@@ -59,13 +59,13 @@ def _states(obs, head):
     """
     minima = [_camera(obs, camera, head) for camera in range(len(obs.cameras))]
     best = np.array([poses[0] for poses in minima])
-    states = [state_of(obs, pose_array(head), best)]
+    choices = [best]
     for camera, poses in enumerate(minima):
         for pose in poses[1:]:
             other = best.copy()
             other[camera] = pose
-            states.append(state_of(obs, pose_array(head), other))
-    return states
+            choices.append(other)
+    return [state_of(obs, pose_array(head), cameras) for cameras in choices]
 
 
 def _camera(obs, camera, head):
@@ -75,23 +75,22 @@ def _camera(obs, camera, head):
     name = obs.cameras[camera]
     mine = np.flatnonzero(obs.view_camera == camera)
     first = mine[np.unique(obs.view_placement[mine], return_index=True)[1]]
-    views = []
-    points = []
-    for view in thin(first, VIEWS):
-        rows = thin(np.flatnonzero(obs.face_placement == obs.view_placement[view]), POINTS)
-        if len(rows) == 0:
-            continue
-        p = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
-        frame = SourceFrame(head, obs.mounts[camera], obs.view_pitch[view])
-        points.append(frame.points(p, obs.face_pitch[rows]))
-        views.append(view)
-    if not views:
+    views = thin(first, VIEWS)
+    placements = obs.view_placement[views]
+    rows = np.concatenate(
+        [thin(np.flatnonzero(obs.face_placement == p), POINTS) for p in placements]
+    )
+    if len(rows) == 0:
         raise DegenerateGeometry(f"camera '{name}' never sees a board that the scans hit")
+    image = views[np.searchsorted(placements, obs.face_placement[rows])]
+    frame = SourceFrame(head, obs.mounts[camera], obs.view_pitch[image])
+    p_lrf = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
     seen = CameraObservations(
         None,
         name,
-        plane_points=np.concatenate(points),
-        plane_placement=np.repeat(np.arange(len(views)), [len(p) for p in points]),
+        plane_points=frame.points(p_lrf, obs.face_pitch[rows]),
+        plane_placement=obs.face_placement[rows],
+        placements=placements,
         board_poses=obs.view_pose[views],
         board_covariance=obs.view_covariance[views],
     )
@@ -114,7 +113,7 @@ def boards_in_images(
     `head` and `cameras` as in JointState.
     """
     on_head = obs.on_head[obs.view_camera]
-    pitch = np.where(on_head, obs.view_pitch, 0.0)
+    pitch = obs.view_pitch * on_head
     T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
     T_platform_lrf = platform_from_head(pitch) * T_head_lrf
     T_platform_camera = T_platform_lrf * pose_transform(cameras[obs.view_camera]).inv()

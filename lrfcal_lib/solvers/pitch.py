@@ -24,7 +24,6 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     tilt,
 )
-from lrfcal_lib.model.kinematics import TILT_AXIS
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.plane_start import start_from_planes
 
@@ -160,25 +159,30 @@ def estimate_pitch_errors(
     placements = _common_placements(cameras)
     turn = np.array([direction[p] for p in placements])
     rows = gather([obs.select(placements) for obs in cameras.values()])
-    each = np.eye(len(placements))[rows.placement]
     middles = np.array([middle[p] for p in placements])
     away = rows.pitch - middles[rows.placement]
-    # columns: by how much the unknowns of a model change the pitch of each row
-    columns = {"none": each[:, :0]}
+    each = np.eye(len(placements))
+    # offset of each placement by the unknowns of a model
+    offsets = {"none": each[:, :0]}
     if {-1, 1} <= set(turn):
-        columns["direction"] = turn[rows.placement, None]
-    columns["sweep"] = each
-    columns["sweep_stretch"] = np.concatenate([each, each * away[:, None]], axis=1)
+        offsets["direction"] = turn[:, None]
+    offsets |= {"sweep": each, "sweep_stretch": each}
 
     poses = np.array([pose_array(start_from_planes(obs))[0] for obs in cameras.values()])
-    numbers = _count_numbers(rows, len(poses), len(placements))
+    # errors of the LRF are common to all cameras, and count once
+    squares = np.where(rows.on_face, 0.0, rows.weight**2)
+    edges = np.bincount(rows.camera, squares, minlength=len(poses)).max()
+    numbers = PLANE_NUMBERS * len(placements) + EDGE_NUMBERS * round(edges)
     models = {}
     by_direction = (np.nan, np.nan)
-    for name, by_unknown in columns.items():
+    for name, by_offset in offsets.items():
+        by_unknown = by_offset[rows.placement]
+        if name == "sweep_stretch":
+            by_unknown = np.hstack([by_unknown, by_unknown * away[:, None]])
         solution = _solve(name, rows, by_unknown, poses)
-        model = _model(name, solution, rows, turn, numbers)
+        model = _model(name, solution, rows, by_offset, numbers)
         if name == "direction":
-            by_direction = (solution.parameters[-1], model.offset_sigma[0])
+            by_direction = (solution.parameters[-1], model.offset_sigma.max())
         if name == "none":
             wanted = before = model
         if model.tested(wanted, numbers).p_value < LEVEL:
@@ -251,13 +255,6 @@ def _shares(part):
     return 1 / np.sqrt(count[index])
 
 
-def _count_numbers(rows, cameras, placements):
-    """Independent numbers; errors of the LRF are common to all cameras, and count once."""
-    squares = np.where(rows.on_face, 0.0, rows.weight**2)
-    edges = np.bincount(rows.camera, squares, minlength=cameras).max()
-    return PLANE_NUMBERS * placements + EDGE_NUMBERS * round(edges)
-
-
 def pitch_blocks(state, rows, by_unknown):
     """Distances of points from their planes, and the unknowns of the pitch with their prior.
 
@@ -270,16 +267,15 @@ def pitch_blocks(state, rows, by_unknown):
     q = tilt(rows.points, by_unknown @ errors)
     R = pose[:, :, :3]
     rotated = np.matvec(R, q)
-    by_angle = np.matvec(R, cross(TILT_AXIS, q))
+    turn = cross(q, np.vecmat(rows.normal, R))[:, :1]  # about the tilt axis
     distances = np.vecdot(rows.normal, rotated + pose[:, :, 3]) - rows.distance
     of_camera = np.arange(6 * cameras) // 6 == rows.camera[:, None]
     by_pose = np.tile(gradient_by_pose(rotated, rows.normal), (1, cameras)) * of_camera
-    by_error = np.vecdot(rows.normal, by_angle)[:, None] * by_unknown
     weight = rows.weight / (SIGMA * np.sqrt(cameras))
     prior = np.repeat(PRIOR, rows.placement.max() + 1)[: len(errors)]
     columns = np.eye(6 * cameras + len(errors))[6 * cameras :]
     return [
-        Block(distances, np.concatenate([by_pose, by_error], axis=1), weight),
+        Block(distances, np.concatenate([by_pose, turn * by_unknown], axis=1), weight),
         Block(errors, columns, 1 / prior),
     ]
 
@@ -308,13 +304,13 @@ def _solve(name, rows, by_unknown, poses):
     )
 
 
-def _model(name, solution, rows, turn, numbers):
-    """What a Solution says about the pitch.
+def _model(name, solution, rows, offsets, numbers):
+    """What a Solution says about the pitch; `offsets` (p, k) are those by the unknowns.
 
     The stated sigmas only weigh faces against edges, the level comes from the residuals.
     """
     poses, errors = solution.state
-    p = len(turn)
+    p, count = offsets.shape
     unit = SIGMA * np.sqrt(len(poses))  # metres, of a residual
     distances = solution.residuals[: len(rows.weight)] / rows.weight * unit
     # what a scan scatters about its own plane tells nothing of the pitch
@@ -322,25 +318,19 @@ def _model(name, solution, rows, turn, numbers):
     away = distances - np.vecdot(rows.normal, scatter)
     misfit = np.sum((rows.weight * away / unit) ** 2)
     free = len(errors)
-    if free >= p:  # the offset common to all sweeps goes with the cameras' poses
+    if count == p:  # the offset common to all sweeps goes with the cameras' poses
         free -= 1
+        offsets = offsets - 1 / p
     level = misfit / max(numbers - POSE - free, 1)
     known = replace(solution, covariance=level / solution.inflation * solution.covariance)
-    offset, sigma, stretch = np.zeros((3, p))
-    if name == "direction":
-        offset = errors * turn
-        sigma = np.full(p, known.trusted_sigma[-1])
-    elif name != "none":
-        centre = np.eye(p) - 1 / p
-        first = 6 * len(poses)
-        offset = centre @ errors[:p]
-        of_offsets = known.covariance[first : first + p, first : first + p]
-        sigma = sigma_of(centre @ of_offsets @ centre)
-        stretch[: len(errors) - p] = errors[p:]
+    own = POSE * len(poses) + np.arange(count)
+    of_unknowns = known.trusted[np.ix_(own, own)]
+    stretch = np.zeros(p)
+    stretch[: len(errors) - count] = errors[count:]
     return PitchModel(
         name,
-        offset=offset,
-        offset_sigma=sigma,
+        offset=offsets @ errors[:count],
+        offset_sigma=sigma_of(offsets @ of_unknowns @ offsets.T),
         stretch=stretch,
         misfit=misfit,
         plane_rms=rms(distances[rows.on_face]),

@@ -24,6 +24,7 @@ from lrfcal_lib.solvers.planes import (
     plane_block,
     plane_residuals,
     plane_sets,
+    source_planes,
 )
 
 SUBSETS = 400  # of the placements, tried at most
@@ -37,11 +38,9 @@ NEARLY = 1.2  # times the misses of the best minimum: another one explains the d
 SEEN = 0.8  # of the placements: a few may be wrong
 FEWEST_PLANES = 5  # that judge a candidate
 FEWEST_LINES = 7  # the same, where placements are single scan lines
-# which of the ten products of three coordinates x, y, 1 each one is, (3, 3, 3, 10)
-_, PRODUCT = np.unique(
-    np.sort(np.indices((3, 3, 3)).reshape(3, -1), axis=0), axis=1, return_inverse=True
-)
-CUBES = np.eye(10)[PRODUCT].reshape(3, 3, 3, 10)
+SIGNS = np.array(
+    [[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1]]
+)  # of roots of three squares
 FLAT = 1e-3  # of its extent: what leaves a common plane less is a set of single scan lines
 
 
@@ -133,12 +132,12 @@ def common_plane(triangles):
     for single scan lines in one plane of the LRF: how far noise scatters them within it tells
     nothing.
     """
-    root, centre = _centred(triangles.reshape(1, -1, 4))
-    _, spread, axes = np.linalg.svd(root[0])
+    root, centre = _centred(triangles.reshape(-1, 4))
+    _, spread, axes = np.linalg.svd(root)
     axes[2] *= np.linalg.det(axes)
     frame = np.eye(4)
     frame[:3, :3] = axes.T
-    frame[3, :3] = -axes @ centre[0]
+    frame[3, :3] = -axes @ centre
     return frame, spread[2] < FLAT * spread[0]
 
 
@@ -163,8 +162,7 @@ def closed_form(triangles: np.ndarray, boards: np.ndarray, rows: np.ndarray) -> 
     root, centre = _centred(triangles)
     source = np.linalg.svd(root)[2][..., 2, :]
     source = source * np.sign(np.vecdot(source, centre))[..., None]
-    outward = np.vecdot(normal, boards[..., 3]) >= 0
-    camera = np.where(outward[..., None], normal, -normal)
+    camera = normal * np.sign(np.vecdot(normal, boards[..., 3]))[..., None]
     across = camera[rows].mT @ source[rows]
     return on_planes(across, normal[rows], boards[rows, :, 3], centre[rows])
 
@@ -195,13 +193,11 @@ def three_planes(triangles: np.ndarray, boards: np.ndarray) -> np.ndarray:
     null = np.linalg.svd(rows.reshape(*normal.shape[:-1], 6))[2][..., 3:, :]
     both = null[..., :3] + 1j * null[..., 3:]
     products = both @ both.mT  # real: by how much the lengths differ; imaginary: the angle
-    columns = _common_points(np.stack([products.real, products.imag], axis=-3))
-    columns = columns @ null
+    columns = _common_points(products.real, products.imag) @ null
     columns = np.concatenate([columns, -columns], axis=-2)
     x = columns[..., :3]
     y = columns[..., 3:]
     rotation = np.stack([x, y, np.cross(x, y)], axis=-1)
-    rotation /= np.maximum(np.linalg.norm(x, axis=-1), 1e-12)[..., None, None]
     each = (..., None, slice(None), slice(None))  # of the eight
     return on_planes(rotation, normal[each], boards[..., 3][each], centre[each])
 
@@ -242,11 +238,10 @@ def _before_boards(poses, sets, centres):
     """Poses that put (most of) the boards before the camera, and the range finder on the side
     that the camera sees.
     """
-    normal = sets.boards[..., 2]
-    point = sets.boards[..., 3]
-    lrf_side = np.vecdot(poses[:, None, :, 3] - point, normal)
+    lrf_side = source_planes(poses, sets.boards)[..., 3]
+    camera_side = -np.vecdot(sets.boards[..., 3], sets.boards[..., 2])
+    facing = lrf_side * camera_side > 0
     ahead = apply_pose(poses, centres)[..., 2] > 0
-    facing = lrf_side * -np.vecdot(point, normal) > 0
     share = np.mean(facing & ahead, axis=1)
     good = share >= min(SEEN, share.max())
     return poses[good & np.isfinite(poses).all(axis=(1, 2))]
@@ -254,7 +249,7 @@ def _before_boards(poses, sets, centres):
 
 def _squares(poses, triangles, sets):
     """Mean squared distances (n, p) of each placement's points from its plane, at n poses."""
-    residuals = plane_residuals(poses[:, None], triangles, sets.boards)
+    residuals = plane_residuals(poses, triangles, sets.boards)
     return np.vecdot(residuals, residuals) / sets.number
 
 
@@ -267,18 +262,15 @@ def _centred(triangles):
 
 
 @np.errstate(all="ignore")
-def _common_points(conics):
-    """The four points ``[x, y, 1]`` (..., 4, 3) that two conics (..., 2, 3, 3) share.
+def _common_points(first, second):
+    """The four points ``[x, y, 1]`` (..., 4, 3) that two conics (..., 3, 3) share.
 
-    Real parts of complex ones. Both conics times x, y and 1 are six equations in the ten products
-    of three coordinates: four combinations stay open, and of those times 1 and times y the points
-    are the eigenvectors.
+    Real parts of complex ones. Along common axes both conics are diagonal: the squares of the
+    coordinates are at right angles to both diagonals.
     """
-    equations = np.tensordot(conics, CUBES, 2)
-    rows = equations.reshape(*conics.shape[:-3], 6, 10)
-    left = np.tensordot(np.linalg.svd(rows)[2][..., 6:, :], CUBES, (-1, -1))
-    _, by_y, by_one = np.moveaxis(left.reshape(*left.shape[:-2], 9), -2, 0)
-    chosen = np.linalg.eig((by_y @ np.linalg.pinv(by_one)).mT)[1]
-    points = chosen.mT @ left[..., 2, 2, :]
+    axes = np.linalg.eig(np.linalg.pinv(first) @ second)[1]
+    diagonals = [np.linalg.diagonal(axes.mT @ conic @ axes) for conic in (first, second)]
+    squares = np.cross(*diagonals)
+    points = SIGNS * np.sqrt(squares + 0j)[..., None, :] @ axes.mT
     # parallel boards leave nothing
     return np.nan_to_num((points / points[..., 2:]).real, posinf=0.0, neginf=0.0)

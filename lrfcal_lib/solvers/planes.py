@@ -17,6 +17,7 @@ from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, LENS, project, project_jacobians
 from lrfcal_lib.model.geometry import (
+    POSE,
     POSE_NAMES,
     DegenerateGeometry,
     apply_pose,
@@ -42,8 +43,7 @@ class PlaneSets(NamedTuple):
     """Face points (..., p, n, 3) by placement, padded with zeros to the same number, source frame,
     metres.
 
-    `boards` (..., p, 3, 4) are ``T_camera_board``, `rows` (p,) those of the placements among the
-    observations' own, `number` (p,) that of each one's points.
+    `boards` (..., p, 3, 4) are ``T_camera_board``, `number` (p,) that of each one's points.
     """
 
     placements: np.ndarray
@@ -52,7 +52,6 @@ class PlaneSets(NamedTuple):
     used: np.ndarray
     boards: np.ndarray
     board_covariance: np.ndarray
-    rows: np.ndarray
     number: np.ndarray
 
 
@@ -98,8 +97,10 @@ def estimate_from_planes(
 
     def freeze(pose, number):
         """The residuals with weights and compressed points as they are at a pose."""
-        if not (weighted and number):
-            triangles = compress(sets, equal_weights(sets, pose))
+        if not (weighted and number):  # one common weight: the mean of the points' noise
+            _, variance = _noise_across(sets, source_planes(pose, sets.boards))
+            total = np.sum(variance * sets.used, axis=(-1, -2), keepdims=True)
+            triangles = compress(sets, np.sqrt(sets.used.sum() / total))
             return lambda p: residual(p, triangles, sets.boards, None, sets.number)
         triangles, offset, _ = correct_and_compress(sets, pose)
         whitener = board_whitener(pose, triangles, sets.boards, sets.board_covariance)
@@ -114,7 +115,7 @@ def estimate_from_planes(
         pose,
         move_pose,
         groups=sets.placements,
-        freedom=count - len(POSE_NAMES),
+        freedom=count - POSE,
         n_observations=count,
         chi2_rest=chi2_rest,
         **pose_unknowns(method, obs.camera),
@@ -132,27 +133,25 @@ def pose_unknowns(method: str, camera: str) -> dict:
     }
 
 
-def plane_sets(obs: CameraObservations) -> PlaneSets:
-    """Group the face points of the placements (three at least) whose board pose the camera
-    knows.
+def plane_sets(obs: CameraObservations, scanned: bool = True) -> PlaneSets:
+    """Group the face points of the placements (three at least) whose board pose the camera knows.
+
+    Without `scanned` also the placements that have none.
     """
     obs.require("plane")
-    placements, rows, _ = np.intersect1d(
-        obs.placements, obs.plane_placement, return_indices=True
-    )
-    mine = np.flatnonzero(np.isin(obs.plane_placement, placements))
-    where = np.searchsorted(placements, obs.plane_placement[mine])
-    padded = pad(where, len(placements), width=4, row=mine)
+    wanted = obs.plane_placement if scanned else obs.placements
+    rows = np.flatnonzero(np.isin(obs.placements, wanted))
+    where, mine = np.nonzero(obs.placements[rows, None] == obs.plane_placement)
+    padded = pad(where, len(rows), width=4, row=mine)
     index = padded["row"]
     used = padded["used"]
     return PlaneSets(
-        placements,
-        points=np.where(used[..., None], obs.plane_points[..., index, :], 0.0),
+        obs.placements[rows],
+        points=obs.plane_points[..., index, :] * used[..., None],
         covariance=obs.plane_covariance[..., index, :, :],
         used=used,
         boards=obs.board_poses[..., rows, :3, :],
         board_covariance=obs.board_covariance[..., rows, :, :],
-        rows=rows,
         number=used.sum(axis=1),
     )
 
@@ -161,7 +160,7 @@ def check_normals(sets: PlaneSets, camera: str) -> None:
     """Refuse boards whose normals hardly spread some way, naming what stays open."""
     normals = sets.boards[:, :, 2]
     _, spread, axes = np.linalg.svd(normals)
-    spread = np.append(spread, np.zeros(3))[:3] / np.sqrt(len(normals))
+    spread = spread / np.sqrt(len(normals))
     directions = ["({:.2f}, {:.2f}, {:.2f})".format(*(axis + 0.0)) for axis in axes]
     if spread[1] < LEAST_SPREAD:
         raise DegenerateGeometry(
@@ -178,11 +177,12 @@ def check_normals(sets: PlaneSets, camera: str) -> None:
 
 
 def source_planes(pose, boards):
-    """Planes of boards (..., 3, 4) in the source frame, ``plane . [P, 1] = 0``, shape (..., 4)."""
+    """Planes of boards (..., p, 3, 4) in the source frame of poses (..., 3, 4), ``plane . [P, 1] =
+    0``, shape (..., p, 4).
+    """
     normal = boards[..., 2]
-    across = np.matvec(pose[..., :3].mT, normal)
-    last = np.vecdot(normal, pose[..., 3] - boards[..., 3])
-    return np.concatenate([across, last[..., None]], axis=-1)
+    last = np.vecdot(normal, pose[..., None, :, 3] - boards[..., 3])
+    return np.concatenate([normal @ pose[..., :3], last[..., None]], axis=-1)
 
 
 def _with_one(points):
@@ -205,15 +205,6 @@ def _noise_across(sets, planes):
     return pull, np.vecdot(pull, across[..., None, :]) + SIGMA_FLOOR**2
 
 
-def equal_weights(sets, pose):
-    """One common weight for all points: the root mean square of their noise (plain least
-    squares), (..., 1, 1).
-    """
-    _, variance = _noise_across(sets, source_planes(pose[..., None, :, :], sets.boards))
-    total = np.sum(variance * sets.used, axis=(-1, -2), keepdims=True)
-    return np.sqrt(sets.used.sum() / total)
-
-
 def correct_and_compress(sets: PlaneSets, pose: np.ndarray):
     """Compress points that were moved onto the camera's planes, as seen at a pose, by their noise.
 
@@ -222,7 +213,7 @@ def correct_and_compress(sets: PlaneSets, pose: np.ndarray):
     p, 4, 4), an offset (..., p, 4) and a rest: residuals are ``A h + offset``, at the pose what the
     moved rows see of the raw distances; the rest is the chi-square of what they do not see.
     """
-    planes = source_planes(pose[..., None, :, :], sets.boards)
+    planes = source_planes(pose, sets.boards)
     pull, variance = _noise_across(sets, planes)
     weights = sets.used / np.sqrt(variance)
     distance = np.vecdot(_with_one(sets.points), planes[..., None, :])
@@ -241,7 +232,7 @@ def plane_block(pose, triangles, boards, whitener=None, count=None, offset=0.0) 
     `count` (p,) is the number of points of each placement, for losses on raw triangles. A loss
     judges a placement as a whole.
     """
-    residuals, by_pose, _ = plane_terms(pose[..., None, :, :], triangles, boards, offset)
+    residuals, by_pose, _ = plane_terms(pose, triangles, boards, offset)
     if whitener is None:
         whitener = np.eye(4)
     whitener = np.broadcast_to(whitener, residuals.shape + (4,))
@@ -252,27 +243,27 @@ def board_whitener(pose, triangles, boards, board_covariance):
     """Whiteners (..., p, 4, 4) for errors of the boards' poses, common to all points of a
     placement.
     """
-    _, _, by_board = plane_terms(pose[..., None, :, :], triangles, boards)
+    _, _, by_board = plane_terms(pose, triangles, boards)
     covariance = np.eye(4) + by_board @ board_covariance @ by_board.mT
     return inverse_root(covariance)
 
 
 def plane_terms(pose, triangles, boards, offset=0.0):
-    """Residuals ``A h + offset`` (..., 4) and their Jacobians (..., 4, 6) by the pose and by
+    """Residuals ``A h + offset`` (..., p, 4) and their Jacobians (..., p, 4, 6) by the pose and by
     the board's pose.
     """
     residuals = plane_residuals(pose, triangles, boards, offset)
     normal = boards[..., 2]
     by_pose = np.zeros(residuals.shape + (6,))  # of h
-    by_pose[..., :3, :3] = pose[..., :3].mT @ hat(normal)
+    by_pose[..., :3, :3] = pose[..., None, :, :3].mT @ hat(normal)
     by_pose[..., 3, 3:] = normal
     by_board = -by_pose
-    by_board[..., 3, :3] = cross(normal, pose[..., 3] - boards[..., 3])
+    by_board[..., 3, :3] = cross(normal, pose[..., None, :, 3] - boards[..., 3])
     return residuals, triangles @ by_pose, triangles @ by_board
 
 
 def plane_residuals(pose, triangles, boards, offset=0.0):
-    """Residuals ``A h + offset`` (..., 4), h the boards' planes in the source frame."""
+    """Residuals ``A h + offset`` (..., p, 4), h the boards' planes in the source frame."""
     return np.matvec(triangles, source_planes(pose, boards)) + offset
 
 
@@ -293,9 +284,9 @@ def planes_and_pattern(state, planes, obs: CameraObservations, lens) -> list[Blo
     """Residuals by placement of pose, intrinsics and board poses (p, 3, 4): point-plane distances,
     pattern corners.
 
-    `planes` are triangles, offsets and whiteners of :func:`plane_terms`; zero where nothing was
-    scanned. Unknowns: pose 6 and intrinsics (the first `lens`) are shared, the board's pose 6 is
-    the placement's own.
+    `planes` are triangles, offsets and whiteners of :func:`plane_terms`; triangles are zero where
+    nothing was scanned. Unknowns: pose 6 and intrinsics (the first `lens`) are shared, the board's
+    pose 6 is the placement's own.
     """
     pose, intrinsics, boards = state
     triangles, offset, whitener = planes
@@ -364,12 +355,17 @@ def estimate_with_lens(
         plane_block, obs, pose, method=method, uses=uses, **options
     )
     error = plane_error(obs, solution)
-    numbers = np.sum(plane_sets(obs).number) + visible.sum()
-    state = (pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3])
+    # of a board's pose: tilt over a lever, offset
+    common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)
+    sets = plane_sets(obs, scanned=False)
+    numbers = sets.number.sum() + visible.sum()
+    state = (pose_array(solution.transform), obs.model.parameters, sets.boards)
     for _ in range(2):
-        planes, rest = _planes_at(obs, state, error)
+        pose, _, boards = state
+        triangles, offset, rest = correct_and_compress(sets._replace(boards=boards), pose)
+        whitener = board_whitener(pose, triangles, boards, common)
         solution = solve(
-            lambda state, planes=planes: residual(state, planes, obs, lens),
+            partial(residual, planes=(triangles, offset, whitener), obs=obs, lens=lens),
             state,
             _move_with_lens,
             read=partial(_read_with_lens, lens=lens),
@@ -384,25 +380,6 @@ def estimate_with_lens(
         )
         state = solution.state
     return _with_refined_model(solution, obs, lens)
-
-
-def _planes_at(obs, state, error):
-    """Triangles, offsets and whiteners of all placements of which the camera knows the board, at a
-    state, and what they do not see of chi-square.
-    """
-    pose, _, boards = state
-    sets = plane_sets(obs)
-    sets = sets._replace(boards=boards[sets.rows])
-    triangles, offset, rest = correct_and_compress(sets, pose)
-    # of a board's pose: tilt over a lever, offset
-    common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)
-    whitener = board_whitener(pose, triangles, sets.boards, common)
-    planes = []
-    for scanned in (triangles, offset, whitener):
-        every = np.zeros((len(boards), *scanned.shape[1:]))
-        every[sets.rows] = scanned
-        planes.append(every)
-    return planes, rest
 
 
 def _move_with_lens(state, step):

@@ -21,15 +21,20 @@ from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.padding import pad
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
+    TiltAxis,
+    apply_pose,
     axis_of,
     cross,
     fit_line,
+    fit_plane,
     gradient_by_pose,
     head_from_axis,
     lrf_to_platform,
+    move_pose,
+    pose_array,
+    pose_transform,
     tilt,
     unit_vector,
 )
@@ -71,7 +76,7 @@ class PlatformSolution:
         return head_from_axis(self.axis)
 
     @property
-    def axis(self) -> geometry.TiltAxis:
+    def axis(self) -> TiltAxis:
         """The tilt axis in the LRF frame."""
         return axis_of(self.solution.transform)
 
@@ -117,7 +122,7 @@ def solve_platform(
         on_edges = boards.edge["used"].sum()
         points = on_edges + boards.face["used"].sum()
         p = len(boards.placements)
-        state = geometry.pose_array(gauge), boards.poses, np.zeros((p, 2))
+        state = pose_array(gauge), boards.poses, np.zeros((p, 2))
         solution = solve(
             partial(
                 platform_blocks, edge=boards.edge, face=boards.face, sigma_pitch=sigma_pitch
@@ -232,7 +237,7 @@ def _start_board(edges, face):
         along, _ = np.linalg.lstsq(np.column_stack([x, -second]), point2 - point)[0]
         point = point + x * along
     elif len(face) >= 3:
-        normal = geometry.fit_plane(face)[0]
+        normal = fit_plane(face)[0]
         z = normal - x * (x @ normal)
     else:
         raise DegenerateGeometry("only one edge, and no points on the face")
@@ -266,8 +271,7 @@ def distances(state, group):
     by_head = gradient_by_pose(rotated[..., None, :], in_head)
     by_unknowns = np.zeros(r.shape + (12,))
     by_unknowns[..., :4] = by_head[..., AXIS_COLUMNS]
-    by_unknowns[..., 4:7] = cross(gradient, lever[..., None, :])  # turn of the board
-    by_unknowns[..., 7:10] = -gradient
+    by_unknowns[..., 4:10] = -gradient_by_pose(lever[..., None, :], gradient)  # board
     by_unknowns[..., 0, 10] = cosine * b[..., 1] - sine * b[..., 0]
     by_unknowns[..., 1, 11] = -second
     by_pitch = cross(q[..., None, :], gradient)[..., 0]
@@ -293,17 +297,12 @@ def platform_blocks(state, edge, face, sigma_pitch):
     """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
     head, boards, bends = state
     p = len(boards)
-    lone = ~np.any(edge["second"], axis=1)
     tolerance = np.broadcast_to(np.eye(12)[10:], (p, 2, 12))
-    # a board seen with one edge may slide along it, which no point shows: it is held
-    slide = np.zeros((p, 1, 12))
-    slide[:, 0, 7:10] = boards[:, :, 0]
     stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))
     return [
         distance_block(state, edge, sigma_pitch, slice(0, 2)),
         distance_block(state, face, sigma_pitch, slice(1, 2)),
         Block(bends, tolerance, stiff),
-        Block(np.zeros((p, 1)), slide, lone[:, None] * 100.0),
     ]
 
 
@@ -312,7 +311,7 @@ def move_platform(state, step):
     head, boards, bends = state
     common, by_placement = step
     pose, bend = np.split(by_placement, [6], axis=1)
-    return move_head(head, common), geometry.move_pose(boards, pose), bends + bend
+    return move_head(head, common), move_pose(boards, pose), bends + bend
 
 
 def solve_projected(
@@ -353,7 +352,7 @@ def solve_projected(
     that. :func:`lrfcal_lib.solvers.platform.solve_platform` weighs every term by its noise.
     """
     gauge = start_head(T0)
-    groups, skipped = _slanted(obs, points_of(geometry.pose_array(gauge), obs, printed))
+    groups, skipped = _slanted(obs, points_of(pose_array(gauge), obs, printed))
     if not groups:
         raise DegenerateGeometry(
             f"projected fits: no placement can be used: {skipped}; use the 3D fits instead"
@@ -369,7 +368,7 @@ def solve_projected(
                 scatter=scatter,
                 printed=printed,
             ),
-            geometry.pose_array(gauge),
+            pose_array(gauge),
             move_head,
             names=AXIS_NAMES,
             method="platform_projected",
@@ -387,7 +386,7 @@ def solve_projected(
 
 def _read_head(head):
     """Transform and parameters of the axis."""
-    return geometry.pose_transform(head), chart_parameters(head)
+    return pose_transform(head), chart_parameters(head)
 
 
 def _slanted(obs, p_platform):
@@ -448,7 +447,7 @@ def points_of(heads, obs, printed):
         z = heads[..., 2:, 3]
         away = np.hypot(y, z) > 10 * SMALL  # an axis through the LRF's origin needs no turn
         pitch = pitch - np.where(away, np.arctan2(z, y), 0.0)
-    return tilt(geometry.apply_pose(heads, obs.edge_points), pitch)
+    return tilt(apply_pose(heads, obs.edge_points), pitch)
 
 
 def _six_terms(first, second):
