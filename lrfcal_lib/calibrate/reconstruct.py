@@ -5,9 +5,9 @@ in bounded memory.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import RigidTransform
 
@@ -237,30 +237,23 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     centre = np.sum(points[valid], axis=0) / max(valid.sum(), 1)
     p = np.where(valid[..., None], points - centre, 0.0)
     width = 2 * WINDOW + 1
-
-    def sums(values):
-        """Means over all windows, where nothing is counts as zero."""
-        size = (width, width) + (1,) * (values.ndim - 2)
-        return uniform_filter(values, size, mode="constant")
-
-    share = sums(valid.astype(float))
+    # means over all windows, where nothing is counts as zero
+    means = partial(uniform_filter, size=width, mode="constant", axes=(0, 1))
+    share = means(valid.astype(float))
     whole = np.maximum(share, 0.5 / width**2)[..., None]
-    mean = sums(p) / whole
-    square = sums(dyads(p)) / whole[..., None]
-    spread = square - dyads(mean)
+    spread = means(dyads(p)) / whole[..., None] - dyads(means(p) / whole)
     variances, directions = np.linalg.eigh(spread)
     least, middle, _ = np.moveaxis(variances, -1, 0)
     known = (share > 1 / 3) & (middle > LEAST_SPREAD)
-    rough = np.where(known, np.maximum(least, 0.0), np.inf)
-    normals = np.full(points.shape, np.nan)
-    flattest = np.full(valid.shape, np.inf)
-    lines, beams = map(np.arange, valid.shape)
-    for shift in product((-WINDOW, 0, WINDOW), repeat=2):  # to the middles of the windows
-        line = np.clip(lines + shift[0], 0, lines[-1])
-        window = np.ix_(line, np.clip(beams + shift[1], 0, beams[-1]))
-        flatter = valid & (rough[window] < flattest)
-        flattest[flatter] = rough[window][flatter]
-        normals[flatter] = directions[..., 0][window][flatter]
+    rough = np.where(known, np.maximum(least, 0.0), np.inf).ravel()
+    around = np.pad(np.arange(rough.size).reshape(valid.shape), WINDOW, mode="edge")
+    nine = sliding_window_view(around, (width, width))[..., ::WINDOW, ::WINDOW]
+    nine = nine.reshape(*valid.shape, -1)  # numbers of the windows that hold a point
+    flattest = rough[nine].argmin(axis=-1, keepdims=True)
+    best = np.take_along_axis(nine, flattest, axis=-1)[..., 0]
+    normals = directions[..., 0].reshape(-1, 3)[best]
     away = np.vecdot(normals, points - origins) > 0
     normals[away] *= -1
-    return normals, np.sqrt(np.where(np.isfinite(flattest), flattest, np.nan))
+    sound = valid & np.isfinite(rough[best])
+    normals[~sound] = np.nan
+    return normals, np.sqrt(np.where(sound, rough[best], np.nan))
