@@ -25,8 +25,8 @@ from lrfcal_lib.calibrate.observe import (
     observe,
     platform_observations,
 )
-from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig, joint_rig
-from lrfcal_lib.calibrate.rig_uncertainty import uncertainty_one_by_one
+from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig
+from lrfcal_lib.calibrate.rig_uncertainty import joint_uncertainty, uncertainty_one_by_one
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior, Solution
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import DegenerateGeometry
@@ -161,10 +161,6 @@ class Calibration:
         CalibratedRig
         """
         session = self.prepared.session
-        axis = self.platform.axes[self.platform.axis_with(method)]
-        if self.joint is not None and method == "joint":
-            rig = joint_rig(self.joint.solution, self.prepared.models)
-            return replace(rig, axis=axis, lrf=session.lrf, session=session.name)
         solved = self.cameras(method)
         cameras = {
             camera: CalibratedCamera(
@@ -174,18 +170,24 @@ class Calibration:
             )
             for camera, solution in solved.items()
         }
-        noise = [scan.sigma_range for scan in self.prepared.scans.values()]
-        uncertainty = uncertainty_one_by_one(
-            axis.covariance,
-            solved,
-            admitted_offset=session.lrf.admitted_offset,
-            sweep_sigma=astuple(self.prepared.pitch_noise),
-            range_noise=np.median(noise) if noise else session.lrf.sigma_range,
-        )
+        axis = self.platform.axes[self.platform.axis_with(method)]
+        if self.joint is not None and method == "joint":
+            corrections = self.joint.solution.corrections
+            uncertainty = joint_uncertainty(self.joint.solution)
+        else:
+            corrections = AS_RECORDED
+            noise = [scan.sigma_range for scan in self.prepared.scans.values()]
+            uncertainty = uncertainty_one_by_one(
+                axis.covariance,
+                solved,
+                admitted_offset=session.lrf.admitted_offset,
+                sweep_sigma=astuple(self.prepared.pitch_noise),
+                range_noise=np.median(noise) if noise else session.lrf.sigma_range,
+            )
         return CalibratedRig(
             method=method,
             axis=axis,
-            corrections=AS_RECORDED,
+            corrections=corrections,
             cameras=cameras,
             lrf=session.lrf,
             uncertainty=uncertainty,

@@ -147,20 +147,16 @@ def uncertainty_one_by_one(
     -------
     RigUncertainty
     """
-    names = list(AXIS_NAMES)
-    noise_only = [of_axis]
-    trusted = [of_axis]
-    for camera, solution in solutions.items():
-        names += [f"{camera}_{name}" for name in POSE_NAMES]
-        noise_only.append(solution.covariance[:6, :6])
-        trusted.append(solution.trusted[:6, :6])
-    names.append("range_offset")
+    poses = [f"{camera}_{name}" for camera in solutions for name in POSE_NAMES]
+    names = (*AXIS_NAMES, *poses, "range_offset")
+    noise_only = [solution.covariance[:6, :6] for solution in solutions.values()]
+    trusted = [solution.trusted[:6, :6] for solution in solutions.values()]
     offset = np.array([[admitted_offset**2]])
     nothing = np.zeros((0, len(COLUMNS)))
     return RigUncertainty(
-        names=tuple(names),
-        covariance=block_diag(*noise_only, offset),
-        trusted=block_diag(*trusted, offset),
+        names=names,
+        covariance=block_diag(of_axis, *noise_only, offset),
+        trusted=block_diag(of_axis, *trusted, offset),
         lens=np.zeros((len(names), len(names))),
         unseen_of_cloud=nothing,
         unseen_of_cameras=dict.fromkeys(solutions, nothing),
