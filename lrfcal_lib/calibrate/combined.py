@@ -191,15 +191,6 @@ def case_of(joint, observations, placement):
     )
     p_lrf, pitch, _ = face_points(prepared.scans[placement])
     face = source.points(p_lrf, pitch)
-    sides = edges_in_cloud(solution, prepared, placement, face)
-    for side in named_sides(prepared, placement, stretch=LEAST_STRETCH):
-        # where a sweep begins and ends may be where a cloud was cut
-        if side.name not in sides and not side.across:
-            sides[side.name] = source.points(side.points, side.pitch)
-    rough = measure_board(face, sides, edges)
-    board = rough.T_platform_plane
-    lines = np.where(np.isnan(rough.lines), [1.0, 0.0, -1.0], rough.lines)
-    lines *= -np.copysign(1.0, lines[:, 2:])  # outwards: the face is in the middle
     obs = observations.with_cameras(solution.observations.cameras).select([placement])
     images = []
     for row, number in enumerate(obs.view_camera):
@@ -208,6 +199,15 @@ def case_of(joint, observations, placement):
         if visible:
             sides_shown = np.array([edges.index(edge.name) for edge in visible])
             images.append(ImageSides(row, sides_shown, visible, prepared.models[camera]))
+    sides = edges_in_cloud(solution, obs, images, face)
+    for side in named_sides(prepared, placement, stretch=LEAST_STRETCH):
+        # where a sweep begins and ends may be where a cloud was cut
+        if side.name not in sides and not side.across:
+            sides[side.name] = source.points(side.points, side.pitch)
+    rough = measure_board(face, sides, edges)
+    board = rough.T_platform_plane
+    lines = np.where(np.isnan(rough.lines), [1.0, 0.0, -1.0], rough.lines)
+    lines *= -np.copysign(1.0, lines[:, 2:])  # outwards: the face is in the middle
     obs = obs.keep(beam=np.isin(obs.beam_edge, [edges.index(name) for name in sides]))
     moving = solution.state
     state = joint_model.undisturbed(
@@ -225,24 +225,21 @@ def case_of(joint, observations, placement):
     )
 
 
-def edges_in_cloud(solution, prepared, placement, face):
-    """Where lines of sight of image edges meet the plane of a face (n, 3), under a JointSolution:
-    points (k, 3) by edge, platform frame, metres.
+def edges_in_cloud(solution, obs, images, face):
+    """Where lines of sight of the edges of ImageSides meet the plane of a face (n, 3), under a
+    JointSolution: points (k, 3) by edge, platform frame, metres.
     """
     plane = plane_frame(face)
     normal = plane[:, 2]
     sides: dict = {}
-    for camera, views in prepared.views.items():
-        view = views.get(placement)
-        if view is None or camera not in solution.transforms:
-            continue
-        pitch = solution.corrections.pitch(placement, view.pitch)
+    for image in images:
+        pitch = solution.corrections.pitch(obs.placements[0], obs.view_pitch[image.row])
+        camera = obs.cameras[obs.view_camera[image.row]]
         T_platform_camera = solution.camera_at(camera, pitch).inv()
-        lens = prepared.models[camera]
         centre = T_platform_camera.translation
         height = (plane[:, 3] - centre) @ normal
-        for edge in view.edges:
-            sight = T_platform_camera.rotation.apply(lens.sights(edge.ends))
+        for edge in image.edges:
+            sight = T_platform_camera.rotation.apply(image.model.sights(edge.ends))
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
     return {name: np.concatenate(points) for name, points in sides.items()}
@@ -288,8 +285,7 @@ def blocks_of(state, case, scale):
     named = joint_residuals.named_blocks(state.joint, data, unknowns)
     if "beam" in named:
         beams = named["beam"]
-        by_sides = side_columns(beams.jacobian, case.data.beam["edge"], state, case)
-        jacobian = np.concatenate([beams.jacobian, by_sides], axis=-1)
+        jacobian = with_sides(beams.jacobian, case.data.beam["edge"], state, case)
         named["beam"] = replace(beams, jacobian=jacobian)
     # no view and nothing that is usual: image edges and the calibration say it
     blocks = [named[name] for name in ("face", "beam", "sweep", "side") if name in named]
@@ -316,11 +312,11 @@ def _rows(residuals, jacobian):
     return Block(residuals[None], jacobian[None])
 
 
-def side_columns(J, edge, state, case):
-    """Derivatives by shifts outwards and turns of the sides (..., 2 E), from those by the board
-    that holds them.
+def with_sides(J, edge, state, case):
+    """Derivatives (..., k), and by shifts outwards and turns of the sides (..., k + 2 E), from
+    those by the board that holds them.
 
-    `J` (..., k) are rows about the side numbers `edge` (...).
+    `J` are rows about the side numbers `edge` (...).
     """
     R = state.joint.boards[0, :, :3]
     outward = state.lines[:, :2] @ R[:, :2].T
@@ -331,7 +327,7 @@ def side_columns(J, edge, state, case):
     motions[:, 1, 3:] = np.cross(arm, R[:, 2])
     by_all = J[..., case.unknowns.columns["board"]] @ np.concatenate(motions).T
     mine = edge[..., None] == np.arange(len(arm))
-    return by_all * np.repeat(mine, 2, axis=-1)
+    return np.concatenate([J, by_all * np.repeat(mine, 2, axis=-1)], axis=-1)
 
 
 def image_blocks(state, case, scale):
@@ -352,8 +348,7 @@ def image_blocks(state, case, scale):
         places = np.stack([x, y, np.zeros_like(x)], axis=-1)
         misses, by_pose = line_misses(image.edges, places, image.model, poses[0, image.row])
         J = by_pose @ by_all[image.row]
-        by_sides = side_columns(J, image.numbers[:, None], state, case)
-        jacobian = np.concatenate([J, by_sides], axis=-1)
+        jacobian = with_sides(J, image.numbers[:, None], state, case)
         yield _rows(misses.ravel() / scale, np.concatenate(jacobian) / scale)
 
 

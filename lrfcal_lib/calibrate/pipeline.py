@@ -257,10 +257,7 @@ def prepare(session: Session) -> Prepared:
     Prepared
         Placements that cannot be used are in its `problems`, with their reason.
     """
-    ready = prepare_images(prepare_scans(session))
-    names, dropped, problems = name_sides(ready)
-    every = (*ready.problems, *problems)
-    ready = without(replace(ready, names=names, dropped=dropped, problems=every))
+    ready = without(name_sides(prepare_images(prepare_scans(session))))
     errors = find_pitch_errors(ready)
     if errors is None:
         return ready
