@@ -13,7 +13,7 @@ import pandas as pd
 from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.joint_observations import observe_joint
-from lrfcal_lib.calibrate.observe import LEAST_STRETCH, named_sides
+from lrfcal_lib.calibrate.observe import sides_in_cloud
 from lrfcal_lib.calibrate.outline import (
     MeasuredBoard,
     bounded,
@@ -26,8 +26,6 @@ from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.model.kinematics import SourceFrame
-from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import ImageEdge
 from lrfcal_lib.preprocess.pose_from_lines import line_misses
 from lrfcal_lib.solvers import joint_model, joint_residuals
@@ -182,15 +180,11 @@ def case_of(joint, observations, placement):
     """
     prepared = joint.prepared
     solution = joint.without.get(placement, joint.solution)
-    edges = tuple(prepared.board.edges)
-    source = SourceFrame(
-        solution.T_head_lrf,
-        "platform",
-        placement=placement,
-        corrections=solution.corrections,
+    edges = prepared.board.edges
+    # where a sweep begins and ends may be where a cloud was cut
+    face, along, _ = sides_in_cloud(
+        prepared, placement, "half_step", solution.T_head_lrf, solution.corrections
     )
-    p_lrf, pitch, _ = face_points(prepared.scans[placement])
-    face = source.points(p_lrf, pitch)
     obs = observations.with_cameras(solution.observations.cameras).select([placement])
     images = []
     for row, number in enumerate(obs.view_camera):
@@ -199,11 +193,7 @@ def case_of(joint, observations, placement):
         if visible:
             sides_shown = np.array([edges.index(edge.name) for edge in visible])
             images.append(ImageSides(row, sides_shown, visible, prepared.models[camera]))
-    sides = edges_in_cloud(solution, obs, images, face)
-    for side in named_sides(prepared, placement, stretch=LEAST_STRETCH):
-        # where a sweep begins and ends may be where a cloud was cut
-        if side.name not in sides and not side.across:
-            sides[side.name] = source.points(side.points, side.pitch)
+    sides = along | edges_in_cloud(solution, obs, images, face)
     rough = measure_board(face, sides, edges)
     board = rough.T_platform_plane
     lines = np.where(np.isnan(rough.lines), [1.0, 0.0, -1.0], rough.lines)

@@ -174,19 +174,33 @@ def outline_of(
     DegenerateGeometry
         If the sweep does not cross enough scan lines to span a plane.
     """
-    T_head_lrf = platform_of(prepared, T_head_lrf)
+    face, along, across = sides_in_cloud(
+        prepared, placement, variant, platform_of(prepared, T_head_lrf), corrections
+    )
+    board = measure_board(face, along | across, prepared.board.edges)
+    return board, frozenset(across)
+
+
+def sides_in_cloud(
+    prepared: Prepared,
+    placement: int,
+    variant: str,
+    T_head_lrf: RigidTransform,
+    corrections: Corrections,
+) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Points of a board's face and, by name, of its sides of which enough is seen: those found
+    along the scan lines, and across them; platform frame, metres.
+    """
     source = SourceFrame(
         T_head_lrf, "platform", placement=placement, corrections=corrections
     )
     p_lrf, pitch, _ = face_points(prepared.scans[placement])
-    sides = {}
-    across = set()
+    along = {}
+    across = {}
     for side in named_sides(prepared, placement, variant, LEAST_STRETCH):
+        sides = across if side.across else along
         sides[side.name] = source.points(side.points, side.pitch)
-        if side.across:
-            across.add(side.name)
-    board = measure_board(source.points(p_lrf, pitch), sides, prepared.board.edges)
-    return board, frozenset(across)
+    return source.points(p_lrf, pitch), along, across
 
 
 def stack(prefix: str, parts: Iterable[dict]) -> dict[str, Any]:

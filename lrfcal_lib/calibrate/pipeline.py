@@ -3,6 +3,7 @@ everything at once.
 """
 
 import operator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from functools import partial
@@ -171,7 +172,7 @@ class Calibration:
             for camera, solution in solved.items()
         }
         axis = self.platform.axes[self.platform.axis_with(method)]
-        if self.joint is not None and method == "joint":
+        if self.joint and method == "joint":
             corrections = self.joint.solution.corrections
             uncertainty = joint_uncertainty(self.joint.solution)
         else:
@@ -195,13 +196,13 @@ class Calibration:
         )
 
 
-def calibrate(session: Session, methods=None) -> Calibration:
+def calibrate(session: Session, methods: Iterable[str] = METHODS) -> Calibration:
     """All stages: preprocessing, platform, cameras, and the joint estimate of everything.
 
     Parameters
     ----------
     session : Session
-    methods : sequence of str, optional
+    methods : iterable of str
         Of :data:`lrfcal_lib.solvers.METHODS`; all rows that are there when this is called by
         default.
 
@@ -214,7 +215,7 @@ def calibrate(session: Session, methods=None) -> Calibration:
     ValueError
         For a method that is not there.
     """
-    methods = tuple(METHODS if methods is None else methods)
+    methods = tuple(methods)
     if any(row_of(name) is not SHIPPED.get(name) for name in methods):
         return _calibrate.__wrapped__(session, methods)  # a row may change without its name
     return _calibrate(session, methods)
