@@ -1,6 +1,6 @@
 """The tilt axis and the cameras, each by itself, from observations alone: no session is needed."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -117,15 +117,15 @@ def calibrate_platform(
         Where the platform is neither stated nor determined, 'combined' is an assumption, and so
         named in `problems`.
     """
-    ways: dict[str, tuple[str, Callable[..., PlatformSolution]]] = {
-        "projected_printed": ("last_beam", partial(solve_projected, printed=True)),
-        "projected_last_beam": ("last_beam", solve_projected),
-        "line_3d": ("half_step", partial(solve_platform, sigma_pitch=sigma_pitch)),
-    }
+    ways = [
+        ("projected_printed", "last_beam", partial(solve_projected, printed=True)),
+        ("projected_last_beam", "last_beam", partial(solve_projected)),
+        ("line_3d", "half_step", partial(solve_platform, sigma_pitch=sigma_pitch)),
+    ]
     solutions = {}
     axes = {}
     problems = []
-    for method, (variant, solve) in ways.items():
+    for method, variant, solve in ways:
         try:
             solution = solve(observations[variant], T_stated)
         except DegenerateGeometry as error:

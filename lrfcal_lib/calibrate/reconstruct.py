@@ -2,7 +2,7 @@
 in bounded memory.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -76,14 +76,12 @@ def reconstruct(
     steps = (_pitch_step(sweep), lrf.bearing_step)
     painter = Painter(views, max(steps), BEHIND * lrf.sigma_range)
     blocks_of = partial(_blocks, sweep, steps, T_head_lrf, corrections, lrf, continuous, {})
-    blocks: Iterable[_Block] = blocks_of()
     if sweep.ranges.size <= KEPT:
-        blocks = list(blocks)
-        blocks_of = partial(iter, blocks)
+        blocks_of = partial(iter, list(blocks_of()))
     points = []
     normals = []
     every = max(1, sweep.ranges.size // GAIN_POINTS)
-    for block in blocks:
+    for block in blocks_of():
         painter.hide(block.hiding[np.isfinite(block.hiding).all(axis=-1)])
         # a view would keep the whole block
         points.append(block.points[block.good][::every].copy())

@@ -21,28 +21,26 @@ from lrfcal_lib.solvers.joint_solution import JointSolution
 COLUMNS = (*AXIS_NAMES, *POSE_NAMES, "range_offset", "pitch_scale", "pitch_by_direction")
 
 
-def rows(*shape: int | None) -> PlainValidator:
-    """How pydantic makes an array of a shape, None where any size will do, of rows of numbers; null
-    is infinite.
+def rows(width: int | None = None, height: int | None = None) -> PlainValidator:
+    """How pydantic makes an array of rows of numbers, of any width and as many as there are unless
+    given; null is infinite.
     """
 
     def array_of(given):
-        """An array (shape) of what a file has."""
+        """An array (height, width) of what a file has."""
         values = np.array(given, float)
         if not len(given):
-            values = np.zeros((0, *shape[1:]))
-        same = [
-            size in (None, found) for size, found in zip(shape, values.shape, strict=False)
-        ]
-        if values.ndim != len(shape) or not all(same):
+            values = np.zeros((0, width))
+        shape = (height or len(given), width or values.shape[-1])
+        if values.shape != shape:
             raise ValueError(f"shape {values.shape} instead of {shape}")
         return np.where(np.isnan(values), np.inf, values)
 
     return PlainValidator(array_of)
 
 
-Square = Annotated[np.ndarray, rows(None, None)]
-Motions = Annotated[np.ndarray, rows(None, len(COLUMNS))]
+Square = Annotated[np.ndarray, rows()]
+Motions = Annotated[np.ndarray, rows(len(COLUMNS))]
 
 
 @dataclass(frozen=True)
