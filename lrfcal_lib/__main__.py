@@ -145,11 +145,10 @@ def check(session, calibration):
     return 0
 
 
-def record(rig_file, session, resume, placements, scene, stations, calibration):
+def record(rig_file, session, scene, stations, calibration, **options):
     """Record placements of the board, or stations of a scene."""
     from lrfcal_lib.acquire.record import main
 
-    options = {"resume": resume, "count": placements}
     if scene:
         from lrfcal_lib.acquire.stations import Stations
         from lrfcal_lib.calibrate.calibration_file import load_calibration
@@ -316,7 +315,13 @@ def _add_rigs(verbs):
         action="store_true",
         help="go on with a session; finished placements stay",
     )
-    add("--placements", type=how_many, metavar="N", help="record N placements of the plan")
+    add(
+        "--placements",
+        dest="count",
+        type=how_many,
+        metavar="N",
+        help="record N placements of the plan",
+    )
     add("--scene", action="store_true", help="record a scene instead of the plan's boards")
     add("--stations", type=how_many, metavar="N", help="of the scene (default 1)")
     add("--calibration", help="calibration.json of the rig: plans the images of the scene")

@@ -415,7 +415,7 @@ def calibrate_jointly(prepared: Prepared, views=None) -> JointCalibration:
     DegenerateGeometry
         When there is no start value, or most placements contradict each other.
     """
-    observations = observe_joint(prepared, all_views(prepared) if views is None else views)
+    observations = observe_joint(prepared, views or all_views(prepared))
     settings = joint_settings(prepared, observations)
     solution = solve_joint(observations, required=False, **settings)
     return JointCalibration(prepared, solution, settings, {})
@@ -496,7 +496,7 @@ def handed_over(calibration: Calibration) -> str | None:
         could be judged.
     """
     joint = calibration.joint
-    if joint is not None and joint.solution.converged and not joint.solution.unobservable:
+    if joint and joint.solution.converged and not joint.solution.unobservable:
         return "joint"
     half_step = {
         camera: calibration.observations[camera, "half_step"]
