@@ -145,10 +145,9 @@ def _known(edges, values):
 
 def moved_lines(lines: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Lines (s, 3) shifted outwards and turned about points (s, 2) of them by steps (..., s, 2)."""
-    cosine = np.cos(step[..., 1])
-    sine = np.sin(step[..., 1])
-    a = lines[:, 0]
-    b = lines[:, 1]
-    normals = np.stack([cosine * a - sine * b, sine * a + cosine * b], axis=-1)
-    at = line_distance(middle, lines) - step[..., 0] - np.vecdot(normals, middle)
-    return np.concatenate([normals, at[..., None]], axis=-1)
+    normals = lines[:, :2]
+    along = normals[:, ::-1] * [-1, 1]
+    turn = step[..., 1:]
+    turned = np.cos(turn) * normals + np.sin(turn) * along
+    at = line_distance(middle, lines) - step[..., 0] - np.vecdot(turned, middle)
+    return np.concatenate([turned, at[..., None]], axis=-1)
