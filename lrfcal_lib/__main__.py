@@ -11,57 +11,57 @@ INTERRUPTED = 130  # exit code after Ctrl-C
 SCENE = "as 'record --scene' recorded it"
 
 
-def compare(args):
+def compare(calibrations, figure):
     """Say how far calibrations of one rig differ."""
     from lrfcal_lib.report.compare import compare_files
 
-    return compare_files(args.calibrations, args.figure)
+    return compare_files(calibrations, figure)
 
 
-def simulate(args):
+def simulate(setup, dst):
     """Record a session with a simulated rig."""
     from lrfcal_lib.session.workers import side_by_side
     from lrfcal_lib.simulate.record import simulate
     from lrfcal_lib.simulate.rig import load_setup
 
     with side_by_side():
-        simulate(args.dst, load_setup(args.setup))
-    print(f"{args.dst}: simulated")
+        simulate(dst, load_setup(setup))
+    print(f"{dst}: simulated")
 
 
-def report(args):
+def report(sessions, out, scheduler, jobs, store):
     """Execute the notebooks on sessions, here or on a cluster."""
-    if args.scheduler is not None:
-        return use_sessions(args)
+    if scheduler is not None:
+        from lrfcal_lib.report.report import report_session
+
+        return use_sessions(report_session, sessions, out, scheduler)
     from lrfcal_lib.report.report import main
 
-    return main(args.sessions, args.out, args.jobs, args.store)
+    return main(sessions, out, jobs, store)
 
 
-def study(args):
+def study(**options):
     """Compare methods on drawn sessions."""
     from lrfcal_lib.report.study import study
 
-    return study(args)
+    return study(**options)
 
 
-def emulate(args):
+def emulate(setup, rig_file, feedback):
     """Emulate the devices of a rig."""
     from lrfcal_lib.emulators.rig import main
 
-    return main(args.setup, args.rig_file, args.feedback)
+    return main(setup, rig_file, feedback)
 
 
-def measure(args):
+def measure(session, **options):
     """Measure lengths between picked places."""
     from lrfcal_lib.report.measure import measure_session
 
-    return measure_session(
-        args.session, args.calibration, args.picks, args.out, args.station, args.untrusted
-    )
+    return measure_session(session, **options)
 
 
-def print_board(args):
+def print_board(columns, rows, square, out):
     """Write a board to print, and what session.json and rig files say about it."""
     from json import dumps
 
@@ -69,99 +69,109 @@ def print_board(args):
     from lrfcal_lib.session.stated import board_to_json
     from lrfcal_lib.session.write import whole
 
-    board = sheet(args.columns, args.rows, args.square)
-    with whole(args.out) as file:
+    board = sheet(columns, rows, square)
+    with whole(out) as file:
         print_sheet(file, board)
     width, height = 1000 * board.known_corners()[2]
     print(
-        f"{args.out}: print at 100 %, glue on a flat plate, cut to {width:.0f} x {height:.0f} mm"
+        f"{out}: print at 100 %, glue on a flat plate, cut to {width:.0f} x {height:.0f} mm"
     )
     print("state it as:", dumps(board_to_json(board)))
 
 
-def import_recording(args):
+def import_recording(src, dst):
     """Make a session of a recording by other people."""
     from lrfcal_lib.session.importers import import_lasersetero
 
-    miss = import_lasersetero(args.src, args.dst)
-    print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
+    miss = import_lasersetero(src, dst)
+    print(f"{dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
 
 
-def use_sessions(args):
-    """Do what a verb asks for with each of some sessions, here or on a cluster."""
+def calibrate(**options):
+    """Calibrate the rigs of sessions."""
+    from lrfcal_lib.report.calibrate import calibrate_session
+
+    return use_sessions(calibrate_session, **options)
+
+
+def reconstruct(**options):
+    """Make coloured clouds of scenes."""
+    from lrfcal_lib.report.reconstruct import reconstruct_session
+
+    return use_sessions(reconstruct_session, **options)
+
+
+def merge(**options):
+    """Join the stations of scenes."""
+    from lrfcal_lib.report.merge import merge_session
+
+    return use_sessions(merge_session, **options)
+
+
+def use_sessions(work, sessions, out, scheduler, **options):
+    """Do something with each of some sessions, here or on a cluster."""
     from functools import partial
 
     from lrfcal_lib.report.many import each_session
 
-    match args.verb:
-        case "calibrate":
-            from lrfcal_lib.report.calibrate import calibrate_session as work
-        case "report":
-            from lrfcal_lib.report.report import report_session as work
-        case "reconstruct":
-            from lrfcal_lib.report.reconstruct import reconstruct_session as work
-        case "merge":
-            from lrfcal_lib.report.merge import merge_session as work
-    if args.verb in ("reconstruct", "merge"):
-        work = partial(work, calibration=args.calibration, untrusted=args.untrusted)
-    return each_session(work, args.sessions, args.out, args.scheduler)
+    return each_session(partial(work, **options), sessions, out, scheduler)
 
 
-def check(args):
+def check(session, calibration):
     """Say what is wrong with a session: 0 where nothing is, else 1. With a calibration 3 where that
     has moved, 2 where it cannot be told.
     """
     from lrfcal_lib.session.read import open_session, validate
     from lrfcal_lib.session.shown import printable
 
-    problems = validate(args.session)
+    problems = validate(session)
     if problems:
         print("\n".join(problems))
         return 1
-    print(f"{printable(args.session)}: nothing to complain about")
-    session = open_session(args.session)
-    count = len(session.board_placements)
-    if count == 0 and session.scene_placements:
+    print(f"{printable(session)}: nothing to complain about")
+    recorded = open_session(session)
+    count = len(recorded.board_placements)
+    if count == 0 and recorded.scene_placements:
         print("no placement of the board: a scene, for a calibration made elsewhere")
     elif count < FEW:
         print(
             f"warning: {count} placements of the board; {FEW} or more are needed to see errors of "
             "the model"
         )
-    if args.calibration is not None:
+    if calibration is not None:
         from lrfcal_lib.report.holds import check_calibration
 
-        return check_calibration(session, args.calibration)
+        return check_calibration(recorded, calibration)
     return 0
 
 
-def record(args):
+def record(rig_file, session, scene, stations, calibration, **options):
     """Record placements of the board, or stations of a scene."""
     from lrfcal_lib.acquire.record import main
 
-    options = {"resume": args.resume, "count": args.placements}
-    if args.scene:
+    if scene:
         from lrfcal_lib.acquire.stations import Stations
         from lrfcal_lib.calibrate.calibration_file import load_calibration
 
         rig = None
-        if args.calibration is not None:
-            rig = load_calibration(args.calibration)
-        options["guide"] = Stations(args.stations or 1, rig)
-    elif args.stations or args.calibration:
+        if calibration is not None:
+            rig = load_calibration(calibration)
+        options["guide"] = Stations(stations or 1, rig)
+    elif stations or calibration:
         raise ValueError("--stations and --calibration are for a scene: add --scene")
-    return main(args.rig_file, args.session, **options)
+    return main(rig_file, session, **options)
 
 
-# what a verb does: its exit code or None; what another verb needs is not imported
+# what a verb does with what its parser reads: its exit code or None; what another verb needs is not
+# imported
 VERBS = {
     "import": import_recording,
     "check": check,
     "simulate": simulate,
-    "calibrate": use_sessions,
+    "calibrate": calibrate,
     "compare": compare,
-    "reconstruct": use_sessions,
-    "merge": use_sessions,
+    "reconstruct": reconstruct,
+    "merge": merge,
     "measure": measure,
     "record": record,
     "emulate": emulate,
@@ -305,7 +315,13 @@ def _add_rigs(verbs):
         action="store_true",
         help="go on with a session; finished placements stay",
     )
-    add("--placements", type=how_many, metavar="N", help="record N placements of the plan")
+    add(
+        "--placements",
+        dest="count",
+        type=how_many,
+        metavar="N",
+        help="record N placements of the plan",
+    )
     add("--scene", action="store_true", help="record a scene instead of the plan's boards")
     add("--stations", type=how_many, metavar="N", help="of the scene (default 1)")
     add("--calibration", help="calibration.json of the rig: plans the images of the scene")
@@ -416,9 +432,10 @@ def main(argv=None):
         Ctrl-C. ``record`` has its own: 2 after a message that says what to do; ``calibrate`` has 3
         where the verdict is 'no'.
     """
-    args = parser().parse_args(argv)
+    options = vars(parser().parse_args(argv))
+    work = VERBS[options.pop("verb")]
     try:
-        return VERBS[args.verb](args) or 0
+        return work(**options) or 0
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

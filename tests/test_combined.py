@@ -20,7 +20,13 @@ def boards(excess, count=40, size=1.0):
             for name, length in TRUE.items()
         }
         found[placement] = (
-            MeasuredBoard(np.eye(4), {}, {}, lengths, sigma=dict.fromkeys(lengths, SIGMA)),
+            MeasuredBoard(
+                np.eye(4),
+                np.zeros((0, 3)),
+                {},
+                lengths,
+                sigma=dict.fromkeys(lengths, SIGMA),
+            ),
             frozenset(),
         )
     return found

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from holds_draws import ROOM, true_rig
 
-from lrfcal_lib.calibrate.cloud import ROWS, Cloud
+from lrfcal_lib.calibrate.cloud import COLUMNS, Cloud
 from lrfcal_lib.measure.creases import EDGE, Sights, creases_of
 from lrfcal_lib.measure.features import fit_feature
 from lrfcal_lib.session.read import open_session
@@ -27,7 +27,7 @@ def corner(rig, seed, thick=0.0, high=0.0):
     floor[:, 2] += rng.normal(0, NOISE, len(x))
     wall[:, 1] += rng.normal(0, NOISE, len(x))
     points = np.concatenate([floor, wall])
-    values = dict.fromkeys(ROWS, np.zeros(len(points)))
+    values = dict.fromkeys(COLUMNS, np.zeros(len(points)))
     values["range"] = np.linalg.norm(points, axis=1)
     values["bearing"] = np.arctan2(points[:, 0], points[:, 1])
     cloud = Cloud(**values | {"points": points, "normals": np.zeros_like(points)})
@@ -56,7 +56,7 @@ def test_a_crease_is_where_readings_beside_it_are(rig, thick):
 def test_surfaces_that_do_not_reach_each_other_have_no_crease(rig):
     creases = corner(rig, 1)
     assert creases.off.shape == (len(creases.points), 2, 3)
-    cloud = Cloud(**{name: np.zeros((0, 3)) for name in ("points", "normals", *ROWS)})
+    cloud = Cloud(**{name: np.zeros((0, 3)) for name in ("points", "normals", *COLUMNS)})
     assert len(creases_of(cloud, [], np.zeros(0, int)).points) == 0
 
 

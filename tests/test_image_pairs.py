@@ -9,7 +9,7 @@ import pytest
 from holds_draws import ROOM, true_rig
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.calibrate.cloud import ROWS, Cloud
+from lrfcal_lib.calibrate.cloud import COLUMNS, Cloud
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.measure import image_pairs
 from lrfcal_lib.measure.image_pairs import clear_places, pairs_pull
@@ -70,7 +70,7 @@ def scanned(columns):
     for low, high in columns:
         x = COLUMN * ray[:, 0]
         distance[(x > low) & (x < high)] = COLUMN
-    values = dict.fromkeys(ROWS, np.zeros(len(ray)))
+    values = dict.fromkeys(COLUMNS, np.zeros(len(ray)))
     values["points"] = ray * distance[:, None]
     values["normals"] = np.tile([0.0, -1.0, 0.0], (len(ray), 1))
     return Cloud(**values | {"bearing": bearing.ravel(), "pitch": pitch.ravel()})

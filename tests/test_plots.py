@@ -88,7 +88,7 @@ def test_measured_edges_lie_on_the_rendered_corners(ax):
         "bc": np.array([0.3, 0.0]),
         "ca": np.array([0.0, 0.4]),
     }
-    measured = MeasuredBoard(T, {}, corners, {"bc": 0.499})
+    measured = MeasuredBoard(T, np.zeros((0, 3)), corners, {"bc": 0.499})
     rig.measured_edges(
         ax, measured, {"ab": 0.3, "bc": 0.5, "ca": 0.4}, IDENTITY, (100, 120), 150
     )

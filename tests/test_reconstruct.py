@@ -278,7 +278,7 @@ def test_blocks_are_the_whole(monkeypatch, tmp_path):
     monkeypatch.setattr("lrfcal_lib.calibrate.reconstruct.KEPT", 36 * len(BEARINGS))
     blocks = list(reconstruct(noisy, views, STILL, AS_RECORDED, lrf=LRF))
     assert len(blocks) == 6
-    for name in clouds.ROWS:
+    for name in clouds.COLUMNS:
         np.testing.assert_allclose(
             getattr(clouds.join(blocks), name),
             getattr(at_once, name),

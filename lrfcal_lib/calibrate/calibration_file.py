@@ -17,6 +17,7 @@ from lrfcal_lib.session.files import SessionError, naming, read_json
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import (
     Endless,
+    LensStated,
     LrfInfo,
     Positive,
     from_json,
@@ -89,18 +90,12 @@ class PlatformWritten(BaseModel):
     axis_covariance: Annotated[np.ndarray, rows(4, 4)]
 
 
-class LensWritten(BaseModel):
+class LensWritten(LensStated):
     """What ``CameraModel(**lens)`` takes; without bound where nothing has determined it."""
 
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
-    fx: Positive
-    fy: Positive
-    cx: FiniteFloat
-    cy: FiniteFloat
-    distortion: Annotated[np.ndarray, rows(5)]
-    covariance: Annotated[np.ndarray, rows(9, 9)] | None
-    rms_px: FiniteFloat | None
+    covariance: Annotated[np.ndarray, rows(9, 9)] | None  # type: ignore[assignment]
 
 
 class CameraWritten(BaseModel):
@@ -305,7 +300,7 @@ def require_same_rig(rig: CalibratedRig, other: Session | CalibratedRig) -> None
     known = set(rig.cameras)
     recorded = set(other.cameras)
     differences = []
-    if recorded and not (known <= recorded or recorded <= known):
+    if not (known <= recorded or recorded <= known):
         differences.append(f"its cameras are {sorted(recorded)}, not {sorted(known)}")
     expected = _facts(rig)
     for what, value in _facts(other).items():

@@ -1,8 +1,9 @@
 """The tilt axis and the cameras, each by itself, from observations alone: no session is needed."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -116,15 +117,15 @@ def calibrate_platform(
         Where the platform is neither stated nor determined, 'combined' is an assumption, and so
         named in `problems`.
     """
-    ways: dict[str, tuple[str, Callable[..., PlatformSolution]]] = {
-        "projected_printed": ("last_beam", partial(solve_projected, printed=True)),
-        "projected_last_beam": ("last_beam", solve_projected),
-        "line_3d": ("half_step", partial(solve_platform, sigma_pitch=sigma_pitch)),
-    }
+    ways = [
+        ("projected_printed", "last_beam", partial(solve_projected, printed=True)),
+        ("projected_last_beam", "last_beam", partial(solve_projected)),
+        ("line_3d", "half_step", partial(solve_platform, sigma_pitch=sigma_pitch)),
+    ]
     solutions = {}
     axes = {}
     problems = []
-    for method, (variant, solve) in ways.items():
+    for method, variant, solve in ways:
         try:
             solution = solve(observations[variant], T_stated)
         except DegenerateGeometry as error:
@@ -147,7 +148,7 @@ def calibrate_platform(
 
 def calibrate_cameras(
     observations: Mapping[tuple[str, str], CameraObservations],
-    methods: Iterable[str] | None = None,
+    methods: Iterable[str] = METHODS,
 ) -> tuple[dict[tuple[str, str], Solution], list[Problem]]:
     """Calibrate every camera by several methods.
 
@@ -155,7 +156,7 @@ def calibrate_cameras(
     ----------
     observations : dict of (str, str) to CameraObservations
         By camera and edge-point variant.
-    methods : iterable of str, optional
+    methods : iterable of str
         Of :data:`lrfcal_lib.solvers.METHODS`; all by default.
 
     Returns
@@ -168,15 +169,12 @@ def calibrate_cameras(
     solutions = {}
     problems = []
     cameras = dict.fromkeys(camera for camera, _ in observations)
-    for camera in cameras:
-        for method in METHODS if methods is None else methods:
-            variant = row_of(method).variant
-            try:
-                solutions[camera, method] = solve_camera(
-                    observations[camera, variant], method
-                )
-            except DegenerateGeometry as error:
-                problems.append(_no_result(Stage.CAMERAS, method, str(error), camera))
+    for camera, method in product(cameras, methods):
+        variant = row_of(method).variant
+        try:
+            solutions[camera, method] = solve_camera(observations[camera, variant], method)
+        except DegenerateGeometry as error:
+            problems.append(_no_result(Stage.CAMERAS, method, str(error), camera))
     return solutions, problems
 
 
@@ -216,7 +214,7 @@ def axis_from_chart(parameters: np.ndarray) -> geometry.TiltAxis:
     Undoes :func:`lrfcal_lib.fit.axis_chart.chart_parameters`.
     """
     rise, sideways = np.tan(parameters[:2])
-    y, z = -parameters[2:]
+    away = parameters[2:]
     along = np.array([1.0, -sideways, rise])
-    foot = np.array([sideways * y - rise * z, y, z])
+    foot = np.r_[along[1:] @ away, -away]
     return geometry.TiltAxis(unit_vector(along), foot)

@@ -1,7 +1,7 @@
 """Clouds of coloured points, and PLY files of them."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -75,10 +75,7 @@ class Cloud:
 
     def rows(self, index: np.ndarray | slice) -> "Cloud":
         """Some of the points."""
-        return replace(self, **{name: getattr(self, name)[index] for name in ROWS})
-
-
-ROWS = tuple(field.name for field in fields(Cloud) if field.name != "removed")
+        return replace(self, **{name: getattr(self, name)[index] for name in COLUMNS})
 
 
 def join(clouds: Iterable[Cloud]) -> Cloud:
@@ -94,7 +91,7 @@ def join(clouds: Iterable[Cloud]) -> Cloud:
     """
     clouds = list(clouds)
     columns = {
-        name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in ROWS
+        name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in COLUMNS
     }
     return Cloud(**columns, removed=sum(cloud.removed for cloud in clouds))
 

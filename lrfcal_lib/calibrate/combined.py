@@ -13,7 +13,7 @@ import pandas as pd
 from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.joint_observations import observe_joint
-from lrfcal_lib.calibrate.observe import LEAST_STRETCH, named_sides
+from lrfcal_lib.calibrate.observe import sides_in_cloud
 from lrfcal_lib.calibrate.outline import (
     MeasuredBoard,
     bounded,
@@ -26,8 +26,6 @@ from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.model.kinematics import SourceFrame
-from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import ImageEdge
 from lrfcal_lib.preprocess.pose_from_lines import line_misses
 from lrfcal_lib.solvers import joint_model, joint_residuals
@@ -52,14 +50,14 @@ ITERATIONS = 30
 TOLERANCE = 0.02  # sigma
 
 
-class ImageSide(NamedTuple):
-    """A side of the board in an image: the row of the image's view, the number of the side, the
-    edge and its lens.
+class ImageSides(NamedTuple):
+    """Sides of the board in an image: the row of the image's view, numbers (n,) of the sides, their
+    edges and the lens.
     """
 
     row: int
-    number: int
-    edge: ImageEdge
+    numbers: np.ndarray
+    edges: tuple[ImageEdge, ...]
     model: CameraModel
 
 
@@ -83,7 +81,7 @@ class Case:
         Of this placement alone.
     whitener : ndarray, shape (c, c)
         Of the calibration that has not seen the placement.
-    images : list of ImageSide
+    images : list of ImageSides
     middle : ndarray, shape (E, 2)
         Points of the sides about which they turn, metres.
     edges : tuple of str
@@ -94,7 +92,7 @@ class Case:
     data: joint_model.JointData
     unknowns: joint_model.Unknowns
     whitener: np.ndarray
-    images: list[ImageSide]
+    images: list[ImageSides]
     middle: np.ndarray
     edges: tuple[str, ...]
     start: State
@@ -145,8 +143,7 @@ def combined_outlines(
                 del cases[placement]
                 continue
             cases[placement] = replace(case, start=state)
-            if case.images:
-                block = image_block(state, case, scale)
+            for block in image_blocks(state, case, scale):
                 J = block.jacobian
                 square += np.sum(block.residuals**2)
                 freedom += np.sum(1 - np.vecdot(J @ covariance, J))
@@ -183,37 +180,28 @@ def case_of(joint, observations, placement):
     """
     prepared = joint.prepared
     solution = joint.without.get(placement, joint.solution)
-    edges = tuple(prepared.board.edges)
-    source = SourceFrame(
-        solution.T_head_lrf,
-        "platform",
-        placement=placement,
-        corrections=solution.corrections,
+    edges = prepared.board.edges
+    # where a sweep begins and ends may be where a cloud was cut
+    face, along, _ = sides_in_cloud(
+        prepared, placement, "half_step", solution.T_head_lrf, solution.corrections
     )
-    p_lrf, pitch, _ = face_points(prepared.scans[placement])
-    face = source.points(p_lrf, pitch)
-    sides = edges_in_cloud(solution, prepared, placement, face)
-    for side in named_sides(prepared, placement, stretch=LEAST_STRETCH):
-        # where a sweep begins and ends may be where a cloud was cut
-        if side.name not in sides and not side.across:
-            sides[side.name] = source.points(side.points, side.pitch)
-    rough = measure_board(face, sides, edges)
-    board = rough.T_platform_plane
-    lines = np.array([rough.lines.get(name, [1.0, 0.0, -1.0]) for name in edges])
-    lines *= -np.where(lines[:, 2:] > 0, 1.0, -1.0)  # outwards: the face is in the middle
     obs = observations.with_cameras(solution.observations.cameras).select([placement])
     images = []
     for row, number in enumerate(obs.view_camera):
         camera = obs.cameras[number]
-        for edge in prepared.views[camera][placement].edges:
-            side = edges.index(edge.name)
-            images.append(ImageSide(row, side, edge, prepared.models[camera]))
+        visible = prepared.views[camera][placement].edges
+        if visible:
+            sides_shown = np.array([edges.index(edge.name) for edge in visible])
+            images.append(ImageSides(row, sides_shown, visible, prepared.models[camera]))
+    sides = along | edges_in_cloud(solution, obs, images, face)
+    rough = measure_board(face, sides, edges)
+    board = rough.T_platform_plane
+    lines = np.where(np.isnan(rough.lines), [1.0, 0.0, -1.0], rough.lines)
+    lines *= -np.copysign(1.0, lines[:, 2:])  # outwards: the face is in the middle
     obs = obs.keep(beam=np.isin(obs.beam_edge, [edges.index(name) for name in sides]))
-    state = replace(
-        solution.state,
-        boards=board[None],
-        sweeps=np.zeros((1, 2)),
-        sides=np.zeros((1, len(edges) + 1)),
+    moving = solution.state
+    state = joint_model.undisturbed(
+        obs, moving.head, moving.cameras, moving.sensor, board[None]
     )
     whitener = whitener_of(solution.solution.trusted)
     return Case(
@@ -227,24 +215,21 @@ def case_of(joint, observations, placement):
     )
 
 
-def edges_in_cloud(solution, prepared, placement, face):
-    """Where lines of sight of image edges meet the plane of a face (n, 3), under a JointSolution:
-    points (k, 3) by edge, platform frame, metres.
+def edges_in_cloud(solution, obs, images, face):
+    """Where lines of sight of the edges of ImageSides meet the plane of a face (n, 3), under a
+    JointSolution: points (k, 3) by edge, platform frame, metres.
     """
     plane = plane_frame(face)
     normal = plane[:, 2]
     sides: dict = {}
-    for camera, views in prepared.views.items():
-        view = views.get(placement)
-        if view is None or camera not in solution.transforms:
-            continue
-        pitch = solution.corrections.pitch(placement, view.pitch)
+    for image in images:
+        pitch = solution.corrections.pitch(obs.placements[0], obs.view_pitch[image.row])
+        camera = obs.cameras[obs.view_camera[image.row]]
         T_platform_camera = solution.camera_at(camera, pitch).inv()
-        lens = prepared.models[camera]
         centre = T_platform_camera.translation
         height = (plane[:, 3] - centre) @ normal
-        for edge in view.edges:
-            sight = T_platform_camera.rotation.apply(lens.sights(edge.ends))
+        for edge in image.edges:
+            sight = T_platform_camera.rotation.apply(image.model.sights(edge.ends))
             points = centre + (height / (sight @ normal))[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
     return {name: np.concatenate(points) for name, points in sides.items()}
@@ -290,25 +275,24 @@ def blocks_of(state, case, scale):
     named = joint_residuals.named_blocks(state.joint, data, unknowns)
     if "beam" in named:
         beams = named["beam"]
-        by_sides = side_columns(beams.jacobian, case.data.beam["edge"], state, case)
-        jacobian = np.concatenate([beams.jacobian, by_sides], axis=-1)
+        jacobian = with_sides(beams.jacobian, case.data.beam["edge"], state, case)
         named["beam"] = replace(beams, jacobian=jacobian)
     # no view and nothing that is usual: image edges and the calibration say it
     blocks = [named[name] for name in ("face", "beam", "sweep", "side") if name in named]
-    if case.images:
-        blocks.append(image_block(state, case, scale))
-    blocks.append(_rows(case.whitener @ state.change, case.whitener))
+    blocks += image_blocks(state, case, scale)
     board = state.joint.boards[0]
-    held = block_diag(
-        np.zeros((0, unknowns.shared)),
+    known = block_diag(
+        case.whitener,
         STILL * board[None, :, 2],  # turn of board and sides together
         STILL * board[:, :2].T,  # their shift
         np.zeros((0, unknowns.own - geometry.POSE)),
         np.diag(np.tile(FAR, len(case.middle))),
     )
-    blocks.append(_rows(np.zeros(len(held)), held))
+    off = np.zeros(len(known))
+    off[: unknowns.shared] = case.whitener @ state.change
+    blocks.append(_rows(off, known))
     for block in blocks:
-        missing = held.shape[1] - block.jacobian.shape[-1]
+        missing = known.shape[1] - block.jacobian.shape[-1]
         jacobian = np.pad(block.jacobian, {-1: (0, missing)})
         yield replace(block, jacobian=jacobian)
 
@@ -318,31 +302,27 @@ def _rows(residuals, jacobian):
     return Block(residuals[None], jacobian[None])
 
 
-def side_columns(J, edge, state, case):
-    """Derivatives by shifts outwards and turns of the sides (..., 2 E), from those by the board
-    that holds them.
+def with_sides(J, edge, state, case):
+    """Derivatives (..., k), and by shifts outwards and turns of the sides (..., k + 2 E), from
+    those by the board that holds them.
 
-    `J` (..., k) are rows about the side numbers `edge` (...).
+    `J` are rows about the side numbers `edge` (...).
     """
     R = state.joint.boards[0, :, :3]
-    start = case.unknowns.columns["board"].start
-    turn = J[..., start : start + 3]
-    shift = J[..., start + 3 : start + 6]
     outward = state.lines[:, :2] @ R[:, :2].T
     arm = case.middle @ R[:, :2].T
-    by_shift = np.vecdot(shift, outward[edge])
-    normal = R[:, 2]
-    along = np.cross(normal, arm)  # the way of a side's middle as it turns
-    by_turn = np.vecdot(turn, normal) - np.vecdot(shift, along[edge])
-    by_both = np.stack([by_shift, by_turn], axis=-1)
+    motions = np.zeros((len(arm), 2, geometry.POSE))  # of the board that take a side along
+    motions[:, 0, 3:] = outward
+    motions[:, 1, :3] = R[:, 2]
+    motions[:, 1, 3:] = np.cross(arm, R[:, 2])
+    by_all = J[..., case.unknowns.columns["board"]] @ np.concatenate(motions).T
     mine = edge[..., None] == np.arange(len(arm))
-    columns = np.where(mine[..., None], by_both[..., None, :], 0.0)
-    return columns.reshape(*edge.shape, -1)
+    return np.concatenate([J, by_all * np.repeat(mine, 2, axis=-1)], axis=-1)
 
 
-def image_block(state, case, scale):
-    """Distances (undistorted pixels) of two points of a side from the line in which an image
-    shows it, whitened.
+def image_blocks(state, case, scale):
+    """Distances (undistorted pixels) of two points of each side from the line in which an image
+    shows it, whitened: a Block for each image.
     """
     view = case.data.view
     off = joint_residuals.view_block(state.joint, case.data, case.unknowns).residuals
@@ -351,20 +331,15 @@ def image_block(state, case, scale):
     data = replace(case.data, view=view | {"pose": poses})
     J = joint_residuals.view_block(state.joint, data, case.unknowns).jacobian
     by_all = J.reshape(-1, 6, J.shape[-1])
-    residuals = []
-    jacobians = []
     for image in case.images:
-        a, b, c = state.lines[image.number]
-        flat = [-c * a, -c * b] + np.outer(PLACES, [-b, a])
-        places = np.insert(flat, 2, 0.0, axis=1)
-        misses, by_pose = line_misses(
-            [image.edge], places[None], image.model, poses[0, image.row]
-        )
-        J = by_pose[0] @ by_all[image.row]
-        by_sides = side_columns(J, np.full(2, image.number), state, case)
-        residuals.append(misses[0] / scale)
-        jacobians.append(np.hstack([J, by_sides]) / scale)
-    return _rows(np.concatenate(residuals), np.concatenate(jacobians))
+        a, b, c = state.lines[image.numbers].T[..., None]
+        x = -c * a - b * PLACES
+        y = -c * b + a * PLACES
+        places = np.stack([x, y, np.zeros_like(x)], axis=-1)
+        misses, by_pose = line_misses(image.edges, places, image.model, poses[0, image.row])
+        J = by_pose @ by_all[image.row]
+        jacobian = with_sides(J, image.numbers[:, None], state, case)
+        yield _rows(misses.ravel() / scale, np.concatenate(jacobian) / scale)
 
 
 def _measured(case, state, covariance):
@@ -374,7 +349,9 @@ def _measured(case, state, covariance):
     edges = case.edges
     beam = case.data.beam
     beams = np.bincount(beam["edge"][beam["used"]], minlength=len(edges))
-    shown = np.isin(np.arange(len(edges)), [image.number for image in case.images])
+    shown = np.isin(
+        np.arange(len(edges)), [n for image in case.images for n in image.numbers]
+    )
     scanned = (beams >= FEWEST_CELLS) & ~shown
     good = scanned | shown
     if not good.any():

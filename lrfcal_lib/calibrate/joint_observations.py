@@ -40,7 +40,7 @@ def observe_joint(
         placements=np.array(list(scans), int),
         direction=np.array([scan.sweep.direction for scan in scans.values()], int),
         middle=np.array([np.mean(scan.sweep.pitch) for scan in scans.values()]),
-        edges=tuple(prepared.board.edges),
+        edges=prepared.board.edges,
         # where nobody knows them, no beam is named after the sides of the printed squares
         corners=prepared.board.outline(),
         cameras=tuple(views),

@@ -1,5 +1,7 @@
 """Name the sides that scans cross after the edges of the board, which the images place there."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
@@ -21,9 +23,7 @@ NAME_ANGLE = np.deg2rad(3.0)
 TURNED = 3.0  # sigma by which noise may turn the line through a side
 
 
-def name_sides(
-    prepared: Prepared,
-) -> tuple[dict[int, dict[int, str]], dict[int, dict[int, DroppedSide]], list[Problem]]:
+def name_sides(prepared: Prepared) -> Prepared:
     """Name the sides that scans cross: the nearest edge of the board.
 
     The cameras' poses come from the planes alone (Zhang and Pless), which needs no names. Sides
@@ -36,16 +36,15 @@ def name_sides(
 
     Returns
     -------
-    names, dropped : dict of int to dict of int to str, or to DroppedSide
-        By placement and side number: edge names, and why sides have none.
-    problems : list of Problem
-        Of :func:`rough_poses`, and of sides without a name.
+    Prepared
+        With `names`, `dropped`, and the problems of :func:`rough_poses` and of sides without a
+        name.
     """
     rough, problems = rough_poses(prepared)
     names: dict = {}
     dropped: dict = {}
     if prepared.board.corners is None:
-        return names, dropped, problems
+        rough = {}
     for camera, T_camera_source in rough.items():
         for placement, view in prepared.posed(camera).items():
             if placement not in prepared.scans or placement in names:
@@ -61,7 +60,8 @@ def name_sides(
                 problems.append(
                     Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement)
                 )
-    return names, dropped, problems
+    every = (*prepared.problems, *problems)
+    return replace(prepared, names=names, dropped=dropped, problems=every)
 
 
 def rough_poses(prepared: Prepared) -> tuple[dict[str, RigidTransform], list[Problem]]:

@@ -65,20 +65,21 @@ def observe(
     posed = prepared.posed(camera)
     rule = "last_beam" if variant == ONE_SCAN else variant
     on_faces = []
-    crossed = []
+    crossed: list = []
+    corners: list = []
     for placement, scan in prepared.scans.items():
         if placement not in views:
             continue
+        view = views[placement]
         source = source_of(prepared, camera, placement, T_head_lrf, corrections)
         if placement in posed and faces:
             on_faces.append(_face(source, scan, faces))
         sides = named_sides(prepared, placement, rule)
         if variant == ONE_SCAN:
-            sides = _one_scan_line(prepared.board.features, views[placement], sides)
-        crossed += _crossings(prepared, views[placement], source, sides, crossings)
-    corners: Iterable[dict] = ()
-    if faces:
-        corners = _corners(prepared, camera, rule, T_head_lrf)
+            sides = _one_scan_line(prepared.board.features, view, sides)
+        crossed += _crossings(prepared, view, source, sides, crossings)
+        if faces and placement in prepared.names:
+            corners += _corners(prepared, view, source, rule)
     pattern = prepared.pattern_points
     model = prepared.models[camera]
     on_base = prepared.session.cameras[camera].mount == "platform"
@@ -146,6 +147,7 @@ def outline_of(
     placement: int,
     variant: str = "half_step",
     T_head_lrf: RigidTransform | None = None,
+    corrections: Corrections = AS_RECORDED,
 ) -> tuple[MeasuredBoard, frozenset[str]]:
     """Measure the board's outline in the cloud of a placement by least squares.
 
@@ -158,6 +160,7 @@ def outline_of(
     variant : {'half_step', 'last_beam'}
     T_head_lrf : RigidTransform, optional
         The session's own platform when left out.
+    corrections : Corrections
 
     Returns
     -------
@@ -171,17 +174,33 @@ def outline_of(
     DegenerateGeometry
         If the sweep does not cross enough scan lines to span a plane.
     """
-    T_head_lrf = platform_of(prepared, T_head_lrf)
-    source = SourceFrame(T_head_lrf, "platform", placement=placement)
-    p_lrf, pitch, _ = face_points(prepared.scans[placement])
-    sides = {}
-    across = set()
-    for side in named_sides(prepared, placement, variant, LEAST_STRETCH):
-        sides[side.name] = source.points(side.points, side.pitch)
-        if side.across:
-            across.add(side.name)
-    board = measure_board(source.points(p_lrf, pitch), sides, prepared.board.edges)
+    face, along, across = sides_in_cloud(
+        prepared, placement, variant, platform_of(prepared, T_head_lrf), corrections
+    )
+    board = measure_board(face, along | across, prepared.board.edges)
     return board, frozenset(across)
+
+
+def sides_in_cloud(
+    prepared: Prepared,
+    placement: int,
+    variant: str,
+    T_head_lrf: RigidTransform,
+    corrections: Corrections,
+) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Points of a board's face and, by name, of its sides of which enough is seen: those found
+    along the scan lines, and across them; platform frame, metres.
+    """
+    source = SourceFrame(
+        T_head_lrf, "platform", placement=placement, corrections=corrections
+    )
+    p_lrf, pitch, _ = face_points(prepared.scans[placement])
+    along = {}
+    across = {}
+    for side in named_sides(prepared, placement, variant, LEAST_STRETCH):
+        sides = across if side.across else along
+        sides[side.name] = source.points(side.points, side.pitch)
+    return source.points(p_lrf, pitch), along, across
 
 
 def stack(prefix: str, parts: Iterable[dict]) -> dict[str, Any]:
@@ -412,39 +431,38 @@ def _crossings(prepared, view, source, sides, count):
         }
 
 
-def _corners(prepared, camera, variant, T_head_lrf) -> Iterator[dict]:
+def _corners(prepared, view, source, variant):
     """Corners of the outline that the cloud and the image can both name: where two fitted edges
     meet.
     """
+    placement = source.placement
+    if len(prepared.edges[placement][variant]) == 1:
+        return
+    board, _ = outline_of(
+        prepared, placement, variant, source.T_head_lrf, source.corrections
+    )
     names = prepared.board.edges
-    named = prepared.names.keys() & prepared.scans.keys()
-    for placement, view in prepared.views[camera].items():
-        if placement not in named or len(prepared.edges[placement][variant]) == 1:
+    for name in board.corners:
+        before = names[names.index(name) - 1]
+        edge = view.edge(name)
+        previous = view.edge(before)
+        if edge is None or previous is None:
             continue
-        board, _ = outline_of(prepared, placement, variant, T_head_lrf)
-        T_source_platform = source_of(
-            prepared, camera, placement, T_head_lrf
-        ).T_source_platform
-        for name in board.corners:
-            before = names[names.index(name) - 1]
-            edge = view.edge(name)
-            previous = view.edge(before)
-            if edge is None or previous is None:
-                continue
-            corner = board.corner_point(name)
-            _, y, z = np.column_stack([corner, board.T_platform_plane[:, 3]])
-            pitch, middle = np.arctan2(z, y)
-            sigma = prepared.pitch_noise.sigma(pitch, middle)
-            error = T_source_platform.rotation.apply(sigma * np.cross(TILT_AXIS, corner))
-            # not averaged down: neighbours share errors
-            scatter = max(board.scatter[name], board.scatter[before])
-            yield {
-                "points": T_source_platform.apply(corner)[None],
-                "covariance": [scatter**2 * np.eye(3) + dyads(error)],
-                "pixels": [corners_of_lines(np.stack([previous.line, edge.line]))[1]],
-                "sigma_px": np.sqrt(edge.covariance[0, 0] + previous.covariance[0, 0]),
-                "placement": placement,
-            }
+        corner = board.corner_point(name)
+        _, y, z = np.column_stack([corner, board.T_platform_plane[:, 3]])
+        pitch, middle = np.arctan2(z, y)
+        sigma = prepared.pitch_noise.sigma(pitch, middle)
+        T_source_platform = source.T_source_platform
+        error = T_source_platform.rotation.apply(sigma * np.cross(TILT_AXIS, corner))
+        # not averaged down: neighbours share errors
+        scatter = max(board.scatter[name], board.scatter[before])
+        yield {
+            "points": T_source_platform.apply(corner)[None],
+            "covariance": [scatter**2 * np.eye(3) + dyads(error)],
+            "pixels": [corners_of_lines(np.stack([previous.line, edge.line]))[1]],
+            "sigma_px": np.sqrt(edge.covariance[0, 0] + previous.covariance[0, 0]),
+            "placement": placement,
+        }
 
 
 def _feature_sides(sides):

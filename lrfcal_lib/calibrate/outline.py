@@ -20,16 +20,17 @@ class MeasuredBoard:
     ----------
     T_platform_plane : ndarray, shape (3, 4)
         Origin in the middle of the face, z along the normal towards the sensor.
-    lines, corners : dict of str to ndarray, shapes (3,) and (2,)
-        Sides that were measured, ``a x + b y + c = 0`` in the plane, metres, and where an edge
-        meets the one before it.
+    lines : ndarray, shape (E, 3)
+        Sides, ``a x + b y + c = 0`` in the plane, metres, NaN where one was not measured.
+    corners : dict of str to ndarray, shape (2,)
+        Where an edge meets the one before it.
     lengths, scatter, sigma : dict of str to float
         Metres: edges of which both ends are measured; rms distances of points from the lines (least
         squares only); standard deviations of the lengths, by least squares from that scatter alone.
     """
 
     T_platform_plane: np.ndarray
-    lines: dict[str, np.ndarray]
+    lines: np.ndarray
     corners: dict[str, np.ndarray]
     lengths: dict[str, float]
     scatter: dict[str, float] = field(default_factory=dict)
@@ -129,7 +130,7 @@ def bounded(
     sigma = np.sqrt(np.vecdot(J @ covariance, J))
     return MeasuredBoard(
         T_platform_plane=pose,
-        lines=_known(edges, lines),
+        lines=lines,
         corners=_known(edges, corners),
         lengths=_known(edges, lengths.tolist()),
         sigma=_known(edges, sigma.tolist()),
@@ -144,10 +145,9 @@ def _known(edges, values):
 
 def moved_lines(lines: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Lines (s, 3) shifted outwards and turned about points (s, 2) of them by steps (..., s, 2)."""
-    cosine = np.cos(step[..., 1])
-    sine = np.sin(step[..., 1])
-    a = lines[:, 0]
-    b = lines[:, 1]
-    normals = np.stack([cosine * a - sine * b, sine * a + cosine * b], axis=-1)
-    at = line_distance(middle, lines) - step[..., 0] - np.vecdot(normals, middle)
-    return np.concatenate([normals, at[..., None]], axis=-1)
+    normals = lines[:, :2]
+    along = normals[:, ::-1] * [-1, 1]
+    turn = step[..., 1:]
+    turned = np.cos(turn) * normals + np.sin(turn) * along
+    at = line_distance(middle, lines) - step[..., 0] - np.vecdot(turned, middle)
+    return np.concatenate([turned, at[..., None]], axis=-1)

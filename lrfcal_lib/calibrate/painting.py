@@ -160,17 +160,18 @@ class Painter:
         if len(self.views) < 2:
             return
         darkest, brightest = LEVELS
-        logs = np.full((len(self.views), len(points)), np.nan)
-        radii = np.zeros(logs.shape)
+        logs = []
+        radii = []
         for k, view in enumerate(self.views):
             colors, _, _ = self.paint(points, normals, slice(k, k + 1))
             grey = colors.mean(axis=1)
-            logs[k] = np.log(np.where((grey > darkest) & (grey < brightest), grey, np.nan))
+            known = (grey > darkest) & (grey < brightest)
+            logs.append(np.log(np.where(known, grey, np.nan)))
             model = view.model
             uv = project(view.T_camera_platform.apply(points), model)
             corner = np.sum(model.size**2) / 4
-            radii[k] = np.sum((uv - [model.cx, model.cy]) ** 2, axis=1) / corner
-        gain, falloff = _compared(logs, radii)
+            radii.append(np.sum((uv - [model.cx, model.cy]) ** 2, axis=1) / corner)
+        gain, falloff = _compared(np.array(logs, float), np.array(radii))
         self.exposures[:, 0] = gain - gain.mean()
         self.exposures[:, 1] = min(falloff, 0.0)
 

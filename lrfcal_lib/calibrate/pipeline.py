@@ -3,6 +3,7 @@ everything at once.
 """
 
 import operator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from functools import partial
@@ -25,8 +26,8 @@ from lrfcal_lib.calibrate.observe import (
     observe,
     platform_observations,
 )
-from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig, joint_rig
-from lrfcal_lib.calibrate.rig_uncertainty import uncertainty_one_by_one
+from lrfcal_lib.calibrate.rig import CalibratedCamera, CalibratedRig
+from lrfcal_lib.calibrate.rig_uncertainty import joint_uncertainty, uncertainty_one_by_one
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior, Solution
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import DegenerateGeometry
@@ -160,10 +161,6 @@ class Calibration:
         CalibratedRig
         """
         session = self.prepared.session
-        axis = self.platform.axes[self.platform.axis_with(method)]
-        if self.joint is not None and method == "joint":
-            rig = joint_rig(self.joint.solution, self.prepared.models)
-            return replace(rig, axis=axis, lrf=session.lrf, session=session.name)
         solved = self.cameras(method)
         cameras = {
             camera: CalibratedCamera(
@@ -173,18 +170,24 @@ class Calibration:
             )
             for camera, solution in solved.items()
         }
-        noise = [scan.sigma_range for scan in self.prepared.scans.values()]
-        uncertainty = uncertainty_one_by_one(
-            axis.covariance,
-            solved,
-            admitted_offset=session.lrf.admitted_offset,
-            sweep_sigma=astuple(self.prepared.pitch_noise),
-            range_noise=np.median(noise) if noise else session.lrf.sigma_range,
-        )
+        axis = self.platform.axes[self.platform.axis_with(method)]
+        if self.joint and method == "joint":
+            corrections = self.joint.solution.corrections
+            uncertainty = joint_uncertainty(self.joint.solution)
+        else:
+            corrections = AS_RECORDED
+            noise = [scan.sigma_range for scan in self.prepared.scans.values()]
+            uncertainty = uncertainty_one_by_one(
+                axis.covariance,
+                solved,
+                admitted_offset=session.lrf.admitted_offset,
+                sweep_sigma=astuple(self.prepared.pitch_noise),
+                range_noise=np.median(noise) if noise else session.lrf.sigma_range,
+            )
         return CalibratedRig(
             method=method,
             axis=axis,
-            corrections=AS_RECORDED,
+            corrections=corrections,
             cameras=cameras,
             lrf=session.lrf,
             uncertainty=uncertainty,
@@ -192,13 +195,13 @@ class Calibration:
         )
 
 
-def calibrate(session: Session, methods=None) -> Calibration:
+def calibrate(session: Session, methods: Iterable[str] = METHODS) -> Calibration:
     """All stages: preprocessing, platform, cameras, and the joint estimate of everything.
 
     Parameters
     ----------
     session : Session
-    methods : sequence of str, optional
+    methods : iterable of str
         Of :data:`lrfcal_lib.solvers.METHODS`; all rows that are there when this is called by
         default.
 
@@ -211,7 +214,7 @@ def calibrate(session: Session, methods=None) -> Calibration:
     ValueError
         For a method that is not there.
     """
-    methods = tuple(METHODS if methods is None else methods)
+    methods = tuple(methods)
     if any(row_of(name) is not SHIPPED.get(name) for name in methods):
         return _calibrate.__wrapped__(session, methods)  # a row may change without its name
     return _calibrate(session, methods)
@@ -254,10 +257,7 @@ def prepare(session: Session) -> Prepared:
     Prepared
         Placements that cannot be used are in its `problems`, with their reason.
     """
-    ready = prepare_images(prepare_scans(session))
-    names, dropped, problems = name_sides(ready)
-    every = (*ready.problems, *problems)
-    ready = without(replace(ready, names=names, dropped=dropped, problems=every))
+    ready = without(name_sides(prepare_images(prepare_scans(session))))
     errors = find_pitch_errors(ready)
     if errors is None:
         return ready
@@ -414,7 +414,7 @@ def calibrate_jointly(prepared: Prepared, views=None) -> JointCalibration:
     DegenerateGeometry
         When there is no start value, or most placements contradict each other.
     """
-    observations = observe_joint(prepared, all_views(prepared) if views is None else views)
+    observations = observe_joint(prepared, views or all_views(prepared))
     settings = joint_settings(prepared, observations)
     solution = solve_joint(observations, required=False, **settings)
     return JointCalibration(prepared, solution, settings, {})
@@ -495,7 +495,7 @@ def handed_over(calibration: Calibration) -> str | None:
         could be judged.
     """
     joint = calibration.joint
-    if joint is not None and joint.solution.converged and not joint.solution.unobservable:
+    if joint and joint.solution.converged and not joint.solution.unobservable:
         return "joint"
     half_step = {
         camera: calibration.observations[camera, "half_step"]

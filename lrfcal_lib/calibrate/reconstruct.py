@@ -2,12 +2,12 @@
 in bounded memory.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import RigidTransform
 
@@ -76,14 +76,12 @@ def reconstruct(
     steps = (_pitch_step(sweep), lrf.bearing_step)
     painter = Painter(views, max(steps), BEHIND * lrf.sigma_range)
     blocks_of = partial(_blocks, sweep, steps, T_head_lrf, corrections, lrf, continuous, {})
-    blocks: Iterable[_Block] = blocks_of()
     if sweep.ranges.size <= KEPT:
-        blocks = list(blocks)
-        blocks_of = partial(iter, blocks)
+        blocks_of = partial(iter, list(blocks_of()))
     points = []
     normals = []
     every = max(1, sweep.ranges.size // GAIN_POINTS)
-    for block in blocks:
+    for block in blocks_of():
         painter.hide(block.hiding[np.isfinite(block.hiding).all(axis=-1)])
         # a view would keep the whole block
         points.append(block.points[block.good][::every].copy())
@@ -237,30 +235,23 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     centre = np.sum(points[valid], axis=0) / max(valid.sum(), 1)
     p = np.where(valid[..., None], points - centre, 0.0)
     width = 2 * WINDOW + 1
-
-    def sums(values):
-        """Means over all windows, where nothing is counts as zero."""
-        size = (width, width) + (1,) * (values.ndim - 2)
-        return uniform_filter(values, size, mode="constant")
-
-    share = sums(valid.astype(float))
+    # means over all windows, where nothing is counts as zero
+    means = partial(uniform_filter, size=width, mode="constant", axes=(0, 1))
+    share = means(valid.astype(float))
     whole = np.maximum(share, 0.5 / width**2)[..., None]
-    mean = sums(p) / whole
-    square = sums(dyads(p)) / whole[..., None]
-    spread = square - dyads(mean)
+    spread = means(dyads(p)) / whole[..., None] - dyads(means(p) / whole)
     variances, directions = np.linalg.eigh(spread)
     least, middle, _ = np.moveaxis(variances, -1, 0)
     known = (share > 1 / 3) & (middle > LEAST_SPREAD)
-    rough = np.where(known, np.maximum(least, 0.0), np.inf)
-    normals = np.full(points.shape, np.nan)
-    flattest = np.full(valid.shape, np.inf)
-    lines, beams = map(np.arange, valid.shape)
-    for shift in product((-WINDOW, 0, WINDOW), repeat=2):  # to the middles of the windows
-        line = np.clip(lines + shift[0], 0, lines[-1])
-        window = np.ix_(line, np.clip(beams + shift[1], 0, beams[-1]))
-        flatter = valid & (rough[window] < flattest)
-        flattest[flatter] = rough[window][flatter]
-        normals[flatter] = directions[..., 0][window][flatter]
+    rough = np.where(known, np.maximum(least, 0.0), np.inf).ravel()
+    around = np.pad(np.arange(rough.size).reshape(valid.shape), WINDOW, mode="edge")
+    nine = sliding_window_view(around, (width, width))[..., ::WINDOW, ::WINDOW]
+    nine = nine.reshape(*valid.shape, -1)  # numbers of the windows that hold a point
+    flattest = rough[nine].argmin(axis=-1, keepdims=True)
+    best = np.take_along_axis(nine, flattest, axis=-1)[..., 0]
+    normals = directions[..., 0].reshape(-1, 3)[best]
     away = np.vecdot(normals, points - origins) > 0
     normals[away] *= -1
-    return normals, np.sqrt(np.where(np.isfinite(flattest), flattest, np.nan))
+    sound = valid & np.isfinite(rough[best])
+    normals[~sound] = np.nan
+    return normals, np.sqrt(np.where(sound, rough[best], np.nan))

@@ -21,28 +21,26 @@ from lrfcal_lib.solvers.joint_solution import JointSolution
 COLUMNS = (*AXIS_NAMES, *POSE_NAMES, "range_offset", "pitch_scale", "pitch_by_direction")
 
 
-def rows(*shape: int | None) -> PlainValidator:
-    """How pydantic makes an array of a shape, None where any size will do, of rows of numbers; null
-    is infinite.
+def rows(width: int | None = None, height: int | None = None) -> PlainValidator:
+    """How pydantic makes an array of rows of numbers, of any width and as many as there are unless
+    given; null is infinite.
     """
 
     def array_of(given):
-        """An array (shape) of what a file has."""
+        """An array (height, width) of what a file has."""
         values = np.array(given, float)
         if not len(given):
-            values = np.zeros((0, *shape[1:]))
-        same = [
-            size in (None, found) for size, found in zip(shape, values.shape, strict=False)
-        ]
-        if values.ndim != len(shape) or not all(same):
+            values = np.zeros((0, width))
+        shape = (height or len(given), width or values.shape[-1])
+        if values.shape != shape:
             raise ValueError(f"shape {values.shape} instead of {shape}")
         return np.where(np.isnan(values), np.inf, values)
 
     return PlainValidator(array_of)
 
 
-Square = Annotated[np.ndarray, rows(None, None)]
-Motions = Annotated[np.ndarray, rows(None, len(COLUMNS))]
+Square = Annotated[np.ndarray, rows()]
+Motions = Annotated[np.ndarray, rows(len(COLUMNS))]
 
 
 @dataclass(frozen=True)
@@ -147,20 +145,16 @@ def uncertainty_one_by_one(
     -------
     RigUncertainty
     """
-    names = list(AXIS_NAMES)
-    noise_only = [of_axis]
-    trusted = [of_axis]
-    for camera, solution in solutions.items():
-        names += [f"{camera}_{name}" for name in POSE_NAMES]
-        noise_only.append(solution.covariance[:6, :6])
-        trusted.append(solution.trusted[:6, :6])
-    names.append("range_offset")
+    poses = [f"{camera}_{name}" for camera in solutions for name in POSE_NAMES]
+    names = (*AXIS_NAMES, *poses, "range_offset")
+    noise_only = [solution.covariance[:6, :6] for solution in solutions.values()]
+    trusted = [solution.trusted[:6, :6] for solution in solutions.values()]
     offset = np.array([[admitted_offset**2]])
     nothing = np.zeros((0, len(COLUMNS)))
     return RigUncertainty(
-        names=tuple(names),
-        covariance=block_diag(*noise_only, offset),
-        trusted=block_diag(*trusted, offset),
+        names=names,
+        covariance=block_diag(of_axis, *noise_only, offset),
+        trusted=block_diag(of_axis, *trusted, offset),
         lens=np.zeros((len(names), len(names))),
         unseen_of_cloud=nothing,
         unseen_of_cameras=dict.fromkeys(solutions, nothing),

@@ -18,7 +18,7 @@ from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
 
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
-UNMEASURED = MeasuredBoard(np.eye(4), lines={}, corners={}, lengths={})
+UNMEASURED = MeasuredBoard(np.eye(4), lines=np.zeros((0, 3)), corners={}, lengths={})
 # what decides the ends of edges (images, beams, the pitch): of most, and of those with a weak side
 ENDS = {
     "last_beam": ("scan", "pitch"),

@@ -7,21 +7,21 @@ from lrfcal_lib.evaluate.study_trials import STUDIED
 from lrfcal_lib.session.cluster import workers_at
 
 
-def study(args):
+def study(scenarios, methods, poses, trials, seed, vary, out, scheduler):
     """Compare methods on scenarios and write the table."""
     tasks = tasks_of(
-        variations(args.scenarios, args.vary),
-        args.methods or STUDIED,
-        args.poses or COUNTS,
-        args.trials,
-        args.seed,
+        variations(scenarios, vary),
+        methods or STUDIED,
+        poses or COUNTS,
+        trials,
+        seed,
     )
     with (
-        workers_at(args.scheduler) as executor,
+        workers_at(scheduler) as executor,
         tqdm(total=len(tasks), desc="tasks", disable=None) as bar,
     ):
-        table = study_to_file(tasks, args.out, executor, bar.update)
+        table = study_to_file(tasks, out, executor, bar.update)
     print(
-        f"{args.out}: {len(table)} rows; {table.failed.sum()} of {table.trials.sum()} estimates "
+        f"{out}: {len(table)} rows; {table.failed.sum()} of {table.trials.sum()} estimates "
         "failed"
     )
