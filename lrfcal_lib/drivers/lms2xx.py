@@ -243,7 +243,7 @@ class LMS2xx(Closed):
     @property
     def variant(self) -> tuple[float, float]:
         """Field of view and resolution, degrees."""
-        return self.status.scan_angle_deg, self.status.resolution_deg
+        return self.status.variant
 
     def _set_rate(self, rate):
         """Set the rate of both ends; flash is not written.

@@ -9,7 +9,6 @@ import numpy as np
 from lrfcal_lib.drivers.lms2xx_link import FASTEST
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_frame import TelegramError
 
 BURST = 508  # bytes that leave in a turn of the mirror at 500 kBd
 PARTIAL = 181  # values of the first of four interlaced scans; the others have one less
@@ -188,10 +187,11 @@ class Assembler:
             None for a part of a set, and for what is no scan of this variant, unit and kind or is
             not new.
         """
-        try:
-            scan = codec.decode_scan(raw, self.configuration.measuring_mode)
-        except TelegramError:
+        mode = self.configuration.measuring_mode
+        scans = codec.decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
+        if not scans:
             return None
+        scan = scans[0]
         count = scan.words.shape[1]
         index = int(scan.scan_index[0])
         kind = (count + (scan.partial > 0), scan.unit, index >= 0, scan.partial >= 0)

@@ -74,6 +74,10 @@ class Scans:
         As sent, flags included.
     ranges : ndarray, shape (n, B)
         Metres; inf where the device says larger than its maximum, NaN for all other special values.
+    reasons : ndarray of uint8, shape (n, B)
+        Index into `REASONS` of every value, 0 for a range.
+    unit : str
+        'cm' or 'mm'.
     partial : int
         Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
     scan_index, telegram_index : ndarray of int, shape (n,)
@@ -83,16 +87,11 @@ class Scans:
     rows: np.ndarray
     words: np.ndarray
     ranges: np.ndarray
+    reasons: np.ndarray
     unit: str
-    mode: int
     partial: int
     scan_index: np.ndarray
     telegram_index: np.ndarray
-
-    @property
-    def reasons(self):
-        """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
-        return meanings(self.mode, self.unit)[1][self.words]
 
 
 def encode_values(
@@ -163,42 +162,11 @@ def encode_words(
     return encode_telegram(code, data, status=status, address=address)
 
 
-def decode_scan(raw: bytes, mode: int = 0) -> Scans:
-    """One scan out of the whole telegram 0xB0.
-
-    Parameters
-    ----------
-    raw
-    mode
-        Measuring mode, which the telegram does not tell.
-
-    Returns
-    -------
-    Scans
-        With one row.
-
-    Raises
-    ------
-    TelegramError
-        If it is damaged, another telegram, or its number of values does not fit its length.
-    """
-    telegram = parse_telegram(raw)
-    if telegram.code != SCAN:
-        raise TelegramError(f"code {telegram.code:02X} is no scan (B0)")
-    found = decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
-    if not found:
-        raise TelegramError(
-            f"{len(raw)} bytes do not fit the number of values "
-            f"{telegram.data[:2].hex(' ') or 'none'}"
-        )
-    return found[0]
-
-
 def decode_scans(
     data: bytes | np.ndarray,
     offset: np.ndarray,
     length: np.ndarray,
-    mode: ArrayLike = 0,
+    mode: ArrayLike,
 ) -> list[Scans]:
     """The scans among the telegrams of a stream, many at once. CRCs are not looked at again.
 
@@ -208,7 +176,7 @@ def decode_scans(
     offset, length
         As of :func:`split_stream`.
     mode
-        Measuring mode, of all or of each.
+        Measuring mode, of all or of each; the telegrams do not tell it.
 
     Returns
     -------
@@ -243,9 +211,8 @@ def decode_scans(
         indices = np.full((len(chosen), 2), -1)
         if extra:
             indices[:] = cut(data, begin + size, 2)
-        number = modes[chosen[0]]
-        ranges = meanings(number, unit)[0][words]
-        scans.append(Scans(chosen, words, ranges, unit, number, partial, *indices.T))
+        known = [of_value[words] for of_value in meanings(modes[chosen[0]], unit)]
+        scans.append(Scans(chosen, words, *known, unit, partial, *indices.T))
     return scans
 
 
@@ -305,8 +272,7 @@ class DeviceStatus:
     """The parts of the status reply 0xB1 that a recording needs."""
 
     measuring_mode: int
-    scan_angle_deg: float
-    resolution_deg: float
+    variant: tuple[float, float]  # field of view and resolution, degrees
     address: int
 
 
@@ -409,8 +375,7 @@ def parse_status(raw: bytes) -> DeviceStatus:
     view, step = struct.unpack_from("<HH", data, 107)
     return DeviceStatus(
         measuring_mode=data[102],
-        scan_angle_deg=float(view),
-        resolution_deg=step / 100,
+        variant=(float(view), step / 100),
         address=data[120],
     )
 
