@@ -61,9 +61,9 @@ def random_words(rng, shape):
 @pytest.mark.parametrize("raw", SENT + REPLIES, ids=bytes.hex)
 def test_telegrams_are_the_verified_bytes(raw):
     found = frame.parse_telegram(raw)
-    data, status = (raw[5:-3], raw[-3]) if raw in REPLIES else (raw[5:-2], None)
+    data = raw[5:-3] if raw in REPLIES else raw[5:-2]
     assert (found.code, found.data) == (raw[4], data)
-    assert encode_telegram(found.code, found.data, status=status, address=raw[1]) == raw
+    assert encode_telegram(found.code, found.data, status=raw[-3], address=raw[1]) == raw
 
 
 REFUSED = [
@@ -77,23 +77,23 @@ REFUSED = [
     (decode_scan, A0, "holds no scan"),
     (
         decode_scan,
-        encode_telegram(0xB0, b"\x05\0\1\1", status=0x10),
+        encode_telegram(0xB0, b"\x05\0\1\1", address=0x80),
         "holds no scan",
     ),
     (
         decode_scan,
-        encode_telegram(0xB0, b"\x01\x80\1\1", status=0x10),
+        encode_telegram(0xB0, b"\x01\x80\1\1", address=0x80),
         "holds no scan",
     ),  # unit reserved
     (codec.parse_status, A0, "code A0 is not the reply B1"),
     (
         codec.parse_status,
-        encode_telegram(0xB1, bytes(100), status=16),
+        encode_telegram(0xB1, bytes(100), address=0x80),
         "100 bytes of data, needs 123",
     ),
     (
         codec.parse_configuration,
-        encode_telegram(0xF4, bytes(6), status=16),
+        encode_telegram(0xF4, bytes(6), address=0x80),
         "6 bytes of data, needs 7",
     ),
     (

@@ -43,7 +43,7 @@ def seeds(rng):
         0x92: 0,
     }
     replies = [
-        encode_telegram(code, rng.bytes(size), status=0x10) for code, size in sizes.items()
+        encode_telegram(code, rng.bytes(size), address=0x80) for code, size in sizes.items()
     ]
     return [
         *scans,
@@ -91,7 +91,7 @@ def test_fuzz_contents():
         parse = PARSERS.get(seed[4], frame.parse_telegram)
         for raw in damaged(rng, seed, STRINGS // 2 // len(every)):
             if len(raw) > 7 and raw[-1] % 4:
-                raw = encode_telegram(seed[4], raw[5:-3], status=raw[-3])
+                raw = encode_telegram(seed[4], raw[5:-3], status=raw[-3], address=0x80)
             with suppress(frame.TelegramError):
                 scan = parse(raw)
                 values += 1

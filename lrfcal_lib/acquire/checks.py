@@ -16,7 +16,7 @@ from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
 from lrfcal_lib.preprocess.prepared import all_crossings
 from lrfcal_lib.session.faults import DARK, brightness, repeated_images, repeated_scans
-from lrfcal_lib.session.files import SessionError
+from lrfcal_lib.session.files import SessionError, short
 from lrfcal_lib.session.read import Session, Sweep
 from lrfcal_lib.session.stated import LrfInfo
 
@@ -163,7 +163,7 @@ def _check_sides(scan):
     each = [
         f"{side.n_points} crossings at {np.degrees(side.angle):.0f} deg" for side in good
     ]
-    text = f"{len(good)} sides: {', '.join(each)}"
+    text = f"{len(good)} sides: {short(each)}"
     ways = unit_vector(np.array([np.subtract(*side.ends) for side in good]))
     if np.abs(ways @ ways.T).min() < PARALLEL:
         return Light("edges", "ok", text)

@@ -413,8 +413,10 @@ class Boards:
         if before is not None:
             possible.append("r")
             again = f", r: {self.kind} {before} again"
-        asked = f"{self.kind} {placement.number}: {self.to_prepare(placement)}"
-        text = f"{asked}, then press Enter{again} (q: end here) "
+        text = (
+            f"{self.kind} {placement.number}: {self.to_prepare(placement)}, then press Enter"
+            f"{again} (q: end here) "
+        )
         while (answer := ask(text)) not in possible:
             pass
         return answer

@@ -22,6 +22,7 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
 )
 from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session.files import short
 from lrfcal_lib.session.lms2xx_codec import TOP, VARIANTS
 from lrfcal_lib.session.lms2xx_frame import TelegramError
 
@@ -95,8 +96,7 @@ class LMS2xx(Closed):
         **configuration,
     ):
         if baudrate not in (None, *RATES):
-            known = ", ".join(map(str, sorted(RATES)))
-            raise ValueError(f"an LMS2xx has {known} Bd, got {baudrate}")
+            raise ValueError(f"an LMS2xx has {short(sorted(RATES))} Bd, got {baudrate}")
         self.port = str(port)
         self._host = host
         self._address = address
@@ -184,9 +184,8 @@ class LMS2xx(Closed):
 
     def _read(self, code, parse):
         """What a reply says."""
-        raw = self._line.ask(code).raw
         try:
-            return parse(raw)
+            return parse(self._line.ask(code).raw)
         except TelegramError as error:
             raise WrongDevice(
                 f"{self.port}: the reply to command {code:02X} is not that of an LMS2xx: {error}"
@@ -292,7 +291,7 @@ class LMS2xx(Closed):
         self._need_quiet()
         wanted = (float(fov_deg), float(resolution_deg))
         if wanted not in VARIANTS:
-            known = ", ".join(f"{fov:g}/{step:g}" for fov, step in VARIANTS)
+            known = short(f"{fov:g}/{step:g}" for fov, step in VARIANTS)
             raise ValueError(
                 f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}"
             )
@@ -305,9 +304,8 @@ class LMS2xx(Closed):
         if self.variant == wanted:
             return
         view, step = wanted
-        data = struct.pack("<HH", round(view), round(100 * step))
         try:
-            self._line.ask(wire.VARIANT, data)
+            self._line.ask(wire.VARIANT, struct.pack("<HH", round(view), round(100 * step)))
         except NoReply as error:  # the reply may be lost and the variant set
             LOG.warning("%s; reading the variant", error)
         self._read_status()

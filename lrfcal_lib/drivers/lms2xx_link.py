@@ -15,6 +15,7 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
     line_lost,
 )
+from lrfcal_lib.session.files import short
 from lrfcal_lib.session.lms2xx_frame import OVERHEAD, encode_telegram, split_stream, whole
 
 ACK = 0x06
@@ -304,7 +305,7 @@ class Link:
             for rate in rates:
                 if self._answers(rate, window, end):
                     return
-        tried = f"{', '.join(map(str, rates))} Bd, address {self.address}"
+        tried = f"{short(rates)} Bd, address {self.address}"
         if not self.address:
             tried += " (any)"
         if self.heard > heard:

@@ -257,7 +257,7 @@ class EmulatedLms(SerialDevice):
         """
         if effect is not None:  # else that of the command whose reply this one interrupted
             self._effect = effect
-        raw = encode_telegram(code, data, status=0x10, address=0x80 | self.memory.address)
+        raw = encode_telegram(code, data, address=0x80 | self.memory.address)
         self.at(at + delay, partial(self.reply, raw, then=self._finish), SENDING)
 
     def _finish(self, at):

@@ -106,16 +106,18 @@ class EmulatedRig:
     def plan(self) -> dict:
         """What a recording of this rig can do: its placements, each with its sweep."""
         setup = self.setup
-        placements = [
-            {
-                "number": p.number,
-                "board": p.purpose == "board",
-                "pitch_deg": np.degrees([*p.sweep, setup.step_of(p)]).round(4).tolist(),
-                "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
-            }
-            for p in self.world.placements.values()
-        ]
-        return {"intrinsics_images": setup.intrinsics_views, "placements": placements}
+        return {
+            "intrinsics_images": setup.intrinsics_views,
+            "placements": [
+                {
+                    "number": p.number,
+                    "board": p.purpose == "board",
+                    "pitch_deg": np.degrees([*p.sweep, setup.step_of(p)]).round(4).tolist(),
+                    "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
+                }
+                for p in self.world.placements.values()
+            ],
+        }
 
     def rig_file(self) -> dict:
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices,
@@ -175,11 +177,10 @@ class EmulatedRig:
 def practice_setup() -> tuple[Setup, list[Placement]]:
     """A rig and placements that are recorded in a minute."""
     setup = load_setup(PRACTICE)
-    placements = [
+    return setup, [
         replace(p, image_pitch=(p.image_pitch[0], p.image_pitch[-1]))
         for p in placements_of(setup)
     ]
-    return setup, placements
 
 
 def emulated(name: str, feedback: str = "full") -> EmulatedRig:

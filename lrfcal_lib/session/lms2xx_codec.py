@@ -211,8 +211,8 @@ def decode_scans(
         indices = np.full((len(chosen), 2), -1)
         if extra:
             indices[:] = cut(data, begin + size, 2)
-        known = [of_value[words] for of_value in meanings(modes[chosen[0]], unit)]
-        scans.append(Scans(chosen, words, *known, unit, partial, *indices.T))
+        ranges, reasons = (known[words] for known in meanings(modes[chosen[0]], unit))
+        scans.append(Scans(chosen, words, ranges, reasons, unit, partial, *indices.T))
     return scans
 
 
@@ -339,7 +339,7 @@ def encode_configuration(configuration: Configuration) -> bytes:
     """Reply 0xF4, as a device sends it; a recorded session begins with it (it states the measuring
     mode).
     """
-    return encode_telegram(CONFIGURATION, configuration.block, status=0x10)
+    return encode_telegram(CONFIGURATION, configuration.block, address=DEVICE)
 
 
 def reply_data(raw, code, shortest):

@@ -68,7 +68,7 @@ def crc16(data):
 
 
 def encode_telegram(
-    code: int, data: bytes = b"", *, status: int | None = None, address: int | None = None
+    code: int, data: bytes = b"", *, status: int = 0x10, address: int = HOST
 ) -> bytes:
     """Bytes of a telegram.
 
@@ -79,9 +79,9 @@ def encode_telegram(
     data
         After it.
     status
-        Makes it a reply.
+        Of a reply; a request has none.
     address
-        By default 0x00 to the device, and 0x80 for replies.
+        Of the device; 0x80 and above, as of `DEVICE`, make it a reply.
 
     Raises
     ------
@@ -89,13 +89,9 @@ def encode_telegram(
         For numbers that are no bytes.
     """
     body = bytes([code, *data])
-    sender = HOST
-    if status is not None:
+    if address >= DEVICE:
         body += bytes([status])
-        sender = DEVICE
-    if address is not None:
-        sender = address
-    raw = bytes([STX, sender]) + len(body).to_bytes(2, "little") + body
+    raw = bytes([STX, address]) + len(body).to_bytes(2, "little") + body
     return raw + crc16(raw).to_bytes(2, "little")
 
 

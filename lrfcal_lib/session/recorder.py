@@ -152,8 +152,7 @@ class SessionRecorder(SessionWriter):
         """
         counts = dict.fromkeys(self.cameras, 0)
         file = self.path / "images.csv"
-        rows = read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(counts))
-        for row in rows:
+        for row in read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(counts)):
             if row["camera"] in counts and row["purpose"] == purpose:
                 counts[row["camera"]] += 1
         return counts

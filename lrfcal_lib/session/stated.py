@@ -275,20 +275,20 @@ def board_to_json(board: Board) -> dict:
     ----------
     board
     """
-    pattern = board.pattern and {
-        "kind": "chessboard",
-        "columns": board.pattern.columns,
-        "rows": board.pattern.rows,
-        "square_m": board.pattern.square,
-        "origin_m": board.pattern.origin,
-    }
     return plain(
         {
             "name": board.name,
             "edges": board.edges,
             "features": board.features,
             "corners_m": board.corners,
-            "pattern": pattern,
+            "pattern": board.pattern
+            and {
+                "kind": "chessboard",
+                "columns": board.pattern.columns,
+                "rows": board.pattern.rows,
+                "square_m": board.pattern.square,
+                "origin_m": board.pattern.origin,
+            },
         }
     )
 

@@ -80,9 +80,8 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     """
     data = np.frombuffer(read_bytes(file, within), np.uint8)
     path = file.with_name("index.csv")
-    rows = read_table(path, INDEX_COLUMNS, within, torn=True)
     with naming(path):
-        index = _index(rows, len(data), file)
+        index = _index(read_table(path, INDEX_COLUMNS, within, torn=True), len(data), file)
         check_amount(len(data) // 2)
 
     sound = are_sound(data, index.offset, index.length)
