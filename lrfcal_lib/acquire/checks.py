@@ -149,14 +149,13 @@ def check_scan(
         fault = ": take a smaller step, or go nearer"
     elif cut and np.ptp(sweep.pitch) > 0:
         fault = f"; the {' and '.join(cut)} line hits it: sweep farther"
-    light = Light("scan", "warn" if fault else "ok", text + fault)
-    return [light, _check_sides(scan)]
+    return [Light("scan", "warn" if fault else "ok", text + fault), _check_sides(scan)]
 
 
 def _check_sides(scan):
     """How many straight sides of the board the scans cross, and how."""
-    ways = all_crossings(scan)["half_step"]
-    by_number = {side.side: side for way in reversed(ways) for side in way.sides}
+    edges = all_crossings(scan)["half_step"]
+    by_number = {side.side: side for way in reversed(edges) for side in way.sides}
     good = [side for side in by_number.values() if side.n_points >= FEWEST_CROSSINGS]
     if not good:
         return Light("edges", "bad", NO_SIDE)

@@ -110,6 +110,11 @@ Speeds = Annotated[
 # ------------------------------------------------------------------------------------- devices
 
 
+def said(data):
+    """What an object states: null is as good as left out."""
+    return {key: value for key, value in data.items() if value is not None}
+
+
 class Stated(BaseModel, frozen=True):
     """An object of a rig file: null is as good as left out, and other keys are refused."""
 
@@ -124,7 +129,7 @@ class Stated(BaseModel, frozen=True):
                 raise ValueError(
                     f"{key} is not known; known are {', '.join(cls.model_fields)}"
                 )
-        return {key: value for key, value in data.items() if value is not None}
+        return said(data)
 
 
 class LrfDevice(Stated):
@@ -412,9 +417,8 @@ def rig_of(data: dict, path: Path = Path("rig.json")) -> RigFile:
         With the path, the key and the value, for anything that cannot be used.
     """
     try:
-        present = {key: value for key, value in data.items() if value is not None}
         unsaid = ABOUT | {"name": "rig"}
-        stated = parse_session(unsaid | present | {"placements": ()}, RigFileStated)
+        stated = parse_session(unsaid | said(data) | {"placements": ()}, RigFileStated)
         _check_cameras(stated["devices"].cameras, stated["cameras"])
     except ValueError as error:
         raise RigFileError(f"{path}: {error}") from error

@@ -58,8 +58,13 @@ def cached(stage):
         key = hashlib.sha256(pickle.dumps(call))
         for record in session.image_records:
             key.update(record.file.read_bytes() if record.file.is_file() else b"missing")
-        versions = f"{source_digest()}{np.__version__}{scipy.__version__}{cv2.__version__}"
-        key.update(versions.encode())
+        for version in (
+            source_digest(),
+            np.__version__,
+            scipy.__version__,
+            cv2.__version__,
+        ):
+            key.update(version.encode())
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
             with opened(

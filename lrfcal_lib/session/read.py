@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -277,8 +277,8 @@ class Session(StatedRig):
     picks: tuple[EdgePick, ...]
     reference: dict
     problems: tuple[str, ...]
-    scans: dict[str, np.ndarray] = field(repr=False)
-    telegrams: TelegramLog | None = field(default=None, repr=False)
+    scans: dict[str, np.ndarray]
+    telegrams: TelegramLog | None = None
     continuous: bool = False
 
     def __repr__(self):

@@ -62,7 +62,6 @@ class SessionRecorder(SessionWriter):
                         "on with the same rig file, or begin another one"
                     )
         self.data = data | {"placements": list(known["placements"])}
-        self._make_folders()
         mend_tables(self.path)
         for placement in known["unfinished"] or ():
             self._mark_dropped(placement)
