@@ -98,11 +98,11 @@ def check_scene(sweep: Sweep) -> Light:
     sweep
     """
     share = np.isfinite(sweep.ranges).mean()
-    state = "ok" if share > LEAST_SCENE else "warn"
-    text = (
-        f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
+    return Light(
+        name="scan",
+        state="ok" if share > LEAST_SCENE else "warn",
+        text=f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back",
     )
-    return Light("scan", state, text)
 
 
 def _together(name, lights):
@@ -111,8 +111,11 @@ def _together(name, lights):
         return Light(name, "bad", "no image")
     good = [light for light in lights if light.state != "bad"]
     worst = max(good or lights, key=lambda light: STATES.index(light.state))
-    state = "warn" if good and good != lights else worst.state
-    return Light(name, state, f"{len(good)} of {len(lights)} images: {worst.text}")
+    return Light(
+        name=name,
+        state="warn" if good and good != lights else worst.state,
+        text=f"{len(good)} of {len(lights)} images: {worst.text}",
+    )
 
 
 def check_scan(
@@ -193,7 +196,7 @@ def check_image(
     except PatternNotFound as error:
         text = str(error)
         if brightness(image) < DARK:
-            text = f"{text}; {DARKNESS}"
+            text += f"; {DARKNESS}"
         return Light(name, "bad", text)
     scale = math.ceil(LEAST_SQUARE_PX / np.linalg.norm(corners[1] - corners[0]))
     large = cv2.resize(
@@ -211,8 +214,11 @@ def check_image(
         "little contrast: avoid glare": white - dark < LOW_CONTRAST,
     }
     text = f"pattern found, edges rise in {rise:.1f} px, squares {dark:.0f} and {white:.0f} of 255"
-    words = "; ".join([text, *compress(faults, faults.values())])
-    return Light(name, "warn" if any(faults.values()) else "ok", words)
+    return Light(
+        name=name,
+        state="warn" if any(faults.values()) else "ok",
+        text="; ".join([text, *compress(faults, faults.values())]),
+    )
 
 
 def _check_plain(image, board, model, name):

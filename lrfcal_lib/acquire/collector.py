@@ -358,9 +358,12 @@ class Collector(Closed):
         lights = check_placement(session, number)
         if placement.purpose == "board" and len(session.board_placements) >= ADVICE_FROM:
             self._advice = advise(session)
-            state = "warn" if self._advice else "ok"
-            words = self._advice or "every direction is well determined"
-            lights.append(Light("information", state, words))
+            light = Light(
+                name="information",
+                state="warn" if self._advice else "ok",
+                text=self._advice or "every direction is well determined",
+            )
+            lights.append(light)
         self.lights[number] = lights
         return lights
 

@@ -259,6 +259,7 @@ class Motion:
         LineLost
             If the port vanished; the head is stopped if it comes back.
         """
+        line = self.line
         settings = self.settings
         way = math.copysign(1, goal - self.estimate())
         bit = UP if (way > 0) != settings.invert else DOWN
@@ -268,7 +269,7 @@ class Motion:
             """Seconds; after a reading the stop has to be on its way in time."""
             rest_s = (goal - self.estimate()) * way / self.speed(way, step)
             if self._known_at > begun:
-                rest_s -= self.line.wire_s()
+                rest_s -= line.wire_s()
             return min(rest_s, begun + longest_s - self._now())
 
         try:

@@ -303,9 +303,9 @@ class Plan(Stated):
     sweep_speed: whole(0, 63) = None
     count: whole(1, 1000) = 12
     intrinsics_images: whole(0, 1000) = 0
-    placements: Annotated[
-        tuple[ListedPlacement, ...], Field(fail_fast=True, max_length=MOST_PLACEMENTS)
-    ] = ()
+    placements: tuple[ListedPlacement, ...] = Field(
+        default=(), fail_fast=True, max_length=MOST_PLACEMENTS
+    )
 
     @model_validator(mode="after")
     def numbered(self):
@@ -417,8 +417,9 @@ def rig_of(data: dict, path: Path = Path("rig.json")) -> RigFile:
         With the path, the key and the value, for anything that cannot be used.
     """
     try:
-        unsaid = ABOUT | {"name": "rig"}
-        stated = parse_session(unsaid | said(data) | {"placements": ()}, RigFileStated)
+        stated = parse_session(
+            {**ABOUT, "name": "rig", **said(data), "placements": ()}, RigFileStated
+        )
         _check_cameras(stated["devices"].cameras, stated["cameras"])
     except ValueError as error:
         raise RigFileError(f"{path}: {error}") from error

@@ -181,7 +181,12 @@ class EmulatedLms(SerialDevice):
         memory = self.memory
         match telegram.code, telegram.data:
             case 0x10, _:
-                self.answer(at, 0x91, effect=self._begin_restart, delay=ACK_S + 0.001)
+                self.answer(
+                    at,
+                    0x91,
+                    effect=lambda told: self.at(told + RESET_S, self.restart),
+                    delay=ACK_S + 0.001,
+                )
             case 0x20, data:
                 self.set_mode(data, at)
             case 0x30, b"\x01" if not self._selection.head:
@@ -286,9 +291,6 @@ class EmulatedLms(SerialDevice):
         for burst, first in enumerate(range(0, len(raw), BURST)):
             self.write(raw[first : first + BURST], at + burst * MIRROR_TURN)
         self.write(b"", at, then)
-
-    def _begin_restart(self, at):
-        self.at(at + RESET_S, self.restart)
 
     def restart(self, at: float) -> None:
         """Fall silent, with variant and rate of the factory; tell at the end that it is ready.

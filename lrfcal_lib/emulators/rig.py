@@ -125,7 +125,6 @@ class EmulatedRig:
         """
         setup = self.setup
         rig = setup.rig
-        cameras = rig.camera_infos(known=setup.intrinsics_views == 0)
         return {
             "schema": stated.SCHEMA,
             "name": f"{setup.name}_emulated",
@@ -134,7 +133,9 @@ class EmulatedRig:
             "source": f"emulated rig of the setup '{setup.name}', seed {setup.seed}",
             "board": stated.board_to_json(rig.board),
             "rig": stated.rig_to_json(
-                rig.beam.info("emulated"), rig.T_head_lrf_stated, cameras
+                rig.beam.info("emulated"),
+                rig.T_head_lrf_stated,
+                rig.camera_infos(known=setup.intrinsics_views == 0),
             ),
             "devices": self._devices(),
             "plan": self.plan(),

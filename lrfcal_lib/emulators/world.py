@@ -268,11 +268,10 @@ class _Handler(BaseHTTPRequestHandler):
                     # a blank line: the camera lives, its head moves
                     self.wfile.write(b"\r\n")
                 else:
-                    head = (
-                        "--frame\r\nContent-Type: image/jpeg\r\n"
-                        f"Content-Length: {len(data)}\r\n\r\n"
+                    self.wfile.write(
+                        b"--frame\r\nContent-Type: image/jpeg\r\n"
+                        b"Content-Length: %d\r\n\r\n%b\r\n" % (len(data), data)
                     )
-                    self.wfile.write(head.encode() + data + b"\r\n")
                     server.quit.wait(1 / FPS)
 
     def do_POST(self):

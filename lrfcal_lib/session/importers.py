@@ -111,8 +111,7 @@ def import_lasersetero(src: str | PathLike, dst: str | PathLike) -> float:
         published[name] = read_bouguet(Path(src) / f"Calib_Results_{name}.m")
         images[name] = numbered(src, f"{name}_*.png")
         first = next(iter(images[name].values()))
-        size = image_size(first, read_bytes(first))
-        cameras.append(CameraInfo(name, "platform", *size))
+        cameras.append(CameraInfo(name, "platform", *image_size(first, read_bytes(first))))
     misses = []
     values = 0
     with SessionWriter(

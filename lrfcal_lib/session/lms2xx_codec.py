@@ -157,8 +157,8 @@ def encode_words(
     count = len(values) | UNITS.index(unit) << 14
     if partial >= 0:
         count |= 1 << 13 | partial << 11
-    tail = bytes(i % 256 for i in indices or ())
-    data = head + count.to_bytes(2, "little") + values.tobytes() + tail
+    data = head + count.to_bytes(2, "little") + values.tobytes()
+    data += bytes(i % 256 for i in indices or ())
     return encode_telegram(code, data, status=status, address=address)
 
 

@@ -126,8 +126,10 @@ class SessionRecorder(SessionWriter):
         rows
             Time of this computer (s), commanded and measured pitch (rad), NaN where unknown.
         """
-        in_degrees = [(time_s, *map(math.degrees, angles)) for time_s, *angles in rows]
-        self._append_rows("platform.csv", in_degrees)
+        self._append_rows(
+            "platform.csv",
+            [(time_s, *map(math.degrees, angles)) for time_s, *angles in rows],
+        )
 
     def finish(self) -> None:
         """Close the recording: nothing can be half done in it any more."""

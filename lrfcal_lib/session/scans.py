@@ -124,12 +124,16 @@ def check_scans(scans: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
     if ranges.ndim != 2:
         raise ValueError(f"ranges must be scan lines x beams, got shape {ranges.shape}")
     lines, beams = ranges.shape
-    shapes = {"bearings": (beams,), "intensities": ranges.shape}
+    shapes = {
+        "bearings": (beams,),
+        "placement": (lines,),
+        "pitch": (lines,),
+        "time_s": (lines,),
+    }
+    if "intensities" in scans:
+        shapes["intensities"] = ranges.shape
     checked = {"ranges": ranges}
-    for key in ARRAYS[1:]:
-        if key == "intensities" and key not in scans:
-            continue
-        shape = shapes.get(key, (lines,))
+    for key, shape in shapes.items():
         values = np.asarray(scans[key], int if key == "placement" else float)
         if values.shape != shape:
             raise ValueError(

@@ -223,14 +223,13 @@ class BoardStated(BaseModel):
     """A board as it stands in a file."""
 
     name: str
-    edges: Annotated[
-        tuple[EdgeName, ...], Field(fail_fast=True, min_length=3, max_length=MOST_CORNERS)
-    ]
+    edges: tuple[EdgeName, ...] = Field(
+        fail_fast=True, min_length=3, max_length=MOST_CORNERS
+    )
     features: tuple[str, str]
-    corners: Annotated[
-        Annotated[tuple[Pair, ...], Field(fail_fast=True), AfterValidator(np.array)] | None,
-        Field(alias="corners_m"),
-    ]
+    corners: (
+        Annotated[tuple[Pair, ...], Field(fail_fast=True), AfterValidator(np.array)] | None
+    ) = Field(alias="corners_m")
     pattern: Annotated[PatternStated, AfterValidator(PatternStated.made)] | None
 
     def made(self):
@@ -535,8 +534,8 @@ class PlatformStated(BaseModel):
     """The platform and how well it is known as they stand in a file."""
 
     T_head_lrf: Transform
-    sigma_direction: Annotated[Step, Field(alias="sigma_direction_deg")] = math.radians(0.5)
-    sigma_offset: Annotated[Length, Field(alias="sigma_offset_m")] = 0.010
+    sigma_direction: Step = Field(default=math.radians(0.5), alias="sigma_direction_deg")
+    sigma_offset: Length = Field(default=0.010, alias="sigma_offset_m")
     continuous: bool = False
 
 
