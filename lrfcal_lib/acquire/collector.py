@@ -126,7 +126,6 @@ class Collector(Closed):
         self.view = View()
         self.lights: dict[int, list[Light]] = {}
         self.stopped = threading.Event()
-        self._advice = ""
         self._devices = threading.Lock()
         self._closing = contextlib.ExitStack()
 

@@ -92,8 +92,8 @@ class PlatformWritten(BaseModel):
 class LensWritten(BaseModel):
     """What ``CameraModel(**lens)`` takes; without bound where nothing has determined it."""
 
-    width: int = Field(ge=1)
-    height: int = Field(ge=1)
+    width: Annotated[int, Field(ge=1)]
+    height: Annotated[int, Field(ge=1)]
     fx: Positive
     fy: Positive
     cx: FiniteFloat

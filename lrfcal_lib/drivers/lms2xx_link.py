@@ -110,7 +110,6 @@ class Link:
         self.interrupted = interrupted
         self.senders: Collection[int] = range(256)
         self.deadline = math.inf
-        self.asked_s = 0.0
         self.heard = 0
         self._port = host.port(path, baudrate, timeout=READ_S)
         self._forget()

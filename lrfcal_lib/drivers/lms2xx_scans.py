@@ -161,10 +161,14 @@ class Assembler:
         if interlaced:
             values = PARTIAL
             self.turns = 1
-        indexed = configuration.realtime_indices
         # number of values, unit, and whether there are indices and parts
-        self._kind = (values, configuration.unit, indexed, interlaced)
-        size = 10 + 2 * values + 2 * indexed
+        self._kind = (
+            values,
+            configuration.unit,
+            configuration.realtime_indices,
+            interlaced,
+        )
+        size = 10 + 2 * values + 2 * configuration.realtime_indices
         scan_s = self.turns * MIRROR_TURN
         self.duration_s = scan_s + transfer_s(size, baudrate)
         self.interval_s = interval_s(size, baudrate, scan_s)
@@ -237,7 +241,7 @@ class Assembler:
         beams = np.concatenate(
             [[part.bearings, part.ranges, part.beam_times_s] for part in parts], axis=1
         )
-        bearings, ranges, times = beams[:, np.argsort(beams[0])]
+        bearings, ranges, times = beams[:, beams[0].argsort()]
         return replace(
             parts[0],
             telegrams=sum((part.telegrams for part in parts), ()),

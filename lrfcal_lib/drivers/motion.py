@@ -100,11 +100,8 @@ class Motion:
         self._dead: set[int] = set()  # speed bytes at which the head does not move
         # way (1 up, -1 down), speed byte and instant of the motion
         self._going: tuple | None = None
-        self._frame = b""
         self._repeated = math.inf  # when it was last sent, if the head goes
         self._pitch: float | None = None
-        self._known_at = 0.0
-        self._misses = 0
         self._tolerance = math.radians(settings.tolerance_deg)
         self._shortest_s = 2 * line.wire_s() + settings.gap_s  # of a motion and its stop
 

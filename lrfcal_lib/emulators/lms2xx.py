@@ -107,9 +107,6 @@ class EmulatedLms(SerialDevice):
         self._effect: Callable | None = None  # of the command whose reply is on its way
         self._zero = host.now() - POWERED_S  # when turns of the mirror are counted from
         self._selection = Selection()
-        # of the next scan of the stream
-        self._turn = 0
-        self._partial = 0
 
     @property
     def baudrate(self) -> int:

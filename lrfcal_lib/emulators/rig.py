@@ -105,14 +105,15 @@ class EmulatedRig:
 
     def plan(self) -> dict:
         """What a recording of this rig can do: its placements, each with its sweep."""
-        setup = self.setup
         return {
-            "intrinsics_images": setup.intrinsics_views,
+            "intrinsics_images": self.setup.intrinsics_views,
             "placements": [
                 {
                     "number": p.number,
                     "board": p.purpose == "board",
-                    "pitch_deg": np.degrees([*p.sweep, setup.step_of(p)]).round(4).tolist(),
+                    "pitch_deg": np.degrees([*p.sweep, self.setup.step_of(p)])
+                    .round(4)
+                    .tolist(),
                     "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
                 }
                 for p in self.world.placements.values()

@@ -116,7 +116,7 @@ def ranges_beyond(session) -> Iterator[Fault]:
     ranges = session.scans["ranges"]
     known = ranges[np.isfinite(ranges)]
     limit = session.lrf.max_range
-    share = np.mean(known > limit)
+    share = (known > limit).mean()
     if share <= BEYOND:
         return
     yield Fault(

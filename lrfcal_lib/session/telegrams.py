@@ -87,7 +87,7 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     sound = are_sound(data, index.offset, index.length)
     whole = index.offset + index.length <= len(data)
     outcome = np.select([sound, whole], [OTHER, WRONG], TRUNCATED).astype(np.uint8)
-    wrong = np.sum(outcome == WRONG)
+    wrong = (outcome == WRONG).sum()
     if wrong > whole.sum() / 2:
         raise SessionError(
             f"{path}: {wrong} of {whole.sum()} telegrams have a wrong CRC in {file.name}; the two "
@@ -213,7 +213,7 @@ def _lines(groups, index):
     begins = np.r_[True, ~_goes_on(partial[rows], number[rows], index[rows])]
     first = index[rows[begins]]
     line = np.full(len(index), -1)
-    line[rows] = np.cumsum(begins) - 1
+    line[rows] = begins.cumsum() - 1
 
     quarters = np.unique(np.concatenate(grids))
     check_amount(len(first) * len(quarters))
