@@ -16,15 +16,14 @@ from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
 from lrfcal_lib.preprocess.prepared import all_crossings
 from lrfcal_lib.session.faults import DARK, brightness, repeated_images, repeated_scans
-from lrfcal_lib.session.files import SessionError, short
+from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session, Sweep
 from lrfcal_lib.session.stated import LrfInfo
 
 STATES = ("ok", "warn", "bad")
 FEWEST_CROSSINGS = 6  # of a side, below which a straight line says little about it
-PARALLEL = np.cos(
-    np.radians(20)
-)  # two sides that include less give one constraint, not two
+# two sides that include less give one constraint, not two
+PARALLEL = np.cos(np.radians(20))
 FEWEST_LINES = 8  # scan lines on the board
 LEAST_SCENE = 0.2  # share of the beams of a scene that come back
 BLURRED_PX = 3.5  # rise of a chessboard's edges from 10 to 90 %; 2 to 3 in a sharp image
@@ -157,15 +156,15 @@ def check_scan(
 
 def _check_sides(scan):
     """How many straight sides of the board the scans cross, and how."""
-    edges = all_crossings(scan)["half_step"]
-    by_number = {side.side: side for way in reversed(edges) for side in way.sides}
+    ways = all_crossings(scan)["half_step"]
+    by_number = {side.side: side for way in reversed(ways) for side in way.sides}
     good = [side for side in by_number.values() if side.n_points >= FEWEST_CROSSINGS]
     if not good:
         return Light("edges", "bad", NO_SIDE)
     each = [
         f"{side.n_points} crossings at {np.degrees(side.angle):.0f} deg" for side in good
     ]
-    text = f"{len(good)} sides: {short(each)}"
+    text = f"{len(good)} sides: {', '.join(each)}"
     ways = unit_vector(np.array([np.subtract(*side.ends) for side in good]))
     if np.abs(ways @ ways.T).min() < PARALLEL:
         return Light("edges", "ok", text)

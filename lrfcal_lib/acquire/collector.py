@@ -54,10 +54,8 @@ class Task:
     title: str
     guidance: str  # where to put the board
     placement: Placement | None = None
-    close: tuple[str, int] = (
-        "",
-        0,
-    )  # without a placement: camera of a close view, its number
+    # without a placement: camera of a close view, its number
+    close: tuple[str, int] = ("", 0)
 
 
 @dataclass(frozen=True)

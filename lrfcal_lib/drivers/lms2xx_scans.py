@@ -61,9 +61,8 @@ class Reading:
     bearings: np.ndarray  # (B,), radians in the LRF frame, ascending
     time_s: float  # clock of the host at the first beam
     beam_times_s: np.ndarray  # (B,), the same for every beam
-    telegram_index: (
-        int  # of the (first) telegram, modulo 256; -1 where the device does not count
-    )
+    # of the (first) telegram, modulo 256; -1 where the device does not count
+    telegram_index: int
 
 
 class ScanClock:

@@ -22,9 +22,8 @@ from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, Refused
 LOG = logging.getLogger(__name__)
 ASSUMED = 4.0, 4.0  # deg/s up and down, as of heads of constant speed
 EXTRA_S = 10  # that a move may take beside twice the time of its way
-ARRIVAL = math.radians(
-    0.5
-)  # a move that ends this near has arrived; its settled pitch counts
+# a move that ends this near has arrived; its settled pitch counts
+ARRIVAL = math.radians(0.5)
 STALLED = 5  # settle times at rest elsewhere: the head does not get to where it was sent
 BURSTS = 25  # of up and down, to reach one pitch
 FIRST_BURST_S = 0.1  # of a head whose speed is unknown

@@ -277,9 +277,8 @@ class Placement:
     pitch: np.ndarray
     image_pitch: tuple[float, ...]  # where images are taken, radians
     purpose: str = "board"  # of the images, or "scene"
-    closing: bool = (
-        False  # back in its first half a last scan shows whether all stood still
-    )
+    # back in its first half a last scan shows whether all stood still
+    closing: bool = False
 
     @property
     def direction(self) -> int:

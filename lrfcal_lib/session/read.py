@@ -480,9 +480,8 @@ def _times_back(session):
                 continue
             try:
                 time = float(row["t_s"])
-            except (
-                ValueError
-            ):  # of a placement that was not finished: nobody else looks at it
+            # of a placement that was not finished: nobody else looks at it
+            except ValueError:
                 yield f"{file} line {line}: t_s is {row['t_s']!r}: a number of seconds is needed"
                 continue
             # rows that share these follow each other in time

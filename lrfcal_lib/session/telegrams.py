@@ -203,9 +203,8 @@ def _lines(groups, index):
         )
     # the quarter of a degree that a scan is turned by, -1 for a whole one, -2 for no scan
     partial = np.full(len(index), -2)
-    number = np.full(
-        len(index), -1
-    )  # of the scan, as the device counts; -1 where it does not
+    # of the scan, as the device counts; -1 where it does not
+    number = np.full(len(index), -1)
     for group in groups:
         partial[group.rows] = group.partial
         number[group.rows] = group.telegram_index
