@@ -168,7 +168,7 @@ def test_any_scan_survives_both_ways(mode, unit, partial, indices):
             words, unit=unit, partial=partial, indices=indices, status=0x51, address=0x85
         )
         scan = decode_scan(raw, mode)
-        assert (scan.unit, scan.partial) == (unit, partial)
+        assert (scan.unit, scan.mode, scan.partial) == (unit, mode, partial)
         assert (raw[-3], raw[1]) == (0x51, 0x85)
         assert (scan.scan_index[0], scan.telegram_index[0]) == (indices or (-1, -1))
         np.testing.assert_array_equal(scan.words[0], words)

@@ -74,10 +74,6 @@ class Scans:
         As sent, flags included.
     ranges : ndarray, shape (n, B)
         Metres; inf where the device says larger than its maximum, NaN for all other special values.
-    reasons : ndarray of uint8, shape (n, B)
-        Index into `REASONS` of every value, 0 for a range.
-    unit : str
-        'cm' or 'mm'.
     partial : int
         Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
     scan_index, telegram_index : ndarray of int, shape (n,)
@@ -87,11 +83,16 @@ class Scans:
     rows: np.ndarray
     words: np.ndarray
     ranges: np.ndarray
-    reasons: np.ndarray
     unit: str
+    mode: int
     partial: int
     scan_index: np.ndarray
     telegram_index: np.ndarray
+
+    @property
+    def reasons(self):
+        """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
+        return meanings(self.mode, self.unit)[1][self.words]
 
 
 def encode_values(
@@ -211,8 +212,9 @@ def decode_scans(
         indices = np.full((len(chosen), 2), -1)
         if extra:
             indices[:] = cut(data, begin + size, 2)
-        ranges, reasons = (known[words] for known in meanings(modes[chosen[0]], unit))
-        scans.append(Scans(chosen, words, ranges, reasons, unit, partial, *indices.T))
+        number = modes[chosen[0]]
+        ranges = meanings(number, unit)[0][words]
+        scans.append(Scans(chosen, words, ranges, unit, number, partial, *indices.T))
     return scans
 
 
