@@ -29,7 +29,7 @@ from rendered_boards import surveyed
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
-from telegrams import encode_scan
+from telegrams import decode_scan, encode_scan
 
 from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.evaluate.study import finished, tasks_of
@@ -40,7 +40,6 @@ from lrfcal_lib.model.observations import thin
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
 from lrfcal_lib.session.cluster import workers_at
 from lrfcal_lib.session.lms2xx_codec import (
-    decode_scan,
     decode_scans,
 )
 from lrfcal_lib.session.lms2xx_frame import (
@@ -305,7 +304,7 @@ def decoding(size):
 
     def whole():
         stream = split_stream(data)
-        return decode_scans(data, stream.offset, stream.length)
+        return decode_scans(data, stream.offset, stream.length, 0)
 
     ours, theirs = seconds(
         size["repeats"], whole, lambda: [decode_scan(one) for one in raw]

@@ -206,7 +206,7 @@ class FaultyLms(FaultyLine, RecordingLms):
                 told.code, told.data, status=status, address=address
             )
         return (
-            frame.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
+            frame.encode_telegram(0xB2, address=0x80) + raw if self.hit("foreign") else raw
         )
 
 

@@ -1,6 +1,9 @@
 """Telegrams with scans, for tests."""
 
-from lrfcal_lib.session.lms2xx_codec import encode_values, encode_words
+import numpy as np
+
+from lrfcal_lib.session.lms2xx_codec import decode_scans, encode_values, encode_words
+from lrfcal_lib.session.lms2xx_frame import TelegramError, parse_telegram
 
 
 def encode_scan(ranges, *, unit="mm", mode=0, reasons=None, **options):
@@ -13,3 +16,12 @@ def encode_scan(ranges, *, unit="mm", mode=0, reasons=None, **options):
     """
     values = encode_values(ranges, unit=unit, mode=mode, reasons=reasons)
     return encode_words(values, unit=unit, **options)
+
+
+def decode_scan(raw, mode=0):
+    """The Scans, of one row, of a telegram 0xB0; TelegramError where it is none or damaged."""
+    parse_telegram(raw)
+    scans = decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
+    if not scans:
+        raise TelegramError("holds no scan")
+    return scans[0]

@@ -4,13 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from telegrams import encode_scan
+from telegrams import decode_scan, encode_scan
 
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session import lms2xx_frame as frame
 from lrfcal_lib.session.lms2xx_codec import (
     TOP,
-    decode_scan,
 )
 from lrfcal_lib.session.lms2xx_frame import (
     encode_telegram,
@@ -62,9 +61,9 @@ def random_words(rng, shape):
 @pytest.mark.parametrize("raw", SENT + REPLIES, ids=bytes.hex)
 def test_telegrams_are_the_verified_bytes(raw):
     found = frame.parse_telegram(raw)
-    data, status = (raw[5:-3], raw[-3]) if raw in REPLIES else (raw[5:-2], None)
+    data = raw[5:-3] if raw in REPLIES else raw[5:-2]
     assert (found.code, found.data) == (raw[4], data)
-    assert encode_telegram(found.code, found.data, status=status, address=raw[1]) == raw
+    assert encode_telegram(found.code, found.data, status=raw[-3], address=raw[1]) == raw
 
 
 REFUSED = [
@@ -75,26 +74,26 @@ REFUSED = [
         A0[:5] + b"\x01" + A0[6:],
         "CRC 0A16 sent, .* computed.*ask again",
     ),
-    (decode_scan, A0, "code A0 is no scan"),
+    (decode_scan, A0, "holds no scan"),
     (
         decode_scan,
-        encode_telegram(0xB0, b"\x05\0\1\1", status=0x10),
-        "do not fit the number of values 05 00",
+        encode_telegram(0xB0, b"\x05\0\1\1", address=0x80),
+        "holds no scan",
     ),
     (
         decode_scan,
-        encode_telegram(0xB0, b"\x01\x80\1\1", status=0x10),
-        "do not fit",
+        encode_telegram(0xB0, b"\x01\x80\1\1", address=0x80),
+        "holds no scan",
     ),  # unit reserved
     (codec.parse_status, A0, "code A0 is not the reply B1"),
     (
         codec.parse_status,
-        encode_telegram(0xB1, bytes(100), status=16),
+        encode_telegram(0xB1, bytes(100), address=0x80),
         "100 bytes of data, needs 123",
     ),
     (
         codec.parse_configuration,
-        encode_telegram(0xF4, bytes(6), status=16),
+        encode_telegram(0xF4, bytes(6), address=0x80),
         "6 bytes of data, needs 7",
     ),
     (
@@ -236,7 +235,7 @@ def test_a_real_device_describes_itself(captures):
     replies = {raw[4]: raw for direction, raw, _ in captures if direction == "lms->host"}
     status = codec.parse_status(replies[0xB1])
     assert status.measuring_mode == 4
-    assert (status.scan_angle_deg, status.resolution_deg) == (180.0, 0.5)
+    assert status.variant == (180.0, 0.5)
     assert codec.parse_type(replies[0xBA]) == ("LMS200", "S18063", "V02.19")
     for code in (0xF4, 0xF7):
         read = codec.parse_configuration(replies[code])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from faults import LMS
 from shared import campaign
+from telegrams import decode_scan
 from virtual import INDEXED, lms
 
 from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.port import DeviceError
-from lrfcal_lib.session.lms2xx_codec import decode_scan
 
 BOOT_S = 0.5
 RECOVERY_S = 3.0

@@ -4,7 +4,7 @@ from contextlib import suppress
 
 import numpy as np
 from shared import STRINGS
-from telegrams import encode_scan
+from telegrams import decode_scan, encode_scan
 
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session import lms2xx_frame as frame
@@ -15,7 +15,7 @@ from lrfcal_lib.session.lms2xx_frame import (
     encode_telegram,
 )
 
-PARSERS = {0xB0: codec.decode_scan, 0xB1: codec.parse_status, 0xBA: codec.parse_type,
+PARSERS = {0xB0: decode_scan, 0xB1: codec.parse_status, 0xBA: codec.parse_type,
            0xF4: codec.parse_configuration, 0xF7: codec.parse_configuration}  # fmt: skip
 
 
@@ -43,7 +43,7 @@ def seeds(rng):
         0x92: 0,
     }
     replies = [
-        encode_telegram(code, rng.bytes(size), status=0x10) for code, size in sizes.items()
+        encode_telegram(code, rng.bytes(size), address=0x80) for code, size in sizes.items()
     ]
     return [
         *scans,
@@ -91,11 +91,11 @@ def test_fuzz_contents():
         parse = PARSERS.get(seed[4], frame.parse_telegram)
         for raw in damaged(rng, seed, STRINGS // 2 // len(every)):
             if len(raw) > 7 and raw[-1] % 4:
-                raw = encode_telegram(seed[4], raw[5:-3], status=raw[-3])
+                raw = encode_telegram(seed[4], raw[5:-3], status=raw[-3], address=0x80)
             with suppress(frame.TelegramError):
                 scan = parse(raw)
                 values += 1
-                assert parse is not codec.decode_scan or np.all(
+                assert parse is not decode_scan or np.all(
                     np.isfinite(scan.ranges) == (scan.reasons == 0)
                 )
     assert 0.1 * STRINGS < values < 0.45 * STRINGS

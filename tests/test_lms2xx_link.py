@@ -31,7 +31,7 @@ class Far(SerialDevice):
 @pytest.mark.parametrize(("rate", "writes"), [(38400, 1), (500000, 8)])
 def test_bytes_are_paced_at_500000_baud_only(rate, writes):
     far = Far(rate)
-    Link(far.path, rate, host=far.host).send(0x20, b"\x25")
+    Link(far.path, rate, interrupted=far.host.event(), host=far.host).send(0x20, b"\x25")
     times, pieces = zip(*far.heard, strict=True)
     assert b"".join(pieces) == encode_telegram(0x20, b"\x25") and len(pieces) == writes
     assert np.all(np.diff(times) >= 75e-6 - 1e-9)

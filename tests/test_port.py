@@ -3,6 +3,7 @@
 import errno
 import os
 import termios
+import threading
 import tty
 from contextlib import suppress
 
@@ -69,7 +70,7 @@ def test_a_rate_that_the_line_does_not_take_is_refused_and_the_old_one_stays(
 
 
 def test_a_port_that_vanishes_is_a_lost_line(wire):
-    link = Link(wire[1], 38400)
+    link = Link(wire[1], 38400, interrupted=threading.Event())
     os.close(wire[0])
     for action in (link.receive, lambda: link.send(0x31), lambda: link.set_rate(9600)):
         with pytest.raises(LineLost, match="is lost.*check plug and power"):

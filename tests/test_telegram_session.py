@@ -153,7 +153,7 @@ def test_without_configuration_the_factory_mode_is_assumed_and_told(recorded):
 
 
 def test_other_telegrams_and_scans_of_no_placement_are_ignored(recorded):
-    a0, short_f4 = (encode_telegram(code, b"\0", status=0x10) for code in (0xA0, 0xF4))
+    a0, short_f4 = (encode_telegram(code, b"\0", address=0x80) for code in (0xA0, 0xF4))
     session = recorded(
         (-1, [a0, short_f4]), (-1, scans(room(1, 361))), (1, [*scans(room()), a0], 0.0)
     )

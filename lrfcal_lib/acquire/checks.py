@@ -21,9 +21,8 @@ from lrfcal_lib.session.stated import StatedRig
 
 STATES = ("ok", "warn", "bad")
 FEWEST_CROSSINGS = 6  # of a side, below which a straight line says little about it
-PARALLEL = np.cos(
-    np.radians(20)
-)  # two sides that include less give one constraint, not two
+# two sides that include less give one constraint, not two
+PARALLEL = np.cos(np.radians(20))
 FEWEST_LINES = 8  # scan lines on the board
 LEAST_SCENE = 0.2  # share of the beams of a scene that come back
 BLURRED_PX = 3.5  # rise of a chessboard's edges from 10 to 90 %; 2 to 3 in a sharp image
@@ -97,11 +96,11 @@ def check_scene(sweep: Sweep) -> Light:
     sweep
     """
     share = np.isfinite(sweep.ranges).mean()
-    state = "ok" if share > LEAST_SCENE else "warn"
-    text = (
-        f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
+    return Light(
+        name="scan",
+        state="ok" if share > LEAST_SCENE else "warn",
+        text=f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back",
     )
-    return Light("scan", state, text)
 
 
 def _together(name, lights):
@@ -110,8 +109,11 @@ def _together(name, lights):
         return Light(name, "bad", "no image")
     good = [light for light in lights if light.state != "bad"]
     worst = max(good or lights, key=lambda light: STATES.index(light.state))
-    state = "warn" if good and good != lights else worst.state
-    return Light(name, state, f"{len(good)} of {len(lights)} images: {worst.text}")
+    return Light(
+        name=name,
+        state="warn" if good and good != lights else worst.state,
+        text=f"{len(good)} of {len(lights)} images: {worst.text}",
+    )
 
 
 def check_scan(sweep: Sweep | None, rig: StatedRig) -> list[Light]:
@@ -143,8 +145,7 @@ def check_scan(sweep: Sweep | None, rig: StatedRig) -> list[Light]:
         fault = ": take a smaller step, or go nearer"
     elif cut and np.ptp(sweep.pitch) > 0:
         fault = f"; the {' and '.join(cut)} line hits it: sweep farther"
-    light = Light("scan", "warn" if fault else "ok", text + fault)
-    return [light, _check_sides(scan)]
+    return [Light("scan", "warn" if fault else "ok", text + fault), _check_sides(scan)]
 
 
 def _check_sides(scan):
@@ -188,7 +189,7 @@ def check_image(
     except PatternNotFound as error:
         text = str(error)
         if brightness(image) < DARK:
-            text = f"{text}; {DARKNESS}"
+            text += f"; {DARKNESS}"
         return Light(name, "bad", text)
     scale = math.ceil(LEAST_SQUARE_PX / np.linalg.norm(corners[1] - corners[0]))
     large = cv2.resize(
@@ -206,8 +207,11 @@ def check_image(
         "little contrast: avoid glare": white - dark < LOW_CONTRAST,
     }
     text = f"pattern found, edges rise in {rise:.1f} px, squares {dark:.0f} and {white:.0f} of 255"
-    words = "; ".join([text, *compress(faults, faults.values())])
-    return Light(name, "warn" if any(faults.values()) else "ok", words)
+    return Light(
+        name=name,
+        state="warn" if any(faults.values()) else "ok",
+        text="; ".join([text, *compress(faults, faults.values())]),
+    )
 
 
 def _check_plain(image, board, model, name):

@@ -54,45 +54,8 @@ class Task:
     title: str
     guidance: str  # where to put the board
     placement: Placement | None = None
-    close: tuple[str, int] = (
-        "",
-        0,
-    )  # without a placement: camera of a close view, its number
-
-
-def next_task(recording: Recording, advice: str = "") -> Task | None:
-    """What to record next.
-
-    Parameters
-    ----------
-    recording
-        Open.
-    advice
-        Where to put the board, instead of the guide.
-
-    Returns
-    -------
-    Task or None
-        None where the plan is done.
-    """
-    plan = recording.rig.stated.plan
-    for camera, view in recording.close_views_to_do():
-        title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"
-        return Task(title, GUIDE_CLOSE, close=(camera, view))
-
-    planned = recording.plan
-    if not plan.placements:  # nothing is listed: one more can always be had
-        planned = plan.to_do(max([plan.count, *recording.finished]) + 1)
-    left = [one for one in planned if one.number not in recording.finished]
-    if not left:
-        return None
-    placement = left[0]
-    done = len(planned) - len(left)
-    guidance = advice or f"put the board {GUIDE[done % len(GUIDE)]}"
-    if placement.purpose == "scene":
-        guidance = "take the board away: this sweep shows the room"
-    count = max(len(recording.plan), placement.number)
-    return Task(f"Placement {done + 1} of {count}", guidance, placement)
+    # without a placement: camera of a close view, its number
+    close: tuple[str, int] = ("", 0)
 
 
 @dataclass(frozen=True)
@@ -106,37 +69,6 @@ class Result:
     poses: dict[str, tuple[str, ...]]
     file: Path | None  # calibration.json
     calibration: Calibration
-
-
-def calibrate_recording(path: Path) -> Result:
-    """Calibrate a session that may still be growing.
-
-    ``<session>_calibration/calibration.json`` is written beside it.
-
-    Parameters
-    ----------
-    path
-        Of the session.
-
-    Raises
-    ------
-    ValueError
-        If the session cannot be used.
-    """
-    calibration = calibrate(open_session(path), CANDIDATES)
-    judged = judge(calibration)
-    sentences = judged.sentences()
-    if not judged.errors:
-        sentences.append("Nothing is written.")
-        return Result(judged.answer, sentences, "", {}, None, calibration)
-    method = handed_over(calibration)
-    poses = {}
-    for camera, solution in calibration.cameras(method).items():
-        told = POSE_UNITS * [solution.parameters[:6], solution.trusted_sigma[:6]]
-        poses[camera] = tuple(f"{value:.2f} ± {sigma:.2f}" for value, sigma in told.T)
-    file = path.with_name(f"{path.name}_calibration") / "calibration.json"
-    write_calibration(file, calibration_record(calibration, method, judged))
-    return Result(judged.answer, sentences, method, poses, file, calibration)
 
 
 def advise(session: Session) -> str:
@@ -192,7 +124,6 @@ class Collector(Closed):
         self.view = View()
         self.lights: dict[int, list[Light]] = {}
         self.stopped = threading.Event()
-        self._advice = ""
         self._devices = threading.Lock()
         self._closing = contextlib.ExitStack()
 
@@ -360,9 +291,27 @@ class Collector(Closed):
 
     def task(self) -> Task | None:
         """What to record next; None where the plan is done."""
-        if self.recording is None:
+        recording = self.recording
+        if recording is None:
             return None
-        return next_task(self.recording, self._advice)
+        plan = recording.rig.stated.plan
+        for camera, view in recording.close_views_to_do():
+            title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"
+            return Task(title, GUIDE_CLOSE, close=(camera, view))
+
+        planned = recording.plan
+        if not plan.placements:  # nothing is listed: one more can always be had
+            planned = plan.to_do(max([plan.count, *self.finished]) + 1)
+        left = [one for one in planned if one.number not in self.finished]
+        if not left:
+            return None
+        placement = left[0]
+        done = len(planned) - len(left)
+        guidance = self._advice or f"put the board {GUIDE[done % len(GUIDE)]}"
+        if placement.purpose == "scene":
+            guidance = "take the board away: this sweep shows the room"
+        count = max(len(recording.plan), placement.number)
+        return Task(f"Placement {done + 1} of {count}", guidance, placement)
 
     def capture(
         self, progress: Callable[[float, str], object] = lambda share, text: None
@@ -406,9 +355,12 @@ class Collector(Closed):
         lights = check_placement(session, number)
         if placement.purpose == "board" and len(session.board_placements) >= ADVICE_FROM:
             self._advice = advise(session)
-            state = "warn" if self._advice else "ok"
-            words = self._advice or "every direction is well determined"
-            lights.append(Light("information", state, words))
+            light = Light(
+                name="information",
+                state="warn" if self._advice else "ok",
+                text=self._advice or "every direction is well determined",
+            )
+            lights.append(light)
         self.lights[number] = lights
         return lights
 
@@ -451,6 +403,8 @@ class Collector(Closed):
     def calibrate(self) -> Result:
         """Calibrate what was recorded so far; the recording can go on afterwards.
 
+        ``<session>_calibration/calibration.json`` is written beside the session.
+
         Raises
         ------
         RecordingError
@@ -458,12 +412,25 @@ class Collector(Closed):
         ValueError
             If it determines no calibration.
         """
-        recording = self._needed()
+        path = self._needed().path
         if not self.finished:
             raise RecordingError(
                 "nothing was recorded yet: capture at least three placements of the board"
             )
-        return calibrate_recording(recording.path)
+        calibration = calibrate(open_session(path), CANDIDATES)
+        judged = judge(calibration)
+        sentences = judged.sentences()
+        if not judged.errors:
+            sentences.append("Nothing is written.")
+            return Result(judged.answer, sentences, "", {}, None, calibration)
+        method = handed_over(calibration)
+        poses = {}
+        for camera, solution in calibration.cameras(method).items():
+            told = POSE_UNITS * [solution.parameters[:6], solution.trusted_sigma[:6]]
+            poses[camera] = tuple(f"{value:.2f} ± {sigma:.2f}" for value, sigma in told.T)
+        file = path.with_name(f"{path.name}_calibration") / "calibration.json"
+        write_calibration(file, calibration_record(calibration, method, judged))
+        return Result(judged.answer, sentences, method, poses, file, calibration)
 
 
 def _stated(rig, stack):

@@ -494,8 +494,8 @@ class Panel(Closed):
             return image, f"{words}; the calibration is of {model.width} x {model.height}"
         pixels = rig.project_scan(name, scan.ranges, scan.bearings, view.pitch)
         image = with_scan(image, pixels, scan.ranges)
-        words = f"{words}; dots: the scan, near is bright"
+        words += "; dots: the scan, near is bright"
         if name in self._moved:
             cv2.rectangle(image, (0, 0), (width - 1, height - 1), RED, round(width / 50))
-            words = f"{words}; has moved since it was calibrated"
+            words += "; has moved since it was calibrated"
         return image, words

@@ -75,7 +75,7 @@ def with_scan(image: np.ndarray, pixels: np.ndarray, ranges: np.ndarray) -> np.n
     drawn = image.copy()
     height, width = image.shape[:2]
     radius = max(2, round(width / WIDTH * 2))
-    inside = np.all((pixels >= 0) & (pixels < (width, height)), axis=1)
+    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
     low, high = np.nanpercentile(ranges, [2, 90])
     near = np.clip((high - ranges[inside]) / max(high - low, 0.1), 0, 1)
     colours = cv2.applyColorMap((255 * near).astype(np.uint8), cv2.COLORMAP_VIRIDIS)

@@ -8,13 +8,12 @@ import signal
 import sys
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from tqdm import tqdm
 
 from lrfcal_lib.acquire.checks import Light, check_image, check_placement
 from lrfcal_lib.drivers.lms2xx_scans import Reading
-from lrfcal_lib.drivers.port import Closed, DeviceError
+from lrfcal_lib.drivers.port import DeviceError
 from lrfcal_lib.drivers.rig import Event, Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, read_rig_file
 from lrfcal_lib.drivers.video import Frame
@@ -44,7 +43,7 @@ class RecordingError(RuntimeError):
     """A recording that cannot go on; the message says what is safe and what to do."""
 
 
-class Recording(Closed):
+class Recording(SessionRecorder):
     """Writes what a rig records to a session; a context manager.
 
     Parameters
@@ -86,43 +85,34 @@ class Recording(Closed):
         count: int | None = None,
     ):
         stated = rig.stated
-        self.rig = rig
-        self.path = Path(path)
         self.plan = stated.plan.to_do(count)
-        reference = {
-            "recording": HOW[stated.plan.mode],
-            "pitch": PITCH[rig.head.has_feedback],
-            "scene_placements": [p.number for p in self.plan if p.purpose == "scene"],
-        }
         source = stated.about["source"] or f"recorded with {stated.path.name}"
         with self._safely(), contextlib.ExitStack() as stack:
-            self.writer = SessionRecorder(
-                self.path,
+            super().__init__(
+                path,
                 stated.board,
                 rig.lrf_info,
                 stated.cameras.values(),
                 stated.T_head_lrf,
                 platform_sigma=stated.platform_sigma,
-                reference=reference,
+                reference={
+                    "recording": HOW[stated.plan.mode],
+                    "pitch": PITCH[rig.head.has_feedback],
+                    "scene_placements": [
+                        p.number for p in self.plan if p.purpose == "scene"
+                    ],
+                },
                 continuous=stated.plan.mode == "continuous",
                 resume=resume,
                 **stated.about | {"source": source},
             )
             stack.callback(self.close)
+            self.rig = rig
             # a scan does not tell its measuring mode, this does
-            self.writer.add_telegrams(
+            self.add_telegrams(
                 -1, [encode_configuration(rig.lrf.configuration)], time_s=rig.clock()
             )
             stack.pop_all()
-
-    @property
-    def finished(self) -> tuple[int, ...]:
-        """Numbers of the placements that are complete and safe."""
-        return self.writer.finished
-
-    def close(self) -> None:
-        """Record nothing any more: the session is free for others, who may go on with it."""
-        self.writer.close()
 
     def to_do(self) -> list[Placement]:
         """The placements of the plan that are not finished, in order."""
@@ -134,7 +124,7 @@ class Recording(Closed):
         """Images of the board held close still to be taken: camera, number of the view from 0."""
         return [
             (camera, view)
-            for camera, taken in self.writer.shots_of("intrinsics").items()
+            for camera, taken in self.shots_of("intrinsics").items()
             for view in range(taken, self.rig.stated.plan.intrinsics_images)
         ]
 
@@ -157,13 +147,13 @@ class Recording(Closed):
             If the disk is full or gone.
         """
         with self._safely():
-            self.writer.begin_placement(placement.number)
+            self.begin_placement(placement.number)
         with contextlib.closing(self.rig.acquire(placement)) as events:
             for event in events:
                 self.write(event)
                 yield event
         with self._safely():
-            self.writer.finish_placement()
+            self.finish_placement()
 
     def run_close(self, camera: str) -> Light:
         """Take an image of the board held close to a camera.
@@ -199,7 +189,7 @@ class Recording(Closed):
             Of the placement.
         """
         with self._safely():
-            self.writer.drop_placement(number)
+            self.drop_placement(number)
 
     def finish(self) -> None:
         """Close the session; without this it can still be opened, and the recording can go on.
@@ -210,7 +200,7 @@ class Recording(Closed):
             If the session on the disk does not hold what was finished.
         """
         with self._safely():
-            self.writer.finish()
+            super().finish()
         if self._lost():
             raise RecordingError(f"{self.path}: {self.safe()}")
 
@@ -253,20 +243,19 @@ class Recording(Closed):
         RecordingError
             If the disk is full or gone.
         """
-        writer = self.writer
         with self._safely():
             match event:
                 case Moved():
                     measured = event.pitch if event.measured else math.nan
-                    writer.add_platform([(event.time_s, event.commanded, measured)])
+                    self.add_platform([(event.time_s, event.commanded, measured)])
                 case Scanned():
                     scans = zip(event.readings, event.pitch, strict=True)
                     rows = [
                         (raw, p, one.time_s) for one, p in scans for raw in one.telegrams
                     ]
-                    writer.add_telegrams(event.placement, *zip(*rows, strict=True))
+                    self.add_telegrams(event.placement, *zip(*rows, strict=True))
                 case Photographed():
-                    writer.add_image(
+                    self.add_image(
                         event.camera,
                         event.frame.image,
                         event.placement,
@@ -275,7 +264,7 @@ class Recording(Closed):
                         purpose=event.purpose,
                     )
                 case Tracked():
-                    writer.add_platform(
+                    self.add_platform(
                         (t, event.commanded, pitch)
                         for t, pitch, measured in event.track
                         if measured
@@ -288,7 +277,7 @@ class Recording(Closed):
             yield
         except OSError as error:
             safe = "then record again"
-            if hasattr(self, "writer"):
+            if hasattr(self, "rig"):  # the session was begun
                 safe = self.safe(resume=True)
             raise RecordingError(f"{self.path}: {not_written(error)}; {safe}") from error
 
@@ -412,8 +401,10 @@ class Boards:
         if before is not None:
             possible.append("r")
             again = f", r: {self.kind} {before} again"
-        asked = f"{self.kind} {placement.number}: {self.to_prepare(placement)}"
-        text = f"{asked}, then press Enter{again} (q: end here) "
+        text = (
+            f"{self.kind} {placement.number}: {self.to_prepare(placement)}, then press Enter"
+            f"{again} (q: end here) "
+        )
         while (answer := ask(text)) not in possible:
             pass
         return answer

@@ -98,9 +98,12 @@ class Stations(Boards):
             station = station_of(session, self.rig, number)
             seen = [cloud.seen for cloud in colored_blocks(session, self.rig, *station)]
             share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
-            text = f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned"
-            state = "ok" if share > EXPECTED * self.share else "warn"
-            lights.append(Light("colour", state, text))
+            light = Light(
+                name="colour",
+                state="ok" if share > EXPECTED * self.share else "warn",
+                text=f"{100 * share:.0f} % of the points, {100 * self.share:.0f} % planned",
+            )
+            lights.append(light)
         return [*lights, _still(sweep)]
 
 

@@ -69,7 +69,7 @@ class PanTilt(port.Closed):
         line.stop()
         reading = None
         if settings.feedback is not False:
-            reading = self.motion.read(settings.retries)
+            reading = self.motion.read(patient=True)
         self.has_feedback = self.motion.feedback = reading is not None
         if self.has_feedback:
             return
@@ -150,7 +150,7 @@ class PanTilt(port.Closed):
         self._need_open()
         if self.has_feedback:
             moving = self.moving()
-            reading = self.motion.read(0 if moving else self.settings.retries)
+            reading = self.motion.read(patient=not moving)
             if reading is not None:
                 return reading.pitch, True
             if not moving:
@@ -232,7 +232,7 @@ class PanTilt(port.Closed):
         """
         self._begin(pitch)
         try:
-            if self.has_feedback and self.motion.read(self.settings.retries) is None:
+            if self.has_feedback and self.motion.read(patient=True) is None:
                 raise self._silence()
             return self.motion.move(pitch)
         except BaseException:

@@ -22,6 +22,7 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
 )
 from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session.files import short
 from lrfcal_lib.session.lms2xx_codec import TOP, VARIANTS
 from lrfcal_lib.session.lms2xx_frame import TelegramError
 
@@ -95,10 +96,10 @@ class LMS2xx(Closed):
         **configuration,
     ):
         if baudrate not in (None, *RATES):
-            known = ", ".join(map(str, sorted(RATES)))
-            raise ValueError(f"an LMS2xx has {known} Bd, got {baudrate}")
+            raise ValueError(f"an LMS2xx has {short(sorted(RATES))} Bd, got {baudrate}")
         self.port = str(port)
         self._host = host
+        self._now = host.now
         self._address = address
         self._interrupted = host.event()
         self._link = None
@@ -184,9 +185,8 @@ class LMS2xx(Closed):
 
     def _read(self, code, parse):
         """What a reply says."""
-        raw = self._line.ask(code).raw
         try:
-            return parse(raw)
+            return parse(self._line.ask(code).raw)
         except TelegramError as error:
             raise WrongDevice(
                 f"{self.port}: the reply to command {code:02X} is not that of an LMS2xx: {error}"
@@ -221,8 +221,7 @@ class LMS2xx(Closed):
         self._mend(deadline)
 
     def _mend(self, deadline):
-        host = self._host
-        end = host.now() + deadline
+        end = self._now() + deadline
         variant, configuration, rate = self._settled
         self._release()
         while self._link is None:
@@ -230,7 +229,7 @@ class LMS2xx(Closed):
                 self._connect(rate, FIND_S, end)
             except (PortError, LineLost) as error:
                 self._release()
-                if self._interrupted.wait(AGAIN_S) or host.now() > end - AGAIN_S:
+                if self._interrupted.wait(AGAIN_S) or self._now() > end - AGAIN_S:
                     raise LineLost(f"the line did not come back: {error}") from error
         self._set_variant(variant)
         self._read_configuration()
@@ -243,7 +242,7 @@ class LMS2xx(Closed):
     @property
     def variant(self) -> tuple[float, float]:
         """Field of view and resolution, degrees."""
-        return self.status.scan_angle_deg, self.status.resolution_deg
+        return self.status.variant
 
     def _set_rate(self, rate):
         """Set the rate of both ends; flash is not written.
@@ -292,7 +291,7 @@ class LMS2xx(Closed):
         self._need_quiet()
         wanted = (float(fov_deg), float(resolution_deg))
         if wanted not in VARIANTS:
-            known = ", ".join(f"{fov:g}/{step:g}" for fov, step in VARIANTS)
+            known = short(f"{fov:g}/{step:g}" for fov, step in VARIANTS)
             raise ValueError(
                 f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}"
             )
@@ -305,9 +304,8 @@ class LMS2xx(Closed):
         if self.variant == wanted:
             return
         view, step = wanted
-        data = struct.pack("<HH", round(view), round(100 * step))
         try:
-            self._line.ask(wire.VARIANT, data)
+            self._line.ask(wire.VARIANT, struct.pack("<HH", round(view), round(100 * step)))
         except NoReply as error:  # the reply may be lost and the variant set
             LOG.warning("%s; reading the variant", error)
         self._read_status()
@@ -374,16 +372,16 @@ class LMS2xx(Closed):
         """
         self._need_quiet()
         link = self._line
-        end = self._host.now() + timeout
+        end = self._now() + timeout
         usual_s = REPLY_S + self._assembler.duration_s
         while True:
-            arrival = link.ask(wire.VALUES, ALL_VALUES, limit_s=end - self._host.now())
+            arrival = link.ask(wire.VALUES, ALL_VALUES, limit_s=end - self._now())
             # nobody knows the instant of a scan that came late
             if arrival.time_s - link.asked_s <= usual_s:
                 reading = self._assembler.feed(*arrival)
                 if reading is not None:
                     return reading
-            if self._host.now() > end - usual_s:
+            if self._now() > end - usual_s:
                 raise NoReply(
                     f"{self.port}: scans arrive, but too late, not new, or not of the variant "
                     f"{self.variant}"
@@ -440,8 +438,7 @@ class LMS2xx(Closed):
 
         The list is replaced, never changed.
         """
-        host = self._host
-        last = host.now()
+        last = self._now()
         quiet_s = max(LEAST_QUIET_S, 2.2 * self._assembler.interval_s + 0.15)
         while not self._interrupted.is_set():
             for arrival in self._line.receive():
@@ -452,8 +449,8 @@ class LMS2xx(Closed):
                     self._readings = [*self._readings, reading][-KEPT:]
                     self._trouble = ""
                     self._news.set()
-                    last = host.now()
-            if host.now() - last > quiet_s:
+                    last = self._now()
+            if self._now() - last > quiet_s:
                 raise NoReply("the stream stopped")
 
     def take(
@@ -484,10 +481,9 @@ class LMS2xx(Closed):
             raise DeviceError(
                 f"{self.port}: the device does not stream; call start() first"
             )
-        host = self._host
         if after is None:
-            after = host.time()
-        end = host.now() + timeout
+            after = self._host.time()
+        end = self._now() + timeout
         readings: list[Reading] = []
         while True:
             self._news.clear()
@@ -497,10 +493,11 @@ class LMS2xx(Closed):
                 return readings[:count]
             if readings:
                 after = readings[-1].time_s
-            left = end - host.now()
+            left = end - self._now()
             if left <= 0 or not alive:
-                trouble = self._trouble or "the stream is silent"
-                raise NoReply(f"no new scan within {timeout:g} s: {trouble}")
+                raise NoReply(
+                    f"no new scan within {timeout:g} s: {self._trouble or 'the stream is silent'}"
+                )
             self._news.wait(min(left, LOOK_S))
 
     def stop(self) -> None:

@@ -4,6 +4,7 @@ import itertools
 import math
 import os
 from collections.abc import Collection
+from threading import Event
 from typing import NamedTuple
 
 from lrfcal_lib.drivers.port import (
@@ -15,6 +16,7 @@ from lrfcal_lib.drivers.port import (
     WrongDevice,
     line_lost,
 )
+from lrfcal_lib.session.files import short
 from lrfcal_lib.session.lms2xx_frame import OVERHEAD, encode_telegram, split_stream, whole
 
 ACK = 0x06
@@ -75,7 +77,7 @@ class Link:
         Bits a second.
     address
         Of the device; 0 reaches any.
-    interrupted : threading.Event, optional
+    interrupted
         Once it is set whoever waits here gets NoReply.
     host
         Machine that the driver runs on.
@@ -98,16 +100,16 @@ class Link:
         baudrate: int,
         *,
         address: int = 0,
-        interrupted=None,
+        interrupted: Event,
         host: Host = REAL,
     ):
         self.path = path
         self.address = address
         self.host = host
-        self.interrupted = interrupted or host.event()
+        self._now = host.now
+        self.interrupted = interrupted
         self.senders: Collection[int] = range(256)
         self.deadline = math.inf
-        self.asked_s = 0.0
         self.heard = 0
         self._port = host.port(path, baudrate, timeout=READ_S)
         self._forget()
@@ -120,7 +122,7 @@ class Link:
     @property
     def silent_s(self) -> float:
         """Seconds since the last byte, or request."""
-        return self.host.now() - self._last
+        return self._now() - self._last
 
     @property
     def declined(self) -> bool:
@@ -150,7 +152,7 @@ class Link:
     def _forget(self):
         self._rest = b""  # bytes of a telegram that is not whole
         self._stray = None  # the last byte outside of telegrams
-        self._last = self.host.now()
+        self._last = self._now()
 
     def send(self, code: int, data: bytes = b"") -> None:
         """Send a request; what arrived before it is thrown away.
@@ -195,7 +197,7 @@ class Link:
         if not data:
             return []
         now = self.host.time()
-        self._last = self.host.now()
+        self._last = self._now()
         self.heard += len(data)
         data = self._rest + data
         stream = split_stream(data)
@@ -235,7 +237,7 @@ class Link:
             If the port vanished.
         """
         again_s, longest_s = PATIENCE.get(code, USUAL)
-        end = min(self.host.now() + min(longest_s, limit_s), self.deadline)
+        end = min(self._now() + min(longest_s, limit_s), self.deadline)
         self.asked_s = self.host.time()
         refusal = None
         for _ in range(TRIES):
@@ -243,7 +245,7 @@ class Link:
             reply, refusal = self._await(code | 0x80, again_s, end)
             if reply is not None:
                 return reply
-            if self.host.now() > end - NAK_PAUSE_S:
+            if self._now() > end - NAK_PAUSE_S:
                 break
             if refusal:
                 self.host.sleep(NAK_PAUSE_S)
@@ -255,9 +257,9 @@ class Link:
 
     def _await(self, code, again_s, end):
         """The reply, or None and why the device declined (None: it is time to ask again)."""
-        begin = self.host.now()
+        begin = self._now()
         patience = NO_ACK_S
-        while (now := self.host.now()) < end:
+        while (now := self._now()) < end:
             for arrival in self.receive():
                 if arrival.code == code:
                     return arrival, None
@@ -295,16 +297,16 @@ class Link:
         WrongDevice
             If only bytes came that make no telegram.
         """
-        end = min(self.host.now() + limit_s, self.deadline)
+        end = min(self._now() + limit_s, self.deadline)
         heard = self.heard
         rates = dict.fromkeys([first, *RATES])
         for window in itertools.cycle(WINDOWS_S):
-            if self.host.now() >= end:
+            if self._now() >= end:
                 break
             for rate in rates:
                 if self._answers(rate, window, end):
                     return
-        tried = f"{', '.join(map(str, rates))} Bd, address {self.address}"
+        tried = f"{short(rates)} Bd, address {self.address}"
         if not self.address:
             tried += " (any)"
         if self.heard > heard:
@@ -326,10 +328,10 @@ class Link:
             self.set_rate(rate)
         except PortError:  # most RS-232 ports lack 500000 Bd
             return False
-        begin = self.host.now()
+        begin = self._now()
         until = begin + window
         asked = -math.inf
-        while (now := self.host.now()) < min(until, end):
+        while (now := self._now()) < min(until, end):
             pause = NAK_PAUSE_S if self.declined else ASK_AGAIN_S
             if now - asked > pause:
                 asked = now
@@ -356,10 +358,10 @@ class Link:
             If the stream goes on.
         """
         for _ in range(TRIES):
-            end = self.host.now() + 5 * SILENCE_S
+            end = self._now() + 5 * SILENCE_S
             heard = self.heard
             while self.heard == heard:
-                if self.host.now() >= end:
+                if self._now() >= end:
                     return
                 self.receive()
             self.ask(MODE, ON_REQUEST)

@@ -9,7 +9,6 @@ import numpy as np
 from lrfcal_lib.drivers.lms2xx_link import FASTEST
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_frame import TelegramError
 
 BURST = 508  # bytes that leave in a turn of the mirror at 500 kBd
 PARTIAL = 181  # values of the first of four interlaced scans; the others have one less
@@ -62,9 +61,8 @@ class Reading:
     bearings: np.ndarray  # (B,), radians in the LRF frame, ascending
     time_s: float  # clock of the host at the first beam
     beam_times_s: np.ndarray  # (B,), the same for every beam
-    telegram_index: (
-        int  # of the (first) telegram, modulo 256; -1 where the device does not count
-    )
+    # of the (first) telegram, modulo 256; -1 where the device does not count
+    telegram_index: int
 
 
 class ScanClock:
@@ -162,10 +160,14 @@ class Assembler:
         if interlaced:
             values = PARTIAL
             self.turns = 1
-        indexed = configuration.realtime_indices
         # number of values, unit, and whether there are indices and parts
-        self._kind = (values, configuration.unit, indexed, interlaced)
-        size = 10 + 2 * values + 2 * indexed
+        self._kind = (
+            values,
+            configuration.unit,
+            configuration.realtime_indices,
+            interlaced,
+        )
+        size = 10 + 2 * values + 2 * configuration.realtime_indices
         scan_s = self.turns * MIRROR_TURN
         self.duration_s = scan_s + transfer_s(size, baudrate)
         self.interval_s = interval_s(size, baudrate, scan_s)
@@ -188,10 +190,11 @@ class Assembler:
             None for a part of a set, and for what is no scan of this variant, unit and kind or is
             not new.
         """
-        try:
-            scan = codec.decode_scan(raw, self.configuration.measuring_mode)
-        except TelegramError:
+        mode = self.configuration.measuring_mode
+        scans = codec.decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
+        if not scans:
             return None
+        scan = scans[0]
         count = scan.words.shape[1]
         index = int(scan.scan_index[0])
         kind = (count + (scan.partial > 0), scan.unit, index >= 0, scan.partial >= 0)
@@ -237,7 +240,7 @@ class Assembler:
         beams = np.concatenate(
             [[part.bearings, part.ranges, part.beam_times_s] for part in parts], axis=1
         )
-        bearings, ranges, times = beams[:, np.argsort(beams[0])]
+        bearings, ranges, times = beams[:, beams[0].argsort()]
         return replace(
             parts[0],
             telegrams=sum((part.telegrams for part in parts), ()),

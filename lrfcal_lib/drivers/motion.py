@@ -22,9 +22,8 @@ from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, Refused
 LOG = logging.getLogger(__name__)
 ASSUMED = 4.0, 4.0  # deg/s up and down, as of heads of constant speed
 EXTRA_S = 10  # that a move may take beside twice the time of its way
-ARRIVAL = math.radians(
-    0.5
-)  # a move that ends this near has arrived; its settled pitch counts
+# a move that ends this near has arrived; its settled pitch counts
+ARRIVAL = math.radians(0.5)
 STALLED = 5  # settle times at rest elsewhere: the head does not get to where it was sent
 BURSTS = 25  # of up and down, to reach one pitch
 FIRST_BURST_S = 0.1  # of a head whose speed is unknown
@@ -96,15 +95,12 @@ class Motion:
         }
         self._longest = math.inf if self.calibrated else FIRST_BURST_S / GROWTH
         # whether set-tilt moves the head; None until it was tried
-        self._obeys = False if settings.absolute is False else None
+        self._obeys = None if settings.absolute else False
         self._dead: set[int] = set()  # speed bytes at which the head does not move
         # way (1 up, -1 down), speed byte and instant of the motion
         self._going: tuple | None = None
-        self._frame = b""
         self._repeated = math.inf  # when it was last sent, if the head goes
         self._pitch: float | None = None
-        self._known_at = 0.0
-        self._misses = 0
         self._tolerance = math.radians(settings.tolerance_deg)
         self._shortest_s = 2 * line.frame_s + settings.gap_s  # of a motion and its stop
 
@@ -140,12 +136,12 @@ class Motion:
         seconds = max(0.0, (instant or self._now()) - max(self._known_at, begun))
         return self._pitch + way * self.speed(way, step) * seconds
 
-    def read(self, retries=0):
+    def read(self, patient=False):
         """What the head tells, as TrackPoint; None without a reply.
 
         A reading far from dead reckoning is asked for twice more, and the one in the middle counts.
         """
-        answer = self.line.pitch(retries)
+        answer = self.line.pitch(patient)
         if answer is None:
             return None
         pitch, instant = answer
@@ -153,7 +149,7 @@ class Motion:
         if self._pitch is not None:
             reckoned = self.estimate(instant)
         if abs(pitch - reckoned) > SURPRISE:
-            answers = [answer, self.line.pitch(retries), self.line.pitch(retries)]
+            answers = [answer, self.line.pitch(patient), self.line.pitch(patient)]
             if None in answers:
                 return None
             pitch, instant = sorted(answers)[1]
@@ -161,12 +157,12 @@ class Motion:
         self.know(pitch, instant)
         return TrackPoint(instant, pitch, reckoned)
 
-    def note(self, retries=0):
+    def note(self, patient=False):
         """Append where the head is now to the rows."""
         point = None
         if self.feedback and self._misses < MISSES:
             self._misses += 1
-            point = self.read(retries)
+            point = self.read(patient)
         if point is None:
             now = self._now()
             pitch = self.estimate(now)
@@ -424,7 +420,7 @@ class Motion:
     def sweep(self, goal, step):
         """Move to a pitch at a speed byte; note where the head is on the way and where it rests."""
         self._misses = 0
-        self.note(self.settings.retries)
+        self.note(patient=True)
         first = self.estimate()
         way = math.copysign(1, goal - first)
         deadline = self._now() + 3 * abs(goal - first) / self.speed(way, step) + 10
@@ -454,10 +450,10 @@ class Motion:
         finally:
             self._misses = 0
             if self._pitch is not None:
-                self.note(self.settings.retries)
+                self.note(patient=True)
         if self.feedback:
             self.settle(self._now() + 5)
-        self.note(self.settings.retries)
+        self.note(patient=True)
 
 
 def _short_of(pitch, target):

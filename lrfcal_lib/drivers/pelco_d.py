@@ -253,15 +253,16 @@ class HeadLine:
 
     # ------------------------------------------------------------------------------------- frames
 
-    def pitch(self, retries):
-        """Pitch that the head tells, rad, and instant of the host; None if no reply came.
+    def pitch(self, patient):
+        """Pitch that the head tells, rad, and instant of the host; None if no reply came, for who
+        is patient to several queries.
 
         After a time-out the next reply may be the late one, so it is thrown away and the head is
         asked again. The head looks at its encoder about half-way between the beginning of the query
         and the end of the reply.
         """
         query = encode_extended(self.settings.address, QUERY_TILT)
-        for _ in range(1 + retries + self._late):
+        for _ in range(1 + self.settings.retries * patient + self._late):
             with self.lock:
                 suspect = self._late
                 begun = self.host.now()

@@ -110,6 +110,11 @@ Speeds = Annotated[
 # ------------------------------------------------------------------------------------- devices
 
 
+def said(data):
+    """What an object states: null is as good as left out."""
+    return {key: value for key, value in data.items() if value is not None}
+
+
 class Stated(BaseModel, frozen=True):
     """An object of a rig file: null is as good as left out, and other keys are refused."""
 
@@ -124,7 +129,7 @@ class Stated(BaseModel, frozen=True):
                 raise ValueError(
                     f"{key} is not known; known are {', '.join(cls.model_fields)}"
                 )
-        return {key: value for key, value in data.items() if value is not None}
+        return said(data)
 
 
 class LrfDevice(Stated):
@@ -272,9 +277,8 @@ class Placement:
     pitch: np.ndarray
     image_pitch: tuple[float, ...]  # where images are taken, radians
     purpose: str = "board"  # of the images, or "scene"
-    closing: bool = (
-        False  # back in its first half a last scan shows whether all stood still
-    )
+    # back in its first half a last scan shows whether all stood still
+    closing: bool = False
 
     @property
     def direction(self) -> int:
@@ -298,9 +302,9 @@ class Plan(Stated):
     sweep_speed: whole(0, 63) = None
     count: whole(1, 1000) = 12
     intrinsics_images: whole(0, 1000) = 0
-    placements: Annotated[
-        tuple[ListedPlacement, ...], Field(fail_fast=True, max_length=MOST_PLACEMENTS)
-    ] = ()
+    placements: tuple[ListedPlacement, ...] = Field(
+        default=(), fail_fast=True, max_length=MOST_PLACEMENTS
+    )
 
     @model_validator(mode="after")
     def numbered(self):
@@ -412,9 +416,9 @@ def rig_of(data: dict, path: Path = Path("rig.json")) -> RigFile:
         With the path, the key and the value, for anything that cannot be used.
     """
     try:
-        present = {key: value for key, value in data.items() if value is not None}
-        unsaid = ABOUT | {"name": "rig"}
-        stated = parse_session(unsaid | present | {"placements": ()}, RigFileStated)
+        stated = parse_session(
+            {**ABOUT, "name": "rig", **said(data), "placements": ()}, RigFileStated
+        )
         _check_cameras(stated["devices"].cameras, stated["cameras"])
     except ValueError as error:
         raise RigFileError(f"{path}: {error}") from error

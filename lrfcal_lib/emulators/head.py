@@ -154,8 +154,7 @@ class Head:
         float
             Radians.
         """
-        angle = self.motor(instant - self.platform.latency)
-        return float(self.platform.encoded(angle))
+        return float(self.platform.encoded(self.motor(instant - self.platform.latency)))
 
     def _with_play(self, dragged, motor):
         """The head stays where it was until the motor is half the play ahead of it."""

@@ -258,9 +258,8 @@ class Terminal(threading.Thread):
                 select.select(listened, [], [], max(0.0, wait))
                 self._listen()
                 self._device.advance()
-        except (
-            Exception
-        ) as error:  # a device that dies must say so: a look at `error` shows it
+        # a device that dies must say so: a look at `error` shows it
+        except Exception as error:
             self._device.error = error
             raise
         finally:

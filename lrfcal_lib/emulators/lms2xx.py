@@ -107,9 +107,6 @@ class EmulatedLms(SerialDevice):
         self._effect: Callable | None = None  # of the command whose reply is on its way
         self._zero = host.now() - POWERED_S  # when turns of the mirror are counted from
         self._selection = Selection()
-        # of the next scan of the stream
-        self._turn = 0
-        self._partial = 0
 
     @property
     def baudrate(self) -> int:
@@ -181,7 +178,12 @@ class EmulatedLms(SerialDevice):
         memory = self.memory
         match telegram.code, telegram.data:
             case 0x10, _:
-                self.answer(at, 0x91, effect=self._begin_restart, delay=ACK_S + 0.001)
+                self.answer(
+                    at,
+                    0x91,
+                    effect=lambda told: self.at(told + RESET_S, self.restart),
+                    delay=ACK_S + 0.001,
+                )
             case 0x20, data:
                 self.set_mode(data, at)
             case 0x30, b"\x01" if not self._selection.head:
@@ -257,7 +259,7 @@ class EmulatedLms(SerialDevice):
         """
         if effect is not None:  # else that of the command whose reply this one interrupted
             self._effect = effect
-        raw = encode_telegram(code, data, status=0x10, address=0x80 | self.memory.address)
+        raw = encode_telegram(code, data, address=0x80 | self.memory.address)
         self.at(at + delay, partial(self.reply, raw, then=self._finish), SENDING)
 
     def _finish(self, at):
@@ -286,9 +288,6 @@ class EmulatedLms(SerialDevice):
         for burst, first in enumerate(range(0, len(raw), BURST)):
             self.write(raw[first : first + BURST], at + burst * MIRROR_TURN)
         self.write(b"", at, then)
-
-    def _begin_restart(self, at):
-        self.at(at + RESET_S, self.restart)
 
     def restart(self, at: float) -> None:
         """Fall silent, with variant and rate of the factory; tell at the end that it is ready.

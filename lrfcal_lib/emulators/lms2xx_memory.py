@@ -1,7 +1,7 @@
 """What an LMS2xx remembers: its settings, and what its operating mode sends of the scans."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -50,7 +50,7 @@ class Memory:
 
     model: str = "LMS221;302063;X01.27 "  # 21 characters, the answer to the type request
     variant: tuple[int, int] = (180, 50)  # degrees and 1/100 degree
-    configuration: Configuration = field(default_factory=Configuration)
+    configuration: Configuration = Configuration()
     baudrate: int = 9600
     baudrates: tuple[int, ...] = (*BAUD_WORD,)  # that the line allows; RS-232 ends at 38400
     mode: int = REQUEST  # operating mode, the sub-command of 0x20

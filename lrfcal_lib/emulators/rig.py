@@ -105,17 +105,20 @@ class EmulatedRig:
 
     def plan(self) -> dict:
         """What a recording of this rig can do: its placements, each with its sweep."""
-        setup = self.setup
-        placements = [
-            {
-                "number": p.number,
-                "board": p.purpose == "board",
-                "pitch_deg": np.degrees([*p.sweep, setup.step_of(p)]).round(4).tolist(),
-                "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
-            }
-            for p in self.world.placements.values()
-        ]
-        return {"intrinsics_images": setup.intrinsics_views, "placements": placements}
+        return {
+            "intrinsics_images": self.setup.intrinsics_views,
+            "placements": [
+                {
+                    "number": p.number,
+                    "board": p.purpose == "board",
+                    "pitch_deg": np.degrees([*p.sweep, self.setup.step_of(p)])
+                    .round(4)
+                    .tolist(),
+                    "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
+                }
+                for p in self.world.placements.values()
+            ],
+        }
 
     def rig_file(self) -> dict:
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices,
@@ -123,7 +126,6 @@ class EmulatedRig:
         """
         setup = self.setup
         rig = setup.rig
-        cameras = rig.camera_infos(known=setup.intrinsics_views == 0)
         return {
             "schema": stated.SCHEMA,
             "name": f"{setup.name}_emulated",
@@ -132,7 +134,9 @@ class EmulatedRig:
             "source": f"emulated rig of the setup '{setup.name}', seed {setup.seed}",
             "board": stated.board_to_json(rig.board),
             "rig": stated.rig_to_json(
-                rig.beam.info("emulated"), rig.T_head_lrf_stated, cameras
+                rig.beam.info("emulated"),
+                rig.T_head_lrf_stated,
+                rig.camera_infos(known=setup.intrinsics_views == 0),
             ),
             "devices": self._devices(),
             "plan": self.plan(),
@@ -175,11 +179,10 @@ class EmulatedRig:
 def practice_setup() -> tuple[Setup, list[Placement]]:
     """A rig and placements that are recorded in a minute."""
     setup = load_setup(PRACTICE)
-    placements = [
+    return setup, [
         replace(p, image_pitch=(p.image_pitch[0], p.image_pitch[-1]))
         for p in placements_of(setup)
     ]
-    return setup, placements
 
 
 def emulated(name: str, feedback: str = "full") -> EmulatedRig:

@@ -16,6 +16,7 @@ import numpy as np
 
 from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.head import Head
+from lrfcal_lib.session.files import short
 from lrfcal_lib.session.images import encode_jpeg
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import close_views, world_of
@@ -79,8 +80,9 @@ class EmulatedWorld:
         """
         places = {None: Placement(0)} | self.placements
         if number not in places:
-            known = ", ".join(map(str, self.placements))
-            raise ValueError(f"no placement {number}; there are {known}, and none")
+            raise ValueError(
+                f"no placement {number}; there are {short(self.placements)}, and none"
+            )
         # in one go, as a scan may be cast meanwhile
         self.current = ("placement", number), world_of(self.setup, places[number])
 
@@ -104,7 +106,7 @@ class EmulatedWorld:
         if camera not in names or not 0 <= view < count:
             raise ValueError(
                 f"no view {view} of camera '{camera}'; there are 0 to {count - 1} of "
-                f"{', '.join(names)}"
+                f"{short(names)}"
             )
         close = close_views(self.setup, names.index(camera))[view]
         self.current = ("close", camera, view), world_of(self.setup, close)
@@ -137,8 +139,10 @@ class EmulatedWorld:
         key = place, quarters.tobytes(), np.rint(pitch / STILL).tobytes()
         if self._seen[0] != key:
             bearings = np.radians(quarters / 4)
-            seen = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
-            self._seen = key, seen
+            self._seen = (
+                key,
+                lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf),
+            )
         return lrf.measured(rig.beam, self._seen[1], self._rng)
 
 
@@ -230,8 +234,7 @@ class CameraServer(ThreadingHTTPServer):
         camera = self.cameras[name]
         rng = np.random.default_rng([0, next(self._count)])
         pose = self.world.setup.rig.camera_pose(camera, pitch)
-        image = camera.imager.render(scene, pose, rng)
-        return encode_jpeg(image, QUALITY)
+        return encode_jpeg(camera.imager.render(scene, pose, rng), QUALITY)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -251,7 +254,7 @@ class _Handler(BaseHTTPRequestHandler):
         server = self.server
         name = self.path.strip("/").removesuffix(".mjpg")
         if name not in server.cameras:
-            known = ", ".join(f"{camera}.mjpg" for camera in server.cameras)
+            known = short(f"{camera}.mjpg" for camera in server.cameras)
             self.send_error(404, f"there are {known}")
             return
         with contextlib.suppress(ConnectionError, TimeoutError):
@@ -265,11 +268,10 @@ class _Handler(BaseHTTPRequestHandler):
                     # a blank line: the camera lives, its head moves
                     self.wfile.write(b"\r\n")
                 else:
-                    head = (
-                        "--frame\r\nContent-Type: image/jpeg\r\n"
-                        f"Content-Length: {len(data)}\r\n\r\n"
+                    self.wfile.write(
+                        b"--frame\r\nContent-Type: image/jpeg\r\n"
+                        b"Content-Length: %d\r\n\r\n%b\r\n" % (len(data), data)
                     )
-                    self.wfile.write(head.encode() + data + b"\r\n")
                     server.quit.wait(1 / FPS)
 
     def do_POST(self):

@@ -55,11 +55,10 @@ def cached(stage):
         _refuse_shared(folder)
         session = getattr(getattr(of, "prepared", of), "session", of)
         call = (stage.__qualname__, of, args, sorted(options.items()))
-        key = hashlib.sha256(pickle.dumps(call))
+        versions = (source_digest(), np.__version__, scipy.__version__, cv2.__version__)
+        key = hashlib.sha256(pickle.dumps((call, versions)))
         for record in session.image_records:
             key.update(record.file.read_bytes() if record.file.is_file() else b"missing")
-        versions = f"{source_digest()}{np.__version__}{scipy.__version__}{cv2.__version__}"
-        key.update(versions.encode())
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
             with opened(

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import cache
 from multiprocessing import get_context
 from os import sched_getaffinity
 from pathlib import Path
@@ -53,8 +53,7 @@ class Checked(Executor):
 
     def submit(self, work, /, *args, **kwargs):
         """See :meth:`concurrent.futures.Executor.submit`."""
-        here = partial(checked, source_digest(), work)
-        return self.executor.submit(here, *args, **kwargs)
+        return self.executor.submit(checked, source_digest(), work, *args, **kwargs)
 
 
 def refuse_others(client):

@@ -80,12 +80,15 @@ def repeated_images(session) -> Iterator[Fault]:
         cause = "a camera that stood still, or a copy"
         if first_camera != camera:
             cause = f"was the folder of camera '{first_camera}' copied?"
-        words = (
+        yield Fault(
+            "repeated image",
             f"{len(same)} of {count} images of camera '{camera}' (in placements: "
             f"{short(placements)}) are identical to others: {examples}: {cause}; put the right "
-            "images there or remove their rows from images.csv"
+            "images there or remove their rows from images.csv",
+            severe=len(same) > MANY * count,
+            camera=camera,
+            placements=placements,
         )
-        yield Fault("repeated image", words, len(same) > MANY * count, camera, placements)
 
 
 def repeated_scans(session) -> Iterator[Fault]:
@@ -99,12 +102,13 @@ def repeated_scans(session) -> Iterator[Fault]:
 
     for (lines, _), numbers in same_ranges.items():
         if len(numbers) > 1:
-            words = (
+            yield Fault(
+                "repeated scan",
                 f"the scans of placements {' and '.join(map(str, numbers))} are the same to the "
                 f"last digit ({lines} scan lines): a copy; record one of them again or remove it "
-                "from placements in session.json"
+                "from placements in session.json",
+                placements=tuple(numbers),
             )
-            yield Fault("repeated scan", words, placements=tuple(numbers))
 
 
 def ranges_beyond(session) -> Iterator[Fault]:
@@ -112,16 +116,16 @@ def ranges_beyond(session) -> Iterator[Fault]:
     ranges = session.scans["ranges"]
     known = ranges[np.isfinite(ranges)]
     limit = session.lrf.max_range
-    share = np.mean(known > limit)
+    share = (known > limit).mean()
     if share <= BEYOND:
         return
-    words = (
+    yield Fault(
+        "beyond range",
         f"{100 * share:.3g} % of the ranges exceed the max_range_m of {limit:g} m that "
         f"session.json states (half of all ranges: {np.median(known):.3g} m or more, largest: "
         f"{known.max():.3g} m): state the range finder's own max_range_m, or convert the ranges "
-        "to metres"
+        "to metres",
     )
-    yield Fault("beyond range", words)
 
 
 def bearings_beyond(session) -> Iterator[Fault]:
@@ -141,12 +145,12 @@ def bearings_beyond(session) -> Iterator[Fault]:
         "{:.5g} to {:.5g} deg in steps of {:.4g} deg".format(*np.degrees(values))
         for values in ((first, last, step), (low, high, lrf.bearing_step))
     )
-    words = (
+    yield Fault(
+        "field of view",
         f"the bearings of the scan lines (lrf) cover {has}, session.json states field_of_view_deg "
         f"and bearing_step_deg as {says}: the scan lines count; correct session.json, or the "
-        "bearings if they are wrong"
+        "bearings if they are wrong",
     )
-    yield Fault("field of view", words)
 
 
 def brightness(image: np.ndarray) -> int:
@@ -175,12 +179,13 @@ def dark_images(session) -> Iterator[Fault]:
             record for record, level in zip(records, levels, strict=True) if level < DARK
         ]
         if len(dark) > len(records) / 2:
-            words = (
+            yield Fault(
+                "dark",
                 f"images of camera '{camera}' are too dark ({len(dark)} of {len(records)} looked "
                 f"at): the brightest surfaces of {dark[0].file.relative_to(session.path)} have "
                 f"{min(levels)} of 255 grey levels, a white square needs {DARK} and more; more "
                 "light, a longer exposure, or, where other values were stored (10 or 12 bits), "
-                "convert the images"
+                "convert the images",
+                camera=camera,
+                placements=tuple(sorted({record.placement for record in dark})),
             )
-            placements = tuple(sorted({record.placement for record in dark}))
-            yield Fault("dark", words, camera=camera, placements=placements)

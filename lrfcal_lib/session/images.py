@@ -63,9 +63,8 @@ def image_size(file: str | PathLike, data: bytes) -> tuple[int, int]:
     if end not in data[-64:]:
         raise SessionError(f"{file}: {cut}")
     with reading(file, cut):
-        if (
-            end == b"IEND"
-        ):  # its size is first; Pillow goes on to the pixels, behind all remarks
+        # of a PNG the size is first; Pillow goes on to the pixels, behind all remarks
+        if end == b"IEND":
             return struct.unpack_from(">II", data, len(PNG) + 8)
         with Image.open(BytesIO(data[:HEADER]), formats=["JPEG"]) as image:
             return image.size

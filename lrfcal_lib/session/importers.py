@@ -111,14 +111,7 @@ def import_lasersetero(src: str | PathLike, dst: str | PathLike) -> float:
         published[name] = read_bouguet(Path(src) / f"Calib_Results_{name}.m")
         images[name] = numbered(src, f"{name}_*.png")
         first = next(iter(images[name].values()))
-        size = image_size(first, read_bytes(first))
-        cameras.append(CameraInfo(name, "platform", *size))
-    reference = {
-        "note": NOTE,
-        "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
-        "T_left_platform": transform_to_json(T_LEFT_CLOUD * LASERSETERO_CLOUD),
-        "cameras": published,
-    }
+        cameras.append(CameraInfo(name, "platform", *image_size(first, read_bytes(first))))
     misses = []
     values = 0
     with SessionWriter(
@@ -129,7 +122,12 @@ def import_lasersetero(src: str | PathLike, dst: str | PathLike) -> float:
         LASERSETERO_HEAD,
         licence="none stated by the authors",
         source=SOURCE,
-        reference=reference,
+        reference={
+            "note": NOTE,
+            "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
+            "T_left_platform": transform_to_json(T_LEFT_CLOUD * LASERSETERO_CLOUD),
+            "cameras": published,
+        },
         platform_sigma=LASERSETERO_PLATFORM_SIGMA,
     ) as writer:
         for placement, file in clouds.items():

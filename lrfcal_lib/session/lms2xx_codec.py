@@ -158,47 +158,16 @@ def encode_words(
     count = len(values) | UNITS.index(unit) << 14
     if partial >= 0:
         count |= 1 << 13 | partial << 11
-    tail = bytes(i % 256 for i in indices or ())
-    data = head + count.to_bytes(2, "little") + values.tobytes() + tail
+    data = head + count.to_bytes(2, "little") + values.tobytes()
+    data += bytes(i % 256 for i in indices or ())
     return encode_telegram(code, data, status=status, address=address)
-
-
-def decode_scan(raw: bytes, mode: int = 0) -> Scans:
-    """One scan out of the whole telegram 0xB0.
-
-    Parameters
-    ----------
-    raw
-    mode
-        Measuring mode, which the telegram does not tell.
-
-    Returns
-    -------
-    Scans
-        With one row.
-
-    Raises
-    ------
-    TelegramError
-        If it is damaged, another telegram, or its number of values does not fit its length.
-    """
-    telegram = parse_telegram(raw)
-    if telegram.code != SCAN:
-        raise TelegramError(f"code {telegram.code:02X} is no scan (B0)")
-    found = decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
-    if not found:
-        raise TelegramError(
-            f"{len(raw)} bytes do not fit the number of values "
-            f"{telegram.data[:2].hex(' ') or 'none'}"
-        )
-    return found[0]
 
 
 def decode_scans(
     data: bytes | np.ndarray,
     offset: np.ndarray,
     length: np.ndarray,
-    mode: ArrayLike = 0,
+    mode: ArrayLike,
 ) -> list[Scans]:
     """The scans among the telegrams of a stream, many at once. CRCs are not looked at again.
 
@@ -208,7 +177,7 @@ def decode_scans(
     offset, length
         As of :func:`split_stream`.
     mode
-        Measuring mode, of all or of each.
+        Measuring mode, of all or of each; the telegrams do not tell it.
 
     Returns
     -------
@@ -305,8 +274,7 @@ class DeviceStatus:
     """The parts of the status reply 0xB1 that a recording needs."""
 
     measuring_mode: int
-    scan_angle_deg: float
-    resolution_deg: float
+    variant: tuple[float, float]  # field of view and resolution, degrees
     address: int
 
 
@@ -373,7 +341,7 @@ def encode_configuration(configuration: Configuration) -> bytes:
     """Reply 0xF4, as a device sends it; a recorded session begins with it (it states the measuring
     mode).
     """
-    return encode_telegram(CONFIGURATION, configuration.block, status=0x10)
+    return encode_telegram(CONFIGURATION, configuration.block, address=DEVICE)
 
 
 def reply_data(raw, code, shortest):
@@ -409,8 +377,7 @@ def parse_status(raw: bytes) -> DeviceStatus:
     view, step = struct.unpack_from("<HH", data, 107)
     return DeviceStatus(
         measuring_mode=data[102],
-        scan_angle_deg=float(view),
-        resolution_deg=step / 100,
+        variant=(float(view), step / 100),
         address=data[120],
     )
 

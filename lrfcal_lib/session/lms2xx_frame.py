@@ -36,8 +36,8 @@ class Stream:
     ----------
     offset, length : ndarray, shape (n,)
         Of whole telegrams with the right CRC.
-    rejected : list of int
-        Offsets outside of those where a telegram seems to begin whose CRC is wrong.
+    rejected : ndarray of int
+        Offsets behind the last of those where a telegram seems to begin whose CRC is wrong.
     pending : int
         Where a telegram may begin whose end has not come yet (the bytes from there on must be
         kept), or the end.
@@ -45,7 +45,7 @@ class Stream:
 
     offset: np.ndarray
     length: np.ndarray
-    rejected: list
+    rejected: np.ndarray
     pending: int
 
 
@@ -68,7 +68,7 @@ def crc16(data):
 
 
 def encode_telegram(
-    code: int, data: bytes = b"", *, status: int | None = None, address: int | None = None
+    code: int, data: bytes = b"", *, status: int = 0x10, address: int = HOST
 ) -> bytes:
     """Bytes of a telegram.
 
@@ -79,9 +79,9 @@ def encode_telegram(
     data
         After it.
     status
-        Makes it a reply.
+        Of a reply; a request has none.
     address
-        By default 0x00 to the device, and 0x80 for replies.
+        Of the device; 0x80 and above, as of `DEVICE`, make it a reply.
 
     Raises
     ------
@@ -89,13 +89,9 @@ def encode_telegram(
         For numbers that are no bytes.
     """
     body = bytes([code, *data])
-    sender = HOST
-    if status is not None:
+    if address >= DEVICE:
         body += bytes([status])
-        sender = DEVICE
-    if address is not None:
-        sender = address
-    raw = bytes([STX, sender]) + len(body).to_bytes(2, "little") + body
+    raw = bytes([STX, address]) + len(body).to_bytes(2, "little") + body
     return raw + crc16(raw).to_bytes(2, "little")
 
 
@@ -162,29 +158,19 @@ def split_stream(data: bytes, *, replies: bool = True) -> Stream:
     plausible = (length > OVERHEAD) & (length <= LONGEST)
     offset = offset[plausible]
     length = length[plausible]
-    complete = offset + length <= len(raw)
-    good = are_sound(raw, offset, length)
-
+    end = offset + length
     sound = []
-    rejected = []
-    begun = []
     free = 0  # behind the last sound telegram
-    for row, begin in enumerate(offset.tolist()):
-        if begin < free:
-            continue
-        if good[row]:
+    for row in np.flatnonzero(are_sound(raw, offset, length)):
+        if offset[row] >= free:
             sound.append(row)
-            free = begin + length[row]
-            begun = []
-        elif complete[row]:
-            rejected.append(begin)
-        else:
-            begun.append(begin)
+            free = end[row]
+    rejected = offset[(offset >= free) & (end <= len(data))]
+    begun = offset[(offset >= free) & (end > len(data))]
     # too few bytes to state a length
     last = data.find(STX, max(free, len(data) - 3))
-    if last >= 0:
-        begun.append(last)
-    return Stream(offset[sound], length[sound], rejected, min(begun, default=len(data)))
+    pending = min([*begun, last if last >= 0 else len(data)])
+    return Stream(offset[sound], length[sound], rejected, pending)
 
 
 def word(data, at):

@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -145,8 +145,9 @@ def read_images(path, facts, unfinished):
     cameras = facts["cameras"]
     out = []
     lines = {}  # in which each file stands
-    torn = unfinished is not None
-    rows = read_table(file, IMAGE_COLUMNS, path, torn, needed=bool(cameras))
+    rows = read_table(
+        file, IMAGE_COLUMNS, path, torn=unfinished is not None, needed=bool(cameras)
+    )
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED:
             continue
@@ -163,8 +164,9 @@ def read_images(path, facts, unfinished):
                 purpose=known(row["purpose"], PURPOSES, "purpose"),
             )
             once(lines, number, record.file)
-            content = read_bytes(record.file, path)
-            check_image_size(record.file, content, cameras[record.camera])
+            check_image_size(
+                record.file, read_bytes(record.file, path), cameras[record.camera]
+            )
         out.append(record)
     return tuple(out)
 
@@ -284,8 +286,8 @@ class Session(StatedRig):
     picks: tuple[EdgePick, ...]
     reference: dict
     problems: tuple[str, ...]
-    scans: dict[str, np.ndarray] = field(repr=False)
-    telegrams: TelegramLog | None = field(default=None, repr=False)
+    scans: dict[str, np.ndarray]
+    telegrams: TelegramLog | None = None
     continuous: bool = False
 
     def __repr__(self):
@@ -360,7 +362,6 @@ class Session(StatedRig):
         SessionError
             If the file cannot be decoded or has another size than the camera.
         """
-        camera = self.cameras[record.camera]
         data = read_bytes(record.file, self.path)
         with reading(
             record.file,
@@ -368,7 +369,7 @@ class Session(StatedRig):
         ):
             image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
             height, width = image.shape[:2]  # there is none of an image that is None
-        check_image_size(record.file, data, camera, (width, height))
+        check_image_size(record.file, data, self.cameras[record.camera], (width, height))
         return image
 
     @property
@@ -469,9 +470,8 @@ def _times_back(session):
                 continue
             try:
                 time = float(row["t_s"])
-            except (
-                ValueError
-            ):  # of a placement that was not finished: nobody else looks at it
+            # of a placement that was not finished: nobody else looks at it
+            except ValueError:
                 yield f"{file} line {line}: t_s is {row['t_s']!r}: a number of seconds is needed"
                 continue
             # rows that share these follow each other in time

@@ -122,8 +122,10 @@ class SessionRecorder(SessionWriter):
         rows
             Time of this computer (s), commanded and measured pitch (rad), NaN where unknown.
         """
-        in_degrees = [(time_s, *map(math.degrees, angles)) for time_s, *angles in rows]
-        self._append_rows("platform.csv", in_degrees)
+        self._append_rows(
+            "platform.csv",
+            [(time_s, *map(math.degrees, angles)) for time_s, *angles in rows],
+        )
 
     def finish(self) -> None:
         """Close the recording: nothing can be half done in it any more."""
@@ -147,8 +149,7 @@ class SessionRecorder(SessionWriter):
         """
         counts = dict.fromkeys(self.cameras, 0)
         file = self.path / "images.csv"
-        rows = read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(counts))
-        for row in rows:
+        for row in read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(counts)):
             if row["camera"] in counts and row["purpose"] == purpose:
                 counts[row["camera"]] += 1
         return counts

@@ -23,10 +23,8 @@ from lrfcal_lib.session.stated import MILLIMETRES
 ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
 ENTRY = b"PK\1\2"  # begins each line of an archive's table of contents
 MOST_ENTRIES = 100  # of an archive; a session's has the six arrays
-PACKED = (
-    ZIP_STORED,
-    ZIP_DEFLATED,
-)  # as numpy packs; bzip2 and LZMA are not unpacked in steps
+# as numpy packs; bzip2 and LZMA are not unpacked in steps
+PACKED = (ZIP_STORED, ZIP_DEFLATED)
 # bytes before the values of an array; numpy refuses more, once it has them
 LONGEST_HEADER = 10_000
 # metres; no pitching 2D scanner sees half of its scene farther away than that

@@ -15,6 +15,7 @@ from pydantic import (
     AfterValidator,
     BaseModel,
     BeforeValidator,
+    ConfigDict,
     Field,
     FiniteFloat,
     PlainSerializer,
@@ -223,14 +224,13 @@ class BoardStated(BaseModel):
     """A board as it stands in a file."""
 
     name: str
-    edges: Annotated[
-        tuple[EdgeName, ...], Field(fail_fast=True, min_length=3, max_length=MOST_CORNERS)
-    ]
+    edges: tuple[EdgeName, ...] = Field(
+        fail_fast=True, min_length=3, max_length=MOST_CORNERS
+    )
     features: tuple[str, str]
-    corners: Annotated[
-        Annotated[tuple[Pair, ...], Field(fail_fast=True), AfterValidator(np.array)] | None,
-        Field(alias="corners_m"),
-    ]
+    corners: (
+        Annotated[tuple[Pair, ...], Field(fail_fast=True), AfterValidator(np.array)] | None
+    ) = Field(alias="corners_m")
     pattern: Annotated[PatternStated, AfterValidator(PatternStated.made)] | None
 
     def made(self):
@@ -275,20 +275,20 @@ def board_to_json(board: Board) -> dict:
     ----------
     board
     """
-    pattern = board.pattern and {
-        "kind": "chessboard",
-        "columns": board.pattern.columns,
-        "rows": board.pattern.rows,
-        "square_m": board.pattern.square,
-        "origin_m": board.pattern.origin,
-    }
     return plain(
         {
             "name": board.name,
             "edges": board.edges,
             "features": board.features,
             "corners_m": board.corners,
-            "pattern": pattern,
+            "pattern": board.pattern
+            and {
+                "kind": "chessboard",
+                "columns": board.pattern.columns,
+                "rows": board.pattern.rows,
+                "square_m": board.pattern.square,
+                "origin_m": board.pattern.origin,
+            },
         }
     )
 
@@ -309,8 +309,6 @@ def board_from_json(data: dict) -> Board:
 
 
 StatedBoard = Annotated[BoardStated, AfterValidator(BoardStated.made)]
-
-
 View = Annotated[
     tuple[Angle, Angle],
     refused(
@@ -324,6 +322,21 @@ Endless = Annotated[
     Field(gt=0),
     PlainSerializer(lambda metres: metres if math.isfinite(metres) else None),
 ]
+
+
+LRF_KEYS = {  # in the file, by field
+    "model": "model",
+    "field_of_view": "field_of_view_deg",
+    "bearing_step": "bearing_step_deg",
+    "sigma_range": "sigma_range_m",
+    "sigma_bearing": "sigma_bearing_deg",
+    "range_resolution": "range_resolution_m",
+    "max_range": "max_range_m",
+    "systematic_error": "systematic_error_m",
+    "step_error": "angular_step_relative",
+    "spot_exit": "spot_exit_m",
+    "spot_divergence": "spot_divergence_rad",
+}
 
 
 def plainly_typed(kind: type) -> type:
@@ -360,23 +373,19 @@ class LrfInfo:
         Standard deviation of the stated angular step, a fraction of it.
     """
 
+    __pydantic_config__ = ConfigDict(alias_generator=LRF_KEYS.__getitem__)
+
     model: str
-    field_of_view: Annotated[View, Field(alias="field_of_view_deg")]
-    bearing_step: Annotated[Step, Field(alias="bearing_step_deg")]
-    sigma_range: Annotated[Length, Field(alias="sigma_range_m")]
-    sigma_bearing: Annotated[Angle, Field(alias="sigma_bearing_deg")] = 0.0
-    range_resolution: Annotated[FiniteFloat, Field(alias="range_resolution_m")] = 0.001
-    max_range: Annotated[Endless, Field(alias="max_range_m")] = math.inf
-    systematic_error: Annotated[Positive | None, Field(alias="systematic_error_m")] = None
-    step_error: Annotated[
-        FiniteFloat | None, Field(alias="angular_step_relative", ge=0, le=0.1)
-    ] = None
-    spot_exit: Annotated[FiniteFloat | None, Field(alias="spot_exit_m", gt=0, le=0.2)] = (
-        None
-    )
-    spot_divergence: Annotated[
-        FiniteFloat | None, Field(alias="spot_divergence_rad", ge=0, lt=0.2)
-    ] = None
+    field_of_view: View
+    bearing_step: Step
+    sigma_range: Length
+    sigma_bearing: Angle = 0.0
+    range_resolution: FiniteFloat = 0.001
+    max_range: Endless = math.inf
+    systematic_error: Positive | None = None
+    step_error: Annotated[FiniteFloat | None, Field(ge=0, le=0.1)] = None
+    spot_exit: Annotated[FiniteFloat | None, Field(gt=0, le=0.2)] = None
+    spot_divergence: Annotated[FiniteFloat | None, Field(ge=0, lt=0.2)] = None
 
     @property
     def admitted_offset(self) -> float:
@@ -535,8 +544,8 @@ class PlatformStated(BaseModel):
     """The platform and how well it is known as they stand in a file."""
 
     T_head_lrf: Transform
-    sigma_direction: Annotated[Step, Field(alias="sigma_direction_deg")] = math.radians(0.5)
-    sigma_offset: Annotated[Length, Field(alias="sigma_offset_m")] = 0.010
+    sigma_direction: Step = Field(default=math.radians(0.5), alias="sigma_direction_deg")
+    sigma_offset: Length = Field(default=0.010, alias="sigma_offset_m")
     continuous: bool = False
 
 

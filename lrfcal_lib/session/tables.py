@@ -5,7 +5,14 @@ import os
 from os import PathLike
 from pathlib import Path
 
-from lrfcal_lib.session.files import LARGEST_TEXT, SPLIT, SessionError, read_bytes, reading
+from lrfcal_lib.session.files import (
+    LARGEST_TEXT,
+    SPLIT,
+    SessionError,
+    read_bytes,
+    reading,
+    short,
+)
 
 MOST_ROWS = 200_000
 
@@ -49,13 +56,13 @@ def read_table(
             )
         header, *rows = list(csv.reader(lines)) or [["an empty file"]]
     if header != [*columns]:
-        got = ", ".join(header)
+        got = short(header)
         if header == ["", *columns]:
             got = (
                 "a first column without a name: write the table without row numbers (index=False "
                 "in pandas)"
             )
-        raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
+        raise SessionError(f"{file}: columns must be {short(columns)}; got {got}")
     table = []
     for number, row in enumerate(rows, start=2):
         if len(row) != len(columns):

@@ -80,15 +80,14 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     """
     data = np.frombuffer(read_bytes(file, within), np.uint8)
     path = file.with_name("index.csv")
-    rows = read_table(path, INDEX_COLUMNS, within, torn=True)
     with naming(path):
-        index = _index(rows, len(data), file)
+        index = _index(read_table(path, INDEX_COLUMNS, within, torn=True), len(data), file)
         check_amount(len(data) // 2)
 
     sound = are_sound(data, index.offset, index.length)
     whole = index.offset + index.length <= len(data)
     outcome = np.select([sound, whole], [OTHER, WRONG], TRUNCATED).astype(np.uint8)
-    wrong = np.sum(outcome == WRONG)
+    wrong = (outcome == WRONG).sum()
     if wrong > whole.sum() / 2:
         raise SessionError(
             f"{path}: {wrong} of {whole.sum()} telegrams have a wrong CRC in {file.name}; the two "
@@ -204,9 +203,8 @@ def _lines(groups, index):
         )
     # the quarter of a degree that a scan is turned by, -1 for a whole one, -2 for no scan
     partial = np.full(len(index), -2)
-    number = np.full(
-        len(index), -1
-    )  # of the scan, as the device counts; -1 where it does not
+    # of the scan, as the device counts; -1 where it does not
+    number = np.full(len(index), -1)
     for group in groups:
         partial[group.rows] = group.partial
         number[group.rows] = group.telegram_index
@@ -214,7 +212,7 @@ def _lines(groups, index):
     begins = np.r_[True, ~_goes_on(partial[rows], number[rows], index[rows])]
     first = index[rows[begins]]
     line = np.full(len(index), -1)
-    line[rows] = np.cumsum(begins) - 1
+    line[rows] = begins.cumsum() - 1
 
     quarters = np.unique(np.concatenate(grids))
     check_amount(len(first) * len(quarters))
