@@ -39,10 +39,29 @@ def report(args):
 
 
 def study(args):
-    """Compare methods on drawn sessions."""
-    from lrfcal_lib.report.study import study
+    """Compare methods on scenarios and write the table."""
+    from tqdm import tqdm
 
-    return study(args)
+    from lrfcal_lib.evaluate.study import COUNTS, study_to_file, tasks_of, variations
+    from lrfcal_lib.evaluate.study_trials import STUDIED
+    from lrfcal_lib.session.cluster import workers_at
+
+    tasks = tasks_of(
+        variations(args.scenarios, args.vary),
+        args.methods or STUDIED,
+        args.poses or COUNTS,
+        args.trials,
+        args.seed,
+    )
+    with (
+        workers_at(args.scheduler) as executor,
+        tqdm(total=len(tasks), desc="tasks", disable=None) as bar,
+    ):
+        table = study_to_file(tasks, args.out, executor, bar.update)
+    print(
+        f"{args.out}: {len(table)} rows; {table.failed.sum()} of {table.trials.sum()} estimates "
+        "failed"
+    )
 
 
 def emulate(args):
@@ -129,9 +148,12 @@ def check(args):
             "the model"
         )
     if args.calibration is not None:
-        from lrfcal_lib.report.holds import check_calibration
+        from lrfcal_lib.calibrate.calibration_file import load_calibration
+        from lrfcal_lib.measure.holds import Answer, holds
 
-        return check_calibration(session, args.calibration)
+        held = holds(session, load_calibration(args.calibration))
+        print(*held.sentences(printable(args.calibration)), sep="\n")
+        return {Answer.HOLDS: 0, Answer.UNKNOWN: 2, Answer.MOVED: 3}[held.answer]
     return 0
 
 

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import date
@@ -321,11 +321,9 @@ def _take_place(new, out):
 
 def _exchanged(one, other):
     """Whether the system has exchanged two folders, at once."""
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if rename is None:
-        return False
-    here = AT_WORKING_FOLDER
-    return rename(here, os.fsencode(one), here, os.fsencode(other), EXCHANGE) == 0
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    places = AT_WORKING_FOLDER, os.fsencode(one), AT_WORKING_FOLDER, os.fsencode(other)
+    return rename is not None and rename(*places, EXCHANGE) == 0
 
 
 def _execute_all(paths, environment, jobs):
@@ -338,11 +336,10 @@ def _execute_all(paths, environment, jobs):
         finally:  # end the notebooks that are being executed and leave out the others
             for future in futures:
                 future.cancel()
-            while not all(future.done() for future in futures):
+            while wait(futures, timeout=0.05).not_done:
                 for client in list(_CLIENTS):
                     with suppress(AttributeError):  # its kernel is just starting
                         client.km.provisioner.process.kill()
-                time.sleep(0.05)
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
@@ -450,17 +447,13 @@ def _provenance(session):
     one.
     """
     digest = hashlib.sha256((Path(session.path) / "session.json").read_bytes()).hexdigest()
-    describe = [
-        "git",
-        "describe",
-        "--always",
-        "--dirty",
-        "--abbrev=12",
-        "--exclude=*",
-    ]
     try:
-        git = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True)
-        commit = git.stdout.strip()
+        commit = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+        ).stdout.strip()
     except FileNotFoundError:
         commit = ""
     pairs = {
