@@ -160,8 +160,8 @@ def table(
     styler = shown.style.format(shapes, na_rep="–").format_index(
         lambda c: escape(in_words(c, True)), axis=1
     )
-    caption = caption or str(in_words(name)).capitalize()
-    styler = styler.hide(axis="index").set_caption(escape(caption))
+    caption = caption or in_words(name).capitalize()
+    styler.hide(axis="index").set_caption(escape(caption))
     made = styler.to_html(table_uuid=name)
     _record("tables", name, name=name, caption=caption, html=made)
     return HTML(made)

@@ -109,8 +109,7 @@ def make_report(session_path, out, jobs=2, notebooks=None):
         SessionError if the session is not sound, or the folder of the report cannot be written.
     """
     begin = time.monotonic()
-    session_path = Path(session_path).resolve()
-    session = open_session(session_path)
+    session = open_session(Path(session_path).resolve())
     out = Path(out).resolve()
     paths = sorted(
         NOTEBOOKS.glob(f"{NUMBERED}.ipynb") if notebooks is None else map(Path, notebooks)
@@ -118,7 +117,7 @@ def make_report(session_path, out, jobs=2, notebooks=None):
     # a fresh cache: a report stands for its session
     with in_place_of(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:
         environment = {
-            "LRFCAL_SESSION": str(session_path),
+            "LRFCAL_SESSION": str(session.path),
             "LRFCAL_REPORT": str(new),
             CACHE: cache,
             # what notebook 09 records with the emulated rig goes with the report's cache
@@ -245,8 +244,7 @@ def _stop(number, frame):
 def report_session(session: str | Path, out: str | Path | None, jobs: int = 2) -> int:
     """Write the report of a session and say so: 0, or 1 if a notebook failed."""
     begin = time.monotonic()
-    session = Path(session)
-    out = Path(out or ROOT / "reports" / session.resolve().name).resolve()
+    out = Path(out or ROOT / "reports" / Path(session).resolve().name).resolve()
     runs = make_report(session, out, jobs)
     good = len(runs)
     for run in runs:
@@ -309,7 +307,9 @@ def _take_place(new, out):
 
     out.mkdir(exist_ok=True)
     shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
-    if not _exchanged(new, out):
+    exchange = getattr(ctypes.CDLL(None), "renameat2", None)
+    places = AT_WORKING_FOLDER, os.fsencode(new), AT_WORKING_FOLDER, os.fsencode(out)
+    if exchange is None or exchange(*places, EXCHANGE) != 0:
         old = new.with_name("old")
         try:
             out.replace(old)
@@ -317,13 +317,6 @@ def _take_place(new, out):
         finally:
             if not out.exists():  # interrupted in between
                 old.replace(out)
-
-
-def _exchanged(one, other):
-    """Whether the system has exchanged two folders, at once."""
-    rename = getattr(ctypes.CDLL(None), "renameat2", None)
-    places = AT_WORKING_FOLDER, os.fsencode(one), AT_WORKING_FOLDER, os.fsencode(other)
-    return rename is not None and rename(*places, EXCHANGE) == 0
 
 
 def _execute_all(paths, environment, jobs):
@@ -438,15 +431,14 @@ def write_pages(out, session, runs, found, seconds):
 
 def _write_page(file, template, **values):
     """Write a page made by a template."""
-    text = TEMPLATES.get_template(template).render(**values)
-    file.write_text(text, encoding="utf-8")
+    file.write_text(TEMPLATES.get_template(template).render(**values), encoding="utf-8")
 
 
 def _provenance(session):
     """Pairs of name and value that tell what the report was made from; the commit where git knows
     one.
     """
-    digest = hashlib.sha256((Path(session.path) / "session.json").read_bytes()).hexdigest()
+    digest = hashlib.sha256((session.path / "session.json").read_bytes()).hexdigest()
     try:
         commit = subprocess.run(
             ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
