@@ -21,7 +21,6 @@ DIMENSION = {
     "shrinkB": 0,
 }
 ARROW = {"arrowstyle": "-|>", "linewidth": 1.8, "shrinkA": 0}
-Place = tuple[float, float]
 
 
 class View:
@@ -64,7 +63,7 @@ class View:
         self,
         point: ArrayLike,
         text: str,
-        away: Place = (8, 8),
+        away: tuple[float, float] = (8, 8),
         color: str = TRUTH,
     ) -> None:
         """A text beside a point (3,), so many printer's points to the right and up."""
@@ -89,7 +88,9 @@ class View:
             self.arrow(T.apply([0 * axis, axis]), color)
             self.name(T.apply(1.15 * axis), name, (0, 0), color)
 
-    def dimension(self, ends: ArrayLike, text: str, away: Place = (0, 8)) -> None:
+    def dimension(
+        self, ends: ArrayLike, text: str, away: tuple[float, float] = (0, 8)
+    ) -> None:
         """The distance of two points (2, 3) as in a drawing of a machine."""
         self.arrow(ends, TRUTH, DIMENSION)
         self.name(np.asarray(ends).mean(axis=0), text, away)

@@ -65,14 +65,25 @@ def scene_page(
     traces = []
     for name, rows in shown.items():
         shades = [f"#{color.tobytes().hex()}" for color in colors[rows]]
-        marker = {"size": 1.6, "color": shades}
         traces.append(
-            _trace(name, points[rows], "markers", marker=marker, hoverinfo="none")
+            _trace(
+                name,
+                points[rows],
+                "markers",
+                marker={"size": 1.6, "color": shades},
+                hoverinfo="none",
+            )
         )
     for name, (color, line) in lines.items():
-        looks = {"color": color, "width": 4}
-        visible = "legendonly" if name == "boards" else True
-        traces.append(_trace(name, line, "lines", line=looks, visible=visible))
+        traces.append(
+            _trace(
+                name,
+                line,
+                "lines",
+                line={"color": color, "width": 4},
+                visible="legendonly" if name == "boards" else True,
+            )
+        )
     data = None
     if measuring is not None:
         data = dict(measuring, edges_trace=len(traces), lengths_trace=len(traces) + 1)
@@ -136,11 +147,10 @@ def _layout(title, note):
 def _measured_traces(lines):
     """Edges (n, 2, 3) that can be picked, and the lengths that were."""
     red = "#d00"
-    broken = np.insert(lines, 2, np.nan, axis=1)
     return [
         _trace(
             "edges",
-            broken.reshape(-1, 3),
+            np.insert(lines, 2, np.nan, axis=1).reshape(-1, 3),
             "lines",
             line={"color": FIT, "width": 3},
             visible="legendonly",

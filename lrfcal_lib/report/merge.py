@@ -85,15 +85,16 @@ def merge_session(
     stations, pairs = (table.to_html(index=False, border=0) for table in tables)
     page = scene.folder / "stations.html"
     with whole(page) as draft:
-        text = PAGE.format(
-            about=escape(scene.about),
-            frame=frame,
-            picture=base64.b64encode(picture.getvalue()).decode(),
-            stations=stations,
-            pairs=pairs,
-            sentences="".join(f"<li>{escape(words)}</li>" for words in said),
+        draft.write_text(
+            PAGE.format(
+                about=escape(scene.about),
+                frame=frame,
+                picture=base64.b64encode(picture.getvalue()).decode(),
+                stations=stations,
+                pairs=pairs,
+                sentences="".join(f"<li>{escape(words)}</li>" for words in said),
+            )
         )
-        draft.write_text(text)
     print("written:", ", ".join(map(str, [*files, page])))
     return 0 if len(joined.T_world_station) == len(clouds) else NOT_ALL
 

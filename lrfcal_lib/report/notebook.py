@@ -307,8 +307,8 @@ class Sections(ast.NodeTransformer):
         needing = [row for row, text in enumerate(words) if text.startswith(NEEDS)]
         undone = "notebook" in _lacking or ("section" in _lacking and not needing)
         if undone and not any("notebook.start(" in text for text in words):
-            node.body = []
-        for row in reversed(needing if node.body else []):
+            return ast.Module([], [])
+        for row in reversed(needing):
             call = ast.parse(words[row], mode="eval").body
             node.body[row:] = [ast.If(call, node.body[row + 1 :] or [ast.Pass()], [])]
         return ast.fix_missing_locations(node)

@@ -250,8 +250,9 @@ def report_session(session: str | Path, out: str | Path | None, jobs: int = 2) -
     for run in runs:
         if run.error:
             good -= 1
-            last = run.error.strip().splitlines()[-1]
-            print(f"{run.name} failed: {last}", file=sys.stderr)
+            print(
+                f"{run.name} failed:", run.error.strip().splitlines()[-1], file=sys.stderr
+            )
     seconds = time.monotonic() - begin
     print(f"{good} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
     return int(good < len(runs))
