@@ -1,12 +1,14 @@
 """Figures of what was recorded: scans, range images, pictures, edges; a colour for each sensor."""
 
 from collections.abc import Sequence
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
 
 from lrfcal_lib.model.board import Board, Chessboard, side_ends
 from lrfcal_lib.model.camera import CameraModel, redistort
@@ -114,6 +116,13 @@ def scan_line(
     ax.plot(0, 0, "^", color=LRF, markersize=8, label="LRF")
     to_scale(ax, "x [m]", "y [m]")
     ax.legend()
+
+
+def png(figure: Figure, **looks: Any) -> bytes:
+    """Content of a PNG file of a figure, with options of `savefig`."""
+    content = BytesIO()
+    figure.savefig(content, format="png", **looks)
+    return content.getvalue()
 
 
 def to_scale(ax: Axes, x: str, y: str) -> None:

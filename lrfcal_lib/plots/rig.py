@@ -47,8 +47,8 @@ def render(
     ndarray of uint8, shape (height, width, 3)
     """
     seen = T_view.apply(points)
-    ahead = np.flatnonzero(seen[:, 2] > NEAREST)
-    order = ahead[np.argsort(-seen[ahead, 2], kind="stable")]  # far to near
+    order = np.argsort(-seen[:, 2], kind="stable")  # far to near
+    order = order[seen[order, 2] > NEAREST]
     # with what is too far out to be seen, but for a part of its square
     height, width = np.add(size, 2 * splat)
     uv = np.rint(pixels(seen[order], size, focal)).astype(int) + splat

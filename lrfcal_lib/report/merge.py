@@ -1,7 +1,6 @@
 """The command ``merge``: the stations of a scene in one frame, as one cloud, and how they lie."""
 
 import base64
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.covariance import sigma_turn_shift
 from lrfcal_lib.measure.scene import station_cloud, write_scene
 from lrfcal_lib.measure.stations import Joined, advice, join_stations, joined_cloud
+from lrfcal_lib.plots.recording import png
 from lrfcal_lib.report.reconstruct import open_scene
 from lrfcal_lib.session.shown import escape
 from lrfcal_lib.session.write import whole
@@ -80,8 +80,7 @@ def merge_session(
     files = write_scene(
         scene.folder, scene.session, scene.rig, joined, scene.about, clouds=clouds
     )
-    picture = BytesIO()
-    stations_figure(joined, joined_cloud(clouds, joined)).savefig(picture, dpi=110)
+    picture = png(stations_figure(joined, joined_cloud(clouds, joined)), dpi=110)
     stations, pairs = (table.to_html(index=False, border=0) for table in tables)
     page = scene.folder / "stations.html"
     with whole(page) as draft:
@@ -89,7 +88,7 @@ def merge_session(
             PAGE.format(
                 about=escape(scene.about),
                 frame=frame,
-                picture=base64.b64encode(picture.getvalue()).decode(),
+                picture=base64.b64encode(picture).decode(),
                 stations=stations,
                 pairs=pairs,
                 sentences="".join(f"<li>{escape(words)}</li>" for words in said),
