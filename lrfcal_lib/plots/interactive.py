@@ -65,25 +65,14 @@ def scene_page(
     traces = []
     for name, rows in shown.items():
         shades = [f"#{color.tobytes().hex()}" for color in colors[rows]]
+        marker = {"size": 1.6, "color": shades}
         traces.append(
-            _trace(
-                name,
-                points[rows],
-                "markers",
-                marker={"size": 1.6, "color": shades},
-                hoverinfo="none",
-            )
+            _trace(name, points[rows], "markers", marker=marker, hoverinfo="none")
         )
     for name, (color, line) in lines.items():
-        traces.append(
-            _trace(
-                name,
-                line,
-                "lines",
-                line={"color": color, "width": 4},
-                visible="legendonly" if name == "boards" else True,
-            )
-        )
+        looks = {"color": color, "width": 4}
+        visible = "legendonly" if name == "boards" else True
+        traces.append(_trace(name, line, "lines", line=looks, visible=visible))
     data = None
     if measuring is not None:
         data = dict(measuring, edges_trace=len(traces), lengths_trace=len(traces) + 1)
