@@ -40,11 +40,30 @@ def report(sessions, out, scheduler, jobs, store):
     return main(sessions, out, jobs, store)
 
 
-def study(**options):
-    """Compare methods on drawn sessions."""
-    from lrfcal_lib.report.study import study
+def study(scenarios, methods, poses, trials, seed, vary, out, scheduler):
+    """Compare methods on scenarios and write the table."""
+    from tqdm import tqdm
 
-    return study(**options)
+    from lrfcal_lib.evaluate.study import COUNTS, study_to_file, tasks_of, variations
+    from lrfcal_lib.evaluate.study_trials import STUDIED
+    from lrfcal_lib.session.cluster import workers_at
+
+    tasks = tasks_of(
+        variations(scenarios, vary),
+        methods or STUDIED,
+        poses or COUNTS,
+        trials,
+        seed,
+    )
+    with (
+        workers_at(scheduler) as executor,
+        tqdm(total=len(tasks), desc="tasks", disable=None) as bar,
+    ):
+        table = study_to_file(tasks, out, executor, bar.update)
+    print(
+        f"{out}: {len(table)} rows; {table.failed.sum()} of {table.trials.sum()} estimates "
+        "failed"
+    )
 
 
 def emulate(setup, rig_file, feedback):
@@ -139,9 +158,12 @@ def check(session, calibration):
             "the model"
         )
     if calibration is not None:
-        from lrfcal_lib.report.holds import check_calibration
+        from lrfcal_lib.calibrate.calibration_file import load_calibration
+        from lrfcal_lib.measure.holds import Answer, holds
 
-        return check_calibration(recorded, calibration)
+        held = holds(recorded, load_calibration(calibration))
+        print(*held.sentences(printable(calibration)), sep="\n")
+        return {Answer.HOLDS: 0, Answer.UNKNOWN: 2, Answer.MOVED: 3}[held.answer]
     return 0
 
 

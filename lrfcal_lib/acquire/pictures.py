@@ -1,14 +1,12 @@
 """Pictures of the data collection panel: a scan from above, a sweep as it grows, camera images."""
 
-import io
-
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
 from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.plots.colors import LRF
-from lrfcal_lib.plots.recording import range_image
+from lrfcal_lib.plots.recording import png, range_image
 from lrfcal_lib.session.images import encode_jpeg
 from lrfcal_lib.session.read import Sweep
 
@@ -30,7 +28,7 @@ def scan_picture(reading: Reading) -> bytes:
     ax.set_thetalim(*reading.bearings[[0, -1]])
     ax.set_rorigin(0)
     figure.text(0.5, 0.03, "range [m]", ha="center")
-    return _png(figure)
+    return png(figure)
 
 
 def sweep_picture(rows: dict[float, Reading], pitch: tuple[float, float]) -> bytes:
@@ -52,7 +50,7 @@ def sweep_picture(rows: dict[float, Reading], pitch: tuple[float, float]) -> byt
         sweep = Sweep(0, ranges, readings[0].bearings, known, np.nan * known)
         range_image(ax, sweep, limits=(None, None)).set_cmap(NEAR_IS_BRIGHT)
     ax.set(ylim=np.degrees(np.sort(pitch)), aspect="auto")
-    return _png(figure)
+    return png(figure)
 
 
 def with_scan(image: np.ndarray, pixels: np.ndarray, ranges: np.ndarray) -> np.ndarray:
@@ -83,13 +81,6 @@ def with_scan(image: np.ndarray, pixels: np.ndarray, ranges: np.ndarray) -> np.n
     for pixel, colour in zip(middles, colours.reshape(-1, 3).tolist(), strict=True):
         cv2.circle(drawn, pixel, radius, colour, -1, cv2.LINE_AA)
     return drawn
-
-
-def _png(figure):
-    """Content of a PNG file."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    return content.getvalue()
 
 
 def jpeg(image: np.ndarray) -> bytes:

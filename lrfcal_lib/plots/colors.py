@@ -18,8 +18,6 @@ COLORS = {
     "fit": FIT,
     "truth": TRUTH,
     "raw": RAW,
-    "filtered": FILTERED,
-    "outlier": OUTLIER,
     "platform": PLATFORM,
 }
 SERIES = (LEFT, LRF, RIGHT, FIT, FILTERED, "#56b4e9", "#7a5c3e", TRUTH)

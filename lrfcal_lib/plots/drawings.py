@@ -1,11 +1,9 @@
 """Drawings of the geometry behind the equations, seen in perspective and named at the things."""
 
-from itertools import product
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
@@ -23,7 +21,6 @@ DIMENSION = {
     "shrinkB": 0,
 }
 ARROW = {"arrowstyle": "-|>", "linewidth": 1.8, "shrinkA": 0}
-Place = tuple[float, float]
 
 
 class View:
@@ -43,7 +40,7 @@ class View:
         self.T_view = look_at(eye, target, up)
         ax.set_axis_off()
         ax.set(aspect="equal")
-        ax.yaxis.set_inverted(True)
+        ax.invert_yaxis()
 
     def flat(self, points: ArrayLike) -> np.ndarray:
         """Where points (..., 3), metres, stand on the axes, (..., 2)."""
@@ -58,14 +55,15 @@ class View:
         self, corners: np.ndarray, color: str, alpha: float = 0.2, edge: str | None = None
     ) -> None:
         """A flat area with corners (n, 3), metres."""
-        flat = self.flat(corners)
-        self.ax.fill(*flat.T, facecolor=to_rgba(color, alpha), edgecolor=edge or color)
+        self.ax.fill(
+            *self.flat(corners).T, facecolor=(color, alpha), edgecolor=edge or color
+        )
 
     def name(
         self,
         point: ArrayLike,
         text: str,
-        away: Place = (8, 8),
+        away: tuple[float, float] = (8, 8),
         color: str = TRUTH,
     ) -> None:
         """A text beside a point (3,), so many printer's points to the right and up."""
@@ -90,7 +88,9 @@ class View:
             self.arrow(T.apply([0 * axis, axis]), color)
             self.name(T.apply(1.15 * axis), name, (0, 0), color)
 
-    def dimension(self, ends: ArrayLike, text: str, away: Place = (0, 8)) -> None:
+    def dimension(
+        self, ends: ArrayLike, text: str, away: tuple[float, float] = (0, 8)
+    ) -> None:
         """The distance of two points (2, 3) as in a drawing of a machine."""
         self.arrow(ends, TRUTH, DIMENSION)
         self.name(np.asarray(ends).mean(axis=0), text, away)
@@ -98,8 +98,7 @@ class View:
     def box(self, T: RigidTransform, low: ArrayLike, high: ArrayLike, color: str) -> None:
         """A solid box between two corners (3,) of its own frame, metres, the far faces first."""
         at_high = [
-            np.insert(UNIT_SQUARE, axis, end, axis=1)
-            for axis, end in product(range(3), (0, 1))
+            np.insert(UNIT_SQUARE, axis, end, axis=1) for axis in range(3) for end in (0, 1)
         ]
         faces = T.apply(np.where(at_high, high, low))
         for face in sorted(faces, key=lambda face: -self.T_view.apply(face)[:, 2].mean()):
@@ -198,7 +197,7 @@ def image_of_edges(
         words = f"{name}, off by\nd({name}, a{other})"
         ax.annotate(words, place, beside, textcoords="offset points", **CENTRED)
     for name in "abc":
-        ax.annotate(name, uv[name], xytext=(10, 6), textcoords="offset points", **CENTRED)
+        ax.annotate(name, uv[name], (10, 6), textcoords="offset points", **CENTRED)
     to_scale(ax, "u [px]", "v [px]")
-    ax.yaxis.set_inverted(True)
+    ax.invert_yaxis()
     return uv

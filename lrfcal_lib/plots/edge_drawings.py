@@ -31,7 +31,7 @@ def plane_constraint(
     normal, distance
         Of the plane n . p = d, camera frame: a unit vector (3,), metres.
     """
-    up = np.sign(distance) * np.asarray(normal)
+    up = np.sign(distance) * normal
     height = abs(distance)
     away = points.mean(axis=0) - origin
     section = np.stack([unit_vector(away - up * (up @ away)), up])
@@ -117,7 +117,7 @@ def reading_by_distance(
     bias, sigma
         Where the reading flips, metres outside the edge, and its standard deviation.
     """
-    u = 1000 * np.asarray(distance)
+    u = 1000 * distance
     b = 1000 * bias
     x = np.linspace(u.min(), u.max(), 400)
     ax.plot(x, ndtr((b - x) / (1000 * sigma)), color=FIT, label="expected, Φ((b - u) / σ)")

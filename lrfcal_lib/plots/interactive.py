@@ -16,9 +16,12 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots.colors import AXES_RGB, FIT, PLATFORM, closed, color_of
 
 MOST_POINTS = 150_000  # that browsers turn smoothly
-PAGE = {"xref": "paper", "yref": "paper", "xanchor": "left", "yanchor": "bottom"}
 SCRIPT = Path(__file__).with_name("scene.js")
-EYE = (-0.3, -1.5, 0.55)  # where one looks from at first, in widths of the scene
+EYE = {
+    "x": -0.3,
+    "y": -1.5,
+    "z": 0.55,
+}  # where one looks from at first, in widths of the scene
 GAP = np.full((1, 3), np.nan)  # where a line breaks
 
 
@@ -59,20 +62,22 @@ def scene_page(
         "points": np.flatnonzero(seen)[::every],
         "points that no image saw": np.flatnonzero(~seen)[::every],
     }
-    traces = [
-        _cloud_trace(name, points[rows], colors[rows]) for name, rows in shown.items()
-    ]
+    traces = []
+    for name, rows in shown.items():
+        shades = [f"#{color.tobytes().hex()}" for color in colors[rows]]
+        marker = {"size": 1.6, "color": shades}
+        traces.append(
+            _trace(name, points[rows], "markers", marker=marker, hoverinfo="none")
+        )
     for name, (color, line) in lines.items():
         looks = {"color": color, "width": 4}
         visible = "legendonly" if name == "boards" else True
         traces.append(_trace(name, line, "lines", line=looks, visible=visible))
     data = None
     if measuring is not None:
-        data = dict(measuring)
+        data = dict(measuring, edges_trace=len(traces), lengths_trace=len(traces) + 1)
         for name in ("plane_of_point", "station_of_point"):
             data[name] = [measuring[name][rows] for rows in shown.values()]
-        data["edges_trace"] = len(traces)
-        data["lengths_trace"] = len(traces) + 1
         traces += _measured_traces(data.pop("lines"))
     options = {"scrollZoom": False, "responsive": True}
     plot = _in_script([traces, _layout(title, note), options])
@@ -100,39 +105,41 @@ def _plotly_js():
     return (package / "package_data/plotly.min.js").read_text(encoding="utf-8")
 
 
-def _cloud_trace(name, points, colors):
-    """Points (n, 3) of a cloud in their colours (n, 3)."""
-    numbers = colors.astype(int) @ [0x10000, 0x100, 1]
-    shades = [f"#{value:06x}" for value in numbers]
-    marker = {"size": 1.6, "color": shades}
-    return _trace(name, points, "markers", marker=marker, hoverinfo="none")
-
-
 def _layout(title, note):
     """Axes of one scale, an orbit that keeps the vertical, a title and a note."""
     axes = {
         f"{axis}axis": {"title": {"text": f"{axis} [m]"}, "showspikes": False}
         for axis in "xyz"
     }
-    view = {"eye": dict(zip("xyz", EYE, strict=True)), "up": {"x": 0, "y": 0, "z": 1}}
+    view = {"eye": EYE, "up": {"x": 0, "y": 0, "z": 1}}
     return {
         "scene": {**axes, "aspectmode": "data", "camera": view, "dragmode": "turntable"},
         "margin": {"l": 0, "r": 0, "t": 30 if title else 0, "b": 0},
         "title": {"text": title, "x": 0.5, "y": 0.99, "yanchor": "top"},
         "legend": {"itemsizing": "constant", "x": 0, "y": 1},
         "hovermode": "closest",
-        "annotations": [{"text": note, "x": 0, "y": 0, "showarrow": False, **PAGE}],
+        "annotations": [
+            {
+                "text": note,
+                "x": 0,
+                "y": 0,
+                "showarrow": False,
+                "xref": "paper",
+                "yref": "paper",
+                "xanchor": "left",
+                "yanchor": "bottom",
+            }
+        ],
     }
 
 
 def _measured_traces(lines):
     """Edges (n, 2, 3) that can be picked, and the lengths that were."""
     red = "#d00"
-    broken = np.insert(lines, 2, np.nan, axis=1)
     return [
         _trace(
             "edges",
-            broken.reshape(-1, 3),
+            np.insert(lines, 2, np.nan, axis=1).reshape(-1, 3),
             "lines",
             line={"color": FIT, "width": 3},
             visible="legendonly",
@@ -162,6 +169,11 @@ def _text(values):
     return base64.b64encode(values.astype("<f4", order="C")).decode()
 
 
+def _broken(lines):
+    """Lines, each of points (n, 3), as one line of breaks between them."""
+    return np.vstack([part for line in lines for part in (line, GAP)])
+
+
 def rig_lines(
     T_head_lrf: RigidTransform,
     cameras: Mapping[str, tuple[RigidTransform, CameraModel]],
@@ -185,14 +197,13 @@ def rig_lines(
     for name, (T, _) in cameras.items():
         frames[name] = T.inv()
     for letter, axis, color in zip("xyz", size * np.eye(3), AXES_RGB, strict=True):
-        arrows = [np.vstack([T.apply([0 * axis, axis]), GAP]) for T in frames.values()]
-        lines[f"{letter} of {', '.join(frames)}"] = (color, np.vstack(arrows))
+        arrows = _broken(T.apply([0 * axis, axis]) for T in frames.values())
+        lines[f"{letter} of {', '.join(frames)}"] = (color, arrows)
     for name, (_, model) in cameras.items():
         rim = 3 * size * model.sights(model.size * UNIT_SQUARE)
-        legs = [np.vstack([np.zeros(3), corner, GAP]) for corner in rim]
-        frustum = np.vstack([closed(rim), GAP, *legs])
+        legs = np.insert(rim[:, None], 0, 0.0, axis=1)
+        frustum = _broken([closed(rim), *legs])
         lines[f"view of {name}"] = (color_of(name), frames[name].apply(frustum))
     if boards:
-        outlines = [np.vstack([closed(corners), GAP]) for corners in boards.values()]
-        lines["boards"] = (FIT, np.vstack(outlines))
+        lines["boards"] = (FIT, _broken(map(closed, boards.values())))
     return lines

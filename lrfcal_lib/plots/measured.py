@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgba_array
+from matplotlib.colors import ListedColormap
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.plots.colors import FIT, LEFT, PLATFORM, RIGHT
@@ -46,12 +46,11 @@ def surfaces_and_edges(
     T_view, size
         See :func:`lrfcal_lib.plots.rig.render`.
     """
-    colors = np.rint(255 * to_rgba_array([*PALETTE, NO_SURFACE])[:, :3]).astype(np.uint8)
-    shades = colors[np.where(of_point < 0, -1, of_point % len(PALETTE))]
+    colors = ListedColormap(PALETTE).with_extremes(under=NO_SURFACE)
+    shades = colors(np.minimum(of_point, of_point % len(PALETTE)), bytes=True)[:, :3]
     ax.imshow(render(points, shades, T_view, size, splat=3))
     for edge in ends:
-        u, v = pixels(T_view.apply(edge), size, None).T
-        ax.plot(u, v, color=FIT, linewidth=1.0)
+        ax.plot(*pixels(T_view.apply(edge), size).T, color=FIT, linewidth=1.0)
     ax.set(xlim=(0, size[1]), ylim=(size[0], 0))
     ax.set_axis_off()
 

@@ -1,14 +1,16 @@
 """Figures of what was recorded: scans, range images, pictures, edges; a colour for each sensor."""
 
 from collections.abc import Sequence
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
 
-from lrfcal_lib.model.board import Board, Chessboard, outline_lines, side_ends
+from lrfcal_lib.model.board import Board, Chessboard, side_ends
 from lrfcal_lib.model.camera import CameraModel, redistort
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.colors import COLORS as COLORS
@@ -116,6 +118,13 @@ def scan_line(
     ax.legend()
 
 
+def png(figure: Figure, **looks: Any) -> bytes:
+    """Content of a PNG file of a figure, with options of `savefig`."""
+    content = BytesIO()
+    figure.savefig(content, format="png", **looks)
+    return content.getvalue()
+
+
 def to_scale(ax: Axes, x: str, y: str) -> None:
     """Equal scales, and the labels `x` and `y`."""
     ax.set(xlabel=x, ylabel=y, aspect="equal", adjustable="datalim")
@@ -145,7 +154,7 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
         raise ValueError(
             f"no beam of scan line {line} is on the board of placement {scan.placement}"
         )
-    last = on[-1] if end > 0 else on[0]
+    last = on[::end][-1]
     near = slice(max(last - BESIDE, 0), last + BESIDE + 1)
     bearing = np.degrees(scan.sweep.bearings[near])
     raw = scan.sweep.ranges[line, near]
@@ -238,14 +247,12 @@ def picture(ax: Axes, image: np.ndarray) -> None:
     ----------
     ax
     image
-        Shape (h, w, 3), blue first, or (h, w).
+        Shape (h, w, 3), blue first.
     """
     brightest = np.quantile(image[::4, ::4], 0.99)
     gain = BRIGHT / np.clip(brightest, BRIGHT / GAIN, BRIGHT)
-    shown = np.clip(gain * image, 0, 255).astype(np.uint8)
-    if image.ndim == 3:
-        shown = shown[..., ::-1]
-    ax.imshow(shown, cmap="gray", interpolation="antialiased", vmin=0, vmax=255)
+    shown = np.clip(gain * image[..., ::-1], 0, 255).astype(np.uint8)
+    ax.imshow(shown, interpolation="antialiased")
     if gain > 1:
         ax.text(
             0.01,
@@ -352,17 +359,17 @@ def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
 def _about_lines(ax, view, image, margin, more=""):
     """Cut an image of the board to the lines drawn in it, and say in the title which it is."""
     ax.set_title(f"{view.camera}, placement {view.placement}{more}")
-    points = np.vstack([np.zeros((0, 2)), *(line.get_xydata() for line in ax.lines)])
+    points = np.vstack([[[np.nan, np.nan]], *(line.get_xydata() for line in ax.lines)])
     if np.isfinite(points).any():
         last = np.array(image.shape[1::-1]) - 0.5
-        left, top = np.clip(np.nanmin(points, axis=0) - margin, -0.5, last)
-        right, bottom = np.clip(np.nanmax(points, axis=0) + margin, -0.5, last)
-        ax.set(xlim=(left, right), ylim=(bottom, top))
+        rim = [np.nanmin(points, axis=0) - margin, np.nanmax(points, axis=0) + margin]
+        columns, rows = np.clip(rim, -0.5, last).T
+        ax.set(xlim=columns, ylim=rows[::-1])
 
 
-def _lengths(ax, board, outwards, away):
-    """The lengths of a board's edges, written so many metres `away` along `outwards` (n, 2)."""
-    middles = side_ends(board.known_corners()).mean(axis=1) + away * outwards
+def _lengths(ax, board, away):
+    """The lengths of a board's edges, written so many metres outside of them."""
+    middles = side_ends(board.known_corners()).mean(axis=1) + away * board.lines()[:, :2]
     for (name, length), at in zip(board.lengths().items(), middles, strict=True):
         ax.text(*at, f"{name.upper()}\n{1000 * length:.1f} mm", **CENTRED)
 
@@ -388,7 +395,7 @@ def board_plan(ax: Axes, board: Board) -> None:
     ax.fill(*corners.T, color=PRINT.colors[0], linewidth=0)
     if board.pattern is not None:
         squares(ax, board.pattern, PRINT)
-    _lengths(ax, board, outline_lines(corners)[:, :2], 0.065)
+    _lengths(ax, board, 0.065)
     ax.update_datalim(np.vstack([corners - 0.09, corners + 0.09]))
     to_scale(ax, "x [m]", "y [m]")
 
@@ -404,12 +411,11 @@ def outline(ax: Axes, measured) -> None:
     board = measured.board
     corners = board.known_corners()
     ax.plot(*closed(corners).T, color=TRUTH)
-    outwards = board.lines()[:, :2]
-    spreads = EXAGGERATED * np.nan_to_num(measured.line_sd)[:, None] * outwards
+    spreads = EXAGGERATED * np.nan_to_num(measured.line_sd)[:, None] * board.lines()[:, :2]
     for ends, away in zip(side_ends(corners), spreads, strict=True):
         band = np.vstack([ends - away, ends[::-1] + away])
         ax.fill(*band.T, color=FIT, alpha=0.25, linewidth=0)
-    _lengths(ax, board, outwards, -0.09)
+    _lengths(ax, board, -0.09)
     if board.pattern is not None:
         ax.plot(*board.pattern.points()[:, :2].T, "+", color=RAW, markersize=4)
     ax.invert_yaxis()

@@ -47,8 +47,8 @@ def render(
     ndarray of uint8, shape (height, width, 3)
     """
     seen = T_view.apply(points)
-    ahead = np.flatnonzero(seen[:, 2] > NEAREST)
-    order = ahead[np.argsort(-seen[ahead, 2], kind="stable")]  # far to near
+    order = np.argsort(-seen[:, 2], kind="stable")  # far to near
+    order = order[seen[order, 2] > NEAREST]
     # with what is too far out to be seen, but for a part of its square
     height, width = np.add(size, 2 * splat)
     uv = np.rint(pixels(seen[order], size, focal)).astype(int) + splat
@@ -71,17 +71,17 @@ def pixels(
     Parameters
     ----------
     seen
-        Points of the view, shape (n, 3), metres.
+        Points of the view, shape (..., 3), metres.
     size, focal
         As there.
 
     Returns
     -------
-    ndarray, shape (n, 2)
+    ndarray, shape (..., 2)
     """
     height, width = size
     centre = np.array([width - 1, height - 1]) / 2
-    return (focal or width) * seen[:, :2] / seen[:, 2:] + centre
+    return (focal or width) * seen[..., :2] / seen[..., 2:] + centre
 
 
 def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidTransform:
@@ -104,16 +104,15 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
     ValueError
         If eye and target coincide, or `up` is the line of sight.
     """
-    eye = np.asarray(eye, float)
-    target = np.asarray(target, float)
-    ahead = target - eye
+    start, end = np.array([eye, target], float)
+    ahead = end - start
     right = np.cross(ahead, up)
     if np.linalg.norm(right) <= PARALLEL * np.linalg.norm(ahead):
         raise ValueError(
-            f"no view from {eye} to {target} with {up} upwards: choose another eye or another up"
+            f"no view from {start} to {end} with {up} upwards: choose another eye or another up"
         )
     axes = unit_vector(np.stack([right, np.cross(ahead, right), ahead]))
-    return carry(Rotation.from_matrix(axes), eye)
+    return carry(Rotation.from_matrix(axes), start)
 
 
 def face_on(
@@ -156,7 +155,7 @@ def measured_edges(
     known: dict[str, float],
     T_view: RigidTransform,
     size: tuple[int, int],
-    focal: float | None = None,
+    focal: float | None,
 ) -> None:
     """Edges of a measured board over a picture of :func:`render`, with their lengths.
 
@@ -170,7 +169,7 @@ def measured_edges(
         Of the picture.
     """
     names = [*known, *known]  # around the outline, so that one comes after the last
-    centre = measured.T_platform_plane[None, :3, 3]
+    centre = measured.T_platform_plane[:3, 3]
     middle = pixels(T_view.apply(centre), size, focal)
     for name, length in measured.lengths.items():
         both = names[names.index(name) :][:2]
@@ -178,6 +177,6 @@ def measured_edges(
         uv = pixels(T_view.apply(ends), size, focal)
         ax.plot(*uv.T, "o-", color=FIT)
         at = uv.mean(axis=0)
-        at = at + 0.07 * size[1] * unit_vector(at - middle[0])
+        at = at + 0.07 * size[1] * unit_vector(at - middle)
         words = f"{name.upper()} {1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
         ax.text(*at, words, color=FIT, **CENTRED)

@@ -5,7 +5,6 @@ from os import PathLike
 import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
 
 from lrfcal_lib.model.board import UNIT_SQUARE, Board, Chessboard
 from lrfcal_lib.plots.recording import squares
@@ -27,7 +26,7 @@ def sheet(columns: int, rows: int, square: float) -> Board:
         Metres.
     """
     start = (1 + BORDER) * square
-    corners = (np.array([columns, rows]) + 1 + 2 * BORDER) * square * UNIT_SQUARE
+    corners = np.add([columns, rows], 1 + 2 * BORDER) * square * UNIT_SQUARE
     pattern = Chessboard(columns, rows, square, (start, start))
     return Board(
         "printed",
@@ -57,7 +56,7 @@ def print_sheet(path: str | PathLike, board: Board, dpi: float = 300) -> None:
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_axis_off()
     squares(ax, board.pattern, ListedColormap(["black", "white"]))
-    ax.add_patch(Polygon(corners, fill=False, edgecolor="black", linewidth=0.5))
+    ax.fill(*corners.T, fill=False, edgecolor="black", linewidth=0.5)
     x, y = low + [PAPER, PAPER / 3]
     ax.plot([x, x + RULER], [y, y], "|-", color="black")
     ax.text(

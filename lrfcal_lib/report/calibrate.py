@@ -2,6 +2,7 @@
 
 import operator
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from lrfcal_lib.calibrate.pipeline import Calibration, calibrate, handed_over
@@ -50,15 +51,15 @@ def calibrate_session(path: str | Path, out: str | Path | None = None) -> int:
     if method is None:
         print(*judge(calibration).sentences(), sep="\n")
         return UNTRUSTED
-    folder = Path(out or Path("reports", Path(path).resolve().name))
+    folder = Path(out or Path("reports", session.path.resolve().name))
     judging = partial(_judged, calibration, method)
     clouds = cloud_tasks(folder, calibration, method)
     *written, (judged, record) = spread(operator.call, [*clouds, judging])
     file = folder / "calibration.json"
     write_calibration(file, record)  # last: where it stands, the clouds do
     print(*judged.sentences(), sep="\n")
-    names = [str(name) for files in reversed(written) for name in files]
-    print("written:", ", ".join([*names, str(file)]))
+    names = [*chain(*reversed(written)), file]
+    print("written:", ", ".join(map(str, names)))
     if judged.answer == NO:
         return UNTRUSTED
     return 0

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lrfcal_lib.measure.compare import Comparison, compare, rig_at
-from lrfcal_lib.plots.comparison import shift_map
 from lrfcal_lib.report.notebook import STYLE
 from lrfcal_lib.session.write import whole
 
@@ -46,10 +46,8 @@ def compare_files(paths: Sequence[str | Path], figure: str | Path | None = None)
         print(*(f"  {part}" for part in (*compared.parts, compared.whole)), sep="\n")
         print(compared.sentence())
     if figure is not None:
-        drawn = comparison_figure(comparisons)
         with whole(figure) as draft:
-            drawn.savefig(draft, format="png", dpi=110)
-        plt.close(drawn)
+            comparison_figure(comparisons).savefig(draft, format="png", dpi=110)
         print(f"written: {figure}")
     return 0 if all(compared.within for compared in comparisons) else DIFFER
 
@@ -70,13 +68,12 @@ def comparison_figure(comparisons: Sequence[Comparison]) -> Figure:
     columns = 1 + max(len(compared.images) for compared in comparisons)
     size = (4.4 * columns, 3.4 * len(comparisons))
     with plt.style.context(STYLE):
-        figure, grid = plt.subplots(
-            len(comparisons), columns, figsize=size, layout="constrained", squeeze=False
-        )
+        figure = Figure(size, layout="constrained")
+        grid = figure.subplots(len(comparisons), columns, squeeze=False)
         for axes, compared in zip(grid, comparisons, strict=True):
             field = compared.cloud
             names = f"{compared.first.session}, {compared.second.session}"
-            shift_map(
+            _shift_map(
                 axes[0],
                 np.degrees(field.at),
                 1000 * field.off,
@@ -87,7 +84,7 @@ def comparison_figure(comparisons: Sequence[Comparison]) -> Figure:
             )
             axes[0].invert_xaxis()  # as the rig sees it
             for ax, (name, shifts) in zip(axes[1:], compared.images.items(), strict=False):
-                shift_map(
+                _shift_map(
                     ax,
                     shifts.at,
                     shifts.off,
@@ -98,3 +95,14 @@ def comparison_figure(comparisons: Sequence[Comparison]) -> Figure:
                 )
                 ax.invert_yaxis()
     return figure
+
+
+def _shift_map(ax: Axes, at: np.ndarray, off: np.ndarray, unit: str, **looks: str) -> None:
+    """By how much things move over an image or a field of view, as colours with a bar.
+
+    Shifts `off`, shape (r, c, k), NaN where there is none, stand where `at` (r, c, 2) says; `looks`
+    are title and labels.
+    """
+    drawn = ax.pcolormesh(*np.moveaxis(at, -1, 0), np.linalg.norm(off, axis=-1), vmin=0)
+    ax.figure.colorbar(drawn, ax=ax, label=f"[{unit}]")
+    ax.set(**looks)

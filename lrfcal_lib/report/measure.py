@@ -46,9 +46,9 @@ def measure_session(
     numbers = scene.stations
     if station is not None:
         if station not in numbers:
-            known = ", ".join(map(str, numbers))
             raise ValueError(
-                f"{path}: there is no station {station}; its stations are {known}"
+                f"{path}: there is no station {station}; its stations are "
+                f"{', '.join(map(str, numbers))}"
             )
         numbers = (station,)
     scenes = {n: features_of_station(scene.session, scene.rig, n) for n in numbers}

@@ -1,7 +1,6 @@
 """The command ``merge``: the stations of a scene in one frame, as one cloud, and how they lie."""
 
 import base64
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.covariance import sigma_turn_shift
 from lrfcal_lib.measure.scene import station_cloud, write_scene
 from lrfcal_lib.measure.stations import Joined, advice, join_stations, joined_cloud
+from lrfcal_lib.plots.recording import png
 from lrfcal_lib.report.reconstruct import open_scene
 from lrfcal_lib.session.shown import escape
 from lrfcal_lib.session.write import whole
@@ -65,16 +65,35 @@ def merge_session(
     scene = open_scene(path, calibration, out, untrusted)
     clouds = {n: station_cloud(scene.session, scene.rig, n) for n in scene.stations}
     joined = joined_stations(clouds, scene.rig, path)
-    print(FRAME.format(min(joined.T_world_station)))
-    for table in (stations_table(joined), pairs_table(joined)):
-        print(table.to_string(index=False))
-    print(*sentences(joined), sep="\n", flush=True)
+    frame = FRAME.format(min(joined.T_world_station))
+    tables = [stations_table(joined), pairs_table(joined)]
+    said = [*map(str, joined.problems), *advice(joined)] or [
+        "Nothing: all stations are joined, and every pair is checked by others."
+    ]
+    print(
+        frame,
+        *(table.to_string(index=False) for table in tables),
+        *said,
+        sep="\n",
+        flush=True,
+    )
     files = write_scene(
         scene.folder, scene.session, scene.rig, joined, scene.about, clouds=clouds
     )
+    picture = png(stations_figure(joined, joined_cloud(clouds, joined)), dpi=110)
+    stations, pairs = (table.to_html(index=False, border=0) for table in tables)
     page = scene.folder / "stations.html"
     with whole(page) as draft:
-        draft.write_text(stations_page(joined, joined_cloud(clouds, joined), scene.about))
+        draft.write_text(
+            PAGE.format(
+                about=escape(scene.about),
+                frame=frame,
+                picture=base64.b64encode(picture).decode(),
+                stations=stations,
+                pairs=pairs,
+                sentences="".join(f"<li>{escape(words)}</li>" for words in said),
+            )
+        )
     print("written:", ", ".join(map(str, [*files, page])))
     return 0 if len(joined.T_world_station) == len(clouds) else NOT_ALL
 
@@ -97,8 +116,8 @@ def stations_table(joined: Joined) -> pd.DataFrame:
         turn, shift = sigma_turn_shift(joined.covariance[number])
         yaw = T.rotation.as_euler("ZYX", degrees=True)[0]
         rows.append([number, *T.translation, yaw, 1000 * shift, np.degrees(turn)])
-    names = ["station", "x_m", "y_m", "z_m", "yaw_deg", "sigma_mm", "sigma_deg"]
-    return pd.DataFrame(rows, columns=names).round(3)
+    columns = ["station", "x_m", "y_m", "z_m", "yaw_deg", "sigma_mm", "sigma_deg"]
+    return pd.DataFrame(rows, columns=columns).round(3)
 
 
 def pairs_table(joined: Joined) -> pd.DataFrame:
@@ -106,47 +125,15 @@ def pairs_table(joined: Joined) -> pd.DataFrame:
     rows = []
     for pair in joined.pairs:
         turn, shift = joined.miss(pair)
-        both = f"{pair.first} and {pair.second}"
-        overlap = round(100 * pair.overlap)
-        rows.append([both, overlap, 1000 * pair.rms, 1000 * shift, np.degrees(turn)])
-    names = ["stations", "overlap_percent", "surfaces_apart_mm", "miss_mm", "miss_deg"]
-    return pd.DataFrame(rows, columns=names).round(3)
-
-
-def sentences(joined: Joined) -> list[str]:
-    """What was not joined and why, and what to record next."""
-    said = [*map(str, joined.problems), *advice(joined)]
-    return said or [
-        "Nothing: all stations are joined, and every pair is checked by others."
-    ]
-
-
-def stations_page(joined: Joined, cloud: Cloud, about: str) -> str:
-    """A page with the plan of the stations, residuals by pair and what to record next.
-
-    Parameters
-    ----------
-    joined : Joined
-    cloud : Cloud
-        Of all stations, in the joined frame.
-    about : str
-        Where it is from.
-
-    Returns
-    -------
-    str
-        HTML that needs no other file.
-    """
-    picture = BytesIO()
-    stations_figure(joined, cloud).savefig(picture, dpi=110)
-    return PAGE.format(
-        about=escape(about),
-        frame=FRAME.format(min(joined.T_world_station)),
-        picture=base64.b64encode(picture.getvalue()).decode(),
-        stations=stations_table(joined).to_html(index=False, border=0),
-        pairs=pairs_table(joined).to_html(index=False, border=0),
-        sentences="".join(f"<li>{escape(words)}</li>" for words in sentences(joined)),
-    )
+        row = {
+            "stations": f"{pair.first} and {pair.second}",
+            "overlap_percent": round(100 * pair.overlap),
+            "surfaces_apart_mm": 1000 * pair.rms,
+            "miss_mm": 1000 * shift,
+            "miss_deg": np.degrees(turn),
+        }
+        rows.append(row)
+    return pd.DataFrame(rows).round(3)
 
 
 def stations_figure(joined: Joined, cloud: Cloud) -> Figure:
@@ -175,7 +162,7 @@ def stations_figure(joined: Joined, cloud: Cloud) -> Figure:
     for number, T in poses.items():
         place, ahead = T.apply([[0, 0, 0], [0, ARROW, 0]])[:, :2]
         arrow = {"arrowstyle": "->", "color": "C3"}
-        plan.annotate(f"{number}", ahead, place, color="C3", size=13, arrowprops=arrow)
+        plan.annotate(number, ahead, place, color="C3", size=13, arrowprops=arrow)
     plan.set(aspect="equal", xlabel="x, m", ylabel="y, m")
     plan.set_title(
         f"Stations, where they look, and the pairs used; points {-low:.1f} m below to {high:.1f} m "

@@ -30,14 +30,14 @@ from lrfcal_lib.solvers import METHODS
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "data" / "sim_lms221"
 STYLE = Path(__file__).with_name("figures.mplstyle")
-UNITS = {
-    "deg": "deg",
-    "mm": "mm",
-    "px": "px",
-    "m": "m",
-    "m3": "m³",
-    "percent": "%",
-    "radii": "spot radii",
+UNITS = {  # by the last word of a column's name, in its heading
+    "deg": "[deg]",
+    "mm": "[mm]",
+    "px": "[px]",
+    "m": "[m]",
+    "m3": "[m³]",
+    "percent": "[%]",
+    "radii": "[spot radii]",
 }
 OTHER_LABELS = {  # of what is no row of METHODS
     "joint": "joint estimate",
@@ -107,7 +107,7 @@ def save(fig: Figure, name: str, caption: str, *, main: bool = True) -> None:
     main
         Whether the first page of the report shows it.
     """
-    _record("figures", name, {"name": name, "caption": caption, "main": main})
+    _record("figures", name, name=name, caption=caption, main=main)
     # drawing gives a figure without layout engine the default one, which would move what was placed
     # by hand
     with plt.rc_context({"figure.constrained_layout.use": False}):
@@ -160,10 +160,10 @@ def table(
     styler = shown.style.format(shapes, na_rep="–").format_index(
         lambda c: escape(in_words(c, True)), axis=1
     )
-    caption = caption or str(in_words(name)).capitalize()
-    styler = styler.hide(axis="index").set_caption(escape(caption))
+    caption = caption or in_words(name).capitalize()
+    styler.hide(axis="index").set_caption(escape(caption))
     made = styler.to_html(table_uuid=name)
-    _record("tables", name, {"name": name, "caption": caption, "html": made})
+    _record("tables", name, name=name, caption=caption, html=made)
     return HTML(made)
 
 
@@ -192,7 +192,9 @@ def in_words(text: object, column: bool = False) -> Any:
     if label != text or not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)+", text):
         return label
     *words, last = text.split("_")
-    return " ".join((*words, f"[{UNITS[last]}]" if column and last in UNITS else last))
+    if column:
+        last = UNITS.get(last, last)
+    return " ".join((*words, last))
 
 
 def finding(
@@ -221,25 +223,24 @@ def finding(
     main
         Whether the first page shows it.
     """
-    known: float | str | None = value.item() if hasattr(value, "item") else value
-    shown = str(known)
-    if isinstance(known, float):
-        shown = f"{known:z.{digits}f}"
-        if not math.isfinite(known):
+    if hasattr(value, "item"):
+        value = value.item()
+    shown = str(value)
+    if isinstance(value, float):
+        shown = f"{value:z.{digits}f}"
+        if not math.isfinite(value):
             shown = "unknown"
-            known = None
+            value = None
     shown = f"{shown} {unit}".strip()
     _record(
         "findings",
         key,
-        {
-            "key": key,
-            "value": known,
-            "unit": unit,
-            "text": text,
-            "shown": shown,
-            "main": main,
-        },
+        key=key,
+        value=value,
+        unit=unit,
+        text=text,
+        shown=shown,
+        main=main,
     )
     print(f"{text}: {shown}")
 
@@ -259,9 +260,7 @@ def verdict(title: str, sentences: Sequence[str], record: dict | None = None) ->
     sentences = [
         f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences
     ]
-    _record(
-        "verdicts", "verdict", {"title": title, "sentences": sentences, "record": record}
-    )
+    _record("verdicts", "verdict", title=title, sentences=sentences, record=record)
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 
@@ -308,14 +307,14 @@ class Sections(ast.NodeTransformer):
         needing = [row for row, text in enumerate(words) if text.startswith(NEEDS)]
         undone = "notebook" in _lacking or ("section" in _lacking and not needing)
         if undone and not any("notebook.start(" in text for text in words):
-            node.body = []
-        for row in reversed(needing if node.body else []):
+            return ast.Module([], [])
+        for row in reversed(needing):
             call = ast.parse(words[row], mode="eval").body
             node.body[row:] = [ast.If(call, node.body[row + 1 :] or [ast.Pass()], [])]
         return ast.fix_missing_locations(node)
 
 
-def _record(kind, name, entry):
+def _record(kind, name, /, **entry):
     """Keep an entry; the file is written each time, so that a notebook that fails later has told
     what it found.
     """

@@ -70,7 +70,7 @@ def open_scene(
     refuse_untrusted(rig, untrusted)
     session = open_session(path)
     require_same_rig(rig, session)
-    folder = Path(out or Path("reports", Path(path).resolve().name))
+    folder = Path(out or Path("reports", session.path.resolve().name))
     return SceneAsked(session, rig, stations_of(session), folder)
 
 
@@ -98,8 +98,7 @@ def reconstruct_session(
         For a calibration or a session that cannot be used, or a file that cannot be written.
     """
     scene = open_scene(path, calibration, out, untrusted)
-    session = scene.session
-    total = sum(np.isfinite(session.sweep(n).ranges).sum() for n in scene.stations)
+    total = sum(np.isfinite(scene.session.sweep(n).ranges).sum() for n in scene.stations)
     several = len(scene.stations) > 1
     with tqdm(total=total, unit=" points", unit_scale=True, disable=None) as bar:
         for number in scene.stations:
@@ -107,7 +106,7 @@ def reconstruct_session(
             if several:
                 place = scene.folder / f"station_{number}"
             files = write_scene(
-                place, session, scene.rig, alone(number), scene.about, bar.update
+                place, scene.session, scene.rig, alone(number), scene.about, bar.update
             )
             bar.clear()
             print(f"station {number}: {', '.join(map(str, files))}", flush=True)

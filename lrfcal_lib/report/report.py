@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import date
@@ -103,8 +103,7 @@ def make_report(session_path, out, jobs=2, notebooks=None):
         SessionError if the session is not sound, or the folder of the report cannot be written.
     """
     begin = time.monotonic()
-    session_path = Path(session_path).resolve()
-    session = open_session(session_path)
+    session = open_session(Path(session_path).resolve())
     out = Path(out).resolve()
     paths = sorted(
         NOTEBOOKS.glob(f"{NUMBERED}.ipynb") if notebooks is None else map(Path, notebooks)
@@ -112,7 +111,7 @@ def make_report(session_path, out, jobs=2, notebooks=None):
     # a fresh cache: a report stands for its session
     with in_place_of(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:
         environment = {
-            "LRFCAL_SESSION": str(session_path),
+            "LRFCAL_SESSION": str(session.path),
             "LRFCAL_REPORT": str(new),
             CACHE: cache,
             # what notebook 09 records with the emulated rig goes with the report's cache
@@ -239,15 +238,15 @@ def _stop(number, frame):
 def report_session(session: str | Path, out: str | Path | None, jobs: int = 2) -> int:
     """Write the report of a session and say so: 0, or 1 if a notebook failed."""
     begin = time.monotonic()
-    session = Path(session)
-    out = Path(out or ROOT / "reports" / session.resolve().name).resolve()
+    out = Path(out or ROOT / "reports" / Path(session).resolve().name).resolve()
     runs = make_report(session, out, jobs)
     good = len(runs)
     for run in runs:
         if run.error:
             good -= 1
-            last = run.error.strip().splitlines()[-1]
-            print(f"{run.name} failed: {last}", file=sys.stderr)
+            print(
+                f"{run.name} failed:", run.error.strip().splitlines()[-1], file=sys.stderr
+            )
     seconds = time.monotonic() - begin
     print(f"{good} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
     return int(good < len(runs))
@@ -303,7 +302,9 @@ def _take_place(new, out):
 
     out.mkdir(exist_ok=True)
     shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
-    if not _exchanged(new, out):
+    exchange = getattr(ctypes.CDLL(None), "renameat2", None)
+    places = AT_WORKING_FOLDER, os.fsencode(new), AT_WORKING_FOLDER, os.fsencode(out)
+    if exchange is None or exchange(*places, EXCHANGE) != 0:
         old = new.with_name("old")
         try:
             out.replace(old)
@@ -311,15 +312,6 @@ def _take_place(new, out):
         finally:
             if not out.exists():  # interrupted in between
                 old.replace(out)
-
-
-def _exchanged(one, other):
-    """Whether the system has exchanged two folders, at once."""
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if rename is None:
-        return False
-    here = AT_WORKING_FOLDER
-    return rename(here, os.fsencode(one), here, os.fsencode(other), EXCHANGE) == 0
 
 
 def _execute_all(paths, environment, jobs):
@@ -332,11 +324,10 @@ def _execute_all(paths, environment, jobs):
         finally:  # end the notebooks that are being executed and leave out the others
             for future in futures:
                 future.cancel()
-            while not all(future.done() for future in futures):
+            while wait(futures, timeout=0.05).not_done:
                 for client in list(_CLIENTS):
                     with suppress(AttributeError):  # its kernel is just starting
                         client.km.provisioner.process.kill()
-                time.sleep(0.05)
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
@@ -430,26 +421,21 @@ def write_pages(out, session, runs, found, seconds):
 
 def _write_page(file, template, **values):
     """Write a page made by a template."""
-    text = TEMPLATES.get_template(template).render(**values)
-    file.write_text(text, encoding="utf-8")
+    file.write_text(TEMPLATES.get_template(template).render(**values), encoding="utf-8")
 
 
 def _provenance(session):
     """Pairs of name and value that tell what the report was made from; the commit where git knows
     one.
     """
-    digest = hashlib.sha256((Path(session.path) / "session.json").read_bytes()).hexdigest()
-    describe = [
-        "git",
-        "describe",
-        "--always",
-        "--dirty",
-        "--abbrev=12",
-        "--exclude=*",
-    ]
+    digest = hashlib.sha256((session.path / "session.json").read_bytes()).hexdigest()
     try:
-        git = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True)
-        commit = git.stdout.strip()
+        commit = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+        ).stdout.strip()
     except FileNotFoundError:
         commit = ""
     pairs = {
