@@ -131,7 +131,7 @@ def test_a_step_that_is_known_is_doubted_beyond_chance_only(step_sigma, named):
     doubts = doubtful(solution, ADMITTED)
     assert ("bearings" in [doubt.kind for doubt in doubts]) is named
     free = next(doubt for doubt in weigh(solution, ADMITTED) if doubt.kind == "bearings")
-    assert free.exceeds(2.0) and not free.exceeds(4.0)
+    assert 2.0 < free.deviations < 4.0
 
 
 @pytest.mark.parametrize(("step_sigma", "said"), [(0.0, False), (0.0058, True)])

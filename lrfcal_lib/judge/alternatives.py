@@ -9,11 +9,11 @@ from itertools import permutations
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
-from scipy.special import ndtr, stdtrit
+from scipy.special import ndtri, stdtr
 
 from lrfcal_lib.fit.covariance import sigma_turn_shift
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.judge.findings import Kind, by_sign
+from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
     axis_difference,
     axis_of,
@@ -104,17 +104,17 @@ def _lag(obs, s):
 
 
 ALTERNATIVES = {
-    Kind.SQUARES: Alternative(
+    "squares": Alternative(
         _views,
         "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
         "measure a square over many of them",
     ),
-    Kind.OUTLINE: Alternative(
+    "outline": Alternative(
         _outline,
         "the board's outline is {size} +- {sigma} % {sign} than stated",
         "measure the board's edges",
     ),
-    Kind.RANGES: Alternative(
+    "ranges": Alternative(
         lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)),
         "all ranges are {size} +- {sigma} % {sign}",
         "measure a square and an edge of the board, check the unit of the ranges",
@@ -123,20 +123,20 @@ ALTERNATIVES = {
             "too long, or board and squares larger than stated",
         ),
     ),
-    Kind.BEARINGS: Alternative(
+    "bearings": Alternative(
         JointObservations.stretched,
         "bearings are {size} +- {sigma} % too {sign}",
         "check the angular step that session.json states",
         ("small", "large"),
     ),
-    Kind.SPOT: Alternative(
+    "spot": Alternative(
         lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)),
         "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
         "state spot_exit_m and spot_divergence_rad as its maker does",
         worth=0.2,
         reach=5.0,
     ),
-    Kind.LAG: Alternative(
+    "lag": Alternative(
         _lag,
         "the recorded pitch of scan lines is {size} +- {sigma} deg {sign} the sweep",
         "check the time stamps of pitch and scans, sweep slower or stop for every scan",
@@ -155,16 +155,16 @@ def alternatives_of(prepared):
     the pattern's first corner.
     """
     stated = dict(ALTERNATIVES)
-    squares = stated.pop(Kind.SQUARES)
+    squares = stated.pop("squares")
     pattern = prepared.board.pattern
     if pattern is not None:
         change = partial(_views, origin=pattern.origin)
         if prepared.session.board.corners is None:
-            del stated[Kind.OUTLINE]
+            del stated["outline"]
             change = _views_and_outline
-        stated[Kind.SQUARES] = replace(squares, change=change)
+        stated["squares"] = replace(squares, change=change)
     if prepared.session.lrf.spot_exit is None:
-        del stated[Kind.SPOT]
+        del stated["spot"]
     return stated
 
 
@@ -180,9 +180,8 @@ class Doubt:
         As the data have it, with its standard deviation.
     ratio : float
         Likelihood ratio (squared score).
-    freedom : float
-        Degrees of freedom of `sigma`: placements less one where it comes from their scatter,
-        infinite where it comes from the noise.
+    deviations : float
+        Chance alone goes so far as seldom as a normal variable goes beyond so many.
     moved : float
         By how many of its standard deviations the axis or a camera would move at most, were it so.
     words : str
@@ -192,21 +191,15 @@ class Doubt:
     value: float
     sigma: float
     ratio: float
-    freedom: float
+    deviations: float
     moved: float
     words: str
-
-    def exceeds(self, deviations):
-        """Whether chance alone goes so far as seldom as a normal variable goes beyond
-        `deviations`.
-        """
-        return self.ratio > stdtrit(self.freedom, ndtr(deviations)) ** 2
 
 
 def weigh(
     solution: JointSolution,
     admitted_offset: float,
-    stated: Mapping[Kind, Alternative] = ALTERNATIVES,
+    stated: Mapping[str, Alternative] = ALTERNATIVES,
 ) -> list[Doubt]:
     """Every alternative tested by itself, all that was estimated free, the likeliest first.
 
@@ -250,6 +243,9 @@ def doubt_about(kind, alternative, solution, admitted_offset):
     noise = covariance[-1, -1]
     scatter = np.sum(pulls[:, -1] ** 2) * len(pulls) / freedom
     sigma = np.sqrt(max(noise, scatter))
+    pull = abs(value) / max(sigma, 1e-300)
+    # what the noise explains is known without limit, scatter by the placements less one
+    chance = stdtr(freedom if scatter > noise else np.inf, -pull)
 
     handed = np.flatnonzero(~np.isin(names, SENSOR))
     # what the accuracy of the angular step may do must not hide that it is wrong
@@ -264,8 +260,8 @@ def doubt_about(kind, alternative, solution, admitted_offset):
         kind=kind,
         value=value,
         sigma=sigma,
-        ratio=(value / max(sigma, 1e-300)) ** 2,
-        freedom=freedom if scatter > noise else np.inf,
+        ratio=pull**2,
+        deviations=-ndtri(chance),
         moved=np.max(np.abs(moves), initial=0.0),
         words=f"{words}: {alternative.remedy}",
     )
@@ -281,15 +277,17 @@ def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
     """
     asked = []
     for doubt in weigh(solution, admitted_offset, stated):
-        harmful = doubt.exceeds(PREFERRED) and doubt.moved > MOVED
-        if doubt.kind == Kind.BEARINGS and not solution.step.any():
-            harmful = (
-                False  # a step that the sensor's disc divides is off for no small reason
-            )
         size = abs(doubt.value)
-        certain = doubt.exceeds(ASKED) and size > stated[doubt.kind].worth
-        asks = harmful or (certain and doubt.kind not in faint)
-        if asks and size < stated[doubt.kind].reach:
+        alternative = stated[doubt.kind]
+        asks = (
+            doubt.deviations > ASKED
+            and size > alternative.worth
+            and doubt.kind not in faint
+        )
+        # a step that the sensor's disc divides is off for no small reason
+        if doubt.kind != "bearings" or solution.step.any():
+            asks |= doubt.deviations > PREFERRED and doubt.moved > MOVED
+        if asks and size < alternative.reach:
             asked.append(doubt)
     return [doubt for doubt in asked if doubt.ratio > AS_GOOD * asked[0].ratio]
 
@@ -329,7 +327,7 @@ def far_from_stated(joint) -> list[Fault]:
 
 def _far(words, angle):
     """The Fault of what lies far from where it is stated, turned by an angle (radians)."""
-    return Fault(Kind.FAR_FROM_STATED, words, severe=angle > np.pi / 2)
+    return Fault("far from stated", words, severe=angle > np.pi / 2)
 
 
 def far_axis(joint) -> Iterator[Fault]:

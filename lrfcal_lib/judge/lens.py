@@ -5,7 +5,6 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.judge.findings import Kind
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault
@@ -48,7 +47,7 @@ def lens_findings(prepared: Prepared) -> Iterator[Fault]:
             )
         if faults:
             yield Fault(
-                Kind.LENS,
+                "lens",
                 f"the lens of camera '{camera}' is not that of its model ({'; '.join(faults)}): "
                 "state intrinsics of this image size, or take sharp images with the chessboard all "
                 "over; undistort the images of a wide lens first",

@@ -12,14 +12,14 @@ from lrfcal_lib.judge.alternatives import (
     doubtful,
     far_from_stated,
 )
-from lrfcal_lib.judge.findings import Kind, by_sign
+from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.weaknesses import ABSURD
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.faults import Fault
 from lrfcal_lib.solvers.joint import solve_joint
 
 CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
-SIZES = (Kind.SQUARES, Kind.RANGES)  # an error of them is one of all distances
+SIZES = ("squares", "ranges")  # an error of them is one of all distances
 LARGE_SIZE = 0.02  # error of a size that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
 RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
@@ -29,9 +29,9 @@ NOT_WEIGHED = (
 # statements that are falsified on purpose, as relative errors of alternatives
 LIES = {
     "as recorded": {},
-    "squares 5 % too small": {Kind.SQUARES: -0.05},
-    "all sizes 5 % too large": {Kind.OUTLINE: 0.05, Kind.SQUARES: 0.05},
-    "angular step 3 % too large": {Kind.BEARINGS: 0.03},
+    "squares 5 % too small": {"squares": -0.05},
+    "all sizes 5 % too large": {"outline": 0.05, "squares": 0.05},
+    "angular step 3 % too large": {"bearings": 0.03},
 }
 
 
@@ -54,21 +54,21 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Fault], float]:
     solution = joint.solution
     if not solution.converged:
         why = "the estimate has not converged"
-        return [Fault(Kind.NOT_WEIGHED, f"{NOT_WEIGHED}: {why}", severe=True)], 0.0
+        return [Fault("not weighed", f"{NOT_WEIGHED}: {why}", severe=True)], 0.0
     findings = []
     doubts = doubtful(
         solution,
         joint.prepared.session.lrf.admitted_offset,
         alternatives_of(joint.prepared),
         # a spot that is no evenly lit disc looks like one of another size, which does no harm
-        faint=(Kind.SPOT,),
+        faint=("spot",),
     )
     level = solution.noise["face_scale"]
     if doubts:
         findings.append(finding_of(doubts))
     elif level > ABSURD:
         why = f"no single error explains why ranges fit {level:.0f} times worse than stated"
-        findings.append(Fault(Kind.NOT_WEIGHED, f"{NOT_WEIGHED}: {why}", severe=True))
+        findings.append(Fault("not weighed", f"{NOT_WEIGHED}: {why}", severe=True))
     sizes = [abs(doubt.value) for doubt in doubts if doubt.kind in SIZES]
     range_doubt = max(sizes, default=0.0) * np.median(solution.observations.face_range)
     beyond = list(beyond_admitted(joint))
@@ -97,7 +97,7 @@ def beyond_admitted(joint) -> Iterator[Fault]:
     margin = CONTRADICTS * joint.solution.sigma.get("range_offset", 0.0)
     if abs(offset) > admitted + margin:
         yield Fault(
-            Kind.RANGE_OFFSET,
+            "range offset",
             f"the range offset of {1000 * offset:.0f} mm exceeds the {1000 * admitted:.0f} mm that "
             "the maker of the range finder admits (session.json may state systematic_error_m): "
             "check the stated size of the board and of the squares of its chessboard (the expected "
@@ -112,7 +112,7 @@ def beyond_spot(solution) -> Iterator[Fault]:
     bias = solution.edge_bias
     if abs(bias) > RIM:
         yield Fault(
-            Kind.SPOT,
+            "spot",
             f"readings change at the rim of the stated spot ({100 * bias:.0f} % of its radius "
             "outside the edges): state spot_exit_m and spot_divergence_rad as they are, or measure "
             "the board's edges",
@@ -125,7 +125,7 @@ def pitch_turns_otherwise(solution) -> Iterator[Fault]:
     sigma = solution.sigma.get("pitch_scale", 0.0)
     if abs(scale) > max(CONTRADICTS * sigma, LARGE_SCALE):
         yield Fault(
-            Kind.PITCH_SCALE,
+            "pitch scale",
             f"the platform turns {100 * abs(scale):.1f} +- {100 * sigma:.1f} % "
             f"{by_sign(scale, 'more', 'less')} than its recorded pitch says: check its gear or "
             "encoder (the estimate has corrected this)",

@@ -4,7 +4,7 @@ What counts is relative to the head at the pitch of the image: a point measured 
 nothing to the axis.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,7 @@ from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
     apply_pose,
-    hat,
+    gradient_by_pose,
     polar_to_points,
     pose_array,
     pose_transform,
@@ -59,17 +59,8 @@ class Chain:
     unseen: np.ndarray
     sweep_sigma: tuple[float, float] = (0.0, 0.0)
 
-    def doubted(self, doubt: float) -> "Chain":
-        """The same where all ranges may be wrong by so many metres beside what is known.
 
-        Boards of a wrong size stand elsewhere before the cameras: the range offset or the cameras'
-        places have taken it up.
-        """
-        taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
-        return replace(self, covariances=self.covariances + np.diag(doubt**2 * taken_up))
-
-
-def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
+def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) -> Chain:
     """The chain of a calibrated rig to a camera, or to points of the cloud.
 
     Parameters
@@ -77,6 +68,8 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
     rig
     camera
         Its name; None for points of the cloud.
+    doubt
+        By how much all ranges may be wrong beside what is known, metres.
 
     Raises
     ------
@@ -88,7 +81,10 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
     both = np.stack([known.covariance, known.trusted])
     # zero for what is known; what has no bound is among `unseen`
     bounded = np.nan_to_num(both, nan=0.0, posinf=0.0, neginf=0.0)
-    covariances = links @ bounded @ links.T
+    # boards of a wrong size stand elsewhere before the cameras: the range offset or the cameras'
+    # places have taken it up
+    taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
+    covariances = links @ bounded @ links.T + np.diag(doubt**2 * taken_up)
 
     on_head = True
     pose = None
@@ -255,10 +251,8 @@ def carried(
     p_head = distance[..., None] * beam
     x = tilt(p_head + t, turn)
     M = tilt(np.eye(3), turn[..., None]).mT
-    by_turn = back * hat(x - t) - M @ hat(p_head)
-    by_shift = M - back * np.eye(3)
     # a turn of the head about x and a shift along it change nothing
-    by_axis = np.concatenate([by_turn, by_shift], axis=-1)[..., AXIS_COLUMNS]
+    by_axis = (M @ by_pose(p_head) - back * by_pose(x - t))[..., AXIS_COLUMNS]
     by_pitch = np.cross(TILT_AXIS, x)
     by_scale = turn[..., None] * by_pitch
     by_sensor = np.stack([-tilt(beam, turn), by_scale, (1 - back) * by_pitch], axis=-1)
@@ -270,11 +264,16 @@ def carried(
         C = chain.camera[:, :3]
         A = C @ A
         points = points @ C.T
-        by_camera[..., :3] = -hat(points)
-        by_camera[..., 3:] = np.eye(3)
+        by_camera = by_pose(points)
         points = points + chain.camera[:, 3]
     by_link = np.concatenate([A @ by_axis, by_camera, A @ by_sensor], axis=-1)
     return points, by_link, by_pitch @ A.T
+
+
+def by_pose(rotated):
+    """Derivatives (..., 3, 6) of points by ``[w, v]`` of the pose that rotated them (..., 3)."""
+    axes = np.broadcast_to(np.eye(3), (*rotated.shape, 3))
+    return gradient_by_pose(rotated[..., None, :], axes)
 
 
 def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
@@ -303,7 +302,7 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
 def beams_of_pixels(chain, model, uv, distance, image_pitch):
     """Bearing and pitch of beams of a given length that end on the rays of pixels (..., 2)."""
     ray = unit_vector(model.sights(undistort(uv, model)))
-    depth = distance * np.ones(ray.shape[:-1])
+    depth = np.asarray(distance)
     for _ in range(ROUNDS):
         x = (depth[..., None] * ray - chain.camera[:, 3]) @ chain.camera[:, :3]
         if chain.on_head:

@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.judge.alternatives import step_words
-from lrfcal_lib.judge.findings import ANSWERS, CARE, NO, YES, Answer, Kind, brief
+from lrfcal_lib.judge.findings import ANSWERS, CARE, NO, YES, Answer, brief
 from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_placement
 from lrfcal_lib.judge.recording_faults import explained, recording_faults
@@ -222,7 +222,7 @@ def judge(
     many_lost, note = left_out(calibration, method)
     findings += [*blind_cameras(prepared), *many_lost]
     if many_lost:  # which says what was excluded, too
-        kept = [reason for reason in judged.reasons if reason.kind != Kind.EXCLUDED]
+        kept = [reason for reason in judged.reasons if reason.kind != "excluded"]
         judged = replace(judged, reasons=tuple(kept))
     findings += sides_elsewhere(prepared)
     return replace(judged.because(findings), notes=_notes(calibration, method, note))
@@ -289,11 +289,11 @@ def _expected(rig, pitch, doubt):
         half = max(np.ptp(pitch) / 2, LEAST_FIELD)
     field = (middle - half, middle + half)
     pitches = np.linspace(*field, PITCHES)
-    chain = chain_of(rig).doubted(doubt)
+    chain = chain_of(rig, doubt=doubt)
     cloud = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
     images = {
         name: projection_sigma(
-            chain_of(rig, name).doubted(doubt),
+            chain_of(rig, name, doubt),
             camera.model,
             DISTANCES,
             PIXELS,
@@ -312,7 +312,7 @@ def _expected(rig, pitch, doubt):
     if not large:
         return judged
     error = Fault(
-        Kind.ERROR,
+        "error",
         f"the expected error at {WORKING:g} m is {large}",
         severe=bool(errors[WORKING].words(BAD_MM, BAD_PX)),
     )
@@ -334,7 +334,7 @@ def _refused(calibration, findings):
         why = lost[0].words if lost else "the session has no camera"
         if calibration.platform.solutions:
             why += "; the tilt axis is known from the edges in the sweeps"
-    refused = Fault(Kind.HANDED_OVER, f"nothing can be handed over: {why}", severe=True)
+    refused = Fault("handed over", f"nothing can be handed over: {why}", severe=True)
     notes = ()
     if prepared.problems:
         named = "; ".join(map(str, prepared.problems))
@@ -373,7 +373,7 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
     )
     if fewest < FEW:
         yield Fault(
-            Kind.PLACEMENTS,
+            "placements",
             f"only {fewest} placements, {FEW} or more are needed",
             severe=True,
         )
@@ -381,12 +381,12 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
         if camera not in solved:
             problem = calibration.problem(method, camera)
             why = problem.words if problem else "no result"
-            yield Fault(Kind.CAMERAS, f"camera '{camera}' is not handed over ({why})")
+            yield Fault("cameras", f"camera '{camera}' is not handed over ({why})")
     for camera, solution in solved.items():
         if solution.rival is not None:
             turn, shift = transform_difference(solution.transform, solution.rival)
             yield Fault(
-                Kind.SECOND_MINIMUM,
+                "second minimum",
                 f"a second minimum explains the data nearly as well: camera '{camera}' "
                 f"{np.degrees(turn):.0f} deg and {1000 * shift:.0f} mm from where it is handed "
                 "over; record more placements that lean other ways",
@@ -395,7 +395,7 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
     unknown = calibration.platform.problem("combined")
     sweeps = any(len(ways["half_step"]) > 1 for ways in prepared.edges.values())
     if unknown and sweeps:
-        yield Fault(Kind.FAR_FROM_STATED, unknown.words, severe=True)
+        yield Fault("far from stated", unknown.words, severe=True)
 
 
 def _not_joint(calibration):
@@ -407,4 +407,4 @@ def _not_joint(calibration):
         bad = [fault.words for fault in diagnose(joint.solution) if fault.severe]
     why = "; ".join(bad) or "another method was asked for"
     severe = joint is None or not joint.solution.converged
-    return Fault(Kind.HANDED_OVER, f"the joint estimate is not handed over ({why})", severe)
+    return Fault("handed over", f"the joint estimate is not handed over ({why})", severe)

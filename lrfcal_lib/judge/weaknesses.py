@@ -8,7 +8,6 @@ from lrfcal_lib.calibrate.pipeline import Calibration, largest_range
 from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.fit.robust import rms
-from lrfcal_lib.judge.findings import Kind
 from lrfcal_lib.judge.next_placement import group_sigma, sights
 from lrfcal_lib.judge.placements import placements_table
 from lrfcal_lib.model.problem import LEAVES_OUT
@@ -58,13 +57,13 @@ def weak_estimate(solution) -> Iterator[Fault]:
     """What keeps the estimate from an answer."""
     if not solution.converged:
         yield Fault(
-            Kind.CONVERGENCE,
+            "convergence",
             f"the estimate has not converged after {solution.solution.iterations} iterations",
             severe=True,
         )
     if solution.unobservable:
         yield Fault(
-            Kind.UNOBSERVABLE,
+            "unobservable",
             f"the data do not determine {'; '.join(solution.unobservable)}",
             severe=True,
         )
@@ -75,14 +74,14 @@ def weak_placements(solution) -> Iterator[Fault]:
     count = len(solution.boards)
     if count < FEW:
         yield Fault(
-            Kind.PLACEMENTS,
+            "placements",
             f"only {count} placements, {FEW} or more are needed to see errors of the model",
             severe=count < FEWEST,
         )
     distance = np.linalg.norm(sights(solution.board_poses, solution), axis=1)
     if count > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance):
         yield Fault(
-            Kind.DISTANCE,
+            "distance",
             f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): "
             "errors at other distances are extrapolated, and a range offset is hard to tell from "
             "shifts",
@@ -106,7 +105,7 @@ def weak_pitch(solution) -> Iterator[Fault]:
     span = largest_range(pitch, placement)
     if span < SMALL_PITCH:
         yield Fault(
-            Kind.PITCH,
+            "pitch",
             f"the recorded pitch spans only {np.degrees(span):.1f} deg{where}: the tilt axis "
             "is hardly determined",
             severe=True,
@@ -115,7 +114,7 @@ def weak_pitch(solution) -> Iterator[Fault]:
         len(image_pitch) and largest_range(image_pitch, image_placement) < SMALL_IMAGE_PITCH
     ):
         yield Fault(
-            Kind.IMAGE_PITCH,
+            "image pitch",
             "every placement has its images at one pitch: the tilt axis rests on the scans of "
             "small boards",
         )
@@ -131,18 +130,18 @@ def large_residuals(solution) -> Iterator[Fault]:
     ]
     if misfits:
         yield Fault(
-            Kind.MISFIT,
+            "misfit",
             f"placements fit much worse than the others: {', '.join(misfits)}",
         )
     if solution.excluded:
-        yield Fault(Kind.EXCLUDED, "; ".join(map(str, solution.excluded)))
+        yield Fault("excluded", "; ".join(map(str, solution.excluded)))
 
     ratio = scatter_over_placements(solution)
     worst = max(ratio, key=ratio.__getitem__)
     if ratio[worst] > MODEL_ERROR:
         what = "the axis" if worst == "axis" else f"camera '{worst}'"
         yield Fault(
-            Kind.MODEL_ERROR,
+            "model error",
             f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: "
             "an error of the model",
         )
@@ -151,7 +150,7 @@ def large_residuals(solution) -> Iterator[Fault]:
     large = [f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED]
     if large:
         yield Fault(
-            Kind.NOISE,
+            "noise",
             f"residuals are larger than the stated noise ({', '.join(large)})",
             severe=max(noise.values()) > ABSURD,
         )
@@ -160,7 +159,7 @@ def large_residuals(solution) -> Iterator[Fault]:
     share = solution.noise["face_share"]
     if share < DEPENDENT:
         yield Fault(
-            Kind.DEPENDENT,
+            "dependent",
             f"only {100 * share:.0f} % of the errors of ranges are independent: neighbouring "
             "ranges have the same error (bent boards, or a wrong pitch)",
         )
@@ -220,7 +219,7 @@ def sides_elsewhere(prepared: Prepared) -> Iterator[Fault]:
             turn = np.degrees(np.median([side.turn for side in dropped]))
             off = 1000 * np.median([side.distance for side in dropped])
             yield Fault(
-                Kind.OUTLINE,
+                "outline",
                 f"the board's edge '{edge}' lies elsewhere than its outline says in "
                 f"{len(dropped)} of {crossed} scans ({off:.0f} mm off, turned by {turn:.1f} deg) "
                 "and is not used there: measure the board's edges (corners_m)",
@@ -245,7 +244,7 @@ def blind_cameras(prepared: Prepared) -> Iterator[Fault]:
         unseen = [f"{placement} ({words})" for placement, words in why.items() if words]
         if len(unseen) > UNSEEN * len(placements):
             yield Fault(
-                Kind.LEFT_OUT,
+                "left out",
                 f"camera '{camera}' does not see the board in {len(unseen)} of {len(placements)} "
                 f"placements: {', '.join(unseen)}",
             )
@@ -287,7 +286,7 @@ def left_out(calibration: Calibration, method: str) -> tuple[list[Fault], str]:
     findings = []
     note = f"{words}. "
     if len(lost) > LOST * len(table):
-        findings.append(Fault(Kind.LEFT_OUT, words))
+        findings.append(Fault("left out", words))
         note = ""
         parts += images  # otherwise a finding says it
     if parts:

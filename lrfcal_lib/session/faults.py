@@ -26,7 +26,11 @@ class Fault:
     kind : str
         'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark'; of
         :mod:`lrfcal_lib.judge.recording_faults` also 'camera moved', 'camera zoomed',
-        'exchanged', 'numbers', 'sense', 'unit'; and :class:`lrfcal_lib.judge.findings.Kind`.
+        'exchanged', 'numbers', 'sense', 'unit'; of the result 'handed over', 'convergence',
+        'unobservable', 'second minimum', 'error'; of the placements 'placements', 'cameras', 'left
+        out', 'excluded', 'distance', 'pitch', 'image pitch'; of residuals 'misfit', 'model error',
+        'noise', 'dependent'; of what is stated 'squares', 'outline', 'ranges', 'bearings', 'spot',
+        'lag', 'range offset', 'pitch scale', 'far from stated', 'not weighed', 'lens'.
     words : str
         What was found, where, and what to do about it.
     severe : bool
