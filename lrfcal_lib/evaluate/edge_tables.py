@@ -99,8 +99,7 @@ def edge_lengths(
         known = prepared.board.lengths()
     measured = {variant: _outlines(prepared, variant, T_head_lrf) for variant in VARIANTS}
     if joint is not None and known:
-        combined = combined_outlines(joint)
-        measured["combined"] = {p: combined[p] for p in prepared.names if p in combined}
+        measured["combined"] = combined_outlines(joint)
     rows = []
     for variant, placement in product(measured, prepared.session.board_placements):
         board, weak = measured[variant].get(placement, (UNMEASURED, frozenset()))
