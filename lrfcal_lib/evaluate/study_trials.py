@@ -273,8 +273,6 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     count = len(shots["ranges"][trial])
     obs = JointObservations(
         placements=np.arange(1, count + 1),
-        middle=np.zeros(count),
-        direction=np.zeros(count, int),
         **_readings(shots, scenario, trial),
         view_pose=pose_transform(shots["boards"][trial]).as_matrix(),
         view_covariance=shots["board_covariance"][trial],
