@@ -154,12 +154,10 @@ def advise(session: Session) -> str:
     """
     prepared = prepare(session)
     try:
-        solution = calibrate_jointly(prepared).solution
+        joint = calibrate_jointly(prepared)
     except DegenerateGeometry as error:
         return f"not determined yet: {error}"
-    judged = verdict(
-        solution, prepared.models, field_of_view=prepared.session.lrf.field_of_view
-    )
+    judged = verdict(joint.solution, joint.rig)
     if judged.answer == YES:
         return ""
     return judged.advice

@@ -63,14 +63,12 @@ class Alternative:
     unit : float
         What s is multiplied by for the words.
     words : str
-        With ``{size}`` and ``{sigma}`` of s, and ``{sign}``: the first of `signs` where s is
-        positive.
-    remedy : str
+        With the remedy; with ``{size}`` and ``{sigma}`` of s, and ``{sign}``: the first of `signs`
+        where s is positive.
     """
 
     change: Callable
     words: str
-    remedy: str
     signs: tuple = ("larger", "smaller")
     worth: float = 0.004
     reach: float = 0.3
@@ -106,18 +104,17 @@ def _lag(obs, s):
 ALTERNATIVES = {
     "squares": Alternative(
         _views,
-        "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
-        "measure a square over many of them",
+        "the chessboard's squares are {size} +- {sigma} % {sign} than stated: measure a square "
+        "over many of them",
     ),
     "outline": Alternative(
         _outline,
-        "the board's outline is {size} +- {sigma} % {sign} than stated",
-        "measure the board's edges",
+        "the board's outline is {size} +- {sigma} % {sign} than stated: measure the board's edges",
     ),
     "ranges": Alternative(
         lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)),
-        "all ranges are {size} +- {sigma} % {sign}",
-        "measure a square and an edge of the board, check the unit of the ranges",
+        "all ranges are {size} +- {sigma} % {sign}: measure a square and an edge of the board, "
+        "check the unit of the ranges",
         (
             "too short, or board and squares smaller than stated",
             "too long, or board and squares larger than stated",
@@ -125,21 +122,21 @@ ALTERNATIVES = {
     ),
     "bearings": Alternative(
         JointObservations.stretched,
-        "bearings are {size} +- {sigma} % too {sign}",
-        "check the angular step that session.json states",
+        "bearings are {size} +- {sigma} % too {sign}: check the angular step that session.json "
+        "states",
         ("small", "large"),
     ),
     "spot": Alternative(
         lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)),
-        "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
-        "state spot_exit_m and spot_divergence_rad as its maker does",
+        "the spot of the range finder is {size} +- {sigma} % {sign} than stated: state spot_exit_m "
+        "and spot_divergence_rad as its maker does",
         worth=0.2,
         reach=5.0,
     ),
     "lag": Alternative(
         _lag,
-        "the recorded pitch of scan lines is {size} +- {sigma} deg {sign} the sweep",
-        "check the time stamps of pitch and scans, sweep slower or stop for every scan",
+        "the recorded pitch of scan lines is {size} +- {sigma} deg {sign} the sweep: check the "
+        "time stamps of pitch and scans, sweep slower or stop for every scan",
         ("behind", "ahead of"),
         worth=np.radians(0.05),
         unit=np.degrees(1.0),
@@ -251,11 +248,6 @@ def doubt_about(kind, alternative, solution, admitted_offset):
     # what the accuracy of the angular step may do must not hide that it is wrong
     spread = np.sqrt(solution.solution.trusted_sigma**2 - solution.step**2)[handed]
     moves = covariance[handed, -1] / max(noise, 1e-300) * value / spread
-    words = alternative.words.format(
-        size=f"{abs(value) * alternative.unit:.2g}",
-        sigma=f"{sigma * alternative.unit:.2g}",
-        sign=by_sign(value, *alternative.signs),
-    )
     return Doubt(
         kind=kind,
         value=value,
@@ -263,26 +255,29 @@ def doubt_about(kind, alternative, solution, admitted_offset):
         ratio=pull**2,
         deviations=-ndtri(chance),
         moved=np.max(np.abs(moves), initial=0.0),
-        words=f"{words}: {alternative.remedy}",
+        words=alternative.words.format(
+            size=f"{abs(value) * alternative.unit:.2g}",
+            sigma=f"{sigma * alternative.unit:.2g}",
+            sign=by_sign(value, *alternative.signs),
+        ),
     )
 
 
-def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
+def doubtful(solution, admitted_offset, stated=ALTERNATIVES):
     """The alternatives that the data ask for: list of Doubt, the best one and those that explain
     them as well.
 
     Beyond chance whatever they do, or preferred by the data where what is handed over would move by
-    more than its standard deviation tells. Kinds named in `faint` need the latter; an angular step
-    that is known needs the former.
+    more than its standard deviation tells. A spot needs the latter: one that is no evenly lit disc
+    looks like one of another size, which does no harm. An angular step that is known needs the
+    former.
     """
     asked = []
     for doubt in weigh(solution, admitted_offset, stated):
         size = abs(doubt.value)
         alternative = stated[doubt.kind]
         asks = (
-            doubt.deviations > ASKED
-            and size > alternative.worth
-            and doubt.kind not in faint
+            doubt.deviations > ASKED and size > alternative.worth and doubt.kind != "spot"
         )
         # a step that the sensor's disc divides is off for no small reason
         if doubt.kind != "bearings" or solution.step.any():

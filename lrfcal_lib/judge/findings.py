@@ -1,17 +1,9 @@
 """What is found about a calibration and the recording behind it, and what that makes of it."""
 
-from enum import StrEnum
-
-
-class Answer(StrEnum):
-    """Whether a calibration can be trusted."""
-
-    YES = "yes"
-    CARE = "with care"
-    NO = "no"
-
-
-YES, CARE, NO = Answer
+# whether a calibration can be trusted
+YES = "yes"
+CARE = "with care"
+NO = "no"
 ANSWERS = {False: CARE, True: NO}  # by whether the worst Fault is severe
 
 

@@ -23,9 +23,6 @@ SIZES = ("squares", "ranges")  # an error of them is one of all distances
 LARGE_SIZE = 0.02  # error of a size that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
 RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
-NOT_WEIGHED = (
-    "whether session.json states sizes, step and spot correctly could not be tested"
-)
 # statements that are falsified on purpose, as relative errors of alternatives
 LIES = {
     "as recorded": {},
@@ -53,22 +50,19 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Fault], float]:
     """
     solution = joint.solution
     if not solution.converged:
-        why = "the estimate has not converged"
-        return [Fault("not weighed", f"{NOT_WEIGHED}: {why}", severe=True)], 0.0
+        return [not_weighed("the estimate has not converged")], 0.0
     findings = []
     doubts = doubtful(
         solution,
         joint.prepared.session.lrf.admitted_offset,
         alternatives_of(joint.prepared),
-        # a spot that is no evenly lit disc looks like one of another size, which does no harm
-        faint=("spot",),
     )
     level = solution.noise["face_scale"]
     if doubts:
         findings.append(finding_of(doubts))
     elif level > ABSURD:
         why = f"no single error explains why ranges fit {level:.0f} times worse than stated"
-        findings.append(Fault("not weighed", f"{NOT_WEIGHED}: {why}", severe=True))
+        findings.append(not_weighed(why))
     sizes = [abs(doubt.value) for doubt in doubts if doubt.kind in SIZES]
     range_doubt = max(sizes, default=0.0) * np.median(solution.observations.face_range)
     beyond = list(beyond_admitted(joint))
@@ -77,6 +71,16 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Fault], float]:
     findings += [*beyond, *beyond_spot(solution), *pitch_turns_otherwise(solution)]
     findings += far_from_stated(joint)
     return findings, range_doubt
+
+
+def not_weighed(why):
+    """The Fault that no statement could be tested."""
+    return Fault(
+        "not weighed",
+        "whether session.json states sizes, step and spot correctly could not be tested: "
+        f"{why}",
+        severe=True,
+    )
 
 
 def finding_of(doubts):

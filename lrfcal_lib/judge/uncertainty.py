@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, selection
@@ -15,11 +16,8 @@ from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
-    apply_pose,
     gradient_by_pose,
     polar_to_points,
-    pose_array,
-    pose_transform,
     tilt,
     unit_vector,
 )
@@ -37,9 +35,9 @@ class Chain:
 
     Attributes
     ----------
-    head : ndarray, shape (3, 4)
+    head : RigidTransform
         ``T_head_lrf``.
-    camera : ndarray, shape (3, 4), or None
+    camera : RigidTransform or None
         ``T_camera_lrf`` of a camera on the head, or ``T_camera_platform``; None for points of the
         cloud.
     on_head : bool
@@ -48,16 +46,16 @@ class Chain:
         that gives more counts, quantity by quantity.
     unseen : ndarray, shape (m, 13)
         Motions that nothing determines: what depends on them has no bound.
-    sweep_sigma : tuple of float
-        Of the offset (radians) and the stretch that the pitch of every sweep has of its own.
+    sweep : PitchNoise
+        Of the offset and the stretch that the pitch of every sweep has of its own.
     """
 
-    head: np.ndarray
-    camera: np.ndarray | None
+    head: RigidTransform
+    camera: RigidTransform | None
     on_head: bool
     covariances: np.ndarray
     unseen: np.ndarray
-    sweep_sigma: tuple[float, float] = (0.0, 0.0)
+    sweep: PitchNoise
 
 
 def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) -> Chain:
@@ -91,11 +89,10 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
     unseen = known.unseen_of_cloud
     if camera is not None:
         on_head = rig.cameras[camera].mount == "head"
-        pose = pose_array(rig.cameras[camera].T_camera)
+        pose = rig.cameras[camera].T_camera
         unseen = known.unseen_of_cameras[camera]
-    return Chain(
-        pose_array(rig.T_head_lrf), pose, on_head, covariances, unseen, known.sweep_sigma
-    )
+    sweep = PitchNoise(*known.sweep_sigma)
+    return Chain(rig.T_head_lrf, pose, on_head, covariances, unseen, sweep)
 
 
 def projection_sigma(
@@ -104,8 +101,8 @@ def projection_sigma(
     distances: ArrayLike,
     grid: tuple[int, int],
     *,
-    image_pitch: float = 0.0,
-    pitches: tuple[float, float] = (-np.pi, np.pi),
+    image_pitch: float,
+    pitches: tuple[float, float],
 ) -> np.ndarray:
     """How far off the pixel of an LRF point may be, over the image.
 
@@ -139,9 +136,9 @@ def projection_sigma(
     )
     points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
     P, *_ = project_jacobians(points, model)
-    sigma_pitch = PitchNoise(*chain.sweep_sigma).sigma(pitch, sum(pitches) / 2)
+    sigma_pitch = chain.sweep.sigma(pitch, sum(pitches) / 2)
     if chain.on_head:  # the offset is that of the image, too
-        sigma_pitch = chain.sweep_sigma[1] * (pitch - image_pitch)
+        sigma_pitch = chain.sweep.stretch * (pitch - image_pitch)
     by_sweep = sigma_pitch * np.linalg.norm(np.matvec(P, by_pitch), axis=-1)
     sigma = np.hypot(spread(chain, P @ by_link), by_sweep)
     low, high = pitches
@@ -183,7 +180,7 @@ def point_sigma(
     """
     away = np.reshape(distances, (-1, 1, 1))
     _, by_link, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
-    sigma_pitch = PitchNoise(*chain.sweep_sigma).sigma(pitches, reference)
+    sigma_pitch = chain.sweep.sigma(pitches, reference)
     by_sweep = sigma_pitch[:, None] * np.linalg.norm(by_pitch, axis=-1)
     return np.hypot(spread(chain, by_link), by_sweep)
 
@@ -242,8 +239,8 @@ def carried(
         Their derivatives by the pitch of the beam.
     """
     bearing, pitch, distance = np.broadcast_arrays(bearing, pitch, distance)
-    R = chain.head[:, :3]
-    t = chain.head[:, 3]
+    R = chain.head.rotation.as_matrix()
+    t = chain.head.translation
     # where it is 1, points go back through the axis to the head at the image
     back = chain.on_head
     turn = pitch - back * image_pitch
@@ -261,11 +258,11 @@ def carried(
     points = (x - back * t) @ A.T
     by_camera = np.zeros((*points.shape, 6))
     if chain.camera is not None:
-        C = chain.camera[:, :3]
+        C = chain.camera.rotation.as_matrix()
         A = C @ A
         points = points @ C.T
         by_camera = by_pose(points)
-        points = points + chain.camera[:, 3]
+        points = points + chain.camera.translation
     by_link = np.concatenate([A @ by_axis, by_camera, A @ by_sensor], axis=-1)
     return points, by_link, by_pitch @ A.T
 
@@ -304,10 +301,10 @@ def beams_of_pixels(chain, model, uv, distance, image_pitch):
     ray = unit_vector(model.sights(undistort(uv, model)))
     depth = np.asarray(distance)
     for _ in range(ROUNDS):
-        x = (depth[..., None] * ray - chain.camera[:, 3]) @ chain.camera[:, :3]
+        x = chain.camera.inv().apply(depth[..., None] * ray)
         if chain.on_head:
-            x = apply_pose(chain.head, x)
-        bearing, pitch, reached = beams_to(x, pose_transform(chain.head))
+            x = chain.head.apply(x)
+        bearing, pitch, reached = beams_to(x, chain.head)
         depth = depth + distance - reached
     if chain.on_head:
         pitch = pitch + image_pitch

@@ -186,8 +186,6 @@ def noise_of_images(solution: JointSolution) -> dict[str, float]:
     solution
     """
     obs = solution.observations
-    if len(obs.view_camera) == 0:
-        return {}
     level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)
     white = np.matvec(inverse_root(obs.view_covariance), solution.residuals("view"))
     usual = max(rms(white), np.finfo(float).tiny)
