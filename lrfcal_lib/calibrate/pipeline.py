@@ -79,13 +79,6 @@ class JointCalibration:
         """Those that took part."""
         return self.solution.observations
 
-    @property
-    def rig(self) -> CalibratedRig:
-        """As the estimate has it."""
-        session = self.prepared.session
-        rig = joint_rig(self.solution, self.prepared.models)
-        return replace(rig, lrf=session.lrf, session=session.name)
-
     def seen_by(
         self, camera: str, solution: JointSolution | None = None, **options
     ) -> CameraObservations:
@@ -170,7 +163,8 @@ class Calibration:
         session = self.prepared.session
         axis = self.platform.axes[self.platform.axis_with(method)]
         if self.joint is not None and method == "joint":
-            return replace(self.joint.rig, axis=axis)
+            rig = joint_rig(self.joint.solution, self.prepared.models)
+            return replace(rig, axis=axis, lrf=session.lrf, session=session.name)
         solved = self.cameras(method)
         cameras = {
             camera: CalibratedCamera(

@@ -138,15 +138,15 @@ def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
     """
     solution = joint.solution
     obs = joint.observations
-    sensor = solution.sensor["edge_log_odds"]
     distance = np.linalg.norm(solution.board_poses[:, :, 3], axis=1)
     odds = obs.beam_background + solution.side_odds[obs.beam_placement, obs.beam_edge]
+    radii = disc_edge(solution.sensor["edge_log_odds"] + odds)[0]
     columns = {
         "placement": obs.placements[obs.beam_placement],
         "edge": obs.beam_edge,
         "distance_m": distance[obs.beam_placement],
-        "bias_mm": 1000 * edge_shift(sensor, obs.beam_radius, odds)[0],
-        "bias_radii": disc_edge(sensor + odds)[0],
+        "bias_mm": 1000 * obs.beam_radius * radii,
+        "bias_radii": radii,
     }
     sides = pd.DataFrame(columns).groupby([*columns][:3]).mean().reset_index()
     return sides.assign(edge=np.array(obs.edges)[sides.edge])

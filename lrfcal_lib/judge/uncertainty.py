@@ -239,12 +239,11 @@ def carried(
         Their derivatives by the pitch of the beam.
     """
     bearing, pitch, distance = np.broadcast_arrays(bearing, pitch, distance)
-    R = chain.head.rotation.as_matrix()
     t = chain.head.translation
     # where it is 1, points go back through the axis to the head at the image
     back = chain.on_head
     turn = pitch - back * image_pitch
-    beam = polar_to_points(1.0, bearing) @ R.T
+    beam = chain.head.rotation.apply(polar_to_points(1.0, bearing))
     p_head = distance[..., None] * beam
     x = tilt(p_head + t, turn)
     M = tilt(np.eye(3), turn[..., None]).mT
@@ -254,17 +253,14 @@ def carried(
     by_scale = turn[..., None] * by_pitch
     by_sensor = np.stack([-tilt(beam, turn), by_scale, (1 - back) * by_pitch], axis=-1)
 
-    A = R.T if chain.on_head else np.eye(3)
-    points = (x - back * t) @ A.T
-    by_camera = np.zeros((*points.shape, 6))
+    last = chain.head.inv() if back else RigidTransform.identity()
+    by_camera = np.zeros((*x.shape, 6))
     if chain.camera is not None:
-        C = chain.camera.rotation.as_matrix()
-        A = C @ A
-        points = points @ C.T
-        by_camera = by_pose(points)
-        points = points + chain.camera.translation
+        last = chain.camera * last
+        by_camera = by_pose(last.apply(x) - chain.camera.translation)
+    A = last.rotation.as_matrix()
     by_link = np.concatenate([A @ by_axis, by_camera, A @ by_sensor], axis=-1)
-    return points, by_link, by_pitch @ A.T
+    return last.apply(x), by_link, by_pitch @ A.T
 
 
 def by_pose(rotated):

@@ -116,8 +116,8 @@ class Verdict:
     range_noise_mm : float
         Of every single point, on top.
     suggestion : Suggestion or None
-    no_suggestion : str
-        Why there is none.
+    advice : str
+        What to record next, or why nothing is suggested.
     notes : tuple of str
         What is handed over, and what became of all placements.
     """
@@ -126,7 +126,7 @@ class Verdict:
     errors: dict[float, ExpectedError]
     range_noise_mm: float
     suggestion: Suggestion | None = None
-    no_suggestion: str = ""
+    advice: str = ""
     notes: tuple[str, ...] = ()
 
     @property
@@ -136,13 +136,16 @@ class Verdict:
 
     def record(self) -> dict:
         """Answer, reasons and expected errors, ready for JSON."""
-        reasons = [
-            {"answer": ANSWERS[reason.severe], "kind": reason.kind, "words": reason.words}
-            for reason in self.reasons
-        ]
         return {
             "answer": self.answer,
-            "reasons": reasons,
+            "reasons": [
+                {
+                    "answer": ANSWERS[reason.severe],
+                    "kind": reason.kind,
+                    "words": reason.words,
+                }
+                for reason in self.reasons
+            ],
             "notes": self.notes,
             "expected_error_at_m": {
                 f"{d:g}": error.record() for d, error in self.errors.items()
@@ -165,11 +168,6 @@ class Verdict:
                 f"{brief(self.range_noise_mm)} mm of noise of its own."
             )
         return [*filter(None, [*sentences, self.advice])]
-
-    @property
-    def advice(self) -> str:
-        """What to record next, or why nothing is suggested."""
-        return self.suggestion.sentence() if self.suggestion else self.no_suggestion
 
     def because(self, findings: list[Fault]) -> "Verdict":
         """The verdict with more findings, which stand before its own; the worst first."""
@@ -268,19 +266,16 @@ def verdict(
     try:
         suggestion = suggest_placement(solution, rig)
     except DegenerateGeometry as error:
-        return replace(judged, no_suggestion=f"No placement can be suggested: {error}.")
-    return replace(judged, suggestion=suggestion)
+        return replace(judged, advice=f"No placement can be suggested: {error}.")
+    return replace(judged, suggestion=suggestion, advice=suggestion.sentence())
 
 
 def _expected(rig, pitch, doubt):
     """A Verdict by the errors that are to be expected of a rig over the recorded pitch (n,), not a
     narrow strip, where all ranges may be wrong by `doubt` (metres) beside what is known.
     """
-    middle = 0.0
-    half = LEAST_FIELD
-    if len(pitch):
-        middle = (pitch.min() + pitch.max()) / 2
-        half = max(np.ptp(pitch) / 2, LEAST_FIELD)
+    middle = (pitch.min() + pitch.max()) / 2
+    half = max(np.ptp(pitch) / 2, LEAST_FIELD)
     field = (middle - half, middle + half)
     pitches = np.linspace(*field, PITCHES)
     chain = chain_of(rig, doubt=doubt)
@@ -329,7 +324,7 @@ def _refused(calibration, findings):
     if prepared.problems:
         named = "; ".join(map(str, prepared.problems))
         notes = (f"Left out: {len(prepared.problems)} ({named}).",)
-    nothing = Verdict((), {}, np.nan, no_suggestion=RECORD, notes=notes)
+    nothing = Verdict((), {}, np.nan, advice=RECORD, notes=notes)
     return nothing.because([*findings, refused])
 
 
