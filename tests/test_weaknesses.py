@@ -9,6 +9,7 @@ import pytest
 from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
 from lrfcal_lib.judge.findings import ANSWERS
+from lrfcal_lib.judge.next_placement import suggest_placement
 from lrfcal_lib.judge.verdict import verdict
 from lrfcal_lib.judge.weaknesses import diagnose, sides_elsewhere
 from lrfcal_lib.model.board import triangle_board
@@ -98,7 +99,8 @@ def test_weak_recordings_are_named(good, kind):
             "the recorded pitch spans only 1.0 deg within a placement"
             in found.sentences()[0]
         )
-        assert found.errors[2.0].cloud_mm > 10 and found.suggestion.gain > 0.5
+        assert found.errors[2.0].cloud_mm > 10 and "Record next: board" in found.advice
+        assert suggest_placement(solution, rig_of(solution, rig)).gain > 0.5
 
 
 def test_a_camera_that_never_sees_the_board(good):

@@ -68,8 +68,7 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Fault], float]:
     beyond = list(beyond_admitted(joint))
     if beyond:
         range_doubt = max(range_doubt, abs(solution.sensor["range_offset"]))
-    findings += [*beyond, *beyond_spot(solution), *pitch_turns_otherwise(solution)]
-    findings += far_from_stated(joint)
+    findings += [*beyond, *sensor_otherwise(solution), *far_from_stated(joint)]
     return findings, range_doubt
 
 
@@ -111,8 +110,10 @@ def beyond_admitted(joint) -> Iterator[Fault]:
         )
 
 
-def beyond_spot(solution) -> Iterator[Fault]:
-    """Readings that change where the stated spot no longer touches the board."""
+def sensor_otherwise(solution) -> Iterator[Fault]:
+    """Readings that change where the stated spot no longer touches the board, and a platform that
+    turns more or less than its recorded pitch says.
+    """
     bias = solution.edge_bias
     if abs(bias) > RIM:
         yield Fault(
@@ -121,10 +122,6 @@ def beyond_spot(solution) -> Iterator[Fault]:
             "outside the edges): state spot_exit_m and spot_divergence_rad as they are, or measure "
             "the board's edges",
         )
-
-
-def pitch_turns_otherwise(solution) -> Iterator[Fault]:
-    """A platform that turns more or less than its recorded pitch says."""
     scale = solution.sensor["pitch_scale"]
     sigma = solution.sigma.get("pitch_scale", 0.0)
     if abs(scale) > max(CONTRADICTS * sigma, LARGE_SCALE):

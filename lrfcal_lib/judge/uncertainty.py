@@ -135,7 +135,7 @@ def projection_sigma(
         chain, model, pixel_grid(model, grid), away, image_pitch
     )
     points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
-    P, *_ = project_jacobians(points, model)
+    P = project_jacobians(points, model)[0]
     sigma_pitch = chain.sweep.sigma(pitch, sum(pitches) / 2)
     if chain.on_head:  # the offset is that of the image, too
         sigma_pitch = chain.sweep.stretch * (pitch - image_pitch)

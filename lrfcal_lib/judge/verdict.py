@@ -13,7 +13,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.judge.alternatives import step_words
 from lrfcal_lib.judge.findings import ANSWERS, CARE, NO, YES, brief
 from lrfcal_lib.judge.lens import lens_findings
-from lrfcal_lib.judge.next_placement import Suggestion, suggest_placement
+from lrfcal_lib.judge.next_placement import suggest_placement
 from lrfcal_lib.judge.recording_faults import explained, recording_faults
 from lrfcal_lib.judge.statements import contradicts_stated
 from lrfcal_lib.judge.uncertainty import (
@@ -115,7 +115,6 @@ class Verdict:
         empty where nothing is handed over.
     range_noise_mm : float
         Of every single point, on top.
-    suggestion : Suggestion or None
     advice : str
         What to record next, or why nothing is suggested.
     notes : tuple of str
@@ -125,7 +124,6 @@ class Verdict:
     reasons: tuple[Fault, ...]
     errors: dict[float, ExpectedError]
     range_noise_mm: float
-    suggestion: Suggestion | None = None
     advice: str = ""
     notes: tuple[str, ...] = ()
 
@@ -216,11 +214,10 @@ def judge(
             [_not_joint(calibration), *_weak_cameras(calibration, method)]
         )
     many_lost, note = left_out(calibration, method)
-    findings += [*blind_cameras(prepared), *many_lost]
+    findings += [*blind_cameras(prepared), *many_lost, *sides_elsewhere(prepared)]
     if many_lost:  # which says what was excluded, too
         kept = [reason for reason in judged.reasons if reason.kind != "excluded"]
         judged = replace(judged, reasons=tuple(kept))
-    findings += sides_elsewhere(prepared)
     return replace(judged.because(findings), notes=_notes(calibration, method, note))
 
 
@@ -264,10 +261,10 @@ def verdict(
     if not suggest:
         return judged
     try:
-        suggestion = suggest_placement(solution, rig)
+        advice = suggest_placement(solution, rig).sentence()
     except DegenerateGeometry as error:
-        return replace(judged, advice=f"No placement can be suggested: {error}.")
-    return replace(judged, suggestion=suggestion, advice=suggestion.sentence())
+        advice = f"No placement can be suggested: {error}."
+    return replace(judged, advice=advice)
 
 
 def _expected(rig, pitch, doubt):
