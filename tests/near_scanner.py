@@ -77,8 +77,6 @@ def as_rig(obs):
     points = obs.plane_points
     return JointObservations(
         placements=obs.placements,
-        direction=np.zeros(n, int),
-        middle=np.zeros(n),
         edges=("bottom", "right", "top", "left"),
         corners=np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * HALF_BOARD,
         cameras=("camera",),

@@ -9,6 +9,7 @@ from conftest import calibrated
 from falsified import FALSIFIED, changed, scaled, second_camera
 from joint_draws import draw, rng
 from shared import DATA, campaign
+from test_weaknesses import rig_of
 
 from lrfcal_lib.evaluate.monte_carlo import state_errors
 from lrfcal_lib.fit.result import PlatformPrior
@@ -97,9 +98,7 @@ def judged(change, seed, *options, **devices):
     joint, truth, rig = estimated(change, seed, *options, **devices)
     solution = joint.solution
     reasons, doubt = contradicts_stated(joint)
-    reasons += verdict(
-        solution, dict.fromkeys(rig.cameras, rig.model), suggest=False, doubt=doubt
-    ).reasons
+    reasons += verdict(solution, rig_of(solution, rig), suggest=False, doubt=doubt).reasons
     whole = len(solution.boards) == len(truth.boards)
     return (
         reasons,

@@ -174,6 +174,8 @@ def test_an_edge_bias_that_only_what_is_usual_bounds_leaves_cameras_that_planes_
         rig.model,
         1.5,
         (4, 3),
+        image_pitch=0.0,
+        pitches=(-np.pi, np.pi),
     )
     assert root_mean_square(sigma) < 20
 

@@ -1,8 +1,10 @@
 """What to record next comes true."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from test_weaknesses import models_of, solve
+from test_weaknesses import rig_of, solve
 
 from lrfcal_lib.judge.next_placement import Suggestion, group_sigma, suggest_placement
 from lrfcal_lib.judge.verdict import verdict
@@ -23,7 +25,7 @@ def good():
 @pytest.fixture(scope="module")
 def suggested(good):
     rig, _, solution = good
-    return suggest_placement(solution, models_of(rig))
+    return suggest_placement(solution, rig_of(solution, rig))
 
 
 def test_the_suggested_placement_brings_what_it_promises(good, suggested):
@@ -47,11 +49,13 @@ def test_the_suggested_placement_brings_what_it_promises(good, suggested):
 
 def test_suggestions_refuse_bad_input(good):
     rig, _, solution = good
+    known = rig_of(solution, rig)
+    blind = replace(known, lrf=replace(known.lrf, field_of_view=NOWHERE))
     with pytest.raises(
         DegenerateGeometry, match="none of .* board poses lies wholly in the view"
     ):
-        suggest_placement(solution, models_of(rig), field_of_view=NOWHERE)
-    last = verdict(solution, models_of(rig), field_of_view=NOWHERE).sentences()[-1]
+        suggest_placement(solution, blind)
+    last = verdict(solution, blind).sentences()[-1]
     assert last.startswith("No placement can be suggested: none of")
 
 

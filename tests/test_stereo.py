@@ -20,16 +20,19 @@ from shared import campaign
 from lrfcal_lib.evaluate.stereo import stereo_reference
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.preprocess.board_in_image import BoardView
-from lrfcal_lib.preprocess.intrinsics import (
-    estimate_intrinsics,
-)
+from lrfcal_lib.preprocess.intrinsics import board_pose, estimate_intrinsics
 from lrfcal_lib.preprocess.prepared import Prepared
 
 
 def stereo(first, second, pattern=PATTERN, models=(MODEL, MODEL)):
     """The mounting of two cameras from the corners that they see at placements 0, 1, ..., and its covariance."""
+    printed = pattern or PATTERN
     views = [
-        {p: BoardView(pixels=own) for p, own in enumerate(seen)} for seen in (first, second)
+        {
+            p: BoardView(pixels=own, T_camera_board=board_pose(own, printed, model)[0])
+            for p, own in enumerate(seen)
+        }
+        for seen, model in zip((first, second), models, strict=True)
     ]
     views, models = (dict(enumerate(each)) for each in (views, models))
     board = SimpleNamespace(pattern=pattern)

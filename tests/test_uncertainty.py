@@ -11,6 +11,7 @@ from lrfcal_lib.judge.uncertainty import Chain, point_sigma, projection_sigma
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.kinematics import SourceFrame, beams_to
+from lrfcal_lib.preprocess.prepared import PitchNoise
 from lrfcal_lib.simulate.draw import Devices
 
 HEAD = RigidTransform.from_components(
@@ -25,26 +26,27 @@ MODEL = Devices().model
 
 def random_chain(mount, rng, camera=CAMERA, size=1e-3):
     mix = size * rng.normal(size=(13, 13)) / 3
-    pose = None if camera is None else geometry.pose_array(camera)
     return Chain(
-        geometry.pose_array(HEAD), pose, mount == "head", (mix @ mix.T,), np.zeros((0, 13))
+        HEAD, camera, mount == "head", (mix @ mix.T,), np.zeros((0, 13)), PitchNoise()
+    )
+
+
+def moved(transform, change):
+    return geometry.pose_transform(
+        geometry.move_pose(geometry.pose_array(transform), change)
     )
 
 
 def moved_points(chain, bearing, pitch, distance, change, image_pitch):
     """The chain carried out with the library's transforms, all links changed by `change` (13,)."""
-    head = geometry.pose_transform(
-        geometry.move_pose(chain.head, np.insert(change[:4], [0, 2], 0.0))
-    )
+    head = moved(chain.head, np.insert(change[:4], [0, 2], 0.0))
     scale = lambda angle: angle * (1 + change[11]) + change[12]  # noqa: E731
     p = geometry.polar_to_points(distance - change[10], bearing)
     frame = SourceFrame(head, "head" if chain.on_head else "platform", scale(image_pitch))
     source = frame.points(p, scale(pitch))
     if chain.camera is None:
         return source
-    return geometry.pose_transform(geometry.move_pose(chain.camera, change[4:10])).apply(
-        source
-    )
+    return moved(chain.camera, change[4:10]).apply(source)
 
 
 def test_beams_to_inverts_the_platform():
@@ -72,7 +74,9 @@ def scatter(chain, ends):
 @pytest.mark.parametrize(("mount", "image_pitch"), [("head", 0.05), ("platform", 0.0)])
 def test_projection_sigma_is_what_perturbed_calibrations_show(mount, image_pitch):
     chain = random_chain(mount, np.random.default_rng(2))
-    sigma = projection_sigma(chain, MODEL, 1.5, (3, 2), image_pitch=image_pitch)
+    sigma = projection_sigma(
+        chain, MODEL, 1.5, (3, 2), image_pitch=image_pitch, pitches=(-np.pi, np.pi)
+    )
     uv = uncertainty.pixel_grid(MODEL, (3, 2)).reshape(-1, 2)
     bearing, pitch = uncertainty.beams_of_pixels(chain, MODEL, uv, 1.5, image_pitch)
 

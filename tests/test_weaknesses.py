@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
 from lrfcal_lib.judge.findings import ANSWERS
+from lrfcal_lib.judge.next_placement import suggest_placement
 from lrfcal_lib.judge.verdict import verdict
 from lrfcal_lib.judge.weaknesses import diagnose, sides_elsewhere
 from lrfcal_lib.model.board import triangle_board
@@ -33,8 +35,9 @@ def solve(rig, poses, rng, **settings):
     return solved(seen(rig, poses, rng, **settings), rig, poses)
 
 
-def models_of(rig):
-    return dict.fromkeys(rig.cameras, rig.model)
+def rig_of(solution, rig):
+    """The calibrated rig behind an estimate, with the cameras of a drawn one."""
+    return joint_rig(solution, dict.fromkeys(rig.cameras, rig.model))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +50,7 @@ def good():
 
 def test_a_good_recording_is_trusted(good):
     rig, _, solution = good
-    found = verdict(solution, models_of(rig))
+    found = verdict(solution, rig_of(solution, rig))
     words = found.sentences()
     errors = found.errors[2.0]
     assert (
@@ -81,7 +84,7 @@ def test_weak_recordings_are_named(good, kind):
     rig, poses, _ = good
     chosen, settings, answer, words = WEAK[kind]
     solution = solve(rig, chosen(poses), np.random.default_rng(4), **settings)
-    found = verdict(solution, models_of(rig), suggest=kind == "pitch")
+    found = verdict(solution, rig_of(solution, rig), suggest=kind == "pitch")
     reasons = {reason.kind: reason for reason in found.reasons}
     assert (
         ANSWERS[reasons[kind].severe] == answer
@@ -96,7 +99,8 @@ def test_weak_recordings_are_named(good, kind):
             "the recorded pitch spans only 1.0 deg within a placement"
             in found.sentences()[0]
         )
-        assert found.errors[2.0].cloud_mm > 10 and found.suggestion.gain > 0.5
+        assert found.errors[2.0].cloud_mm > 10 and "Record next: board" in found.advice
+        assert suggest_placement(solution, rig_of(solution, rig)).gain > 0.5
 
 
 def test_a_camera_that_never_sees_the_board(good):
@@ -105,7 +109,8 @@ def test_a_camera_that_never_sees_the_board(good):
     obs = obs.keep(view=obs.view_camera == 0)
     with pytest.raises(DegenerateGeometry, match="camera 'right': it never sees the board"):
         solve_joint(obs)
-    found = verdict(solve_joint(obs, required=False), models_of(rig), suggest=False)
+    solution = solve_joint(obs, required=False)
+    found = verdict(solution, rig_of(solution, rig), suggest=False)
     assert found.sentences()[0].startswith(
         "Use this calibration with care: camera 'right': it never sees the board"
     )
@@ -124,7 +129,7 @@ def test_a_motion_that_nothing_determines(good):
         face=obs.face_placement != 0,
     )
     solution = solved(obs, rig, poses)
-    found = verdict(solution, models_of(rig), suggest=False)
+    found = verdict(solution, rig_of(solution, rig), suggest=False)
     assert found.sentences()[0].startswith(
         "This calibration cannot be trusted: the data do not determine"
     )
@@ -175,7 +180,7 @@ def test_large_errors_forbid_trust(good):
         solution,
         solution=replace(solution.solution, covariance=4e4 * solution.solution.covariance),
     )
-    found = verdict(wide, models_of(rig), suggest=False)
+    found = verdict(wide, rig_of(wide, rig), suggest=False)
     assert found.answer == "no" and "the expected error at 2 m is" in found.sentences()[0]
 
 

@@ -18,6 +18,7 @@ from lrfcal_lib.calibrate.pipeline import (
     handed_over,
     prepare,
 )
+from lrfcal_lib.calibrate.rig import joint_rig
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import Placement, read_rig_file, rig_of
@@ -89,9 +90,8 @@ def advise(session: Session) -> str:
         solution = calibrate_jointly(prepared).solution
     except DegenerateGeometry as error:
         return f"not determined yet: {error}"
-    judged = verdict(
-        solution, prepared.models, field_of_view=prepared.session.lrf.field_of_view
-    )
+    rig = replace(joint_rig(solution, prepared.models), lrf=prepared.session.lrf)
+    judged = verdict(solution, rig)
     if judged.answer == YES:
         return ""
     return judged.advice

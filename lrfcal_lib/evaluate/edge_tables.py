@@ -99,8 +99,7 @@ def edge_lengths(
         known = prepared.board.lengths()
     measured = {variant: _outlines(prepared, variant, T_head_lrf) for variant in VARIANTS}
     if joint is not None and known:
-        combined = combined_outlines(joint)
-        measured["combined"] = {p: combined[p] for p in prepared.names if p in combined}
+        measured["combined"] = combined_outlines(joint)
     rows = []
     for variant, placement in product(measured, prepared.session.board_placements):
         board, weak = measured[variant].get(placement, (UNMEASURED, frozenset()))
@@ -116,17 +115,8 @@ def edge_lengths(
             if np.isfinite(length):
                 hangs = not neighbours(prepared.board.edges, name).isdisjoint(weak)
                 ends = ENDS[variant][hangs]
-            row = (
-                prepared.session.name,
-                placement,
-                name,
-                ends,
-                variant,
-                1000 * true,
-                1000 * length,
-                1000 * sigma,
-            )
-            rows.append(row)
+            where = (prepared.session.name, placement, name, ends, variant)
+            rows.append((*where, 1000 * true, 1000 * length, 1000 * sigma))
     for name, (true, length) in PAPER_EDGES_MM.items():
         rows.append(("paper", np.nan, name, "scan", "last_beam", true, length, np.nan))
     table = pd.DataFrame(rows, columns=LENGTH_COLUMNS).astype({"placement": "Int64"})

@@ -115,11 +115,12 @@ def file_hashes(session: Session) -> dict[str, str]:
     """
     stated = filter(os.path.lexists, [session.path / name for name in FILES])
     images = {record.file for record in session.image_records}
-    hashes = {}
-    for file in sorted(images.union(stated)):
-        digest = hashlib.sha256(read_bytes(file, session.path))
-        hashes[file.relative_to(session.path).as_posix()] = digest.hexdigest()
-    return hashes
+    return {
+        file.relative_to(session.path).as_posix(): hashlib.sha256(
+            read_bytes(file, session.path)
+        ).hexdigest()
+        for file in sorted(images.union(stated))
+    }
 
 
 def write_calibration(path: str | Path, record: dict) -> None:

@@ -138,15 +138,15 @@ def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
     """
     solution = joint.solution
     obs = joint.observations
-    sensor = solution.sensor["edge_log_odds"]
     distance = np.linalg.norm(solution.board_poses[:, :, 3], axis=1)
     odds = obs.beam_background + solution.side_odds[obs.beam_placement, obs.beam_edge]
+    radii = disc_edge(solution.sensor["edge_log_odds"] + odds)[0]
     columns = {
         "placement": obs.placements[obs.beam_placement],
         "edge": obs.beam_edge,
         "distance_m": distance[obs.beam_placement],
-        "bias_mm": 1000 * edge_shift(sensor, obs.beam_radius, odds)[0],
-        "bias_radii": disc_edge(sensor + odds)[0],
+        "bias_mm": 1000 * obs.beam_radius * radii,
+        "bias_radii": radii,
     }
     sides = pd.DataFrame(columns).groupby([*columns][:3]).mean().reset_index()
     return sides.assign(edge=np.array(obs.edges)[sides.edge])
@@ -211,6 +211,7 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         the halves share). Splits of which a half leaves something open are missing.
     """
     rng = np.random.default_rng(0)
+    common = np.diag(joint.solution.lens) + joint.solution.step**2
     numbers = list(joint.solution.boards)
     rows = []
     if len(numbers) <= 4:  # two placements determine no rig
@@ -228,7 +229,10 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
             apart = transform_difference(
                 first.transforms[camera], second.transforms[camera]
             )
-            predicted = _predicted(joint.solution, camera)
+            # without what halves share
+            variances = joint.solution.camera(camera).trusted_sigma ** 2
+            variances -= common[joint.solution.columns(camera)]
+            predicted = 2 * np.sqrt(np.maximum(variances, 0.0).reshape(2, 3).sum(axis=1))
             rows.append((pair, camera, *DEG_MM * apart, *DEG_MM * predicted))
     return pd.DataFrame(
         rows,
@@ -241,16 +245,6 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
             "predicted_translation_mm",
         ],
     )
-
-
-def _predicted(solution, camera):
-    """Root mean square difference of two halves of the placements as sigma predicts it, turn and
-    shift, (2,).
-    """
-    common = np.diag(solution.lens) + solution.step**2
-    variances = solution.camera(camera).trusted_sigma ** 2
-    variances -= common[solution.columns(camera)]
-    return 2 * np.sqrt(np.maximum(variances, 0.0).reshape(2, 3).sum(axis=1))
 
 
 def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:

@@ -268,10 +268,9 @@ def consistency(trials: Trials) -> pd.DataFrame:
 
 def _judge(trials, index, factor):
     """One row: a group in its unit, or (factor None) unknowns of many units, each by its bounds."""
-    block = np.ix_(np.arange(len(trials.errors)), index, index)
     e = trials.errors[:, index]
-    C = trials.covariances[block]
-    B = trials.bounds[block]
+    C = trials.covariances[:, index][..., index]
+    B = trials.bounds[:, index][..., index]
     mean = np.mean(C, axis=0)
     seen = max(round(len(e) * _freedom(mean / dyads(sigma_of(mean)))), 1)
     unit = np.full(e.shape, factor)

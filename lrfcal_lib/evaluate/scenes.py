@@ -85,7 +85,7 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     true = origins + true_length[:, None] * directions
     blocked = np.zeros(len(points), bool)
     for view in views_of(session, rig, placement):
-        painted = np.flatnonzero((cloud.image == view.number) & np.isfinite(depth))
+        painted = (cloud.image == view.number) & np.isfinite(depth)
         eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
         blocked[painted] = _hidden(world, eye, true[painted])
     return SceneErrors(

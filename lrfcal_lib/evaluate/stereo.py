@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.geometry import transform_difference
 from lrfcal_lib.preprocess.bundle import LENS, adjust_robust
-from lrfcal_lib.preprocess.intrinsics import K5, board_pose
+from lrfcal_lib.preprocess.intrinsics import K5
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers import METHODS
 
@@ -56,7 +56,7 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
             f"a stereo reference needs two cameras and a pattern, got {len(prepared.views)} cameras"
         )
     first, second = list(prepared.views)[:2]
-    shown = [prepared.patterned(camera) for camera in (first, second)]
+    shown = [prepared.patterned(first), prepared.patterned(second)]
     common = sorted(shown[0].keys() & shown[1].keys())
     if not common:
         raise ValueError(
@@ -64,10 +64,10 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
         )
     models = [prepared.models[first], prepared.models[second]]
     pixels = np.array([[of_camera[p].pixels for p in common] for of_camera in shown])
-    poses = []
-    for model, of_camera in zip(models, pixels, strict=True):
-        boards = [board_pose(image, pattern, model)[0] for image in of_camera]
-        poses.append(RigidTransform.concatenate(boards))
+    poses = [
+        RigidTransform.concatenate([of_camera[p].T_camera_board for p in common])
+        for of_camera in shown
+    ]
     between = poses[1] * poses[0].inv()
     rough = RigidTransform.from_components(
         np.median(between.translation, axis=0), between.rotation.mean()
@@ -107,29 +107,23 @@ def stereo_check(solutions: dict, reference: StereoReference) -> pd.DataFrame:
     rows = []
     baseline = np.linalg.norm(reference.T_second_first.translation)
     for method in (*METHODS, "joint"):
-        if not all((camera, method) in solutions for camera in reference.cameras):
+        both = [
+            solutions[camera, method].transform
+            for camera in reference.cameras
+            if (camera, method) in solutions
+        ]
+        if len(both) < 2:
             continue
-        first, second = (
-            solutions[camera, method].transform for camera in reference.cameras
-        )
-        between = second * first.inv()
+        between = both[1] * both[0].inv()
         turn, shift = transform_difference(between, reference.T_second_first)
         length = np.linalg.norm(between.translation)
-        row = (
-            method,
-            1000 * length,
-            1000 * (length - baseline),
-            1000 * shift,
-            np.rad2deg(turn),
-        )
-        rows.append(row)
-    return pd.DataFrame(
-        rows,
-        columns=[
-            "method",
-            "baseline_mm",
-            "baseline_error_mm",
-            "translation_error_mm",
-            "rotation_error_deg",
-        ],
-    )
+        off = length - baseline
+        rows.append((method, 1000 * length, 1000 * off, 1000 * shift, np.rad2deg(turn)))
+    columns = [
+        "method",
+        "baseline_mm",
+        "baseline_error_mm",
+        "translation_error_mm",
+        "rotation_error_deg",
+    ]
+    return pd.DataFrame(rows, columns=columns)

@@ -21,14 +21,13 @@ COUNTS = (5, 10, 20, 50, 100)  # placements
 CHUNK = 10  # trials of a task: some seconds, of which handing it over takes a thousandth
 INTERVAL = {"low": 0.05, "high": 0.95}  # of the bootstrap
 RESAMPLES = 1000
-UNITS = {"rotation": ("deg", 180 / np.pi), "translation": ("mm", 1000.0)}
+ERRORS = ("rotation_deg", "translation_mm")
 NUMBERS = (
-    "rotation",
-    "translation",
-    "bound_rotation",
-    "bound_translation",
-    "known_rotation",
-    "known_translation",
+    *ERRORS,
+    "rotation_deg_bound",
+    "translation_mm_bound",
+    "rotation_deg_known",
+    "translation_mm_known",
     "over_bound",
     "nees",
     "covered",
@@ -156,24 +155,17 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     ).sort_values("trial")
     every = rows.groupby(keys, observed=True)
     good = rows[~rows.failed].groupby(keys, observed=True)
-    columns = {
-        "trials": every.size(),
-        "failed": every.failed.sum(),
-        "failures": every.outcome.agg(_reasons),
-    }
-    table = pd.DataFrame(columns)
-    for name, (unit, factor) in UNITS.items():
-        columns = {"": every[name].median(), "_mean": every[name].mean()}
+    table = every.agg(
+        trials=("trial", "size"), failed=("failed", "sum"), failures=("outcome", _reasons)
+    )
+    for name in ERRORS:
+        table[name] = every[name].median()
+        table[f"{name}_mean"] = every[name].mean()
         for end, share in INTERVAL.items():
-            columns[f"_{end}"] = every[name].agg(resampled, share=share)
-        for end, of in (
-            ("_rmse", name),
-            ("_bound", f"bound_{name}"),
-            ("_known", f"known_{name}"),
-        ):
-            columns[end] = good[of].agg(rms)
-        for end, values in columns.items():
-            table[f"{name}_{unit}{end}"] = factor * values
+            table[f"{name}_{end}"] = every[name].agg(resampled, share=share)
+        table[f"{name}_rmse"] = good[name].agg(rms)
+        for bound in (f"{name}_bound", f"{name}_known"):
+            table[bound] = good[bound].agg(rms)
     table["rmse_over_bound"] = np.sqrt(good.over_bound.mean())
     for end, share in INTERVAL.items():
         squares = good.over_bound.agg(resampled, share=share, statistic=np.mean)

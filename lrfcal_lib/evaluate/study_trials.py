@@ -14,6 +14,7 @@ from lrfcal_lib.evaluate.monte_carlo import (
 )
 from lrfcal_lib.fit.covariance import dyads, sigma_of
 from lrfcal_lib.model.geometry import (
+    POSE_UNITS,
     DegenerateGeometry,
     move_pose,
     polar_to_points,
@@ -31,7 +32,7 @@ from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Unknowns
 
-FAR = np.radians(10.0)  # from the truth: another minimum, or nothing was determined
+FAR = 10.0  # deg from the truth: another minimum, or nothing was determined
 # of crossings, solved as one batch: options of `solve_camera`
 BATCHED: dict[str, dict] = {
     "line_printed": {},
@@ -82,10 +83,10 @@ def run_task(task: Task) -> list[dict]:
     -------
     list of dict
         A row for every trial and method: scenario, what was varied of it, n_poses, trial, method,
-        outcome ('ok', or why it failed), and where there is an estimate rotation (radians) and
-        translation (metres) errors; where boards are looked at the same as bound with unknown and
-        with known sensor, and of the six numbers of the pose the mean squared error over the bound,
-        and over the stated covariance, and how many lie in their 90 % intervals.
+        outcome ('ok', or why it failed), and where there is an estimate its errors rotation_deg and
+        translation_mm; where boards are looked at the same as bound with unknown (``_bound``) and
+        with known sensor (``_known``), and of the six numbers of the pose the mean squared error
+        over the bound, and over the stated covariance, and how many lie in their 90 % intervals.
     """
     scenario = task.scenario
     rng = np.random.default_rng([task.seed, task.n_poses, task.first])
@@ -154,29 +155,26 @@ def _judged(estimate, true, bounds):
     error = pose_step(pose_transform(true), transform)
     if not (np.isfinite(error).all() and np.isfinite(covariance).all()):
         return {"outcome": "not finite"}
-    numbers = _sizes(error)
-    outcome = "ok"
-    if numbers["rotation"] > FAR:
-        outcome = "more than 10 deg from the truth"
+    row = {"outcome": "ok"} | _sizes(error)
+    if row["rotation_deg"] > FAR:
+        row["outcome"] = "more than 10 deg from the truth"
     elif not converged:
-        outcome = "not converged"
+        row["outcome"] = "not converged"
     if not bounds:
-        return {"outcome": outcome} | numbers
-    return {
-        "outcome": outcome,
-        **numbers,
-        **_sizes(bounds["bound"], "bound_"),
-        **_sizes(bounds["known"], "known_"),
-        "over_bound": np.mean((error / bounds["bound"]) ** 2),
+        return row
+    for end, sigma in bounds.items():
+        row |= _sizes(sigma, end)
+    return row | {
+        "over_bound": np.mean((error / bounds["_bound"]) ** 2),
         "nees": error @ np.linalg.pinv(covariance) @ error / 6,
         "covered": np.mean(np.abs(error) < HALF_WIDTH * sigma_of(covariance)),
     }
 
 
-def _sizes(step, what=""):
+def _sizes(step, end=""):
     """Lengths of the turn and the shift of a step (6,), by column."""
-    turn, shift = np.linalg.norm(np.split(step, 2), axis=1)
-    return {f"{what}rotation": turn, f"{what}translation": shift}
+    turn, shift = np.linalg.norm(np.split(POSE_UNITS * step, 2), axis=1)
+    return {f"rotation_deg{end}": turn, f"translation_mm{end}": shift}
 
 
 def crossing_observations(
@@ -277,8 +275,6 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     count = len(shots["ranges"][trial])
     obs = JointObservations(
         placements=np.arange(1, count + 1),
-        middle=np.zeros(count),
-        direction=np.zeros(count, int),
         **_readings(shots, scenario, trial),
         view_pose=pose_transform(shots["boards"][trial]).as_matrix(),
         view_covariance=shots["board_covariance"][trial],
@@ -295,7 +291,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
         obs,
         RigidTransform.identity(),
         {"camera": T_camera_lrf},
-        list(boards),
+        boards,
         bias=scenario.bias,
         softness=scenario.softness,
     )
@@ -314,7 +310,7 @@ def _readings(shots, scenario, trial):
     _, ends = row_ends(hit)
     at_ends = np.maximum(np.take_along_axis(ranges, ends, axis=1), LEAST_RANGE)
     # beams about either end of every scan line
-    near = np.arange(2 * REACH) - REACH
+    near = np.arange(-REACH, REACH)
     window = np.clip(ends[..., None] + [[0], [1]] + near, 0, beams - 1)
     at_end = np.repeat(at_ends, near.size)
     return {
@@ -333,11 +329,11 @@ def _readings(shots, scenario, trial):
 
 def bounds_of_camera(obs, truth, sensor):
     """Cramer-Rao bounds (6,) of the camera's standard deviations, the boards' poses unknown in
-    either: 'bound' with these properties of the sensor unknown, 'known' with none. NaN where the
+    either: '_bound' with these properties of the sensor unknown, '_known' with none. NaN where the
     data leave it open.
     """
     bounds = {}
-    for name, open_ in (("bound", sensor), ("known", ())):
+    for name, open_ in (("_bound", sensor), ("_known", ())):
         unknowns = Unknowns(1, len(obs.edges), axis=False, sensor=open_)
         bounds[name] = np.full(6, np.nan)
         with suppress(DegenerateGeometry):

@@ -205,11 +205,12 @@ def platform_calibration_table(
         parameters[method,] = names, [*axis.parameters, *phi, ty], sigma
     table = parameter_table(["method"], parameters)
     if truth is not None:
-        errors = {
-            method: axis_errors(axis, truth) for method, axis in platform.axes.items()
-        }
         for column, name in AXIS_ERRORS.items():
-            table[column] = [errors[method][name] for method in table.method]
+            errors = {
+                method: axis_errors(axis, truth)[name]
+                for method, axis in platform.axes.items()
+            }
+            table[column] = table.method.map(errors)
     return table
 
 
@@ -266,26 +267,25 @@ def scans_table(prepared: Prepared) -> pd.DataFrame:
     rows = []
     for placement, board in prepared.scans.items():
         across = [side.across for side in sides_of(prepared, placement) if side.straight]
-        row = (
-            placement,
-            board.mask.sum(),
-            1000 * board.sigma_range,
-            board.n_jump_points,
-            across.count(False),
-            across.count(True),
+        rows.append(
+            (
+                placement,
+                board.mask.sum(),
+                1000 * board.sigma_range,
+                board.n_jump_points,
+                across.count(False),
+                across.count(True),
+            )
         )
-        rows.append(row)
-    return pd.DataFrame(
-        rows,
-        columns=[
-            "placement",
-            "n_points",
-            "sigma_range_mm",
-            "jump_points",
-            "sides_along",
-            "sides_across",
-        ],
-    )
+    columns = [
+        "placement",
+        "n_points",
+        "sigma_range_mm",
+        "jump_points",
+        "sides_along",
+        "sides_across",
+    ]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def intrinsics_table(models: dict[str, CameraModel]) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from itertools import permutations
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
-from scipy.special import ndtr, stdtrit
+from scipy.special import ndtri, stdtr
 
 from lrfcal_lib.fit.covariance import sigma_turn_shift
 from lrfcal_lib.fit.result import AXIS_NAMES
@@ -63,14 +63,12 @@ class Alternative:
     unit : float
         What s is multiplied by for the words.
     words : str
-        With ``{size}`` and ``{sigma}`` of s, and ``{sign}``: the first of `signs` where s is
-        positive.
-    remedy : str
+        With the remedy; with ``{size}`` and ``{sigma}`` of s, and ``{sign}``: the first of `signs`
+        where s is positive.
     """
 
     change: Callable
     words: str
-    remedy: str
     signs: tuple = ("larger", "smaller")
     worth: float = 0.004
     reach: float = 0.3
@@ -106,18 +104,17 @@ def _lag(obs, s):
 ALTERNATIVES = {
     Kind.SQUARES: Alternative(
         _views,
-        "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
-        "measure a square over many of them",
+        "the chessboard's squares are {size} +- {sigma} % {sign} than stated: measure a square "
+        "over many of them",
     ),
     Kind.OUTLINE: Alternative(
         _outline,
-        "the board's outline is {size} +- {sigma} % {sign} than stated",
-        "measure the board's edges",
+        "the board's outline is {size} +- {sigma} % {sign} than stated: measure the board's edges",
     ),
     Kind.RANGES: Alternative(
         lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)),
-        "all ranges are {size} +- {sigma} % {sign}",
-        "measure a square and an edge of the board, check the unit of the ranges",
+        "all ranges are {size} +- {sigma} % {sign}: measure a square and an edge of the board, "
+        "check the unit of the ranges",
         (
             "too short, or board and squares smaller than stated",
             "too long, or board and squares larger than stated",
@@ -125,21 +122,21 @@ ALTERNATIVES = {
     ),
     Kind.BEARINGS: Alternative(
         JointObservations.stretched,
-        "bearings are {size} +- {sigma} % too {sign}",
-        "check the angular step that session.json states",
+        "bearings are {size} +- {sigma} % too {sign}: check the angular step that session.json "
+        "states",
         ("small", "large"),
     ),
     Kind.SPOT: Alternative(
         lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)),
-        "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
-        "state spot_exit_m and spot_divergence_rad as its maker does",
+        "the spot of the range finder is {size} +- {sigma} % {sign} than stated: state spot_exit_m "
+        "and spot_divergence_rad as its maker does",
         worth=0.2,
         reach=5.0,
     ),
     Kind.LAG: Alternative(
         _lag,
-        "the recorded pitch of scan lines is {size} +- {sigma} deg {sign} the sweep",
-        "check the time stamps of pitch and scans, sweep slower or stop for every scan",
+        "the recorded pitch of scan lines is {size} +- {sigma} deg {sign} the sweep: check the "
+        "time stamps of pitch and scans, sweep slower or stop for every scan",
         ("behind", "ahead of"),
         worth=np.radians(0.05),
         unit=np.degrees(1.0),
@@ -174,33 +171,26 @@ class Doubt:
 
     Attributes
     ----------
-    kind : str
+    kind : Kind
         Of `ALTERNATIVES`.
     value, sigma : float
         As the data have it, with its standard deviation.
     ratio : float
         Likelihood ratio (squared score).
-    freedom : float
-        Degrees of freedom of `sigma`: placements less one where it comes from their scatter,
-        infinite where it comes from the noise.
+    deviations : float
+        Chance alone goes so far as seldom as a normal variable goes beyond so many.
     moved : float
         By how many of its standard deviations the axis or a camera would move at most, were it so.
     words : str
     """
 
-    kind: str
+    kind: Kind
     value: float
     sigma: float
     ratio: float
-    freedom: float
+    deviations: float
     moved: float
     words: str
-
-    def exceeds(self, deviations):
-        """Whether chance alone goes so far as seldom as a normal variable goes beyond
-        `deviations`.
-        """
-        return self.ratio > stdtrit(self.freedom, ndtr(deviations)) ** 2
 
 
 def weigh(
@@ -250,46 +240,51 @@ def doubt_about(kind, alternative, solution, admitted_offset):
     noise = covariance[-1, -1]
     scatter = np.sum(pulls[:, -1] ** 2) * len(pulls) / freedom
     sigma = np.sqrt(max(noise, scatter))
+    pull = abs(value) / max(sigma, 1e-300)
+    # what the noise explains is known without limit, scatter by the placements less one
+    chance = stdtr(freedom if scatter > noise else np.inf, -pull)
 
     handed = np.flatnonzero(~np.isin(names, SENSOR))
     # what the accuracy of the angular step may do must not hide that it is wrong
     spread = np.sqrt(solution.solution.trusted_sigma**2 - solution.step**2)[handed]
     moves = covariance[handed, -1] / max(noise, 1e-300) * value / spread
-    words = alternative.words.format(
-        size=f"{abs(value) * alternative.unit:.2g}",
-        sigma=f"{sigma * alternative.unit:.2g}",
-        sign=by_sign(value, *alternative.signs),
-    )
     return Doubt(
         kind=kind,
         value=value,
         sigma=sigma,
-        ratio=(value / max(sigma, 1e-300)) ** 2,
-        freedom=freedom if scatter > noise else np.inf,
+        ratio=pull**2,
+        deviations=-ndtri(chance),
         moved=np.max(np.abs(moves), initial=0.0),
-        words=f"{words}: {alternative.remedy}",
+        words=alternative.words.format(
+            size=f"{abs(value) * alternative.unit:.2g}",
+            sigma=f"{sigma * alternative.unit:.2g}",
+            sign=by_sign(value, *alternative.signs),
+        ),
     )
 
 
-def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
+def doubtful(solution, admitted_offset, stated=ALTERNATIVES):
     """The alternatives that the data ask for: list of Doubt, the best one and those that explain
     them as well.
 
     Beyond chance whatever they do, or preferred by the data where what is handed over would move by
-    more than its standard deviation tells. Kinds named in `faint` need the latter; an angular step
-    that is known needs the former.
+    more than its standard deviation tells. A spot needs the latter: one that is no evenly lit disc
+    looks like one of another size, which does no harm. An angular step that is known needs the
+    former.
     """
     asked = []
     for doubt in weigh(solution, admitted_offset, stated):
-        harmful = doubt.exceeds(PREFERRED) and doubt.moved > MOVED
-        if doubt.kind == Kind.BEARINGS and not solution.step.any():
-            harmful = (
-                False  # a step that the sensor's disc divides is off for no small reason
-            )
         size = abs(doubt.value)
-        certain = doubt.exceeds(ASKED) and size > stated[doubt.kind].worth
-        asks = harmful or (certain and doubt.kind not in faint)
-        if asks and size < stated[doubt.kind].reach:
+        alternative = stated[doubt.kind]
+        asks = (
+            doubt.deviations > ASKED
+            and size > alternative.worth
+            and doubt.kind != Kind.SPOT
+        )
+        # a step that the sensor's disc divides is off for no small reason
+        if doubt.kind != Kind.BEARINGS or solution.step.any():
+            asks |= doubt.deviations > PREFERRED and doubt.moved > MOVED
+        if asks and size < alternative.reach:
             asked.append(doubt)
     return [doubt for doubt in asked if doubt.ratio > AS_GOOD * asked[0].ratio]
 

@@ -236,7 +236,7 @@ def change_between(solution, first, later, camera, prepared):
     index = obs.cameras.index(later)
     change = solution.transforms[later] * solution.transforms[first].inv()
     both = solution.covariance(first, later)
-    later_less_first = np.hstack([-np.eye(POSE), np.eye(POSE)])
+    later_less_first = np.kron([-1.0, 1.0], np.eye(POSE))
     spread = later_less_first @ both @ later_less_first.T
     step = pose_step(solution.transforms[first], solution.transforms[later])
     square = step @ pseudo_inverse(spread) @ step

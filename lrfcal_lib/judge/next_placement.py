@@ -6,13 +6,13 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.calibrate.rig import LMS200, joint_rig
+from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import selection
 from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.uncertainty import carried, chain_of
-from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
+from lrfcal_lib.model.camera import pinhole, project_jacobians
 from lrfcal_lib.model.geometry import (
     AHEAD,
     POSE_NAMES,
@@ -43,7 +43,6 @@ PLACES = (
     range(0, 360, 60),
     range(len(LEANS)),
 )
-FIELD_OF_VIEW = LMS200.field_of_view  # the paper's
 LARGEST_PITCH = np.radians(30)  # of a head that is asked to look at a board
 # pitch angles that images are tried at
 LATTICE = np.linspace(-LARGEST_PITCH, LARGEST_PITCH, 41)
@@ -95,11 +94,7 @@ class Suggestion:
         )
 
 
-def suggest_placement(
-    solution: JointSolution,
-    models: dict[str, CameraModel],
-    field_of_view: tuple[float, float] = FIELD_OF_VIEW,
-) -> Suggestion:
+def suggest_placement(solution: JointSolution, rig: CalibratedRig) -> Suggestion:
     """The board pose and pitch angles of images that would make axis and cameras known best.
 
     Of a grid of poses that the LRF and all cameras see, the one that leaves the least sum of their
@@ -108,10 +103,8 @@ def suggest_placement(
     Parameters
     ----------
     solution
-    models
-        Of every camera of the solution.
-    field_of_view
-        Bearings that the LRF measures, radians.
+    rig
+        As the solution has it.
 
     Raises
     ------
@@ -120,7 +113,7 @@ def suggest_placement(
     """
     grid = np.array(list(product(*PLACES)))
     boards = board_poses(solution, grid)
-    seen, pitches = pitches_of_images(boards, solution, models, field_of_view)
+    seen, pitches = pitches_of_images(boards, solution, rig)
     if len(seen) == 0:
         raise DegenerateGeometry(
             f"none of {len(grid)} board poses lies wholly in the view of the LRF and of all "
@@ -129,7 +122,7 @@ def suggest_placement(
         )
     boards = boards[seen]
     known = solution.score().information.sum(axis=0)
-    added = candidate_information(boards, pitches, solution, models)
+    added = candidate_information(boards, pitches, solution, rig)
     before = total_sigma(known, solution)
     after = total_sigma(known + added, solution)
     best = np.argmin(after)
@@ -225,22 +218,23 @@ def board_poses(solution, grid):
     return pose_array(T_platform_board)
 
 
-def pitches_of_images(boards, solution, models, field_of_view):
+def pitches_of_images(boards, solution, rig):
     """Which of some boards (n, 3, 4) LRF and cameras see wholly, (m,), and pitch angles (m, k) of
     images of them, radians.
     """
     points = apply_pose(boards, outline(solution))
-    bearing, pitch, _ = beams_to(points, solution.T_head_lrf)
-    inside = (bearing > field_of_view[0]) & (bearing < field_of_view[1])
+    bearing, pitch, _ = beams_to(points, rig.T_head_lrf)
+    low, high = rig.lrf.field_of_view
+    inside = (bearing > low) & (bearing < high)
     inside &= np.abs(pitch) < LARGEST_PITCH
     visible = np.tile(inside.all(axis=1), (len(LATTICE), 1))
-    for name in solution.transforms:
-        border = MARGIN * models[name].size
-        poses = pose_array(solution.camera_at(name, LATTICE))
+    for name, camera in rig.cameras.items():
+        border = MARGIN * camera.model.size
+        poses = pose_array(rig.camera_at(name, LATTICE))
         p_camera = apply_pose(poses[..., None, :, :], points)
         # far outside the image a lens model would fold back
-        uv = pinhole(p_camera, models[name])
-        inside = (uv > border) & (uv < models[name].size - border)
+        uv = pinhole(p_camera, camera.model)
+        inside = (uv > border) & (uv < camera.model.size - border)
         visible &= np.all(inside & (p_camera[..., 2:] > 0), axis=(-2, -1))
 
     seen, ends = row_ends(visible.T)
@@ -248,7 +242,7 @@ def pitches_of_images(boards, solution, models, field_of_view):
     return seen, np.linspace(first, last, IMAGES, axis=1)
 
 
-def candidate_information(boards, pitches, solution, models):
+def candidate_information(boards, pitches, solution, rig):
     """Information that boards would add about the shared unknowns, shape (n, c, c).
 
     `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images. Points of a
@@ -262,9 +256,8 @@ def candidate_information(boards, pitches, solution, models):
     by_scan = np.sqrt(count) * scan_sigma(solution, boards)[:, None]
     unknowns = len(solution.solution.names)
     information = np.zeros((len(boards), unknowns, unknowns))
-    rig = joint_rig(solution, models)
     for camera, at in zip(obs.cameras, images, strict=True):
-        model = models[camera]
+        model = rig.cameras[camera].model
         by_image = image_sigma(solution, camera, model)
         chain = chain_of(rig, camera)
         links = selection(solution.solution.names, camera)

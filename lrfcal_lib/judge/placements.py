@@ -6,7 +6,10 @@ import numpy as np
 import pandas as pd
 
 from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.prepared import Prepared
+
+NO_IMAGE = BoardView(reason="no image")
 
 
 def placements_table(
@@ -34,10 +37,8 @@ def placements_table(
             mask = prepared.scans[placement].mask
         notes = []
         for camera, views in prepared.views.items():
-            view = views.get(placement)
-            if view is None:
-                notes.append(f"{camera}: no image")
-            elif view.reason:
+            view = views.get(placement, NO_IMAGE)
+            if view.reason:
                 notes.append(f"{camera}: {view.reason}")
             else:
                 notes += [f"{camera} {edge}: {why}" for edge, why in view.rejected]

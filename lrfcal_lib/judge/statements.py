@@ -23,9 +23,6 @@ SIZES = (Kind.SQUARES, Kind.RANGES)  # an error of them is one of all distances
 LARGE_SIZE = 0.02  # error of a size that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
 RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
-NOT_WEIGHED = (
-    "whether session.json states sizes, step and spot correctly could not be tested"
-)
 # statements that are falsified on purpose, as relative errors of alternatives
 LIES = {
     "as recorded": {},
@@ -53,30 +50,36 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Fault], float]:
     """
     solution = joint.solution
     if not solution.converged:
-        why = "the estimate has not converged"
-        return [Fault(Kind.NOT_WEIGHED, f"{NOT_WEIGHED}: {why}", severe=True)], 0.0
+        return [not_weighed("the estimate has not converged")], 0.0
     findings = []
     doubts = doubtful(
         solution,
         joint.prepared.session.lrf.admitted_offset,
         alternatives_of(joint.prepared),
-        # a spot that is no evenly lit disc looks like one of another size, which does no harm
-        faint=(Kind.SPOT,),
     )
     level = solution.noise["face_scale"]
     if doubts:
         findings.append(finding_of(doubts))
     elif level > ABSURD:
         why = f"no single error explains why ranges fit {level:.0f} times worse than stated"
-        findings.append(Fault(Kind.NOT_WEIGHED, f"{NOT_WEIGHED}: {why}", severe=True))
+        findings.append(not_weighed(why))
     sizes = [abs(doubt.value) for doubt in doubts if doubt.kind in SIZES]
     range_doubt = max(sizes, default=0.0) * np.median(solution.observations.face_range)
     beyond = list(beyond_admitted(joint))
     if beyond:
         range_doubt = max(range_doubt, abs(solution.sensor["range_offset"]))
-    findings += [*beyond, *beyond_spot(solution), *pitch_turns_otherwise(solution)]
-    findings += far_from_stated(joint)
+    findings += [*beyond, *sensor_otherwise(solution), *far_from_stated(joint)]
     return findings, range_doubt
+
+
+def not_weighed(why):
+    """The Fault that no statement could be tested."""
+    return Fault(
+        Kind.NOT_WEIGHED,
+        "whether session.json states sizes, step and spot correctly could not be tested: "
+        f"{why}",
+        severe=True,
+    )
 
 
 def finding_of(doubts):
@@ -107,8 +110,10 @@ def beyond_admitted(joint) -> Iterator[Fault]:
         )
 
 
-def beyond_spot(solution) -> Iterator[Fault]:
-    """Readings that change where the stated spot no longer touches the board."""
+def sensor_otherwise(solution) -> Iterator[Fault]:
+    """Readings that change where the stated spot no longer touches the board, and a platform that
+    turns more or less than its recorded pitch says.
+    """
     bias = solution.edge_bias
     if abs(bias) > RIM:
         yield Fault(
@@ -117,10 +122,6 @@ def beyond_spot(solution) -> Iterator[Fault]:
             "outside the edges): state spot_exit_m and spot_divergence_rad as they are, or measure "
             "the board's edges",
         )
-
-
-def pitch_turns_otherwise(solution) -> Iterator[Fault]:
-    """A platform that turns more or less than its recorded pitch says."""
     scale = solution.sensor["pitch_scale"]
     sigma = solution.sigma.get("pitch_scale", 0.0)
     if abs(scale) > max(CONTRADICTS * sigma, LARGE_SCALE):

@@ -4,10 +4,11 @@ What counts is relative to the head at the pitch of the image: a point measured 
 nothing to the axis.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, selection
@@ -15,11 +16,8 @@ from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
-    apply_pose,
-    hat,
+    gradient_by_pose,
     polar_to_points,
-    pose_array,
-    pose_transform,
     tilt,
     unit_vector,
 )
@@ -37,9 +35,9 @@ class Chain:
 
     Attributes
     ----------
-    head : ndarray, shape (3, 4)
+    head : RigidTransform
         ``T_head_lrf``.
-    camera : ndarray, shape (3, 4), or None
+    camera : RigidTransform or None
         ``T_camera_lrf`` of a camera on the head, or ``T_camera_platform``; None for points of the
         cloud.
     on_head : bool
@@ -48,28 +46,19 @@ class Chain:
         that gives more counts, quantity by quantity.
     unseen : ndarray, shape (m, 13)
         Motions that nothing determines: what depends on them has no bound.
-    sweep_sigma : tuple of float
-        Of the offset (radians) and the stretch that the pitch of every sweep has of its own.
+    sweep : PitchNoise
+        Of the offset and the stretch that the pitch of every sweep has of its own.
     """
 
-    head: np.ndarray
-    camera: np.ndarray | None
+    head: RigidTransform
+    camera: RigidTransform | None
     on_head: bool
     covariances: np.ndarray
     unseen: np.ndarray
-    sweep_sigma: tuple[float, float] = (0.0, 0.0)
-
-    def doubted(self, doubt: float) -> "Chain":
-        """The same where all ranges may be wrong by so many metres beside what is known.
-
-        Boards of a wrong size stand elsewhere before the cameras: the range offset or the cameras'
-        places have taken it up.
-        """
-        taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
-        return replace(self, covariances=self.covariances + np.diag(doubt**2 * taken_up))
+    sweep: PitchNoise
 
 
-def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
+def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) -> Chain:
     """The chain of a calibrated rig to a camera, or to points of the cloud.
 
     Parameters
@@ -77,6 +66,8 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
     rig
     camera
         Its name; None for points of the cloud.
+    doubt
+        By how much all ranges may be wrong beside what is known, metres.
 
     Raises
     ------
@@ -88,18 +79,20 @@ def chain_of(rig: CalibratedRig, camera: str | None = None) -> Chain:
     both = np.stack([known.covariance, known.trusted])
     # zero for what is known; what has no bound is among `unseen`
     bounded = np.nan_to_num(both, nan=0.0, posinf=0.0, neginf=0.0)
-    covariances = links @ bounded @ links.T
+    # boards of a wrong size stand elsewhere before the cameras: the range offset or the cameras'
+    # places have taken it up
+    taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
+    covariances = links @ bounded @ links.T + np.diag(doubt**2 * taken_up)
 
     on_head = True
     pose = None
     unseen = known.unseen_of_cloud
     if camera is not None:
         on_head = rig.cameras[camera].mount == "head"
-        pose = pose_array(rig.cameras[camera].T_camera)
+        pose = rig.cameras[camera].T_camera
         unseen = known.unseen_of_cameras[camera]
-    return Chain(
-        pose_array(rig.T_head_lrf), pose, on_head, covariances, unseen, known.sweep_sigma
-    )
+    sweep = PitchNoise(*known.sweep_sigma)
+    return Chain(rig.T_head_lrf, pose, on_head, covariances, unseen, sweep)
 
 
 def projection_sigma(
@@ -108,8 +101,8 @@ def projection_sigma(
     distances: ArrayLike,
     grid: tuple[int, int],
     *,
-    image_pitch: float = 0.0,
-    pitches: tuple[float, float] = (-np.pi, np.pi),
+    image_pitch: float,
+    pitches: tuple[float, float],
 ) -> np.ndarray:
     """How far off the pixel of an LRF point may be, over the image.
 
@@ -142,10 +135,10 @@ def projection_sigma(
         chain, model, pixel_grid(model, grid), away, image_pitch
     )
     points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
-    P, *_ = project_jacobians(points, model)
-    sigma_pitch = PitchNoise(*chain.sweep_sigma).sigma(pitch, sum(pitches) / 2)
+    P = project_jacobians(points, model)[0]
+    sigma_pitch = chain.sweep.sigma(pitch, sum(pitches) / 2)
     if chain.on_head:  # the offset is that of the image, too
-        sigma_pitch = chain.sweep_sigma[1] * (pitch - image_pitch)
+        sigma_pitch = chain.sweep.stretch * (pitch - image_pitch)
     by_sweep = sigma_pitch * np.linalg.norm(np.matvec(P, by_pitch), axis=-1)
     sigma = np.hypot(spread(chain, P @ by_link), by_sweep)
     low, high = pitches
@@ -187,7 +180,7 @@ def point_sigma(
     """
     away = np.reshape(distances, (-1, 1, 1))
     _, by_link, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
-    sigma_pitch = PitchNoise(*chain.sweep_sigma).sigma(pitches, reference)
+    sigma_pitch = chain.sweep.sigma(pitches, reference)
     by_sweep = sigma_pitch[:, None] * np.linalg.norm(by_pitch, axis=-1)
     return np.hypot(spread(chain, by_link), by_sweep)
 
@@ -246,35 +239,34 @@ def carried(
         Their derivatives by the pitch of the beam.
     """
     bearing, pitch, distance = np.broadcast_arrays(bearing, pitch, distance)
-    R = chain.head[:, :3]
-    t = chain.head[:, 3]
+    t = chain.head.translation
     # where it is 1, points go back through the axis to the head at the image
     back = chain.on_head
     turn = pitch - back * image_pitch
-    beam = polar_to_points(1.0, bearing) @ R.T
+    beam = chain.head.rotation.apply(polar_to_points(1.0, bearing))
     p_head = distance[..., None] * beam
     x = tilt(p_head + t, turn)
     M = tilt(np.eye(3), turn[..., None]).mT
-    by_turn = back * hat(x - t) - M @ hat(p_head)
-    by_shift = M - back * np.eye(3)
     # a turn of the head about x and a shift along it change nothing
-    by_axis = np.concatenate([by_turn, by_shift], axis=-1)[..., AXIS_COLUMNS]
+    by_axis = (M @ by_pose(p_head) - back * by_pose(x - t))[..., AXIS_COLUMNS]
     by_pitch = np.cross(TILT_AXIS, x)
     by_scale = turn[..., None] * by_pitch
     by_sensor = np.stack([-tilt(beam, turn), by_scale, (1 - back) * by_pitch], axis=-1)
 
-    A = R.T if chain.on_head else np.eye(3)
-    points = (x - back * t) @ A.T
-    by_camera = np.zeros((*points.shape, 6))
+    last = chain.head.inv() if back else RigidTransform.identity()
+    by_camera = np.zeros((*x.shape, 6))
     if chain.camera is not None:
-        C = chain.camera[:, :3]
-        A = C @ A
-        points = points @ C.T
-        by_camera[..., :3] = -hat(points)
-        by_camera[..., 3:] = np.eye(3)
-        points = points + chain.camera[:, 3]
+        last = chain.camera * last
+        by_camera = by_pose(last.apply(x) - chain.camera.translation)
+    A = last.rotation.as_matrix()
     by_link = np.concatenate([A @ by_axis, by_camera, A @ by_sensor], axis=-1)
-    return points, by_link, by_pitch @ A.T
+    return last.apply(x), by_link, by_pitch @ A.T
+
+
+def by_pose(rotated):
+    """Derivatives (..., 3, 6) of points by ``[w, v]`` of the pose that rotated them (..., 3)."""
+    axes = np.broadcast_to(np.eye(3), (*rotated.shape, 3))
+    return gradient_by_pose(rotated[..., None, :], axes)
 
 
 def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
@@ -303,12 +295,12 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
 def beams_of_pixels(chain, model, uv, distance, image_pitch):
     """Bearing and pitch of beams of a given length that end on the rays of pixels (..., 2)."""
     ray = unit_vector(model.sights(undistort(uv, model)))
-    depth = distance * np.ones(ray.shape[:-1])
+    depth = np.asarray(distance)
     for _ in range(ROUNDS):
-        x = (depth[..., None] * ray - chain.camera[:, 3]) @ chain.camera[:, :3]
+        x = chain.camera.inv().apply(depth[..., None] * ray)
         if chain.on_head:
-            x = apply_pose(chain.head, x)
-        bearing, pitch, reached = beams_to(x, pose_transform(chain.head))
+            x = chain.head.apply(x)
+        bearing, pitch, reached = beams_to(x, chain.head)
         depth = depth + distance - reached
     if chain.on_head:
         pitch = pitch + image_pitch

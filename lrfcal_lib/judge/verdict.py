@@ -9,11 +9,11 @@ import numpy as np
 from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
-from lrfcal_lib.calibrate.rig import joint_rig
+from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.judge.alternatives import step_words
 from lrfcal_lib.judge.findings import ANSWERS, CARE, NO, YES, Answer, Kind, brief
 from lrfcal_lib.judge.lens import lens_findings
-from lrfcal_lib.judge.next_placement import FIELD_OF_VIEW, Suggestion, suggest_placement
+from lrfcal_lib.judge.next_placement import suggest_placement
 from lrfcal_lib.judge.recording_faults import explained, recording_faults
 from lrfcal_lib.judge.statements import contradicts_stated
 from lrfcal_lib.judge.uncertainty import (
@@ -31,7 +31,6 @@ from lrfcal_lib.judge.weaknesses import (
     left_out,
     sides_elsewhere,
 )
-from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry, transform_difference
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.session.faults import Fault
@@ -44,8 +43,9 @@ FIRST = {
 }
 DISTANCES = (1.0, 2.0, 5.0)  # metres
 WORKING = 2.0  # metres, one of them: errors there decide
-POOR_MM, BAD_MM = 10.0, 50.0
-POOR_PX, BAD_PX = 5.0, 25.0
+POOR_MM = 10.0
+POOR_PX = 5.0
+BAD = 5.0  # times as much
 NO_BOUND = 1e4  # ten metres in millimetres; more pixels than an image has
 BEARINGS = np.radians(np.linspace(60, 120, 7))
 PITCHES = 9  # of the field that errors are judged over
@@ -79,13 +79,13 @@ class ExpectedError:
             f"{camera}_px": value for camera, value in self.pixels.items()
         }
 
-    def words(self, above_mm: float = -np.inf, above_px: float = -np.inf) -> str:
-        """Those above some limits, with units; '' where none is."""
+    def words(self, above: float = -np.inf) -> str:
+        """Those above so many times what is poor, with units; '' where none is."""
         parts = []
-        if self.cloud_mm > above_mm:
+        if self.cloud_mm > above * POOR_MM:
             parts.append(_amount(self.cloud_mm, "mm", "in the cloud"))
         for camera, value in self.pixels.items():
-            if value > above_px:
+            if value > above * POOR_PX:
                 parts.append(_amount(value, "px", f"in the image of '{camera}'"))
         return ", ".join(parts)
 
@@ -115,9 +115,8 @@ class Verdict:
         empty where nothing is handed over.
     range_noise_mm : float
         Of every single point, on top.
-    suggestion : Suggestion or None
-    no_suggestion : str
-        Why there is none.
+    advice : str
+        What to record next, or why nothing is suggested.
     notes : tuple of str
         What is handed over, and what became of all placements.
     """
@@ -125,8 +124,7 @@ class Verdict:
     reasons: tuple[Fault, ...]
     errors: dict[float, ExpectedError]
     range_noise_mm: float
-    suggestion: Suggestion | None = None
-    no_suggestion: str = ""
+    advice: str = ""
     notes: tuple[str, ...] = ()
 
     @property
@@ -136,13 +134,16 @@ class Verdict:
 
     def record(self) -> dict:
         """Answer, reasons and expected errors, ready for JSON."""
-        reasons = [
-            {"answer": ANSWERS[reason.severe], "kind": reason.kind, "words": reason.words}
-            for reason in self.reasons
-        ]
         return {
             "answer": self.answer,
-            "reasons": reasons,
+            "reasons": [
+                {
+                    "answer": ANSWERS[reason.severe],
+                    "kind": reason.kind,
+                    "words": reason.words,
+                }
+                for reason in self.reasons
+            ],
             "notes": self.notes,
             "expected_error_at_m": {
                 f"{d:g}": error.record() for d, error in self.errors.items()
@@ -165,11 +166,6 @@ class Verdict:
                 f"{brief(self.range_noise_mm)} mm of noise of its own."
             )
         return [*filter(None, [*sentences, self.advice])]
-
-    @property
-    def advice(self) -> str:
-        """What to record next, or why nothing is suggested."""
-        return self.suggestion.sentence() if self.suggestion else self.no_suggestion
 
     def because(self, findings: list[Fault]) -> "Verdict":
         """The verdict with more findings, which stand before its own; the worst first."""
@@ -209,22 +205,19 @@ def judge(
     if method is None:
         return _refused(calibration, findings)
 
+    rig = calibration.rig(method)
     if method == "joint" and joint is not None:
-        judged = verdict(
-            joint.solution,
-            prepared.models,
-            suggest=suggest,
-            doubt=doubt,
-            field_of_view=prepared.session.lrf.field_of_view,
+        judged = verdict(joint.solution, rig, suggest=suggest, doubt=doubt)
+    else:  # cameras that were calibrated one by one, with the axis of the platform step
+        pitch = [scan.sweep.pitch for scan in prepared.scans.values()]
+        judged = _expected(rig, np.concatenate(pitch), doubt).because(
+            [_not_joint(calibration), *_weak_cameras(calibration, method)]
         )
-    else:
-        judged = _without_joint(calibration, method, doubt)
     many_lost, note = left_out(calibration, method)
-    findings += [*blind_cameras(prepared), *many_lost]
+    findings += [*blind_cameras(prepared), *many_lost, *sides_elsewhere(prepared)]
     if many_lost:  # which says what was excluded, too
         kept = [reason for reason in judged.reasons if reason.kind != Kind.EXCLUDED]
         judged = replace(judged, reasons=tuple(kept))
-    findings += sides_elsewhere(prepared)
     return replace(judged.because(findings), notes=_notes(calibration, method, note))
 
 
@@ -243,11 +236,10 @@ def _notes(calibration, method, lost):
 
 def verdict(
     solution: JointSolution,
-    models: dict[str, CameraModel],
+    rig: CalibratedRig,
     *,
     suggest: bool = True,
     doubt: float = 0.0,
-    field_of_view: tuple[float, float] = FIELD_OF_VIEW,
 ) -> Verdict:
     """Judge a joint estimate by itself.
 
@@ -255,45 +247,39 @@ def verdict(
     ----------
     solution
         Solved with ``required=False``, so that weak sessions get here.
-    models
-        Of all cameras.
+    rig
+        As the estimate has it.
     suggest
         Also look for the next placement.
     doubt
         By how much all ranges may be wrong beside what the estimate knows, metres; see
         :func:`lrfcal_lib.judge.statements.contradicts_stated`.
-    field_of_view
-        Bearings that the LRF measures, radians.
     """
     obs = solution.observations
     pitch = np.concatenate([obs.face_pitch, obs.beam_pitch])
-    rig = joint_rig(solution, models)
     judged = _expected(rig, pitch, doubt).because(diagnose(solution))
     if not suggest:
         return judged
     try:
-        suggestion = suggest_placement(solution, models, field_of_view)
+        advice = suggest_placement(solution, rig).sentence()
     except DegenerateGeometry as error:
-        return replace(judged, no_suggestion=f"No placement can be suggested: {error}.")
-    return replace(judged, suggestion=suggestion)
+        advice = f"No placement can be suggested: {error}."
+    return replace(judged, advice=advice)
 
 
 def _expected(rig, pitch, doubt):
     """A Verdict by the errors that are to be expected of a rig over the recorded pitch (n,), not a
     narrow strip, where all ranges may be wrong by `doubt` (metres) beside what is known.
     """
-    middle = 0.0
-    half = LEAST_FIELD
-    if len(pitch):
-        middle = (pitch.min() + pitch.max()) / 2
-        half = max(np.ptp(pitch) / 2, LEAST_FIELD)
+    middle = (pitch.min() + pitch.max()) / 2
+    half = max(np.ptp(pitch) / 2, LEAST_FIELD)
     field = (middle - half, middle + half)
     pitches = np.linspace(*field, PITCHES)
-    chain = chain_of(rig).doubted(doubt)
+    chain = chain_of(rig, doubt=doubt)
     cloud = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
     images = {
         name: projection_sigma(
-            chain_of(rig, name).doubted(doubt),
+            chain_of(rig, name, doubt),
             camera.model,
             DISTANCES,
             PIXELS,
@@ -307,16 +293,12 @@ def _expected(rig, pitch, doubt):
         pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
         errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud[i])), pixels)
 
-    judged = Verdict((), errors, range_noise_mm=1000 * range_noise(rig))
-    large = errors[WORKING].words(POOR_MM, POOR_PX)
-    if not large:
-        return judged
-    error = Fault(
-        Kind.ERROR,
-        f"the expected error at {WORKING:g} m is {large}",
-        severe=bool(errors[WORKING].words(BAD_MM, BAD_PX)),
-    )
-    return judged.because([error])
+    reasons: tuple[Fault, ...] = ()
+    large = errors[WORKING].words(above=1.0)
+    if large:
+        words = f"the expected error at {WORKING:g} m is {large}"
+        reasons = (Fault(Kind.ERROR, words, bool(errors[WORKING].words(BAD))),)
+    return Verdict(reasons, errors, range_noise_mm=1000 * range_noise(rig))
 
 
 def _refused(calibration, findings):
@@ -339,7 +321,7 @@ def _refused(calibration, findings):
     if prepared.problems:
         named = "; ".join(map(str, prepared.problems))
         notes = (f"Left out: {len(prepared.problems)} ({named}).",)
-    nothing = Verdict((), {}, np.nan, no_suggestion=RECORD, notes=notes)
+    nothing = Verdict((), {}, np.nan, advice=RECORD, notes=notes)
     return nothing.because([*findings, refused])
 
 
@@ -352,14 +334,6 @@ def _scatter_note(placements):
     return (
         f"{placements} placements determine their own scatter to {known:.0f} % only: 90 % of the "
         f"errors lie within {within:.1f} stated standard deviations, not 1.6."
-    )
-
-
-def _without_joint(calibration, method, doubt):
-    """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
-    pitch = [scan.sweep.pitch for scan in calibration.prepared.scans.values()]
-    return _expected(calibration.rig(method), np.concatenate(pitch), doubt).because(
-        [_not_joint(calibration), *_weak_cameras(calibration, method)]
     )
 
 

@@ -10,7 +10,7 @@ from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.findings import Kind
 from lrfcal_lib.judge.next_placement import group_sigma, sights
-from lrfcal_lib.judge.placements import placements_table
+from lrfcal_lib.judge.placements import NO_IMAGE, placements_table
 from lrfcal_lib.model.problem import LEAVES_OUT
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault
@@ -184,8 +184,6 @@ def noise_of_images(solution: JointSolution) -> dict[str, float]:
     solution
     """
     obs = solution.observations
-    if len(obs.view_camera) == 0:
-        return {}
     level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)
     white = np.matvec(inverse_root(obs.view_covariance), solution.residuals("view"))
     usual = max(rms(white), np.finfo(float).tiny)
@@ -238,7 +236,7 @@ def blind_cameras(prepared: Prepared) -> Iterator[Fault]:
     """
     placements = prepared.session.board_placements
     for camera, views in prepared.views.items():
-        why = {p: views[p].reason if p in views else "no image" for p in placements}
+        why = {p: views.get(p, NO_IMAGE).reason for p in placements}
         unseen = [f"{placement} ({words})" for placement, words in why.items() if words]
         if len(unseen) > UNSEEN * len(placements):
             yield Fault(

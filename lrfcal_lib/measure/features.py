@@ -19,7 +19,6 @@ from lrfcal_lib.judge.uncertainty import (
     uncertainty_of,
 )
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, unit_vector
-from lrfcal_lib.preprocess.prepared import PitchNoise
 
 AT_ONCE = 1 << 16  # points
 ALIKE = np.radians(15.0)  # between normals of one plane
@@ -52,18 +51,17 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
     Cloud
     """
     chain = chain_of(rig)
-    sweep_noise = PitchNoise(*chain.sweep_sigma)
+    noise = range_noise(rig)
     sigma = np.zeros(len(cloud.points))
     for rows in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
         part = cloud.rows(rows)
         _, J, by_pitch = carried(chain, part.bearing, part.pitch, part.range)
-        normals = part.normals @ chain.head[:, :3]
+        normals = part.normals @ chain.head.rotation.as_matrix()
         beams = -J[..., COLUMNS.index("range_offset")]
         normals = np.where(np.isfinite(normals), normals, beams)
         calibration = spread(chain, normals[:, None] @ J)
-        sweep = sweep_noise.sigma(part.pitch, 0.0) * np.vecdot(normals, by_pitch)
-        noise = range_noise(rig) * np.vecdot(normals, beams)
-        reading = np.maximum(np.abs(noise), part.sigma)
+        sweep = chain.sweep.sigma(part.pitch, 0.0) * np.vecdot(normals, by_pitch)
+        reading = np.maximum(np.abs(noise * np.vecdot(normals, beams)), part.sigma)
         sigma[rows] = np.linalg.norm([calibration, sweep, reading], axis=0)
     return replace(cloud, sigma=sigma)
 
@@ -272,7 +270,7 @@ def beams_moved(
     by_stretch = (beams[1] - image_pitch)[..., None] * by_pitch
     sweep = np.stack([by_offset, by_stretch, 0 * by_pitch], axis=-1)
     moved = np.concatenate([moved, sweep], axis=-1)
-    return moved if camera else chain.head[:, :3] @ moved
+    return moved if camera else chain.head.rotation.as_matrix() @ moved
 
 
 def fit_feature(

@@ -304,7 +304,7 @@ def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
     _, J, _ = carried(
         chain, wall.bearing, rig.corrections.pitch(-1, wall.pitch), wall.range
     )
-    by_link = normal @ chain.head[:, :3] @ J
+    by_link = normal @ chain.head.rotation.as_matrix() @ J
     # a plane turns and shifts with the errors: only what bends it shows
     plane = np.insert(wall.points - wall.points.mean(axis=0), 0, 1.0, axis=1)
     by_link -= plane @ np.linalg.lstsq(plane, by_link)[0]

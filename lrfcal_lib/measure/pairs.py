@@ -167,8 +167,8 @@ def _moves(cloud, rig):
     _, J, by_pitch = carried(chain, cloud.bearing, cloud.pitch, cloud.range)
     by_rig = np.vecmat(cloud.normals, J)
     turn = np.vecdot(cloud.normals, by_pitch)
-    offset, stretch = chain.sweep_sigma
-    return np.column_stack([by_rig, offset * turn, stretch * cloud.pitch * turn])
+    by_stretch = chain.sweep.stretch * cloud.pitch * turn
+    return np.column_stack([by_rig, chain.sweep.offset * turn, by_stretch])
 
 
 def _cells(points):

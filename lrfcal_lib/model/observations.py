@@ -274,7 +274,7 @@ class JointObservations(_Grouped):
     placements : ndarray of int, shape (p,)
         Numbers of the placements.
     direction : ndarray of int, shape (p,)
-        Sweep direction, +1 or -1; 0 for a single shot.
+        Sweep direction, +1 or -1; 0 for a single shot, and by default.
     middle : ndarray, shape (p,)
         Pitch about which a sweep may be stretched, radians.
     face_range, face_bearing, face_pitch, face_sigma : ndarray, shape (m,)
@@ -310,9 +310,9 @@ class JointObservations(_Grouped):
         Of the intrinsics of every camera. Zeros (exactly known) by default.
     """
 
-    placements: Array
-    direction: Array
-    middle: Array
+    placements: Array = rows("placement", default=None)
+    direction: Array = rows("placement", default=0)
+    middle: Array = rows("placement")
     face_range: Array = rows("face")
     face_bearing: Array = rows("face")
     face_pitch: Array = rows("face")
@@ -369,15 +369,13 @@ class JointObservations(_Grouped):
             beam=np.isin(self.beam_placement, kept),
             view=np.isin(self.view_placement, kept),
         )
-        return replace(
+        numbered = replace(
             out,
-            placements=self.placements[kept],
-            direction=self.direction[kept],
-            middle=self.middle[kept],
             face_placement=np.searchsorted(kept, out.face_placement),
             beam_placement=np.searchsorted(kept, out.beam_placement),
             view_placement=np.searchsorted(kept, out.view_placement),
         )
+        return numbered.keep(placement=kept)
 
     def stretched(self, share: float):
         """The observations with bearings stretched by a share about the middle one, pi / 2."""
