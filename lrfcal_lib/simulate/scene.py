@@ -20,7 +20,7 @@ import pydantic
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 from pydantic import Field, NonNegativeFloat, PositiveInt
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, project, undistort
@@ -338,18 +338,15 @@ class Imager:
         corners = sliding_window_view(np.dstack([color, thing]), (2, 2), axis=(0, 1))
         # another thing is a change of one at least
         changes = np.ptp(corners, axis=(3, 4)).max(axis=2) > FLAT
-        block, within = np.divmod(np.indices(self.model.size[::-1]), BLOCK)
-        middle = (within[..., None] + 0.5) / BLOCK
-        out = _between(color, *block, *middle)
-        mixed = np.argwhere(changes[tuple(block)])
-        cells = np.array(list(np.ndindex(n, n)))
+        pixels = np.indices(self.model.size[::-1])
+        out = _between(color, (pixels + 0.5) / BLOCK)
+        mixed = np.argwhere(changes[tuple(pixels // BLOCK)])
+        cells = np.indices((n, n)).reshape(2, -1, 1)
         for part in np.array_split(mixed, 1 + len(mixed) * n * n // BATCH):
-            row, column = np.hsplit(part, 2)
-            places = (cells + rng.random((len(part), n * n, 2))) / n
-            down, across = np.dsplit(places, 2)
-            rays = _between(self.rays, row, column, down, across)
+            within = (cells + rng.random((len(part), n * n, 2)).T) / n
+            rays = _between(self.rays, part.T[:, None] + within)
             color, _ = self._trace(world, T_camera_platform, rays)
-            out[tuple(part.T)] = color.mean(axis=1)
+            out[tuple(part.T)] = color.mean(axis=0)
         return out
 
     def _trace(self, world, T_camera_platform, rays):
@@ -360,8 +357,7 @@ class Imager:
         return world.radiance(hits), hits.thing
 
 
-def _between(grid, row, column, down, across):
-    """What a grid holds at shares of the way from points of it to the next rows and columns."""
-    top = grid[row, column] * (1 - across) + grid[row, column + 1] * across
-    low = grid[row + 1, column] * (1 - across) + grid[row + 1, column + 1] * across
-    return top * (1 - down) + low * down
+def _between(grid, places):
+    """What a grid (rows, columns, k) holds at places (2, ...) between its points."""
+    layers = [map_coordinates(layer, places, order=1) for layer in np.moveaxis(grid, -1, 0)]
+    return np.stack(layers, axis=-1)
