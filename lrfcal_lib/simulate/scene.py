@@ -110,8 +110,8 @@ class World:
         whole = np.linalg.norm(normals, axis=1) > 1e-12
         self.normals = unit_vector(normals[whole])
         self.offsets = np.vecdot(self.normals, first[whole])
-        number = np.arange(len(meshes))
-        self.thing_of = np.repeat(number, [len(mesh) for mesh in meshes])[whole]
+        sizes = [len(mesh) for mesh in meshes]
+        self.thing_of = np.repeat(np.arange(len(sizes)), sizes)[whole]
         vertices = corners[whole].reshape(-1, 3).astype(np.float32)
         faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         self._scene = o3d.t.geometry.RaycastingScene()
@@ -234,9 +234,8 @@ def furnished_room(*more: Thing) -> World:
 def board_on_stand(board, T_platform_board, ring):
     """The board, a sheet of no thickness whose edges are its outline, and a tripod behind it."""
     centre = np.mean(board.corners, axis=0)
-    middle = T_platform_board.apply([*centre, -0.004])
-    behind = T_platform_board.apply([*centre, -0.07])
-    away = T_platform_board.rotation.apply([0.0, 0.0, -1.0]) * [1, 1, 0]
+    middle, behind = T_platform_board.apply([[*centre, -0.004], [*centre, -0.07]])
+    away = (behind - middle) * [1, 1, 0]
     # a tilted board stays clear of it
     head = behind + 0.3 * unit_vector(away) + [0.0, 0.0, -0.02]
     knee = [*head[:2], min(head[2] - 0.3, FLOOR + 0.75)]

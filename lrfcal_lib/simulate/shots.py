@@ -223,8 +223,7 @@ def board_shots(setup, rng, T_camera_lrf):
         "are not in the image": ahead,
     }
 
-    shown = np.where(ahead[:, None, None], true, true[ahead.argmax()])
-    boards, covariance, pixels = seen_poses(setup, shown, rng, 1.0)
+    boards, covariance, pixels = seen_poses(setup, true, rng, 1.0)
     noisy = ranges[:, None] + setup.range_errors(rng, hit.shape)
     homography = (
         setup.model.matrix @ true[..., [0, 1, 3]]
