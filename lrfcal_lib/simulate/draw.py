@@ -247,9 +247,9 @@ def _scan_lines(bench, T_lrf_board, pitch, bearings, rng, noise):
     beam_range = r[row, b]
     step = np.where(along[row, b], bench.step, bench.pitch_step)
     line, beam = np.nonzero(hit)
-    errors = noise * bench.sigma_range * rng.standard_normal(len(line))
+    faces = r[line, beam] + bench.range_offset
     return {
-        "face_range": r[line, beam] + bench.range_offset + errors,
+        "face_range": rng.normal(faces, noise * bench.sigma_range),
         "face_bearing": bearings[beam],
         "face_pitch": pitch[line],
         "face_sigma": np.full(len(line), bench.sigma_range),
@@ -272,8 +272,7 @@ def _bias_of_sides(bench, rng):
     """How far outside each edge (E,) of a placement a spot still reads the board, spot radii."""
     bias = np.full(len(bench.board.edges), float(bench.bias))
     if bench.spread:
-        own = logit(disc_share(bias)) + bench.spread * rng.standard_normal(len(bias))
-        bias, _ = disc_edge(own)
+        bias, _ = disc_edge(rng.normal(logit(disc_share(bias)), bench.spread))
     return bias
 
 
@@ -281,7 +280,7 @@ def _views(bench, pose, at, rng, noise):
     """Poses of the board in the cameras at recorded pitch angles, with errors."""
     pitch = at * (1 + bench.stretch)  # of the head
     if bench.sigma_stop:  # one error for all cameras
-        pitch = pitch + noise * bench.sigma_stop * rng.standard_normal(len(at))
+        pitch = rng.normal(pitch, noise * bench.sigma_stop)
     T_source_platform = _from_platform(bench, bench.mount, pitch)
     cameras = bench.cameras.values()
     poses = np.concatenate(
@@ -314,10 +313,9 @@ def seen_poses(devices, true, rng, noise):
     corners = CORNERS if pattern is None else pattern.points()
     turned, points = rotate_and_move(true, corners)
     by_point = project_jacobians(points, devices.model)[0]
-    rows = (len(true), 2 * len(corners), 3)
-    J = gradient_by_pose(turned.repeat(2, axis=1), by_point.reshape(rows))
+    J = gradient_by_pose(turned[:, :, None], by_point).reshape(len(true), -1, 6)
     inverse = np.linalg.inv(J.mT @ J)
-    errors_px = noise * devices.sigma_px * rng.standard_normal(rows[:2])
+    errors_px = noise * devices.sigma_px * rng.standard_normal(J.shape[:2])
     pixels = pinhole(points, devices.model) + errors_px.reshape(len(true), -1, 2)
     poses = move_pose(true, np.matvec(inverse @ J.mT, errors_px))
     return poses, inverse * devices.sigma_px**2, pixels

@@ -97,7 +97,7 @@ class Platform:
             f"platform: pitch {first:.2f} to {last:.2f} deg is asked for, it turns {low:.2f} to "
             f"{high:.2f} deg",
         )
-        motor = commanded + self.noise * rng.standard_normal(commanded.shape)
+        motor = rng.normal(commanded, self.noise)
         head = (1 + self.stretch) * motor - direction * self.backlash / 2
         return head, self.encoded(motor)
 

@@ -78,11 +78,11 @@ class Scenario(Devices):
         first, last = self.field_of_view
         return first + self.step * np.arange(int((last - first) / self.step + 1.5))
 
-    def range_errors(self, rng, shape):
-        """Errors of ranges, metres."""
+    def noisy(self, rng, ranges):
+        """Ranges with errors, metres."""
         if self.uniform:
-            return self.sigma_range * np.sqrt(3) * rng.uniform(-1, 1, shape)
-        return self.sigma_range * rng.standard_normal(shape)
+            return ranges + self.sigma_range * np.sqrt(3) * rng.uniform(-1, 1, ranges.shape)
+        return rng.normal(ranges, self.sigma_range)
 
     def rigs(self, rng, trials):
         """True poses ``T_camera_lrf``, one a trial."""
@@ -224,7 +224,7 @@ def board_shots(setup, rng, T_camera_lrf):
     }
 
     boards, covariance, pixels = seen_poses(setup, true, rng, 1.0)
-    noisy = ranges[:, None] + setup.range_errors(rng, hit.shape)
+    noisy = setup.noisy(rng, np.where(hit, ranges[:, None], np.nan))
     homography = (
         setup.model.matrix @ true[..., [0, 1, 3]]
     )  # from the board's plane to pixels
@@ -232,7 +232,7 @@ def board_shots(setup, rng, T_camera_lrf):
     lines = unit_lines(board.lines()[edges] @ np.linalg.inv(homography))
     lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
     return conditions, {
-        "ranges": np.where(hit, noisy, np.nan),
+        "ranges": noisy,
         "lines": lines,
         "edges": edges,
         "boards": boards,
