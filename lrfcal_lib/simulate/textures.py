@@ -91,11 +91,10 @@ def printed_page(points, width, height):
     ink = LATTICE[row & 63, word & 63, 3] > 0.22
     ink &= np.mod(lines, 1.0) < 0.5
     ink &= between(x, 0.1, 0.9) & between(y, 0.18, 0.93)
-    ink |= (np.abs(y - 0.1) < 0.025) & between(x, 0.2, 0.8)
-    grey = np.where(ink, 0.12, 0.86)
+    ink |= between(x, 0.2, 0.8) & between(y, 0.075, 0.125)
     picture = between(x, 0.52, 0.88) & between(y, 0.55, 0.8)
-    grey = np.where(picture, 0.25 + 0.5 * value_noise(points, 0.02), grey)
-    return _grey(grey)
+    shades = 0.25 + 0.5 * value_noise(points, 0.02)
+    return _grey(np.select([picture, ink], [shades, 0.12], 0.86))
 
 
 def _grey(levels):
@@ -118,11 +117,11 @@ def poster(points, width, height, colors):
     from_sun = np.hypot(across - 0.2 * width, up - 0.2 * height)
     far_hills = 0.45 + 0.12 * np.sin(7 * x + 1)
     near_hills = 0.25 + 0.08 * np.sin(11 * x)
-    margin = (np.abs(x - 0.5) > 0.47) | (np.abs(y - 0.5) > 0.48)
+    inside = between(x, 0.03, 0.97) & between(y, 0.02, 0.98)
     out[from_sun < 0.11 * width] = sun
     out[y < far_hills] = far
     out[y < near_hills] = near
-    out[margin] = 0.85
+    out[~inside] = 0.85
     return out
 
 
