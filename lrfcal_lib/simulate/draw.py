@@ -122,7 +122,7 @@ def bench(
 def upright_camera(rng, side, *shape):
     """Poses ``T_camera_lrf`` of cameras beside the LRF, left (-1) or right, mounted wrongly."""
     rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (*shape, 3))) * AHEAD
-    centre = np.array([0.12 * side, 0.03, 0.12]) + rng.normal(0, 0.01, (*shape, 3))
+    centre = rng.normal([0.12 * side, 0.03, 0.12], 0.01, (*shape, 3))
     return carry(rotation, centre)
 
 

@@ -437,7 +437,7 @@ def held_close(
         # towards the middle of the image first, then away from the camera
         for tried in np.arange(2 * MOST_TRIES) / MOST_TRIES:
             inwards = (m.size / 2 - pixel) * min(tried, 1.0)
-            shown = pixel + inwards + rng.normal(0, 15, 2)
+            shown = rng.normal(pixel + inwards, 15)
             z = rng.uniform(*NEAR) * max(tried, 1.0)
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])
             turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
