@@ -57,7 +57,7 @@ def _scanned(setup, rng, T_lrf_target):
     away = np.matvec(on_plate, plates)
     hit = (ranges > 0) & (away > 0) & (away < SIZE) & (np.abs(on_plate @ EDGE) < SIZE)
     enough = (hit.sum(axis=-1) >= FEWEST_POINTS).all(axis=0)
-    noisy = ranges + setup.range_errors(rng, ranges.shape)
+    noisy = setup.noisy(rng, ranges)
     meeting = np.cross(*_fitted(noisy[..., None] * rays[:, :2], hit))
     return meeting / meeting[:, 2:] * [1.0, 1.0, 0.0], enough
 
@@ -86,6 +86,6 @@ def _image_lines(setup, rng, T_camera_target):
     long = np.linalg.norm(np.diff(ends, axis=2), axis=-1) > LEAST_LENGTH
     whole = (inside.any(axis=-1, keepdims=True) & long).all(axis=(1, 2))
 
-    noisy = ends[:, 0] + setup.sigma_px * rng.standard_normal(ends[:, 0].shape)
+    noisy = rng.normal(ends[:, 0], setup.sigma_px)
     both = np.insert(noisy, 2, 1.0, axis=-1).swapaxes(0, 1)
     return unit_lines(np.cross(*both)), whole

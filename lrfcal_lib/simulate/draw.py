@@ -18,12 +18,13 @@ from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import (
     AHEAD,
+    apply_pose,
     carry,
     gradient_by_pose,
     move_pose,
     polar_to_points,
+    pose_array,
     rotate_and_move,
-    tilt,
 )
 from lrfcal_lib.model.kinematics import camera_at
 
@@ -56,6 +57,30 @@ class Devices:
     def radius(self, ranges):
         """Of the spot, metres."""
         return (self.spot[0] + self.spot[1] * ranges) / 2
+
+    def least_softness(self, ranges):
+        """Standard deviation, in spot radii."""
+        return self.floor * self.step * ranges / self.radius(ranges)
+
+    def beside(self, pose, rays):
+        """How far rays (LRF frame, (..., B, 3)) pass outside the lines of the edges of boards at
+        poses ``T_lrf_board`` (..., 3, 4): spot radii (..., B, E).
+
+        And the ranges (..., B) to the planes of the boards.
+        """
+        R = pose[..., :3]
+        rays = rays @ R
+        origin = -pose[..., None, :, 3] @ R
+        ranges = -origin[..., 2] / rays[..., 2]
+        at = origin + ranges[..., None] * rays
+        lines = self.board.lines()
+        normals = lines[:, :2].T
+        inside = at[..., :2] @ normals + lines[:, 2]
+        # ray along the edge's normal; its part along z is the other cosine
+        across = rays[..., :2] @ normals
+        z = rays[..., 2:]
+        spot = self.radius(np.abs(ranges))[..., None]
+        return inside * np.abs(z) / np.hypot(across, z) / spot, ranges
 
 
 @dataclass(frozen=True)
@@ -97,7 +122,7 @@ def bench(
 def upright_camera(rng, side, *shape):
     """Poses ``T_camera_lrf`` of cameras beside the LRF, left (-1) or right, mounted wrongly."""
     rotation = Rotation.from_rotvec(rng.normal(0, 0.03, (*shape, 3))) * AHEAD
-    centre = np.array([0.12 * side, 0.03, 0.12]) + rng.normal(0, 0.01, (*shape, 3))
+    centre = rng.normal([0.12 * side, 0.03, 0.12], 0.01, (*shape, 3))
     return carry(rotation, centre)
 
 
@@ -113,19 +138,13 @@ def board_poses(
     distances : tuple of float
         Least and largest, metres.
     """
-    limits = [
-        (0.0, 2 * np.pi),  # turn in the plane, radians
-        (-0.6, 0.6),  # lean about x and y, radians
-        (-0.6, 0.6),
-        (-0.35, 0.35),  # to the right and up, of the distance
-        (-0.1, 0.1),
-        distances,
-    ]
-    low, high = np.transpose(limits)
-    drawn = rng.uniform(low, high, (count, len(limits)))
-    right, up, away = drawn[:, 3:].T
+    least, most = distances
+    # turn in the plane, radians; lean about x and y, radians; to the right and up, of the distance
+    low = [0.0, -0.6, -0.6, -0.35, -0.1, least]
+    high = [2 * np.pi, 0.6, 0.6, 0.35, 0.1, most]
+    spin, *lean, right, up, away = rng.uniform(low, high, (count, 6)).T
     centre = np.column_stack([right * away, away, up * away])
-    return list(posed(drawn[:, 0], drawn[:, 1:3], centre, [0.105, 0.127, 0.0]))
+    return list(posed(spin, np.transpose(lean), centre, [0.105, 0.127, 0.0]))
 
 
 def observe(
@@ -160,8 +179,8 @@ def observe(
     """
     parts = []
     for number, pose in enumerate(poses):
-        pitch, bearings = _grid(bench, pose, span)
-        drawn = _scan_lines(bench, pose, pitch, bearings, rng, noise)
+        pitch, T_lrf_board, bearings = _grid(bench, pose, span)
+        drawn = _scan_lines(bench, T_lrf_board, pitch, bearings, rng, noise)
         between = np.linspace(pitch[0], pitch[-1], images + 2)[1:-1]
         drawn |= _views(bench, pose, between, rng, noise)
         for kind in ("face", "beam", "view"):
@@ -186,7 +205,8 @@ def end_to_end(parts):
 
 def _grid(bench, pose, span):
     """Recorded pitch of the scan lines over a board, and bearings of the beams about it."""
-    p = pose.apply(bench.board.points())
+    points = bench.board.points()
+    p = pose.apply(points)
     up = np.arctan2(p[:, 2], p[:, 1])
     _, ahead, above = p.mean(axis=0)
     middle = np.arctan2(above, ahead)
@@ -194,31 +214,24 @@ def _grid(bench, pose, span):
         span = 2 * (np.abs(up - middle).max() + 6 * bench.pitch_step)
     steps = int(span / 2 / bench.pitch_step)
     pitch = middle + bench.pitch_step * np.arange(-steps, steps + 1)
-    p_head = tilt(p[:, None], -pitch * (1 + bench.stretch)).reshape(-1, 3)
-    p_lrf = bench.T_head_lrf.inv().apply(p_head)
-    bearing = np.arctan2(p_lrf[:, 1], p_lrf[:, 0])
+    T_lrf_platform = _from_platform(bench, "head", pitch * (1 + bench.stretch))
+    T_lrf_board = pose_array(T_lrf_platform * pose)
+    p_lrf = apply_pose(T_lrf_board, points)
+    bearing = np.arctan2(p_lrf[..., 1], p_lrf[..., 0])
     first = round(bearing.min() / bench.step) - MARGIN
     last = round(bearing.max() / bench.step) + MARGIN
-    return pitch, bench.step * np.arange(first, last + 1)
+    return pitch, T_lrf_board, bench.step * np.arange(first, last + 1)
 
 
-def _scan_lines(bench, pose, pitch, bearings, rng, noise):
+def _scan_lines(bench, T_lrf_board, pitch, bearings, rng, noise):
     """Readings of the face, and the beams about where readings change to the background."""
-    true = pitch[:, None] * (1 + bench.stretch)
-    R = pose.rotation.as_matrix()
-    head = bench.T_head_lrf
-    p_head = head.rotation.apply(polar_to_points(1.0, bearings))
-    rays = tilt(p_head, true) @ R
-    origin = (tilt(head.translation, true) - pose.translation) @ R
-    distances, r = beside(bench.board, origin, rays)
-    radius = bench.radius(r)
+    radii, r = bench.beside(T_lrf_board, polar_to_points(1.0, bearings))
     sensible = (r > 0.2) & (r < 30)
-    u = distances.max(axis=-1)
-    edge = distances.argmax(axis=-1)
-    soft = np.hypot(bench.softness * radius, bench.floor * bench.step * r)
+    edge = radii.argmax(axis=-1)
+    soft = np.hypot(bench.softness, bench.least_softness(r))
     jitter = noise * soft * rng.standard_normal(r.shape)
     bias = _bias_of_sides(bench, rng)[edge]
-    hit = (u + jitter < bias * radius) & sensible
+    hit = (radii.max(axis=-1) + jitter < bias) & sensible
     # near to an edge across the scan lines, and along them
     across, along = (
         maximum_filter1d(
@@ -229,14 +242,14 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
         )
         for axis in (0, 1)
     )
-    second = np.sort(distances, axis=-1)[..., -2]
-    alone = second <= -2 * radius  # elsewhere two edges cut the spot
+    alone = np.sort(radii, axis=-1)[..., -2] <= -2  # elsewhere two edges cut the spot
     row, b = np.nonzero((across | along) & alone & sensible)
+    beam_range = r[row, b]
     step = np.where(along[row, b], bench.step, bench.pitch_step)
     line, beam = np.nonzero(hit)
-    errors = noise * bench.sigma_range * rng.standard_normal(len(line))
+    faces = r[line, beam] + bench.range_offset
     return {
-        "face_range": r[line, beam] + bench.range_offset + errors,
+        "face_range": rng.normal(faces, noise * bench.sigma_range),
         "face_bearing": bearings[beam],
         "face_pitch": pitch[line],
         "face_sigma": np.full(len(line), bench.sigma_range),
@@ -244,17 +257,22 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
         "beam_pitch": pitch[row],
         "beam_hit": hit[row, b],
         "beam_edge": edge[row, b],
-        "beam_radius": radius[row, b],
-        "beam_step": step * r[row, b],
+        "beam_radius": bench.radius(beam_range),
+        "beam_step": step * beam_range,
     }
+
+
+def _from_platform(bench, mount, pitch):
+    """``T_source_platform`` of what is fixed to the head (the LRF) or to the platform."""
+    still = RigidTransform.identity(len(pitch))
+    return camera_at(still, mount, bench.T_head_lrf, pitch)
 
 
 def _bias_of_sides(bench, rng):
     """How far outside each edge (E,) of a placement a spot still reads the board, spot radii."""
     bias = np.full(len(bench.board.edges), float(bench.bias))
     if bench.spread:
-        own = logit(disc_share(bias)) + bench.spread * rng.standard_normal(len(bias))
-        bias, _ = disc_edge(own)
+        bias, _ = disc_edge(rng.normal(logit(disc_share(bias)), bench.spread))
     return bias
 
 
@@ -262,12 +280,12 @@ def _views(bench, pose, at, rng, noise):
     """Poses of the board in the cameras at recorded pitch angles, with errors."""
     pitch = at * (1 + bench.stretch)  # of the head
     if bench.sigma_stop:  # one error for all cameras
-        pitch = pitch + noise * bench.sigma_stop * rng.standard_normal(len(at))
-    still = RigidTransform.identity(len(at))
-    T_source_platform = camera_at(still, bench.mount, bench.T_head_lrf, pitch)
+        pitch = rng.normal(pitch, noise * bench.sigma_stop)
+    T_source_platform = _from_platform(bench, bench.mount, pitch)
     cameras = bench.cameras.values()
-    true = [(camera * T_source_platform * pose).as_matrix() for camera in cameras]
-    poses = np.concatenate(true)
+    poses = np.concatenate(
+        [(camera * T_source_platform * pose).as_matrix() for camera in cameras]
+    )
     poses[:, :3], covariance, _ = seen_poses(bench, poses[:, :3], rng, noise)
     return {
         "view_camera": np.repeat(np.arange(len(cameras)), len(at)),
@@ -281,26 +299,10 @@ def posed(spin, lean, centre, middle):
     """Poses of boards with their middle (board frame) at a centre (n, 3), which face the LRF but
     for a lean (n, 2) about x and y, and are turned in their plane by a spin (n,).
     """
-    leant = np.pad(lean, ((0, 0), (0, 1)))
+    leant = np.column_stack([lean, 0 * spin])
     turned = np.outer(spin, [0.0, 0.0, 1.0])
     facing = AHEAD * Rotation.from_rotvec(leant) * Rotation.from_rotvec(turned)
     return carry(facing, middle, centre)
-
-
-def beside(board, origin, rays):
-    """Distances between rays (board frame) and the lines of edges (..., E), positive outside.
-
-    And the ranges to the plane of the board.
-    """
-    ranges = -origin[..., 2] / rays[..., 2]
-    at = origin + ranges[..., None] * rays
-    lines = board.lines()
-    normals = lines[:, :2].T
-    inside = at[..., :2] @ normals + lines[:, 2]
-    # ray along the edge's normal; its part along z is the other cosine
-    across = rays[..., :2] @ normals
-    z = rays[..., 2:]
-    return inside * np.abs(z) / np.hypot(across, z), ranges
 
 
 def seen_poses(devices, true, rng, noise):
@@ -311,10 +313,9 @@ def seen_poses(devices, true, rng, noise):
     corners = CORNERS if pattern is None else pattern.points()
     turned, points = rotate_and_move(true, corners)
     by_point = project_jacobians(points, devices.model)[0]
-    rows = (len(true), 2 * len(corners), 3)
-    J = gradient_by_pose(turned.repeat(2, axis=1), by_point.reshape(rows))
+    J = gradient_by_pose(turned[:, :, None], by_point).reshape(len(true), -1, 6)
     inverse = np.linalg.inv(J.mT @ J)
-    errors_px = noise * devices.sigma_px * rng.standard_normal(rows[:2])
+    errors_px = noise * devices.sigma_px * rng.standard_normal(J.shape[:2])
     pixels = pinhole(points, devices.model) + errors_px.reshape(len(true), -1, 2)
     poses = move_pose(true, np.matvec(inverse @ J.mT, errors_px))
     return poses, inverse * devices.sigma_px**2, pixels

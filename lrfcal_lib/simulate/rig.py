@@ -97,7 +97,7 @@ class Platform:
             f"platform: pitch {first:.2f} to {last:.2f} deg is asked for, it turns {low:.2f} to "
             f"{high:.2f} deg",
         )
-        motor = commanded + self.noise * rng.standard_normal(commanded.shape)
+        motor = rng.normal(commanded, self.noise)
         head = (1 + self.stretch) * motor - direction * self.backlash / 2
         return head, self.encoded(motor)
 
@@ -248,9 +248,9 @@ def _camera(name, row, width, exposure):
     off = Rotation.from_rotvec(row["guess"]["turn"], degrees=True)
     shift = mounting.translation + row["guess"]["shift"]
     guess = RigidTransform.from_components(shift, off * mounting.rotation)
-    width, height = (round(v * scale) for v in row["size"])
+    size = [round(v * scale) for v in row["size"]]
     pinhole = [v * scale for v in row["pinhole"]]
-    model = CameraModel(width, height, *pinhole, np.array(row["distortion"]))
+    model = CameraModel(*size, *pinhole, np.array(row["distortion"]))
     return RigCamera(name, model, mounting, guess, Exposure(**exposure | row["exposure"]))
 
 
@@ -303,11 +303,9 @@ def placements_of(setup: Setup) -> list[Placement]:
         rng = random(setup, PLACES)
         out = pairs(setup.rig, setup.pairs, setup.distances, rng, setup.margin)
     if setup.room_sweep:
-        first, last, _ = setup.room_sweep
-        for T_room_platform in setup.stations or (None,):
-            number = len(out) + 1
-            sweep = (first, last)
-            out.append(Placement(number, None, sweep, setup.room_images, T_room_platform))
+        sweep = setup.room_sweep[:2]
+        for station in setup.stations or (None,):
+            out.append(Placement(len(out) + 1, None, sweep, setup.room_images, station))
     return out
 
 
@@ -344,53 +342,41 @@ def pairs(
         f"{count} pairs at {distances} m: at least one pair, at 0.3 m or more, is needed",
     )
     out = []
-    shuffled = rng.permutation(np.linspace(*distances, count))
-    for i, distance in enumerate(shuffled):
-        turn = -135.0 + 90.0 * (
-            i % 4
-        )  # which way the right angle points: up, left, down, right
+    for distance in rng.permutation(np.linspace(*distances, count)):
         for _ in range(MOST_TRIES):
-            poses = _pair(rig, distance, turn, rng)
-            spans = [_spans(rig, pose, margin) for pose in poses]
-            if all(spans):
+            both = _pair(rig, len(out) + 1, distance, rng, margin)
+            if all(both):
                 break
         else:
             raise ValueError(
                 f"no place at {distance:.2f} m where the LRF and all cameras see board "
                 f"'{rig.board.name}'"
             )
-        upward, downward = zip(poses, spans, strict=True)
-        out.append(_placement(2 * i + 1, *upward, [-1.0, 0.0, 1.0], 1))
-        out.append(_placement(2 * i + 2, *downward, [0.0], -1))
+        out += both
     return out
 
 
-def _placement(number, pose, spans, image_shares, way):
-    """A Placement swept upwards (1) or downwards (-1), with images at shares of the pitch."""
-    sweep, seen = spans
-    half = min(np.ptp(seen) * 0.4, np.radians(9.0))
-    angles = np.mean(seen) + half * np.array(image_shares)
-    angles = np.radians(np.round(np.degrees(angles), 2))
-    return Placement(number, pose, sweep[::way], tuple(angles[::way]))
-
-
-def _pair(rig, distance, turn, rng):
-    """Two poses about one middle; boards face the rig up to 35 deg."""
+def _pair(rig, first, distance, rng, margin):
+    """Two placements about one middle, by the number of the first; boards face the rig up to 35
+    deg.
+    """
     azimuth = np.radians(rng.uniform(-24, 24))
     height = rng.uniform(-0.22, 0.28) * distance / 1.6
     middle = np.array([distance * np.sin(azimuth), distance * np.cos(azimuth), height])
+    angles = rng.uniform([-35, -28, -12], [35, 28, 12], (2, 3))
+    # which way the right angle points: up, left, down, right; then a right angle on
+    angles[:, 2] += 90 * (first // 2 % 4) + np.array([-135.0, -45.0])
+    leant = Rotation.from_euler("YXZ", angles, degrees=True)
+    turned = Rotation.from_euler("z", -azimuth) * AHEAD * leant
     centre = rig.board.points().mean(axis=0)
-    out = []
-    for more in (0.0, 90.0):
-        angles = rng.uniform([-35, -28, -12], [35, 28, 12]) + [0, 0, turn + more]
-        leant = Rotation.from_euler("YXZ", angles, degrees=True)
-        turned = Rotation.from_euler("z", -azimuth) * AHEAD * leant
-        out.append(carry(turned, centre, middle))
-    return out
+    return [
+        _placement(rig, number, carry(rotation, centre, middle), margin)
+        for number, rotation in enumerate(turned, first)
+    ]
 
 
-def _spans(rig, pose, margin):
-    """First and last pitch of a sweep, and at which all cameras see the whole board.
+def _placement(rig, number, pose, margin):
+    """A Placement swept over the whole board, with images where all cameras see it.
 
     None where that is too little.
     """
@@ -406,7 +392,14 @@ def _spans(rig, pose, margin):
     half_field = np.radians(rig.beam.field_of_view / 2)
     if np.abs(bearing - np.pi / 2).max() >= half_field - 2 * margin:
         return None
-    return (pitch.min() - margin, pitch.max() + margin), seen[[0, -1]]
+    sweep = (pitch.min() - margin, pitch.max() + margin)
+    shares = [-1.0, 0.0, 1.0]
+    if number % 2 == 0:
+        sweep = sweep[::-1]
+        shares = [0.0]
+    half = min(np.ptp(seen) * 0.4, np.radians(9.0))
+    angles = np.degrees(np.mean(seen[[0, -1]]) + half * np.array(shares))
+    return Placement(number, pose, sweep, tuple(np.radians(np.round(angles, 2))))
 
 
 def held_close(
@@ -440,11 +433,11 @@ def held_close(
     out = []
     for i in range(count):
         row, column = divmod(i, columns)
-        pixel = np.array([(column + 0.5) / columns, (row + 0.5) / rows]) * m.size
+        pixel = (np.array([column, row]) + 0.5) / [columns, rows] * m.size
         # towards the middle of the image first, then away from the camera
         for tried in np.arange(2 * MOST_TRIES) / MOST_TRIES:
             inwards = (m.size / 2 - pixel) * min(tried, 1.0)
-            shown = pixel + inwards + rng.normal(0, 15, 2)
+            shown = rng.normal(pixel + inwards, 15)
             z = rng.uniform(*NEAR) * max(tried, 1.0)
             angles = rng.uniform([-42, -42, -180], [42, 42, 180])
             turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)

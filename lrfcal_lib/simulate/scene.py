@@ -20,7 +20,7 @@ import pydantic
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 from pydantic import Field, NonNegativeFloat, PositiveInt
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, project, undistort
@@ -110,8 +110,8 @@ class World:
         whole = np.linalg.norm(normals, axis=1) > 1e-12
         self.normals = unit_vector(normals[whole])
         self.offsets = np.vecdot(self.normals, first[whole])
-        number = np.arange(len(meshes))
-        self.thing_of = np.repeat(number, [len(mesh) for mesh in meshes])[whole]
+        sizes = [len(mesh) for mesh in meshes]
+        self.thing_of = np.repeat(np.arange(len(sizes)), sizes)[whole]
         vertices = corners[whole].reshape(-1, 3).astype(np.float32)
         faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         self._scene = o3d.t.geometry.RaycastingScene()
@@ -234,9 +234,8 @@ def furnished_room(*more: Thing) -> World:
 def board_on_stand(board, T_platform_board, ring):
     """The board, a sheet of no thickness whose edges are its outline, and a tripod behind it."""
     centre = np.mean(board.corners, axis=0)
-    middle = T_platform_board.apply([*centre, -0.004])
-    behind = T_platform_board.apply([*centre, -0.07])
-    away = T_platform_board.rotation.apply([0.0, 0.0, -1.0]) * [1, 1, 0]
+    middle, behind = T_platform_board.apply([[*centre, -0.004], [*centre, -0.07]])
+    away = (behind - middle) * [1, 1, 0]
     # a tilted board stays clear of it
     head = behind + 0.3 * unit_vector(away) + [0.0, 0.0, -0.02]
     knee = [*head[:2], min(head[2] - 0.3, FLOOR + 0.75)]
@@ -338,18 +337,15 @@ class Imager:
         corners = sliding_window_view(np.dstack([color, thing]), (2, 2), axis=(0, 1))
         # another thing is a change of one at least
         changes = np.ptp(corners, axis=(3, 4)).max(axis=2) > FLAT
-        block, within = np.divmod(np.indices(self.model.size[::-1]), BLOCK)
-        middle = (within[..., None] + 0.5) / BLOCK
-        out = _between(color, *block, *middle)
-        mixed = np.argwhere(changes[tuple(block)])
-        cells = np.array(list(np.ndindex(n, n)))
+        pixels = np.indices(self.model.size[::-1])
+        out = _between(color, (pixels + 0.5) / BLOCK)
+        mixed = np.argwhere(changes[tuple(pixels // BLOCK)])
+        cells = np.indices((n, n)).reshape(2, -1, 1)
         for part in np.array_split(mixed, 1 + len(mixed) * n * n // BATCH):
-            row, column = np.hsplit(part, 2)
-            places = (cells + rng.random((len(part), n * n, 2))) / n
-            down, across = np.dsplit(places, 2)
-            rays = _between(self.rays, row, column, down, across)
+            within = (cells + rng.random((len(part), n * n, 2)).T) / n
+            rays = _between(self.rays, part.T[:, None] + within)
             color, _ = self._trace(world, T_camera_platform, rays)
-            out[tuple(part.T)] = color.mean(axis=1)
+            out[tuple(part.T)] = color.mean(axis=0)
         return out
 
     def _trace(self, world, T_camera_platform, rays):
@@ -360,8 +356,7 @@ class Imager:
         return world.radiance(hits), hits.thing
 
 
-def _between(grid, row, column, down, across):
-    """What a grid holds at shares of the way from points of it to the next rows and columns."""
-    top = grid[row, column] * (1 - across) + grid[row, column + 1] * across
-    low = grid[row + 1, column] * (1 - across) + grid[row + 1, column + 1] * across
-    return top * (1 - down) + low * down
+def _between(grid, places):
+    """What a grid (rows, columns, k) holds at places (2, ...) between its points."""
+    layers = [map_coordinates(layer, places, order=1) for layer in np.moveaxis(grid, -1, 0)]
+    return np.stack(layers, axis=-1)

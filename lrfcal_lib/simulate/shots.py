@@ -19,7 +19,6 @@ from lrfcal_lib.model.geometry import (
 from lrfcal_lib.simulate.corner import corner_shots
 from lrfcal_lib.simulate.draw import (
     Devices,
-    beside,
     end_to_end,
     posed,
     seen_poses,
@@ -79,11 +78,11 @@ class Scenario(Devices):
         first, last = self.field_of_view
         return first + self.step * np.arange(int((last - first) / self.step + 1.5))
 
-    def range_errors(self, rng, shape):
-        """Errors of ranges, metres."""
+    def noisy(self, rng, ranges):
+        """Ranges with errors, metres."""
         if self.uniform:
-            return self.sigma_range * np.sqrt(3) * rng.uniform(-1, 1, shape)
-        return self.sigma_range * rng.standard_normal(shape)
+            return ranges + self.sigma_range * np.sqrt(3) * rng.uniform(-1, 1, ranges.shape)
+        return rng.normal(ranges, self.sigma_range)
 
     def rigs(self, rng, trials):
         """True poses ``T_camera_lrf``, one a trial."""
@@ -103,8 +102,7 @@ class Scenario(Devices):
         T_lrf_world = self._around(rng, count).inv()
         if self.corner:
             return T_lrf_world
-        centred = RigidTransform.from_translation(-middle)
-        return T_lrf_world * RigidTransform.from_rotation(TARGET) * centred
+        return T_lrf_world * carry(TARGET, middle)
 
     def _ahead(self, rng, count, middle):
         """Poses ``T_lrf_board`` of boards that face the LRF but for a lean."""
@@ -196,9 +194,7 @@ def draw_shots(
 
     drawn = end_to_end(parts)
     trial = drawn.pop("trial")
-    order = np.argsort(trial, kind="stable")
-    first = np.searchsorted(trial[order], np.arange(trials))
-    kept = order[first[:, None] + np.arange(placements)]
+    kept = [np.flatnonzero(trial == t)[:placements] for t in range(trials)]
     shots = {name: value[kept] for name, value in drawn.items()}
     return {"T_camera_lrf": pose_array(T_camera_lrf)} | shots
 
@@ -227,9 +223,8 @@ def board_shots(setup, rng, T_camera_lrf):
         "are not in the image": ahead,
     }
 
-    shown = np.where(ahead[:, None, None], true, true[ahead.argmax()])
-    boards, covariance, pixels = seen_poses(setup, shown, rng, 1.0)
-    noisy = ranges[:, None] + setup.range_errors(rng, hit.shape)
+    boards, covariance, pixels = seen_poses(setup, true, rng, 1.0)
+    noisy = setup.noisy(rng, np.where(hit, ranges[:, None], np.nan))
     homography = (
         setup.model.matrix @ true[..., [0, 1, 3]]
     )  # from the board's plane to pixels
@@ -237,7 +232,7 @@ def board_shots(setup, rng, T_camera_lrf):
     lines = unit_lines(board.lines()[edges] @ np.linalg.inv(homography))
     lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
     return conditions, {
-        "ranges": np.where(hit, noisy, np.nan),
+        "ranges": noisy,
         "lines": lines,
         "edges": edges,
         "boards": boards,
@@ -259,10 +254,9 @@ def _crossed_edges(setup, pose, ends):
     bearing = np.where(crossed, np.arctan2(at[..., 1], at[..., 0]), np.nan)
     edges = np.argsort(bearing, axis=1)[:, :2]  # NaN comes last
     at = np.take_along_axis(at, edges[..., None], axis=1)
-    distances, _ = _beside(setup, pose, at)
-    second = np.sort(distances, axis=-1)[..., -2]
-    away = np.linalg.norm(at, axis=-1)
-    least = CLEAR * setup.radius(away) + CLEAR_FLOORS * setup.floor * setup.step * away
+    radii, away = setup.beside(pose, unit_vector(at))
+    second = np.sort(radii, axis=-1)[..., -2]
+    least = CLEAR + CLEAR_FLOORS * setup.least_softness(away)
     return edges, (crossed.sum(axis=1) == 2) & (second < -least).all(axis=1)
 
 
@@ -270,13 +264,11 @@ def _scans(setup, rng, pose, ends):
     """Of the scan lines over boards at poses (n, 3, 4) with corners there: exact ranges (n, B),
     which beams hit (n, S, B), and whether there are enough in every one.
     """
-    distances, ranges = _beside(setup, pose, polar_to_points(1.0, setup.bearings()))
-    spot = setup.radius(np.abs(ranges))
-    radii = distances / spot[..., None]
+    radii, ranges = setup.beside(pose, polar_to_points(1.0, setup.bearings()))
     if setup.spread:
         radii -= setup.spread * rng.standard_normal((len(pose), 1, radii.shape[-1]))
     outside = radii.max(axis=-1)[:, None]
-    soft = np.hypot(setup.softness, setup.floor * setup.step * ranges / spot)[:, None]
+    soft = np.hypot(setup.softness, setup.least_softness(ranges))[:, None]
     flips = rng.standard_normal((len(pose), setup.scans, ranges.shape[1]))
     # rays along the board meet its plane far away, where the least softness means nothing
     farthest = np.linalg.norm(ends, axis=-1).max(axis=-1, keepdims=True)
@@ -285,9 +277,3 @@ def _scans(setup, rng, pose, ends):
     enough = hit.sum(axis=-1) >= setup.fewest_beams
     whole = ~hit[..., [0, -1]].any(axis=-1)
     return ranges, hit, (enough & whole).all(axis=1)
-
-
-def _beside(setup, pose, rays):
-    """:func:`lrfcal_lib.simulate.draw.beside` of boards at poses (n, 3, 4), and rays of the LRF."""
-    R = pose[..., :3]
-    return beside(setup.board, -pose[:, None, :, 3] @ R, rays @ R)

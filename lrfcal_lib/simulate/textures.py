@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import map_coordinates
 
 LINE = 0.0055  # metres, of a printed page
 # random values that textures are made of
@@ -15,17 +16,9 @@ def whole_below(values):
 
 def value_noise(points, cell):
     """Smooth noise (n,) between 0 and 1, from random values on a lattice of cells, metres."""
-    at = points / cell
-    low = whole_below(at)
-    f = at - low
-    f = f * f * (3 - 2 * f)
-    cells = np.stack([low, low + 1]) & 63  # (2, n, 3)
-    shares = np.stack([1 - f, f])
-    axes = np.arange(3)
-    return sum(
-        np.prod(shares[corner, :, axes], axis=0) * LATTICE[tuple(cells[corner, :, axes])]
-        for corner in np.ndindex(2, 2, 2)
-    )
+    low, above = np.divmod(points / cell, 1)
+    soft = above * above * (3 - 2 * above)
+    return map_coordinates(LATTICE, (low + soft).T, order=1, mode="grid-wrap")
 
 
 def plain(
@@ -56,8 +49,7 @@ def plain(
 
 def wood(points, color, cell=(0.5, 0.03, 0.03)):
     """Grain along x."""
-    tone = 0.8 + 0.4 * value_noise(points, cell)
-    return tone[:, None] * color
+    return plain(points, color, 0.4, cell)
 
 
 def planks(points, color):
@@ -85,8 +77,7 @@ def tiles(points, color, joint, size):
     """Square tiles in x and z with joints of 4 mm."""
     at = points[:, [0, 2]] / size
     near = from_whole(at).min(axis=1) * size < 0.002
-    tone = 0.94 + 0.12 * value_noise(points, size)
-    return np.where(near[:, None], joint, tone[:, None] * color)
+    return np.where(near[:, None], joint, plain(points, color, 0.12, size))
 
 
 def printed_page(points, width, height):
@@ -100,11 +91,10 @@ def printed_page(points, width, height):
     ink = LATTICE[row & 63, word & 63, 3] > 0.22
     ink &= np.mod(lines, 1.0) < 0.5
     ink &= between(x, 0.1, 0.9) & between(y, 0.18, 0.93)
-    ink |= (np.abs(y - 0.1) < 0.025) & between(x, 0.2, 0.8)
-    grey = np.where(ink, 0.12, 0.86)
+    ink |= between(x, 0.2, 0.8) & between(y, 0.075, 0.125)
     picture = between(x, 0.52, 0.88) & between(y, 0.55, 0.8)
-    grey = np.where(picture, 0.25 + 0.5 * value_noise(points, 0.02), grey)
-    return _grey(grey)
+    shades = 0.25 + 0.5 * value_noise(points, 0.02)
+    return _grey(np.select([picture, ink], [shades, 0.12], 0.86))
 
 
 def _grey(levels):
@@ -127,11 +117,11 @@ def poster(points, width, height, colors):
     from_sun = np.hypot(across - 0.2 * width, up - 0.2 * height)
     far_hills = 0.45 + 0.12 * np.sin(7 * x + 1)
     near_hills = 0.25 + 0.08 * np.sin(11 * x)
-    margin = (np.abs(x - 0.5) > 0.47) | (np.abs(y - 0.5) > 0.48)
+    inside = between(x, 0.03, 0.97) & between(y, 0.02, 0.98)
     out[from_sun < 0.11 * width] = sun
     out[y < far_hills] = far
     out[y < near_hills] = near
-    out[margin] = 0.85
+    out[~inside] = 0.85
     return out
 
 
