@@ -407,7 +407,7 @@ def test_a_recording_into_a_file_tells_how_far_it_is(run, rig, monkeypatch):
     lines = [line.rstrip() for line in re.split("[\r\n]+", said)]
     assert lines[0].endswith("rig.json: opening the devices")
     begun = lines.index("placement 2 (2 of 3): board, pitch 0.00 to 2.00 deg")
-    stop = r"  stop 2 of 3, \+1\.00 deg, 1 scans, 1 images, \d\d:\d\d left"
+    stop = r"  stop 2 of 3, \+1\.00 deg, 2 scans, 1 images, \d\d:\d\d left"
     assert any(re.fullmatch(stop, line) for line in lines[begun:])
     assert lines.index("  2 of 3 placements left") < begun
     assert lines.index("  1 of 3 placements left") > begun

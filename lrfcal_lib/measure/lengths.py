@@ -28,7 +28,7 @@ from lrfcal_lib.measure.features import (
     shared_covariances,
 )
 from lrfcal_lib.measure.surfaces import planes_of
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
 from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
@@ -330,7 +330,7 @@ def for_page(
         "sweep_sigma": known.sweep_sigma,
         "range_noise": known.range_noise,
         "systematic": SYSTEMATIC,
-        "head": chain_of(rig).head.tolist(),
+        "head": pose_array(chain_of(rig).head).tolist(),
         "alike": ALIKE,
         "reach": REACH,
         "on_it": ON_IT,
