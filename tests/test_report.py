@@ -18,6 +18,7 @@ import nbformat
 import numpy as np
 import pandas as pd
 import pytest
+from jupyter_client import AsyncKernelClient
 from shared import ROOT, campaign, until
 from test_session import CAMERAS, HEAD, LRF, wall
 
@@ -129,6 +130,30 @@ def test_a_failing_notebook_is_told_and_the_rest_delivered(finished):
         and "<span>(3)</span>" in page
         and "$" not in page
     )
+
+
+@pytest.mark.parametrize("failures", [1, 2])
+def test_a_kernel_that_does_not_start_has_a_second_chance(tmp_path, monkeypatch, failures):
+    """Its ports may be taken by another program in between; what fails twice is said of its notebook."""
+    start = AsyncKernelClient.wait_for_ready
+    tried = []
+
+    async def once(self, timeout=None):
+        tried.append(self)
+        if len(tried) <= failures:
+            raise RuntimeError("Kernel died before replying to kernel_info")
+        await start(self, timeout)
+
+    monkeypatch.setattr(AsyncKernelClient, "wait_for_ready", once)
+    path = tmp_path / "00_short.ipynb"
+    cells = [nbformat.v4.new_code_cell("print(6 * 7)")]
+    nbformat.write(nbformat.v4.new_notebook(cells=cells, metadata=KERNEL), path)
+    done, error = report.execute(path, {})
+    assert len(tried) == 2
+    if failures == 1:
+        assert error == "" and done.cells[0].outputs[0].text == "42\n"
+    else:
+        assert "Kernel died" in error
 
 
 def test_index_states_what_was_found_and_needs_no_other_file(finished, session):

@@ -144,10 +144,8 @@ def execute(path, environment):
     )
     _CLIENTS.add(client)
     try:
-        client.execute(
-            env={**os.environ, "MPLBACKEND": "", **environment}
-        )  # that of notebooks
-    except (CellControlSignal, DeadKernelError) as problem:
+        _execute_in(client, {**os.environ, "MPLBACKEND": "", **environment})
+    except (CellControlSignal, RuntimeError) as problem:
         # no colours of a terminal
         error = strip_ansi(str(problem)) or type(problem).__name__
     finally:
@@ -158,6 +156,16 @@ def execute(path, environment):
         for output in cell.get("outputs", []):
             output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
     return notebook, error
+
+
+def _execute_in(client, variables):
+    """Execute with environment variables, among them the backend of notebooks."""
+    try:
+        client.execute(env=variables)
+    except DeadKernelError:
+        raise
+    except RuntimeError:  # it did not start: another program took a port that it had chosen
+        client.execute(env=variables)
 
 
 def store(path, session_path, cache=""):
