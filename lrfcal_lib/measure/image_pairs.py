@@ -40,6 +40,8 @@ BORDER = 20  # pixels
 STILL = 1e-12  # radians or metres, of what is not fitted
 APART = 12.0  # pixels, side of cells: a patch is alone in its own and in those about it
 REACH = 2**1.5 * APART  # pixels, to their farthest corner
+# pixels, where gradients are taken: in the middle, to the right and to the left, below and above
+ABOUT = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 BEFORE = 4.0  # standard deviations of a range by which something else is nearer or farther
 
 
@@ -203,8 +205,7 @@ def _compared(pair, sharp, x):
 
 def _normalised(image, model, uv):
     """Patches (n, s) of mean 0 and standard deviation 1, and their gradients (n, s, 2)."""
-    # in the middle, half a pixel to the right and to the left, below and above
-    places = uv + np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[:, None, None] / 2
+    places = uv + ABOUT[:, None, None]
     values = sample(image, model, places)[..., 0]
     values -= values.mean(axis=-1, keepdims=True)
     middle, right, left, below, above = values
