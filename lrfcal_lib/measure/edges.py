@@ -72,14 +72,13 @@ def _edges_in(cloud, surfaces, views, view):
     points = np.column_stack([uv, p_camera[:, 2], of_point, cloud.image])[near]
     reach = np.linalg.norm(np.ptp(segments, axis=1), axis=1) / 2 + BESIDE_PX[1]
     about = KDTree(points[:, :2]).query_ball_point(segments.mean(axis=1), reach)
-    edges = []
+    bounds = []
     for ends, rows in zip(segments, about, strict=True):
         plane = _surface_at(ends, points[rows], planes, view, pose)
         if plane is not None:
             with suppress(EdgeNotSeen):
-                line = _refined(view, ends, segments)
-                edges.append(_on_plane(plane, line, view, pose))
-    return edges
+                bounds.append((plane, _refined(view, ends, segments)))
+    return _on_planes(bounds, view, pose)
 
 
 def _segments(view):
@@ -155,9 +154,23 @@ def _where_seen(view, pose, plane, pixels):
     return eye + depth[:, None] * rays, depth
 
 
-def _on_plane(plane, line, view, pose):
-    """The edge of a scene that a line of an image shows, on its plane."""
-    rig = plane.rig
+def _on_planes(bounds, view, pose):
+    """The edges of a scene that lines of an image show, each on its plane."""
+    if not bounds:
+        return []
+    rig = bounds[0][0].rig
+    ends = [_where_seen(view, pose, plane, line.ends)[0] for plane, line in bounds]
+    beams = beams_to(ends, rig.T_head_lrf)
+    of_image = beams_moved(rig, beams, view.camera, view.pitch)
+    of_scan = beams_moved(rig, beams)
+    return [
+        _on_plane(plane, line, view, pose, by_image, by_scan)
+        for (plane, line), by_image, by_scan in zip(bounds, of_image, of_scan, strict=True)
+    ]
+
+
+def _on_plane(plane, line, view, pose, of_image, of_scan):
+    """One of them; what moves its ends, in the image and in the scan, is known."""
     ends, depth = _where_seen(view, pose, plane, line.ends)
     way = ends[1] - ends[0]
     direction = unit_vector(way)
@@ -177,9 +190,8 @@ def _on_plane(plane, line, view, pose):
     by_noise = np.dstack([by_plane, by_offset, by_line])
     noise = block_diag(plane.noise, line.covariance)
 
-    beams = beams_to(ends, rig.T_head_lrf)
-    by_sight = sight[:, None] @ beams_moved(rig, beams, view.camera, view.pitch)
-    by_shared = beams_moved(rig, beams) - by_offset[..., None] * by_sight
+    by_sight = sight[:, None] @ of_image
+    by_shared = of_scan - by_offset[..., None] * by_sight
     by_shared[..., -1] = by_height
 
     # from both ends to middle and direction

@@ -13,9 +13,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.geometry import lrf_to_platform, tilt
 
 TILT_AXIS = np.array([1.0, 0.0, 0.0])  # of the head and of the platform
-MIRROR_TURN = (
-    1 / 75.08
-)  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real LMS200
+# s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real LMS200
+MIRROR_TURN = 1 / 75.08
 
 
 @dataclass(frozen=True)
