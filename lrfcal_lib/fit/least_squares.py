@@ -274,7 +274,7 @@ def likeliest(
 
 def _step(hessian, gradient, damping, shared):
     """A damped step, its squared length in standard deviations, and the fall of the cost it
-    promises.
+    promises: of each trial, or of all placements.
     """
     diagonal = np.linalg.diagonal(hessian)
     extra = damping[..., None] * diagonal
@@ -284,15 +284,13 @@ def _step(hessian, gradient, damping, shared):
     if shared:
         reduced, right, by_shared = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
-        whole = by_shared @ np.append(common, 1.0)
-        step = common, whole[:, shared:]
+        step = by_shared @ np.append(common, 1.0)
     else:
-        step = whole = -solve_each(damped, gradient)
-    length = np.vecdot(whole, np.matvec(hessian, whole))
-    promised = -np.vecdot(whole, gradient) - 0.5 * length
-    if shared:
-        return step, np.sum(length), np.sum(promised)
-    return step, length, promised
+        step = -solve_each(damped, gradient)
+    length = np.vecdot(step, np.matvec(hessian, step))
+    promised = -np.vecdot(step, gradient) - 0.5 * length
+    each = _axes(shared)[1:]  # placements
+    return step, np.sum(length, axis=each), np.sum(promised, axis=each)
 
 
 class Minimum(NamedTuple):
@@ -324,7 +322,8 @@ def minimise(
         ``state -> Block`` or list of blocks.
     state : ndarray (leading trial axes) or, with `shared`, any object
     retract : callable
-        ``(state, step) -> state``; with `shared` the step is the pair (common (c,), own (p, l)).
+        ``(state, step) -> state``; with `shared` the step is (p, k), of which the first c are those
+        common to all placements, in every row.
     shared : int
         Number of unknowns common to all entries of the leading axis; 0 for trials.
     robust : bool
@@ -359,9 +358,8 @@ def minimise(
         if accepted.all():
             state = trial
             blocks = tried
-        elif accepted.any():
-            chosen = accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim))
-            state = np.where(chosen, trial, state)
+        elif not shared:  # transposed, trials come last
+            state = np.where(accepted.T, trial.T, state.T).T
         if robust or not accepted.all():
             blocks, roots = problem(state)
         at = linearise(blocks, axes)
@@ -428,7 +426,7 @@ class Question:
         The placement of every residual, or of every few in a row, for `covariance_placements`; one
         by default. With `shared` the leading axis is the placement.
     freedom, n_observations : int, optional
-        By default those of the residuals.
+        By default those of the residuals of a trial.
     chi2_rest : float
         Chi-square that no unknown can change (compressed away).
     required : bool
@@ -542,9 +540,7 @@ def _solution(question, minimum, blocks, weighted, shared):
     chi2 = np.sum(weighted_r**2, axis=_axes(shared)) + question.chi2_rest
     freedom = question.freedom
     if freedom is None:
-        own = J.shape[-1] - shared
-        groups = len(r) if shared else 1
-        freedom = r.size // chi2.size - shared - groups * own
+        freedom = r.shape[-1] - J.shape[-1]
     too_large = chi2 > chdtri(freedom, LARGE_CHI2)  # without any freedom never
     inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
     transform, parameters = question.read(minimum.state)

@@ -139,7 +139,7 @@ def assemble(unknowns, parts, **derivatives):
         "pitch_by_direction": parts[..., 1:2],
         "sweep": parts[..., 2:],
     }
-    J = np.zeros(parts.shape[:-1] + (unknowns.shared + unknowns.own,))
+    J = np.zeros(parts.shape[:-1] + (unknowns.size,))
     for name, derivative in derivatives.items():
         where = unknowns.columns[name]
         J[..., where] = derivative[..., : where.stop - where.start]
@@ -341,7 +341,7 @@ def inverse_left_jacobian(w):
 
 def own_jacobian(unknowns, name):
     """Jacobian (n, k) of unknowns that every placement has (or shares) by themselves."""
-    return np.eye(unknowns.shared + unknowns.own)[unknowns.columns[name]]
+    return np.eye(unknowns.size)[unknowns.columns[name]]
 
 
 def sweep_block(state, data, unknowns):

@@ -309,9 +309,7 @@ def platform_blocks(state, edge, face, sigma_pitch):
 def move_platform(state, step):
     """Retraction of axis, boards, and their skew and gap."""
     head, boards, bends = state
-    common, by_placement = step
-    pose, bend = np.split(by_placement, [6], axis=1)
-    return move_head(head, common), move_pose(boards, pose), bends + bend
+    return move_head(head, step[0, :4]), move_pose(boards, step[:, 4:10]), bends + step[:, 10:]
 
 
 def solve_projected(
