@@ -95,12 +95,11 @@ def tilt_axis():
 
         yield block(np.zeros(4)).jacobian, lambda s: block(s).residuals, 4
     boards = platform.prepare_boards(make(8, count=4, noise=1.0), ROUGH)
-    data = boards.edge, boards.face
     state = head, boards.poses, np.full((4, 2), 0.02)
 
     def blocks(s):
         moved = platform.move_platform(state, np.tile(s, (4, 1)))
-        return platform.platform_blocks(moved, *data, 1e-3)
+        return platform.platform_blocks(moved, boards.points, 1e-3)
 
     for i, block in enumerate(blocks(np.zeros(12))):
         used = (
@@ -108,7 +107,8 @@ def tilt_axis():
             if block.size > 1
             else ...
         )
-        yield block.jacobian[used], lambda s: blocks(s)[i].residuals[used], 12
+        J = np.broadcast_to(block.jacobian, (*block.residuals.shape, 12))
+        yield J[used], lambda s: blocks(s)[i].residuals[used], 12
 
 
 def recorded_pitch():
@@ -173,7 +173,9 @@ def joint_estimate():
             data = gather(obs, Levels(lapse=lapse))
 
             def block(s):
-                return named_blocks(EVERY.move(state, np.tile(s, (3, 1))), data, EVERY)[name]
+                return named_blocks(EVERY.move(state, np.tile(s, (3, 1))), data, EVERY)[
+                    name
+                ]
 
             def costs(s):
                 found = block(s)

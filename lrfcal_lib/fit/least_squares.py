@@ -358,7 +358,7 @@ def minimise(
         if accepted.all():
             state = trial
             blocks = tried
-        elif not shared:  # transposed, trials come last
+        elif accepted.any():  # transposed, trials come last
             state = np.where(accepted.T, trial.T, state.T).T
         if robust or not accepted.all():
             blocks, roots = problem(state)

@@ -12,10 +12,10 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.fit.covariance import pseudo_inverse
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import LENS, CameraModel, project_jacobians
-from lrfcal_lib.model.geometry import gradient_by_pose
+from lrfcal_lib.model.geometry import among, gradient_by_pose
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint_model import JointData, Unknowns
-from lrfcal_lib.solvers.joint_residuals import among_cameras, view_block
+from lrfcal_lib.solvers.joint_residuals import view_block
 
 LEAST_CORNERS = 6  # of a pattern, for the derivative of its pose by the intrinsics
 
@@ -77,7 +77,7 @@ def lens_share(
     block = view_block(found.state, data, unknowns)
     J = block.white_jacobian
     J_own = J[..., c:]
-    by_lens = among_cameras(data.view["lens"], data.view["camera"], len(obs.cameras))
+    by_lens = among(data.view["lens"], data.view["camera"][..., None], len(obs.cameras))
     shift = block.whitened(by_lens.reshape(*J.shape[:2], -1))
     spread = block_diag(*obs.lens_covariance)
     hessian = found.jacobian.mT @ found.jacobian

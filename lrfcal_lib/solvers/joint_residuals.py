@@ -14,6 +14,7 @@ from lrfcal_lib.fit.edge_likelihood import beam_terms, edge_shift, flip_sigma
 from lrfcal_lib.fit.least_squares import Block, Minimum, minimise
 from lrfcal_lib.fit.stops import ViewBlock, same_stop
 from lrfcal_lib.model.geometry import (
+    among,
     cross,
     gradient_by_pose,
     hat,
@@ -301,7 +302,7 @@ def view_block(state, data, unknowns):
         by_pitch * by_parts[..., None, :],
         axis=of_head[..., AXIS_COLUMNS],
         board=_by_pose(left @ R_camera_platform, 0.0, R_camera_platform),
-        cameras=among_cameras(of_camera, view["camera"], unknowns.cameras),
+        cameras=among(of_camera, view["camera"][..., None], unknowns.cameras),
     )
     return ViewBlock.of_groups(
         residuals,
@@ -320,13 +321,6 @@ def _by_pose(turn_by_turn, shift_by_turn, shift_by_shift):
     by_pose[..., 3:, :3] = shift_by_turn
     by_pose[..., 3:, 3:] = shift_by_shift
     return by_pose
-
-
-def among_cameras(by_one, camera, count):
-    """Derivatives (p, v, 6, k) by what is a view's camera's, among those of all, (p, v, 6, k c)."""
-    mine = camera[..., None] == np.arange(count)
-    among_all = by_one[..., None, :] * mine[:, :, None, :, None]
-    return among_all.reshape(*by_one.shape[:-1], -1)
 
 
 def inverse_left_jacobian(w):
