@@ -9,10 +9,10 @@ from joint_draws import MOUNTS, draw, joint_step, misses_of, none
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.calibrate.joint_observations import pose_by_intrinsics
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
-from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 
 CORNERS = np.array([[0.05 * i, 0.05 * j, 0.0] for i in range(5) for j in range(4)])
 MODEL = CameraModel(

@@ -67,9 +67,9 @@ class Block:
         Jacobian that includes the change of the whitener: ``J - dS/2 S^-1 r`` for residuals with
         covariance S. The steps use it where it is given.
     cost : ndarray, shape (..., n), optional
-        Negative log likelihood of each residual where it is not half a square; the residuals are
-        then score over root information, the Jacobian root information times the derivative, the
-        whitener one or zero. No loss applies.
+        Negative log likelihood of each residual where it is not half a square; whitened residuals
+        are then score over root information, the whitened Jacobian root information times the
+        derivative. No loss applies.
     """
 
     residuals: np.ndarray
@@ -117,11 +117,11 @@ class Block:
         return self.whitened(self.jacobian if self.corrected is None else self.corrected)
 
 
-def _roots(block, axes):
+def _roots(block, axes, robust):
     """Roots of Cauchy's weights of residuals, or of groups of them, that are judged together, in
     their usual size: by the median of a trial. As factors of the whitener.
     """
-    if block.cost is not None:
+    if block.cost is not None or not robust:
         return np.ones(())
     groups = block.white.reshape(*block.white.shape[:-1], -1, block.size)
     squares = np.vecdot(groups, groups)
@@ -133,26 +133,18 @@ def _roots(block, axes):
     return roots[..., None, None] if block.size > 1 else roots
 
 
-def _robust(blocks, axes, roots=None):
-    """Blocks with robust weights, given ones or those of their residuals; and the roots of
-    these.
-    """
-    if roots is None:
-        roots = [_roots(block, axes) for block in blocks]
-    weighted = [
-        replace(block, whitener=block.whitener * root)
-        for block, root in zip(blocks, roots, strict=True)
-    ]
-    return weighted, roots
-
-
 def _weighted(evaluate, robust, axes):
     """A problem whose blocks may have robust weights."""
 
-    def problem(state, roots=None):
+    def problem(state, roots=()):
         """Blocks at a state, and the roots of their weights: given ones, or those there."""
         blocks = _blocks(evaluate, state)
-        return _robust(blocks, axes, roots) if robust else (blocks, None)
+        roots = roots or [_roots(block, axes, robust) for block in blocks]
+        weighted = [
+            replace(block, whitener=block.whitener * root)
+            for block, root in zip(blocks, roots, strict=True)
+        ]
+        return weighted, roots
 
     return problem
 
@@ -294,14 +286,15 @@ def _step(hessian, gradient, damping, shared):
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended, trial by trial, and the cost before each iteration and at the
-    end.
+    """Where a minimisation ended, trial by trial, the cost before each iteration and at the end, and
+    the blocks there, with their weights.
     """
 
     state: Any
     converged: bool | np.ndarray
     iterations: int
     cost_history: np.ndarray
+    blocks: list[Block]
 
 
 def minimise(
@@ -364,7 +357,7 @@ def minimise(
             blocks, roots = problem(state)
         at = linearise(blocks, axes)
         history.append(at.cost)
-    return Minimum(state, converged[()], len(history) - 1, np.array(history))
+    return Minimum(state, converged[()], len(history) - 1, np.array(history), blocks)
 
 
 def _next_damping(damping, gain, accepted):
@@ -488,11 +481,6 @@ def solve(
         When residuals at the start are not finite.
     """
     question = Question(**asked)
-    if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
-        raise ValueError(
-            f"{question.method}: residuals at the start value are not finite: check the "
-            "observations and T0"
-        )
     minimum = minimise(
         evaluate,
         start,
@@ -502,11 +490,15 @@ def solve(
         max_iterations=max_iterations,
         tolerance=tolerance,
     )
-    blocks = _blocks(evaluate, minimum.state)
-    weighted = blocks
+    if not np.isfinite(minimum.cost_history[0]).all():
+        raise ValueError(
+            f"{question.method}: residuals at the start value are not finite: check the "
+            "observations and T0"
+        )
+    blocks = minimum.blocks
     if robust:
-        weighted, _ = _robust(blocks, _axes(shared))
-    return _solution(question, minimum, blocks, weighted, shared)
+        blocks = _blocks(evaluate, minimum.state)
+    return _solution(question, minimum, blocks, shared)
 
 
 def _stacked(blocks):
@@ -529,10 +521,10 @@ def _by_placement(r, J, groups, shared):
     return transposed @ J[..., None, :, :], np.matvec(transposed, r[..., None, :])
 
 
-def _solution(question, minimum, blocks, weighted, shared):
-    """The Solution at a minimum, from the blocks there without and with their robust weights."""
+def _solution(question, minimum, blocks, shared):
+    """The Solution at a minimum, with the blocks there without their robust weights."""
     r, J = _stacked(blocks)
-    weighted_r, weighted_J = _stacked(weighted)
+    weighted_r, weighted_J = _stacked(minimum.blocks)
     hessians, scores = _by_placement(weighted_r, weighted_J, question.groups, shared)
     hessian = np.sum(hessians, axis=-3)
     scales = np.broadcast_to(question.scales, hessian.shape[-1:])
@@ -548,7 +540,10 @@ def _solution(question, minimum, blocks, weighted, shared):
         transform,
         parameters,
         tuple(question.names),
-        **minimum._asdict(),
+        converged=minimum.converged,
+        iterations=minimum.iterations,
+        cost_history=minimum.cost_history,
+        state=minimum.state,
         residuals=r,
         jacobian=J,
         covariance=covariance_of(hessian, scales, motions) * inflation[..., None, None],

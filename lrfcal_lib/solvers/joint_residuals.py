@@ -356,7 +356,7 @@ def side_block(state, data, unknowns):
     J = own_jacobian(unknowns, "sides")
     root = np.sqrt((SIDE_FREEDOM + 1) / (spread + x**2))
     cost = 0.5 * (SIDE_FREEDOM + 1) * np.log1p(x**2 / spread)
-    return Block(root * x, root[..., None] * J, cost=cost)
+    return Block(x, J, root, cost=cost)
 
 
 def prior_block(state, data, unknowns):
@@ -370,10 +370,12 @@ def prior_block(state, data, unknowns):
     square = np.sum((r / sigma) ** 2)
     p = len(state.boards)
     root = np.sqrt((PRIOR_FREEDOM + 4) / (PRIOR_FREEDOM + square) / p) / sigma
-    jacobian = root[:, None] * J @ own_jacobian(unknowns, "axis")
     cost = 0.125 * (PRIOR_FREEDOM + 4) * np.log1p(square / PRIOR_FREEDOM) / p
     return Block(
-        np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=np.full((p, 4), cost)
+        r[None],
+        J @ own_jacobian(unknowns, "axis"),
+        np.tile(root, (p, 1)),
+        cost=np.full((p, 4), cost),
     )
 
 
@@ -383,14 +385,13 @@ def usual_block(state, unknowns, name):
     Every placement holds a part.
     """
     usual, spread = USUAL[name]
-    value = state.sensor[SENSOR.index(name)]
-    one = np.ones((len(state.boards), 1))
-    scale = spread * np.sqrt(len(one))
-    away = (value - usual) / scale
-    bend = 1.0
+    away = state.sensor[None, [SENSOR.index(name)]] - usual
+    bend = np.ones_like(away)
     if name == "edge_log_softness":
         # where the floor of `flip_sigma` takes over, the beams' gradient by ln softness falls with
         # the softness squared: without this curvature steps overshoot twofold
-        bend = np.sqrt(1 + 2 * max(usual - value, 0.0))
+        bend = np.sqrt(1 + 2 * np.maximum(-away, 0.0))
+    p = len(state.boards)
+    root = np.repeat(bend / (spread * np.sqrt(p)), p, axis=0)
     J = own_jacobian(unknowns, name)
-    return Block(away / bend * one, J * bend / scale, one, cost=0.5 * away**2 * one)
+    return Block(away / bend**2, J, root, cost=0.5 * (root / bend * away) ** 2)

@@ -124,7 +124,7 @@ class _Rows(NamedTuple):
     pitch: np.ndarray
     placement: np.ndarray  # index
     camera: np.ndarray  # index
-    # 1 / metres: of a point's share in the mean square of its face, or of its edge, and the cameras'
+    # root of a point's share in the mean square of its face, or of its edge, over `SIGMA`
     weight: np.ndarray
     on_face: np.ndarray
 
