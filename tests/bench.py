@@ -187,7 +187,7 @@ def with_gtsam(count):
 
     def error(p, values, jacobians):
         at, piece = pieces[p]
-        moved = unknowns.move(at, (values.atVector(0), values.atVector(p + 1)[None]))
+        moved = unknowns.move(at, np.r_[values.atVector(0), values.atVector(p + 1)][None])
         parts = [
             (b.white, b.white_jacobian)
             for b in named_blocks(moved, piece, unknowns).values()
@@ -204,7 +204,7 @@ def with_gtsam(count):
     first = gtsam.Values()
     first.insert(0, np.zeros(c))
     for p in range(count):
-        first.insert(p + 1, np.zeros(unknowns.own))
+        first.insert(p + 1, np.zeros(unknowns.size - c))
         noise = gtsam.noiseModel.Unit.Create(len(error(p, first, None)))
         graph.add(
             gtsam.CustomFactor(
@@ -216,8 +216,8 @@ def with_gtsam(count):
         found = gtsam.LevenbergMarquardtOptimizer(
             graph, first, gtsam.LevenbergMarquardtParams()
         ).optimize()
-        own = np.stack([found.atVector(p + 1) for p in range(count)])
-        return unknowns.move(start, (found.atVector(0), own))
+        step = [np.r_[found.atVector(0), found.atVector(p + 1)] for p in range(count)]
+        return unknowns.move(start, np.stack(step))
 
     apart = np.abs(run().cameras - minimum(start, data, unknowns, 1e-4).state.cameras).max()
     assert apart < 1e-4, f"GTSAM and we end in different places, {apart}"

@@ -68,6 +68,12 @@ def none(obs, *groups):
     )
 
 
+def joint_step(x, unknowns):
+    """The step of six placements from the shared increments and then those of each of them."""
+    shared, own = np.split(x, [unknowns.shared])
+    return np.hstack([np.tile(shared, (6, 1)), own.reshape(6, -1)])
+
+
 def misses_of(state, obs):
     """Whitened residuals of ranges and images, from the chain of transforms as one would write it down."""
     T_head_lrf = pose_transform(state.head)

@@ -95,12 +95,11 @@ def tilt_axis():
 
         yield block(np.zeros(4)).jacobian, lambda s: block(s).residuals, 4
     boards = platform.prepare_boards(make(8, count=4, noise=1.0), ROUGH)
-    data = boards.edge, boards.face
     state = head, boards.poses, np.full((4, 2), 0.02)
 
     def blocks(s):
-        moved = platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1))))
-        return platform.platform_blocks(moved, *data, 1e-3)
+        moved = platform.move_platform(state, np.tile(s, (4, 1)))
+        return platform.platform_blocks(moved, boards.points, 1e-3)
 
     for i, block in enumerate(blocks(np.zeros(12))):
         used = (
@@ -108,7 +107,8 @@ def tilt_axis():
             if block.size > 1
             else ...
         )
-        yield block.jacobian[used], lambda s: blocks(s)[i].residuals[used], 12
+        J = np.broadcast_to(block.jacobian, (*block.residuals.shape, 12))
+        yield J[used], lambda s: blocks(s)[i].residuals[used], 12
 
 
 def recorded_pitch():
@@ -167,14 +167,15 @@ def joint_estimate():
                 for name, place in places.items()
             }
         )
-        off = own.normal(0, 0.03, EVERY.shared), own.normal(0, 0.03, (3, EVERY.own))
+        off = own.normal(0, 0.03, (3, EVERY.size))
         state = EVERY.move(truth, off)
         for lapse in (0, 0.05):
             data = gather(obs, Levels(lapse=lapse))
 
             def block(s):
-                step = s[: EVERY.shared], np.tile(s[EVERY.shared :], (3, 1))
-                return named_blocks(EVERY.move(state, step), data, EVERY)[name]
+                return named_blocks(EVERY.move(state, np.tile(s, (3, 1))), data, EVERY)[
+                    name
+                ]
 
             def costs(s):
                 found = block(s)
@@ -182,7 +183,7 @@ def joint_estimate():
                     found.cost if found.cost is not None else 0.5 * found.white**2, axis=1
                 )
 
-            count = EVERY.shared + EVERY.own
+            count = EVERY.size
             for name in ("beam",) if lapse else ("face", "beam", "view", "sweep", "side"):
                 here = block(np.zeros(count))
                 r = here.white

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from joint_draws import MOUNTS, draw, misses_of, none, rng, scores
+from joint_draws import MOUNTS, draw, joint_step, misses_of, none, rng, scores
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -202,12 +202,11 @@ def test_scipy_finds_the_same_rig(mount):
     options = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
 
     def moved(x):
-        step = x[: unknowns.shared], x[unknowns.shared :].reshape(6, -1)
-        return unknowns.move(truth, step)
+        return unknowns.move(truth, joint_step(x, unknowns))
 
     theirs = least_squares(
         lambda x: misses_of(moved(x), obs),
-        np.zeros(unknowns.shared + 6 * unknowns.own),
+        np.zeros(6 * unknowns.size - 5 * unknowns.shared),
         **options,
     )
     assert found.solution.cost_history[-1] == pytest.approx(theirs.cost, rel=1e-6)

@@ -5,14 +5,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from joint_draws import MOUNTS, draw, misses_of, none
+from joint_draws import MOUNTS, draw, joint_step, misses_of, none
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.calibrate.joint_observations import pose_by_intrinsics
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
-from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 
 CORNERS = np.array([[0.05 * i, 0.05 * j, 0.0] for i in range(5) for j in range(4)])
 MODEL = CameraModel(
@@ -108,8 +108,7 @@ def test_scipy_carries_the_lens_into_the_poses_alike(mount):
     shared = unknowns.shared
 
     def residuals(x):
-        step = x[:shared], x[shared:].reshape(6, -1)
-        return misses_of(unknowns.move(found.state, step), obs)
+        return misses_of(unknowns.move(found.state, joint_step(x, unknowns)), obs)
 
     def with_lens(error):
         moved = replace(obs, view_pose=obs.view_pose.copy())
@@ -118,7 +117,7 @@ def test_scipy_carries_the_lens_into_the_poses_alike(mount):
         moved.view_pose[:, :3] = move_pose(pose, by_view)
         return misses_of(found.state, moved)
 
-    J = approx_fprime(np.zeros(shared + 6 * unknowns.own), residuals, 1e-7)
+    J = approx_fprime(np.zeros(6 * unknowns.size - 5 * shared), residuals, 1e-7)
     by_lens = approx_fprime(np.zeros(9 * len(obs.cameras)), with_lens, 1e-7)
     gain = -np.linalg.lstsq(J, by_lens)[0][:shared]
     whole = np.zeros((len(gain.T), len(gain.T)))

@@ -149,9 +149,10 @@ def test_misfit_model_error_and_noise_are_named(good):
         converged=False,
     )
     left_out = Problem(Stage.JOINT, ProblemKind.CONTRADICTS, "left out", 9)
-    bad = replace(
-        solution, misfit=solution.misfit | {3: 30.0}, excluded=(left_out,), solution=inner,
-    ).with_levels(face_scale=2.6)  # fmt: skip
+    bad = replace(solution, excluded=(left_out,), solution=inner).with_levels(
+        face_scale=2.6
+    )
+    vars(bad)["misfit"] = solution.misfit | {3: 30.0}
     words = {r.kind: r.words for r in diagnose(bad)}
     assert words["misfit"].startswith("placements fit much worse than the others: 3 (5.")
     assert (

@@ -245,12 +245,11 @@ def whitener_of(covariance):
 
 def moved(case, state, step):
     """Everything a step on; the last two numbers of each side are its own."""
-    own = case.unknowns.own
-    shared, each = step
+    joint, lines = np.split(step, [case.unknowns.size], axis=1)
     return State(
-        case.unknowns.move(state.joint, (shared, each[:, :own])),
-        moved_lines(state.lines, case.middle, each[0, own:].reshape(-1, 2)),
-        state.change + shared,
+        case.unknowns.move(state.joint, joint),
+        moved_lines(state.lines, case.middle, lines.reshape(-1, 2)),
+        state.change + joint[0, : case.unknowns.shared],
     )
 
 
@@ -285,7 +284,7 @@ def blocks_of(state, case, scale):
         case.whitener,
         STILL * board[None, :, 2],  # turn of board and sides together
         STILL * board[:, :2].T,  # their shift
-        np.zeros((0, unknowns.own - geometry.POSE)),
+        np.zeros((0, unknowns.size - unknowns.columns["board"].stop)),
         np.diag(np.tile(FAR, len(case.middle))),
     )
     off = np.zeros(len(known))

@@ -1,17 +1,19 @@
 """What the joint estimate uses of a session: ranges, beams about edges, poses in images."""
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.observe import FACE_POINTS, stack
-from lrfcal_lib.model.camera import LENS
+from lrfcal_lib.model.camera import LENS, CameraModel, project_jacobians
+from lrfcal_lib.model.geometry import gradient_by_pose
 from lrfcal_lib.model.observations import JointObservations, thin
 from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edge_cells import edge_cells
 from lrfcal_lib.preprocess.prepared import Prepared
-from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 
 CELLS_PER_EDGE = 160  # a placement
+LEAST_CORNERS = 6  # of a pattern, for the derivative of its pose by the intrinsics
 
 
 def observe_joint(
@@ -110,3 +112,29 @@ def _views(prepared, views, placements):
                 "pitch": np.nan_to_num(view.pitch),
                 "placement": placements.index(view.placement),
             }
+
+
+def pose_by_intrinsics(
+    T_camera_board: RigidTransform, corners: np.ndarray, model: CameraModel
+) -> np.ndarray:
+    """How the pose of a board that fits given pixels changes with the intrinsics.
+
+    Parameters
+    ----------
+    T_camera_board : RigidTransform
+    corners : ndarray, shape (k, 3)
+        Those of the pattern that were seen, board frame, metres.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (6, 9)
+        Derivative of the increments ``[w, v]`` of T_camera_board; zeros with fewer than six
+        corners.
+    """
+    if len(corners) < LEAST_CORNERS:
+        return np.zeros((6, LENS))
+    turned = T_camera_board.rotation.apply(corners)
+    by_point, by_lens = project_jacobians(turned + T_camera_board.translation, model)
+    by_pose = gradient_by_pose(turned[:, None], by_point)
+    return -np.linalg.lstsq(by_pose.reshape(-1, 6), by_lens.reshape(-1, LENS))[0]

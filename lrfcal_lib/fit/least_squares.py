@@ -67,9 +67,9 @@ class Block:
         Jacobian that includes the change of the whitener: ``J - dS/2 S^-1 r`` for residuals with
         covariance S. The steps use it where it is given.
     cost : ndarray, shape (..., n), optional
-        Negative log likelihood of each residual where it is not half a square; the residuals are
-        then score over root information, the Jacobian root information times the derivative, the
-        whitener one or zero. No loss applies.
+        Negative log likelihood of each residual where it is not half a square; whitened residuals
+        are then score over root information, the whitened Jacobian root information times the
+        derivative. No loss applies.
     """
 
     residuals: np.ndarray
@@ -117,11 +117,11 @@ class Block:
         return self.whitened(self.jacobian if self.corrected is None else self.corrected)
 
 
-def _roots(block, axes):
+def _roots(block, axes, robust):
     """Roots of Cauchy's weights of residuals, or of groups of them, that are judged together, in
     their usual size: by the median of a trial. As factors of the whitener.
     """
-    if block.cost is not None:
+    if block.cost is not None or not robust:
         return np.ones(())
     groups = block.white.reshape(*block.white.shape[:-1], -1, block.size)
     squares = np.vecdot(groups, groups)
@@ -133,26 +133,18 @@ def _roots(block, axes):
     return roots[..., None, None] if block.size > 1 else roots
 
 
-def _robust(blocks, axes, roots=None):
-    """Blocks with robust weights, given ones or those of their residuals; and the roots of
-    these.
-    """
-    if roots is None:
-        roots = [_roots(block, axes) for block in blocks]
-    weighted = [
-        replace(block, whitener=block.whitener * root)
-        for block, root in zip(blocks, roots, strict=True)
-    ]
-    return weighted, roots
-
-
 def _weighted(evaluate, robust, axes):
     """A problem whose blocks may have robust weights."""
 
-    def problem(state, roots=None):
+    def problem(state, roots=()):
         """Blocks at a state, and the roots of their weights: given ones, or those there."""
         blocks = _blocks(evaluate, state)
-        return _robust(blocks, axes, roots) if robust else (blocks, None)
+        roots = roots or [_roots(block, axes, robust) for block in blocks]
+        weighted = [
+            replace(block, whitener=block.whitener * root)
+            for block, root in zip(blocks, roots, strict=True)
+        ]
+        return weighted, roots
 
     return problem
 
@@ -274,7 +266,7 @@ def likeliest(
 
 def _step(hessian, gradient, damping, shared):
     """A damped step, its squared length in standard deviations, and the fall of the cost it
-    promises.
+    promises: of each trial, or of all placements.
     """
     diagonal = np.linalg.diagonal(hessian)
     extra = damping[..., None] * diagonal
@@ -284,26 +276,25 @@ def _step(hessian, gradient, damping, shared):
     if shared:
         reduced, right, by_shared = eliminate(damped, gradient, shared, regular=True)
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
-        whole = by_shared @ np.append(common, 1.0)
-        step = common, whole[:, shared:]
+        step = by_shared @ np.append(common, 1.0)
     else:
-        step = whole = -solve_each(damped, gradient)
-    length = np.vecdot(whole, np.matvec(hessian, whole))
-    promised = -np.vecdot(whole, gradient) - 0.5 * length
-    if shared:
-        return step, np.sum(length), np.sum(promised)
-    return step, length, promised
+        step = -solve_each(damped, gradient)
+    length = np.vecdot(step, np.matvec(hessian, step))
+    promised = -np.vecdot(step, gradient) - 0.5 * length
+    each = _axes(shared)[1:]  # placements
+    return step, np.sum(length, axis=each), np.sum(promised, axis=each)
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended, trial by trial, and the cost before each iteration and at the
-    end.
+    """Where a minimisation ended, trial by trial, the cost before each iteration and at the end, and
+    the blocks there, with their weights.
     """
 
     state: Any
     converged: bool | np.ndarray
     iterations: int
     cost_history: np.ndarray
+    blocks: list[Block]
 
 
 def minimise(
@@ -324,7 +315,8 @@ def minimise(
         ``state -> Block`` or list of blocks.
     state : ndarray (leading trial axes) or, with `shared`, any object
     retract : callable
-        ``(state, step) -> state``; with `shared` the step is the pair (common (c,), own (p, l)).
+        ``(state, step) -> state``; with `shared` the step is (p, k), of which the first c are those
+        common to all placements, in every row.
     shared : int
         Number of unknowns common to all entries of the leading axis; 0 for trials.
     robust : bool
@@ -359,14 +351,13 @@ def minimise(
         if accepted.all():
             state = trial
             blocks = tried
-        elif accepted.any():
-            chosen = accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim))
-            state = np.where(chosen, trial, state)
+        elif accepted.any():  # transposed, trials come last
+            state = np.where(accepted.T, trial.T, state.T).T
         if robust or not accepted.all():
             blocks, roots = problem(state)
         at = linearise(blocks, axes)
         history.append(at.cost)
-    return Minimum(state, converged[()], len(history) - 1, np.array(history))
+    return Minimum(state, converged[()], len(history) - 1, np.array(history), blocks)
 
 
 def _next_damping(damping, gain, accepted):
@@ -428,7 +419,7 @@ class Question:
         The placement of every residual, or of every few in a row, for `covariance_placements`; one
         by default. With `shared` the leading axis is the placement.
     freedom, n_observations : int, optional
-        By default those of the residuals.
+        By default those of the residuals of a trial.
     chi2_rest : float
         Chi-square that no unknown can change (compressed away).
     required : bool
@@ -490,11 +481,6 @@ def solve(
         When residuals at the start are not finite.
     """
     question = Question(**asked)
-    if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
-        raise ValueError(
-            f"{question.method}: residuals at the start value are not finite: check the "
-            "observations and T0"
-        )
     minimum = minimise(
         evaluate,
         start,
@@ -504,11 +490,15 @@ def solve(
         max_iterations=max_iterations,
         tolerance=tolerance,
     )
-    blocks = _blocks(evaluate, minimum.state)
-    weighted = blocks
+    if not np.isfinite(minimum.cost_history[0]).all():
+        raise ValueError(
+            f"{question.method}: residuals at the start value are not finite: check the "
+            "observations and T0"
+        )
+    blocks = minimum.blocks
     if robust:
-        weighted, _ = _robust(blocks, _axes(shared))
-    return _solution(question, minimum, blocks, weighted, shared)
+        blocks = _blocks(evaluate, minimum.state)
+    return _solution(question, minimum, blocks, shared)
 
 
 def _stacked(blocks):
@@ -531,10 +521,10 @@ def _by_placement(r, J, groups, shared):
     return transposed @ J[..., None, :, :], np.matvec(transposed, r[..., None, :])
 
 
-def _solution(question, minimum, blocks, weighted, shared):
-    """The Solution at a minimum, from the blocks there without and with their robust weights."""
+def _solution(question, minimum, blocks, shared):
+    """The Solution at a minimum, with the blocks there without their robust weights."""
     r, J = _stacked(blocks)
-    weighted_r, weighted_J = _stacked(weighted)
+    weighted_r, weighted_J = _stacked(minimum.blocks)
     hessians, scores = _by_placement(weighted_r, weighted_J, question.groups, shared)
     hessian = np.sum(hessians, axis=-3)
     scales = np.broadcast_to(question.scales, hessian.shape[-1:])
@@ -542,9 +532,7 @@ def _solution(question, minimum, blocks, weighted, shared):
     chi2 = np.sum(weighted_r**2, axis=_axes(shared)) + question.chi2_rest
     freedom = question.freedom
     if freedom is None:
-        own = J.shape[-1] - shared
-        groups = len(r) if shared else 1
-        freedom = r.size // chi2.size - shared - groups * own
+        freedom = r.shape[-1] - J.shape[-1]
     too_large = chi2 > chdtri(freedom, LARGE_CHI2)  # without any freedom never
     inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
     transform, parameters = question.read(minimum.state)
@@ -552,7 +540,10 @@ def _solution(question, minimum, blocks, weighted, shared):
         transform,
         parameters,
         tuple(question.names),
-        **minimum._asdict(),
+        converged=minimum.converged,
+        iterations=minimum.iterations,
+        cost_history=minimum.cost_history,
+        state=minimum.state,
         residuals=r,
         jacobian=J,
         covariance=covariance_of(hessian, scales, motions) * inflation[..., None, None],

@@ -304,8 +304,7 @@ class JointObservations(_Grouped):
         Stated platform: one of the start values, and the rotation about the axis and shift along it
         that no data show.
     view_lens : ndarray, shape (v, 6, 9), optional
-        Derivative of the view's pose by the intrinsics; see :mod:`lrfcal_lib.solvers.joint_lens`.
-        Zeros by default.
+        Derivative of the view's pose by the intrinsics. Zeros by default.
     lens_covariance : ndarray, shape (c, 9, 9), optional
         Of the intrinsics of every camera. Zeros (exactly known) by default.
     """

@@ -6,29 +6,22 @@ Equations (4) to (6) and (16) to (19) at once, every board's pose unknown and el
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.fit.least_squares import solve
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
+    among,
     axis_of,
     head_from_axis,
     pose_array,
     pose_transform,
 )
 from lrfcal_lib.model.observations import JointObservations
-from lrfcal_lib.solvers.joint_contradictions import (
-    LAST_MISS,
-    misfits,
-    refuse_contradiction,
-    without_blind_cameras,
-    without_lost_placements,
-)
-from lrfcal_lib.solvers.joint_lens import lens_share
 from lrfcal_lib.solvers.joint_model import (
     SENSOR,
     SWEEPS,
@@ -39,8 +32,15 @@ from lrfcal_lib.solvers.joint_model import (
 )
 from lrfcal_lib.solvers.joint_noise import estimate_noise, settled
 from lrfcal_lib.solvers.joint_residuals import MOST_STEPS, minimum, named_blocks
-from lrfcal_lib.solvers.joint_search import best_start, coarse
 from lrfcal_lib.solvers.joint_solution import JointSolution, joint_words
+from lrfcal_lib.solvers.joint_start import (
+    LAST_MISS,
+    best_start,
+    coarse,
+    refuse_contradiction,
+    without_blind_cameras,
+    without_lost_placements,
+)
 
 # what counts as a change by one, beside rad and m
 SCALES = {
@@ -216,10 +216,8 @@ def in_stated_gauge(state: JointState, obs: JointObservations) -> JointState:
 def finished(obs, state, data, unknowns, required, excluded):
     """The last steps, in the gauge of the stated platform, and all that a solution says."""
     names = unknowns.names(obs.cameras)
-    # the last ones that the minimiser asks for are asked for again
-    blocks = lru_cache(maxsize=1)(lambda at: named_blocks(at, data, unknowns))
     found = solve(
-        lambda at: blocks(at).values(),
+        lambda at: named_blocks(at, data, unknowns).values(),
         in_stated_gauge(state, obs),
         unknowns.move,
         shared=unknowns.shared,
@@ -235,21 +233,55 @@ def finished(obs, state, data, unknowns, required, excluded):
         tolerance=LAST_STEP,
         n_observations=obs.count,
     )
-    lens = lens_share(obs, found, data, unknowns)
-    found = found.widened(lens.covariance - lens.counted, lens.covariance)
-    squares = misfits(blocks(found.state), data)
     solution = JointSolution(
         found,
         obs,
         data,
         unknowns,
         excluded=tuple(excluded),
-        misfit=dict(zip(obs.placements.tolist(), squares.tolist(), strict=True)),
-        lens=lens.covariance,
-        lens_scale=lens.scatter,
+        lens=np.zeros_like(found.covariance),
+        lens_scale=0.0,
         step=np.zeros(unknowns.shared),
     )
-    return with_step_error(solution)
+    return with_step_error(with_lens_error(solution))
+
+
+def with_lens_error(solution: JointSolution) -> JointSolution:
+    """The solution with what errors of the intrinsics, which all images share, do to it, by
+    equations (18) and (19) to first order.
+
+    They let views scatter, too, by what no unknown can take up of the error that all views of a
+    camera share. As far as that exceeds the stated noise, the scale of views has added it to the
+    covariance, where it would count twice.
+    """
+    obs = solution.observations
+    if not np.any(obs.lens_covariance):
+        return solution
+    found = solution.solution
+    view = solution.data.view
+    c = solution.unknowns.shared
+    block = solution.blocks["view"]
+    J = block.white_jacobian
+    J_own = J[..., c:]
+    by_lens = among(view["lens"], view["camera"][..., None], len(obs.cameras))
+    shift = block.whitened(by_lens.reshape(*J.shape[:2], -1))
+    spread = block_diag(*obs.lens_covariance)
+    hessian = found.jacobian.mT @ found.jacobian
+    own = pseudo_inverse(hessian[:, c:, c:])
+    reduced = J[..., :c] - J_own @ own @ hessian[:, c:, :c]
+    finite = np.nan_to_num(found.covariance, posinf=0.0, neginf=0.0)
+    gain = finite @ np.sum(reduced.mT @ shift, axis=0)
+    left = shift - reduced @ gain - J_own @ (own @ (J_own.mT @ shift))
+    square = np.sum(left @ spread * left)
+    level = solution.data.levels.view_scale**2
+    information = np.sum(reduced.mT @ reduced, axis=0)
+    taken = np.sum((J_own @ own) * J_own) + np.sum(information * finite)
+    # rows that are left to show it
+    square *= level / max(6 * len(obs.view_camera) - taken, 1.0)
+    share = np.clip(level - 1, 0, square) / level
+    lens = gain @ spread @ gain.T
+    widened = found.widened(lens - share * finite @ information @ finite, lens)
+    return replace(solution, solution=widened, lens=lens, lens_scale=np.sqrt(square))
 
 
 def with_step_error(solution: JointSolution) -> JointSolution:

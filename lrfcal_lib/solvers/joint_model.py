@@ -120,9 +120,9 @@ class Unknowns:
         return self.columns["board"].start
 
     @property
-    def own(self) -> int:
-        """Number of unknowns of one placement."""
-        return self.columns["sides"].stop - self.shared
+    def size(self) -> int:
+        """Number of unknowns of one placement, with the shared ones."""
+        return self.columns["sides"].stop
 
     def names(self, cameras) -> tuple[str, ...]:
         """Names of the shared unknowns, of cameras with these names."""
@@ -137,14 +137,15 @@ class Unknowns:
         every = np.concatenate([chart_parameters(state.head), poses, state.sensor])
         return None, every[self.mask]
 
-    def move(self, state: JointState, step: tuple) -> JointState:
-        """Retraction of the joint estimate: shared increments (c,) and those of each placement (p,
-        l).
+    def move(self, state: JointState, step: np.ndarray) -> JointState:
+        """Retraction of the joint estimate by increments (p, k), in every row the shared ones and
+        those of a placement.
         """
         full = np.zeros(len(self.mask))
-        full[self.mask] = step[0]
+        full[self.mask] = step[0, : self.shared]
         axis, cameras, sensor = np.split(full, [4, len(full) - len(SENSOR)])
-        boards, sweep, sides = np.split(step[1], [6, 6 + SWEEPS[self.sweep]], axis=1)
+        own = step[:, self.shared :]
+        boards, sweep, sides = np.split(own, [6, 6 + SWEEPS[self.sweep]], axis=1)
         sensor = state.sensor + sensor
         sensor[1] = np.clip(sensor[1], -LARGEST_ODDS, LARGEST_ODDS)
         sensor[2] = np.clip(sensor[2], *SOFTEST)

@@ -82,11 +82,14 @@ def with_face_levels(state, data, block, shared, spread):
     scale = np.sqrt(np.sum(z**2) / max(used.sum() - taken, 1))
     # where the ranges should end: noise must not decide which part a point lies in
     exact = meeting(state, rays(state, data, data.face)).point
-    x, y, _ = np.moveaxis(exact @ state.boards[:, :, :3], -1, 0)
-    part = _part(x, used) * PARTS + _part(y, used)
-    parts = np.eye(PARTS**2)[part] * used[..., None]
-    planes = np.linalg.qr(np.stack([used, x * used, y * used], axis=-1))[0]
-    planes *= used[..., None]  # of a placement without ranges it makes something else
+    flat = (exact @ state.boards[:, :, :3])[..., :2]
+    counted = used[..., None]
+    there = np.where(counted | ~counted.any(axis=1, keepdims=True), flat, np.nan)
+    limits = np.nanquantile(there, np.arange(1, PARTS) / PARTS, axis=1)
+    part = np.sum(flat > limits[:, :, None], axis=0) @ [PARTS, 1]
+    parts = np.eye(PARTS**2)[part] * counted
+    planes = np.linalg.qr(np.insert(flat, 0, 1.0, axis=-1) * counted)[0]
+    planes *= counted  # of a placement without ranges it makes something else
     shares = [
         independent_share(modes, z / scale, by_own, before, spread)
         for modes in (parts, planes)
@@ -129,13 +132,6 @@ def independent_share(modes, residuals, by_own, share, spread, usual=1.0):
     square = np.sum(score[there] ** 2 / counted[there])
     variance = (square - np.sum(taken * (1 - taken)) / share) / told
     return usual * np.exp(-beyond_chance(np.log(max(variance / usual, 1.0)), told))
-
-
-def _part(values, used):
-    """Third of the spread of values that each one lies in, row by row."""
-    ordered = np.where(used | ~used.any(axis=1, keepdims=True), values, np.nan)
-    limits = np.nanquantile(ordered, np.arange(1, PARTS) / PARTS, axis=1)
-    return np.sum(values[None] > limits[..., None], axis=0)
 
 
 def with_beam_share(state, data, block, shared, spread):

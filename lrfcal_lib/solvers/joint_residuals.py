@@ -14,6 +14,7 @@ from lrfcal_lib.fit.edge_likelihood import beam_terms, edge_shift, flip_sigma
 from lrfcal_lib.fit.least_squares import Block, Minimum, minimise
 from lrfcal_lib.fit.stops import ViewBlock, same_stop
 from lrfcal_lib.model.geometry import (
+    among,
     cross,
     gradient_by_pose,
     hat,
@@ -139,7 +140,7 @@ def assemble(unknowns, parts, **derivatives):
         "pitch_by_direction": parts[..., 1:2],
         "sweep": parts[..., 2:],
     }
-    J = np.zeros(parts.shape[:-1] + (unknowns.shared + unknowns.own,))
+    J = np.zeros(parts.shape[:-1] + (unknowns.size,))
     for name, derivative in derivatives.items():
         where = unknowns.columns[name]
         J[..., where] = derivative[..., : where.stop - where.start]
@@ -301,7 +302,7 @@ def view_block(state, data, unknowns):
         by_pitch * by_parts[..., None, :],
         axis=of_head[..., AXIS_COLUMNS],
         board=_by_pose(left @ R_camera_platform, 0.0, R_camera_platform),
-        cameras=among_cameras(of_camera, view["camera"], unknowns.cameras),
+        cameras=among(of_camera, view["camera"][..., None], unknowns.cameras),
     )
     return ViewBlock.of_groups(
         residuals,
@@ -322,13 +323,6 @@ def _by_pose(turn_by_turn, shift_by_turn, shift_by_shift):
     return by_pose
 
 
-def among_cameras(by_one, camera, count):
-    """Derivatives (p, v, 6, k) by what is a view's camera's, among those of all, (p, v, 6, k c)."""
-    mine = camera[..., None] == np.arange(count)
-    among_all = by_one[..., None, :] * mine[:, :, None, :, None]
-    return among_all.reshape(*by_one.shape[:-1], -1)
-
-
 def inverse_left_jacobian(w):
     """How a small turn of a rotation changes its rotation vector, shape (..., 3) -> (..., 3, 3).
 
@@ -341,7 +335,7 @@ def inverse_left_jacobian(w):
 
 def own_jacobian(unknowns, name):
     """Jacobian (n, k) of unknowns that every placement has (or shares) by themselves."""
-    return np.eye(unknowns.shared + unknowns.own)[unknowns.columns[name]]
+    return np.eye(unknowns.size)[unknowns.columns[name]]
 
 
 def sweep_block(state, data, unknowns):
@@ -362,7 +356,7 @@ def side_block(state, data, unknowns):
     J = own_jacobian(unknowns, "sides")
     root = np.sqrt((SIDE_FREEDOM + 1) / (spread + x**2))
     cost = 0.5 * (SIDE_FREEDOM + 1) * np.log1p(x**2 / spread)
-    return Block(root * x, root[..., None] * J, cost=cost)
+    return Block(x, J, root, cost=cost)
 
 
 def prior_block(state, data, unknowns):
@@ -376,10 +370,12 @@ def prior_block(state, data, unknowns):
     square = np.sum((r / sigma) ** 2)
     p = len(state.boards)
     root = np.sqrt((PRIOR_FREEDOM + 4) / (PRIOR_FREEDOM + square) / p) / sigma
-    jacobian = root[:, None] * J @ own_jacobian(unknowns, "axis")
     cost = 0.125 * (PRIOR_FREEDOM + 4) * np.log1p(square / PRIOR_FREEDOM) / p
     return Block(
-        np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=np.full((p, 4), cost)
+        r[None],
+        J @ own_jacobian(unknowns, "axis"),
+        np.tile(root, (p, 1)),
+        cost=np.full((p, 4), cost),
     )
 
 
@@ -389,14 +385,13 @@ def usual_block(state, unknowns, name):
     Every placement holds a part.
     """
     usual, spread = USUAL[name]
-    value = state.sensor[SENSOR.index(name)]
-    one = np.ones((len(state.boards), 1))
-    scale = spread * np.sqrt(len(one))
-    away = (value - usual) / scale
-    bend = 1.0
+    away = state.sensor[None, [SENSOR.index(name)]] - usual
+    bend = np.ones_like(away)
     if name == "edge_log_softness":
         # where the floor of `flip_sigma` takes over, the beams' gradient by ln softness falls with
         # the softness squared: without this curvature steps overshoot twofold
-        bend = np.sqrt(1 + 2 * max(usual - value, 0.0))
+        bend = np.sqrt(1 + 2 * np.maximum(-away, 0.0))
+    p = len(state.boards)
+    root = np.repeat(bend / (spread * np.sqrt(p)), p, axis=0)
     J = own_jacobian(unknowns, name)
-    return Block(away / bend * one, J * bend / scale, one, cost=0.5 * away**2 * one)
+    return Block(away / bend**2, J, root, cost=0.5 * (root / bend * away) ** 2)

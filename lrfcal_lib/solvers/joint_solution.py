@@ -15,6 +15,7 @@ from lrfcal_lib.fit.edge_likelihood import disc_edge
 from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model.geometry import (
+    POSE,
     POSE_NAMES,
     TiltAxis,
     axis_of,
@@ -95,8 +96,6 @@ class JointSolution:
         Padded observations with the noise levels used, and what was unknown; for `solvers` only.
     excluded : tuple of Problem
         Placements, cameras and single images left out, with the reason.
-    misfit : dict of int to float
-        Normalised squared residuals of each placement (1 is what the noise explains).
     lens : ndarray, shape (c, c)
         The part of the covariances that comes from the intrinsics, which all placements share.
     lens_scale : float
@@ -112,7 +111,6 @@ class JointSolution:
     data: JointData
     unknowns: Unknowns
     excluded: tuple[Problem, ...]
-    misfit: dict[int, float]
     lens: np.ndarray
     lens_scale: float
     step: np.ndarray
@@ -272,6 +270,21 @@ class JointSolution:
     def blocks(self) -> dict[str, Block]:
         """Residuals by name at the solution; for `solvers` only."""
         return named_blocks(self.state, self.data, self.unknowns)
+
+    @cached_property
+    def misfit(self) -> dict[int, float]:
+        """Normalised mean squared residual of ranges and views of each placement; 1 is what the
+        noise explains.
+        """
+        data = self.data
+        count = data.face["used"].sum(axis=1) + POSE * data.view["used"].sum(axis=1)
+        shares = {"face": data.levels.face_share, "view": 1.0}
+        squares = sum(
+            np.sum(self.blocks[name].white ** 2, axis=1) / share
+            for name, share in shares.items()
+            if name in self.blocks
+        )
+        return self._by_placement((squares / np.maximum(count - POSE, 1)).tolist())
 
     def residuals(self, group: str) -> np.ndarray:
         """Residuals in the order of the observations.

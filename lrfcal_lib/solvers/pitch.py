@@ -17,6 +17,7 @@ from lrfcal_lib.model.geometry import (
     POSE,
     POSE_NAMES,
     DegenerateGeometry,
+    among,
     cross,
     fit_plane,
     gradient_by_pose,
@@ -123,7 +124,7 @@ class _Rows(NamedTuple):
     pitch: np.ndarray
     placement: np.ndarray  # index
     camera: np.ndarray  # index
-    # root of a point's share in the mean square of its face, or of its edge
+    # root of a point's share in the mean square of its face, or of its edge, over `SIGMA`
     weight: np.ndarray
     on_face: np.ndarray
 
@@ -157,30 +158,30 @@ def estimate_pitch_errors(
         When a camera is not fixed to the platform.
     """
     placements = _common_placements(cameras)
+    count = len(placements)
     turn = np.array([direction[p] for p in placements])
-    rows = gather([obs.select(placements) for obs in cameras.values()])
+    seen = [obs.select(placements) for obs in cameras.values()]
+    rows = gather(seen)
     middles = np.array([middle[p] for p in placements])
     away = rows.pitch - middles[rows.placement]
-    each = np.eye(len(placements))
-    # offset of each placement by the unknowns of a model
-    offsets = {"none": each[:, :0]}
+    # offset and stretch of each placement by the unknowns of a model
+    every = np.eye(2 * count).reshape(2, count, -1)
+    each = every[..., :count]
+    by_unknowns = {"none": each[..., :0]}
     if {-1, 1} <= set(turn):
-        offsets["direction"] = turn[:, None]
-    offsets |= {"sweep": each, "sweep_stretch": each}
+        by_unknowns["direction"] = each @ turn[:, None]
+    by_unknowns |= {"sweep": each, "sweep_stretch": every}
 
     poses = np.array([pose_array(start_from_planes(obs))[0] for obs in cameras.values()])
     # errors of the LRF are common to all cameras, and count once
-    squares = np.where(rows.on_face, 0.0, rows.weight**2)
-    edges = np.bincount(rows.camera, squares, minlength=len(poses)).max()
-    numbers = PLANE_NUMBERS * len(placements) + EDGE_NUMBERS * round(edges)
+    edges = [{*zip(o.crossing_placement, o.crossing_edge, strict=True)} for o in seen]
+    numbers = PLANE_NUMBERS * count + EDGE_NUMBERS * max(map(len, edges))
     models = {}
     by_direction = (np.nan, np.nan)
-    for name, by_offset in offsets.items():
-        by_unknown = by_offset[rows.placement]
-        if name == "sweep_stretch":
-            by_unknown = np.hstack([by_unknown, by_unknown * away[:, None]])
-        solution = _solve(name, rows, by_unknown, poses)
-        model = _model(name, solution, rows, by_offset, numbers)
+    for name, by_unknown in by_unknowns.items():
+        by_offset, by_stretch = by_unknown[:, rows.placement]
+        solution = _solve(name, rows, by_offset + away[:, None] * by_stretch, poses)
+        model = _model(name, solution, rows, by_unknown, numbers)
         if name == "direction":
             by_direction = (solution.parameters[-1], model.offset_sigma.max())
         if name == "none":
@@ -218,6 +219,7 @@ def gather(cameras):
         points = faces.plane_points[face == index]
         normal, distance, _ = fit_plane(points)
         scatter[face == index] = np.outer(points @ normal - distance, normal)
+    unit = SIGMA * np.sqrt(len(cameras))
     parts = []
     for number, obs in enumerate(cameras):
         board = obs.board_poses[np.argsort(obs.placements)][face]
@@ -229,7 +231,7 @@ def gather(cameras):
             pitch=faces.plane_pitch,
             placement=face,
             camera=np.full(len(face), number),
-            weight=_shares(face),
+            weight=_shares(face) / unit,
             on_face=np.ones(len(face), bool),
         )
         placement = np.searchsorted(placements, obs.crossing_placement)
@@ -242,7 +244,7 @@ def gather(cameras):
             pitch=obs.crossing_pitch,
             placement=placement,
             camera=np.full(len(placement), number),
-            weight=_shares(placement + len(placements) * edge),
+            weight=_shares(placement + len(placements) * edge) / unit,
             on_face=np.zeros(len(placement), bool),
         )
         parts += [on_board, on_sight]
@@ -269,13 +271,11 @@ def pitch_blocks(state, rows, by_unknown):
     rotated = np.matvec(R, q)
     turn = cross(q, np.vecmat(rows.normal, R))[:, :1]  # about the tilt axis
     distances = np.vecdot(rows.normal, rotated + pose[:, :, 3]) - rows.distance
-    of_camera = np.arange(6 * cameras) // 6 == rows.camera[:, None]
-    by_pose = np.tile(gradient_by_pose(rotated, rows.normal), (1, cameras)) * of_camera
-    weight = rows.weight / (SIGMA * np.sqrt(cameras))
+    by_pose = among(gradient_by_pose(rotated, rows.normal), rows.camera, cameras)
     prior = np.repeat(PRIOR, rows.placement.max() + 1)[: len(errors)]
     columns = np.eye(6 * cameras + len(errors))[6 * cameras :]
     return [
-        Block(distances, np.concatenate([by_pose, turn * by_unknown], axis=1), weight),
+        Block(distances, np.concatenate([by_pose, turn * by_unknown], axis=1), rows.weight),
         Block(errors, columns, 1 / prior),
     ]
 
@@ -304,34 +304,31 @@ def _solve(name, rows, by_unknown, poses):
     )
 
 
-def _model(name, solution, rows, offsets, numbers):
-    """What a Solution says about the pitch; `offsets` (p, k) are those by the unknowns.
+def _model(name, solution, rows, by_unknown, numbers):
+    """What a Solution says about the pitch; offsets and stretches are ``by_unknown @ unknowns``.
 
     The stated sigmas only weigh faces against edges, the level comes from the residuals.
     """
     poses, errors = solution.state
-    p, count = offsets.shape
-    unit = SIGMA * np.sqrt(len(poses))  # metres, of a residual
-    distances = solution.residuals[: len(rows.weight)] / rows.weight * unit
+    _, p, free = by_unknown.shape
+    distances = solution.residuals[: len(rows.weight)] / rows.weight
     # what a scan scatters about its own plane tells nothing of the pitch
     scatter = np.matvec(poses[rows.camera][:, :, :3], rows.scatter)
     away = distances - np.vecdot(rows.normal, scatter)
-    misfit = np.sum((rows.weight * away / unit) ** 2)
-    free = len(errors)
-    if count == p:  # the offset common to all sweeps goes with the cameras' poses
+    misfit = np.sum((rows.weight * away) ** 2)
+    offsets, stretches = by_unknown
+    if free >= p:  # the offset common to all sweeps goes with the cameras' poses
         free -= 1
-        offsets = offsets - 1 / p
+        offsets = offsets - offsets.mean(axis=0)
     level = misfit / max(numbers - POSE - free, 1)
     known = replace(solution, covariance=level / solution.inflation * solution.covariance)
-    own = POSE * len(poses) + np.arange(count)
-    of_unknowns = known.trusted[np.ix_(own, own)]
-    stretch = np.zeros(p)
-    stretch[: len(errors) - count] = errors[count:]
+    own = slice(POSE * len(poses), None)
+    of_unknowns = known.trusted[own, own]
     return PitchModel(
         name,
-        offset=offsets @ errors[:count],
+        offset=offsets @ errors,
         offset_sigma=sigma_of(offsets @ of_unknowns @ offsets.T),
-        stretch=stretch,
+        stretch=stretches @ errors,
         misfit=misfit,
         plane_rms=rms(distances[rows.on_face]),
         n_parameters=POSE + free,

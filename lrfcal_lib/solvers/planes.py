@@ -385,10 +385,9 @@ def estimate_with_lens(
 def _move_with_lens(state, step):
     """Retraction of pose, intrinsics (the first of them, as many as are free) and board poses."""
     pose, intrinsics, boards = state
-    common, by_placement = step
-    change = common[6:]
+    change = step[0, 6:-6]
     refined = intrinsics + np.pad(change, (0, LENS - len(change)))
-    return move_pose(pose, common[:6]), refined, move_pose(boards, by_placement)
+    return move_pose(pose, step[0, :6]), refined, move_pose(boards, step[:, -6:])
 
 
 def _read_with_lens(state, lens):

@@ -119,14 +119,12 @@ def solve_platform(
     gauge = start_head(T0)
     for final in (False, True):  # the second time in the gauge of the axis of the first
         boards = prepare_boards(obs, gauge)
-        on_edges = boards.edge["used"].sum()
-        points = on_edges + boards.face["used"].sum()
+        points = boards.points["used"].sum()
+        on_edges = np.sum(boards.points["number"] > 0)
         p = len(boards.placements)
         state = pose_array(gauge), boards.poses, np.zeros((p, 2))
         solution = solve(
-            partial(
-                platform_blocks, edge=boards.edge, face=boards.face, sigma_pitch=sigma_pitch
-            ),
+            partial(platform_blocks, points=boards.points, sigma_pitch=sigma_pitch),
             state,
             move_platform,
             names=AXIS_NAMES,
@@ -153,72 +151,54 @@ class Boards:
     placements : ndarray of int, shape (p,)
     poses : ndarray, shape (p, 3, 4)
         ``T_platform_board``, with x along edge 1 and z along the normal.
-    edge, face : dict of str to ndarray, shapes (p, n, ...)
-        Columns of the points, padded by placement. `second` is 1 for points of edge 2 and 0 for
-        others, those of a lone edge, too.
+    points : dict of str to ndarray, shapes (p, n, ...)
+        Columns of the points, padded by placement. `number` is 1 for points of the first edge that
+        is there, 2 for those of another, 0 for those on the face.
     skipped : dict of int to str
         Why the other placements cannot be used.
     """
 
     placements: np.ndarray
     poses: np.ndarray
-    edge: dict[str, np.ndarray]
-    face: dict[str, np.ndarray]
+    points: dict[str, np.ndarray]
     skipped: dict[int, str]
 
 
 def prepare_boards(obs: PlatformObservations, T_head_lrf: RigidTransform) -> Boards:
     """Boards and the points on them; DegenerateGeometry where no placement can be used."""
-    p_edge = lrf_to_platform(obs.edge_points, obs.edge_pitch, T_head_lrf)
-    p_face = lrf_to_platform(obs.face_points, obs.face_pitch, T_head_lrf)
+    pitch = np.concatenate([obs.edge_pitch, obs.face_pitch])
+    points = np.concatenate([obs.edge_points, obs.face_points])
+    placements = np.concatenate([obs.edge_placement, obs.face_placement])
+    number = np.pad(obs.edge_number, (0, len(obs.face_pitch)))
+    p_platform = lrf_to_platform(points, pitch, T_head_lrf)
     boards = {}
     skipped = {}
-    second = np.zeros(len(p_edge))
-    edge_row = np.full(len(p_edge), -1)
-    face_row = np.full(len(p_face), -1)
-    for placement, both in _edges(obs):
-        edges = [rows for rows in both if len(rows) >= 2]
-        on_face = obs.face_placement == placement
+    place = np.full(len(pitch), -1)
+    for placement in np.unique(obs.edge_placement).tolist():
+        here = placements == placement
+        face, *edges = (np.flatnonzero(here & (number == which)) for which in range(3))
+        edges = [rows for rows in edges if len(rows) >= 2]
         try:
-            pose = _start_board([p_edge[rows] for rows in edges], p_face[on_face])
+            pose = _start_board([p_platform[rows] for rows in edges], p_platform[face])
         except DegenerateGeometry as error:
             skipped[placement] = str(error)
             continue
-        face_row[on_face] = len(boards)
-        for number, rows in enumerate(edges):
-            edge_row[rows] = len(boards)
-            second[rows] = number
+        for which, rows in enumerate([face, *edges]):
+            place[rows] = len(boards)
+            number[rows] = which
         boards[placement] = pose
     if not boards:
         raise DegenerateGeometry(f"no placement can be used for the tilt axis: {skipped}")
-    edge = pad(
-        edge_row,
+    padded = pad(
+        place,
         len(boards),
-        points=obs.edge_points,
-        covariance=obs.edge_covariance,
-        pitch=obs.edge_pitch,
-        second=second,
+        points=points,
+        covariance=np.concatenate([obs.edge_covariance, obs.face_covariance]),
+        pitch=pitch,
+        number=number,
     )
-    face = pad(
-        face_row,
-        len(boards),
-        points=obs.face_points,
-        covariance=obs.face_covariance,
-        pitch=obs.face_pitch,
-        second=np.zeros(len(p_face)),
-    )
-    for group in (edge, face):
-        group["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
-    return Boards(
-        np.array(list(boards)), np.array(list(boards.values())), edge, face, skipped
-    )
-
-
-def _edges(obs):
-    """Placements, each with the rows of its edges 1 and 2."""
-    for placement in np.unique(obs.edge_placement).tolist():
-        here = obs.edge_placement == placement
-        yield placement, [np.flatnonzero(here & (obs.edge_number == n)) for n in (1, 2)]
+    padded["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
+    return Boards(np.array(list(boards)), np.array(list(boards.values())), padded, skipped)
 
 
 def _start_board(edges, face):
@@ -245,29 +225,29 @@ def _start_board(edges, face):
     return np.column_stack([x, np.cross(z, x), z, point])
 
 
-def distances(state, group):
+def distances(state, points):
     """Distances (p, n, 2) of points from their edge in the board's plane and across it.
 
     And their Jacobians by the unknowns, by the point and by the pitch. Edge 1 lies along x of the
-    board, edge 2 along y but for the skew and the gap. The second distance serves for points on the
-    face, too.
+    board, edge 2 along y but for the skew and the gap. Points on the face have no edge: the first
+    is zero.
     """
     head, boards, bends = state
-    second = group["second"]
-    rotated = group["points"] @ head[:, :3].T
-    q = tilt(rotated + head[:, 3], group["pitch"])
+    second = 1.0 * (points["number"] == 2)
+    rotated = points["points"] @ head[:, :3].T
+    q = tilt(rotated + head[:, 3], points["pitch"])
     lever = q - boards[:, None, :, 3]
     b = lever @ boards[:, :, :3]
     cosine = second * np.cos(bends[:, :1])
     sine = second * np.sin(bends[:, :1])
     normals = np.zeros(b.shape[:2] + (2, 3))  # board frame
     normals[..., 0, 0] = cosine
-    normals[..., 0, 1] = 1 - second + sine
+    normals[..., 0, 1] = sine + (points["number"] == 1)
     normals[..., 1, 2] = 1.0
     r = np.matvec(normals, b)
     r[..., 1] -= second * bends[:, 1:]
     gradient = normals @ boards[:, None, :, :3].mT  # by q, platform frame
-    in_head = tilt(gradient, -group["pitch"][..., None])
+    in_head = tilt(gradient, -points["pitch"][..., None])
     by_head = gradient_by_pose(rotated[..., None, :], in_head)
     by_unknowns = np.zeros(r.shape + (12,))
     by_unknowns[..., :4] = by_head[..., AXIS_COLUMNS]
@@ -278,40 +258,36 @@ def distances(state, group):
     return r, by_unknowns, in_head @ head[:, :3], by_pitch
 
 
-def distance_block(state, group, sigma_pitch, which):
-    """Some of the :func:`distances` of a group, whitened by the noise of points and pitch."""
-    r, J, by_point, by_pitch = (x[:, :, which] for x in distances(state, group))
-    pull = group["covariance"] @ by_point.mT
+def platform_blocks(state, points, sigma_pitch):
+    """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
+    r, J, by_point, by_pitch = distances(state, points)
+    pull = points["covariance"] @ by_point.mT
     by_pitch = sigma_pitch * by_pitch
     noise = by_point @ pull + dyads(by_pitch)
+    noise[..., 0, 0] += points["number"] == 0  # of no distance at all
     force = solve_each(noise, r)
-    points = group["points"] - np.matvec(pull, force)
-    pitch = group["pitch"] - sigma_pitch * np.vecdot(by_pitch, force)
-    moved = group | {"points": points, "pitch": pitch}
-    corrected = distances(state, moved)[1][:, :, which]
-    whitener = inverse_root(noise) * group["used"][..., None, None]
-    return Block.of_groups(r, J, whitener, corrected)
-
-
-def platform_blocks(state, edge, face, sigma_pitch):
-    """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
-    head, boards, bends = state
-    p = len(boards)
-    tolerance = np.broadcast_to(np.eye(12)[10:], (p, 2, 12))
-    stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))
+    moved = points | {
+        "points": points["points"] - np.matvec(pull, force),
+        "pitch": points["pitch"] - sigma_pitch * np.vecdot(by_pitch, force),
+    }
+    _, corrected, *_ = distances(state, moved)
+    whitener = inverse_root(noise) * points["used"][..., None, None]
+    _, _, bends = state
+    stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], bends.shape)
     return [
-        distance_block(state, edge, sigma_pitch, slice(0, 2)),
-        distance_block(state, face, sigma_pitch, slice(1, 2)),
-        Block(bends, tolerance, stiff),
+        Block.of_groups(r, J, whitener, corrected),
+        Block(bends, np.eye(12)[10:], stiff),
     ]
 
 
 def move_platform(state, step):
     """Retraction of axis, boards, and their skew and gap."""
     head, boards, bends = state
-    common, by_placement = step
-    pose, bend = np.split(by_placement, [6], axis=1)
-    return move_head(head, common), move_pose(boards, pose), bends + bend
+    return (
+        move_head(head, step[0, :4]),
+        move_pose(boards, step[:, 4:10]),
+        bends + step[:, 10:],
+    )
 
 
 def solve_projected(
@@ -393,7 +369,9 @@ def _slanted(obs, p_platform):
     """Rows of edges 1 and 2 of placements whose edges are slanted, and why others are left out."""
     groups = {}
     skipped = {}
-    for placement, edges in _edges(obs):
+    for placement in np.unique(obs.edge_placement).tolist():
+        here = obs.edge_placement == placement
+        edges = [np.flatnonzero(here & (obs.edge_number == number)) for number in (1, 2)]
         reasons = []
         for number, rows in enumerate(edges, start=1):
             if len(rows) < 3:
