@@ -99,7 +99,7 @@ def test_point_sigma_is_what_perturbed_calibrations_show():
     only_axis = replace(
         chain, covariances=(chain.covariances[0] * np.outer(of_axis, of_axis),)
     )
-    sigma = point_sigma(only_axis, bearings, pitches, 2.0, reference=0.1)[0]
+    sigma = point_sigma(only_axis, bearings, pitches, 2.0, reference=0.1)
     assert np.allclose(
         sigma[1], 0, atol=1e-12
     )  # measured at the reference: the axis cancels

@@ -171,7 +171,7 @@ class Calibration:
             for camera, solution in solved.items()
         }
         axis = self.platform.axes[self.platform.axis_with(method)]
-        if self.joint and method == "joint":
+        if method == "joint":
             corrections = self.joint.solution.corrections
             uncertainty = joint_uncertainty(self.joint.solution)
         else:

@@ -82,7 +82,7 @@ def reconstruct(
     normals = []
     every = max(1, sweep.ranges.size // GAIN_POINTS)
     for block in blocks_of():
-        painter.hide(block.hiding[np.isfinite(block.hiding).all(axis=-1)])
+        painter.hide(block.hiding.reshape(-1, 3))
         # a view would keep the whole block
         points.append(block.points[block.good][::every].copy())
         normals.append(block.normals[block.good][::every].copy())
@@ -170,8 +170,7 @@ def _blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous, sound):
     lines, beams = sweep.ranges.shape
     size = max(1, BLOCK // beams)
     for start in range(0, lines, size):
-        stop = min(start + size, lines)
-        about = slice(max(0, start - MARGIN), stop + MARGIN)
+        about = slice(max(0, start - MARGIN), start + size + MARGIN)
         ranges = sweep.ranges[about].astype(float)
         p_lrf = corrections.points(polar_to_points(ranges, sweep.bearings))
         # of every beam: between scan lines the mirror turns while the head moves
@@ -188,9 +187,9 @@ def _blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous, sound):
             hiding = lrf_to_platform(surface, pitch, T_head_lrf)
         origin = lrf_to_platform(np.zeros(3), pitch, T_head_lrf)
         normals, scatter = grid_normals(np.where(good[..., None], points, np.nan), origin)
-        inner = slice(start - about.start, stop - about.start)
+        inner = slice(start - about.start, start - about.start + size)
         yield _Block(
-            lines=slice(start, stop),
+            lines=slice(start, start + size),
             points=points[inner],
             normals=normals[inner],
             scatter=scatter[inner],

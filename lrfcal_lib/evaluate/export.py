@@ -62,7 +62,7 @@ def calibration_record(
     ]
     for camera, solution in calibration.cameras(method).items():
         record["cameras"][camera] |= _camera(calibration, camera, method, solution)
-    if calibration.joint is not None and method == "joint":
+    if method == "joint":
         record["sensor"] = _sensor(calibration.joint.solution)
     # numbers of this recording stand behind those of the rig, hashes last
     record["uncertainty"] = record.pop("uncertainty")

@@ -118,7 +118,7 @@ def method_comparison(
             "camera": camera,
             "method": name,
             "n_placements": len(np.unique(used)),
-            "edge_median_px": np.median(np.abs(edge)) if len(edge) else np.nan,
+            "edge_median_px": pd.Series(edge).abs().median(),
             "edge_rms_px": rms(edge),
             "plane_rms_mm": 1000 * rms(plane),
             "left_out_edge_rms_px": rms(held_edge),
@@ -323,11 +323,15 @@ def outline_table(outline: Outline) -> pd.DataFrame:
         Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours),
         n_images.
     """
-    rows = [
-        (name, 1000 * length, 1000 * outline.length_sd[name], outline.n_lengths[name])
-        for name, length in outline.board.lengths().items()
-    ]
-    return pd.DataFrame(rows, columns=["edge", "length_mm", "sd_mm", "n_images"])
+    table = pd.DataFrame(
+        {
+            "length_mm": outline.board.lengths(),
+            "sd_mm": outline.length_sd,
+            "n_images": outline.n_lengths,
+        }
+    )
+    table[["length_mm", "sd_mm"]] *= 1000
+    return table.rename_axis("edge").reset_index()
 
 
 def pitch_models_table(errors: PitchErrors) -> pd.DataFrame:

@@ -361,7 +361,7 @@ def far_cameras(joint) -> Iterator[Fault]:
         if camera not in guesses:
             continue
         turn, shift = transform_difference(transform, guesses[camera])
-        nearest = nearest_guess(transform, guesses)
+        nearest = min(guesses, key=lambda name: distance(transform, guesses[name]))
         if turn > FAR_TURN or shift > FAR_SHIFT:
             where = f"{_apart(turn, shift)} from its guess in session.json"
             yield _far(f"camera '{camera}' stands {where}: {CHECK}", turn)
@@ -371,11 +371,6 @@ def far_cameras(joint) -> Iterator[Fault]:
                 "folders exchanged?",
                 turn,
             )
-
-
-def nearest_guess(transform, guesses):
-    """Name of the camera whose guess is nearest."""
-    return min(guesses, key=lambda name: distance(transform, guesses[name]))
 
 
 def distance(a: RigidTransform, b: RigidTransform) -> float:

@@ -98,7 +98,7 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
 def projection_sigma(
     chain: Chain,
     model: CameraModel,
-    distances: ArrayLike,
+    distance: float,
     grid: tuple[int, int],
     *,
     image_pitch: float,
@@ -114,7 +114,7 @@ def projection_sigma(
     chain
         To the camera.
     model
-    distances : array_like, shape (d,)
+    distance : float
         From the LRF, metres.
     grid
         Columns and rows, see :func:`pixel_grid`.
@@ -126,15 +126,14 @@ def projection_sigma(
 
     Returns
     -------
-    ndarray, shape (d, rows, columns)
+    ndarray, shape (rows, columns)
         Root mean square distance from the true pixel; inf where a motion that matters is not
         determined, NaN where no scan reaches.
     """
-    away = np.reshape(distances, (-1, 1, 1))
     bearing, pitch = beams_of_pixels(
-        chain, model, pixel_grid(model, grid), away, image_pitch
+        chain, model, pixel_grid(model, grid), distance, image_pitch
     )
-    points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
+    points, by_link, by_pitch = carried(chain, bearing, pitch, distance, image_pitch)
     P = project_jacobians(points, model)[0]
     sigma_pitch = chain.sweep.sigma(pitch, sum(pitches) / 2)
     if chain.on_head:  # the offset is that of the image, too
@@ -154,7 +153,7 @@ def point_sigma(
     chain: Chain,
     bearings: np.ndarray,
     pitches: np.ndarray,
-    distances: ArrayLike,
+    distance: float,
     *,
     reference: float,
 ) -> np.ndarray:
@@ -168,20 +167,21 @@ def point_sigma(
     ----------
     chain
         To the cloud.
-    bearings, pitches, distances : array_like, shapes (c,), (r,), (d,)
-        Radians, radians, metres.
+    bearings, pitches : ndarray, shapes (c,), (r,)
+        Radians.
+    distance : float
+        Metres.
     reference
         Radians.
 
     Returns
     -------
-    ndarray, shape (d, r, c)
+    ndarray, shape (r, c)
         Metres; inf where a motion that matters is not determined.
     """
-    away = np.reshape(distances, (-1, 1, 1))
-    _, by_link, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
-    sigma_pitch = chain.sweep.sigma(pitches, reference)
-    by_sweep = sigma_pitch[:, None] * np.linalg.norm(by_pitch, axis=-1)
+    pitch = pitches[:, None]
+    _, by_link, by_pitch = carried(chain, bearings, pitch, distance, reference)
+    by_sweep = chain.sweep.sigma(pitch, reference) * np.linalg.norm(by_pitch, axis=-1)
     return np.hypot(spread(chain, by_link), by_sweep)
 
 

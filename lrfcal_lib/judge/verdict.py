@@ -206,7 +206,7 @@ def judge(
         return _refused(calibration, findings)
 
     rig = calibration.rig(method)
-    if method == "joint" and joint is not None:
+    if method == "joint":
         judged = verdict(joint.solution, rig, suggest=suggest, doubt=doubt)
     else:  # cameras that were calibrated one by one, with the axis of the platform step
         pitch = [scan.sweep.pitch for scan in prepared.scans.values()]
@@ -228,7 +228,7 @@ def _notes(calibration, method, lost):
         f"'{calibration.platform.axis_with(method)}'.",
         lost,
     ]
-    if method == "joint" and calibration.joint is not None:
+    if method == "joint":
         solution = calibration.joint.solution
         notes += [step_words(solution), _scatter_note(len(solution.boards))]
     return tuple(filter(None, notes))
@@ -275,23 +275,23 @@ def _expected(rig, pitch, doubt):
     half = max(np.ptp(pitch) / 2, LEAST_FIELD)
     field = (middle - half, middle + half)
     pitches = np.linspace(*field, PITCHES)
-    chain = chain_of(rig, doubt=doubt)
-    cloud = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
-    images = {
-        name: projection_sigma(
-            chain_of(rig, name, doubt),
-            camera.model,
-            DISTANCES,
-            PIXELS,
-            image_pitch=middle,
-            pitches=field,
-        )
-        for name, camera in rig.cameras.items()
-    }
     errors = {}
-    for i, distance in enumerate(DISTANCES):
-        pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
-        errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud[i])), pixels)
+    for distance in DISTANCES:
+        cloud = point_sigma(
+            chain_of(rig, doubt=doubt), BEARINGS, pitches, distance, reference=middle
+        )
+        pixels = {}
+        for name, camera in rig.cameras.items():
+            off = projection_sigma(
+                chain_of(rig, name, doubt),
+                camera.model,
+                distance,
+                PIXELS,
+                image_pitch=middle,
+                pitches=field,
+            )
+            pixels[name] = bounded(root_mean_square(off))
+        errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud)), pixels)
 
     reasons: tuple[Fault, ...] = ()
     large = errors[WORKING].words(above=1.0)

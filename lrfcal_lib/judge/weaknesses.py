@@ -94,11 +94,9 @@ def weak_pitch(solution) -> Iterator[Fault]:
     if AXIS_NAMES[0] not in solution.solution.names:
         return
     obs = solution.observations
-    of_view = obs.on_head[obs.view_camera]
-    image_pitch = obs.view_pitch[of_view]
-    image_placement = obs.view_placement[of_view]
-    pitch = np.concatenate([obs.face_pitch, obs.beam_pitch, image_pitch])
-    placement = np.concatenate([obs.face_placement, obs.beam_placement, image_placement])
+    obs = obs.keep(view=obs.on_head[obs.view_camera])
+    pitch = np.concatenate([obs.face_pitch, obs.beam_pitch, obs.view_pitch])
+    placement = np.concatenate([obs.face_placement, obs.beam_placement, obs.view_placement])
     where = " within a placement"
     if "platform" in obs.mounts:  # a camera on the base ties all placements together
         placement = np.zeros_like(placement)
@@ -112,7 +110,8 @@ def weak_pitch(solution) -> Iterator[Fault]:
             severe=True,
         )
     elif (
-        len(image_pitch) and largest_range(image_pitch, image_placement) < SMALL_IMAGE_PITCH
+        len(obs.view_pitch)
+        and largest_range(obs.view_pitch, obs.view_placement) < SMALL_IMAGE_PITCH
     ):
         yield Fault(
             Kind.IMAGE_PITCH,
@@ -267,7 +266,7 @@ def left_out(calibration: Calibration, method: str) -> tuple[list[Fault], str]:
     table = placements_table(prepared, calibration.observations).set_index("placement")
     reasons = table.reason.replace("", "no edge").to_dict()
     parts = [problem for problem in prepared.problems if problem.kind not in LEAVES_OUT]
-    if method == "joint" and calibration.joint is not None:
+    if method == "joint":
         solution = calibration.joint.solution
         used = set(solution.boards)
         reasons |= solution.excluded_placements
