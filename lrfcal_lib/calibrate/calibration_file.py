@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat, PlainValidator
+from pydantic import AfterValidator, BaseModel, Field, FiniteFloat
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
@@ -68,11 +68,8 @@ FORMULAS = {
 ROUND = 1e-9  # a rotation's matrix may be off by so much
 
 
-def _pose(matrix):
-    """A RigidTransform to the last bit."""
-    whole = np.array(matrix, float)
-    if whole.shape != (4, 4):
-        raise ValueError(f"it has the shape {whole.shape}, not (4, 4)")
+def _pose(whole):
+    """A RigidTransform of a matrix (4, 4), to the last bit."""
     R = whole[:3, :3]
     proper = np.abs(R @ R.T - np.eye(3)).max() < ROUND and np.linalg.det(R) > 0
     if not proper or whole[3].tolist() != [0, 0, 0, 1]:
@@ -80,7 +77,7 @@ def _pose(matrix):
     return pose_transform(whole[:3], proper=True)
 
 
-Pose = Annotated[RigidTransform, PlainValidator(_pose)]
+Pose = Annotated[RigidTransform, rows(4, 4), AfterValidator(_pose)]
 
 
 class PlatformWritten(BaseModel):
@@ -165,13 +162,14 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
     ----------
     rig : CalibratedRig
     """
-    cameras = {}
-    for name, camera in rig.cameras.items():
-        cameras[name] = {
+    cameras = {
+        name: {
             "mount": camera.mount,
             **pose_record(camera.T_camera),
             "lens": plain(vars(camera.model)),
         }
+        for name, camera in rig.cameras.items()
+    }
     return {
         "platform": {
             "maps": "lrf to head",

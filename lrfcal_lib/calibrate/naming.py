@@ -131,10 +131,11 @@ def nearest_edges(
     lines = board.lines()
     names = {}
     dropped = {}
-    cost = np.zeros((len(sides), len(lines)))
-    for row, points in enumerate(sides.values()):
-        distances = line_distance(points[:, None, :2], lines)
-        cost[row] = np.median(np.abs(distances), axis=0)
+    cost = [
+        np.median(np.abs(line_distance(points[:, None, :2], lines)), axis=0)
+        for points in sides.values()
+    ]
+    cost = np.reshape(cost, (-1, len(lines)))
     numbers = list(sides)
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
         number = numbers[row]

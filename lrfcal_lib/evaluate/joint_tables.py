@@ -148,7 +148,7 @@ def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
         "bias_mm": 1000 * obs.beam_radius * radii,
         "bias_radii": radii,
     }
-    sides = pd.DataFrame(columns).groupby([*columns][:3]).mean().reset_index()
+    sides = pd.DataFrame(columns).groupby([*columns][:3], as_index=False).mean()
     return sides.assign(edge=np.array(obs.edges)[sides.edge])
 
 

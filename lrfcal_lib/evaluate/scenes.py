@@ -87,27 +87,18 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     for view in views_of(session, rig, placement):
         painted = (cloud.image == view.number) & np.isfinite(depth)
         eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
-        blocked[painted] = _hidden(world, eye, true[painted])
+        way = true[painted] - eye
+        met = world.cast(eye, unit_vector(way))
+        blocked[painted] = met.distance < np.linalg.norm(way, axis=1) - CLEAR
+    light = 255 * world.radiance(hits)
+    ratio = cloud.colors[cloud.seen] / np.maximum(light[cloud.seen], 1e-9)
+    exposed = np.clip(light * np.median(ratio), 0, 255)
     return SceneErrors(
         depth=depth,
         normal=depth * hits.cosine,
-        color=_color_errors(cloud, 255 * world.radiance(hits)),
+        color=np.where(cloud.seen, np.abs(cloud.colors - exposed).mean(axis=1), np.nan),
         blocked=blocked,
     )
-
-
-def _hidden(world, eye, points):
-    """Which points (n, 3) something of a World hides from an eye (3,)."""
-    way = points - eye
-    hits = world.cast(eye, unit_vector(way))
-    return hits.distance < np.linalg.norm(way, axis=1) - CLEAR
-
-
-def _color_errors(cloud, light):
-    """Mean absolute difference (n,) of colours from the true light (n, 3) at one exposure."""
-    ratio = cloud.colors[cloud.seen] / np.maximum(light[cloud.seen], 1e-9)
-    exposed = np.clip(light * np.median(ratio), 0, 255)
-    return np.where(cloud.seen, np.abs(cloud.colors - exposed).mean(axis=1), np.nan)
 
 
 def as_stated(calibration: Calibration) -> Cloud:
