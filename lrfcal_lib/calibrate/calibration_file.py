@@ -162,21 +162,20 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
     ----------
     rig : CalibratedRig
     """
-    cameras = {
-        name: {
-            "mount": camera.mount,
-            **pose_record(camera.T_camera),
-            "lens": plain(vars(camera.model)),
-        }
-        for name, camera in rig.cameras.items()
-    }
     return {
         "platform": {
             "maps": "lrf to head",
             **pose_record(rig.axis.T_head_lrf),
             "axis_covariance": rig.axis.covariance.tolist(),
         },
-        "cameras": cameras,
+        "cameras": {
+            name: {
+                "mount": camera.mount,
+                **pose_record(camera.T_camera),
+                "lens": plain(vars(camera.model)),
+            }
+            for name, camera in rig.cameras.items()
+        },
         "corrections": {
             "range_offset_m": float(rig.corrections.range_offset),
             "pitch_scale": float(rig.corrections.pitch_scale),

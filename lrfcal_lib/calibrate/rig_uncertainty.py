@@ -103,8 +103,7 @@ def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
     information = solution.score().information.sum(axis=0)
     noise = 0.0
     if len(solution.observations.face_sigma):
-        stated = np.median(solution.observations.face_sigma)
-        noise = stated * solution.noise["face_scale"]
+        noise = solution.noise["face_scale"] * np.median(solution.observations.face_sigma)
     return RigUncertainty(
         names=estimate.names,
         covariance=estimate.covariance,
@@ -172,8 +171,7 @@ def _unseen(information, names, camera=None):
     index = columns_of(names, camera)
     known = index >= 0
     links = index[known]
-    others = np.setdiff1d(np.arange(len(names)), links)
-    order = np.concatenate([links, others])
+    order = np.concatenate([links, np.setdiff1d(np.arange(len(names)), links)])
     scales = np.array([SCALES.get(name, 1.0) for name in names])[order]
     whole = information[np.ix_(order, order)]
     hessian = reduced_hessian((whole * scales[:, None] * scales)[None], len(links))[0]

@@ -75,12 +75,11 @@ def calibration_record(
 def _sensor(solution):
     """What a JointSolution says about range finder and pitch, and what it left out in words."""
     sigma = solution.sigma
-    sensor = {
+    return {
         name: {"value": value, "sigma": sigma[name]}
         for name, value in solution.sensor.items()
         if name in sigma
-    }
-    return sensor | {"noise": solution.noise, "excluded": [*map(str, solution.excluded)]}
+    } | {"noise": solution.noise, "excluded": [*map(str, solution.excluded)]}
 
 
 def _camera(calibration, camera, method, solution):

@@ -101,9 +101,11 @@ def joint_table(joint: JointCalibration) -> pd.DataFrame:
         `Solution.trusted`).
     """
     s = joint.solution.solution
-    arrays = s.names, s.parameters, s.sigma, s.sigma_placements, s.trusted_sigma
-    columns = ("value", "sigma_noise", "sigma_placements", "sigma")
-    return parameter_table([], {(): arrays}, columns)
+    return parameter_table(
+        [],
+        {(): (s.names, s.parameters, s.sigma, s.sigma_placements, s.trusted_sigma)},
+        ("value", "sigma_noise", "sigma_placements", "sigma"),
+    )
 
 
 def noise_table(joint: JointCalibration) -> pd.DataFrame:
@@ -120,8 +122,8 @@ def noise_table(joint: JointCalibration) -> pd.DataFrame:
     """
     noise = joint.solution.noise
     noise["sigma_pitch"] = np.rad2deg(noise["sigma_pitch"])
-    values = pd.Series(noise).rename(NOISE_WORDS)
-    return values.rename_axis("what").reset_index(name="value")
+    values = pd.Series(noise).rename(NOISE_WORDS).rename_axis("what")
+    return values.reset_index(name="value")
 
 
 def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
@@ -167,11 +169,10 @@ def joint_fit(joint: JointCalibration, cameras: Iterable[str] = ()) -> dict[str,
         ``plane_rms_mm`` of face points from their boards, ``edge_rms_px`` of all half-step
         crossings of scan lines from the image edges, the estimated edge bias taken off.
     """
-    solution = joint.solution
     cameras = cameras or joint.observations.cameras
     edges = np.concatenate([edge_misses_px(joint, camera) for camera in cameras])
     return {
-        "plane_rms_mm": 1000 * rms(solution.face_heights()),
+        "plane_rms_mm": 1000 * rms(joint.solution.face_heights()),
         "edge_rms_px": rms(edges),
     }
 
@@ -267,6 +268,8 @@ def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:
         axis = KnownAxis(solution.T_head_lrf, solution.covariance(*AXIS_NAMES))
         rows.append({"what": "tilt axis"} | axis_errors(axis, truth))
     for camera in solution.transforms:
-        errors = camera_errors(solution.camera(camera), truth, camera)
-        rows.append({"what": f"camera {camera}"} | errors)
+        rows.append(
+            {"what": f"camera {camera}"}
+            | camera_errors(solution.camera(camera), truth, camera)
+        )
     return pd.DataFrame(rows)

@@ -172,10 +172,10 @@ def camera_calibration_table(solutions: dict[tuple[str, str], Solution]) -> pd.D
     DataFrame
         Columns camera, method, parameter, unit, value, sigma (`Solution.trusted`).
     """
-    parameters = {
-        key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()
-    }
-    return parameter_table(["camera", "method"], parameters)
+    return parameter_table(
+        ["camera", "method"],
+        {key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()},
+    )
 
 
 def platform_calibration_table(
@@ -277,15 +277,17 @@ def scans_table(prepared: Prepared) -> pd.DataFrame:
                 across.count(True),
             )
         )
-    columns = [
-        "placement",
-        "n_points",
-        "sigma_range_mm",
-        "jump_points",
-        "sides_along",
-        "sides_across",
-    ]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(
+        rows,
+        columns=[
+            "placement",
+            "n_points",
+            "sigma_range_mm",
+            "jump_points",
+            "sides_along",
+            "sides_across",
+        ],
+    )
 
 
 def intrinsics_table(models: dict[str, CameraModel]) -> pd.DataFrame:

@@ -62,8 +62,7 @@ class Truth:
         """Points (n, 3) of scans at their true pitch (n,) on a board, or each on its own: x and y
         in its plane, metres, and a 1, as lines take them.
         """
-        p_platform = lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
-        flat = T_platform_board.inv().apply(p_platform)
+        flat = T_platform_board.inv().apply(lrf_to_platform(p_lrf, pitch, self.T_head_lrf))
         flat[:, 2] = 1.0
         return flat
 

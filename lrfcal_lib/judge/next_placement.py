@@ -213,8 +213,7 @@ def board_poses(solution, grid):
     spin = Rotation.from_euler("z", turn, degrees=True)
     rotation = solution.T_head_lrf.rotation * gaze * AHEAD * tip * spin
     middle = solution.T_head_lrf.apply(distance * gaze.apply([0.0, 1.0, 0.0]))
-    T_platform_board = carry(rotation, outline(solution).mean(axis=0), middle)
-    return pose_array(T_platform_board)
+    return pose_array(carry(rotation, outline(solution).mean(axis=0), middle))
 
 
 def pitches_of_images(boards, solution, rig):
@@ -259,9 +258,9 @@ def candidate_information(boards, pitches, solution, rig):
         links = selection(solution.solution.names, camera)
         for pitch in at.T:
             p_camera, by_link, _ = carried(chain, *beams, image_pitch=pitch[:, None])
-            by_point = project_jacobians(p_camera, model)[0]
             sigma = np.hypot(by_image, by_scan * model.fx / p_camera[..., 2])
-            J = by_point @ by_link @ links / sigma[..., None, None]
+            J = project_jacobians(p_camera, model)[0] @ by_link @ links
+            J /= sigma[..., None, None]
             J = J.reshape(len(boards), -1, len(links.T))
             yield J.mT @ J
 

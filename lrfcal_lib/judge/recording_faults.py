@@ -161,8 +161,9 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     if hopeless(joint) and (misread := misread_recording(prepared)):
         return found + misread
     if joint is not None:
-        changes = camera_changes(joint.solution, prepared, joint.settings)
-        found += faults_of_changes(changes, prepared.views)
+        found += faults_of_changes(
+            camera_changes(joint.solution, prepared, joint.settings), prepared.views
+        )
         found += exchanged_placements(calibration)
     return found
 
@@ -354,8 +355,7 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
 def exchanged_placements(calibration) -> Iterator[Fault]:
     """Pairs of placements that are left out, and whose images fit the scans of each other."""
     prepared = calibration.prepared
-    excluded = calibration.joint.solution.excluded_placements
-    lost = sorted(prepared.left_out | excluded)
+    lost = sorted(prepared.left_out | calibration.joint.solution.excluded_placements)
     scans = boards_in(prepared.session, lost[:MOST_LOST], AS_STATED)
 
     strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
@@ -374,18 +374,16 @@ def exchanged_placements(calibration) -> Iterator[Fault]:
 
 def _same_board(calibration, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
-    prepared = calibration.prepared
     solution = calibration.joint.solution
     middle = solution.observations.corners.mean(axis=0)
     p_lrf, pitch, _ = face_points(scan, POINTS)
     p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
     agree = []
     for camera in solution.transforms:
-        view = prepared.posed(camera).get(placement)
+        view = calibration.prepared.posed(camera).get(placement)
         if view is not None:
-            T_camera_platform = solution.camera_at(camera, view.pitch)
-            T_board_platform = view.T_camera_board.inv() * T_camera_platform
-            on_board = T_board_platform.apply(p_platform)
+            p_camera = solution.camera_at(camera, view.pitch).apply(p_platform)
+            on_board = view.T_camera_board.inv().apply(p_camera)
             beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
             away = np.median(np.abs(on_board[:, 2]))
             agree.append(away < GOOD and beside < BESIDE)

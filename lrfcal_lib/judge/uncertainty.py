@@ -76,7 +76,7 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
     """
     known = uncertainty_of(rig)
     links = selection(known.names, camera)
-    both = np.stack([known.covariance, known.trusted])
+    both = [known.covariance, known.trusted]
     # zero for what is known; what has no bound is among `unseen`
     bounded = np.nan_to_num(both, nan=0.0, posinf=0.0, neginf=0.0)
     # boards of a wrong size stand elsewhere before the cameras: the range offset or the cameras'
@@ -91,8 +91,9 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
         on_head = rig.cameras[camera].mount == "head"
         pose = rig.cameras[camera].T_camera
         unseen = known.unseen_of_cameras[camera]
-    sweep = PitchNoise(*known.sweep_sigma)
-    return Chain(rig.T_head_lrf, pose, on_head, covariances, unseen, sweep)
+    return Chain(
+        rig.T_head_lrf, pose, on_head, covariances, unseen, PitchNoise(*known.sweep_sigma)
+    )
 
 
 def projection_sigma(
@@ -283,13 +284,13 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
     ndarray, shape (...)
         Of all m together, in their unit; inf where an undetermined motion matters.
     """
-    each = np.einsum("...ik,nkl,...il->n...", jacobian, chain.covariances, jacobian)
-    variance = each.max(axis=0, initial=0.0)
+    variance = np.einsum("...ik,nkl,...il->n...", jacobian, chain.covariances, jacobian)
     moved = chain.unseen @ jacobian.mT
     size = np.linalg.norm(jacobian, axis=(-2, -1))[..., None]
     least = SEEN * size * np.linalg.norm(chain.unseen, axis=-1)
     matters = np.linalg.norm(moved, axis=-1) > least
-    return np.where(np.any(matters, axis=-1), np.inf, np.sqrt(variance))
+    sigma = np.sqrt(variance.max(axis=0, initial=0.0))
+    return np.where(np.any(matters, axis=-1), np.inf, sigma)
 
 
 def beams_of_pixels(chain, model, uv, distance, image_pitch):

@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.judge.alternatives import step_words
+from lrfcal_lib.judge.alternatives import apart_words, step_words
 from lrfcal_lib.judge.findings import ANSWERS, CARE, NO, YES, Answer, Kind, brief
 from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import suggest_placement
@@ -169,8 +169,10 @@ class Verdict:
 
     def because(self, findings: list[Fault]) -> "Verdict":
         """The verdict with more findings, which stand before its own; the worst first."""
-        reasons = sorted((*findings, *self.reasons), key=lambda reason: not reason.severe)
-        return replace(self, reasons=tuple(reasons))
+        every = (*findings, *self.reasons)
+        return replace(
+            self, reasons=tuple(sorted(every, key=lambda reason: not reason.severe))
+        )
 
 
 def judge(
@@ -296,8 +298,13 @@ def _expected(rig, pitch, doubt):
     reasons: tuple[Fault, ...] = ()
     large = errors[WORKING].words(above=1.0)
     if large:
-        words = f"the expected error at {WORKING:g} m is {large}"
-        reasons = (Fault(Kind.ERROR, words, bool(errors[WORKING].words(BAD))),)
+        reasons = (
+            Fault(
+                Kind.ERROR,
+                f"the expected error at {WORKING:g} m is {large}",
+                bool(errors[WORKING].words(BAD)),
+            ),
+        )
     return Verdict(reasons, errors, range_noise_mm=1000 * range_noise(rig))
 
 
@@ -321,8 +328,7 @@ def _refused(calibration, findings):
     if prepared.problems:
         named = "; ".join(map(str, prepared.problems))
         notes = (f"Left out: {len(prepared.problems)} ({named}).",)
-    nothing = Verdict((), {}, np.nan, advice=RECORD, notes=notes)
-    return nothing.because([*findings, refused])
+    return Verdict((), {}, np.nan, RECORD, notes).because([*findings, refused])
 
 
 def _scatter_note(placements):
@@ -362,13 +368,12 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
             yield Fault(
                 Kind.SECOND_MINIMUM,
                 f"a second minimum explains the data nearly as well: camera '{camera}' "
-                f"{np.degrees(turn):.0f} deg and {1000 * shift:.0f} mm from where it is handed "
-                "over; record more placements that lean other ways",
+                f"{apart_words(turn, shift)} from where it is handed over; record more placements "
+                "that lean other ways",
                 severe=True,
             )
     unknown = calibration.platform.problem("combined")
-    sweeps = any(len(ways["half_step"]) > 1 for ways in prepared.edges.values())
-    if unknown and sweeps:
+    if unknown and any(len(ways["half_step"]) > 1 for ways in prepared.edges.values()):
         yield Fault(Kind.FAR_FROM_STATED, unknown.words, severe=True)
 
 

@@ -235,8 +235,11 @@ def blind_cameras(prepared: Prepared) -> Iterator[Fault]:
     """
     placements = prepared.session.board_placements
     for camera, views in prepared.views.items():
-        why = {p: views.get(p, NO_IMAGE).reason for p in placements}
-        unseen = [f"{placement} ({words})" for placement, words in why.items() if words]
+        unseen = [
+            f"{placement} ({why})"
+            for placement in placements
+            if (why := views.get(placement, NO_IMAGE).reason)
+        ]
         if len(unseen) > UNSEEN * len(placements):
             yield Fault(
                 Kind.LEFT_OUT,
