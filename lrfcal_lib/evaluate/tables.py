@@ -100,24 +100,18 @@ def method_comparison(
     rows = []
     for (camera, name), solution in solutions.items():
         if name == "joint":
-            obs = observations[camera, "joint"]
-            judge = obs.along()
-            used = obs.placements
+            judge = observations[camera, "joint"].along()
             held = () if joint is None else jointly_left_out(joint, camera)
         else:
-            method = METHODS[name]
-            obs = observations[camera, method.variant]
             judge = observations[camera, "half_step"].along()
-            used = obs.placements
-            if method.uses != "plane":
-                used = getattr(obs, f"{method.uses}_placement")
+            obs = observations[camera, METHODS[name].variant]
             held = left_out(obs, judge, name, solution)
         edge, plane = left_out_residuals([(judge, solution)])
         held_edge, held_plane = left_out_residuals(held)
         row = {
             "camera": camera,
             "method": name,
-            "n_placements": len(np.unique(used)),
+            "n_placements": solution.n_placements,
             "edge_median_px": pd.Series(edge).abs().median(),
             "edge_rms_px": rms(edge),
             "plane_rms_mm": 1000 * rms(plane),

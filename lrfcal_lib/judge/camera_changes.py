@@ -72,11 +72,6 @@ class CameraChange:
         """Whether turn and shift are more than chance allows, and more than nothing."""
         return self.p_value < LEVEL and self.motion_px > LEAST_SIZE
 
-    @property
-    def size_px(self):
-        """What the change does to images."""
-        return self.corner_px if self.zoomed else self.motion_px
-
 
 @dataclass(frozen=True)
 class Step:

@@ -220,11 +220,11 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
         return mirrored
 
     for group in (SENSES, IMAGES, UNITS):
-        fitting = {}
-        for reading in group:
-            misses = board_misses(prepared, reading)
-            if _fits(misses, stated):
-                fitting[reading] = misses
+        fitting = {
+            reading: misses
+            for reading in group
+            if _fits(misses := board_misses(prepared, reading), stated)
+        }
         if fitting:
             return [_misread(prepared, fitting, stated)]
     return []
@@ -327,6 +327,7 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
     steps = [change.after for change in changes]
     for change in changes:
         kind = "camera moved"
+        size_px = change.motion_px
         words = (
             f"camera '{change.camera}' was moved before placement {change.after}: turned by "
             f"{np.degrees(change.turn):.2f} deg and shifted by {1000 * change.shift:.1f} mm, which "
@@ -334,6 +335,7 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
         )
         if change.zoomed:
             kind = "camera zoomed"
+            size_px = change.corner_px
             words = (
                 f"the images of camera '{change.camera}' are {100 * abs(change.zoom):.2f} +- "
                 f"{100 * change.zoom_sigma:.2f} % {by_sign(change.zoom, 'larger', 'smaller')} "
@@ -346,7 +348,7 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
             kind,
             f"{words}; fix what is loose and record anew, or make two sessions: one of the "
             f"placements before {change.after}, one of the others",
-            severe=change.size_px > SEVERE_PX,
+            severe=size_px > SEVERE_PX,
             camera=change.camera,
             placements=(change.after,),
         )

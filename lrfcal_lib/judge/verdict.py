@@ -232,7 +232,15 @@ def _notes(calibration, method, lost):
     ]
     if method == "joint":
         solution = calibration.joint.solution
-        notes += [step_words(solution), _scatter_note(len(solution.boards))]
+        notes.append(step_words(solution))
+        count = len(solution.boards)
+        if FEWEST <= count < MANY:  # how well their scatter is itself known
+            known = 100 / np.sqrt(2 * (count - 1))
+            within = stdtrit(count - 1, 0.95)
+            notes.append(
+                f"{count} placements determine their own scatter to {known:.0f} % only: 90 % of "
+                f"the errors lie within {within:.1f} stated standard deviations, not 1.6."
+            )
     return tuple(filter(None, notes))
 
 
@@ -331,26 +339,11 @@ def _refused(calibration, findings):
     return Verdict((), {}, np.nan, RECORD, notes).because([*findings, refused])
 
 
-def _scatter_note(placements):
-    """How well the scatter over placements is itself known; '' where many tell it."""
-    if not FEWEST <= placements < MANY:
-        return ""
-    known = 100 / np.sqrt(2 * (placements - 1))
-    within = stdtrit(placements - 1, 0.95)
-    return (
-        f"{placements} placements determine their own scatter to {known:.0f} % only: 90 % of the "
-        f"errors lie within {within:.1f} stated standard deviations, not 1.6."
-    )
-
-
 def _weak_cameras(calibration, method) -> Iterator[Fault]:
     """What is weak about cameras that were calibrated one by one."""
     prepared = calibration.prepared
     solved = calibration.cameras(method)
-    fewest = min(
-        len(calibration.observations[camera, "half_step"].all_placements)
-        for camera in solved
-    )
+    fewest = min(solution.n_placements for solution in solved.values())
     if fewest < FEW:
         yield Fault(
             Kind.PLACEMENTS,
