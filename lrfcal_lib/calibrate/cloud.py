@@ -126,9 +126,11 @@ def write_ply(
     ValueError
         If the file cannot be written; it is whole, or as it was before.
     """
-    properties = []
-    for kind, names in COLUMNS.values():
-        properties += [f"property {KINDS[kind]} {name}" for name in names.split()]
+    properties = [
+        f"property {KINDS[kind]} {name}"
+        for kind, names in COLUMNS.values()
+        for name in names.split()
+    ]
     head = ["ply", "format binary_little_endian 1.0"]
     head += [f"comment {words}" for words in (*ABOUT, *comments)]
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import minimum_filter, uniform_filter
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud
@@ -243,11 +242,11 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     least, middle, _ = np.moveaxis(variances, -1, 0)
     known = (share > 1 / 3) & (middle > LEAST_SPREAD)
     rough = np.where(known, np.maximum(least, 0.0), np.inf).ravel()
-    around = np.pad(np.arange(rough.size).reshape(valid.shape), WINDOW, mode="edge")
-    nine = sliding_window_view(around, (width, width))[..., ::WINDOW, ::WINDOW]
-    nine = nine.reshape(*valid.shape, -1)  # numbers of the windows that hold a point
-    flattest = rough[nine].argmin(axis=-1, keepdims=True)
-    best = np.take_along_axis(nine, flattest, axis=-1)[..., 0]
+    flattest = rough.argsort()  # numbers of windows
+    rank = flattest.argsort().reshape(valid.shape)
+    nine = np.zeros((width, width))
+    nine[::WINDOW, ::WINDOW] = 1
+    best = flattest[minimum_filter(rank, footprint=nine, mode="nearest")]
     normals = directions[..., 0].reshape(-1, 3)[best]
     away = np.vecdot(normals, points - origins) > 0
     normals[away] *= -1

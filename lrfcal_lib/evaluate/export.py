@@ -13,6 +13,7 @@ from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.verdict import Verdict, judge
+from lrfcal_lib.model.geometry import POSE_NAMES
 from lrfcal_lib.session.files import read_bytes
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import FILES
@@ -95,9 +96,7 @@ def _camera(calibration, camera, method, solution):
         misfit = joint_fit(calibration.joint, [camera])
     return {
         "maps": f"{obs.source} to {obs.camera}",
-        "sigma": dict(
-            zip(solution.names[:6], solution.trusted_sigma[:6].tolist(), strict=True)
-        ),
+        "sigma": dict(zip(POSE_NAMES, solution.trusted_sigma.tolist(), strict=False)),
         "covariance": solution.trusted[:6, :6].tolist(),
         "converged": bool(solution.converged),
         "unobservable": solution.unobservable,

@@ -212,8 +212,10 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         the halves share). Splits of which a half leaves something open are missing.
     """
     rng = np.random.default_rng(0)
-    common = np.diag(joint.solution.lens) + joint.solution.step**2
-    numbers = list(joint.solution.boards)
+    solution = joint.solution
+    common = np.diag(solution.lens) + solution.step**2  # of what halves share
+    variances = np.maximum(solution.solution.trusted_sigma**2 - common, 0.0)
+    numbers = list(solution.boards)
     rows = []
     if len(numbers) <= 4:  # two placements determine no rig
         pairs = 0
@@ -221,7 +223,7 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         parts = np.array_split(rng.permutation(numbers), 2)
         try:
             first, second = (
-                solve_again(joint.observations.select(np.sort(part)), joint.solution)
+                solve_again(joint.observations.select(np.sort(part)), solution)
                 for part in parts
             )
         except DegenerateGeometry:
@@ -230,10 +232,8 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
             apart = transform_difference(
                 first.transforms[camera], second.transforms[camera]
             )
-            # without what halves share
-            variances = joint.solution.camera(camera).trusted_sigma ** 2
-            variances -= common[joint.solution.columns(camera)]
-            predicted = 2 * np.sqrt(np.maximum(variances, 0.0).reshape(2, 3).sum(axis=1))
+            of_camera = variances[solution.columns(camera)].reshape(2, 3)
+            predicted = 2 * np.sqrt(of_camera.sum(axis=1))
             rows.append((pair, camera, *DEG_MM * apart, *DEG_MM * predicted))
     return pd.DataFrame(
         rows,
