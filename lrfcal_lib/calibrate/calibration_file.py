@@ -26,7 +26,6 @@ from lrfcal_lib.session.stated import (
 
 SCHEMA = 3
 KIND = "lrfcal calibration"
-AGAIN = "calibrate its session again"
 FORMULAS = {
     "frames": (
         "Destination first: p_camera = T_camera_source p_source, metres and radians; `matrix` is "
@@ -167,6 +166,12 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
             "maps": "lrf to head",
             **pose_record(rig.axis.T_head_lrf),
             "axis_covariance": rig.axis.covariance.tolist(),
+            "axis_covariance_of": [
+                "out_of_scan_plane_rad",
+                "in_scan_plane_rad",
+                "offset_in_scan_plane_m",
+                "offset_across_scan_plane_m",
+            ],
         },
         "cameras": {
             name: {
@@ -177,11 +182,11 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
             for name, camera in rig.cameras.items()
         },
         "corrections": {
-            "range_offset_m": float(rig.corrections.range_offset),
-            "pitch_scale": float(rig.corrections.pitch_scale),
+            "range_offset_m": rig.corrections.range_offset,
+            "pitch_scale": rig.corrections.pitch_scale,
         },
-        "lrf": dict(vars(rig.lrf)),
-        "uncertainty": None if rig.uncertainty is None else plain(vars(rig.uncertainty)),
+        "lrf": vars(rig.lrf),
+        "uncertainty": rig.uncertainty and plain(vars(rig.uncertainty)),
     }
 
 
@@ -229,8 +234,9 @@ def load_calibration(path: str | Path) -> CalibratedRig:
             "'calibrate' writes calibration.json"
         )
     if schema != SCHEMA:
-        newer = isinstance(schema, int) and schema > SCHEMA
-        remedy = "take a newer lrfcal" if newer else AGAIN
+        remedy = "calibrate its session again"
+        if isinstance(schema, int) and schema > SCHEMA:
+            remedy = "take a newer lrfcal"
         raise SessionError(f"{path}: schema {schema}, this reads {SCHEMA}: {remedy}")
     with naming(path):
         return _made(from_json(CalibrationFile, data))

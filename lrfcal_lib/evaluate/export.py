@@ -55,12 +55,6 @@ def calibration_record(
         "verdict": judged.record(),
         **rig_record(calibration.rig(method)),
     }
-    record["platform"]["axis_covariance_of"] = [
-        "out_of_scan_plane_rad",
-        "in_scan_plane_rad",
-        "offset_in_scan_plane_m",
-        "offset_across_scan_plane_m",
-    ]
     for camera, solution in calibration.cameras(method).items():
         record["cameras"][camera] |= _camera(calibration, camera, method, solution)
     if method == "joint":
@@ -88,8 +82,7 @@ def _camera(calibration, camera, method, solution):
 
     Of the joint estimate without the edge bias, from its own boards.
     """
-    variant = "joint" if method == "joint" else "half_step"
-    obs = calibration.observations[camera, variant]
+    obs = calibration.observations[camera, "joint" if method == "joint" else "half_step"]
     edge, plane = left_out_residuals([(obs, solution)])
     misfit = {"edge_rms_px": rms(edge), "plane_rms_mm": 1000 * rms(plane)}
     if method == "joint":

@@ -124,17 +124,16 @@ def suggest_placement(solution: JointSolution, rig: CalibratedRig) -> Suggestion
     boards = boards[seen]
     known = solution.score().information.sum(axis=0)
     added = sum(candidate_information(boards, pitches, solution, rig))
-    before = total_sigma(known, solution)
-    after = total_sigma(known + added, solution)
-    best = np.argmin(after)
+    left = total_sigma(known + added, solution) / total_sigma(known, solution)
+    best = np.argmin(left)
     if "head" not in solution.observations.mounts:
         pitches = pitches[:, :0]
     return Suggestion(
         T_platform_board=pose_transform(boards[best]),
         place=grid[seen[best]],
         pitches=pitches[best],
-        gain=1 - after[best] / before,
-        median_gain=1 - np.median(after) / before,
+        gain=1 - left[best],
+        median_gain=1 - np.median(left),
     )
 
 
@@ -166,12 +165,12 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
     Returns
     -------
     dict of str to ndarray, shape (...)
-        Of 'axis' and of each camera, as far as they were unknown.
+        Of the axis and of each camera, by its name in words, as far as they were unknown.
     """
     sigma = sigma_of(covariance) / scales_of(solution)
-    columns = {"axis": solution.columns(*AXIS_NAMES)}
+    columns = {"the axis": solution.columns(*AXIS_NAMES)}
     for camera in solution.transforms:
-        columns[camera] = solution.columns(camera)
+        columns[f"camera '{camera}'"] = solution.columns(camera)
     return {
         name: np.linalg.norm(sigma[..., index], axis=-1)
         for name, index in columns.items()
@@ -306,4 +305,4 @@ def image_sigma(solution, camera, model):
     variance = solution.noise["view_scale"] ** 2 * np.median(by_pixel / by_shift)
     if obs.mounts[number] == "head":  # all points of an image share the error of its pitch
         variance += (model.fx * solution.noise["sigma_pitch"]) ** 2
-    return np.sqrt(variance * len(points_of_face(solution)))
+    return np.sqrt(variance * len(obs.corners))

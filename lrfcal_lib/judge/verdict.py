@@ -322,10 +322,10 @@ def _refused(calibration, findings):
     It says what keeps the joint estimate, or else every camera, from an answer.
     """
     prepared = calibration.prepared
-    at_once = calibration.problem("joint")
-    problems = calibration.problems if at_once is None else [at_once]
-    words = dict.fromkeys(problem.words for problem in problems)
-    why = "; ".join([*words][:3])
+    why = calibration.why_not("joint")
+    if not why:
+        words = dict.fromkeys(problem.words for problem in calibration.problems)
+        why = "; ".join([*words][:3])
     if not prepared.views:
         lost = prepared.problems_of(ProblemKind.NO_IMAGES)
         why = lost[0].words if lost else "the session has no camera"
@@ -352,8 +352,7 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
         )
     for camera in prepared.views:
         if camera not in solved:
-            problem = calibration.problem(method, camera)
-            why = problem.words if problem else "no result"
+            why = calibration.why_not(method, camera) or "no result"
             yield Fault(Kind.CAMERAS, f"camera '{camera}' is not handed over ({why})")
     for camera, solution in solved.items():
         if solution.rival is not None:
@@ -365,18 +364,17 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
                 "that lean other ways",
                 severe=True,
             )
-    unknown = calibration.platform.problem("combined")
+    unknown = calibration.platform.why_not("combined")
     if unknown and any(len(ways["half_step"]) > 1 for ways in prepared.edges.values()):
-        yield Fault(Kind.FAR_FROM_STATED, unknown.words, severe=True)
+        yield Fault(Kind.FAR_FROM_STATED, unknown, severe=True)
 
 
 def _not_joint(calibration):
     """The Fault that another method than the joint estimate is handed over, and why."""
     joint = calibration.joint
-    at_once = calibration.problem("joint")
-    bad = [at_once.words] if at_once else []
+    why = calibration.why_not("joint")
     if joint is not None:
-        bad = [fault.words for fault in diagnose(joint.solution) if fault.severe]
-    why = "; ".join(bad) or "another method was asked for"
+        why = "; ".join(fault.words for fault in diagnose(joint.solution) if fault.severe)
+    why = why or "another method was asked for"
     severe = joint is None or not joint.solution.converged
     return Fault(Kind.HANDED_OVER, f"the joint estimate is not handed over ({why})", severe)

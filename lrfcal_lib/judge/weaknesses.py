@@ -139,10 +139,9 @@ def large_residuals(solution) -> Iterator[Fault]:
     ratio = scatter_over_placements(solution)
     worst = max(ratio, key=ratio.__getitem__)
     if ratio[worst] > MODEL_ERROR:
-        what = "the axis" if worst == "axis" else f"camera '{worst}'"
         yield Fault(
             Kind.MODEL_ERROR,
-            f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: "
+            f"placements disagree about {worst} {ratio[worst]:.1f} times more than noise explains: "
             "an error of the model",
         )
 
@@ -204,20 +203,24 @@ def sides_elsewhere(prepared: Prepared) -> Iterator[Fault]:
     Fault
         One an edge.
     """
-    elsewhere = [side for sides in prepared.dropped.values() for side in sides.values()]
     for edge in prepared.board.edges:
-        dropped = [side for side in elsewhere if side.edge == edge]
+        dropped = [
+            side
+            for sides in prepared.dropped.values()
+            for side in sides.values()
+            if side.edge == edge
+        ]
         crossed = len(dropped) + sum(
             edge in names.values() for names in prepared.names.values()
         )
         if len(dropped) >= FEWEST and len(dropped) > MOST * crossed:
-            turn = np.degrees(np.median([side.turn for side in dropped]))
-            off = 1000 * np.median([side.distance for side in dropped])
+            off, turn = np.median([[side.distance, side.turn] for side in dropped], axis=0)
             yield Fault(
                 Kind.OUTLINE,
                 f"the board's edge '{edge}' lies elsewhere than its outline says in "
-                f"{len(dropped)} of {crossed} scans ({off:.0f} mm off, turned by {turn:.1f} deg) "
-                "and is not used there: measure the board's edges (corners_m)",
+                f"{len(dropped)} of {crossed} scans ({1000 * off:.0f} mm off, turned by "
+                f"{np.degrees(turn):.1f} deg) and is not used there: measure the board's edges "
+                "(corners_m)",
             )
 
 
