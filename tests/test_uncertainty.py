@@ -27,7 +27,13 @@ MODEL = Devices().model
 def random_chain(mount, rng, camera=CAMERA, size=1e-3):
     mix = size * rng.normal(size=(13, 13)) / 3
     return Chain(
-        HEAD, camera, mount == "head", (mix @ mix.T,), np.zeros((0, 13)), PitchNoise()
+        head=HEAD,
+        camera=camera,
+        on_head=mount == "head",
+        covariances=(mix @ mix.T,),
+        links=np.eye(13),
+        unseen=np.zeros((0, 13)),
+        sweep=PitchNoise(),
     )
 
 

@@ -3,8 +3,8 @@ in bounded memory.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import minimum_filter, uniform_filter
@@ -143,8 +143,7 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
     )
 
 
-@dataclass(frozen=True)
-class _Block:
+class _Block(NamedTuple):
     """Some scan lines of a sweep, points on a grid (l, B): in space, with normals and scatter
     about the surface, as they hide others, and whether they are sound.
     """

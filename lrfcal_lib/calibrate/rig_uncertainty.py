@@ -144,8 +144,11 @@ def uncertainty_one_by_one(
     -------
     RigUncertainty
     """
-    poses = [f"{camera}_{name}" for camera in solutions for name in POSE_NAMES]
-    names = (*AXIS_NAMES, *poses, "range_offset")
+    names = (
+        *AXIS_NAMES,
+        *(f"{camera}_{name}" for camera in solutions for name in POSE_NAMES),
+        "range_offset",
+    )
     noise_only = [solution.covariance[:6, :6] for solution in solutions.values()]
     trusted = [solution.trusted[:6, :6] for solution in solutions.values()]
     offset = np.array([[admitted_offset**2]])

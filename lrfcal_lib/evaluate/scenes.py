@@ -70,10 +70,9 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     station = Placement(placement, T_room_platform=truth.stations.get(placement))
     world = world_of(load_setup(truth.setup), station)
     recorded = session.sweep(placement).pitch
-    true_pitch = truth.pitch[placement]
     gauge = truth.gauge(rig, placement, recorded)
     order = np.argsort(recorded)
-    pitch = np.interp(cloud.pitch, recorded[order], true_pitch[order])
+    pitch = np.interp(cloud.pitch, recorded[order], truth.pitch[placement][order])
     points = gauge.apply(cloud.points)
     origins = tilt(truth.T_head_lrf.translation, pitch)
     length = np.linalg.norm(points - origins, axis=1)

@@ -342,12 +342,12 @@ def pitch_models_table(errors: PitchErrors) -> pd.DataFrame:
     DataFrame
         Columns model, n_parameters, plane_rms_mm, F, p_value (against the model before).
     """
-    rows = [
-        (model.name, model.n_parameters, 1000 * model.plane_rms, model.F, model.p_value)
-        for model in errors.models.values()
-    ]
     return pd.DataFrame(
-        rows, columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"]
+        [
+            (model.name, model.n_parameters, 1000 * model.plane_rms, model.F, model.p_value)
+            for model in errors.models.values()
+        ],
+        columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"],
     )
 
 

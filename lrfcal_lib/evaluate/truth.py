@@ -148,8 +148,10 @@ def camera_errors(solution: Solution, truth: Truth, camera: str) -> dict[str, fl
     dict of str to float
         See :func:`beside_sigma`.
     """
-    apart = transform_difference(solution.transform, truth.cameras[camera])
-    return beside_sigma(*apart, solution.trusted[:6, :6])
+    return beside_sigma(
+        *transform_difference(solution.transform, truth.cameras[camera]),
+        solution.trusted[:6, :6],
+    )
 
 
 def axis_errors(axis: KnownAxis, truth: Truth) -> dict[str, float]:
@@ -165,8 +167,10 @@ def axis_errors(axis: KnownAxis, truth: Truth) -> dict[str, float]:
     dict of str to float
         See :func:`beside_sigma`.
     """
-    apart = axis_difference(axis_of(axis.T_head_lrf), axis_of(truth.T_head_lrf))
-    return beside_sigma(*apart, axis.covariance)
+    return beside_sigma(
+        *axis_difference(axis_of(axis.T_head_lrf), axis_of(truth.T_head_lrf)),
+        axis.covariance,
+    )
 
 
 def beside_sigma(turn: float, shift: float, covariance: np.ndarray) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -73,8 +74,7 @@ class CameraChange:
         return self.p_value < LEVEL and self.motion_px > LEAST_SIZE
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """A step in a camera's pose at some place (indices), and its probability by chance.
 
     `change` (6,) are the increments ``[w, v]`` of the pose, as a score test has them.
@@ -82,8 +82,8 @@ class Step:
 
     camera: int
     row: int
-    p_value: float = 0.0
-    change: np.ndarray | None = None
+    p_value: float
+    change: np.ndarray
 
 
 def camera_changes(
@@ -191,8 +191,7 @@ def _chance_of_step(score, columns, row):
     square = change @ information @ change
     pull = pulls[:, -POSE:]  # its scatter is that of the placements
     scatter = np.einsum("pi,ij,pj->", pull, information, pull) / POSE * count / (count - 1)
-    p_value = fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0))
-    return p_value, change
+    return fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0)), change
 
 
 def largest_motion(solution, step, model):

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import selection
 from lrfcal_lib.fit.covariance import dyads, sigma_of
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import by_sign
@@ -254,13 +253,12 @@ def candidate_information(boards, pitches, solution, rig):
         model = rig.cameras[camera].model
         by_image = image_sigma(solution, camera, model)
         chain = chain_of(rig, camera)
-        links = selection(solution.solution.names, camera)
         for pitch in at.T:
             p_camera, by_link, _ = carried(chain, *beams, image_pitch=pitch[:, None])
             sigma = np.hypot(by_image, by_scan * model.fx / p_camera[..., 2])
-            J = project_jacobians(p_camera, model)[0] @ by_link @ links
+            J = project_jacobians(p_camera, model)[0] @ by_link @ chain.links
             J /= sigma[..., None, None]
-            J = J.reshape(len(boards), -1, len(links.T))
+            J = J.reshape(len(boards), -1, J.shape[-1])
             yield J.mT @ J
 
 
@@ -288,8 +286,7 @@ def scan_sigma(solution, boards):
 def solid_angle(solution, boards):
     """How large boards (n, 3, 4) look from the LRF, relative to their area, (n,)."""
     sight = sights(boards, solution)
-    distance = np.linalg.norm(sight, axis=1)
-    return np.abs(np.vecdot(sight, boards[:, :, 2])) / distance**3
+    return np.abs(np.vecdot(sight, boards[:, :, 2])) / np.linalg.norm(sight, axis=1) ** 3
 
 
 def image_sigma(solution, camera, model):

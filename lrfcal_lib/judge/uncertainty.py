@@ -44,6 +44,9 @@ class Chain:
     covariances : ndarray, shape (n, 13, 13)
         Of `COLUMNS` (increments ``[w, v]`` of the transforms). Where there are several, the one
         that gives more counts, quantity by quantity.
+    links : ndarray, shape (13, c)
+        Which of the rig's shared unknowns each of `COLUMNS` is, see
+        :func:`lrfcal_lib.calibrate.rig_uncertainty.selection`.
     unseen : ndarray, shape (m, 13)
         Motions that nothing determines: what depends on them has no bound.
     sweep : PitchNoise
@@ -54,6 +57,7 @@ class Chain:
     camera: RigidTransform | None
     on_head: bool
     covariances: np.ndarray
+    links: np.ndarray
     unseen: np.ndarray
     sweep: PitchNoise
 
@@ -92,7 +96,13 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
         pose = rig.cameras[camera].T_camera
         unseen = known.unseen_of_cameras[camera]
     return Chain(
-        rig.T_head_lrf, pose, on_head, covariances, unseen, PitchNoise(*known.sweep_sigma)
+        head=rig.T_head_lrf,
+        camera=pose,
+        on_head=on_head,
+        covariances=covariances,
+        links=links,
+        unseen=unseen,
+        sweep=PitchNoise(*known.sweep_sigma),
     )
 
 

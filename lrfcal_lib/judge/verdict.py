@@ -284,11 +284,14 @@ def _expected(rig, pitch, doubt):
     middle = (pitch.min() + pitch.max()) / 2
     half = max(np.ptp(pitch) / 2, LEAST_FIELD)
     field = (middle - half, middle + half)
-    pitches = np.linspace(*field, PITCHES)
     errors = {}
     for distance in DISTANCES:
         cloud = point_sigma(
-            chain_of(rig, doubt=doubt), BEARINGS, pitches, distance, reference=middle
+            chain_of(rig, doubt=doubt),
+            BEARINGS,
+            np.linspace(*field, PITCHES),
+            distance,
+            reference=middle,
         )
         pixels = {}
         for name, camera in rig.cameras.items():
@@ -376,5 +379,8 @@ def _not_joint(calibration):
     if joint is not None:
         why = "; ".join(fault.words for fault in diagnose(joint.solution) if fault.severe)
     why = why or "another method was asked for"
-    severe = joint is None or not joint.solution.converged
-    return Fault(Kind.HANDED_OVER, f"the joint estimate is not handed over ({why})", severe)
+    return Fault(
+        Kind.HANDED_OVER,
+        f"the joint estimate is not handed over ({why})",
+        severe=joint is None or not joint.solution.converged,
+    )
