@@ -66,9 +66,9 @@ def test_an_axis_that_nothing_tells_is_assumed_and_named_so():
     platform = calibrate_platform(nothing)
     assert not platform.solutions and list(platform.axes) == ["combined"]
     assert np.allclose(platform.transform("combined").as_matrix(), np.eye(4))
-    assert "neither stated nor determined" in platform.problem("combined").words
+    assert "neither stated nor determined" in platform.why_not("combined")
     stated = calibrate_platform(nothing, head(1), SIGMA)
     assert (
-        stated.problem("combined") is None
+        stated.why_not("combined") == ""
         and stated.axes["combined"] is stated.axes["stated"]
     )

@@ -31,7 +31,7 @@ def cloud(quick):
 def ply(cloud, tmp_path_factory):
     """Its file."""
     path = tmp_path_factory.mktemp("cloud") / "cloud.ply"
-    write_ply(path, cloud)
+    write_ply(path, [cloud])
     return path
 
 
@@ -39,7 +39,7 @@ WRITERS = {  # by the name of the file
     "calibration.json": lambda path, cloud, ply: write_calibration(
         path, {"numbers": [0.5] * LITTLE}
     ),
-    "cloud.ply": lambda path, cloud, ply: write_ply(path, cloud),
+    "cloud.ply": lambda path, cloud, ply: write_ply(path, [cloud]),
     "scene.pcd": lambda path, cloud, ply: write_pcd(path, ply),
 }
 

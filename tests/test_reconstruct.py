@@ -286,7 +286,7 @@ def test_blocks_are_the_whole(monkeypatch, tmp_path):
             err_msg=name,
         )
     assert clouds.write_ply(tmp_path / "blocks.ply", iter(blocks)) == len(at_once.points)
-    clouds.write_ply(tmp_path / "whole.ply", clouds.join(blocks))
+    clouds.write_ply(tmp_path / "whole.ply", [clouds.join(blocks)])
     assert (tmp_path / "blocks.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
 
 
@@ -360,7 +360,7 @@ def test_files_hold_everything_and_say_frame_and_units(tmp_path):
     import open3d as o3d
 
     cloud = whole(scan(step_edge)[1], [view(plain_image(), pose=AHEAD)])
-    clouds.write_ply(tmp_path / "deep" / "c.ply", cloud, ["session made up"])
+    clouds.write_ply(tmp_path / "deep" / "c.ply", [cloud], ["session made up"])
     head = (tmp_path / "deep" / "c.ply").read_bytes().split(b"end_header")[0].decode()
     assert all(f"comment {words}" in head for words in (*clouds.ABOUT, "session made up"))
     write_pcd(tmp_path / "c.pcd", tmp_path / "deep" / "c.ply")

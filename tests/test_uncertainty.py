@@ -27,7 +27,13 @@ MODEL = Devices().model
 def random_chain(mount, rng, camera=CAMERA, size=1e-3):
     mix = size * rng.normal(size=(13, 13)) / 3
     return Chain(
-        HEAD, camera, mount == "head", (mix @ mix.T,), np.zeros((0, 13)), PitchNoise()
+        head=HEAD,
+        camera=camera,
+        on_head=mount == "head",
+        covariances=(mix @ mix.T,),
+        links=np.eye(13),
+        unseen=np.zeros((0, 13)),
+        sweep=PitchNoise(),
     )
 
 
@@ -99,7 +105,7 @@ def test_point_sigma_is_what_perturbed_calibrations_show():
     only_axis = replace(
         chain, covariances=(chain.covariances[0] * np.outer(of_axis, of_axis),)
     )
-    sigma = point_sigma(only_axis, bearings, pitches, 2.0, reference=0.1)[0]
+    sigma = point_sigma(only_axis, bearings, pitches, 2.0, reference=0.1)
     assert np.allclose(
         sigma[1], 0, atol=1e-12
     )  # measured at the reference: the axis cancels

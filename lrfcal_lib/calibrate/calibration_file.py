@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat, PlainValidator
+from pydantic import AfterValidator, BaseModel, Field, FiniteFloat
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cameras import KnownAxis
@@ -26,7 +26,6 @@ from lrfcal_lib.session.stated import (
 
 SCHEMA = 3
 KIND = "lrfcal calibration"
-AGAIN = "calibrate its session again"
 FORMULAS = {
     "frames": (
         "Destination first: p_camera = T_camera_source p_source, metres and radians; `matrix` is "
@@ -68,11 +67,8 @@ FORMULAS = {
 ROUND = 1e-9  # a rotation's matrix may be off by so much
 
 
-def _pose(matrix):
-    """A RigidTransform to the last bit."""
-    whole = np.array(matrix, float)
-    if whole.shape != (4, 4):
-        raise ValueError(f"it has the shape {whole.shape}, not (4, 4)")
+def _pose(whole):
+    """A RigidTransform of a matrix (4, 4), to the last bit."""
     R = whole[:3, :3]
     proper = np.abs(R @ R.T - np.eye(3)).max() < ROUND and np.linalg.det(R) > 0
     if not proper or whole[3].tolist() != [0, 0, 0, 1]:
@@ -80,7 +76,7 @@ def _pose(matrix):
     return pose_transform(whole[:3], proper=True)
 
 
-Pose = Annotated[RigidTransform, PlainValidator(_pose)]
+Pose = Annotated[RigidTransform, rows(4, 4), AfterValidator(_pose)]
 
 
 class PlatformWritten(BaseModel):
@@ -165,26 +161,32 @@ def rig_record(rig: CalibratedRig) -> dict[str, Any]:
     ----------
     rig : CalibratedRig
     """
-    cameras = {}
-    for name, camera in rig.cameras.items():
-        cameras[name] = {
-            "mount": camera.mount,
-            **pose_record(camera.T_camera),
-            "lens": plain(vars(camera.model)),
-        }
     return {
         "platform": {
             "maps": "lrf to head",
             **pose_record(rig.axis.T_head_lrf),
             "axis_covariance": rig.axis.covariance.tolist(),
+            "axis_covariance_of": [
+                "out_of_scan_plane_rad",
+                "in_scan_plane_rad",
+                "offset_in_scan_plane_m",
+                "offset_across_scan_plane_m",
+            ],
         },
-        "cameras": cameras,
+        "cameras": {
+            name: {
+                "mount": camera.mount,
+                **pose_record(camera.T_camera),
+                "lens": plain(vars(camera.model)),
+            }
+            for name, camera in rig.cameras.items()
+        },
         "corrections": {
-            "range_offset_m": float(rig.corrections.range_offset),
-            "pitch_scale": float(rig.corrections.pitch_scale),
+            "range_offset_m": rig.corrections.range_offset,
+            "pitch_scale": rig.corrections.pitch_scale,
         },
-        "lrf": dict(vars(rig.lrf)),
-        "uncertainty": None if rig.uncertainty is None else plain(vars(rig.uncertainty)),
+        "lrf": vars(rig.lrf),
+        "uncertainty": rig.uncertainty and plain(vars(rig.uncertainty)),
     }
 
 
@@ -232,8 +234,9 @@ def load_calibration(path: str | Path) -> CalibratedRig:
             "'calibrate' writes calibration.json"
         )
     if schema != SCHEMA:
-        newer = isinstance(schema, int) and schema > SCHEMA
-        remedy = "take a newer lrfcal" if newer else AGAIN
+        remedy = "calibrate its session again"
+        if isinstance(schema, int) and schema > SCHEMA:
+            remedy = "take a newer lrfcal"
         raise SessionError(f"{path}: schema {schema}, this reads {SCHEMA}: {remedy}")
     with naming(path):
         return _made(from_json(CalibrationFile, data))

@@ -82,9 +82,9 @@ class PlatformCalibration:
         """Name of the axis that goes with the camera poses of a method."""
         return "joint" if method == "joint" else "combined"
 
-    def problem(self, method: str) -> Problem | None:
-        """Why a method (or 'combined') has no result; None if it has one."""
-        return result_problem(self.problems, method)
+    def why_not(self, method: str) -> str:
+        """Why a method (or 'combined') has no result; '' if it has one."""
+        return why_no_result(self.problems, method)
 
     def transform(self, method: str) -> RigidTransform:
         """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint')."""
@@ -178,14 +178,14 @@ def calibrate_cameras(
     return solutions, problems
 
 
-def result_problem(
+def why_no_result(
     problems: Iterable[Problem], method: str, camera: str | None = None
-) -> Problem | None:
-    """Why a method has no result, of a camera or without one; None if it has one."""
+) -> str:
+    """Why a method has no result, of a camera or without one; '' if it has one."""
     for problem in problems:
         if (problem.method, problem.camera) == (method, camera):
-            return problem
-    return None
+            return problem.words
+    return ""
 
 
 def _no_result(stage, method, words, camera=None):

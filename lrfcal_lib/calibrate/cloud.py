@@ -90,10 +90,10 @@ def join(clouds: Iterable[Cloud]) -> Cloud:
     Cloud
     """
     clouds = list(clouds)
-    columns = {
-        name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in COLUMNS
-    }
-    return Cloud(**columns, removed=sum(cloud.removed for cloud in clouds))
+    return Cloud(
+        **{n: np.concatenate([getattr(cloud, n) for cloud in clouds]) for n in COLUMNS},
+        removed=sum(cloud.removed for cloud in clouds),
+    )
 
 
 def point_type(columns: dict[str, tuple[str, str]]) -> np.dtype:
@@ -104,15 +104,15 @@ def point_type(columns: dict[str, tuple[str, str]]) -> np.dtype:
 
 
 def write_ply(
-    path: str | Path, clouds: Cloud | Iterable[Cloud], comments: Iterable[str] = ()
+    path: str | Path, clouds: Iterable[Cloud], comments: Iterable[str] = ()
 ) -> int:
     """Write a cloud as binary PLY with all attributes; frame and units are comments.
 
     Parameters
     ----------
     path : path-like
-    clouds : Cloud or iterable of Cloud
-        The cloud, or blocks of it as they come.
+    clouds : iterable of Cloud
+        Blocks of the cloud as they come.
     comments : iterable of str
         For the head of the file.
 
@@ -126,18 +126,18 @@ def write_ply(
     ValueError
         If the file cannot be written; it is whole, or as it was before.
     """
-    if isinstance(clouds, Cloud):
-        clouds = [clouds]
-    properties = []
-    for kind, names in COLUMNS.values():
-        properties += [f"property {KINDS[kind]} {name}" for name in names.split()]
+    properties = [
+        f"property {KINDS[kind]} {name}"
+        for kind, names in COLUMNS.values()
+        for name in names.split()
+    ]
     head = ["ply", "format binary_little_endian 1.0"]
     head += [f"comment {words}" for words in (*ABOUT, *comments)]
 
     def header(number):
         """The same length for every number of points."""
-        vertices = f"element vertex {number:<12d}"
-        return "\n".join([*head, vertices, *properties, "end_header", ""]).encode()
+        lines = [*head, f"element vertex {number:<12d}", *properties, "end_header", ""]
+        return "\n".join(lines).encode()
 
     count = 0
     with whole(path) as draft, open(draft, "wb") as file:

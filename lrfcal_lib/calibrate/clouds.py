@@ -74,7 +74,6 @@ def cloud_blocks(
     rig = calibration.rig(method)
     for placement, mask in masks.items():
         sweep = session.sweep(placement)
-        views = views_of(session, rig, placement)
         if mask is None:
             sweep, _ = without_closing(sweep)
         else:
@@ -82,7 +81,9 @@ def cloud_blocks(
             ((lines, beams),) = find_objects(about)
             sweep = sweep.part(lines, beams)
             mask = mask[lines, beams]
-        yield from sweep_blocks(session, rig, sweep, views, mask)
+        yield from sweep_blocks(
+            session, rig, sweep, views_of(session, rig, placement), mask
+        )
 
 
 def sweep_blocks(

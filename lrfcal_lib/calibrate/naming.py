@@ -60,8 +60,9 @@ def name_sides(prepared: Prepared) -> Prepared:
                 problems.append(
                     Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement)
                 )
-    every = (*prepared.problems, *problems)
-    return replace(prepared, names=names, dropped=dropped, problems=every)
+    return replace(
+        prepared, names=names, dropped=dropped, problems=(*prepared.problems, *problems)
+    )
 
 
 def rough_poses(prepared: Prepared) -> tuple[dict[str, RigidTransform], list[Problem]]:
@@ -106,8 +107,10 @@ def _disagreement(prepared, placement, misses):
         if placement in seen
     }
     if small_squares(views, prepared.board.pattern):
-        small = f"squares below {SMALL_SQUARE_PX:.0f} px"
-        causes += f"; or the images: {small}, whose distance may be biased"
+        causes += (
+            f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be "
+            "biased"
+        )
     return f"scan: {off} board in the images of all {len(misses)} cameras ({causes})"
 
 
@@ -131,10 +134,11 @@ def nearest_edges(
     lines = board.lines()
     names = {}
     dropped = {}
-    cost = np.zeros((len(sides), len(lines)))
-    for row, points in enumerate(sides.values()):
-        distances = line_distance(points[:, None, :2], lines)
-        cost[row] = np.median(np.abs(distances), axis=0)
+    medians = [
+        np.median(np.abs(line_distance(points[:, None, :2], lines)), axis=0)
+        for points in sides.values()
+    ]
+    cost = np.reshape(medians, (-1, len(lines)))
     numbers = list(sides)
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
         number = numbers[row]

@@ -17,7 +17,9 @@ from lrfcal_lib.model.geometry import pose_array
 SHARE = 1 << 15  # points that a thread takes at a time
 WORKERS = min(os.cpu_count() or 1, 8)
 LEAST_CELL = 2.0  # pixels of a depth buffer
-LEVELS = (12.0, 230.0)  # of grey: between these the exposures of images are compared
+# levels of grey: between these the exposures of images are compared
+DARKEST = 12.0
+BRIGHTEST = 230.0
 EXPOSURE_ROUNDS = 50
 LARGEST_MISS = 0.1  # of the logarithm of a brightness: more is another surface
 
@@ -159,18 +161,17 @@ class Painter:
         """
         if len(self.views) < 2:
             return
-        darkest, brightest = LEVELS
         logs = []
         radii = []
         for k, view in enumerate(self.views):
             colors, _, _ = self.paint(points, normals, slice(k, k + 1))
             grey = colors.mean(axis=1)
-            known = (grey > darkest) & (grey < brightest)
+            known = (grey > DARKEST) & (grey < BRIGHTEST)
             logs.append(np.log(np.where(known, grey, np.nan)))
             model = view.model
             uv = project(view.T_camera_platform.apply(points), model)
-            corner = np.sum(model.size**2) / 4
-            radii.append(np.sum((uv - [model.cx, model.cy]) ** 2, axis=1) / corner)
+            away = np.sum((uv - [model.cx, model.cy]) ** 2, axis=1)
+            radii.append(away / self.eyes[k].corner)
         gain, falloff = _compared(np.array(logs, float), np.array(radii))
         self.exposures[:, 0] = gain - gain.mean()
         self.exposures[:, 1] = min(falloff, 0.0)

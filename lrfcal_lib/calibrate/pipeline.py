@@ -16,8 +16,8 @@ from lrfcal_lib.calibrate.cameras import (
     PlatformCalibration,
     calibrate_cameras,
     calibrate_platform,
-    result_problem,
     stated_covariance,
+    why_no_result,
 )
 from lrfcal_lib.calibrate.joint_observations import observe_joint
 from lrfcal_lib.calibrate.naming import name_sides
@@ -130,11 +130,11 @@ class Calibration:
     problems: tuple[Problem, ...]
     joint: JointCalibration | None = None
 
-    def problem(self, method: str, camera: str | None = None) -> Problem | None:
-        """Why a method has no result, of a camera where it takes them one by one; None if it has
+    def why_not(self, method: str, camera: str | None = None) -> str:
+        """Why a method has no result, of a camera where it takes them one by one; '' if it has
         one.
         """
-        return result_problem(self.problems, method, camera)
+        return why_no_result(self.problems, method, camera)
 
     def cameras(self, method: str) -> dict[str, Solution]:
         """What a method says of every camera that it has a result of."""
@@ -171,7 +171,7 @@ class Calibration:
             for camera, solution in solved.items()
         }
         axis = self.platform.axes[self.platform.axis_with(method)]
-        if self.joint and method == "joint":
+        if method == "joint":
             corrections = self.joint.solution.corrections
             uncertainty = joint_uncertainty(self.joint.solution)
         else:

@@ -3,12 +3,11 @@ in bounded memory.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import minimum_filter, uniform_filter
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud
@@ -82,7 +81,7 @@ def reconstruct(
     normals = []
     every = max(1, sweep.ranges.size // GAIN_POINTS)
     for block in blocks_of():
-        painter.hide(block.hiding[np.isfinite(block.hiding).all(axis=-1)])
+        painter.hide(block.hiding.reshape(-1, 3))
         # a view would keep the whole block
         points.append(block.points[block.good][::every].copy())
         normals.append(block.normals[block.good][::every].copy())
@@ -144,8 +143,7 @@ def _coloured(block, sweep, painter, wanted, sigma_range):
     )
 
 
-@dataclass(frozen=True)
-class _Block:
+class _Block(NamedTuple):
     """Some scan lines of a sweep, points on a grid (l, B): in space, with normals and scatter
     about the surface, as they hide others, and whether they are sound.
     """
@@ -170,8 +168,7 @@ def _blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous, sound):
     lines, beams = sweep.ranges.shape
     size = max(1, BLOCK // beams)
     for start in range(0, lines, size):
-        stop = min(start + size, lines)
-        about = slice(max(0, start - MARGIN), stop + MARGIN)
+        about = slice(max(0, start - MARGIN), start + size + MARGIN)
         ranges = sweep.ranges[about].astype(float)
         p_lrf = corrections.points(polar_to_points(ranges, sweep.bearings))
         # of every beam: between scan lines the mirror turns while the head moves
@@ -188,9 +185,9 @@ def _blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous, sound):
             hiding = lrf_to_platform(surface, pitch, T_head_lrf)
         origin = lrf_to_platform(np.zeros(3), pitch, T_head_lrf)
         normals, scatter = grid_normals(np.where(good[..., None], points, np.nan), origin)
-        inner = slice(start - about.start, stop - about.start)
+        inner = slice(start - about.start, start - about.start + size)
         yield _Block(
-            lines=slice(start, stop),
+            lines=slice(start, start + size),
             points=points[inner],
             normals=normals[inner],
             scatter=scatter[inner],
@@ -244,11 +241,11 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     least, middle, _ = np.moveaxis(variances, -1, 0)
     known = (share > 1 / 3) & (middle > LEAST_SPREAD)
     rough = np.where(known, np.maximum(least, 0.0), np.inf).ravel()
-    around = np.pad(np.arange(rough.size).reshape(valid.shape), WINDOW, mode="edge")
-    nine = sliding_window_view(around, (width, width))[..., ::WINDOW, ::WINDOW]
-    nine = nine.reshape(*valid.shape, -1)  # numbers of the windows that hold a point
-    flattest = rough[nine].argmin(axis=-1, keepdims=True)
-    best = np.take_along_axis(nine, flattest, axis=-1)[..., 0]
+    flattest = rough.argsort()  # numbers of windows
+    rank = flattest.argsort().reshape(valid.shape)
+    nine = np.zeros((width, width))
+    nine[::WINDOW, ::WINDOW] = 1
+    best = flattest[minimum_filter(rank, footprint=nine, mode="nearest")]
     normals = directions[..., 0].reshape(-1, 3)[best]
     away = np.vecdot(normals, points - origins) > 0
     normals[away] *= -1

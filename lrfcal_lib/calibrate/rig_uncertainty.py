@@ -103,8 +103,7 @@ def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
     information = solution.score().information.sum(axis=0)
     noise = 0.0
     if len(solution.observations.face_sigma):
-        stated = np.median(solution.observations.face_sigma)
-        noise = stated * solution.noise["face_scale"]
+        noise = solution.noise["face_scale"] * np.median(solution.observations.face_sigma)
     return RigUncertainty(
         names=estimate.names,
         covariance=estimate.covariance,
@@ -145,8 +144,11 @@ def uncertainty_one_by_one(
     -------
     RigUncertainty
     """
-    poses = [f"{camera}_{name}" for camera in solutions for name in POSE_NAMES]
-    names = (*AXIS_NAMES, *poses, "range_offset")
+    names = (
+        *AXIS_NAMES,
+        *(f"{camera}_{name}" for camera in solutions for name in POSE_NAMES),
+        "range_offset",
+    )
     noise_only = [solution.covariance[:6, :6] for solution in solutions.values()]
     trusted = [solution.trusted[:6, :6] for solution in solutions.values()]
     offset = np.array([[admitted_offset**2]])
@@ -172,8 +174,7 @@ def _unseen(information, names, camera=None):
     index = columns_of(names, camera)
     known = index >= 0
     links = index[known]
-    others = np.setdiff1d(np.arange(len(names)), links)
-    order = np.concatenate([links, others])
+    order = np.concatenate([links, np.setdiff1d(np.arange(len(names)), links)])
     scales = np.array([SCALES.get(name, 1.0) for name in names])[order]
     whole = information[np.ix_(order, order)]
     hessian = reduced_hessian((whole * scales[:, None] * scales)[None], len(links))[0]

@@ -25,16 +25,6 @@ ENDS = {
     "half_step": ("scan", "pitch"),
     "combined": ("image", "scan"),
 }
-LENGTH_COLUMNS = (
-    "source",
-    "placement",
-    "edge",
-    "ends",
-    "variant",
-    "true_mm",
-    "measured_mm",
-    "sigma_mm",
-)
 
 
 def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
@@ -50,21 +40,17 @@ def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
     DataFrame
         Columns variant, edge, n, bias_mm (positive outside the board), sd_mm.
     """
-    rows = []
     lines = dict(zip(truth.board.edges, truth.board.lines(), strict=True))
-    for variant in VARIANTS:
-        misses = {edge: [np.zeros(0)] for edge in lines}
-        for placement, names in prepared.names.items():
-            scanned = prepared.edges[placement][variant][0]
-            pitch = truth.pitch[placement][scanned.line]
-            flat = truth.on_board(truth.boards[placement], scanned.points, pitch)
-            for side, edge in names.items():
-                misses[edge].append(flat[scanned.side == side] @ lines[edge])
-        for edge, parts in misses.items():
-            miss = pd.Series(1000 * np.concatenate(parts))
-            mean = miss.mean() if len(miss) > 1 else np.nan
-            rows.append((variant, edge, len(miss), mean, miss.std()))
-    return pd.DataFrame(rows, columns=["variant", "edge", "n", "bias_mm", "sd_mm"])
+    rows = [(*of_none, []) for of_none in product(VARIANTS, lines)]
+    for variant, (placement, names) in product(VARIANTS, prepared.names.items()):
+        scanned = prepared.edges[placement][variant][0]
+        pitch = truth.pitch[placement][scanned.line]
+        flat = truth.on_board(truth.boards[placement], scanned.points, pitch)
+        for side, edge in names.items():
+            rows.append((variant, edge, 1000 * flat[scanned.side == side] @ lines[edge]))
+    table = pd.DataFrame(rows, columns=["variant", "edge", "miss"]).explode("miss")
+    misses = table.astype({"miss": float}).groupby(["variant", "edge"], sort=False).miss
+    return misses.agg(n="count", bias_mm="mean", sd_mm="std").reset_index()
 
 
 def edge_lengths(
@@ -101,25 +87,27 @@ def edge_lengths(
     if joint is not None and known:
         measured["combined"] = combined_outlines(joint)
     rows = []
+    edges = prepared.board.edges
     for variant, placement in product(measured, prepared.session.board_placements):
         board, weak = measured[variant].get(placement, (UNMEASURED, frozenset()))
         views = [
             views[placement] for views in prepared.views.values() if placement in views
         ]
-        for name, true in known.items():
+        for i, (name, true) in enumerate(known.items()):
             if not any(view.edge(name) for view in views):
                 continue
-            length = board.lengths.get(name, np.nan)
-            sigma = board.sigma.get(name, np.nan)
             ends = "not measured"
-            if np.isfinite(length):
-                hangs = not neighbours(prepared.board.edges, name).isdisjoint(weak)
-                ends = ENDS[variant][hangs]
+            if name in board.lengths:
+                beside = {edges[i - 1], edges[(i + 1) % len(edges)]}
+                ends = ENDS[variant][not weak.isdisjoint(beside)]
+            sizes = [true, board.lengths.get(name, np.nan), board.sigma.get(name, np.nan)]
             where = (prepared.session.name, placement, name, ends, variant)
-            rows.append((*where, 1000 * true, 1000 * length, 1000 * sigma))
+            rows.append((*where, *np.multiply(1000, sizes)))
     for name, (true, length) in PAPER_EDGES_MM.items():
         rows.append(("paper", np.nan, name, "scan", "last_beam", true, length, np.nan))
-    table = pd.DataFrame(rows, columns=LENGTH_COLUMNS).astype({"placement": "Int64"})
+    columns = ["source", "placement", "edge", "ends", "variant"]
+    columns += ["true_mm", "measured_mm", "sigma_mm"]
+    table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})
     return table.assign(error_mm=table.measured_mm - table.true_mm)
 
 
@@ -130,12 +118,6 @@ def _outlines(prepared, variant, T_head_lrf):
         with suppress(DegenerateGeometry):
             out[placement] = outline_of(prepared, placement, variant, T_head_lrf)
     return out
-
-
-def neighbours(edges: tuple[str, ...], name: str) -> set[str]:
-    """The edges that meet the edge of this name; `edges` stand in order around the board."""
-    i = edges.index(name)
-    return {edges[i - 1], edges[(i + 1) % len(edges)]}
 
 
 def edge_summary(table: pd.DataFrame) -> pd.DataFrame:

@@ -13,6 +13,7 @@ from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.verdict import Verdict, judge
+from lrfcal_lib.model.geometry import POSE_NAMES
 from lrfcal_lib.session.files import read_bytes
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import FILES
@@ -54,15 +55,9 @@ def calibration_record(
         "verdict": judged.record(),
         **rig_record(calibration.rig(method)),
     }
-    record["platform"]["axis_covariance_of"] = [
-        "out_of_scan_plane_rad",
-        "in_scan_plane_rad",
-        "offset_in_scan_plane_m",
-        "offset_across_scan_plane_m",
-    ]
     for camera, solution in calibration.cameras(method).items():
         record["cameras"][camera] |= _camera(calibration, camera, method, solution)
-    if calibration.joint is not None and method == "joint":
+    if method == "joint":
         record["sensor"] = _sensor(calibration.joint.solution)
     # numbers of this recording stand behind those of the rig, hashes last
     record["uncertainty"] = record.pop("uncertainty")
@@ -75,12 +70,11 @@ def calibration_record(
 def _sensor(solution):
     """What a JointSolution says about range finder and pitch, and what it left out in words."""
     sigma = solution.sigma
-    sensor = {
+    return {
         name: {"value": value, "sigma": sigma[name]}
         for name, value in solution.sensor.items()
         if name in sigma
-    }
-    return sensor | {"noise": solution.noise, "excluded": [*map(str, solution.excluded)]}
+    } | {"noise": solution.noise, "excluded": [*map(str, solution.excluded)]}
 
 
 def _camera(calibration, camera, method, solution):
@@ -88,17 +82,14 @@ def _camera(calibration, camera, method, solution):
 
     Of the joint estimate without the edge bias, from its own boards.
     """
-    variant = "joint" if method == "joint" else "half_step"
-    obs = calibration.observations[camera, variant]
+    obs = calibration.observations[camera, "joint" if method == "joint" else "half_step"]
     edge, plane = left_out_residuals([(obs, solution)])
     misfit = {"edge_rms_px": rms(edge), "plane_rms_mm": 1000 * rms(plane)}
     if method == "joint":
         misfit = joint_fit(calibration.joint, [camera])
     return {
         "maps": f"{obs.source} to {obs.camera}",
-        "sigma": dict(
-            zip(solution.names[:6], solution.trusted_sigma[:6].tolist(), strict=True)
-        ),
+        "sigma": dict(zip(POSE_NAMES, solution.trusted_sigma.tolist(), strict=False)),
         "covariance": solution.trusted[:6, :6].tolist(),
         "converged": bool(solution.converged),
         "unobservable": solution.unobservable,

@@ -101,9 +101,11 @@ def joint_table(joint: JointCalibration) -> pd.DataFrame:
         `Solution.trusted`).
     """
     s = joint.solution.solution
-    arrays = s.names, s.parameters, s.sigma, s.sigma_placements, s.trusted_sigma
-    columns = ("value", "sigma_noise", "sigma_placements", "sigma")
-    return parameter_table([], {(): arrays}, columns)
+    return parameter_table(
+        [],
+        {(): (s.names, s.parameters, s.sigma, s.sigma_placements, s.trusted_sigma)},
+        ("value", "sigma_noise", "sigma_placements", "sigma"),
+    )
 
 
 def noise_table(joint: JointCalibration) -> pd.DataFrame:
@@ -120,8 +122,8 @@ def noise_table(joint: JointCalibration) -> pd.DataFrame:
     """
     noise = joint.solution.noise
     noise["sigma_pitch"] = np.rad2deg(noise["sigma_pitch"])
-    values = pd.Series(noise).rename(NOISE_WORDS)
-    return values.rename_axis("what").reset_index(name="value")
+    values = pd.Series(noise).rename(NOISE_WORDS).rename_axis("what")
+    return values.reset_index(name="value")
 
 
 def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
@@ -148,7 +150,7 @@ def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
         "bias_mm": 1000 * obs.beam_radius * radii,
         "bias_radii": radii,
     }
-    sides = pd.DataFrame(columns).groupby([*columns][:3]).mean().reset_index()
+    sides = pd.DataFrame(columns).groupby([*columns][:3], as_index=False).mean()
     return sides.assign(edge=np.array(obs.edges)[sides.edge])
 
 
@@ -167,11 +169,10 @@ def joint_fit(joint: JointCalibration, cameras: Iterable[str] = ()) -> dict[str,
         ``plane_rms_mm`` of face points from their boards, ``edge_rms_px`` of all half-step
         crossings of scan lines from the image edges, the estimated edge bias taken off.
     """
-    solution = joint.solution
     cameras = cameras or joint.observations.cameras
     edges = np.concatenate([edge_misses_px(joint, camera) for camera in cameras])
     return {
-        "plane_rms_mm": 1000 * rms(solution.face_heights()),
+        "plane_rms_mm": 1000 * rms(joint.solution.face_heights()),
         "edge_rms_px": rms(edges),
     }
 
@@ -211,8 +212,10 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         the halves share). Splits of which a half leaves something open are missing.
     """
     rng = np.random.default_rng(0)
-    common = np.diag(joint.solution.lens) + joint.solution.step**2
-    numbers = list(joint.solution.boards)
+    solution = joint.solution
+    common = np.diag(solution.lens) + solution.step**2  # of what halves share
+    variances = np.maximum(solution.solution.trusted_sigma**2 - common, 0.0)
+    numbers = list(solution.boards)
     rows = []
     if len(numbers) <= 4:  # two placements determine no rig
         pairs = 0
@@ -220,7 +223,7 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
         parts = np.array_split(rng.permutation(numbers), 2)
         try:
             first, second = (
-                solve_again(joint.observations.select(np.sort(part)), joint.solution)
+                solve_again(joint.observations.select(np.sort(part)), solution)
                 for part in parts
             )
         except DegenerateGeometry:
@@ -229,10 +232,8 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
             apart = transform_difference(
                 first.transforms[camera], second.transforms[camera]
             )
-            # without what halves share
-            variances = joint.solution.camera(camera).trusted_sigma ** 2
-            variances -= common[joint.solution.columns(camera)]
-            predicted = 2 * np.sqrt(np.maximum(variances, 0.0).reshape(2, 3).sum(axis=1))
+            of_camera = variances[solution.columns(camera)].reshape(2, 3)
+            predicted = 2 * np.sqrt(of_camera.sum(axis=1))
             rows.append((pair, camera, *DEG_MM * apart, *DEG_MM * predicted))
     return pd.DataFrame(
         rows,
@@ -267,6 +268,8 @@ def joint_errors(joint: JointCalibration, truth: Truth) -> pd.DataFrame:
         axis = KnownAxis(solution.T_head_lrf, solution.covariance(*AXIS_NAMES))
         rows.append({"what": "tilt axis"} | axis_errors(axis, truth))
     for camera in solution.transforms:
-        errors = camera_errors(solution.camera(camera), truth, camera)
-        rows.append({"what": f"camera {camera}"} | errors)
+        rows.append(
+            {"what": f"camera {camera}"}
+            | camera_errors(solution.camera(camera), truth, camera)
+        )
     return pd.DataFrame(rows)

@@ -70,11 +70,10 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     station = Placement(placement, T_room_platform=truth.stations.get(placement))
     world = world_of(load_setup(truth.setup), station)
     recorded = session.sweep(placement).pitch
-    true_pitch = truth.pitch[placement]
-    turn, shift = truth.gauge(rig, placement, recorded)
+    gauge = truth.gauge(rig, placement, recorded)
     order = np.argsort(recorded)
-    pitch = np.interp(cloud.pitch, recorded[order], true_pitch[order])
-    points = tilt(cloud.points, turn) + shift
+    pitch = np.interp(cloud.pitch, recorded[order], truth.pitch[placement][order])
+    points = gauge.apply(cloud.points)
     origins = tilt(truth.T_head_lrf.translation, pitch)
     length = np.linalg.norm(points - origins, axis=1)
     directions = unit_vector(points - origins)
@@ -86,28 +85,19 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     blocked = np.zeros(len(points), bool)
     for view in views_of(session, rig, placement):
         painted = (cloud.image == view.number) & np.isfinite(depth)
-        eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
-        blocked[painted] = _hidden(world, eye, true[painted])
+        eye = gauge.apply(view.T_camera_platform.inv().translation)
+        way = true[painted] - eye
+        met = world.cast(eye, unit_vector(way))
+        blocked[painted] = met.distance < np.linalg.norm(way, axis=1) - CLEAR
+    light = 255 * world.radiance(hits)
+    ratio = cloud.colors[cloud.seen] / np.maximum(light[cloud.seen], 1e-9)
+    exposed = np.clip(light * np.median(ratio), 0, 255)
     return SceneErrors(
         depth=depth,
         normal=depth * hits.cosine,
-        color=_color_errors(cloud, 255 * world.radiance(hits)),
+        color=np.where(cloud.seen, np.abs(cloud.colors - exposed).mean(axis=1), np.nan),
         blocked=blocked,
     )
-
-
-def _hidden(world, eye, points):
-    """Which points (n, 3) something of a World hides from an eye (3,)."""
-    way = points - eye
-    hits = world.cast(eye, unit_vector(way))
-    return hits.distance < np.linalg.norm(way, axis=1) - CLEAR
-
-
-def _color_errors(cloud, light):
-    """Mean absolute difference (n,) of colours from the true light (n, 3) at one exposure."""
-    ratio = cloud.colors[cloud.seen] / np.maximum(light[cloud.seen], 1e-9)
-    exposed = np.clip(light * np.median(ratio), 0, 255)
-    return np.where(cloud.seen, np.abs(cloud.colors - exposed).mean(axis=1), np.nan)
 
 
 def as_stated(calibration: Calibration) -> Cloud:

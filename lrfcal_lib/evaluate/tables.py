@@ -100,25 +100,19 @@ def method_comparison(
     rows = []
     for (camera, name), solution in solutions.items():
         if name == "joint":
-            obs = observations[camera, "joint"]
-            judge = obs.along()
-            used = obs.placements
+            judge = observations[camera, "joint"].along()
             held = () if joint is None else jointly_left_out(joint, camera)
         else:
-            method = METHODS[name]
-            obs = observations[camera, method.variant]
             judge = observations[camera, "half_step"].along()
-            used = obs.placements
-            if method.uses != "plane":
-                used = getattr(obs, f"{method.uses}_placement")
+            obs = observations[camera, METHODS[name].variant]
             held = left_out(obs, judge, name, solution)
         edge, plane = left_out_residuals([(judge, solution)])
         held_edge, held_plane = left_out_residuals(held)
         row = {
             "camera": camera,
             "method": name,
-            "n_placements": len(np.unique(used)),
-            "edge_median_px": np.median(np.abs(edge)) if len(edge) else np.nan,
+            "n_placements": solution.n_placements,
+            "edge_median_px": pd.Series(edge).abs().median(),
             "edge_rms_px": rms(edge),
             "plane_rms_mm": 1000 * rms(plane),
             "left_out_edge_rms_px": rms(held_edge),
@@ -172,10 +166,10 @@ def camera_calibration_table(solutions: dict[tuple[str, str], Solution]) -> pd.D
     DataFrame
         Columns camera, method, parameter, unit, value, sigma (`Solution.trusted`).
     """
-    parameters = {
-        key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()
-    }
-    return parameter_table(["camera", "method"], parameters)
+    return parameter_table(
+        ["camera", "method"],
+        {key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()},
+    )
 
 
 def platform_calibration_table(
@@ -277,15 +271,17 @@ def scans_table(prepared: Prepared) -> pd.DataFrame:
                 across.count(True),
             )
         )
-    columns = [
-        "placement",
-        "n_points",
-        "sigma_range_mm",
-        "jump_points",
-        "sides_along",
-        "sides_across",
-    ]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(
+        rows,
+        columns=[
+            "placement",
+            "n_points",
+            "sigma_range_mm",
+            "jump_points",
+            "sides_along",
+            "sides_across",
+        ],
+    )
 
 
 def intrinsics_table(models: dict[str, CameraModel]) -> pd.DataFrame:
@@ -323,11 +319,15 @@ def outline_table(outline: Outline) -> pd.DataFrame:
         Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours),
         n_images.
     """
-    rows = [
-        (name, 1000 * length, 1000 * outline.length_sd[name], outline.n_lengths[name])
-        for name, length in outline.board.lengths().items()
-    ]
-    return pd.DataFrame(rows, columns=["edge", "length_mm", "sd_mm", "n_images"])
+    table = pd.DataFrame(
+        {
+            "length_mm": outline.board.lengths(),
+            "sd_mm": outline.length_sd,
+            "n_images": outline.n_lengths,
+        }
+    )
+    table[["length_mm", "sd_mm"]] *= 1000
+    return table.rename_axis("edge").reset_index()
 
 
 def pitch_models_table(errors: PitchErrors) -> pd.DataFrame:
@@ -342,12 +342,12 @@ def pitch_models_table(errors: PitchErrors) -> pd.DataFrame:
     DataFrame
         Columns model, n_parameters, plane_rms_mm, F, p_value (against the model before).
     """
-    rows = [
-        (model.name, model.n_parameters, 1000 * model.plane_rms, model.F, model.p_value)
-        for model in errors.models.values()
-    ]
     return pd.DataFrame(
-        rows, columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"]
+        [
+            (model.name, model.n_parameters, 1000 * model.plane_rms, model.F, model.p_value)
+            for model in errors.models.values()
+        ],
+        columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"],
     )
 
 

@@ -19,6 +19,7 @@ from lrfcal_lib.model.geometry import (
     tilt,
     transform_difference,
 )
+from lrfcal_lib.model.kinematics import platform_from_head
 from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.session.files import naming, read_json
 from lrfcal_lib.session.read import Session
@@ -62,16 +63,15 @@ class Truth:
         """Points (n, 3) of scans at their true pitch (n,) on a board, or each on its own: x and y
         in its plane, metres, and a 1, as lines take them.
         """
-        p_platform = lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
-        flat = T_platform_board.inv().apply(p_platform)
+        flat = T_platform_board.inv().apply(lrf_to_platform(p_lrf, pitch, self.T_head_lrf))
         flat[:, 2] = 1.0
         return flat
 
     def gauge(
         self, rig: CalibratedRig, placement: int, recorded: np.ndarray
-    ) -> tuple[float, np.ndarray]:
-        """The turn about the tilt axis (radians) and then the shift along it (3,) that lead from a
-        rig's platform frame to the true one, which no data can show.
+    ) -> RigidTransform:
+        """The turn about the tilt axis and then the shift along it that lead from a rig's platform
+        frame to the true one, which no data can show.
 
         Parameters
         ----------
@@ -83,7 +83,8 @@ class Truth:
         apart = self.T_head_lrf * rig.T_head_lrf.inv()
         turn = apart.rotation.as_rotvec()[0]
         turn += np.mean(self.pitch[placement] - rig.corrections.pitch(placement, recorded))
-        return turn, apart.translation * [1, 0, 0]
+        along = RigidTransform.from_translation(apart.translation * [1, 0, 0])
+        return along * platform_from_head(turn)
 
 
 def read_truth(session: Session) -> Truth | None:
@@ -147,8 +148,10 @@ def camera_errors(solution: Solution, truth: Truth, camera: str) -> dict[str, fl
     dict of str to float
         See :func:`beside_sigma`.
     """
-    apart = transform_difference(solution.transform, truth.cameras[camera])
-    return beside_sigma(*apart, solution.trusted[:6, :6])
+    return beside_sigma(
+        *transform_difference(solution.transform, truth.cameras[camera]),
+        solution.trusted[:6, :6],
+    )
 
 
 def axis_errors(axis: KnownAxis, truth: Truth) -> dict[str, float]:
@@ -164,8 +167,10 @@ def axis_errors(axis: KnownAxis, truth: Truth) -> dict[str, float]:
     dict of str to float
         See :func:`beside_sigma`.
     """
-    apart = axis_difference(axis_of(axis.T_head_lrf), axis_of(truth.T_head_lrf))
-    return beside_sigma(*apart, axis.covariance)
+    return beside_sigma(
+        *axis_difference(axis_of(axis.T_head_lrf), axis_of(truth.T_head_lrf)),
+        axis.covariance,
+    )
 
 
 def beside_sigma(turn: float, shift: float, covariance: np.ndarray) -> dict[str, float]:

@@ -297,8 +297,7 @@ def step_words(solution: JointSolution) -> str:
     ----------
     solution
     """
-    share = np.max(np.abs(solution.step) / solution.solution.trusted_sigma)
-    if share < LARGE_SHARE:
+    if np.max(np.abs(solution.step) / solution.solution.trusted_sigma) < LARGE_SHARE:
         return ""
     return (
         f"The angular step is taken to be known to {100 * solution.data.levels.step_sigma:.2g} %, "
@@ -318,8 +317,7 @@ def far_from_stated(joint) -> list[Fault]:
     ----------
     joint : JointCalibration
     """
-    far = [*far_axis(joint), *far_cameras(joint)]
-    return far or list(exchanged_sides(joint.solution))
+    return [*far_axis(joint), *far_cameras(joint)] or [*exchanged_sides(joint.solution)]
 
 
 def _far(words, angle):
@@ -336,8 +334,10 @@ def far_axis(joint) -> Iterator[Fault]:
     apart = axis_difference(solution.axis, axis_of(session.T_head_lrf))
     known = sigma_turn_shift(solution.covariance(*AXIS_NAMES))
     if np.any(apart > FAR * np.hypot(session.platform_sigma, known)):
-        where = f"{_apart(*apart)} from where session.json states it"
-        yield _far(f"the tilt axis lies {where}: {CHECK}", apart[0])
+        yield _far(
+            f"the tilt axis lies {apart_words(*apart)} from where session.json states it: {CHECK}",
+            apart[0],
+        )
 
 
 def guesses_of(session: Session) -> dict[str, RigidTransform]:
@@ -361,21 +361,19 @@ def far_cameras(joint) -> Iterator[Fault]:
         if camera not in guesses:
             continue
         turn, shift = transform_difference(transform, guesses[camera])
-        nearest = nearest_guess(transform, guesses)
+        nearest = min(guesses, key=lambda name: distance(transform, guesses[name]))
         if turn > FAR_TURN or shift > FAR_SHIFT:
-            where = f"{_apart(turn, shift)} from its guess in session.json"
-            yield _far(f"camera '{camera}' stands {where}: {CHECK}", turn)
+            yield _far(
+                f"camera '{camera}' stands {apart_words(turn, shift)} from its guess in "
+                f"session.json: {CHECK}",
+                turn,
+            )
         elif nearest != camera:
             yield _far(
                 f"camera '{camera}' stands where camera '{nearest}' is said to stand: were the "
                 "folders exchanged?",
                 turn,
             )
-
-
-def nearest_guess(transform, guesses):
-    """Name of the camera whose guess is nearest."""
-    return min(guesses, key=lambda name: distance(transform, guesses[name]))
 
 
 def distance(a: RigidTransform, b: RigidTransform) -> float:
@@ -403,9 +401,9 @@ def exchanged_sides(solution) -> Iterator[Fault]:
 
 def _right_of_lrf(solution, camera):
     """How far to the right of the range finder a camera sits, metres."""
-    T_camera_lrf = solution.camera_at(camera, 0.0) * solution.T_head_lrf
-    return T_camera_lrf.inv().translation[0]
+    return (solution.camera_at(camera, 0.0) * solution.T_head_lrf).inv().translation[0]
 
 
-def _apart(angle, distance):
+def apart_words(angle: float, distance: float) -> str:
+    """How far two things are apart, angle (radians) and distance (metres)."""
     return f"{np.degrees(angle):.1f} deg and {1000 * distance:.0f} mm"

@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -72,14 +73,8 @@ class CameraChange:
         """Whether turn and shift are more than chance allows, and more than nothing."""
         return self.p_value < LEVEL and self.motion_px > LEAST_SIZE
 
-    @property
-    def size_px(self):
-        """What the change does to images."""
-        return self.corner_px if self.zoomed else self.motion_px
 
-
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """A step in a camera's pose at some place (indices), and its probability by chance.
 
     `change` (6,) are the increments ``[w, v]`` of the pose, as a score test has them.
@@ -87,8 +82,8 @@ class Step:
 
     camera: int
     row: int
-    p_value: float = 0.0
-    change: np.ndarray | None = None
+    p_value: float
+    change: np.ndarray
 
 
 def camera_changes(
@@ -148,8 +143,8 @@ def with_change(obs, step, camera, prepared, settings):
     later = f"{camera} from placement {obs.placements[step.row]}"
     with suppress(DegenerateGeometry):
         solution = solve_joint(with_two_poses(obs, step, later), required=False, **settings)
-        both = {first, later} <= solution.transforms.keys()
-        if both and np.isfinite(solution.covariance(first, later)).all():
+        found = {first, later} <= solution.transforms.keys()
+        if found and np.isfinite(solution.covariance(first, later)).all():
             change = change_between(solution, first, later, camera, prepared)
             if change.moved or change.zoomed:
                 return solution, change
@@ -170,8 +165,7 @@ def likeliest_step(solution):
         columns = solution.columns(name)
         shown = np.unique(obs.view_placement[obs.view_camera == camera])
         for row in range(len(obs.placements)):
-            before = np.searchsorted(shown, row)
-            if BESIDE <= before <= len(shown) - BESIDE:
+            if BESIDE <= np.searchsorted(shown, row) <= len(shown) - BESIDE:
                 tested.append(Step(camera, row, *_chance_of_step(score, columns, row)))
     best = min(tested, key=lambda step: step.p_value, default=None)
     if best is None or best.p_value * len(tested) > LEVEL:
@@ -191,23 +185,20 @@ def _chance_of_step(score, columns, row):
     kept = np.ones((count, len(repeated)))
     kept[:row, shared:] = 0.0
     whole = dyads(kept) * score.information[:, repeated[:, None], repeated]
-    parted = Score(whole, score.gradient[:, repeated] * kept)
-
-    covariance, step, pulls = parted.solved()
+    covariance, step, pulls = Score(whole, score.gradient[:, repeated] * kept).solved()
     information = pseudo_inverse(covariance[-POSE:, -POSE:])
     change = step[-POSE:]
     square = change @ information @ change
     pull = pulls[:, -POSE:]  # its scatter is that of the placements
     scatter = np.einsum("pi,ij,pj->", pull, information, pull) / POSE * count / (count - 1)
-    p_value = fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0))
-    return p_value, change
+    return fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0)), change
 
 
 def largest_motion(solution, step, model):
     """By how many pixels the change of a Step moves a corner of a board in an image, at most."""
     obs = solution.observations
-    poses = obs.view_pose[obs.view_camera == step.camera]
-    corners = apply_pose(poses[:, :3], outline(solution))
+    poses = obs.view_pose[obs.view_camera == step.camera, :3]
+    corners = apply_pose(poses, outline(solution))
     origin = solution.transforms[obs.cameras[step.camera]].translation
     turn = Rotation.from_rotvec(step.change[:3])
     moved = carry(turn, origin, origin + step.change[3:]).apply(corners)
@@ -235,9 +226,8 @@ def change_between(solution, first, later, camera, prepared):
     model = prepared.models[camera]
     index = obs.cameras.index(later)
     change = solution.transforms[later] * solution.transforms[first].inv()
-    both = solution.covariance(first, later)
     later_less_first = np.kron([-1.0, 1.0], np.eye(POSE))
-    spread = later_less_first @ both @ later_less_first.T
+    spread = later_less_first @ solution.covariance(first, later) @ later_less_first.T
     step = pose_step(solution.transforms[first], solution.transforms[later])
     square = step @ pseudo_inverse(spread) @ step
 

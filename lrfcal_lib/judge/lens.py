@@ -39,8 +39,7 @@ def lens_findings(prepared: Prepared) -> Iterator[Fault]:
                 f"in parts of the images the corners of the chessboard lie {miss:.2f} px beside "
                 "their prediction, all in one direction"
             )
-        middle = np.array([model.cx, model.cy]) / model.size
-        other_size = np.abs(middle - 0.5).max() > OFF_MIDDLE
+        other_size = np.abs([model.cx, model.cy] / model.size - 0.5).max() > OFF_MIDDLE
         if other_size:
             faults.append(
                 f"its principal point ({model.cx:.0f}, {model.cy:.0f}) is far from the "

@@ -1,5 +1,6 @@
 """Which placement of the board would help a joint estimate most if it were recorded next."""
 
+import re
 from dataclasses import dataclass
 from itertools import product
 
@@ -7,15 +8,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import selection
-from lrfcal_lib.fit.covariance import dyads
+from lrfcal_lib.fit.covariance import dyads, sigma_of
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.judge.uncertainty import carried, chain_of
 from lrfcal_lib.model.camera import pinhole, project_jacobians
 from lrfcal_lib.model.geometry import (
     AHEAD,
-    POSE_NAMES,
     DegenerateGeometry,
     apply_pose,
     carry,
@@ -50,6 +49,7 @@ LATTICE = np.linspace(-LARGEST_PITCH, LARGEST_PITCH, 41)
 IMAGES = 3
 MARGIN = 0.04  # of the image, that a board keeps from its border, distortion included
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
+TURN = re.compile(r"axis_.*_plane|.*_r[xyz]|pitch_scale|pitch_by_direction")  # unknowns
 
 
 @dataclass(frozen=True)
@@ -122,18 +122,17 @@ def suggest_placement(solution: JointSolution, rig: CalibratedRig) -> Suggestion
         )
     boards = boards[seen]
     known = solution.score().information.sum(axis=0)
-    added = candidate_information(boards, pitches, solution, rig)
-    before = total_sigma(known, solution)
-    after = total_sigma(known + added, solution)
-    best = np.argmin(after)
+    added = sum(candidate_information(boards, pitches, solution, rig))
+    left = total_sigma(known + added, solution) / total_sigma(known, solution)
+    best = np.argmin(left)
     if "head" not in solution.observations.mounts:
         pitches = pitches[:, :0]
     return Suggestion(
         T_platform_board=pose_transform(boards[best]),
         place=grid[seen[best]],
         pitches=pitches[best],
-        gain=1 - after[best] / before,
-        median_gain=1 - np.median(after) / before,
+        gain=1 - left[best],
+        median_gain=1 - np.median(left),
     )
 
 
@@ -142,18 +141,16 @@ def total_sigma(information, solution):
 
     What is not observed counts as known to a metre at 2 m, so that it can be compared as well.
     """
-    scales = scales_of(solution)
-    unit = dyads(scales)
-    covariance = np.linalg.inv(information * unit + np.eye(len(unit))) * unit
-    return np.linalg.norm([*group_sigma(covariance, solution).values()], axis=0)
+    unit = dyads(scales_of(solution))
+    scaled = np.linalg.inv(information * unit + np.eye(len(unit)))
+    asked = solution.columns(*AXIS_NAMES, *solution.transforms)
+    return np.linalg.norm(sigma_of(scaled)[..., asked], axis=-1)
 
 
 def scales_of(solution: JointSolution) -> np.ndarray:
     """How much of each pose, (c,), shifts what lies 2 m away by a metre; 1 of other unknowns."""
-    turns = [*AXIS_NAMES[:2], "pitch_scale", "pitch_by_direction"]
-    for camera in solution.transforms:
-        turns += [f"{camera}_{name}" for name in POSE_NAMES[:3]]
-    return np.where(np.isin(solution.solution.names, turns), 1 / RADIUS, 1.0)
+    turns = [bool(TURN.fullmatch(name)) for name in solution.solution.names]
+    return np.where(turns, 1 / RADIUS, 1.0)
 
 
 def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np.ndarray]:
@@ -167,14 +164,14 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
     Returns
     -------
     dict of str to ndarray, shape (...)
-        Of 'axis' and of each camera, as far as they were unknown.
+        Of the axis and of each camera, by its name in words, as far as they were unknown.
     """
-    variance = np.linalg.diagonal(covariance) / scales_of(solution) ** 2
-    columns = {"axis": solution.columns(*AXIS_NAMES)}
+    sigma = sigma_of(covariance) / scales_of(solution)
+    columns = {"the axis": solution.columns(*AXIS_NAMES)}
     for camera in solution.transforms:
-        columns[camera] = solution.columns(camera)
+        columns[f"camera '{camera}'"] = solution.columns(camera)
     return {
-        name: np.sqrt(variance[..., index].sum(axis=-1))
+        name: np.linalg.norm(sigma[..., index], axis=-1)
         for name, index in columns.items()
         if index
     }
@@ -214,8 +211,7 @@ def board_poses(solution, grid):
     spin = Rotation.from_euler("z", turn, degrees=True)
     rotation = solution.T_head_lrf.rotation * gaze * AHEAD * tip * spin
     middle = solution.T_head_lrf.apply(distance * gaze.apply([0.0, 1.0, 0.0]))
-    T_platform_board = carry(rotation, outline(solution).mean(axis=0), middle)
-    return pose_array(T_platform_board)
+    return pose_array(carry(rotation, outline(solution).mean(axis=0), middle))
 
 
 def pitches_of_images(boards, solution, rig):
@@ -231,11 +227,10 @@ def pitches_of_images(boards, solution, rig):
     for name, camera in rig.cameras.items():
         border = MARGIN * camera.model.size
         poses = pose_array(rig.camera_at(name, LATTICE))
-        p_camera = apply_pose(poses[..., None, :, :], points)
         # far outside the image a lens model would fold back
-        uv = pinhole(p_camera, camera.model)
+        uv = pinhole(apply_pose(poses[..., None, :, :], points), camera.model)
         inside = (uv > border) & (uv < camera.model.size - border)
-        visible &= np.all(inside & (p_camera[..., 2:] > 0), axis=(-2, -1))
+        visible &= inside.all(axis=(-2, -1))
 
     seen, ends = row_ends(visible.T)
     first, last = LATTICE[ends].T
@@ -243,7 +238,7 @@ def pitches_of_images(boards, solution, rig):
 
 
 def candidate_information(boards, pitches, solution, rig):
-    """Information that boards would add about the shared unknowns, shape (n, c, c).
+    """Information that boards would add about the shared unknowns, shape (n, c, c) by image.
 
     `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images. Points of a
     board that a scan knows, with its errors, are compared with where images show them; all images
@@ -254,21 +249,17 @@ def candidate_information(boards, pitches, solution, rig):
     images = [pitches if mount == "head" else pitches[:, :1] for mount in obs.mounts]
     count = sum(at.shape[1] for at in images)
     by_scan = np.sqrt(count) * scan_sigma(solution, boards)[:, None]
-    unknowns = len(solution.solution.names)
-    information = np.zeros((len(boards), unknowns, unknowns))
     for camera, at in zip(obs.cameras, images, strict=True):
         model = rig.cameras[camera].model
         by_image = image_sigma(solution, camera, model)
         chain = chain_of(rig, camera)
-        links = selection(solution.solution.names, camera)
         for pitch in at.T:
             p_camera, by_link, _ = carried(chain, *beams, image_pitch=pitch[:, None])
-            by_point = project_jacobians(p_camera, model)[0]
             sigma = np.hypot(by_image, by_scan * model.fx / p_camera[..., 2])
-            J = by_point @ by_link @ links / sigma[..., None, None]
-            J = J.reshape(len(boards), -1, unknowns)
-            information += J.mT @ J
-    return information
+            J = project_jacobians(p_camera, model)[0] @ by_link @ chain.links
+            J /= sigma[..., None, None]
+            J = J.reshape(len(boards), -1, J.shape[-1])
+            yield J.mT @ J
 
 
 def points_of_face(solution):
@@ -295,8 +286,7 @@ def scan_sigma(solution, boards):
 def solid_angle(solution, boards):
     """How large boards (n, 3, 4) look from the LRF, relative to their area, (n,)."""
     sight = sights(boards, solution)
-    distance = np.linalg.norm(sight, axis=1)
-    return np.abs(np.vecdot(sight, boards[:, :, 2])) / distance**3
+    return np.abs(np.vecdot(sight, boards[:, :, 2])) / np.linalg.norm(sight, axis=1) ** 3
 
 
 def image_sigma(solution, camera, model):
@@ -312,4 +302,4 @@ def image_sigma(solution, camera, model):
     variance = solution.noise["view_scale"] ** 2 * np.median(by_pixel / by_shift)
     if obs.mounts[number] == "head":  # all points of an image share the error of its pitch
         variance += (model.fx * solution.noise["sigma_pitch"]) ** 2
-    return np.sqrt(variance * len(points_of_face(solution)))
+    return np.sqrt(variance * len(obs.corners))

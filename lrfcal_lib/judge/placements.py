@@ -50,7 +50,7 @@ def placements_table(
             "n_points": mask.sum(),
         }
         for camera, obs in by_camera.items():
-            crossed = obs.crossing_edge[obs.crossing_placement == placement]
-            row[f"edges_{camera}"] = len(np.unique(crossed))
+            crossed = obs.crossing_placement == placement
+            row[f"edges_{camera}"] = len(set(obs.crossing_edge[crossed]))
         rows.append(row)
     return pd.DataFrame(rows)

@@ -161,8 +161,9 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     if hopeless(joint) and (misread := misread_recording(prepared)):
         return found + misread
     if joint is not None:
-        changes = camera_changes(joint.solution, prepared, joint.settings)
-        found += faults_of_changes(changes, prepared.views)
+        found += faults_of_changes(
+            camera_changes(joint.solution, prepared, joint.settings), prepared.views
+        )
         found += exchanged_placements(calibration)
     return found
 
@@ -219,11 +220,11 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
         return mirrored
 
     for group in (SENSES, IMAGES, UNITS):
-        fitting = {}
-        for reading in group:
-            misses = board_misses(prepared, reading)
-            if _fits(misses, stated):
-                fitting[reading] = misses
+        fitting = {
+            reading: misses
+            for reading in group
+            if _fits(misses := board_misses(prepared, reading), stated)
+        }
         if fitting:
             return [_misread(prepared, fitting, stated)]
     return []
@@ -326,6 +327,7 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
     steps = [change.after for change in changes]
     for change in changes:
         kind = "camera moved"
+        size_px = change.motion_px
         words = (
             f"camera '{change.camera}' was moved before placement {change.after}: turned by "
             f"{np.degrees(change.turn):.2f} deg and shifted by {1000 * change.shift:.1f} mm, which "
@@ -333,6 +335,7 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
         )
         if change.zoomed:
             kind = "camera zoomed"
+            size_px = change.corner_px
             words = (
                 f"the images of camera '{change.camera}' are {100 * abs(change.zoom):.2f} +- "
                 f"{100 * change.zoom_sigma:.2f} % {by_sign(change.zoom, 'larger', 'smaller')} "
@@ -345,7 +348,7 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
             kind,
             f"{words}; fix what is loose and record anew, or make two sessions: one of the "
             f"placements before {change.after}, one of the others",
-            severe=change.size_px > SEVERE_PX,
+            severe=size_px > SEVERE_PX,
             camera=change.camera,
             placements=(change.after,),
         )
@@ -354,8 +357,7 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
 def exchanged_placements(calibration) -> Iterator[Fault]:
     """Pairs of placements that are left out, and whose images fit the scans of each other."""
     prepared = calibration.prepared
-    excluded = calibration.joint.solution.excluded_placements
-    lost = sorted(prepared.left_out | excluded)
+    lost = sorted(prepared.left_out | calibration.joint.solution.excluded_placements)
     scans = boards_in(prepared.session, lost[:MOST_LOST], AS_STATED)
 
     strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
@@ -374,18 +376,16 @@ def exchanged_placements(calibration) -> Iterator[Fault]:
 
 def _same_board(calibration, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
-    prepared = calibration.prepared
     solution = calibration.joint.solution
     middle = solution.observations.corners.mean(axis=0)
     p_lrf, pitch, _ = face_points(scan, POINTS)
     p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
     agree = []
     for camera in solution.transforms:
-        view = prepared.posed(camera).get(placement)
+        view = calibration.prepared.posed(camera).get(placement)
         if view is not None:
-            T_camera_platform = solution.camera_at(camera, view.pitch)
-            T_board_platform = view.T_camera_board.inv() * T_camera_platform
-            on_board = T_board_platform.apply(p_platform)
+            p_camera = solution.camera_at(camera, view.pitch).apply(p_platform)
+            on_board = view.T_camera_board.inv().apply(p_camera)
             beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
             away = np.median(np.abs(on_board[:, 2]))
             agree.append(away < GOOD and beside < BESIDE)

@@ -61,8 +61,11 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Fault], float]:
     if doubts:
         findings.append(finding_of(doubts))
     elif level > ABSURD:
-        why = f"no single error explains why ranges fit {level:.0f} times worse than stated"
-        findings.append(not_weighed(why))
+        findings.append(
+            not_weighed(
+                f"no single error explains why ranges fit {level:.0f} times worse than stated"
+            )
+        )
     sizes = [abs(doubt.value) for doubt in doubts if doubt.kind in SIZES]
     range_doubt = max(sizes, default=0.0) * np.median(solution.observations.face_range)
     beyond = list(beyond_admitted(joint))

@@ -44,6 +44,9 @@ class Chain:
     covariances : ndarray, shape (n, 13, 13)
         Of `COLUMNS` (increments ``[w, v]`` of the transforms). Where there are several, the one
         that gives more counts, quantity by quantity.
+    links : ndarray, shape (13, c)
+        Which of the rig's shared unknowns each of `COLUMNS` is, see
+        :func:`lrfcal_lib.calibrate.rig_uncertainty.selection`.
     unseen : ndarray, shape (m, 13)
         Motions that nothing determines: what depends on them has no bound.
     sweep : PitchNoise
@@ -54,6 +57,7 @@ class Chain:
     camera: RigidTransform | None
     on_head: bool
     covariances: np.ndarray
+    links: np.ndarray
     unseen: np.ndarray
     sweep: PitchNoise
 
@@ -76,7 +80,7 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
     """
     known = uncertainty_of(rig)
     links = selection(known.names, camera)
-    both = np.stack([known.covariance, known.trusted])
+    both = [known.covariance, known.trusted]
     # zero for what is known; what has no bound is among `unseen`
     bounded = np.nan_to_num(both, nan=0.0, posinf=0.0, neginf=0.0)
     # boards of a wrong size stand elsewhere before the cameras: the range offset or the cameras'
@@ -91,14 +95,21 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
         on_head = rig.cameras[camera].mount == "head"
         pose = rig.cameras[camera].T_camera
         unseen = known.unseen_of_cameras[camera]
-    sweep = PitchNoise(*known.sweep_sigma)
-    return Chain(rig.T_head_lrf, pose, on_head, covariances, unseen, sweep)
+    return Chain(
+        head=rig.T_head_lrf,
+        camera=pose,
+        on_head=on_head,
+        covariances=covariances,
+        links=links,
+        unseen=unseen,
+        sweep=PitchNoise(*known.sweep_sigma),
+    )
 
 
 def projection_sigma(
     chain: Chain,
     model: CameraModel,
-    distances: ArrayLike,
+    distance: float,
     grid: tuple[int, int],
     *,
     image_pitch: float,
@@ -114,7 +125,7 @@ def projection_sigma(
     chain
         To the camera.
     model
-    distances : array_like, shape (d,)
+    distance : float
         From the LRF, metres.
     grid
         Columns and rows, see :func:`pixel_grid`.
@@ -126,15 +137,14 @@ def projection_sigma(
 
     Returns
     -------
-    ndarray, shape (d, rows, columns)
+    ndarray, shape (rows, columns)
         Root mean square distance from the true pixel; inf where a motion that matters is not
         determined, NaN where no scan reaches.
     """
-    away = np.reshape(distances, (-1, 1, 1))
     bearing, pitch = beams_of_pixels(
-        chain, model, pixel_grid(model, grid), away, image_pitch
+        chain, model, pixel_grid(model, grid), distance, image_pitch
     )
-    points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
+    points, by_link, by_pitch = carried(chain, bearing, pitch, distance, image_pitch)
     P = project_jacobians(points, model)[0]
     sigma_pitch = chain.sweep.sigma(pitch, sum(pitches) / 2)
     if chain.on_head:  # the offset is that of the image, too
@@ -154,7 +164,7 @@ def point_sigma(
     chain: Chain,
     bearings: np.ndarray,
     pitches: np.ndarray,
-    distances: ArrayLike,
+    distance: float,
     *,
     reference: float,
 ) -> np.ndarray:
@@ -168,20 +178,21 @@ def point_sigma(
     ----------
     chain
         To the cloud.
-    bearings, pitches, distances : array_like, shapes (c,), (r,), (d,)
-        Radians, radians, metres.
+    bearings, pitches : ndarray, shapes (c,), (r,)
+        Radians.
+    distance : float
+        Metres.
     reference
         Radians.
 
     Returns
     -------
-    ndarray, shape (d, r, c)
+    ndarray, shape (r, c)
         Metres; inf where a motion that matters is not determined.
     """
-    away = np.reshape(distances, (-1, 1, 1))
-    _, by_link, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
-    sigma_pitch = chain.sweep.sigma(pitches, reference)
-    by_sweep = sigma_pitch[:, None] * np.linalg.norm(by_pitch, axis=-1)
+    pitch = pitches[:, None]
+    _, by_link, by_pitch = carried(chain, bearings, pitch, distance, reference)
+    by_sweep = chain.sweep.sigma(pitch, reference) * np.linalg.norm(by_pitch, axis=-1)
     return np.hypot(spread(chain, by_link), by_sweep)
 
 
@@ -283,13 +294,13 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
     ndarray, shape (...)
         Of all m together, in their unit; inf where an undetermined motion matters.
     """
-    each = np.einsum("...ik,nkl,...il->n...", jacobian, chain.covariances, jacobian)
-    variance = each.max(axis=0, initial=0.0)
+    variance = np.einsum("...ik,nkl,...il->n...", jacobian, chain.covariances, jacobian)
     moved = chain.unseen @ jacobian.mT
     size = np.linalg.norm(jacobian, axis=(-2, -1))[..., None]
     least = SEEN * size * np.linalg.norm(chain.unseen, axis=-1)
     matters = np.linalg.norm(moved, axis=-1) > least
-    return np.where(np.any(matters, axis=-1), np.inf, np.sqrt(variance))
+    sigma = np.sqrt(variance.max(axis=0, initial=0.0))
+    return np.where(np.any(matters, axis=-1), np.inf, sigma)
 
 
 def beams_of_pixels(chain, model, uv, distance, image_pitch):

@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.judge.alternatives import step_words
+from lrfcal_lib.judge.alternatives import apart_words, step_words
 from lrfcal_lib.judge.findings import ANSWERS, CARE, NO, YES, Answer, Kind, brief
 from lrfcal_lib.judge.lens import lens_findings
 from lrfcal_lib.judge.next_placement import suggest_placement
@@ -169,8 +169,10 @@ class Verdict:
 
     def because(self, findings: list[Fault]) -> "Verdict":
         """The verdict with more findings, which stand before its own; the worst first."""
-        reasons = sorted((*findings, *self.reasons), key=lambda reason: not reason.severe)
-        return replace(self, reasons=tuple(reasons))
+        every = (*findings, *self.reasons)
+        return replace(
+            self, reasons=tuple(sorted(every, key=lambda reason: not reason.severe))
+        )
 
 
 def judge(
@@ -206,7 +208,7 @@ def judge(
         return _refused(calibration, findings)
 
     rig = calibration.rig(method)
-    if method == "joint" and joint is not None:
+    if method == "joint":
         judged = verdict(joint.solution, rig, suggest=suggest, doubt=doubt)
     else:  # cameras that were calibrated one by one, with the axis of the platform step
         pitch = [scan.sweep.pitch for scan in prepared.scans.values()]
@@ -228,9 +230,17 @@ def _notes(calibration, method, lost):
         f"'{calibration.platform.axis_with(method)}'.",
         lost,
     ]
-    if method == "joint" and calibration.joint is not None:
+    if method == "joint":
         solution = calibration.joint.solution
-        notes += [step_words(solution), _scatter_note(len(solution.boards))]
+        notes.append(step_words(solution))
+        count = len(solution.boards)
+        if FEWEST <= count < MANY:  # how well their scatter is itself known
+            known = 100 / np.sqrt(2 * (count - 1))
+            within = stdtrit(count - 1, 0.95)
+            notes.append(
+                f"{count} placements determine their own scatter to {known:.0f} % only: 90 % of "
+                f"the errors lie within {within:.1f} stated standard deviations, not 1.6."
+            )
     return tuple(filter(None, notes))
 
 
@@ -274,30 +284,38 @@ def _expected(rig, pitch, doubt):
     middle = (pitch.min() + pitch.max()) / 2
     half = max(np.ptp(pitch) / 2, LEAST_FIELD)
     field = (middle - half, middle + half)
-    pitches = np.linspace(*field, PITCHES)
-    chain = chain_of(rig, doubt=doubt)
-    cloud = point_sigma(chain, BEARINGS, pitches, DISTANCES, reference=middle)
-    images = {
-        name: projection_sigma(
-            chain_of(rig, name, doubt),
-            camera.model,
-            DISTANCES,
-            PIXELS,
-            image_pitch=middle,
-            pitches=field,
-        )
-        for name, camera in rig.cameras.items()
-    }
     errors = {}
-    for i, distance in enumerate(DISTANCES):
-        pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
-        errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud[i])), pixels)
+    for distance in DISTANCES:
+        cloud = point_sigma(
+            chain_of(rig, doubt=doubt),
+            BEARINGS,
+            np.linspace(*field, PITCHES),
+            distance,
+            reference=middle,
+        )
+        pixels = {}
+        for name, camera in rig.cameras.items():
+            off = projection_sigma(
+                chain_of(rig, name, doubt),
+                camera.model,
+                distance,
+                PIXELS,
+                image_pitch=middle,
+                pitches=field,
+            )
+            pixels[name] = bounded(root_mean_square(off))
+        errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud)), pixels)
 
     reasons: tuple[Fault, ...] = ()
     large = errors[WORKING].words(above=1.0)
     if large:
-        words = f"the expected error at {WORKING:g} m is {large}"
-        reasons = (Fault(Kind.ERROR, words, bool(errors[WORKING].words(BAD))),)
+        reasons = (
+            Fault(
+                Kind.ERROR,
+                f"the expected error at {WORKING:g} m is {large}",
+                bool(errors[WORKING].words(BAD)),
+            ),
+        )
     return Verdict(reasons, errors, range_noise_mm=1000 * range_noise(rig))
 
 
@@ -307,10 +325,10 @@ def _refused(calibration, findings):
     It says what keeps the joint estimate, or else every camera, from an answer.
     """
     prepared = calibration.prepared
-    at_once = calibration.problem("joint")
-    problems = calibration.problems if at_once is None else [at_once]
-    words = dict.fromkeys(problem.words for problem in problems)
-    why = "; ".join([*words][:3])
+    why = calibration.why_not("joint")
+    if not why:
+        words = dict.fromkeys(problem.words for problem in calibration.problems)
+        why = "; ".join([*words][:3])
     if not prepared.views:
         lost = prepared.problems_of(ProblemKind.NO_IMAGES)
         why = lost[0].words if lost else "the session has no camera"
@@ -321,30 +339,14 @@ def _refused(calibration, findings):
     if prepared.problems:
         named = "; ".join(map(str, prepared.problems))
         notes = (f"Left out: {len(prepared.problems)} ({named}).",)
-    nothing = Verdict((), {}, np.nan, advice=RECORD, notes=notes)
-    return nothing.because([*findings, refused])
-
-
-def _scatter_note(placements):
-    """How well the scatter over placements is itself known; '' where many tell it."""
-    if not FEWEST <= placements < MANY:
-        return ""
-    known = 100 / np.sqrt(2 * (placements - 1))
-    within = stdtrit(placements - 1, 0.95)
-    return (
-        f"{placements} placements determine their own scatter to {known:.0f} % only: 90 % of the "
-        f"errors lie within {within:.1f} stated standard deviations, not 1.6."
-    )
+    return Verdict((), {}, np.nan, RECORD, notes).because([*findings, refused])
 
 
 def _weak_cameras(calibration, method) -> Iterator[Fault]:
     """What is weak about cameras that were calibrated one by one."""
     prepared = calibration.prepared
     solved = calibration.cameras(method)
-    fewest = min(
-        len(calibration.observations[camera, "half_step"].all_placements)
-        for camera in solved
-    )
+    fewest = min(solution.n_placements for solution in solved.values())
     if fewest < FEW:
         yield Fault(
             Kind.PLACEMENTS,
@@ -353,8 +355,7 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
         )
     for camera in prepared.views:
         if camera not in solved:
-            problem = calibration.problem(method, camera)
-            why = problem.words if problem else "no result"
+            why = calibration.why_not(method, camera) or "no result"
             yield Fault(Kind.CAMERAS, f"camera '{camera}' is not handed over ({why})")
     for camera, solution in solved.items():
         if solution.rival is not None:
@@ -362,23 +363,24 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
             yield Fault(
                 Kind.SECOND_MINIMUM,
                 f"a second minimum explains the data nearly as well: camera '{camera}' "
-                f"{np.degrees(turn):.0f} deg and {1000 * shift:.0f} mm from where it is handed "
-                "over; record more placements that lean other ways",
+                f"{apart_words(turn, shift)} from where it is handed over; record more placements "
+                "that lean other ways",
                 severe=True,
             )
-    unknown = calibration.platform.problem("combined")
-    sweeps = any(len(ways["half_step"]) > 1 for ways in prepared.edges.values())
-    if unknown and sweeps:
-        yield Fault(Kind.FAR_FROM_STATED, unknown.words, severe=True)
+    unknown = calibration.platform.why_not("combined")
+    if unknown and any(len(ways["half_step"]) > 1 for ways in prepared.edges.values()):
+        yield Fault(Kind.FAR_FROM_STATED, unknown, severe=True)
 
 
 def _not_joint(calibration):
     """The Fault that another method than the joint estimate is handed over, and why."""
     joint = calibration.joint
-    at_once = calibration.problem("joint")
-    bad = [at_once.words] if at_once else []
+    why = calibration.why_not("joint")
     if joint is not None:
-        bad = [fault.words for fault in diagnose(joint.solution) if fault.severe]
-    why = "; ".join(bad) or "another method was asked for"
-    severe = joint is None or not joint.solution.converged
-    return Fault(Kind.HANDED_OVER, f"the joint estimate is not handed over ({why})", severe)
+        why = "; ".join(fault.words for fault in diagnose(joint.solution) if fault.severe)
+    why = why or "another method was asked for"
+    return Fault(
+        Kind.HANDED_OVER,
+        f"the joint estimate is not handed over ({why})",
+        severe=joint is None or not joint.solution.converged,
+    )

@@ -94,11 +94,9 @@ def weak_pitch(solution) -> Iterator[Fault]:
     if AXIS_NAMES[0] not in solution.solution.names:
         return
     obs = solution.observations
-    of_view = obs.on_head[obs.view_camera]
-    image_pitch = obs.view_pitch[of_view]
-    image_placement = obs.view_placement[of_view]
-    pitch = np.concatenate([obs.face_pitch, obs.beam_pitch, image_pitch])
-    placement = np.concatenate([obs.face_placement, obs.beam_placement, image_placement])
+    obs = obs.keep(view=obs.on_head[obs.view_camera])
+    pitch = np.concatenate([obs.face_pitch, obs.beam_pitch, obs.view_pitch])
+    placement = np.concatenate([obs.face_placement, obs.beam_placement, obs.view_placement])
     where = " within a placement"
     if "platform" in obs.mounts:  # a camera on the base ties all placements together
         placement = np.zeros_like(placement)
@@ -112,7 +110,8 @@ def weak_pitch(solution) -> Iterator[Fault]:
             severe=True,
         )
     elif (
-        len(image_pitch) and largest_range(image_pitch, image_placement) < SMALL_IMAGE_PITCH
+        len(obs.view_pitch)
+        and largest_range(obs.view_pitch, obs.view_placement) < SMALL_IMAGE_PITCH
     ):
         yield Fault(
             Kind.IMAGE_PITCH,
@@ -140,10 +139,9 @@ def large_residuals(solution) -> Iterator[Fault]:
     ratio = scatter_over_placements(solution)
     worst = max(ratio, key=ratio.__getitem__)
     if ratio[worst] > MODEL_ERROR:
-        what = "the axis" if worst == "axis" else f"camera '{worst}'"
         yield Fault(
             Kind.MODEL_ERROR,
-            f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: "
+            f"placements disagree about {worst} {ratio[worst]:.1f} times more than noise explains: "
             "an error of the model",
         )
 
@@ -205,20 +203,24 @@ def sides_elsewhere(prepared: Prepared) -> Iterator[Fault]:
     Fault
         One an edge.
     """
-    elsewhere = [side for sides in prepared.dropped.values() for side in sides.values()]
     for edge in prepared.board.edges:
-        dropped = [side for side in elsewhere if side.edge == edge]
+        dropped = [
+            side
+            for sides in prepared.dropped.values()
+            for side in sides.values()
+            if side.edge == edge
+        ]
         crossed = len(dropped) + sum(
             edge in names.values() for names in prepared.names.values()
         )
         if len(dropped) >= FEWEST and len(dropped) > MOST * crossed:
-            turn = np.degrees(np.median([side.turn for side in dropped]))
-            off = 1000 * np.median([side.distance for side in dropped])
+            off, turn = np.median([[side.distance, side.turn] for side in dropped], axis=0)
             yield Fault(
                 Kind.OUTLINE,
                 f"the board's edge '{edge}' lies elsewhere than its outline says in "
-                f"{len(dropped)} of {crossed} scans ({off:.0f} mm off, turned by {turn:.1f} deg) "
-                "and is not used there: measure the board's edges (corners_m)",
+                f"{len(dropped)} of {crossed} scans ({1000 * off:.0f} mm off, turned by "
+                f"{np.degrees(turn):.1f} deg) and is not used there: measure the board's edges "
+                "(corners_m)",
             )
 
 
@@ -236,8 +238,11 @@ def blind_cameras(prepared: Prepared) -> Iterator[Fault]:
     """
     placements = prepared.session.board_placements
     for camera, views in prepared.views.items():
-        why = {p: views.get(p, NO_IMAGE).reason for p in placements}
-        unseen = [f"{placement} ({words})" for placement, words in why.items() if words]
+        unseen = [
+            f"{placement} ({why})"
+            for placement in placements
+            if (why := views.get(placement, NO_IMAGE).reason)
+        ]
         if len(unseen) > UNSEEN * len(placements):
             yield Fault(
                 Kind.LEFT_OUT,
@@ -267,7 +272,7 @@ def left_out(calibration: Calibration, method: str) -> tuple[list[Fault], str]:
     table = placements_table(prepared, calibration.observations).set_index("placement")
     reasons = table.reason.replace("", "no edge").to_dict()
     parts = [problem for problem in prepared.problems if problem.kind not in LEAVES_OUT]
-    if method == "joint" and calibration.joint is not None:
+    if method == "joint":
         solution = calibration.joint.solution
         used = set(solution.boards)
         reasons |= solution.excluded_placements

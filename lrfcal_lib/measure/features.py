@@ -9,7 +9,6 @@ from scipy.linalg import block_diag, null_space
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import selection
 from lrfcal_lib.judge.uncertainty import (
     COLUMNS,
     carried,
@@ -263,7 +262,7 @@ def beams_moved(
     """
     chain = chain_of(rig, camera)
     _, by_link, by_pitch = carried(chain, *beams, image_pitch)
-    moved = by_link @ selection(uncertainty_of(rig).names, camera)
+    moved = by_link @ chain.links
     by_offset = by_pitch
     if camera and chain.on_head:  # the offset is that of the image, too
         by_offset = 0 * by_pitch

@@ -6,7 +6,7 @@ import numpy as np
 
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import columns_of, selection
+from lrfcal_lib.calibrate.rig_uncertainty import columns_of
 from lrfcal_lib.fit.robust import sums_by
 from lrfcal_lib.judge.uncertainty import carried, chain_of
 from lrfcal_lib.model.kinematics import beams_to
@@ -75,7 +75,7 @@ def seen(
     beams = beams_to(points, rig.T_head_lrf)
     chain = chain_of(rig, view.camera)
     p_camera, by_link, by_pitch = carried(chain, *beams, view.pitch)
-    by_rig = by_link @ selection(rig.uncertainty.names, view.camera)
+    by_rig = by_link @ chain.links
     return p_camera, np.concatenate([by_rig, by_pitch[..., None]], axis=-1)
 
 

@@ -11,7 +11,6 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.measure.features import SYSTEMATIC
 from lrfcal_lib.measure.lengths import END, IN_PLACE, ON_IT, SceneFeatures
-from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.session.read import Session
 
 NEAR = 0.03  # metres from a true face to a point of the cloud that shows it
@@ -61,9 +60,8 @@ def true_picks(
             look = _on_face if kind == "plane" else _on_edge
             by_station = {}
             for station, scene in scenes.items():
-                turn, shift = truth.gauge(rig, station, session.sweep(station).pitch)
-                in_room = truth.stations[station].inv().apply(end)
-                corners = tilt(in_room - shift, -turn)
+                gauge = truth.gauge(rig, station, session.sweep(station).pitch)
+                corners = (truth.stations[station] * gauge).inv().apply(end)
                 by_station[station] = poses[station].apply(look(scene, corners))
             nothing = poses[station].apply(corners.mean(axis=0))
             shown.append((by_station, nothing))
