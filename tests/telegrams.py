@@ -22,6 +22,6 @@ def decode_scan(raw, mode=0):
     """The Scans, of one row, of a telegram 0xB0; TelegramError where it is none or damaged."""
     parse_telegram(raw)
     scans = decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
-    if not scans:
+    if not len(scans.rows):
         raise TelegramError("holds no scan")
-    return scans[0]
+    return scans

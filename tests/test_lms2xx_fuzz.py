@@ -74,10 +74,10 @@ def test_fuzz_streams():
         assert len(stream.offset) == len(stream.length) and stream.pending <= len(data)
         assert np.all(stream.offset[1:] >= stream.offset[:-1] + stream.length[:-1])
         assert stream.length.sum() <= stream.pending
-        for group in codec.decode_scans(
+        scans = codec.decode_scans(
             data, stream.offset, stream.length, int(rng.choice(list(TOP)))
-        ):
-            assert group.words.shape == group.ranges.shape == group.reasons.shape
+        )
+        assert scans.words.shape == scans.ranges.shape == scans.reasons.shape
         found += len(stream.offset)
     assert found > 0.02 * STRINGS  # those that were not hit
 

@@ -163,7 +163,7 @@ class Assembler:
         # number of values, unit, and whether there are indices and parts
         self._kind = (
             values,
-            configuration.unit,
+            codec.UNITS.index(configuration.unit),
             configuration.realtime_indices,
             interlaced,
         )
@@ -192,31 +192,31 @@ class Assembler:
         """
         mode = self.configuration.measuring_mode
         scans = codec.decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
-        if not scans:
+        if not len(scans.rows):
             return None
-        scan = scans[0]
-        count = scan.words.shape[1]
-        index = int(scan.scan_index[0])
-        kind = (count + (scan.partial > 0), scan.unit, index >= 0, scan.partial >= 0)
+        count = scans.words.shape[1]
+        (partial,) = scans.partial.tolist()
+        (index,) = scans.scan_index.tolist()
+        kind = (count + (partial > 0), *scans.unit, index >= 0, partial >= 0)
         if kind != self._kind:
             return None
         begun = arrival_s - transfer_s(len(raw), self.baudrate) - self.turns * MIRROR_TURN
         start_s = self._clock.place(index, begun)
         if start_s is None:
             return None
-        quarters = codec.scan_quarters(count, scan.partial)
+        quarters = codec.scan_quarters(count, partial)
         # the first turn begins at 0 deg
         times = start_s + (np.arange(count) % self.turns + quarters / 1440) * MIRROR_TURN
         reading = Reading(
             telegrams=(raw,),
-            ranges=np.nan_to_num(scan.ranges[0], nan=np.nan, posinf=np.nan),
+            ranges=np.nan_to_num(scans.ranges[0], nan=np.nan, posinf=np.nan),
             bearings=np.radians(quarters / 4),
             time_s=float(times[0]),
             beam_times_s=times,
-            telegram_index=int(scan.telegram_index[0]),
+            telegram_index=int(scans.telegram_index[0]),
         )
         if self.interlaced:
-            return self._merged(scan.partial, reading)
+            return self._merged(partial, reading)
         return reading
 
     def _merged(self, partial, part):

@@ -183,10 +183,9 @@ def are_sound(data, offset, length):
     CRC, shape (m,).
     """
     sound = np.zeros(len(offset), bool)
-    whole = np.flatnonzero(offset + length <= len(data))
-    for group in alike(length[whole]):
-        rows = whole[group]
-        size = length[rows[0]]
+    whole = offset + length <= len(data)
+    for size in np.unique(length[whole]):
+        rows = np.flatnonzero(whole & (length == size))
         raw = cut(data, offset[rows], size)
         if len(rows) < MANY:
             sums = [crc16(bytes(one)) for one in raw[:, :-2]]
@@ -195,13 +194,6 @@ def are_sound(data, offset, length):
         framed = (raw[:, 0] == STX) & (word(raw.T, 2) + OVERHEAD == size)
         sound[rows] = framed & (sums == word(raw.T, -2))
     return sound
-
-
-def alike(*keys):
-    """Rows with the same keys, each group in order."""
-    order = np.lexsort(keys)
-    differs = np.any(np.diff(np.stack(keys)[:, order]), axis=0)
-    return np.split(order, np.flatnonzero(differs) + 1)[: len(order)]  # no group of no rows
 
 
 def cut(data, offset, length):
