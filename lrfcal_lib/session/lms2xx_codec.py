@@ -360,14 +360,10 @@ def parse_status(raw: bytes) -> DeviceStatus:
     TelegramError
         If it is damaged, another reply, or too short.
     """
-    # counted as in the manual, which calls the code 0
-    data = bytes([STATUS]) + reply_data(raw, STATUS, 123)
-    view, step = struct.unpack_from("<HH", data, 107)
-    return DeviceStatus(
-        measuring_mode=data[102],
-        variant=(float(view), step / 100),
-        address=data[120],
-    )
+    # in the manual, which calls the code 0, the bytes 102, 107 to 110, and 120
+    data = reply_data(raw, STATUS, 123)
+    mode, view, step, address = struct.unpack_from("<101x B 4x 2H 9x B", data)
+    return DeviceStatus(mode, (float(view), step / 100), address)
 
 
 def parse_type(raw: bytes) -> tuple[str, ...]:

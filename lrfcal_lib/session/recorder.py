@@ -147,12 +147,10 @@ class SessionRecorder(SessionWriter):
         purpose
             Of the images.
         """
-        counts = dict.fromkeys(self.cameras, 0)
         file = self.path / "images.csv"
-        for row in read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(counts)):
-            if row["camera"] in counts and row["purpose"] == purpose:
-                counts[row["camera"]] += 1
-        return counts
+        rows = read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(self.cameras))
+        shot = [row["camera"] for row in rows if row["purpose"] == purpose]
+        return {camera: shot.count(camera) for camera in self.cameras}
 
     def _note_placement(self, placement):
         if placement not in (-1, *self.data["unfinished"]):

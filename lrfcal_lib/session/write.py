@@ -346,10 +346,11 @@ def complete(path):
             f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already"
         )
     sweeps = [read_npz(part, path) for part in parts]
-    scans = {}
-    for key in sweeps[0]:
-        if key != "bearings" and all(key in sweep for sweep in sweeps):
-            scans[key] = np.concatenate([sweep[key] for sweep in sweeps])
+    scans = {
+        key: np.concatenate([sweep[key] for sweep in sweeps])
+        for key in sweeps[0]
+        if all(key in sweep for sweep in sweeps)
+    }
     scans["bearings"] = sweeps[0]["bearings"]
     write_file(path, "lrf/scans.npz", scans)
     for part in parts:
