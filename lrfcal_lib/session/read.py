@@ -65,13 +65,13 @@ class EdgePick:
 
 
 def read_scans(path):
-    """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or
-    None).
+    """The recording of the LRF, whichever kind of file holds it, the log of its telegrams (or
+    None), and what of them is not used.
     """
     arrays = path / "lrf/scans.npz"
     telegrams = path / "lrf/telegrams.bin"
     if os.path.lexists(arrays):
-        return read_npz(arrays, path), None
+        return read_npz(arrays, path), None, []
     if os.path.lexists(telegrams):
         return read_telegrams(telegrams, path)
     if os.path.lexists(path / "lrf") and parts_of(path):
@@ -406,15 +406,14 @@ def open_session(path: str | os.PathLike) -> Session:
             )
         facts = parse_session(data)
         unfinished = facts.pop("unfinished")
-    scans, log = read_scans(path)
+    scans, log, unused = read_scans(path)
     records = read_images(path, facts, unfinished)
     problems = [
         *missing_parts(
             facts["placements"], scans, records, facts["cameras"], unfinished or ()
-        )
+        ),
+        *unused,
     ]
-    if log is not None:
-        problems += log.problems
     return Session(
         path=path,
         image_records=records,

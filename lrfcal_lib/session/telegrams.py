@@ -34,22 +34,22 @@ class TelegramLog:
     ----------
     offset, placement : ndarray of int, shape (n,)
         In the file; -1 for no placement.
-    outcome : ndarray of uint8, shape (n,)
+    outcome : ndarray of int, shape (n,)
         Index into `OUTCOMES`; 'other' is every sound telegram that holds no whole or partial scan.
     values : ndarray of int, shape (len(REASONS),)
         How many values of all scans had each reason, see
         ``lrfcal_lib.session.lms2xx_codec.REASONS``.
-    problems : tuple of str
     """
 
     offset: np.ndarray
     placement: np.ndarray
     outcome: np.ndarray
     values: np.ndarray
-    problems: tuple[str, ...]
 
 
-def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], TelegramLog]:
+def read_telegrams(
+    file: Path, within: Path
+) -> tuple[dict[str, np.ndarray], TelegramLog, list[str]]:
     """Decode a recording.
 
     Parameters
@@ -64,6 +64,8 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     scans : dict of ndarray
         As in scans.npz, see :func:`lrfcal_lib.session.scans.check_scans`.
     log : TelegramLog
+    problems : list of str
+        What is not used, and why.
 
     Raises
     ------
@@ -86,7 +88,7 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
 
     sound = are_sound(data, index.offset, index.length)
     whole = index.offset + index.length <= len(data)
-    outcome = np.select([sound, whole], [OTHER, WRONG], TRUNCATED).astype(np.uint8)
+    outcome = np.select([sound, whole], [OTHER, WRONG], TRUNCATED)
     wrong = (outcome == WRONG).sum()
     if wrong > whole.sum() / 2:
         raise SessionError(
@@ -108,9 +110,7 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     problems = [f"{file}: {note}" for note in (*notes, *_damage(index, outcome, len(data)))]
     if not read_bytes(path, within).endswith(b"\n"):
         problems.append(f"{path}: the last row is cut off, its telegram is left out")
-    return lines, TelegramLog(
-        index.offset, index.placement, outcome, values, tuple(problems)
-    )
+    return lines, TelegramLog(index.offset, index.placement, outcome, values), problems
 
 
 def _index(rows, size, file):
