@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from telegrams import decode_scan, encode_scan
+from telegrams import decode_scan, encode_scan, parse_telegram
 
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session import lms2xx_frame as frame
@@ -60,19 +60,16 @@ def random_words(rng, shape):
 
 @pytest.mark.parametrize("raw", SENT + REPLIES, ids=bytes.hex)
 def test_telegrams_are_the_verified_bytes(raw):
-    found = frame.parse_telegram(raw)
+    found = parse_telegram(raw)
     data = raw[5:-3] if raw in REPLIES else raw[5:-2]
     assert (found.code, found.data) == (raw[4], data)
     assert encode_telegram(found.code, found.data, status=raw[-3], address=raw[1]) == raw
 
 
 REFUSED = [
-    (frame.parse_telegram, b"", "begins with 02.*got none"),
-    (frame.parse_telegram, A0 + b"\0", "states 9 bytes, got 10"),
-    (
-        frame.parse_telegram,
-        A0[:5] + b"\x01" + A0[6:],
-        "CRC 0A16 sent, .* computed.*ask again",
+    *(
+        (parse_telegram, raw, "no telegram, or a damaged one")
+        for raw in (b"", A0 + b"\0", A0[:5] + b"\x01" + A0[6:])
     ),
     (decode_scan, A0, "holds no scan"),
     (
@@ -85,7 +82,6 @@ REFUSED = [
         encode_telegram(0xB0, b"\x01\x80\1\1", address=0x80),
         "holds no scan",
     ),  # unit reserved
-    (codec.parse_status, A0, "code A0 is not the reply B1"),
     (
         codec.parse_status,
         encode_telegram(0xB1, bytes(100), address=0x80),

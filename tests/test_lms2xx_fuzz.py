@@ -4,7 +4,7 @@ from contextlib import suppress
 
 import numpy as np
 from shared import STRINGS
-from telegrams import decode_scan, encode_scan
+from telegrams import decode_scan, encode_scan, parse_telegram
 
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session import lms2xx_frame as frame
@@ -88,11 +88,11 @@ def test_fuzz_contents():
     every = seeds(rng)
     values = 0
     for seed in every:
-        parse = PARSERS.get(seed[4], frame.parse_telegram)
         for raw in damaged(rng, seed, STRINGS // 2 // len(every)):
             if len(raw) > 7 and raw[-1] % 4:
                 raw = encode_telegram(seed[4], raw[5:-3], status=raw[-3], address=0x80)
             with suppress(frame.TelegramError):
+                parse = PARSERS.get(parse_telegram(raw).code, parse_telegram)
                 scan = parse(raw)
                 values += 1
                 assert parse is not decode_scan or np.all(

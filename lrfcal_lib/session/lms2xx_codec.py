@@ -12,7 +12,6 @@ from lrfcal_lib.session.lms2xx_frame import (
     TelegramError,
     cut,
     encode_telegram,
-    parse_telegram,
     word,
 )
 
@@ -252,7 +251,6 @@ def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
 
 
 STATUS = 0xB1
-TYPE = 0xBA
 CONFIGURATION = 0xF4
 CONFIGURED = 0xF7
 
@@ -332,36 +330,31 @@ def encode_configuration(configuration: Configuration) -> bytes:
     return encode_telegram(CONFIGURATION, configuration.block, address=DEVICE)
 
 
-def reply_data(raw, code, shortest):
-    """Data of a reply that must have a code and a least number of bytes; TelegramError
-    otherwise.
-    """
-    telegram = parse_telegram(raw)
-    if telegram.code != code:
+def reply_data(raw, shortest):
+    """Data of a reply that must have a least number of bytes; TelegramError otherwise."""
+    data = raw[5:-3]
+    if len(data) < shortest:
         raise TelegramError(
-            f"code {telegram.code:02X} is not the reply {code:02X} asked for"
+            f"reply {raw[4]:02X} has {len(data)} bytes of data, needs {shortest}"
         )
-    if len(telegram.data) < shortest:
-        raise TelegramError(
-            f"reply {code:02X} has {len(telegram.data)} bytes of data, needs {shortest}"
-        )
-    return telegram.data
+    return data
 
 
 def parse_status(raw: bytes) -> DeviceStatus:
-    """What the whole telegram 0xB1 says.
+    """What the telegram 0xB1 says.
 
     Parameters
     ----------
     raw
+        Sound, with its frame.
 
     Raises
     ------
     TelegramError
-        If it is damaged, another reply, or too short.
+        If it is too short.
     """
     # in the manual, which calls the code 0, the bytes 102, 107 to 110, and 120
-    data = reply_data(raw, STATUS, 123)
+    data = reply_data(raw, 123)
     mode, view, step, address = struct.unpack_from("<101x B 4x 2H 9x B", data)
     return DeviceStatus(mode, (float(view), step / 100), address)
 
@@ -372,13 +365,14 @@ def parse_type(raw: bytes) -> tuple[str, ...]:
     Parameters
     ----------
     raw
+        As for :func:`parse_status`.
 
     Returns
     -------
     tuple of str
         Such as ('LMS200', '301063', 'V02.10').
     """
-    text = reply_data(raw, TYPE, 1).decode("ascii", "replace").strip(" \0")
+    text = reply_data(raw, 1).decode("ascii", "replace").strip(" \0")
     return tuple(map(str.strip, text.split(";")))
 
 
@@ -388,16 +382,16 @@ def parse_configuration(raw: bytes) -> Configuration:
     Parameters
     ----------
     raw
+        As for :func:`parse_status`.
 
     Raises
     ------
     TelegramError
-        If it is damaged, another reply, or shorter than the measuring mode and the unit need, or
-        of a unit that there is not.
+        If it is shorter than the measuring mode and the unit need, or of a unit that there is not.
     """
-    if raw[4:5] == bytes([CONFIGURED]):
-        return Configuration(reply_data(raw, CONFIGURED, 8)[1:])
-    return Configuration(reply_data(raw, CONFIGURATION, 7))
+    if raw[4] == CONFIGURED:
+        return Configuration(reply_data(raw, 8)[1:])
+    return Configuration(reply_data(raw, 7))
 
 
 STATE_MODE = {  # by code, how to read the replies that do

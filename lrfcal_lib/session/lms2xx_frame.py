@@ -18,17 +18,6 @@ class TelegramError(ValueError):
 
 
 @dataclass(frozen=True)
-class Telegram:
-    """A telegram without its frame.
-
-    `code` is the command, or command + 0x80 in replies; `data` without code and status.
-    """
-
-    code: int
-    data: bytes
-
-
-@dataclass(frozen=True)
 class Stream:
     """Where the telegrams of a byte stream are.
 
@@ -93,44 +82,6 @@ def encode_telegram(
         body += bytes([status])
     raw = bytes([STX, address]) + len(body).to_bytes(2, "little") + body
     return raw + crc16(raw).to_bytes(2, "little")
-
-
-def whole(raw):
-    """Bytes as a number, the least first."""
-    return int.from_bytes(raw, "little")
-
-
-def parse_telegram(raw: bytes) -> Telegram:
-    """The telegram in bytes from the start byte to the CRC.
-
-    Parameters
-    ----------
-    raw
-
-    Raises
-    ------
-    TelegramError
-        If start, length or CRC is wrong.
-    """
-    if len(raw) < OVERHEAD + 1 or raw[0] != STX:
-        raise TelegramError(
-            f"a telegram begins with 02 and has 7 or more bytes, got {raw[:8].hex(' ') or 'none'}"
-        )
-    stated = whole(raw[2:4]) + OVERHEAD
-    if stated != len(raw):
-        raise TelegramError(
-            f"the telegram states {stated} bytes, got {len(raw)}: cut it with split_stream"
-        )
-    sent = whole(raw[-2:])
-    computed = crc16(raw[:-2])
-    if sent != computed:
-        raise TelegramError(
-            f"CRC {sent:04X} sent, {computed:04X} computed: damaged on the line, ask again"
-        )
-    data = raw[5:-2]
-    if raw[1] >= DEVICE:
-        data = data[:-1]  # without the status
-    return Telegram(raw[4], data)
 
 
 def split_stream(data: bytes, *, replies: bool = True) -> Stream:
