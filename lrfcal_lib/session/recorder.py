@@ -57,7 +57,7 @@ class SessionRecorder(SessionWriter):
                         f"{_first_difference(data[key], mine[key], key)}, unlike the rig now: go "
                         "on with the same rig file, or begin another one"
                     )
-        self.data = data | {"placements": list(known["placements"])}
+        self.data = data
         mend_tables(self.path)
         for placement in known["unfinished"] or ():
             self._mark_dropped(placement)

@@ -19,7 +19,6 @@ from lrfcal_lib.session.scans import check_scans
 from lrfcal_lib.session.tables import read_table, whole_number
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
-INDEX = [(name, float if name in ("t_s", "pitch_deg") else int) for name in INDEX_COLUMNS]
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
 SCANNED, OTHER, WRONG, TRUNCATED = range(4)
 LONGEST = OVERHEAD + 0xFFFF  # bytes of a telegram
@@ -114,12 +113,12 @@ def read_telegrams(
 
 
 def _index(rows, size, file):
-    """The rows of index.csv as an array of INDEX: NaN for no time or pitch, -1 for no placement.
+    """The rows of index.csv as an array: NaN for no time or pitch, -1 for no placement.
 
     Telegrams lie one after the other in the file, but for a last one that is cut off, and every
     scan has a pitch.
     """
-    index = np.recarray(len(rows), INDEX)
+    index = np.recarray(len(rows), formats="f8, i8, i8, i8, f8", names=INDEX_COLUMNS)
     for at, row in enumerate(rows):
         for key, cell in row.items():
             if index.dtype[key].kind == "f":
