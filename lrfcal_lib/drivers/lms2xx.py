@@ -288,7 +288,7 @@ class LMS2xx(Closed):
             If this one does not have it.
         """
         self._need_quiet()
-        wanted = (float(fov_deg), float(resolution_deg))
+        wanted = (fov_deg, resolution_deg)
         if wanted not in VARIANTS:
             known = short(f"{fov:g}/{step:g}" for fov, step in VARIANTS)
             raise ValueError(

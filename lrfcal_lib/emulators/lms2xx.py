@@ -304,7 +304,6 @@ class EmulatedLms(SerialDevice):
 
     def _ready(self, at):
         self._booting = False
-        self._buffer = b""
         self._zero = at
         self.telegrams = 0
         self.answer(at, 0x90, self.memory.model.encode(), delay=0.0)

@@ -93,6 +93,9 @@ def missing_parts(placements, scans, records, cameras, unfinished):
     for placement in placements:
         if placement not in swept:
             yield f"placement {placement}: no scan line with a range"
+        for camera in cameras:
+            if (camera, placement) not in shot:
+                yield f"placement {placement}: no image of camera '{camera}'"
     for placement in unfinished:
         yield (
             f"placement {placement}: its recording was not finished, ignored; 'record --resume' "
@@ -100,10 +103,6 @@ def missing_parts(placements, scans, records, cameras, unfinished):
         )
     for placement in sorted(swept - {*placements, *unfinished}):
         yield f"placement {placement}: in the scan lines but not in session.json, ignored"
-    for placement in placements:
-        for camera in cameras:
-            if (camera, placement) not in shot:
-                yield f"placement {placement}: no image of camera '{camera}'"
 
 
 def inside(path, name):

@@ -47,15 +47,15 @@ class SessionRecorder(SessionWriter):
         """Take over what an earlier recording wrote, without the placement that it did
         not finish.
         """
-        mine = stated.plain(self.data)
         data = files.read_json(self.path / "session.json", self.path)
         with naming(self.path / "session.json"):
             known = stated.parse_session(data)
             for key in ("board", "rig"):
-                if data[key] != mine[key]:
+                now = self.data[key]
+                if data[key] != now:
                     raise ValueError(
-                        f"{_first_difference(data[key], mine[key], key)}, unlike the rig now: go "
-                        "on with the same rig file, or begin another one"
+                        f"{_first_difference(data[key], now, key)}, unlike the rig now: go on with "
+                        "the same rig file, or begin another one"
                     )
         self.data = data
         mend_tables(self.path)

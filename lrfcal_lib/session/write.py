@@ -80,7 +80,7 @@ class SessionWriter(contextlib.AbstractContextManager):
         self.parts = 0  # files of sweeps so far
         if not about.keys() <= ABOUT.keys():
             raise TypeError(f"a session has {short(ABOUT)}, got {short(about)}")
-        self.data = {
+        data = {
             "schema": stated.SCHEMA,
             **ABOUT,
             "name": self.path.resolve().name,
@@ -93,7 +93,8 @@ class SessionWriter(contextlib.AbstractContextManager):
             "reference": reference or {},  # last: it may be long
         }
         with naming(self.path):
-            stated.parse_session(stated.plain(self.data))
+            self.data = stated.plain(data)
+            stated.parse_session(self.data)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
