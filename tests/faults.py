@@ -6,6 +6,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
+from telegrams import parse_telegram
 
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import SYNC, encode_extended
@@ -178,7 +179,7 @@ class FaultyLms(FaultyLine, RecordingLms):
         if data != ACK or not self.hit("no_ack"):
             super().write(data, at, then)
 
-    def obey(self, telegram, at):
+    def obey(self, code, data, at):
         memory = self.memory
         if self.hit("reboot"):
             return self.at(at + RESET_S, self.restart)
@@ -188,7 +189,9 @@ class FaultyLms(FaultyLine, RecordingLms):
                     [rate for rate in BAUD_WORD if rate != memory.baudrate]
                 )
             )
-        return self.answer(at, 0x92) if self.hit("refused") else super().obey(telegram, at)
+        return (
+            self.answer(at, 0x92) if self.hit("refused") else super().obey(code, data, at)
+        )
 
     def emit(self, scan, at, then=None):
         if then is None and self.hit("skip"):
@@ -199,7 +202,7 @@ class FaultyLms(FaultyLine, RecordingLms):
     def prepare(self, raw):
         """A reply with the faults that keep its checksum sound."""
         with suppress(frame.TelegramError):
-            told = frame.parse_telegram(raw)
+            told = parse_telegram(raw)
             status = 0xD3 if self.hit("status") else raw[-3]
             address = 0x80 | (raw[1] + 5) % 0x80 if self.hit("address") else raw[1]
             raw = frame.encode_telegram(

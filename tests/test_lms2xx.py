@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from telegrams import decode_scan, encode_scan
+from telegrams import decode_scan, encode_scan, parse_telegram
 
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session import lms2xx_frame as frame
@@ -60,19 +60,16 @@ def random_words(rng, shape):
 
 @pytest.mark.parametrize("raw", SENT + REPLIES, ids=bytes.hex)
 def test_telegrams_are_the_verified_bytes(raw):
-    found = frame.parse_telegram(raw)
+    found = parse_telegram(raw)
     data = raw[5:-3] if raw in REPLIES else raw[5:-2]
     assert (found.code, found.data) == (raw[4], data)
     assert encode_telegram(found.code, found.data, status=raw[-3], address=raw[1]) == raw
 
 
 REFUSED = [
-    (frame.parse_telegram, b"", "begins with 02.*got none"),
-    (frame.parse_telegram, A0 + b"\0", "states 9 bytes, got 10"),
-    (
-        frame.parse_telegram,
-        A0[:5] + b"\x01" + A0[6:],
-        "CRC 0A16 sent, .* computed.*ask again",
+    *(
+        (parse_telegram, raw, "no telegram, or a damaged one")
+        for raw in (b"", A0 + b"\0", A0[:5] + b"\x01" + A0[6:])
     ),
     (decode_scan, A0, "holds no scan"),
     (
@@ -85,7 +82,6 @@ REFUSED = [
         encode_telegram(0xB0, b"\x01\x80\1\1", address=0x80),
         "holds no scan",
     ),  # unit reserved
-    (codec.parse_status, A0, "code A0 is not the reply B1"),
     (
         codec.parse_status,
         encode_telegram(0xB1, bytes(100), address=0x80),
@@ -123,6 +119,11 @@ def test_what_is_no_telegram_or_another_one_is_refused(parse, given, message):
 # ------------------------------------------------------------------------------------------------------ scans
 
 
+def unit_and_partial(scan):
+    """Of a single scan."""
+    return codec.UNITS[scan.unit[0]], scan.partial[0]
+
+
 def test_the_two_scans_of_the_fact_sheet():
     first, second = (raw for raw in REPLIES if raw[4] == 0xB0)
     scan = decode_scan(first)
@@ -132,11 +133,12 @@ def test_the_two_scans_of_the_fact_sheet():
         "larger than maximum",
         "not valid",
     ]
-    assert (scan.unit, scan.partial) == ("cm", -1)
+    assert unit_and_partial(scan) == ("cm", -1)
     assert scan.scan_index.tolist() == scan.telegram_index.tolist() == [-1]
     scan = decode_scan(second)
     np.testing.assert_allclose(scan.ranges, [[1.234, 1.234, np.nan]])
-    assert (codec.REASONS[scan.reasons[0, 2]], scan.unit) == ("dazzled", "mm")
+    assert codec.REASONS[scan.reasons[0, 2]] == "dazzled"
+    assert unit_and_partial(scan) == ("mm", -1)
     values = codec.encode_values([1.234, 1.234, 0], reasons=[0, 0, 2])
     assert codec.encode_words(values | np.uint16([0, 1 << 13, 0])) == second
 
@@ -168,7 +170,7 @@ def test_any_scan_survives_both_ways(mode, unit, partial, indices):
             words, unit=unit, partial=partial, indices=indices, status=0x51, address=0x85
         )
         scan = decode_scan(raw, mode)
-        assert (scan.unit, scan.mode, scan.partial) == (unit, mode, partial)
+        assert unit_and_partial(scan) == (unit, partial)
         assert (raw[-3], raw[1]) == (0x51, 0x85)
         assert (scan.scan_index[0], scan.telegram_index[0]) == (indices or (-1, -1))
         np.testing.assert_array_equal(scan.words[0], words)
@@ -211,7 +213,7 @@ def test_real_scans_decode_and_encode_to_the_same_bytes(captures):
     raws = [raw for _, raw, _ in captures if raw[4] == 0xB0]
     data = b"\x06".join(raws)
     stream = split_stream(data)
-    (scans,) = codec.decode_scans(data, stream.offset, stream.length, mode=4)
+    scans = codec.decode_scans(data, stream.offset, stream.length, mode=4)
     assert scans.ranges.shape == (316, 361) and len(stream.rejected) == 0
     counts = zip(
         *(found.tolist() for found in np.unique(scans.reasons, return_counts=True)),

@@ -12,6 +12,7 @@ import struct
 
 import numpy as np
 import pytest
+from telegrams import parse_telegram
 from virtual import INDEXED, Source, lms
 
 from lrfcal_lib.session.lms2xx_codec import (
@@ -20,7 +21,6 @@ from lrfcal_lib.session.lms2xx_codec import (
 from lrfcal_lib.session.lms2xx_frame import (
     crc16,
     encode_telegram,
-    parse_telegram,
 )
 
 BAUD = {9600: "20 42", 19200: "20 41", 38400: "20 40", 500000: "20 48"}

@@ -128,6 +128,6 @@ def test_faults_are_recovered_from_and_no_wrong_scan_is_accepted(number, times):
         assert (
             abs(reading.time_s - record.time_s) < 0.6
         )  # below the delay that the fault 'delay' makes
-        unit = {"cm": 0.01, "mm": 0.001}[decode_scan(record.telegram).unit]
+        unit = (0.01, 0.001)[decode_scan(record.telegram).unit[0]]
         valid = np.isfinite(reading.ranges)
         np.testing.assert_allclose(reading.ranges[valid], record.words[valid] * unit)

@@ -4,7 +4,7 @@ from contextlib import suppress
 
 import numpy as np
 from shared import STRINGS
-from telegrams import decode_scan, encode_scan
+from telegrams import decode_scan, encode_scan, parse_telegram
 
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session import lms2xx_frame as frame
@@ -74,10 +74,10 @@ def test_fuzz_streams():
         assert len(stream.offset) == len(stream.length) and stream.pending <= len(data)
         assert np.all(stream.offset[1:] >= stream.offset[:-1] + stream.length[:-1])
         assert stream.length.sum() <= stream.pending
-        for group in codec.decode_scans(
+        scans = codec.decode_scans(
             data, stream.offset, stream.length, int(rng.choice(list(TOP)))
-        ):
-            assert group.words.shape == group.ranges.shape == group.reasons.shape
+        )
+        assert scans.words.shape == scans.ranges.shape == scans.reasons.shape
         found += len(stream.offset)
     assert found > 0.02 * STRINGS  # those that were not hit
 
@@ -88,11 +88,11 @@ def test_fuzz_contents():
     every = seeds(rng)
     values = 0
     for seed in every:
-        parse = PARSERS.get(seed[4], frame.parse_telegram)
         for raw in damaged(rng, seed, STRINGS // 2 // len(every)):
             if len(raw) > 7 and raw[-1] % 4:
                 raw = encode_telegram(seed[4], raw[5:-3], status=raw[-3], address=0x80)
             with suppress(frame.TelegramError):
+                parse = PARSERS.get(parse_telegram(raw).code, parse_telegram)
                 scan = parse(raw)
                 values += 1
                 assert parse is not decode_scan or np.all(

@@ -177,7 +177,8 @@ def _blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous, sound):
         points = lrf_to_platform(p_lrf, pitch, T_head_lrf)
         hiding = points
         good = sound.get(start, np.isfinite(ranges))
-        if lrf.spot_divergence is not None and start not in sound:
+        spot_stated = None not in (lrf.spot_exit, lrf.spot_divergence)
+        if spot_stated and start not in sound:
             nearer = mixed(ranges, steps, lrf)
             good = sound[start] = good & (nearer == 0)
             length = np.linalg.norm(p_lrf, axis=-1, keepdims=True)

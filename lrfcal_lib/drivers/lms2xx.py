@@ -41,7 +41,6 @@ LEAST_QUIET_S = 0.6  # of a stream, before it is taken for silent
 RECOVERY_S = 8.0
 # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
 REPLY_S = 0.4
-LOOK_S = 0.2  # between looks whether the reader thread lives
 
 
 class LMS2xx(Closed):
@@ -289,7 +288,7 @@ class LMS2xx(Closed):
             If this one does not have it.
         """
         self._need_quiet()
-        wanted = (float(fov_deg), float(resolution_deg))
+        wanted = (fov_deg, resolution_deg)
         if wanted not in VARIANTS:
             known = short(f"{fov:g}/{step:g}" for fov, step in VARIANTS)
             raise ValueError(
@@ -487,18 +486,17 @@ class LMS2xx(Closed):
         readings: list[Reading] = []
         while True:
             self._news.clear()
-            alive = self._thread.is_alive()
             readings += [reading for reading in self._readings if reading.time_s > after]
             if len(readings) >= count:
                 return readings[:count]
             if readings:
                 after = readings[-1].time_s
             left = end - self._now()
-            if left <= 0 or not alive:
+            if left <= 0:
                 raise NoReply(
                     f"no new scan within {timeout:g} s: {self._trouble or 'the stream is silent'}"
                 )
-            self._news.wait(min(left, LOOK_S))
+            self._news.wait(left)
 
     def stop(self) -> None:
         """Stop streaming; nothing happens where the device does not.

@@ -17,7 +17,7 @@ from lrfcal_lib.drivers.port import (
     line_lost,
 )
 from lrfcal_lib.session.files import short
-from lrfcal_lib.session.lms2xx_frame import OVERHEAD, encode_telegram, split_stream, whole
+from lrfcal_lib.session.lms2xx_frame import OVERHEAD, encode_telegram, split_stream
 
 ACK = 0x06
 NAK = 0x15
@@ -188,11 +188,10 @@ class Link:
         """
         if self.interrupted.is_set():
             raise NoReply(f"{self.path}: waiting was interrupted")
-        missing = 1
-        if self._rest:  # a telegram has begun; bytes 2 and 3 state its length
-            missing = max(1, whole(self._rest[2:4]) + OVERHEAD - len(self._rest))
+        # bytes 2 and 3 of a telegram that has begun state its length
+        size = int.from_bytes(self._rest[2:4], "little") + OVERHEAD
         with line_lost(self.path):
-            data = self._port.read(missing)
+            data = self._port.read(max(1, size - len(self._rest)))
             data += self._port.read(self._port.in_waiting)
         if not data:
             return []

@@ -1,7 +1,6 @@
 """Scans out of the telegrams of an LMS2xx, with the instants of their beams."""
 
 import math
-from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +11,8 @@ from lrfcal_lib.session import lms2xx_codec as codec
 
 BURST = 508  # bytes that leave in a turn of the mirror at 500 kBd
 PARTIAL = 181  # values of the first of four interlaced scans; the others have one less
-# arrivals in the last so many seconds tell the host's clock from the device's
-WINDOW_S = 2.0
+# arrivals in the last so many turns, 2 s, tell the host's clock from the device's
+WINDOW = 2.0 / MIRROR_TURN
 OFF_S = 1.2  # how far a scan may arrive off its expected instant
 JITTER_S = 0.05  # larger corrections of the clock leave scans out, smaller ones are spread
 LEAST_S = MIRROR_TURN / 100  # between two instants told; far less than between two scans
@@ -75,7 +74,8 @@ class ScanClock:
     """
 
     def __init__(self):
-        self._arrivals = deque()  # turn, counted on, and instant
+        # of turn 0, as each turn, counted on, tells its instant
+        self._zeros: dict[int, float] = {}
         self._refused = 0
         self._told = -np.inf
 
@@ -92,29 +92,24 @@ class ScanClock:
         if index < 0:
             return time_s
         turn = index
-        if self._arrivals:
-            last, _ = self._arrivals[-1]
-            expected = (time_s - self._zero()) / MIRROR_TURN
+        if self._zeros:
+            last = max(self._zeros)
+            expected = (time_s - min(self._zeros.values())) / MIRROR_TURN
             if expected - last > FORGET or self._refused >= STUBBORN:
-                self._arrivals.clear()
+                self._zeros.clear()
             else:
                 turn += 256 * round((expected - turn) / 256)
                 if turn <= last or abs(expected - turn) * MIRROR_TURN >= OFF_S:
                     self._refused += 1
                     return None
         self._refused = 0
-        self._arrivals.append((turn, time_s))
-        while self._arrivals[0][1] < time_s - WINDOW_S:  # never the one that came just now
-            self._arrivals.popleft()
-        instant = turn * MIRROR_TURN + self._zero()
+        self._zeros[turn] = time_s - turn * MIRROR_TURN
+        self._zeros = {t: zero for t, zero in self._zeros.items() if t > turn - WINDOW}
+        instant = turn * MIRROR_TURN + min(self._zeros.values())
         if instant < self._told - JITTER_S:  # the clock was found to be far ahead
             return None
         self._told = max(instant, self._told + LEAST_S)
         return self._told
-
-    def _zero(self):
-        """Instant of turn 0, by the earliest arrival of the window."""
-        return min(time_s - turn * MIRROR_TURN for turn, time_s in self._arrivals)
 
 
 class Assembler:
@@ -163,7 +158,7 @@ class Assembler:
         # number of values, unit, and whether there are indices and parts
         self._kind = (
             values,
-            configuration.unit,
+            codec.UNITS.index(configuration.unit),
             configuration.realtime_indices,
             interlaced,
         )
@@ -192,31 +187,31 @@ class Assembler:
         """
         mode = self.configuration.measuring_mode
         scans = codec.decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
-        if not scans:
+        if not len(scans.rows):
             return None
-        scan = scans[0]
-        count = scan.words.shape[1]
-        index = int(scan.scan_index[0])
-        kind = (count + (scan.partial > 0), scan.unit, index >= 0, scan.partial >= 0)
+        count = scans.words.shape[1]
+        (partial,) = scans.partial.tolist()
+        (index,) = scans.scan_index.tolist()
+        kind = (count + (partial > 0), *scans.unit, index >= 0, partial >= 0)
         if kind != self._kind:
             return None
         begun = arrival_s - transfer_s(len(raw), self.baudrate) - self.turns * MIRROR_TURN
         start_s = self._clock.place(index, begun)
         if start_s is None:
             return None
-        quarters = codec.scan_quarters(count, scan.partial)
+        quarters = codec.scan_quarters(count, partial)
         # the first turn begins at 0 deg
         times = start_s + (np.arange(count) % self.turns + quarters / 1440) * MIRROR_TURN
         reading = Reading(
             telegrams=(raw,),
-            ranges=np.nan_to_num(scan.ranges[0], nan=np.nan, posinf=np.nan),
+            ranges=np.nan_to_num(scans.ranges[0], nan=np.nan, posinf=np.nan),
             bearings=np.radians(quarters / 4),
             time_s=float(times[0]),
             beam_times_s=times,
-            telegram_index=int(scan.telegram_index[0]),
+            telegram_index=int(scans.telegram_index[0]),
         )
         if self.interlaced:
-            return self._merged(scan.partial, reading)
+            return self._merged(partial, reading)
         return reading
 
     def _merged(self, partial, part):

@@ -30,12 +30,7 @@ from lrfcal_lib.emulators.lms2xx_memory import (
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import SCAN, largest
-from lrfcal_lib.session.lms2xx_frame import (
-    Telegram,
-    encode_telegram,
-    parse_telegram,
-    split_stream,
-)
+from lrfcal_lib.session.lms2xx_frame import encode_telegram, split_stream
 
 ACK = b"\x06"
 NAK = b"\x15"
@@ -163,20 +158,20 @@ class EmulatedLms(SerialDevice):
             self.write(NAK, at + ACK_S, self._finish)
             return
         self.write(ACK, at + ACK_S)
-        self.obey(parse_telegram(raw), at)
+        self.obey(raw[4], raw[5:-2], at)
 
-    def obey(self, telegram: Telegram, at: float) -> None:
+    def obey(self, code: int, data: bytes, at: float) -> None:
         """Do what a telegram says, and answer it.
 
         Parameters
         ----------
-        telegram
-            Sound.
+        code, data
+            Of the telegram.
         at
             Instant of its last byte, s.
         """
         memory = self.memory
-        match telegram.code, telegram.data:
+        match code, data:
             case 0x10, _:
                 self.answer(
                     at,
@@ -184,7 +179,7 @@ class EmulatedLms(SerialDevice):
                     effect=lambda told: self.at(told + RESET_S, self.restart),
                     delay=ACK_S + 0.001,
                 )
-            case 0x20, data:
+            case 0x20, _:
                 self.set_mode(data, at)
             case 0x30, b"\x01" if not self._selection.head:
                 # the scan that is being measured when the request is whole
@@ -193,7 +188,7 @@ class EmulatedLms(SerialDevice):
                 self._measure(
                     scans * memory.turns, -1, partial(self.emit, then=self._finish)
                 )
-            case code, data if (reply := memory.reply(code, data)) is not None:
+            case _ if (reply := memory.reply(code, data)) is not None:
                 delay = WRITE_S if code in WRITTEN else REPLY_S
                 self.answer(at, 0x80 | code, reply, delay=delay)
             case _:
@@ -309,7 +304,6 @@ class EmulatedLms(SerialDevice):
 
     def _ready(self, at):
         self._booting = False
-        self._buffer = b""
         self._zero = at
         self.telegrams = 0
         self.answer(at, 0x90, self.memory.model.encode(), delay=0.0)

@@ -1,9 +1,7 @@
 """What an LMS2xx remembers: its settings, and what its operating mode sends of the scans."""
 
-from collections.abc import Sequence
+import struct
 from dataclasses import dataclass
-
-import numpy as np
 
 from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.session.lms2xx_codec import SCAN, TOP, UNITS, VARIANTS, Configuration
@@ -90,11 +88,11 @@ class Memory:
             case 0x3A:
                 return self.model.encode()
             case 0x3B if len(data) == 4:
-                view, step = np.frombuffer(data, "<u2").tolist()
+                view, step = struct.unpack("<2H", data)
                 taken = (view, step / 100) in VARIANTS and view <= self.widest
                 if taken:
                     self.variant = view, step
-                return bytes([taken]) + words_of(self.variant)
+                return struct.pack("<?2H", taken, *self.variant)
             case 0x74:
                 return self.configuration.block
             case 0x77 if 32 <= len(data) <= 34 and self.mode == INSTALLATION:
@@ -123,31 +121,19 @@ class Memory:
         return True
 
     def status_data(self) -> bytes:
-        """Data of the status reply 0xB1; offsets count from its code. What no driver reads is 0."""
-        parts = {
-            1: self.model[14:21].encode(),
-            8: bytes([self.mode]),
-            102: bytes([self.configuration.measuring_mode]),
-            107: words_of(self.variant),
-            116: words_of([BAUD_WORD[self.baudrate]]),
-            120: bytes([self.address, 1]),
-            122: bytes([UNITS.index(self.configuration.unit), 1]),
-        }
-        data = bytearray(153)
-        for at, part in parts.items():
-            data[at : at + len(part)] = part
-        return bytes(data[1:])
-
-
-def words_of(numbers: Sequence[int]) -> bytes:
-    """16-bit numbers as bytes.
-
-    Parameters
-    ----------
-    numbers
-        From 0 to 65535.
-    """
-    return np.array(numbers, "<u2").tobytes()
+        """Data of the status reply 0xB1, 152 bytes. What no driver reads is 0."""
+        return struct.pack(
+            "<7sB 93x B 4x 2H 5x H 2x 2B 2B 29x",
+            self.model[14:21].encode(),
+            self.mode,
+            self.configuration.measuring_mode,
+            *self.variant,
+            BAUD_WORD[self.baudrate],
+            self.address,
+            1,
+            UNITS.index(self.configuration.unit),
+            1,
+        )
 
 
 def selection_of(mode: int, parameters: bytes) -> Selection | None:
@@ -171,6 +157,6 @@ def selection_of(mode: int, parameters: bytes) -> Selection | None:
         scans = parameters[0]
         return Selection(parameters, scans=scans) if scans in SCANS else None
     if mode in (PART, REFLECTIVITY):
-        first, last = np.frombuffer(parameters, "<u2")[-2:].tolist()
+        first, last = struct.unpack("<2H", parameters[-4:])
         return Selection(parameters, first, last) if 1 <= first <= last <= LAST else None
     return Selection()

@@ -60,17 +60,14 @@ def cached(stage):
         for record in session.image_records:
             key.update(record.file.read_bytes() if record.file.is_file() else b"missing")
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
-        if not file.is_file():
-            with opened(
-                file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT
-            ) as lock:
-                # of two notebooks at the same time the second waits
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                if not file.is_file():
-                    result = pickle.dumps(stage(of, *args, **options))
-                    with NamedTemporaryFile(dir=folder, delete=False) as part:
-                        part.write(result)
-                    os.replace(part.name, file)  # whole or not at all
+        with opened(file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT) as lock:
+            # of two notebooks at the same time the second waits
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not file.is_file():
+                result = pickle.dumps(stage(of, *args, **options))
+                with NamedTemporaryFile(dir=folder, delete=False) as part:
+                    part.write(result)
+                os.replace(part.name, file)  # whole or not at all
         with opened(file, folder, most=LARGEST_RESULT) as stream:
             # of what is open: the name may be another's file by now
             _refuse_others(file, os.fstat(stream.fileno()))

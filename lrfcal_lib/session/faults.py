@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
@@ -65,25 +66,23 @@ def faults_of_files(session) -> list[Fault]:
 def repeated_images(session) -> Iterator[Fault]:
     """Images whose files are the same to the byte; one Fault a pair of cameras."""
     firsts = {}  # by the hash of their content
-    pairs = defaultdict(list)
+    pairs = defaultdict(dict)  # placements by words
     for record in session.image_records:
         first = firsts.setdefault(hash(read_bytes(record.file, session.path)), record)
         if first is not record:
-            pairs[first.camera, record.camera].append((first, record))
+            names = [one.file.relative_to(session.path) for one in (record, first)]
+            words = "{} is {}".format(*names)
+            pairs[first.camera, record.camera][words] = record.placement
     for (first_camera, camera), same in pairs.items():
         count = len(session.images(camera))
-        examples = short(
-            f"{other.file.relative_to(session.path)} is {first.file.relative_to(session.path)}"
-            for first, other in same
-        )
-        placements = tuple(sorted({other.placement for _, other in same} - {-1}))
+        placements = tuple(sorted({*same.values()} - {-1}))
         cause = "a camera that stood still, or a copy"
         if first_camera != camera:
             cause = f"was the folder of camera '{first_camera}' copied?"
         yield Fault(
             "repeated image",
             f"{len(same)} of {count} images of camera '{camera}' (in placements: "
-            f"{short(placements)}) are identical to others: {examples}: {cause}; put the right "
+            f"{short(placements)}) are identical to others: {short(same)}: {cause}; put the right "
             "images there or remove their rows from images.csv",
             severe=len(same) > MANY * count,
             camera=camera,
@@ -175,9 +174,7 @@ def dark_images(session) -> Iterator[Fault]:
         records = session.images(camera, purpose="board")
         records = records[:: max(len(records) // SHOWN, 1)][:SHOWN]
         levels = [brightness(session.read_image(record)) for record in records]
-        dark = [
-            record for record, level in zip(records, levels, strict=True) if level < DARK
-        ]
+        dark = [*compress(records, np.less(levels, DARK))]
         if len(dark) > len(records) / 2:
             yield Fault(
                 "dark",

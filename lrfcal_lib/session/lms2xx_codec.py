@@ -2,25 +2,22 @@
 
 import struct
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lrfcal_lib.session.files import short
+from lrfcal_lib.session.files import check_amount, short
 from lrfcal_lib.session.lms2xx_frame import (
     DEVICE,
     TelegramError,
-    alike,
     cut,
     encode_telegram,
-    parse_telegram,
     word,
 )
 
 SCAN = 0xB0
 METRES = {"cm": 0.01, "mm": 0.001}
-UNITS = ("cm", "mm")
+UNITS = tuple(METRES)
 REASONS = (
     "valid",
     "not valid",
@@ -51,48 +48,39 @@ def largest(mode: int) -> int:
     return TOP[mode] - len(REASON_BELOW_TOP) + 1
 
 
-@lru_cache
-def meanings(mode, unit):
-    """What each of the 65536 values means: ranges (metres) and reasons why there is none."""
-    counts = np.arange(1 << 16) & TOP[mode]
-    reasons = REASON_BELOW_TOP.take(TOP[mode] - counts, mode="clip")
-    ranges = counts * METRES[unit]
-    ranges[reasons > 0] = np.nan
-    ranges[reasons == BEYOND] = np.inf
-    return ranges, reasons
-
-
 @dataclass(frozen=True)
 class Scans:
-    """Scans of the same number of values.
+    """Scans, each with B values: those of the longest; behind the others stand zeros.
 
     Attributes
     ----------
     rows : ndarray of int, shape (n,)
         Which of the telegrams asked for these are.
+    count : ndarray of int, shape (n,)
+        Values of each.
     words : ndarray of uint16, shape (n, B)
         As sent, flags included.
     ranges : ndarray, shape (n, B)
         Metres; inf where the device says larger than its maximum, NaN for all other special values.
-    partial : int
+    reasons : ndarray of uint8, shape (n, B)
+        Index into `REASONS` of every value, 0 for a range.
+    unit : ndarray of int, shape (n,)
+        Index into `UNITS`.
+    partial : ndarray of int, shape (n,)
         Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
     scan_index, telegram_index : ndarray of int, shape (n,)
         Real-time indices, modulo 256; -1 where the device does not send them.
     """
 
     rows: np.ndarray
+    count: np.ndarray
     words: np.ndarray
     ranges: np.ndarray
-    unit: str
-    mode: int
-    partial: int
+    reasons: np.ndarray
+    unit: np.ndarray
+    partial: np.ndarray
     scan_index: np.ndarray
     telegram_index: np.ndarray
-
-    @property
-    def reasons(self):
-        """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
-        return meanings(self.mode, self.unit)[1][self.words]
 
 
 def encode_values(
@@ -168,7 +156,7 @@ def decode_scans(
     offset: np.ndarray,
     length: np.ndarray,
     mode: ArrayLike,
-) -> list[Scans]:
+) -> Scans:
     """The scans among the telegrams of a stream, many at once. CRCs are not looked at again.
 
     Parameters
@@ -181,10 +169,8 @@ def decode_scans(
 
     Returns
     -------
-    list of Scans
-        One for each number of values, mode, unit, and kind (whole or a part, with indices or
-        without). Telegrams with another code, or with a length that does not fit the number of
-        values, are in none of them.
+    Scans
+        Without telegrams of another code, or of a length that does not fit the number of values.
     """
     modes = np.broadcast_to(mode, len(offset))
     for other in set(modes.tolist()) - TOP.keys():  # sends no range with special values
@@ -195,27 +181,28 @@ def decode_scans(
     rows = np.flatnonzero(length >= 10)
     rows = rows[data[offset[rows] + 4] == SCAN]
     heads = word(data, offset[rows] + 5)
-    scans = []
-    for group in alike(modes[rows], length[rows], heads):
-        chosen = rows[group]
-        begin = offset[chosen] + 7
-        head = int(heads[group[0]])
-        size = 2 * (head & 0x3FF)  # bytes of the values
-        extra = length[chosen[0]] - 10 - size  # bytes of indices
-        if extra not in (0, 2) or head >= 1 << 15:
-            continue
-        words = cut(data, begin, size).view("<u2")
-        unit = UNITS[head >> 14]
-        partial = -1
-        if head >> 13 & 1:
-            partial = head >> 11 & 3
-        indices = np.full((len(chosen), 2), -1)
-        if extra:
-            indices[:] = cut(data, begin + size, 2)
-        number = modes[chosen[0]]
-        ranges = meanings(number, unit)[0][words]
-        scans.append(Scans(chosen, words, ranges, unit, number, partial, *indices.T))
-    return scans
+    count = heads & 0x3FF
+    extra = length[rows] - 10 - 2 * count  # bytes of indices
+    fits = np.isin(extra, (0, 2)) & (heads < 1 << 15)
+    rows, heads, count, extra = np.stack([rows, heads, count, extra])[:, fits]
+    begin = offset[rows] + 7
+    most = count.max(initial=0)
+    check_amount(len(rows) * most)
+    words = np.zeros((len(rows), most), np.uint16)
+    for size in np.unique(count):
+        same = count == size
+        words[same, :size] = cut(data, begin[same], 2 * size).view("<u2")
+    top = np.array([*TOP.values()], np.uint16)[modes[rows], None]
+    counts = words & top
+    reasons = REASON_BELOW_TOP.take(top - counts, mode="clip")
+    unit = heads >> 14
+    ranges = counts * np.array([*METRES.values()])[unit, None]
+    ranges[reasons > 0] = np.nan
+    ranges[reasons == BEYOND] = np.inf
+    partial = np.where(heads >> 13 & 1, heads >> 11 & 3, -1)
+    behind = word(data, begin + 2 * count)
+    indices = np.where(extra, [behind & 0xFF, behind >> 8], -1)
+    return Scans(rows, count, words, ranges, reasons, unit, partial, *indices)
 
 
 # field of view and step of whole scans, deg
@@ -264,7 +251,6 @@ def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
 
 
 STATUS = 0xB1
-TYPE = 0xBA
 CONFIGURATION = 0xF4
 CONFIGURED = 0xF7
 
@@ -344,42 +330,33 @@ def encode_configuration(configuration: Configuration) -> bytes:
     return encode_telegram(CONFIGURATION, configuration.block, address=DEVICE)
 
 
-def reply_data(raw, code, shortest):
-    """Data of a reply that must have a code and a least number of bytes; TelegramError
-    otherwise.
-    """
-    telegram = parse_telegram(raw)
-    if telegram.code != code:
+def reply_data(raw, shortest):
+    """Data of a reply that must have a least number of bytes; TelegramError otherwise."""
+    data = raw[5:-3]
+    if len(data) < shortest:
         raise TelegramError(
-            f"code {telegram.code:02X} is not the reply {code:02X} asked for"
+            f"reply {raw[4]:02X} has {len(data)} bytes of data, needs {shortest}"
         )
-    if len(telegram.data) < shortest:
-        raise TelegramError(
-            f"reply {code:02X} has {len(telegram.data)} bytes of data, needs {shortest}"
-        )
-    return telegram.data
+    return data
 
 
 def parse_status(raw: bytes) -> DeviceStatus:
-    """What the whole telegram 0xB1 says.
+    """What the telegram 0xB1 says.
 
     Parameters
     ----------
     raw
+        Sound, with its frame.
 
     Raises
     ------
     TelegramError
-        If it is damaged, another reply, or too short.
+        If it is too short.
     """
-    # counted as in the manual, which calls the code 0
-    data = bytes([STATUS]) + reply_data(raw, STATUS, 123)
-    view, step = struct.unpack_from("<HH", data, 107)
-    return DeviceStatus(
-        measuring_mode=data[102],
-        variant=(float(view), step / 100),
-        address=data[120],
-    )
+    # in the manual, which calls the code 0, the bytes 102, 107 to 110, and 120
+    data = reply_data(raw, 123)
+    mode, view, step, address = struct.unpack_from("<101x B 4x 2H 9x B", data)
+    return DeviceStatus(mode, (float(view), step / 100), address)
 
 
 def parse_type(raw: bytes) -> tuple[str, ...]:
@@ -388,13 +365,14 @@ def parse_type(raw: bytes) -> tuple[str, ...]:
     Parameters
     ----------
     raw
+        As for :func:`parse_status`.
 
     Returns
     -------
     tuple of str
         Such as ('LMS200', '301063', 'V02.10').
     """
-    text = reply_data(raw, TYPE, 1).decode("ascii", "replace").strip(" \0")
+    text = reply_data(raw, 1).decode("ascii", "replace").strip(" \0")
     return tuple(map(str.strip, text.split(";")))
 
 
@@ -404,34 +382,20 @@ def parse_configuration(raw: bytes) -> Configuration:
     Parameters
     ----------
     raw
+        As for :func:`parse_status`.
 
     Raises
     ------
     TelegramError
-        If it is damaged, another reply, or shorter than the measuring mode and the unit need, or
-        of a unit that there is not.
+        If it is shorter than the measuring mode and the unit need, or of a unit that there is not.
     """
-    if raw[4:5] == bytes([CONFIGURED]):
-        return Configuration(reply_data(raw, CONFIGURED, 8)[1:])
-    return Configuration(reply_data(raw, CONFIGURATION, 7))
+    if raw[4] == CONFIGURED:
+        return Configuration(reply_data(raw, 8)[1:])
+    return Configuration(reply_data(raw, 7))
 
 
-STATE_MODE = (CONFIGURATION, CONFIGURED, STATUS)  # codes of the replies that do
-
-
-def parse_mode(raw: bytes) -> int:
-    """Measuring mode out of a reply that states it.
-
-    Parameters
-    ----------
-    raw
-        One of `STATE_MODE`.
-
-    Raises
-    ------
-    TelegramError
-        If it is damaged, or too short.
-    """
-    if raw[4] == STATUS:
-        return parse_status(raw).measuring_mode
-    return parse_configuration(raw).measuring_mode
+STATE_MODE = {  # by code, how to read the replies that do
+    CONFIGURATION: parse_configuration,
+    CONFIGURED: parse_configuration,
+    STATUS: parse_status,
+}

@@ -18,17 +18,6 @@ class TelegramError(ValueError):
 
 
 @dataclass(frozen=True)
-class Telegram:
-    """A telegram without its frame.
-
-    `code` is the command, or command + 0x80 in replies; `data` without code and status.
-    """
-
-    code: int
-    data: bytes
-
-
-@dataclass(frozen=True)
 class Stream:
     """Where the telegrams of a byte stream are.
 
@@ -95,44 +84,6 @@ def encode_telegram(
     return raw + crc16(raw).to_bytes(2, "little")
 
 
-def whole(raw):
-    """Bytes as a number, the least first."""
-    return int.from_bytes(raw, "little")
-
-
-def parse_telegram(raw: bytes) -> Telegram:
-    """The telegram in bytes from the start byte to the CRC.
-
-    Parameters
-    ----------
-    raw
-
-    Raises
-    ------
-    TelegramError
-        If start, length or CRC is wrong.
-    """
-    if len(raw) < OVERHEAD + 1 or raw[0] != STX:
-        raise TelegramError(
-            f"a telegram begins with 02 and has 7 or more bytes, got {raw[:8].hex(' ') or 'none'}"
-        )
-    stated = whole(raw[2:4]) + OVERHEAD
-    if stated != len(raw):
-        raise TelegramError(
-            f"the telegram states {stated} bytes, got {len(raw)}: cut it with split_stream"
-        )
-    sent = whole(raw[-2:])
-    computed = crc16(raw[:-2])
-    if sent != computed:
-        raise TelegramError(
-            f"CRC {sent:04X} sent, {computed:04X} computed: damaged on the line, ask again"
-        )
-    data = raw[5:-2]
-    if raw[1] >= DEVICE:
-        data = data[:-1]  # without the status
-    return Telegram(raw[4], data)
-
-
 def split_stream(data: bytes, *, replies: bool = True) -> Stream:
     """Find the telegrams in a byte stream, whatever lies between them.
 
@@ -183,10 +134,9 @@ def are_sound(data, offset, length):
     CRC, shape (m,).
     """
     sound = np.zeros(len(offset), bool)
-    whole = np.flatnonzero(offset + length <= len(data))
-    for group in alike(length[whole]):
-        rows = whole[group]
-        size = length[rows[0]]
+    whole = offset + length <= len(data)
+    for size in np.unique(length[whole]):
+        rows = np.flatnonzero(whole & (length == size))
         raw = cut(data, offset[rows], size)
         if len(rows) < MANY:
             sums = [crc16(bytes(one)) for one in raw[:, :-2]]
@@ -195,13 +145,6 @@ def are_sound(data, offset, length):
         framed = (raw[:, 0] == STX) & (word(raw.T, 2) + OVERHEAD == size)
         sound[rows] = framed & (sums == word(raw.T, -2))
     return sound
-
-
-def alike(*keys):
-    """Rows with the same keys, each group in order."""
-    order = np.lexsort(keys)
-    differs = np.any(np.diff(np.stack(keys)[:, order]), axis=0)
-    return np.split(order, np.flatnonzero(differs) + 1)[: len(order)]  # no group of no rows
 
 
 def cut(data, offset, length):

@@ -44,24 +44,17 @@ def alone(path: str | os.PathLike) -> Iterator[None]:
 
 def _locked(file, path):
     """The open lock of a session, which nobody else holds."""
-    stream = opened(file, path, os.O_RDWR | os.O_CREAT)
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        with stream:
-            holder = stream.read(200).decode(errors="replace") or "another process"
-        raise SessionError(
-            f"{path}: {holder} writes this session: end that first, or choose another one"
-        ) from None
-    if _still_there(file, stream):
-        return stream
-    stream.close()  # its holder removed the file after we had opened it
-    return _locked(file, path)
-
-
-def _still_there(file, stream):
-    """Whether an open file is the one that has this name now."""
-    try:
-        return os.path.samestat(os.fstat(stream.fileno()), os.lstat(file))
-    except FileNotFoundError:
-        return False
+    while True:
+        stream = opened(file, path, os.O_RDWR | os.O_CREAT)
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            with stream:
+                holder = stream.read(200).decode(errors="replace") or "another process"
+            raise SessionError(
+                f"{path}: {holder} writes this session: end that first, or choose another one"
+            ) from None
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(stream.fileno()), os.lstat(file)):
+                return stream
+        stream.close()  # its holder removed the file after we had opened it

@@ -65,13 +65,13 @@ class EdgePick:
 
 
 def read_scans(path):
-    """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or
-    None).
+    """The recording of the LRF, whichever kind of file holds it, the log of its telegrams (or
+    None), and what of them is not used.
     """
     arrays = path / "lrf/scans.npz"
     telegrams = path / "lrf/telegrams.bin"
     if os.path.lexists(arrays):
-        return read_npz(arrays, path), None
+        return read_npz(arrays, path), None, []
     if os.path.lexists(telegrams):
         return read_telegrams(telegrams, path)
     if os.path.lexists(path / "lrf") and parts_of(path):
@@ -93,6 +93,9 @@ def missing_parts(placements, scans, records, cameras, unfinished):
     for placement in placements:
         if placement not in swept:
             yield f"placement {placement}: no scan line with a range"
+        for camera in cameras:
+            if (camera, placement) not in shot:
+                yield f"placement {placement}: no image of camera '{camera}'"
     for placement in unfinished:
         yield (
             f"placement {placement}: its recording was not finished, ignored; 'record --resume' "
@@ -100,22 +103,16 @@ def missing_parts(placements, scans, records, cameras, unfinished):
         )
     for placement in sorted(swept - {*placements, *unfinished}):
         yield f"placement {placement}: in the scan lines but not in session.json, ignored"
-    for placement in placements:
-        for camera in cameras:
-            if (camera, placement) not in shot:
-                yield f"placement {placement}: no image of camera '{camera}'"
 
 
-def inside(path, name, where):
+def inside(path, name):
     """The file a session names; it must lie inside the session's folder (no ``..`` or absolute
-    path).
+    path): ValueError.
     """
     if OUTSIDE.match(name):
-        raise SessionError(
-            f"{path}: {where} must stay inside the session's folder, got '{name}'"
-        )
+        raise ValueError(f"file must stay inside the session's folder, got '{name}'")
     if not name.isprintable():
-        raise SessionError(f"{path}: {where} must be printable, got '{name}': rename it")
+        raise ValueError(f"file must be printable, got '{name}': rename it")
     return path / name
 
 
@@ -157,7 +154,7 @@ def read_images(path, facts, unfinished):
                 continue
             record = ImageRecord(
                 camera=known(row["camera"], cameras, "camera"),
-                file=inside(path, row["file"], "images.csv: file"),
+                file=inside(path, row["file"]),
                 placement=known(placement, (*facts["placements"], -1), "placement"),
                 pitch=math.radians(float(row["pitch_deg"] or "nan")),
                 time_s=float(row["t_s"] or "nan"),
@@ -180,20 +177,19 @@ def read_edges(path, facts, records):
     rows = read_table(file, EDGE_COLUMNS, path, needed=False)
     for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
-            target = inside(path, row["file"], "edges.csv: file")
-            if (row["camera"], target) not in images:
-                raise ValueError(
-                    f"images.csv has no '{row['file']}' of camera '{row['camera']}'"
-                )
-            edge = known(row["edge"], facts["board"].edges, "edge")
-            once(lines, number, row["camera"], target, edge)
-            ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
+            camera, name, edge, *pixels = row.values()
+            target = inside(path, name)
+            if (camera, target) not in images:
+                raise ValueError(f"images.csv has no '{name}' of camera '{camera}'")
+            known(edge, facts["board"].edges, "edge")
+            once(lines, number, camera, target, edge)
+            ends = np.array(pixels, float).reshape(2, 2)
             if not CLOSEST <= np.linalg.norm(ends[1] - ends[0]) < math.inf:
                 raise ValueError(
                     f"the two pixels {ends.tolist()} give no direction: pick two that are "
                     f"{CLOSEST} or more pixels apart"
                 )
-            out.append(EdgePick(row["camera"], target, edge, ends))
+            out.append(EdgePick(camera, target, edge, ends))
     return tuple(out)
 
 
@@ -409,15 +405,14 @@ def open_session(path: str | os.PathLike) -> Session:
             )
         facts = parse_session(data)
         unfinished = facts.pop("unfinished")
-    scans, log = read_scans(path)
+    scans, log, unused = read_scans(path)
     records = read_images(path, facts, unfinished)
     problems = [
         *missing_parts(
             facts["placements"], scans, records, facts["cameras"], unfinished or ()
-        )
+        ),
+        *unused,
     ]
-    if log is not None:
-        problems += log.problems
     return Session(
         path=path,
         image_records=records,

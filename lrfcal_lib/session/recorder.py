@@ -47,17 +47,17 @@ class SessionRecorder(SessionWriter):
         """Take over what an earlier recording wrote, without the placement that it did
         not finish.
         """
-        mine = stated.plain(self.data)
         data = files.read_json(self.path / "session.json", self.path)
         with naming(self.path / "session.json"):
             known = stated.parse_session(data)
             for key in ("board", "rig"):
-                if data[key] != mine[key]:
+                now = self.data[key]
+                if data[key] != now:
                     raise ValueError(
-                        f"{_first_difference(data[key], mine[key], key)}, unlike the rig now: go "
-                        "on with the same rig file, or begin another one"
+                        f"{_first_difference(data[key], now, key)}, unlike the rig now: go on with "
+                        "the same rig file, or begin another one"
                     )
-        self.data = data | {"placements": list(known["placements"])}
+        self.data = data
         mend_tables(self.path)
         for placement in known["unfinished"] or ():
             self._mark_dropped(placement)
@@ -147,12 +147,10 @@ class SessionRecorder(SessionWriter):
         purpose
             Of the images.
         """
-        counts = dict.fromkeys(self.cameras, 0)
         file = self.path / "images.csv"
-        for row in read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(counts)):
-            if row["camera"] in counts and row["purpose"] == purpose:
-                counts[row["camera"]] += 1
-        return counts
+        rows = read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(self.cameras))
+        shot = [row["camera"] for row in rows if row["purpose"] == purpose]
+        return {camera: shot.count(camera) for camera in self.cameras}
 
     def _note_placement(self, placement):
         if placement not in (-1, *self.data["unfinished"]):

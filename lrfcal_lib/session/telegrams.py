@@ -19,7 +19,6 @@ from lrfcal_lib.session.scans import check_scans
 from lrfcal_lib.session.tables import read_table, whole_number
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
-INDEX = [(name, float if name in ("t_s", "pitch_deg") else int) for name in INDEX_COLUMNS]
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
 SCANNED, OTHER, WRONG, TRUNCATED = range(4)
 LONGEST = OVERHEAD + 0xFFFF  # bytes of a telegram
@@ -34,22 +33,22 @@ class TelegramLog:
     ----------
     offset, placement : ndarray of int, shape (n,)
         In the file; -1 for no placement.
-    outcome : ndarray of uint8, shape (n,)
+    outcome : ndarray of int, shape (n,)
         Index into `OUTCOMES`; 'other' is every sound telegram that holds no whole or partial scan.
     values : ndarray of int, shape (len(REASONS),)
         How many values of all scans had each reason, see
         ``lrfcal_lib.session.lms2xx_codec.REASONS``.
-    problems : tuple of str
     """
 
     offset: np.ndarray
     placement: np.ndarray
     outcome: np.ndarray
     values: np.ndarray
-    problems: tuple[str, ...]
 
 
-def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], TelegramLog]:
+def read_telegrams(
+    file: Path, within: Path
+) -> tuple[dict[str, np.ndarray], TelegramLog, list[str]]:
     """Decode a recording.
 
     Parameters
@@ -64,6 +63,8 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     scans : dict of ndarray
         As in scans.npz, see :func:`lrfcal_lib.session.scans.check_scans`.
     log : TelegramLog
+    problems : list of str
+        What is not used, and why.
 
     Raises
     ------
@@ -86,7 +87,7 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
 
     sound = are_sound(data, index.offset, index.length)
     whole = index.offset + index.length <= len(data)
-    outcome = np.select([sound, whole], [OTHER, WRONG], TRUNCATED).astype(np.uint8)
+    outcome = np.select([sound, whole], [OTHER, WRONG], TRUNCATED)
     wrong = (outcome == WRONG).sum()
     if wrong > whole.sum() / 2:
         raise SessionError(
@@ -97,30 +98,27 @@ def read_telegrams(file: Path, within: Path) -> tuple[dict[str, np.ndarray], Tel
     with naming(file):
         modes, notes = _modes(data, index, np.flatnonzero(sound))
         # what is damaged holds no scan
-        groups = codec.decode_scans(
+        scans = codec.decode_scans(
             data, index.offset, np.where(sound, index.length, 0), modes
         )
-        scans = check_scans(_lines(groups, index))
+        lines = check_scans(_lines(scans, index))
 
-    values = np.zeros(len(codec.REASONS), int)
-    for group in groups:
-        outcome[group.rows] = SCANNED
-        values += np.bincount(group.reasons.ravel(), minlength=len(values))
+    outcome[scans.rows] = SCANNED
+    sent = np.arange(scans.words.shape[1]) < scans.count[:, None]
+    values = np.bincount(scans.reasons[sent], minlength=len(codec.REASONS))
     problems = [f"{file}: {note}" for note in (*notes, *_damage(index, outcome, len(data)))]
     if not read_bytes(path, within).endswith(b"\n"):
         problems.append(f"{path}: the last row is cut off, its telegram is left out")
-    return scans, TelegramLog(
-        index.offset, index.placement, outcome, values, tuple(problems)
-    )
+    return lines, TelegramLog(index.offset, index.placement, outcome, values), problems
 
 
 def _index(rows, size, file):
-    """The rows of index.csv as an array of INDEX: NaN for no time or pitch, -1 for no placement.
+    """The rows of index.csv as an array: NaN for no time or pitch, -1 for no placement.
 
     Telegrams lie one after the other in the file, but for a last one that is cut off, and every
     scan has a pitch.
     """
-    index = np.recarray(len(rows), INDEX)
+    index = np.recarray(len(rows), formats="f8, i8, i8, i8, f8", names=INDEX_COLUMNS)
     for at, row in enumerate(rows):
         for key, cell in row.items():
             if index.dtype[key].kind == "f":
@@ -168,10 +166,10 @@ def _modes(data, index, sound):
     """
     modes = np.full(len(index), -1)
     notes = []
-    for row in sound[np.isin(data[index.offset[sound] + 4], codec.STATE_MODE)]:
+    for row in sound[np.isin(data[index.offset[sound] + 4], [*codec.STATE_MODE])]:
         raw = data[index.offset[row] :][: index.length[row]]
         try:
-            modes[row:] = codec.parse_mode(raw.tobytes())
+            modes[row:] = codec.STATE_MODE[raw[4]](raw.tobytes()).measuring_mode
         except TelegramError as error:
             notes.append(f"{_place(index, row)}: {error}; ignored")
     stated = modes[modes >= 0]
@@ -185,57 +183,47 @@ def _modes(data, index, sound):
     return modes, notes
 
 
-def _lines(groups, index):
+def _lines(scans, index):
     """Scan lines on one grid of bearings; refuses a mixture of variants."""
-    placed = index.placement >= 0
-    groups = [group for group in groups if placed[group.rows].any()]
-    if not groups:
+    placed = index.placement[scans.rows] >= 0
+    rows = scans.rows[placed]
+    partial = scans.partial[placed]
+    variants = {*zip(scans.count[placed].tolist(), partial.tolist(), strict=True)}
+    if not variants:
         raise ValueError(
             "no telegram with a scan belongs to a placement: was the device streaming?"
         )
-    grids = [codec.scan_quarters(group.words.shape[1], group.partial) for group in groups]
-    counts = {len(grid) for grid in grids}
-    partials = {group.partial for group in groups}
-    if -1 in partials and (len(counts) > 1 or len(partials) > 1):
+    grids = [codec.scan_quarters(*variant) for variant in variants]
+    parts, part = np.unique(partial, return_inverse=True)
+    if parts[0] < 0 and len(variants) > 1:
+        counts = sorted({count for count, _ in variants})
         raise ValueError(
-            f"scans of {short(sorted(counts))} values are mixed: a session holds one variant, "
+            f"scans of {short(counts)} values are mixed: a session holds one variant, "
             "split the recording"
         )
-    # the quarter of a degree that a scan is turned by, -1 for a whole one, -2 for no scan
-    partial = np.full(len(index), -2)
-    # of the scan, as the device counts; -1 where it does not
-    number = np.full(len(index), -1)
-    for group in groups:
-        partial[group.rows] = group.partial
-        number[group.rows] = group.telegram_index
-    rows = np.flatnonzero((partial > -2) & placed)
-    begins = np.r_[True, ~_goes_on(partial[rows], number[rows], index[rows])]
-    first = index[rows[begins]]
-    line = np.full(len(index), -1)
-    line[rows] = begins.cumsum() - 1
+    scanned = index[rows]
+    step = np.diff(partial)
+    number = scans.telegram_index[placed]
+    # a scan goes on with the line of the one before
+    goes_on = (partial[:-1] >= 0) & (step > 0)
+    goes_on &= (np.diff(scanned.placement) == 0) & (np.diff(scanned.pitch_deg) == 0)
+    goes_on &= (number[1:] < 0) | (np.diff(number) % 256 == step)
+    begins = np.r_[True, ~goes_on]
+    first = scanned[begins]
+    line = begins.cumsum() - 1
 
     quarters = np.unique(np.concatenate(grids))
     check_amount(len(first) * len(quarters))
-    # scans of no placement, line -1, go into one more that is left out
-    ranges = np.full((len(first) + 1, len(quarters)), np.nan)
-    for grid, group in zip(grids, groups, strict=True):
-        columns = np.searchsorted(quarters, grid)
-        ranges[line[group.rows][:, None], columns] = group.ranges
+    # the parts of an interlaced line are its columns by turns
+    ranges = np.full((len(first), scans.words.shape[1], len(parts)), np.nan)
+    ranges[line, :, part] = scans.ranges[placed]
     return {
-        "ranges": ranges[:-1],
+        "ranges": ranges.reshape(len(first), -1)[:, : len(quarters)],
         "bearings": np.radians(quarters / 4),
-        "time_s": np.bincount(line[rows], index.t_s[rows]) / np.bincount(line[rows]),
+        "time_s": np.bincount(line, scanned.t_s) / np.bincount(line),
         "placement": first.placement,
         "pitch": np.radians(first.pitch_deg),
     }
-
-
-def _goes_on(partial, number, scans):
-    """Whether each scan but the first goes on with the line of the one before, shape (n - 1,)."""
-    step = np.diff(partial)
-    rises = (partial[:-1] >= 0) & (step > 0)
-    stays = (np.diff(scans.placement) == 0) & (np.diff(scans.pitch_deg) == 0)
-    return rises & stays & ((number[1:] < 0) | (np.diff(number) % 256 == step))
 
 
 def _damage(index, outcome, size):

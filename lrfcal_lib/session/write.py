@@ -80,7 +80,7 @@ class SessionWriter(contextlib.AbstractContextManager):
         self.parts = 0  # files of sweeps so far
         if not about.keys() <= ABOUT.keys():
             raise TypeError(f"a session has {short(ABOUT)}, got {short(about)}")
-        self.data = {
+        data = {
             "schema": stated.SCHEMA,
             **ABOUT,
             "name": self.path.resolve().name,
@@ -93,7 +93,8 @@ class SessionWriter(contextlib.AbstractContextManager):
             "reference": reference or {},  # last: it may be long
         }
         with naming(self.path):
-            stated.parse_session(stated.plain(self.data))
+            self.data = stated.plain(data)
+            stated.parse_session(self.data)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
@@ -346,10 +347,11 @@ def complete(path):
             f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already"
         )
     sweeps = [read_npz(part, path) for part in parts]
-    scans = {}
-    for key in sweeps[0]:
-        if key != "bearings" and all(key in sweep for sweep in sweeps):
-            scans[key] = np.concatenate([sweep[key] for sweep in sweeps])
+    scans = {
+        key: np.concatenate([sweep[key] for sweep in sweeps])
+        for key in sweeps[0]
+        if all(key in sweep for sweep in sweeps)
+    }
     scans["bearings"] = sweeps[0]["bearings"]
     write_file(path, "lrf/scans.npz", scans)
     for part in parts:
