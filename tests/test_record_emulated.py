@@ -67,7 +67,7 @@ class Still:
 
     def newest(self, after=None, timeout=None):
         self.rig.host.sleep(0.5)
-        _, data = self.rig.camera_server.image(self.name, timeout=DEADLINE)
+        data = self.rig.camera_server.image(self.name, timeout=DEADLINE)
         self.count += 1
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         return Frame(image, self.rig.host.time(), self.count)

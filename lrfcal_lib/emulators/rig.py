@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib.drivers.lms2xx_link import FASTEST
-from lrfcal_lib.drivers.port import REAL, Host
+from lrfcal_lib.drivers.port import REAL, Closed, Host
 from lrfcal_lib.emulators.head import EmulatedHead
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld
@@ -28,10 +28,10 @@ QUICK_HEAD = {"baudrate": 38400, "go_speed": 60.0}  # habits
 QUICK_SETTINGS = {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}  # of its driver
 
 
-class EmulatedRig:
+class EmulatedRig(Closed):
     """The devices of a simulated setup, as files and addresses that any program can open.
 
-    A context manager.
+    A context manager that removes them, and their folder.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class EmulatedRig:
     Examples
     --------
     >>> with EmulatedRig(load_setup("sim_quick")) as rig:  # doctest: +SKIP
-    ...     rig.world.put(1)
+    ...     rig.world.put("place/1")
     """
 
     def __init__(
@@ -67,37 +67,30 @@ class EmulatedRig:
         self.setup = setup
         self.host = host
         self.quick = quick
-        self._closing = contextlib.ExitStack()
-        folder = tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
-        self.folder = Path(self._closing.enter_context(folder))
-        self.world = EmulatedWorld(setup, host, placements)
-        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host)
         if quick:
             habits |= QUICK_HEAD
-        self.pan_tilt = EmulatedHead(
-            self.world.head, path=self.folder / "head", host=host, **habits
-        )
-        self.camera_server = CameraServer(self.world, rest_s=rest_s)
-        self.camera_urls = {
-            name: f"{self.camera_server.url}/{name}.mjpg"
-            for name in self.camera_server.cameras
-        }
-        self._parts = self.lrf, self.pan_tilt, self.camera_server
-        for part in self._parts:
-            self._closing.callback(part.close)
-
-    def start(self):
-        """Let all devices appear; the rig."""
-        for part in self._parts:
-            part.start()
-        return self
-
-    def close(self, *_) -> None:
-        """Remove all devices, and their folder."""
-        self._closing.close()
-
-    __enter__ = start
-    __exit__ = close
+        with contextlib.ExitStack() as stack:
+            folder = tempfile.TemporaryDirectory(
+                prefix="lrfcal-", ignore_cleanup_errors=True
+            )
+            self.folder = Path(stack.enter_context(folder))
+            self.world = EmulatedWorld(setup, host, placements)
+            self.camera_server = stack.enter_context(
+                contextlib.closing(CameraServer(self.world, rest_s=rest_s))
+            )
+            self.camera_urls = {
+                name: f"{self.camera_server.url}/{name}.mjpg"
+                for name in self.camera_server.cameras
+            }
+            self.lrf = stack.enter_context(
+                EmulatedLms(self.world, path=self.folder / "lrf", host=host)
+            )
+            self.pan_tilt = stack.enter_context(
+                EmulatedHead(
+                    self.world.head, path=self.folder / "head", host=host, **habits
+                )
+            )
+            self.close = stack.pop_all().close
 
     def error(self) -> Exception | None:
         """What ended a device by itself, None while all live."""
@@ -116,7 +109,7 @@ class EmulatedRig:
                     .tolist(),
                     "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
                 }
-                for p in self.world.placements.values()
+                for p in self.world.placements
             ],
         }
 
@@ -186,7 +179,7 @@ def practice_setup() -> tuple[Setup, list[Placement]]:
 
 
 def emulated(name: str, feedback: str = "full") -> EmulatedRig:
-    """An emulated rig, not started yet.
+    """An emulated rig.
 
     Parameters
     ----------
@@ -310,7 +303,7 @@ def summary(rig: EmulatedRig, file: str | os.PathLike | None) -> str:
         Its rig file.
     """
     head = rig.pan_tilt
-    places = ", ".join(map(str, rig.world.placements))
+    places = ", ".join(str(placement.number) for placement in rig.world.placements)
     lines = [
         f"emulated rig '{rig.setup.name}' ({rig.setup.rig.beam.name}); Ctrl-C ends it",
         f"  lrf      {rig.lrf.path}   {rig.lrf.baudrate} Bd, SICK LMS2xx",
