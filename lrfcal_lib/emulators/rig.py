@@ -96,23 +96,6 @@ class EmulatedRig(Closed):
         """What ended a device by itself, None while all live."""
         return self.lrf.error or self.pan_tilt.error
 
-    def plan(self) -> dict:
-        """What a recording of this rig can do: its placements, each with its sweep."""
-        return {
-            "intrinsics_images": self.setup.intrinsics_views,
-            "placements": [
-                {
-                    "number": p.number,
-                    "board": p.purpose == "board",
-                    "pitch_deg": np.degrees([*p.sweep, self.setup.step_of(p)])
-                    .round(4)
-                    .tolist(),
-                    "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
-                }
-                for p in self.world.placements
-            ],
-        }
-
     def rig_file(self) -> dict:
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices,
         plan. Without close views of the board nobody can find the intrinsics, so they are stated.
@@ -120,8 +103,6 @@ class EmulatedRig(Closed):
         setup = self.setup
         rig = setup.rig
         return {
-            "schema": stated.SCHEMA,
-            "name": f"{setup.name}_emulated",
             "licence": "CC-BY-4.0",
             "simulated": True,
             "source": f"emulated rig of the setup '{setup.name}', seed {setup.seed}",
@@ -132,7 +113,20 @@ class EmulatedRig(Closed):
                 rig.camera_infos(known=setup.intrinsics_views == 0),
             ),
             "devices": self._devices(),
-            "plan": self.plan(),
+            "plan": {
+                "intrinsics_images": self.setup.intrinsics_views,
+                "placements": [
+                    {
+                        "number": p.number,
+                        "board": p.purpose == "board",
+                        "pitch_deg": np.degrees([*p.sweep, self.setup.step_of(p)])
+                        .round(4)
+                        .tolist(),
+                        "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
+                    }
+                    for p in self.world.placements
+                ],
+            },
         }
 
     def _devices(self):
@@ -234,9 +228,8 @@ def main(
         if rig_file is not None:
             stack.enter_context(written_rig_file(rig, Path(rig_file)))
         print(summary(rig, rig_file), flush=True)
-        while not quit_.wait(LOOK_S) and rig.error() is None:
+        while (error := rig.error()) is None and not quit_.wait(LOOK_S):
             pass
-        error = rig.error()
     if error is not None:
         print(f"a device ended: {error!r}", flush=True)
         return 1
@@ -248,7 +241,7 @@ def main(
 def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
     """The rig file of a running rig, for as long as the rig lives.
 
-    It is removed at the end, unless somebody changed or replaced it. A file that was there before
+    It is removed at the end, unless somebody changed it. A file that was there before
     is never touched.
 
     Parameters
@@ -278,15 +271,11 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
             f"{file}: cannot be written ({error.strerror}): name another file, in a folder that "
             "exists and can be written, with --rig-file"
         ) from error
-    written = file.stat()
     try:
         yield
     finally:
         with contextlib.suppress(OSError):  # somebody removed it
-            if (
-                os.path.samestat(file.lstat(), written)
-                and file.read_bytes() == text.encode()
-            ):
+            if file.read_bytes() == text.encode():
                 file.unlink()
             else:
                 print(f"{file}: was changed, so it stays; its devices are gone", flush=True)

@@ -214,12 +214,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def parse_request(self):
         """Refuse what was sent to another name, as by a web page whose name leads here."""
-        if not super().parse_request():
-            return False
-        known = self.headers["Host"] == self.server.host
-        if not known:
+        parsed = super().parse_request()
+        if parsed and self.headers["Host"] != self.server.host:
             self.send_error(403, f"this is {self.server.url} only")
-        return known
+            return False
+        return parsed
 
     def do_GET(self):
         """Send the images of a camera."""
