@@ -139,18 +139,12 @@ class SessionRecorder(SessionWriter):
         """A recording ends by :meth:`finish`; after anything else it may go on."""
         self.close()
 
-    def shots_of(self, purpose: str) -> dict[str, int]:
-        """Numbers of images by camera.
-
-        Parameters
-        ----------
-        purpose
-            Of the images.
-        """
+    def close_views(self) -> dict[str, int]:
+        """Numbers of images of the board held close by camera."""
         counts = dict.fromkeys(self.cameras, 0)
         file = self.path / "images.csv"
         for row in read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(counts)):
-            if row["camera"] in counts and row["purpose"] == purpose:
+            if row["camera"] in counts and row["purpose"] == "intrinsics":
                 counts[row["camera"]] += 1
         return counts
 
