@@ -41,8 +41,12 @@ def _one_thread():
             }
         for library in map(ctypes.CDLL, files):
             # NumPy's, SciPy's, OpenCV's
-            for name in ("scipy_openblas{}64_", "scipy_openblas{}", "openblas{}"):
-                getattr(library, name.format("_set_num_threads"), int)(1)
+            for name in (
+                "scipy_openblas_set_num_threads64_",
+                "scipy_openblas_set_num_threads",
+                "openblas_set_num_threads",
+            ):
+                getattr(library, name, int)(1)
 
 
 _one_thread()

@@ -226,12 +226,15 @@ def parser():
         prog="python -m lrfcal_lib", description=__doc__.replace("``", "")
     )
     verbs = top.add_subparsers(title="verbs", metavar="VERB", dest="verb", required=True)
-    _add_import(verbs)
-    _add_sessions(verbs)
-    _add_measure(verbs)
-    _add_rigs(verbs)
-    _add_report(verbs)
-    _add_study(verbs)
+    for add in (
+        _add_import,
+        _add_sessions,
+        _add_measure,
+        _add_rigs,
+        _add_report,
+        _add_study,
+    ):
+        add(verbs)
     return top
 
 

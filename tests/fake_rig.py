@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from lrfcal_lib.drivers.lms2xx_scans import Reading
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply
+from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import rig_of
 from lrfcal_lib.drivers.video import Frame
@@ -43,7 +43,7 @@ def picture(pitch, camera="left"):
     return rng.integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
 
 
-class Head:
+class Head(Closed):
     """Moves at 20 deg/s; answers unless it is told not to."""
 
     def __init__(self, clock, feedback=True, silent_moving=False):
@@ -107,7 +107,7 @@ class Head:
     close = stop
 
 
-class Lrf:
+class Lrf(Closed):
     """Scans the wall at the head's pitch."""
 
     type = "LMS221"
@@ -117,13 +117,7 @@ class Lrf:
     configuration = Configuration().changed(unit="mm")
 
     def __init__(self, head, clock):
-        self.head, self.clock, self.streaming, self.silent, self.stale = (
-            head,
-            clock,
-            False,
-            False,
-            0.0,
-        )
+        self.head, self.clock, self.streaming, self.silent = head, clock, False, False
         self.readings, self.wait, self.lost, self.reconnects = [], lambda: None, 0, 0
 
     def start(self, interlaced=False):
@@ -146,14 +140,14 @@ class Lrf:
         )
         return self.readings[-1]
 
-    def request(self):
+    def request(self, after=-math.inf):
         if self.streaming:
             raise DeviceError("the device streams; call stop() first")
         if self.lost:
             raise LineLost("the line is lost")
         self.streaming = True
         try:
-            return self.take(1)[0]
+            return self.take(1, after)[0]
         finally:
             self.streaming = False
 
@@ -169,13 +163,13 @@ class Lrf:
             if self.silent:
                 self.clock.now += timeout
                 raise NoReply("no new scan: the stream is silent")
-            instant = max(after or -math.inf, self.clock()) + LAZY_S - self.stale
+            instant = max(after or -math.inf, self.clock()) + LAZY_S
             out.append(self._scan(instant))
             self.clock.now = max(self.clock.now, instant) + SCAN_S
         return out
 
 
-class Camera:
+class Camera(Closed):
     """Sees noise that depends on the pitch."""
 
     def __init__(self, name, head, clock):

@@ -274,11 +274,11 @@ class FaultyHead(FaultyLine, EmulatedHead):
     def moved(self, frame, at):
         moves = frame.command2 & (pelco_d.UP | pelco_d.DOWN) and not frame.command2 & 1
         head = self.head
-        until = self.absolute_until
+        absolute = self.absolute
         stalls = (moves or frame.command2 == pelco_d.SET_TILT) and self.hit("stall")
         self.head = copy(head) if stalls else head  # another one moves
         super().obey(frame, at)
-        self.head, self.absolute_until = head, until if stalls else self.absolute_until
+        self.head, self.absolute = head, absolute if stalls else self.absolute
 
     def stop(self, at):
         super().stop(at + SLIP_S * self.hit("slip"))

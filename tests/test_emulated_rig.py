@@ -41,12 +41,12 @@ def rig(placements):
 
 
 def test_cameras_open_as_any_stream_and_show_the_place(rig):
-    rig.world.put(1)
+    rig.world.put("place/1")
     video = cv2.VideoCapture(rig.camera_urls["left"])
     assert video.isOpened()
     ok, first = video.read()
     assert ok and first.shape == (48, 64, 3)
-    rig.world.put(None)
+    rig.world.put("place/none")
     until(lambda: np.abs(video.read()[1].astype(int) - first).mean() > 3)
     video.release()
 

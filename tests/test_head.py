@@ -237,6 +237,16 @@ def test_what_cannot_be_is_said_and_the_head_stands(
         assert head.move_to(10 * DEGREE) == near(10)
 
 
+def test_a_reading_has_the_instant_of_its_own_query(opened):
+    """Not that of the wait for the line before it."""
+    device, head = opened(replace(FAST, gap_s=0.2))
+    device.head.move(device.host.now(), 1.0, 0.5)
+    device.host.sleep(0.1)
+    for _ in range(3):
+        pitch, instant = head.line.pitch(patient=False)
+        assert pitch == pytest.approx(float(device.head.pitch(instant)), abs=0.01)
+
+
 # ------------------------------------------------------------------------------------------------------- sweeps
 
 SWEEPS = {"full": {}, "echo and general": {"echo": True, "confirms": True}, "silent while moving": PARTIAL,

@@ -265,6 +265,15 @@ def test_scans_that_come_late_are_asked_for_until_the_time_is_over(monkeypatch):
             lms.request()
 
 
+def test_a_scan_later_than_an_instant_is_asked_for_until_the_time_is_over():
+    device = emulated()
+    with opened(device) as lms:
+        soon = device.host.time() + 1
+        assert lms.request(after=soon).time_s > soon
+        with pytest.raises(NoReply, match="scans arrive, but .*not new"):
+            lms.request(after=soon + 1000)
+
+
 @pytest.mark.parametrize(("call", "limit_s"), [
     (lambda lms: lms.request(), 4.5), (lambda lms: lms.request(timeout=0.1), 0.2),
     (lambda lms: lms.set_variant(100, 1), 5.2), (lambda lms: lms.configure(unit="cm"), 2.6),

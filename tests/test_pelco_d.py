@@ -55,8 +55,8 @@ PAN_45 = bytes.fromhex("FF 01 00 59 11 94 FF")
 @pytest.mark.parametrize(("raw", "frame"), FRAMES.items())
 def test_printed_frames(raw, frame):
     raw = bytes.fromhex(raw)
-    assert split_frames(raw) == ((frame,), 7) and encode_frame(*vars(frame).values()) == raw
-    assert split_frames(raw[:-1] + bytes([raw[-1] ^ 1]))[0] == ()
+    assert split_frames(raw) == ([frame], 7) and encode_frame(*vars(frame).values()) == raw
+    assert split_frames(raw[:-1] + bytes([raw[-1] ^ 1]))[0] == []
     if frame.command2 & 1:
         assert encode_extended(frame.address, frame.command2, frame.value) == raw
 
@@ -92,9 +92,9 @@ def test_commands_between_garbage():
     ]
     data = b"\xff\xff\x00".join([b"\x12", *frames]) + STOP[:5]
     found, pending = split_frames(data)
-    assert list(found) == [split_frames(raw)[0][0] for raw in frames]
+    assert found == [split_frames(raw)[0][0] for raw in frames]
     assert data[pending:] == STOP[:5]
-    assert split_frames(b"\x01\x02") == ((), 2)
+    assert split_frames(b"\x01\x02") == ([], 2)
 
 
 ACKNOWLEDGED = bytes.fromhex("FF 01 00 29")  # of the motion

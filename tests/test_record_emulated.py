@@ -22,6 +22,7 @@ from lrfcal_lib.acquire.record import record_session
 from lrfcal_lib.calibrate.calibration_file import load_calibration
 from lrfcal_lib.calibrate.pipeline import calibrate_jointly, prepare
 from lrfcal_lib.drivers import rig as rig_module
+from lrfcal_lib.drivers.port import Closed
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.emulators.rig import EmulatedRig
@@ -57,7 +58,7 @@ def setup():
     return small_setup()
 
 
-class Still:
+class Still(Closed):
     """A camera in virtual time, which stands still while an image is drawn."""
 
     size = None
@@ -67,7 +68,7 @@ class Still:
 
     def newest(self, after=None, timeout=None):
         self.rig.host.sleep(0.5)
-        _, data = self.rig.camera_server.image(self.name, timeout=DEADLINE)
+        data = self.rig.camera_server.image(self.name, timeout=DEADLINE)
         self.count += 1
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         return Frame(image, self.rig.host.time(), self.count)

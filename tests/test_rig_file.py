@@ -92,4 +92,4 @@ def test_sweeps_meet_their_ends_and_do_not_exceed_their_step(step, stops):
     )
     assert np.ptp(np.diff(odd.pitch)) < 1e-12
     np.testing.assert_array_equal(even.pitch, odd.pitch[::-1])
-    assert (odd.direction, even.direction) == (1, -1)
+    assert (odd.descends, even.descends) == (False, True)

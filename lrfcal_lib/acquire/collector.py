@@ -90,7 +90,7 @@ def advise(session: Session) -> str:
         solution = calibrate_jointly(prepared).solution
     except DegenerateGeometry as error:
         return f"not determined yet: {error}"
-    rig = replace(joint_rig(solution, prepared.models), lrf=prepared.session.lrf)
+    rig = replace(joint_rig(solution, prepared.models), lrf=session.lrf)
     judged = verdict(solution, rig)
     if judged.answer == YES:
         return ""
@@ -115,17 +115,15 @@ class Collector(Closed):
     ----------
     view : View
     lights : dict of int to list of Light
-        By placement.
+        By placement, of the rig that was connected last.
     recording : Recording or None
     """
 
     def __init__(self):
         self.recording: Recording | None = None
         self.view = View()
-        self.lights: dict[int, list[Light]] = {}
         self.stopped = threading.Event()
         self._devices = threading.Lock()
-        self._closing = contextlib.ExitStack()
 
     @property
     def connected(self) -> bool:
@@ -178,8 +176,8 @@ class Collector(Closed):
                 Recording(opened, Path(session), resume=True)
             )
             self._closing = stack.pop_all()
-            self.view = View()
-            self.lights = {}
+            self.view = View(sweep=self.recording.plan[0].pitch)
+            self.lights: dict[int, list[Light]] = {}
             self._advice = ""
         return opened
 
@@ -207,6 +205,7 @@ class Collector(Closed):
         """The devices for oneself."""
         if not self._devices.acquire(timeout=WAIT_S):
             raise Busy("the rig is busy: wait until it is done, or press stop")
+        self.stopped.clear()
         try:
             yield
         finally:
@@ -242,7 +241,6 @@ class Collector(Closed):
         """
         head = self.rig.head
         with self._exclusively():
-            self.stopped.clear()
             self.view.pitch = head.move_to(pitch)
             self.view.measured = head.has_feedback
         return self.view.pitch
@@ -281,7 +279,7 @@ class Collector(Closed):
         if self._devices.acquire(blocking=False):
             try:
                 view.pitch, view.measured = rig.head.pitch()
-                view.reading = rig.scan(RECONNECT_S, LineLost)
+                view.reading = rig.scan(reconnect_s=RECONNECT_S, errors=LineLost)
             except DeviceError as error:
                 troubles.append(str(error))
             finally:
@@ -299,14 +297,13 @@ class Collector(Closed):
             title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"
             return Task(title, GUIDE_CLOSE, close=(camera, view))
 
-        planned = recording.plan
-        if not plan.placements:  # nothing is listed: one more can always be had
-            planned = plan.to_do(max([plan.count, *self.finished]) + 1)
-        left = [one for one in planned if one.number not in self.finished]
+        left = recording.to_do()
+        if not (left or plan.placements):  # nothing is listed: one more can always be had
+            left = plan.to_do(max([plan.count, *self.finished]) + 1)[-1:]
         if not left:
             return None
         placement = left[0]
-        done = len(planned) - len(left)
+        done = len(self.finished)
         guidance = self._advice or f"put the board {GUIDE[done % len(GUIDE)]}"
         if placement.purpose == "scene":
             guidance = "take the board away: this sweep shows the room"
@@ -340,14 +337,21 @@ class Collector(Closed):
                 "the plan of this rig is done: calibrate, or connect with another session"
             )
         with self._exclusively():
-            self.stopped.clear()
             placement = task.placement
             if placement is None:
                 camera, view = task.close
                 recording.rig.hold_close(camera, view)
                 return [recording.run_close(camera)]
             number = placement.number
-            self.view = replace(self.view, rows={}, scans=0, images=0, stop="", share=0.0)
+            self.view = replace(
+                self.view,
+                rows={},
+                scans=0,
+                images=0,
+                stop="",
+                share=0.0,
+                sweep=placement.pitch,
+            )
             recording.rig.move_board(number)
             self._record(placement, progress)
         progress(1.0, "checking what was recorded")
@@ -420,16 +424,20 @@ class Collector(Closed):
         calibration = calibrate(open_session(path), CANDIDATES)
         judged = judge(calibration)
         sentences = judged.sentences()
-        if not judged.errors:
-            sentences.append("Nothing is written.")
-            return Result(judged.answer, sentences, "", {}, None, calibration)
-        method = handed_over(calibration)
+        method = ""
         poses = {}
-        for camera, solution in calibration.cameras(method).items():
-            told = POSE_UNITS * [solution.parameters[:6], solution.trusted_sigma[:6]]
-            poses[camera] = tuple(f"{value:.2f} ± {sigma:.2f}" for value, sigma in told.T)
-        file = path.with_name(f"{path.name}_calibration") / "calibration.json"
-        write_calibration(file, calibration_record(calibration, method, judged))
+        file = None
+        if judged.errors:
+            method = handed_over(calibration)
+            for camera, solution in calibration.cameras(method).items():
+                told = POSE_UNITS * [solution.parameters[:6], solution.trusted_sigma[:6]]
+                poses[camera] = tuple(
+                    f"{value:.2f} ± {sigma:.2f}" for value, sigma in told.T
+                )
+            file = path.with_name(f"{path.name}_calibration") / "calibration.json"
+            write_calibration(file, calibration_record(calibration, method, judged))
+        else:
+            sentences.append("Nothing is written.")
         return Result(judged.answer, sentences, method, poses, file, calibration)
 
 

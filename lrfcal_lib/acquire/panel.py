@@ -105,6 +105,11 @@ def card(*children):
     return named("card", w.VBox(children))
 
 
+def titled(heading, *children):
+    """A framed part with a heading."""
+    return card(w.HTML(HTML.title(heading)), *children)
+
+
 def row(*children):
     """Widgets side by side, wrapped where the window is narrow."""
     return named("row", w.HBox(children))
@@ -116,7 +121,7 @@ class Picture:
     def __init__(self, name, heading, kind="png"):
         self.image = named(f"picture-{name}", w.Image(format=kind))
         self.remark = w.HTML()
-        self.box = card(w.HTML(HTML.title(heading)), self.image, self.remark)
+        self.box = titled(heading, self.image, self.remark)
 
     def show(self, data, remark):
         """Show the bytes of an image; what did not change is not sent again."""
@@ -156,11 +161,11 @@ class Parts(SimpleNamespace):
             self.trouble,
             self.views,
             row(
-                card(w.HTML(HTML.title("Head")), self.pitch, self.slider, row(self.go)),
+                titled("Head", self.pitch, self.slider, row(self.go)),
                 card(self.task, self.progress, self.doing),
                 named("checks", card(self.lights)),
             ),
-            card(w.HTML(HTML.title("Result")), row(self.calibrate), self.result),
+            titled("Result", row(self.calibrate), self.result),
             self.notes,
         ]
         self.root = named("panel", w.VBox(shown))
@@ -342,7 +347,6 @@ class Panel(Closed):
             with parts.slider.hold_trait_notifications():
                 parts.slider.min, parts.slider.max = collector.limits_deg
             parts.show_pictures(rig.cameras)
-            self._begin_sweep(collector.task())
             self._quit.clear()
             self._live = threading.Thread(
                 target=self._keep_looking, name="panel view", daemon=True
@@ -369,7 +373,6 @@ class Panel(Closed):
         """Record the next placement; returns its lights."""
         task = self.collector.task()
         with self._doing("recording"):
-            self._begin_sweep(task)
             lights = self.collector.capture(self._show_progress)
             self.parts.show_lights(f"Quality of {task.title.lower()}", lights)
             self._check_calibration()
@@ -446,12 +449,6 @@ class Panel(Closed):
         self.parts.progress.value = share
         self.parts.doing.value = HTML.soft(text)
 
-    def _begin_sweep(self, task):
-        """An empty picture of the sweep to come."""
-        self._sweep = None  # ends of the pitch, radians
-        if task and task.placement:
-            self._sweep = task.placement.pitch[[0, -1]]
-
     def _keep_looking(self):
         while not self._quit.wait(LOOK_S):
             try:
@@ -469,10 +466,9 @@ class Panel(Closed):
         if view.reading is not None:
             known = np.isfinite(view.reading.ranges).sum()
             pictures["scan"].show(scan_picture(view.reading), f"{known} beams came back")
-        if self._sweep is not None:
-            rows = dict(view.rows)  # a copy: the recording goes on
-            words = f"{len(rows)} scan lines; near is bright, white is no range"
-            pictures["sweep"].show(sweep_picture(rows, self._sweep), words)
+        rows = dict(view.rows)  # a copy: the recording goes on
+        words = f"{len(rows)} scan lines; near is bright, white is no range"
+        pictures["sweep"].show(sweep_picture(rows, view.sweep), words)
         for name, frame in dict(view.frames).items():
             image, words = self._overlaid(name, frame.image, view)
             pictures[name].show(jpeg(image), words)

@@ -31,7 +31,7 @@ def scan_picture(reading: Reading) -> bytes:
     return png(figure)
 
 
-def sweep_picture(rows: dict[float, Reading], pitch: tuple[float, float]) -> bytes:
+def sweep_picture(rows: dict[float, Reading], pitch: np.ndarray) -> bytes:
     """A sweep as it grows: ranges as colours, near is bright; a PNG file.
 
     Parameters
@@ -39,7 +39,7 @@ def sweep_picture(rows: dict[float, Reading], pitch: tuple[float, float]) -> byt
     rows
         By pitch, radians.
     pitch
-        Its ends, radians.
+        Of all of it, radians.
     """
     figure = Figure(**PLAIN)
     ax = figure.add_axes((0.17, 0.17, 0.81, 0.79))
@@ -49,7 +49,7 @@ def sweep_picture(rows: dict[float, Reading], pitch: tuple[float, float]) -> byt
         ranges = np.array([reading.ranges for reading in readings])
         sweep = Sweep(0, ranges, readings[0].bearings, known, np.nan * known)
         range_image(ax, sweep, limits=(None, None)).set_cmap(NEAR_IS_BRIGHT)
-    ax.set(ylim=np.degrees(np.sort(pitch)), aspect="auto")
+    ax.set(ylim=np.degrees([pitch.min(), pitch.max()]), aspect="auto")
     return png(figure)
 
 

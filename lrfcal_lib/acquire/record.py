@@ -9,6 +9,7 @@ import sys
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field
 
+import numpy as np
 from tqdm import tqdm
 
 from lrfcal_lib.acquire.checks import Light, check_image, check_placement
@@ -86,8 +87,7 @@ class Recording(SessionRecorder):
     ):
         stated = rig.stated
         self.plan = stated.plan.to_do(count)
-        source = stated.about["source"] or f"recorded with {stated.path.name}"
-        with self._safely(), contextlib.ExitStack() as stack:
+        with self._safely():
             super().__init__(
                 path,
                 stated.board,
@@ -104,15 +104,17 @@ class Recording(SessionRecorder):
                 },
                 continuous=stated.plan.mode == "continuous",
                 resume=resume,
-                **stated.about | {"source": source},
+                **stated.about,
             )
-            stack.callback(self.close)
             self.rig = rig
-            # a scan does not tell its measuring mode, this does
-            self.add_telegrams(
-                -1, [encode_configuration(rig.lrf.configuration)], time_s=rig.clock()
-            )
-            stack.pop_all()
+            try:
+                # a scan does not tell its measuring mode, this does
+                self.add_telegrams(
+                    -1, [encode_configuration(rig.lrf.configuration)], time_s=rig.clock()
+                )
+            except BaseException:
+                self.close()
+                raise
 
     def to_do(self) -> list[Placement]:
         """The placements of the plan that are not finished, in order."""
@@ -124,7 +126,7 @@ class Recording(SessionRecorder):
         """Images of the board held close still to be taken: camera, number of the view from 0."""
         return [
             (camera, view)
-            for camera, taken in self.shots_of("intrinsics").items()
+            for camera, taken in self.close_views().items()
             for view in range(taken, self.rig.stated.plan.intrinsics_images)
         ]
 
@@ -148,11 +150,10 @@ class Recording(SessionRecorder):
         """
         with self._safely():
             self.begin_placement(placement.number)
-        with contextlib.closing(self.rig.acquire(placement)) as events:
-            for event in events:
-                self.write(event)
-                yield event
-        with self._safely():
+            with contextlib.closing(self.rig.acquire(placement)) as events:
+                for event in events:
+                    self.write(event, placement.number, placement.purpose)
+                    yield event
             self.finish_placement()
 
     def run_close(self, camera: str) -> Light:
@@ -177,7 +178,8 @@ class Recording(SessionRecorder):
             f"camera {camera}",
         )
         if light.state != "bad":
-            self.write(photo)
+            with self._safely():
+                self.write(photo)
         return light
 
     def drop(self, number: int) -> None:
@@ -230,45 +232,44 @@ class Recording(SessionRecorder):
             return bool(self.finished) or not self.path.exists()
         return not set(self.finished) <= set(recorded.tolist())
 
-    def write(self, event: Event) -> None:
+    def write(self, event: Event, number: int = -1, purpose: str = "intrinsics") -> None:
         """Put an event on the disk; the parts of an interlaced scan share its pitch.
 
         Parameters
         ----------
         event
             Of the rig.
+        number, purpose
+            Of its placement; by default the board is held close.
 
         Raises
         ------
-        RecordingError
+        OSError
             If the disk is full or gone.
         """
-        with self._safely():
-            match event:
-                case Moved():
-                    measured = event.pitch if event.measured else math.nan
-                    self.add_platform([(event.time_s, event.commanded, measured)])
-                case Scanned():
-                    scans = zip(event.readings, event.pitch, strict=True)
-                    rows = [
-                        (raw, p, one.time_s) for one, p in scans for raw in one.telegrams
-                    ]
-                    self.add_telegrams(event.placement, *zip(*rows, strict=True))
-                case Photographed():
-                    self.add_image(
-                        event.camera,
-                        event.frame.image,
-                        event.placement,
-                        pitch=event.pitch,
-                        time_s=event.frame.time_s,
-                        purpose=event.purpose,
-                    )
-                case Tracked():
-                    self.add_platform(
-                        (t, event.commanded, pitch)
-                        for t, pitch, measured in event.track
-                        if measured
-                    )
+        match event:
+            case Moved():
+                measured = event.pitch if event.measured else math.nan
+                self.add_platform([(event.time_s, event.commanded, measured)])
+            case Scanned():
+                scans = zip(event.readings, event.pitch, strict=True)
+                rows = [(raw, p, one.time_s) for one, p in scans for raw in one.telegrams]
+                self.add_telegrams(number, *zip(*rows, strict=True))
+            case Photographed():
+                self.add_image(
+                    event.camera,
+                    event.frame.image,
+                    number,
+                    pitch=event.pitch,
+                    time_s=event.frame.time_s,
+                    purpose=purpose,
+                )
+            case Tracked():
+                self.add_platform(
+                    (t, event.commanded, pitch)
+                    for t, pitch, measured in event.track
+                    if measured
+                )
 
     @contextlib.contextmanager
     def _safely(self):
@@ -313,6 +314,7 @@ class View:
     measured: bool = False  # the head tells its pitch
     stop: str = ""
     share: float = 0.0  # of the sweep
+    sweep: np.ndarray = None  # pitch of the placement recorded last, or next, radians
     reading: Reading | None = None  # the newest
     frames: dict[str, Frame] = field(default_factory=dict)  # the newest by camera
     # by pitch, of the placement recorded last

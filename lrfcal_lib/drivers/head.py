@@ -21,7 +21,7 @@ from lrfcal_lib.drivers.rig_file import ROUNDING_DEG
 LOG = logging.getLogger(__name__)
 
 
-class PanTilt(port.Closed):
+class PanTilt(Motion, port.Closed):
     """A head on a serial line, stopped on every way out, Ctrl-C and SIGTERM included.
 
     Parameters
@@ -48,34 +48,30 @@ class PanTilt(port.Closed):
     """
 
     def __init__(self, path: str | os.PathLike, settings, *, host: Host = REAL):
-        self.settings = settings
+        super().__init__(HeadLine(path, settings, host), settings)
         self._lock = threading.Lock()
-        self._line: HeadLine | None = HeadLine(path, settings, host)
-        self._host = host
         self._thread: threading.Thread | None = None
-        self._error: DeviceError | None = None
-        self.motion = Motion(self._line, settings)
+        self._closed = False
         try:
             self._probe()
         except BaseException:
-            self._line.close()
+            self.line.close()
             raise
         port.guard(self)
 
     def _probe(self):
         """Stop the head, ask whether it tells its tilt, and see who answers."""
         settings = self.settings
-        line = self.motion.line
+        line = self.line
         line.stop()
-        reading = None
-        if settings.feedback is not False:
-            reading = self.motion.read(patient=True)
-        self.has_feedback = self.motion.feedback = reading is not None
+        self.has_feedback = (
+            settings.feedback is not False and self.read(patient=True) is not None
+        )
         if self.has_feedback:
             return
-        if line.skipped > FRAME * line.frames:
+        if line.received.skipped > FRAME:
             raise WrongDevice(
-                f"{line.path} sends {line.skipped} bytes that are no Pelco-D at "
+                f"{line.path} sends {line.received.skipped} bytes that are no Pelco-D at "
                 f"{settings.baudrate} Bd: another device, another rate, or Pelco-P"
             )
         if settings.feedback is True:
@@ -90,9 +86,9 @@ class PanTilt(port.Closed):
 
     def _silence(self):
         settings = self.settings
-        line = self.motion.line
+        line = self.line
         echo = ""
-        if line.echoed:
+        if line.received.echoed:
             echo = "what was sent came back, so the adapter works: "
         return NoReply(
             f"the head at {line.path} does not tell its tilt: {echo}check its power, the wires A "
@@ -103,25 +99,24 @@ class PanTilt(port.Closed):
 
     def close(self) -> None:
         """Stop the head and close the port; a second call does nothing."""
-        line = self._line
-        if line is None:
+        if self._closed:
             return
         try:
             with port.stopping("head"):
                 self.stop()
         finally:
             port.release(self)
-            self._line = None
-            line.close()
+            self._closed = True
+            self.line.close()
 
     def emergency_stop(self) -> None:
         """Stop at once, from a signal or at exit; errors are logged."""
-        self.motion.abort.set()
-        if self._line is not None:
-            self._line.blurt_stop()
+        self.abort.set()
+        if not self._closed:
+            self.line.blurt_stop()
 
     def _need_open(self):
-        if self._line is None:
+        if self._closed:
             raise DeviceError("the head is closed: open it again")
 
     # ---------------------------------------------------------------------------------------------
@@ -150,12 +145,12 @@ class PanTilt(port.Closed):
         self._need_open()
         if self.has_feedback:
             moving = self.moving()
-            reading = self.motion.read(patient=not moving)
+            reading = self.read(patient=not moving)
             if reading is not None:
                 return reading.pitch, True
             if not moving:
                 raise self._silence()
-        return self.motion.estimate(), False
+        return self.estimate(), False
 
     def set_pitch(self, pitch: float) -> None:
         """Say where a head without feedback stands.
@@ -165,7 +160,7 @@ class PanTilt(port.Closed):
         pitch
             Radians, up positive.
         """
-        self.motion.know(pitch, self._host.now())
+        self.know(pitch, self._now())
 
     def moving(self) -> bool:
         """Whether a move or sweep of this object is under way."""
@@ -183,8 +178,8 @@ class PanTilt(port.Closed):
             If the port stays away.
         """
         self._need_open()
-        self.motion.abort.set()
-        self.motion.stop()
+        self.abort.set()
+        self.halt()
         if self._thread is not None:
             self._thread.join()
 
@@ -200,7 +195,7 @@ class PanTilt(port.Closed):
             )
         if not self._lock.acquire(blocking=False):
             raise DeviceError("the head is moving already: stop it, or wait for it")
-        self.motion.abort.clear()
+        self.abort.clear()
 
     def move_to(self, pitch: float) -> float:
         """Move and wait until the head rests.
@@ -232,9 +227,9 @@ class PanTilt(port.Closed):
         """
         self._begin(pitch)
         try:
-            if self.has_feedback and self.motion.read(patient=True) is None:
+            if self.has_feedback and self.read(patient=True) is None:
                 raise self._silence()
-            return self.motion.move(pitch)
+            return self.move(pitch)
         except BaseException:
             self.emergency_stop()
             raise
@@ -261,11 +256,13 @@ class PanTilt(port.Closed):
         """
         step = self.settings.tilt_speed if speed is None else speed
         self._begin(stop_at)
+        self.rows = []
+        self._error: DeviceError | None = None
 
         def run():
             """The sweep, in its own thread."""
             try:
-                self.motion.sweep(stop_at, step)
+                self.sweep(stop_at, step)
             except Stopped:
                 pass
             except DeviceError as error:
@@ -273,9 +270,7 @@ class PanTilt(port.Closed):
             finally:
                 self._lock.release()
 
-        self.motion.rows = []
-        self._error = None
-        self._thread = self._host.thread(run, "sweep")
+        self._thread = self.line.host.thread(run, "sweep")
         self._thread.start()
 
     def finish_sweep(self) -> list[tuple[float, float, bool]]:
@@ -286,12 +281,3 @@ class PanTilt(port.Closed):
         if self._error is not None:
             raise self._error
         return self.track
-
-    @property
-    def track(self) -> list[tuple[float, float, bool]]:
-        """Host time (s), pitch (rad) and whether it was measured, of the sweep that runs or ran
-        last.
-
-        Between readings the pitch is dead reckoning, which is drawn to the readings.
-        """
-        return self.motion.track()

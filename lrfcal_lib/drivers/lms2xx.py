@@ -354,11 +354,13 @@ class LMS2xx(Closed):
                 f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}"
             )
 
-    def request(self, timeout: float = 4.0) -> Reading:
+    def request(self, after: float = -math.inf, timeout: float = 4.0) -> Reading:
         """One scan.
 
         Parameters
         ----------
+        after
+            Date of the host, s, later than which it is.
         timeout
             Seconds.
 
@@ -378,7 +380,7 @@ class LMS2xx(Closed):
             # nobody knows the instant of a scan that came late
             if arrival.time_s - link.asked_s <= usual_s:
                 reading = self._assembler.feed(*arrival)
-                if reading is not None:
+                if reading is not None and reading.time_s > after:
                     return reading
             if self._now() > end - usual_s:
                 raise NoReply(
@@ -494,7 +496,8 @@ class LMS2xx(Closed):
             left = end - self._now()
             if left <= 0:
                 raise NoReply(
-                    f"no new scan within {timeout:g} s: {self._trouble or 'the stream is silent'}"
+                    f"no new scan within {timeout:g} s: "
+                    f"{self._trouble or 'the stream is silent, check its line'}"
                 )
             self._news.wait(left)
 

@@ -70,7 +70,7 @@ class Motion:
 
     Attributes
     ----------
-    feedback : bool
+    has_feedback : bool
         The head tells its tilt, if maybe not while it moves.
     calibrated : bool
         Its speed was stated or measured, not assumed.
@@ -78,11 +78,12 @@ class Motion:
         Of the sweep that runs or ran last.
     """
 
+    has_feedback: bool
+
     def __init__(self, line: HeadLine, settings):
         self.line = line
         self.settings = settings
         self.abort = line.host.event()
-        self.feedback = False
         self.rows: list[TrackPoint] = []
         self.calibrated = settings.degrees_per_second is not None
         self._now = line.host.now
@@ -97,7 +98,7 @@ class Motion:
         # whether set-tilt moves the head; None until it was tried
         self._obeys = None if settings.absolute else False
         self._dead: set[int] = set()  # speed bytes at which the head does not move
-        # way (1 up, -1 down), speed byte and instant of the motion
+        # way (1 up, -1 down) and speed byte of the motion
         self._going: tuple | None = None
         self._repeated = math.inf  # when it was last sent, if the head goes
         self._pitch: float | None = None
@@ -132,8 +133,8 @@ class Motion:
             raise DeviceError(UNKNOWN)
         if self._going is None:
             return self._pitch
-        way, step, begun = self._going
-        seconds = max(0.0, (instant or self._now()) - max(self._known_at, begun))
+        way, step = self._going
+        seconds = max(0.0, (instant or self._now()) - self._known_at)
         return self._pitch + way * self.speed(way, step) * seconds
 
     def read(self, patient=False):
@@ -160,7 +161,7 @@ class Motion:
     def note(self, patient=False):
         """Append where the head is now to the rows."""
         point = None
-        if self.feedback and self._misses < MISSES:
+        if self.has_feedback and self._misses < MISSES:
             self._misses += 1
             point = self.read(patient)
         if point is None:
@@ -171,10 +172,12 @@ class Motion:
             self._misses = 0
         self.rows.append(point)
 
-    def track(self):
-        """Of the sweep: date of the host (s), pitch (rad), and whether it was measured.
+    @property
+    def track(self) -> list[tuple[float, float, bool]]:
+        """Host time (s), pitch (rad) and whether it was measured, of the sweep that runs or ran
+        last.
 
-        What lies between two readings is stretched to both.
+        Between readings the pitch is dead reckoning, which is stretched to the readings.
         """
         rows = list(self.rows)
         pitches = np.array([row.pitch for row in rows])
@@ -201,10 +204,10 @@ class Motion:
                 raise Stopped(STOPPED)
             return self.line.exchange(frame).sent
 
-    def stop(self):
+    def halt(self):
         """Stop; its instant."""
         ended = self.line.stop()
-        if self._going is not None and self._pitch is not None:
+        if self._pitch is not None:
             self.know(self.estimate(ended), ended)
         self._going = None
         self._repeated = math.inf
@@ -255,7 +258,6 @@ class Motion:
         LineLost
             If the port vanished; the head is stopped if it comes back.
         """
-        line = self.line
         settings = self.settings
         way = math.copysign(1, goal - self.estimate())
         bit = UP if (way > 0) != settings.invert else DOWN
@@ -265,24 +267,24 @@ class Motion:
             """Seconds; after a reading the stop has to be on its way in time."""
             rest_s = (goal - self.estimate()) * way / self.speed(way, step)
             if self._known_at > begun:
-                rest_s -= line.frame_s
+                rest_s -= self.line.frame_s
             return min(rest_s, begun + longest_s - self._now())
 
         try:
             self._frame = encode_frame(settings.address, command2=bit, data2=step)
-            begun = self._repeated = self._send(self._frame)
-            self._going = way, step, begun
+            begun = self._repeated = self._known_at = self._send(self._frame)
+            self._going = way, step
             try:
                 while left() > LEAST_S:
                     if look is not None:
                         look()
-                    elif self.feedback and left() > asking_s:
+                    elif self.has_feedback and left() > asking_s:
                         self.read()
                     self.pause(min(left(), settings.poll_s))
             finally:
-                ended = self.stop()
+                ended = self.halt()
         except LineLost:
-            if not self.feedback:
+            if not self.has_feedback:
                 self._pitch = None
             raise
         return ended - begun
@@ -312,7 +314,7 @@ class Motion:
                 resting = None
             elif resting is None or abs(reading.pitch - resting.pitch) > self._tolerance:
                 if resting is not None and target is None:
-                    self.stop()  # the one before was lost
+                    self.halt()  # the one before was lost
                 resting = reading
             else:
                 enough_s = self.settings.settle_s
@@ -358,27 +360,27 @@ class Motion:
         settings = self.settings
         way = target - self.estimate()
         seconds = abs(way) / self.speed(way, settings.tilt_speed)
-        if not self.feedback:
+        if not self.has_feedback:
             if seconds >= self._shortest_s / 2:
                 self.run(target, settings.tilt_speed)
                 self.pause(settings.settle_s)
             return self.estimate()
         deadline = self._now() + 2 * seconds + EXTRA_S
-        if self._obeys is False:
-            return self.steer(target, deadline)
-        value = pelco_d.encode_tilt(settings.elevation(target))
-        for _ in range(2):  # the first may be lost, or come while the head was still busy
-            self._send(encode_extended(settings.address, SET_TILT, value))
-            pitch = self.settle(deadline, target)
-            if abs(pitch - target) <= ARRIVAL:
-                self._obeys = True
-                return pitch
-        if self._obeys:
-            raise _short_of(pitch, target)
-        if settings.absolute is True:
-            raise Refused(f"{DISOBEYS}: state absolute false to use up and down")
-        self._obeys = False
-        LOG.warning("%s: it is moved by up and down", DISOBEYS)
+        if self._obeys is not False:
+            value = pelco_d.encode_tilt(settings.elevation(target))
+            # the first may be lost, or come while the head was still busy
+            for _ in range(2):
+                self._send(encode_extended(settings.address, SET_TILT, value))
+                pitch = self.settle(deadline, target)
+                if abs(pitch - target) <= ARRIVAL:
+                    self._obeys = True
+                    return pitch
+            if self._obeys:
+                raise _short_of(pitch, target)
+            if settings.absolute is True:
+                raise Refused(f"{DISOBEYS}: state absolute false to use up and down")
+            self._obeys = False
+            LOG.warning("%s: it is moved by up and down", DISOBEYS)
         return self.steer(target, deadline)
 
     def steer(self, target, deadline):
@@ -391,11 +393,12 @@ class Motion:
         for _ in range(BURSTS):
             error = target - pitch
             steps = {full, full // 4, full // 16} - self._dead
-            shortest = {step: self._shortest_s * self.speed(error, step) for step in steps}
+            # speed at which the shortest motion is all of the way
+            enough = abs(error) / self._shortest_s
             slowest = min(steps)
-            if abs(error) <= max(ARRIVAL, shortest[slowest]):
+            if abs(error) <= ARRIVAL or enough <= self.speed(error, slowest):
                 return pitch
-            short = [step for step in steps if abs(error) >= 2 * shortest[step]]
+            short = [step for step in steps if enough >= 2 * self.speed(error, step)]
             step = max(short, default=slowest)
             took = self.run(pitch + SHORT_OF * error, step, GROWTH * self._longest)
             before = pitch
@@ -435,7 +438,7 @@ class Motion:
                 )
             if (self.rows[-1].pitch - first) * way < -WRONG_WAY:
                 raise Refused(OTHER_WAY)
-            if self.feedback and self._misses >= MISSES and not self.calibrated:
+            if self.has_feedback and self._misses >= MISSES and not self.calibrated:
                 raise NoReply(
                     "the head is silent while it moves and its speed is unknown: state "
                     "degrees_per_second"
@@ -451,7 +454,7 @@ class Motion:
             self._misses = 0
             if self._pitch is not None:
                 self.note(patient=True)
-        if self.feedback:
+        if self.has_feedback:
             self.settle(self._now() + 5)
         self.note(patient=True)
 

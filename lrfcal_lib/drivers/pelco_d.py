@@ -96,7 +96,7 @@ def encode_extended(address: int, opcode: int, value: int = 0) -> bytes:
     return encode_frame(address, 0, opcode, *value.to_bytes(2, "big"))
 
 
-def split_frames(data: bytes) -> tuple[tuple[Frame, ...], int]:
+def split_frames(data: bytes) -> tuple[list[Frame], int]:
     """The frames in a stream of commands, of overlapping ones the first.
 
     Parameters
@@ -106,7 +106,7 @@ def split_frames(data: bytes) -> tuple[tuple[Frame, ...], int]:
 
     Returns
     -------
-    frames : tuple of Frame
+    frames : list of Frame
     pending : int
         From where on bytes must be kept: a frame may begin there whose end has not come yet.
     """
@@ -115,13 +115,13 @@ def split_frames(data: bytes) -> tuple[tuple[Frame, ...], int]:
     while (at := data.find(SYNC, at)) >= 0:
         raw = data[at : at + FRAME]
         if len(raw) < FRAME:
-            return tuple(frames), at
+            return frames, at
         if encode_frame(*raw[1:6]) == raw:
             frames.append(Frame(*raw[1:6]))
             at += FRAME
         else:
             at += 1
-    return tuple(frames), len(data)
+    return frames, len(data)
 
 
 def encode_tilt(elevation: float) -> int:
@@ -232,17 +232,14 @@ class HeadLine:
     ----------
     frame_s : float
         Seconds that a frame takes on the line.
-    frames, echoed, skipped : int
-        Frames sent, and bytes that came back as an echo or belong to nothing.
+    received : Received
+        After the frame that was sent last.
     """
 
     def __init__(self, path: str | os.PathLike, settings, host: Host):
         self.path = path
         self.settings = settings
         self.host = host
-        self.frames = 0
-        self.echoed = 0
-        self.skipped = 0
         self.lock = host.lock()
         self.frame_s = FRAME * 10 / settings.baudrate
         self._stop = encode_frame(settings.address)
@@ -261,16 +258,17 @@ class HeadLine:
         asked again. The head looks at its encoder about half-way between the beginning of the query
         and the end of the reply.
         """
-        query = encode_extended(self.settings.address, QUERY_TILT)
         for _ in range(1 + self.settings.retries * patient + self._late):
             with self.lock:
                 suspect = self._late
-                begun = self.host.now()
-                tilts = self.exchange(query, self.settings.reply_s).tilts
-                self._late = not tilts
-            if tilts and not suspect:
-                halfway = (begun + self.host.now()) / 2
-                return self.settings.pitch(decode_tilt(tilts[-1])), halfway
+                received = self.exchange(
+                    encode_extended(self.settings.address, QUERY_TILT),
+                    self.settings.reply_s,
+                )
+                self._late = not received.tilts
+            if received.tilts and not suspect:
+                halfway = (received.sent + self.host.now()) / 2
+                return self.settings.pitch(decode_tilt(received.tilts[-1])), halfway
         return None
 
     def stop(self):
@@ -294,12 +292,17 @@ class HeadLine:
         try:
             # on the way out nothing else can be done
             with stopping("head", Exception), line_lost(self.path):
-                for _ in range(2):
-                    self.opened().write(self._stop)
-                    self.host.sleep(self.frame_s + self.settings.gap_s)
+                self.opened()
+                self._send_stop()
         finally:
             if held:
                 self.lock.release()
+
+    def _send_stop(self):
+        """Send the stop twice, without waiting for what comes back."""
+        for _ in range(2):
+            self._port.write(self._stop)
+            self.host.sleep(self.frame_s + self.settings.gap_s)
 
     def exchange(self, frame, wait_s=None):
         """Send a frame, and collect what is Received until a reply.
@@ -327,10 +330,8 @@ class HeadLine:
             self.close()
             raise
         self._free = max(self.host.now(), sent + self.frame_s) + gap_s
-        self.frames += 1
-        self.echoed += received.echoed
-        self.skipped += received.skipped
         received.sent = sent
+        self.received = received
         return received
 
     # --------------------------------------------------------------------------------------- port
@@ -352,8 +353,7 @@ class HeadLine:
                 self.host.sleep(AGAIN_S)
             else:
                 LOG.warning("the line %s to the head is back", self.path)
-                self._port.write(self._stop * 2)
-                self.host.sleep(2 * self.frame_s + self.settings.gap_s)
+                self._send_stop()
         return self._port
 
     def close(self):

@@ -40,14 +40,12 @@ FEWEST_SCANS = 8
 LEAST_SWEEP = math.radians(10)
 STILL = 1.9  # mean ratio of von Neumann; 2 of scans that differ by noise alone
 LEAST_SPREAD = 1e-12  # square metres; what is always the same is taken for noise
-CLOSE = -1  # placement of images of the board held close
 
 
 @dataclass(frozen=True)
 class Moved:
     """The head rests at a stop; what is recorded at it is later than its host time."""
 
-    placement: int
     time_s: float
     commanded: float  # pitch, radians
     pitch: float  # as it is, radians
@@ -60,7 +58,6 @@ class Moved:
 class Scanned:
     """Readings, each with its pitch."""
 
-    placement: int
     readings: tuple[Reading, ...]
     pitch: np.ndarray  # radians
     share: float  # of the sweep that is done
@@ -68,20 +65,17 @@ class Scanned:
 
 @dataclass(frozen=True, eq=False)
 class Photographed:
-    """An image of a placement, -1 for the board held close."""
+    """An image of the board, also one held close, or of a scene."""
 
-    placement: int
     camera: str
     frame: Frame
     pitch: float  # radians
-    purpose: str  # 'board', 'scene' or 'intrinsics'
 
 
 @dataclass(frozen=True)
 class Tracked:
     """The pitch over a continuous sweep."""
 
-    placement: int
     commanded: float  # where it ends, radians
     track: tuple  # of host time (s), pitch (radians) and whether it was measured
 
@@ -124,7 +118,6 @@ class Rig(Closed):
         self.cameras = cameras
         self.clock = host.time
         self._closing = contextlib.ExitStack()
-        self._now = host.now
 
     @classmethod
     def open(cls, stated: RigFile, *, host: Host = REAL) -> "Rig":
@@ -161,7 +154,7 @@ class Rig(Closed):
                     raise
                 except ValueError as error:
                     raise RigFileError(f"{stated.path}: {name}: {error}") from error
-                return stack.enter_context(contextlib.closing(device))
+                return stack.enter_context(device)
 
             rig = cls(
                 stated,
@@ -294,7 +287,7 @@ class Rig(Closed):
             move.
         """
         stops = placement.pitch.tolist()
-        sweep = self._at_stops(placement, stops, placement.image_pitch)
+        sweep = self._at_stops(stops, placement.image_pitch, placement.descends)
         if self.stated.plan.mode == "continuous":
             sweep = self._continuous(placement)
         scans = []  # of a head that tells nothing
@@ -308,7 +301,7 @@ class Rig(Closed):
             if placement.closing:
                 # as level as it was in the first half: walls show most
                 level = min(stops[: len(stops) // 2 + 1], key=abs)
-                yield from self._at_stops(placement, [level])
+                yield from self._at_stops([level])
             self.lrf.stop()
             wide = np.ptp(placement.pitch) >= LEAST_SWEEP
             if wide and len(scans) >= FEWEST_SCANS and unchanged(scans):
@@ -335,11 +328,8 @@ class Rig(Closed):
         DeviceError
             As :meth:`acquire`.
         """
-        close = Placement(
-            number=CLOSE, pitch=np.zeros(1), image_pitch=(0.0,), purpose="intrinsics"
-        )
         try:
-            _, photo = self._at_stops(close, images=close.image_pitch, cameras=[camera])
+            _, photo = self._at_stops(images=[0.0], cameras=[camera])
         except BaseException:
             self.halt()
             raise
@@ -347,6 +337,7 @@ class Rig(Closed):
 
     def scan(
         self,
+        after: float = -math.inf,
         reconnect_s: float = 10.0,
         errors: type[Exception] | tuple = (LineLost, NoReply),
     ) -> Reading:
@@ -354,6 +345,8 @@ class Rig(Closed):
 
         Parameters
         ----------
+        after
+            Date of the host, s, later than which it is.
         reconnect_s
             Seconds that it may take to find it again.
         errors
@@ -365,11 +358,11 @@ class Rig(Closed):
             As :meth:`acquire`.
         """
         try:
-            return self.lrf.request()
+            return self.lrf.request(after)
         except errors as error:
             LOG.warning("%s; looking for the laser range finder", error)
             self.lrf.reconnect(reconnect_s)
-        return self.lrf.request()
+        return self.lrf.request(after)
 
     def halt(self) -> None:
         """Stop the head and the scans; what cannot be stopped is logged, with what to do."""
@@ -377,57 +370,45 @@ class Rig(Closed):
             with stopping(name):
                 device.stop()
 
-    def _at_stops(self, placement, scans=(), images=(), cameras=None):
+    def _at_stops(self, scans=(), images=(), descends=False, cameras=None):
         """Scan and take images (of all cameras by default) at pitches, each at rest."""
         alone = [
             image
             for image in images
             if not np.isclose(scans, image, rtol=0, atol=SAME_STOP).any()
         ]
-        stops = sorted([*scans, *alone], reverse=placement.direction < 0)
+        stops = sorted([*scans, *alone], reverse=descends)
         for number, pitch in enumerate(stops, 1):
-            moved = self._move(placement.number, pitch, number, len(stops))
+            moved = self._move(pitch, number, len(stops))
             yield moved
             if pitch not in alone:
                 readings = tuple(self._scans(moved.time_s))
                 pitches = np.full(len(readings), moved.pitch)
-                yield Scanned(placement.number, readings, pitches, number / len(stops))
+                yield Scanned(readings, pitches, number / len(stops))
             if np.isclose(images, pitch, rtol=0, atol=SAME_STOP).any():
                 for name in cameras or self.cameras:
                     frame = self.cameras[name].newest(after=moved.time_s, timeout=IMAGE_S)
-                    yield Photographed(
-                        placement.number, name, frame, moved.pitch, placement.purpose
-                    )
+                    yield Photographed(name, frame, moved.pitch)
 
     def _scans(self, after):
         """Scans of a stream, or one by one, later than an instant."""
         count = self.stated.plan.scans_per_stop
-        wait_s = SCAN_S * count
         if self.stated.devices.lrf.interlaced:
-            return self.lrf.take(count, after=after, timeout=wait_s)
+            return self.lrf.take(count, after=after, timeout=SCAN_S * count)
         readings = []
-        end = self._now() + wait_s
-        while len(readings) < count:
-            reading = self.scan()
-            if reading.time_s > after:
-                readings.append(reading)
-                after = reading.time_s
-            elif self._now() > end:
-                raise NoReply(
-                    f"the laser range finder gives no scan later than the stop in {wait_s:g} s"
-                )
+        for _ in range(count):
+            readings.append(self.scan(after))
+            after = readings[-1].time_s
         return readings
 
-    def _move(self, placement, pitch, number=1, of=1):
+    def _move(self, pitch, number=1, of=1):
         reached = self.head.move_to(pitch)
-        return Moved(
-            placement, self.clock(), pitch, reached, self.head.has_feedback, number, of
-        )
+        return Moved(self.clock(), pitch, reached, self.head.has_feedback, number, of)
 
     def _continuous(self, placement):
         first, last = placement.pitch[[0, -1]].tolist()
-        yield from self._at_stops(placement, images=placement.image_pitch)
-        yield self._move(placement.number, first)
+        yield from self._at_stops(images=placement.image_pitch, descends=placement.descends)
+        yield self._move(first)
         self.lrf.start()
         held = self.lrf.take(1, timeout=SCAN_S)  # readings whose pitch is not known yet
         newest = held[-1].time_s
@@ -437,26 +418,21 @@ class Rig(Closed):
             moving = self.head.moving()
             if not moving:
                 self.head.finish_sweep()
-            end = self._now() + BATCH_S
-            with contextlib.suppress(NoReply):
-                while self._now() < end:
-                    held += self.lrf.take(1, after=newest, timeout=BATCH_S)
-                    newest = held[-1].time_s
-            if self.clock() - newest > GAP_S:
-                raise NoReply(
-                    f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range "
-                    "finder"
-                )
+            end = self.clock() + BATCH_S
+            while self.clock() < end:
+                held += self.lrf.take(1, after=newest, timeout=GAP_S)
+                newest = held[-1].time_s
             track = self.head.track
             if moving and self.head.has_feedback:
                 # what is not measured may change until the next reading
                 track = [point for point in track if point[2]]
-            readings, pitch, held = placed(held, track)
-            if readings:
-                share = np.clip((pitch[-1] - first) / (last - first), 0, 1)
-                yield Scanned(placement.number, readings, pitch, share)
+            if track:
+                readings, pitch, held = placed(held, track)
+                if readings:
+                    share = np.clip((pitch[-1] - first) / (last - first), 0, 1)
+                    yield Scanned(readings, pitch, share)
         self.lrf.stop()
-        yield Tracked(placement.number, last, tuple(track))
+        yield Tracked(last, tuple(track))
 
 
 def placed(
@@ -469,7 +445,7 @@ def placed(
     readings
         Of the sweep, in order.
     track
-        Host time (s), pitch (rad) and whether it was measured.
+        Host time (s), pitch (rad) and whether it was measured; not empty.
 
     Returns
     -------
@@ -480,8 +456,6 @@ def placed(
     later : list of Reading
         Those after the track.
     """
-    if not track:
-        return (), np.empty(0), readings
     times, pitch = np.array([point[:2] for point in track]).T
     middle = np.array([np.mean(reading.beam_times_s[[0, -1]]) for reading in readings])
     begin, end = np.searchsorted(middle, times[[0, -1]], side="right")

@@ -281,9 +281,9 @@ class Placement:
     closing: bool = False
 
     @property
-    def direction(self) -> int:
-        """+1 for a sweep upwards, -1 downwards."""
-        return 1 if self.pitch[-1] >= self.pitch[0] else -1
+    def descends(self) -> bool:
+        """Whether it is swept downwards."""
+        return bool(self.pitch[-1] < self.pitch[0])
 
 
 class Plan(Stated):
@@ -417,14 +417,21 @@ def rig_of(data: dict, path: Path = Path("rig.json")) -> RigFile:
     """
     try:
         stated = parse_session(
-            {**ABOUT, "name": "rig", **said(data), "placements": ()}, RigFileStated
+            {
+                **ABOUT,
+                "name": "rig",
+                "source": f"recorded with {path.name}",
+                **said(data),
+                "placements": (),
+            },
+            RigFileStated,
         )
         _check_cameras(stated["devices"].cameras, stated["cameras"])
     except ValueError as error:
         raise RigFileError(f"{path}: {error}") from error
     about = {key: stated[key] for key in ("licence", "source", "simulated")}
     rest = ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras", "devices", "plan")
-    return RigFile(path=Path(path), about=about, **{key: stated[key] for key in rest})
+    return RigFile(path=path, about=about, **{key: stated[key] for key in rest})
 
 
 def _check_cameras(devices, cameras):

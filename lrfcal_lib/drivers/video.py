@@ -97,15 +97,21 @@ class Camera(Closed):
         if self._path.isdigit():
             self._path = f"/dev/video{self._path}"
         self._silence_s = silence_s
-        self._remedy = remedy_of(self._path)
+        self._remedy = remedy_of(self._path)  # of a live source
         self._frame: Frame | None = None
         self._count = 0
         self._new = threading.Condition()
         self._quit = threading.Event()
-        self._wanted = self._properties(size, exposure)
+        self._wanted = {}  # what a device is to be set to, by the keys of OpenCV
+        if self._path.startswith("/dev/"):
+            self._wanted[cv2.CAP_PROP_BUFFERSIZE] = 1
+            if size is not None:
+                self._wanted[WIDTH], self._wanted[HEIGHT] = size
+            if exposure is not None:
+                self._wanted[cv2.CAP_PROP_AUTO_EXPOSURE] = MANUAL
+                self._wanted[cv2.CAP_PROP_EXPOSURE] = round(exposure / EXPOSURE_UNIT_S)
         self._open()
         self._read_back(exposure)
-        self._thread = None
         if self._remedy:
             self._thread = threading.Thread(
                 target=self._grab, name=f"camera {name}", daemon=True
@@ -137,11 +143,11 @@ class Camera(Closed):
             return frame is not None and frame.time_s > (after or -math.inf)
 
         with self._new:
-            if self._thread is not None:
+            if self._remedy:
                 self._new.wait_for(lambda: self._quit.is_set() or fresh(), timeout)
             if self._quit.is_set():
                 raise DeviceError(f"camera {self.name} is closed: open it again")
-            if self._thread is None:
+            if not self._remedy:
                 return self._next()
             if fresh():
                 return self._frame
@@ -156,25 +162,13 @@ class Camera(Closed):
         self._quit.set()
         with self._new:
             self._new.notify_all()
-        if self._thread is not None:
+        if self._remedy:
             self._thread.join(CLOSE_S)
         else:
-            self._release()
+            self._capture.release()
 
     # ---------------------------------------------------------------------------------------------
     # settings
-
-    def _properties(self, size, exposure):
-        """What a device is to be set to, by the keys of OpenCV."""
-        if not self._path.startswith("/dev/"):
-            return {}
-        wanted = {cv2.CAP_PROP_BUFFERSIZE: 1}
-        if size is not None:
-            wanted[WIDTH], wanted[HEIGHT] = size
-        if exposure is not None:
-            wanted[cv2.CAP_PROP_AUTO_EXPOSURE] = MANUAL
-            wanted[cv2.CAP_PROP_EXPOSURE] = round(exposure / EXPOSURE_UNIT_S)
-        return wanted
 
     def _open(self):
         self._capture = open_source(self._path, self._silence_s)
@@ -202,11 +196,6 @@ class Camera(Closed):
     # ---------------------------------------------------------------------------------------------
     # grabbing
 
-    def _release(self):
-        if self._capture is not None:
-            self._capture.release()
-        self._capture = None
-
     def _next(self):
         """The next image of a recorded source."""
         self.lost = not self._capture.grab() or not self._keep(REAL.time())
@@ -220,7 +209,7 @@ class Camera(Closed):
     def _grab(self):
         """Keep the newest frame; this thread alone touches the source."""
         while not self._quit.is_set():
-            if self._capture is None or not self._capture.grab():
+            if not self._capture.grab():
                 self._lose()
                 continue
             now = REAL.time()
@@ -228,7 +217,7 @@ class Camera(Closed):
             # else it may have come at any time since the frame before
             self._keep(now if waited else self._before)
             self._before = now
-        self._release()
+        self._capture.release()
 
     def _keep(self, instant):
         """Decode what was grabbed; whether that was an image."""
@@ -251,7 +240,7 @@ class Camera(Closed):
                 LOG.warning("camera %s is lost: %s", self.name, self._remedy)
             self.lost = True
             self._frame = None
-        self._release()
+        self._capture.release()
         if not self._quit.wait(AGAIN_S):
             with contextlib.suppress(PortError):
                 self._open()

@@ -215,7 +215,7 @@ class EmulatedHead(SerialDevice):
         super().__init__(path, host, seed)
         self.head = head or Head(seed=seed)
         self.habits = Habits(**habits)
-        self.absolute_until = -math.inf  # an absolute move is under way
+        self.absolute = False  # its last move
 
     @property
     def baudrate(self) -> int:
@@ -266,23 +266,17 @@ class EmulatedHead(SerialDevice):
         if goal is None:
             self.stop(at)
             return
-        self.absolute_until = -math.inf
+        self.absolute = False
         speed = np.interp(frame.data2, (0, FASTEST), self.habits.speeds)
         self.head.move(at, goal, math.radians(speed))
 
     def _set_tilt(self, value, at):
         """Move to an elevation; a second such move is lost while the first is under way."""
-        if (
-            self.habits.feedback != "full"
-            or value >= pelco_d.TURN
-            or at < self.absolute_until
-        ):
+        busy = self.absolute and self.head.moving(at)
+        if busy or self.habits.feedback != "full" or value >= pelco_d.TURN:
             return
-        head = self.head
-        speed = math.radians(self.habits.go_speed)
-        goal = np.clip(pelco_d.decode_tilt(value), *head.platform.limits)
-        self.absolute_until = at + abs(goal - head.motor(at)) / speed
-        head.go(at, goal, speed)
+        self.absolute = True
+        self.head.go(at, pelco_d.decode_tilt(value), math.radians(self.habits.go_speed))
 
     def stop(self, at: float) -> None:
         """Stop the motor.
@@ -292,7 +286,7 @@ class EmulatedHead(SerialDevice):
         at
             Instant of the command, s.
         """
-        self.absolute_until = -math.inf
+        self.absolute = False
         self.head.stop(at)
 
     def tell(self, opcode: int, at: float) -> None:
@@ -306,7 +300,7 @@ class EmulatedHead(SerialDevice):
             Instant of its last byte, s.
         """
         feedback = self.habits.feedback
-        busy = at < self.absolute_until or (feedback == "partial" and self.head.moving(at))
+        busy = self.head.moving(at) and (self.absolute or feedback == "partial")
         if feedback == "none" or busy:
             return
         value = 0

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib.drivers.lms2xx_link import FASTEST
-from lrfcal_lib.drivers.port import REAL, Host
+from lrfcal_lib.drivers.port import REAL, Closed, Host
 from lrfcal_lib.emulators.head import EmulatedHead
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld
@@ -28,10 +28,10 @@ QUICK_HEAD = {"baudrate": 38400, "go_speed": 60.0}  # habits
 QUICK_SETTINGS = {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}  # of its driver
 
 
-class EmulatedRig:
+class EmulatedRig(Closed):
     """The devices of a simulated setup, as files and addresses that any program can open.
 
-    A context manager.
+    A context manager that removes them, and their folder.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class EmulatedRig:
     Examples
     --------
     >>> with EmulatedRig(load_setup("sim_quick")) as rig:  # doctest: +SKIP
-    ...     rig.world.put(1)
+    ...     rig.world.put("place/1")
     """
 
     def __init__(
@@ -67,58 +67,34 @@ class EmulatedRig:
         self.setup = setup
         self.host = host
         self.quick = quick
-        self._closing = contextlib.ExitStack()
-        folder = tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
-        self.folder = Path(self._closing.enter_context(folder))
-        self.world = EmulatedWorld(setup, host, placements)
-        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", host=host)
         if quick:
             habits |= QUICK_HEAD
-        self.pan_tilt = EmulatedHead(
-            self.world.head, path=self.folder / "head", host=host, **habits
-        )
-        self.camera_server = CameraServer(self.world, rest_s=rest_s)
-        self.camera_urls = {
-            name: f"{self.camera_server.url}/{name}.mjpg"
-            for name in self.camera_server.cameras
-        }
-        self._parts = self.lrf, self.pan_tilt, self.camera_server
-        for part in self._parts:
-            self._closing.callback(part.close)
-
-    def start(self):
-        """Let all devices appear; the rig."""
-        for part in self._parts:
-            part.start()
-        return self
-
-    def close(self, *_) -> None:
-        """Remove all devices, and their folder."""
-        self._closing.close()
-
-    __enter__ = start
-    __exit__ = close
+        with contextlib.ExitStack() as stack:
+            folder = tempfile.TemporaryDirectory(
+                prefix="lrfcal-", ignore_cleanup_errors=True
+            )
+            self.folder = Path(stack.enter_context(folder))
+            self.world = EmulatedWorld(setup, host, placements)
+            self.camera_server = stack.enter_context(
+                contextlib.closing(CameraServer(self.world, rest_s=rest_s))
+            )
+            self.camera_urls = {
+                name: f"{self.camera_server.url}/{name}.mjpg"
+                for name in self.camera_server.cameras
+            }
+            self.lrf = stack.enter_context(
+                EmulatedLms(self.world, path=self.folder / "lrf", host=host)
+            )
+            self.pan_tilt = stack.enter_context(
+                EmulatedHead(
+                    self.world.head, path=self.folder / "head", host=host, **habits
+                )
+            )
+            self.close = stack.pop_all().close
 
     def error(self) -> Exception | None:
         """What ended a device by itself, None while all live."""
         return self.lrf.error or self.pan_tilt.error
-
-    def plan(self) -> dict:
-        """What a recording of this rig can do: its placements, each with its sweep."""
-        return {
-            "intrinsics_images": self.setup.intrinsics_views,
-            "placements": [
-                {
-                    "number": p.number,
-                    "board": p.purpose == "board",
-                    "pitch_deg": np.degrees([*p.sweep, self.setup.step_of(p)])
-                    .round(4)
-                    .tolist(),
-                    "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
-                }
-                for p in self.world.placements.values()
-            ],
-        }
 
     def rig_file(self) -> dict:
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices,
@@ -127,8 +103,6 @@ class EmulatedRig:
         setup = self.setup
         rig = setup.rig
         return {
-            "schema": stated.SCHEMA,
-            "name": f"{setup.name}_emulated",
             "licence": "CC-BY-4.0",
             "simulated": True,
             "source": f"emulated rig of the setup '{setup.name}', seed {setup.seed}",
@@ -139,7 +113,20 @@ class EmulatedRig:
                 rig.camera_infos(known=setup.intrinsics_views == 0),
             ),
             "devices": self._devices(),
-            "plan": self.plan(),
+            "plan": {
+                "intrinsics_images": self.setup.intrinsics_views,
+                "placements": [
+                    {
+                        "number": p.number,
+                        "board": p.purpose == "board",
+                        "pitch_deg": np.degrees([*p.sweep, self.setup.step_of(p)])
+                        .round(4)
+                        .tolist(),
+                        "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
+                    }
+                    for p in self.world.placements
+                ],
+            },
         }
 
     def _devices(self):
@@ -186,7 +173,7 @@ def practice_setup() -> tuple[Setup, list[Placement]]:
 
 
 def emulated(name: str, feedback: str = "full") -> EmulatedRig:
-    """An emulated rig, not started yet.
+    """An emulated rig.
 
     Parameters
     ----------
@@ -241,9 +228,8 @@ def main(
         if rig_file is not None:
             stack.enter_context(written_rig_file(rig, Path(rig_file)))
         print(summary(rig, rig_file), flush=True)
-        while not quit_.wait(LOOK_S) and rig.error() is None:
+        while (error := rig.error()) is None and not quit_.wait(LOOK_S):
             pass
-        error = rig.error()
     if error is not None:
         print(f"a device ended: {error!r}", flush=True)
         return 1
@@ -255,7 +241,7 @@ def main(
 def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
     """The rig file of a running rig, for as long as the rig lives.
 
-    It is removed at the end, unless somebody changed or replaced it. A file that was there before
+    It is removed at the end, unless somebody changed it. A file that was there before
     is never touched.
 
     Parameters
@@ -285,15 +271,11 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
             f"{file}: cannot be written ({error.strerror}): name another file, in a folder that "
             "exists and can be written, with --rig-file"
         ) from error
-    written = file.stat()
     try:
         yield
     finally:
         with contextlib.suppress(OSError):  # somebody removed it
-            if (
-                os.path.samestat(file.lstat(), written)
-                and file.read_bytes() == text.encode()
-            ):
+            if file.read_bytes() == text.encode():
                 file.unlink()
             else:
                 print(f"{file}: was changed, so it stays; its devices are gone", flush=True)
@@ -310,7 +292,7 @@ def summary(rig: EmulatedRig, file: str | os.PathLike | None) -> str:
         Its rig file.
     """
     head = rig.pan_tilt
-    places = ", ".join(map(str, rig.world.placements))
+    places = ", ".join(str(placement.number) for placement in rig.world.placements)
     lines = [
         f"emulated rig '{rig.setup.name}' ({rig.setup.rig.beam.name}); Ctrl-C ends it",
         f"  lrf      {rig.lrf.path}   {rig.lrf.baudrate} Bd, SICK LMS2xx",

@@ -10,6 +10,7 @@ import secrets
 import threading
 import time
 from collections.abc import Sequence
+from functools import cached_property, lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
@@ -43,12 +44,9 @@ class EmulatedWorld:
 
     Attributes
     ----------
-    current : tuple
-        Where the board is, ('placement', number or None) or ('close', camera, view), and the world
-        with it.
+    current : World
+        As it is now, without the board at first.
     """
-
-    current: tuple
 
     def __init__(
         self,
@@ -59,57 +57,41 @@ class EmulatedWorld:
         self.setup = setup
         self.host = host
         self.head = Head(setup.rig.platform)
-        self.placements = {p.number: p for p in placements or placements_of(setup)}
+        self.placements = placements or placements_of(setup)
         self._rng = np.random.default_rng([0, 3])
         # what was looked at last, and what was seen without noise
         self._seen: tuple = (None, None)
-        self.put(None)
+        self.current = world_of(setup, Placement(0))
 
-    def put(self, number: int | None) -> None:
-        """Put the board at a placement.
-
-        Parameters
-        ----------
-        number
-            Of the placement; None takes the board away.
-
-        Raises
-        ------
-        ValueError
-            For a placement that the setup does not have.
+    @cached_property
+    def places(self) -> dict[str, Placement]:
+        """Where the board can be: place/none, place/NUMBER of a placement, and close/CAMERA/VIEW,
+        held close to a camera, in one of the views for its intrinsics.
         """
-        places = {None: Placement(0)} | self.placements
-        if number not in places:
-            raise ValueError(
-                f"no placement {number}; there are {short(self.placements)}, and none"
-            )
-        # in one go, as a scan may be cast meanwhile
-        self.current = ("placement", number), world_of(self.setup, places[number])
+        places = {"place/none": Placement(0)}
+        for placement in self.placements:
+            places[f"place/{placement.number}"] = placement
+        for number, camera in enumerate(self.setup.rig.cameras):
+            for view, close in enumerate(close_views(self.setup, number)):
+                places[f"close/{camera.name}/{view}"] = close
+        return places
 
-    def hold_close(self, camera: str, view: int) -> None:
-        """Hold the board close to a camera, in one of the views for its intrinsics.
+    def put(self, place: str) -> None:
+        """Put the board at one of the places.
 
         Parameters
         ----------
-        camera
+        place
             Its name.
-        view
-            Number of the view, from 0.
 
         Raises
         ------
         ValueError
-            For a camera or view that there is not.
+            For a place that there is not.
         """
-        names = [camera.name for camera in self.setup.rig.cameras]
-        count = self.setup.intrinsics_views
-        if camera not in names or not 0 <= view < count:
-            raise ValueError(
-                f"no view {view} of camera '{camera}'; there are 0 to {count - 1} of "
-                f"{short(names)}"
-            )
-        close = close_views(self.setup, names.index(camera))[view]
-        self.current = ("close", camera, view), world_of(self.setup, close)
+        if place not in self.places:
+            raise ValueError(f"no {place}; there are {short(self.places)}")
+        self.current = world_of(self.setup, self.places[place])
 
     def scan(
         self, turn: int, quarters: np.ndarray, times: np.ndarray
@@ -132,11 +114,11 @@ class EmulatedWorld:
         reasons : ndarray, shape (B,)
             Index into `REASONS`, 0 for a range.
         """
-        place, world = self.current
+        world = self.current
         rig = self.setup.rig
         pitch = self.head.pitch(times)
         # a head at rest sees the same again and again
-        key = place, quarters.tobytes(), np.rint(pitch / STILL).tobytes()
+        key = world, quarters.tobytes(), np.rint(pitch / STILL).tobytes()
         if self._seen[0] != key:
             bearings = np.radians(quarters / 4)
             self._seen = (
@@ -149,8 +131,8 @@ class EmulatedWorld:
 class CameraServer(ThreadingHTTPServer):
     """The cameras of a world, and who puts its board elsewhere, over HTTP.
 
-    `url` has ``NAME.mjpg`` of all `cameras`; `control` obeys POST of ``place/NUMBER`` (or none) and
-    ``close/CAMERA/VIEW``. A web page cannot know the token in that address.
+    `url` has ``NAME.mjpg`` of all `cameras`; `control` obeys POST of any place of the world. A web
+    page cannot know the token in that address.
 
     Parameters
     ----------
@@ -167,31 +149,25 @@ class CameraServer(ThreadingHTTPServer):
         self.rest_s = rest_s
         self.quit = threading.Event()
         self.cameras = {camera.name: camera for camera in world.setup.rig.cameras}
-        # what is shown, and a JPEG file, by camera
-        self._images: dict = dict.fromkeys(self.cameras, (None, None))
+        self._draw = lru_cache(len(self.cameras))(self._drawn)
         self._count = itertools.count()
         self._lock = threading.Lock()
         self.host = f"127.0.0.1:{self.server_port}"
         self.url = f"http://{self.host}"
         self.token = secrets.token_urlsafe()
         self.control = f"{self.url}/{self.token}"
-        self._thread = threading.Thread(
-            target=self.serve_forever, args=(SERVE_S,), daemon=True
-        )
-        self.start = self._thread.start
+        thread = threading.Thread(target=self.serve_forever, args=(SERVE_S,), daemon=True)
+        thread.start()
 
     def close(self) -> None:
-        """End the server, started or not, and wait for the end of a drawing."""
+        """End the server, and wait for the end of a drawing."""
         self.quit.set()
-        if self._thread.is_alive():
-            self.shutdown()
+        self.shutdown()
         self.server_close()
         with self._lock:
-            self._images.clear()
+            pass
 
-    def image(
-        self, name: str, timeout: float = 1.0
-    ) -> tuple[tuple, bytes] | tuple[None, None]:
+    def image(self, name: str, timeout: float = 1.0) -> bytes | None:
         """The image of the rig as it stands now.
 
         Parameters
@@ -203,33 +179,29 @@ class CameraServer(ThreadingHTTPServer):
 
         Returns
         -------
-        key : tuple or None
-            What it shows: the camera, the place, the pitch. None where the head does not rest.
-        data : bytes or None
-            A JPEG file.
+        bytes or None
+            A JPEG file; None where the head does not rest.
         """
         end = time.monotonic() + timeout
         while not self.quit.is_set() and time.monotonic() < end:
             with self._lock:
-                place, scene = self.world.current
-                key = self._key(name, place)
-                if key is not None:
-                    if self._images[name][0] != key:
-                        self._images[name] = key, self._draw(name, scene, key[2])
-                    if self._key(name, self.world.current[0]) == key:
-                        return self._images[name]
+                shown = self._shown()
+                if shown is not None:
+                    data = self._draw(name, *shown)
+                    if self._shown() == shown:
+                        return data
             self.quit.wait(LOOK_S)
-        return None, None
+        return None
 
-    def _key(self, name, place):
-        """What the camera shows now; None while the head moves or hardly rests."""
+    def _shown(self):
+        """The world that cameras see now, and the pitch; None while the head hardly rests."""
         head = self.world.head
         now = self.world.host.now()
         if self.quit.is_set() or not head.settled(now, self.rest_s):
             return None
-        return name, place, round(float(head.pitch(now)), 7)
+        return self.world.current, round(float(head.pitch(now)), 7)
 
-    def _draw(self, name, scene, pitch):
+    def _drawn(self, name, scene, pitch):
         """JPEG of what a camera sees."""
         camera = self.cameras[name]
         rng = np.random.default_rng([0, next(self._count)])
@@ -242,12 +214,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def parse_request(self):
         """Refuse what was sent to another name, as by a web page whose name leads here."""
-        if not super().parse_request():
-            return False
-        known = self.headers["Host"] == self.server.host
-        if not known:
+        parsed = super().parse_request()
+        if parsed and self.headers["Host"] != self.server.host:
             self.send_error(403, f"this is {self.server.url} only")
-        return known
+            return False
+        return parsed
 
     def do_GET(self):
         """Send the images of a camera."""
@@ -263,7 +234,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Cache-Control", "no-cache")
             self.end_headers()
             while not server.quit.is_set():
-                _, data = server.image(name)
+                data = server.image(name)
                 if data is None:
                     # a blank line: the camera lives, its head moves
                     self.wfile.write(b"\r\n")
@@ -276,21 +247,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self):
         """Move the board."""
-        world = self.server.world
+        token, _, place = self.path.strip("/").partition("/")
+        if token != self.server.token:
+            return self.send_error(
+                403, "the address of devices.control in the rig file is needed"
+            )
         try:
-            match self.path.strip("/").split("/"):
-                case [token, *_] if token != self.server.token:
-                    return self.send_error(
-                        403, "the address of devices.control in the rig file is needed"
-                    )
-                case [_, "place", number]:
-                    world.put(None if number == "none" else int(number))
-                case [_, "close", camera, view]:
-                    world.hold_close(camera, int(view))
-                case _:
-                    return self.send_error(
-                        404, "there are place/NUMBER and close/CAMERA/VIEW"
-                    )
+            self.server.world.put(place)
         except ValueError as error:
             return self.send_error(400, str(error))
         self.send_response(204)

@@ -139,18 +139,12 @@ class SessionRecorder(SessionWriter):
         """A recording ends by :meth:`finish`; after anything else it may go on."""
         self.close()
 
-    def shots_of(self, purpose: str) -> dict[str, int]:
-        """Numbers of images by camera.
-
-        Parameters
-        ----------
-        purpose
-            Of the images.
-        """
+    def close_views(self) -> dict[str, int]:
+        """Numbers of images of the board held close by camera."""
         file = self.path / "images.csv"
         rows = read_table(file, read.IMAGE_COLUMNS, self.path, needed=bool(self.cameras))
-        shot = [row["camera"] for row in rows if row["purpose"] == purpose]
-        return {camera: shot.count(camera) for camera in self.cameras}
+        close = [row["camera"] for row in rows if row["purpose"] == "intrinsics"]
+        return {camera: close.count(camera) for camera in self.cameras}
 
     def _note_placement(self, placement):
         if placement not in (-1, *self.data["unfinished"]):
