@@ -137,11 +137,12 @@ def _single(method, shots, scenario, trial, T0, obs):
     """The same of one trial, or the words of the solver's refusal."""
     try:
         if method == "joint":
-            solution = solve_joint(obs, axis=False, sensor=scenario.sensor)
-            return solution.transforms["camera"], solution.solution.covariance[:6, :6], True
-        planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
-        options = {"method": method, "T0": T0} | PLANES[method]
-        found = solve_camera(planes, search=False, **options)
+            joint = solve_joint(obs, axis=False, sensor=scenario.sensor)
+            found = joint.camera("camera")
+        else:
+            planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
+            options = {"method": method, "T0": T0} | PLANES[method]
+            found = solve_camera(planes, search=False, **options)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:
         return str(error)
     return found.transform, found.covariance[:6, :6], found.converged
@@ -199,7 +200,7 @@ def crossing_observations(
     else:
         lines = np.tile(shots["lines"], (1, 1, scenario.scans, 1))
         points, covariance = _ends_of_lines(shots["ranges"], scenario, last_beam)
-    sessions, placements = points.shape[:2]
+    sessions, placements = lines.shape[:2]
     lines = lines.reshape(sessions, -1, 3)
     count = lines.shape[1]
     return CameraObservations(
@@ -213,23 +214,16 @@ def crossing_observations(
 
 
 def _ends_of_lines(ranges, setup, last_beam):
-    """Where the lines fitted to scan lines (t, p, s, B) end, (t, p, 2 s, 3), and their
-    covariances.
-    """
+    """Where the lines fitted to scan lines (t, p, s, B) end, (t p s, 2, 3), and their covariances."""
     bearings = setup.bearings()
-    sessions, placements, _, beams = ranges.shape
-    ranges = ranges.reshape(-1, beams)
+    ranges = ranges.reshape(-1, len(bearings))
     lines, of_line = fit_lines(ranges, bearings)
     ends = bearings[row_ends(np.isfinite(ranges))[1]]
     if not last_beam:
         ends = ends + np.array([-0.5, 0.5]) * setup.step
-    of_line *= setup.sigma_range**2
-    points, noise, by_bearing = crossings_of(
-        lines.repeat(2, axis=0), of_line.repeat(2, axis=0), ends.ravel()
-    )
-    points = points.reshape(sessions, placements, -1, 3)
+    points, noise, by_bearing = crossings_of(lines, setup.sigma_range**2 * of_line, ends.T)
     covariance = dyads(noise) + dyads(by_bearing * setup.step * UNIFORM)
-    return points, covariance.reshape(*points.shape, 3)
+    return points.swapaxes(0, 1), covariance.swapaxes(0, 1)
 
 
 def plane_observations(
@@ -299,31 +293,28 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
 
 def _readings(shots, scenario, trial):
     """Readings of the boards, and the beams about the ends of their scan lines."""
-    ranges = shots["ranges"][trial]
-    placements, scans, beams = ranges.shape
-    of_line = np.repeat(np.arange(placements), scans)
-    edges = np.repeat(shots["edges"][trial], scans, axis=0)
-    ranges = ranges.reshape(-1, beams)
     bearings = scenario.bearings()
+    ranges = shots["ranges"][trial].reshape(-1, len(bearings))
     hit = np.isfinite(ranges)
     line, beam = np.nonzero(hit)
     _, ends = row_ends(hit)
-    at_ends = np.maximum(np.take_along_axis(ranges, ends, axis=1), LEAST_RANGE)
     # beams about either end of every scan line
-    near = np.arange(-REACH, REACH)
-    window = np.clip(ends[..., None] + [[0], [1]] + near, 0, beams - 1)
-    at_end = np.repeat(at_ends, near.size)
+    ended, end, number = np.indices((*ends.shape, 2 * REACH)).reshape(3, -1)
+    last = ends[ended, end]
+    near = np.clip(last + end + number - REACH, 0, len(bearings) - 1)
+    distance = np.maximum(ranges[ended, last], LEAST_RANGE)
+    placement = ended // scenario.scans
     return {
         "face_range": ranges[hit],
         "face_bearing": bearings[beam],
         "face_sigma": np.full(len(beam), scenario.sigma_range),
-        "face_placement": of_line[line],
-        "beam_bearing": bearings[window.ravel()],
-        "beam_hit": np.take_along_axis(hit[:, None], window, axis=2).ravel(),
-        "beam_edge": np.repeat(edges, near.size),
-        "beam_radius": scenario.radius(at_end),
-        "beam_step": scenario.step * at_end,
-        "beam_placement": np.repeat(of_line, 2 * near.size),
+        "face_placement": line // scenario.scans,
+        "beam_bearing": bearings[near],
+        "beam_hit": hit[ended, near],
+        "beam_edge": shots["edges"][trial][placement, end],
+        "beam_radius": scenario.radius(distance),
+        "beam_step": scenario.step * distance,
+        "beam_placement": placement,
     }
 
 
