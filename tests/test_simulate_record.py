@@ -144,7 +144,8 @@ def test_impossible_settings(given, change, message):
 
 
 def lens(width, *distortion):
-    return Imager(CameraModel(width, 384, 200.0, 200.0, 255.0, 191.0, np.array(distortion)))
+    model = CameraModel(width, 384, 200.0, 200.0, 255.0, 191.0, np.array(distortion))
+    return Imager(model).rays
 
 
 def test_what_cannot_be_simulated(tmp_path, tiny, monkeypatch):

@@ -151,7 +151,7 @@ def rig_of(v):
         model = CameraModel(
             640, 480, focal, focal * rng.uniform(0.998, 1.002), *middle, lens
         )
-        cameras.append(RigCamera(name, model, mounting, None))
+        cameras.append(RigCamera(model, name=name, mounting=mounting, guess=None))
     spot, divergence = SPOTS[v.spot]
     beam = replace(
         LMS221, name=v.spot, spot_exit=spot, divergence=divergence, sigma_range=v.sigma_range, systematic=v.systematic,

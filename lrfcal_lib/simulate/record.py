@@ -41,6 +41,8 @@ from lrfcal_lib.simulate.scene import (
 )
 
 LICENCE = "CC-BY-4.0"
+# how well T_head_lrf is said to be known: direction (radians) and offset (metres)
+STATED_SIGMA = (np.radians(1.5), 0.020)
 RECORDING = (
     "stop-and-go: the head rests at every pitch step, one scan line and the images are taken at "
     "rest"
@@ -158,7 +160,7 @@ def photograph(setup, shots):
     rng = random(setup, *shots.key)
     poses = rig.camera_pose(camera, shots.stops.true)
     return [
-        encode_jpeg(camera.imager.render(world, pose, rng), setup.quality) for pose in poses
+        encode_jpeg(camera.render(world, pose, rng), setup.quality) for pose in poses
     ]
 
 
@@ -213,7 +215,7 @@ def _record(folder, name, setup):
         name=name,
         licence=LICENCE,
         simulated=True,
-        platform_sigma=rig.stated_sigma,
+        platform_sigma=STATED_SIGMA,
         reference=reference,
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}",
     ) as writer:

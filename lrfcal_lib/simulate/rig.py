@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -107,20 +106,13 @@ class Platform:
         return np.rint(motor / step) * step if step else motor
 
 
-@dataclass(frozen=True)
-class RigCamera:
+@dataclass(frozen=True, kw_only=True)
+class RigCamera(Imager):
     """A camera on the head of the rig."""
 
     name: str
-    model: CameraModel  # true intrinsics
     mounting: RigidTransform  # T_camera_lrf
     guess: RigidTransform  # the same as a tape measure gives it
-    exposure: Exposure = Exposure()
-
-    @cached_property
-    def imager(self) -> Imager:
-        """Takes its pictures."""
-        return Imager(self.model, self.exposure)
 
 
 @dataclass(frozen=True)
@@ -136,8 +128,6 @@ class Rig:
     board: Board  # with corners
     # width of the outermost squares of the board's pattern as a share of a square
     ring: float = 0.65
-    # how well the stated transform is said to be known: direction (radians) and offset (metres)
-    stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
     def camera_pose(self, camera: RigCamera, pitch: ArrayLike) -> RigidTransform:
         """``T_camera_platform`` of a camera.
@@ -251,7 +241,8 @@ def _camera(name, row, width, exposure):
     size = [round(v * scale) for v in row["size"]]
     pinhole = [v * scale for v in row["pinhole"]]
     model = CameraModel(*size, *pinhole, np.array(row["distortion"]))
-    return RigCamera(name, model, mounting, guess, Exposure(**exposure | row["exposure"]))
+    light = Exposure(**exposure | row["exposure"])
+    return RigCamera(model, light, name=name, mounting=mounting, guess=guess)
 
 
 def _placed(row):

@@ -68,7 +68,7 @@ def varied(scenario: Scenario, key: str, value: float) -> Scenario:
         raise ValueError(f"nothing called {key!r} can be varied: use one of {known}")
     if not value > 0 and key not in ("bias", "spread"):
         raise ValueError(f"{key}={value:g}: a positive number is needed")
-    changed = VARIED[key](scenario, value)
+    changed = in_radians(VARIED[key](scenario, value))
     return replace(scenario, varied=scenario.varied | {key: value}, **changed)
 
 
@@ -81,14 +81,14 @@ def _spot(scenario, value):
 VARIED = {
     "range_noise_mm": lambda scenario, value: {"sigma_range": value / 1000},
     "pixel_noise_px": lambda scenario, value: {"sigma_px": value},
-    "step_deg": lambda scenario, value: {"step": np.radians(value)},
+    "step_deg": lambda scenario, value: {"step_deg": value},
     "spot_mm": _spot,
     "bias": lambda scenario, value: {"bias": value},  # spot radii
     "spread": lambda scenario, value: {"spread": value},  # of the bias, spot radii
     "board_scale": lambda scenario, value: {"board": _scaled(scenario.board, value)},
-    "lean_deg": lambda scenario, value: {"lean": np.radians(value)},  # at most
+    "lean_deg": lambda scenario, value: {"lean_deg": value},  # at most
     # standard deviation; a degree comes with 17 mm
-    "start_deg": lambda scenario, value: {"start": (np.radians(value), np.radians(value))},
+    "start_deg": lambda scenario, value: {"start_deg": [value, value]},
 }
 
 
