@@ -274,7 +274,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
         view_covariance=shots["board_covariance"][trial],
         view_placement=np.arange(count),
         edges=scenario.board.edges,
-        corners=np.asarray(scenario.board.corners, float),
+        corners=scenario.board.known_corners(),
         cameras=("camera",),
         mounts=("head",),
         T_head_lrf=RigidTransform.identity(),
@@ -283,7 +283,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     boards = T_camera_lrf.inv() * pose_transform(shots["true_boards"][trial])
     return obs, joint_truth(
         obs,
-        RigidTransform.identity(),
+        obs.T_head_lrf,
         {"camera": T_camera_lrf},
         boards,
         bias=scenario.bias,

@@ -225,7 +225,7 @@ def load_setup(name: str) -> Setup:
         ),
         board=printed_triangle(),
     )
-    stations = tuple(_placed(station) for station in row["stations"])
+    stations = tuple(map(_placed, row["stations"]))
     # what else is in the row the Setup ignores
     return Setup(**row | {"name": name, "rig": rig, "stations": stations})
 

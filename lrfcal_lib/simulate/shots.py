@@ -213,10 +213,9 @@ def board_shots(setup, rng, T_camera_lrf):
     true = pose_array(T_camera_lrf * T_lrf_board)
     corners = apply_pose(true, board.points())
     uv = pinhole(corners, setup.model)
-    inside = (uv > 0) & (uv < setup.model.size)
     ahead = (corners[..., 2] > LEAST_DEPTH).all(axis=1)
     if setup.whole_image:
-        ahead &= inside.all(axis=(1, 2))
+        ahead &= ((uv > 0) & (uv < setup.model.size)).all(axis=(1, 2))
     conditions = {
         f"have fewer than {setup.fewest_beams} beams on the board": enough,
         "are crossed near a corner": clear,
@@ -246,11 +245,10 @@ def _crossed_edges(setup, pose, ends):
     """Edges (n, 2) that the scan plane crosses, at the low and the high bearing, of convex boards
     at poses (n, 3, 4) with corners there, and whether both crossings are clear of other edges.
     """
-    following = np.roll(ends, -1, axis=1)
-    height = ends[..., 2]
-    crossed = height * following[..., 2] < 0
-    share = height / np.where(crossed, height - following[..., 2], 1.0)
-    at = ends + share[..., None] * (following - ends)
+    along = np.roll(ends, -1, axis=1) - ends
+    share = -ends[..., 2] / along[..., 2]
+    crossed = (share > 0) & (share < 1)
+    at = ends + share[..., None] * along
     bearing = np.where(crossed, np.arctan2(at[..., 1], at[..., 0]), np.nan)
     edges = np.argsort(bearing, axis=1)[:, :2]  # NaN comes last
     at = np.take_along_axis(at, edges[..., None], axis=1)
