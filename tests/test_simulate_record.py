@@ -159,7 +159,7 @@ def test_what_cannot_be_simulated(tmp_path, tiny, monkeypatch):
             lambda: Platform().stop(np.radians([-10, 80]), 1, rng),
             "pitch -10.00 to 80.00 deg is asked for, it turns -60.00 to 60.00",
         ),
-        (lambda: pairs(tiny.rig, 0, (1.0, 2.0), rng, 0.03), "0 pairs"),
+        (lambda: pairs(tiny.rig, 0, (1.0, 2.0), rng, 0.03, 0.01), "0 pairs"),
         (lambda: held_close(huge, camera, 1, rng), "does not fit into the image of 'left'"),
         (lambda: World([]), "at least one thing"),
         (lambda: lens(512, -0.9, 0.0, 0.0, 0.0, 0.0), "folds the image"),

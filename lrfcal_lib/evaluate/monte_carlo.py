@@ -255,7 +255,9 @@ def consistency(trials: Trials) -> pd.DataFrame:
     if not (np.isfinite(trials.errors).all() and np.isfinite(trials.covariances).all()):
         bad = trials.seeds[~np.isfinite(trials.errors).all(axis=1)]
         raise ValueError(f"errors or covariances are not finite (seeds {bad.tolist()[:5]})")
-    groups = groups_of(trials.names) | {"all": (slice(None), "", 1 / sigma_of(trials.bounds))}
+    groups = groups_of(trials.names) | {
+        "all": (slice(None), "", 1 / sigma_of(trials.bounds))
+    }
     rows = [
         {"group": words, "unit": unit} | _judge(trials, index, factor)
         for words, (index, unit, factor) in groups.items()

@@ -101,11 +101,11 @@ def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     setup
     placement
     """
-    step = setup.step_of(placement)
     rng = random(setup, STOPS, placement.number)
-    way = placement.direction
     images = np.array(placement.image_pitch)
-    low, high = sorted(placement.sweep)
+    first, last, step = placement.sweep
+    way = 1 if first <= last else -1
+    low, high = sorted([first, last])
     lines = np.arange(np.floor(low / step), np.ceil(high / step) + 1)[::way] * step
     stop = setup.rig.platform.stop
     return [Stops(commanded, *stop(commanded, way, rng)) for commanded in (images, lines)]
@@ -159,9 +159,7 @@ def photograph(setup, shots):
     world = world_of(setup, shots.placement)
     rng = random(setup, *shots.key)
     poses = rig.camera_pose(camera, shots.stops.true)
-    return [
-        encode_jpeg(camera.render(world, pose, rng), setup.quality) for pose in poses
-    ]
+    return [encode_jpeg(camera.render(world, pose, rng), setup.quality) for pose in poses]
 
 
 def simulate(path: str | os.PathLike, setup: Setup) -> None:

@@ -11,9 +11,6 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.stated import TransformStated, board_from_json
 from lrfcal_lib.simulate.shots import Scenario
 
-FILE = json.loads(Path(__file__).with_name("scenarios.json").read_text())
-
-
 MADE = {
     "model": lambda stated: CameraModel(**stated),
     "board": board_from_json,
@@ -25,13 +22,11 @@ def load_scenario(name: str) -> Scenario:
     """A scenario of ``scenarios.json``; ValueError names those that there are."""
     if name not in FILE:
         raise ValueError(f"unknown scenario {name!r}: use one of {', '.join(FILE)}")
-    settings = in_radians(FILE[name])
-    made = {key: MADE[key](settings[key]) for key in MADE.keys() & settings.keys()}
-    return Scenario(name=name, **settings | made)
+    return Scenario(name=name, **FILE[name])
 
 
 def in_radians(row: dict) -> dict[str, Any]:
-    """A row of a file with what ends in _deg in radians, and no lists.
+    """A row of a file with what ends in _deg in radians, and no lists; what `MADE` knows is made.
 
     Parameters
     ----------
@@ -39,12 +34,23 @@ def in_radians(row: dict) -> dict[str, Any]:
     """
     turned = {}
     for key, value in row.items():
+        if key in MADE:
+            value = MADE[key](value)
         if key.endswith("_deg"):
             value = np.radians(value).tolist()
         if isinstance(value, list):
             value = tuple(value)
         turned[key.removesuffix("_deg")] = value
     return turned
+
+
+def read_json(name: str) -> dict:
+    """A file of this folder, its rows as of :func:`in_radians`."""
+    text = Path(__file__).with_name(name).read_text()
+    return json.loads(text, object_hook=in_radians)
+
+
+FILE = read_json("scenarios.json")
 
 
 def varied(scenario: Scenario, key: str, value: float) -> Scenario:
