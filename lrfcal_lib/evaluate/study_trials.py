@@ -214,7 +214,9 @@ def crossing_observations(
 
 
 def _ends_of_lines(ranges, setup, last_beam):
-    """Where the lines fitted to scan lines (t, p, s, B) end, (t p s, 2, 3), and their covariances."""
+    """Where the lines fitted to scan lines (t, p, s, B) end, (t p s, 2, 3), and their
+    covariances.
+    """
     bearings = setup.bearings()
     ranges = ranges.reshape(-1, len(bearings))
     lines, of_line = fit_lines(ranges, bearings)
