@@ -355,7 +355,7 @@ def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
 
 
 def _picture_about_lines(ax, view, image, margin, more=""):
-    """An image of the board behind the lines drawn so far, cut to them; which it is is the title."""
+    """An image of the board behind the lines drawn so far, cut to them; the title says which."""
     rim = ax.dataLim.get_points() + [[-margin], [margin]]  # not finite without a line
     picture(ax, image)
     ax.set_title(f"{view.camera}, placement {view.placement}{more}")

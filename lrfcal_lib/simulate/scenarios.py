@@ -11,10 +11,10 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.stated import TransformStated, board_from_json
 from lrfcal_lib.simulate.shots import Scenario
 
-MADE = {
-    "model": lambda stated: CameraModel(**stated),
-    "board": board_from_json,
-    "T_camera_lrf": lambda stated: TransformStated(**stated).made(),
+MADE = {  # of rows that have this key
+    "fx": lambda row: CameraModel(**row),
+    "corners_m": board_from_json,
+    "translation_m": lambda row: TransformStated(**row).made(),
 }
 
 
@@ -26,7 +26,7 @@ def load_scenario(name: str) -> Scenario:
 
 
 def in_radians(row: dict) -> dict[str, Any]:
-    """A row of a file with what ends in _deg in radians, and no lists; what `MADE` knows is made.
+    """A row of a file with what ends in _deg in radians, and no lists.
 
     Parameters
     ----------
@@ -34,8 +34,6 @@ def in_radians(row: dict) -> dict[str, Any]:
     """
     turned = {}
     for key, value in row.items():
-        if key in MADE:
-            value = MADE[key](value)
         if key.endswith("_deg"):
             value = np.radians(value).tolist()
         if isinstance(value, list):
@@ -45,9 +43,16 @@ def in_radians(row: dict) -> dict[str, Any]:
 
 
 def read_json(name: str) -> dict:
-    """A file of this folder, its rows as of :func:`in_radians`."""
+    """A file of this folder: what `MADE` knows is made, other rows are as of :func:`in_radians`."""
     text = Path(__file__).with_name(name).read_text()
-    return json.loads(text, object_hook=in_radians)
+    return json.loads(text, object_hook=_made)
+
+
+def _made(row):
+    for key, make in MADE.items():
+        if key in row:
+            return make(row)
+    return in_radians(row)
 
 
 FILE = read_json("scenarios.json")
