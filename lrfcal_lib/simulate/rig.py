@@ -209,17 +209,16 @@ def load_setup(name: str) -> Setup:
     rig = Rig(
         beam=replace(LMS221, **row["beam"]),
         platform=Platform(**row["platform"]),
-        T_head_lrf=_placed(row["head"]),
-        T_head_lrf_stated=_placed(row["head_stated"]),
+        T_head_lrf=row["head"],
+        T_head_lrf_stated=row["head_stated"],
         cameras=tuple(
             _camera(key, camera, row["image_width"], row["exposure"])
             for key, camera in row["cameras"].items()
         ),
         board=printed_triangle(),
     )
-    stations = tuple(map(_placed, row["stations"]))
     # what else is in the row the Setup ignores
-    return Setup(**row | {"name": name, "rig": rig, "stations": stations})
+    return Setup(**row | {"name": name, "rig": rig})
 
 
 def _camera(name, row, width, exposure):
@@ -227,20 +226,14 @@ def _camera(name, row, width, exposure):
     scale = width / row["size"][0]
     turn = Rotation.from_rotvec(row["turn"], degrees=True) * AHEAD
     mounting = carry(turn, row["centre"])
-    off = Rotation.from_rotvec(row["guess"]["turn"], degrees=True)
-    shift = mounting.translation + row["guess"]["shift"]
+    off = Rotation.from_rotvec(row["guess_turn"], degrees=True)
+    shift = mounting.translation + row["guess_shift"]
     guess = RigidTransform.from_components(shift, off * mounting.rotation)
     size = [round(v * scale) for v in row["size"]]
     pinhole = [v * scale for v in row["pinhole"]]
     model = CameraModel(*size, *pinhole, np.array(row["distortion"]))
     light = Exposure(**exposure | row["exposure"])
     return RigCamera(model, light, name=name, mounting=mounting, guess=guess)
-
-
-def _placed(row):
-    """The transform of a shift and a turn."""
-    turn = Rotation.from_rotvec(row["turn"], degrees=True)
-    return RigidTransform.from_components(row["shift"], turn)
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.stated import TransformStated, board_from_json
 from lrfcal_lib.simulate.shots import Scenario
 
+
+def _placed(row):
+    """The transform of a shift and a turn."""
+    turn = Rotation.from_rotvec(row["turn"], degrees=True)
+    return RigidTransform.from_components(row["shift"], turn)
+
+
 MADE = {  # of rows that have this key
+    "shift": _placed,
     "fx": lambda row: CameraModel(**row),
     "corners_m": board_from_json,
     "translation_m": lambda row: TransformStated(**row).made(),
