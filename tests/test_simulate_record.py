@@ -103,6 +103,15 @@ def test_the_data_card_has_the_sums_of_all_files(name):
     )
 
 
+def test_a_room_may_be_swept_without_an_image(tmp_path, tiny):
+    record.simulate(
+        tmp_path / "s", replace(tiny, pairs=0, room_sweep=(0.0, np.radians(1.0), 0.01))
+    )
+    session = open_session(tmp_path / "s")
+    assert list(session.placements) == [1] and not session.images()
+    assert len(session.sweep(1).pitch) == 3
+
+
 def test_an_existing_folder_is_left_alone(tmp_path, tiny, capsys):
     (tmp_path / "s").mkdir()
     with pytest.raises(ValueError, match="exists already"):

@@ -252,9 +252,10 @@ def consistency(trials: Trials) -> pd.DataFrame:
         raise ValueError(
             f"{count} trials say nothing about consistency: at least {FEWEST_TRIALS} are needed"
         )
-    if not (np.isfinite(trials.errors).all() and np.isfinite(trials.covariances).all()):
-        bad = trials.seeds[~np.isfinite(trials.errors).all(axis=1)]
-        raise ValueError(f"errors or covariances are not finite (seeds {bad.tolist()[:5]})")
+    bad = ~np.isfinite(trials.errors.sum(axis=1) + trials.covariances.sum(axis=(1, 2)))
+    if bad.any():
+        seeds = trials.seeds[bad].tolist()[:5]
+        raise ValueError(f"errors or covariances are not finite (seeds {seeds})")
     groups = groups_of(trials.names) | {
         "all": (slice(None), "", 1 / sigma_of(trials.bounds))
     }

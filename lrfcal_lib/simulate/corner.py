@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import UNIT_SQUARE, Board
-from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array, unit_lines
+from lrfcal_lib.model.camera import line_through, pinhole
+from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
 
 # where the plates meet, through the origin of the target, and the plates' ways from there
 EDGE = np.array([-0.5, -0.5, 0.70711])
@@ -86,5 +86,4 @@ def _image_lines(setup, rng, T_camera_target):
     whole = (inside.any(axis=-1, keepdims=True) & long).all(axis=(1, 2))
 
     noisy = rng.normal(ends[:, 0], setup.sigma_px)
-    both = np.insert(noisy, 2, 1.0, axis=-1).swapaxes(0, 1)
-    return unit_lines(np.cross(*both)), whole
+    return line_through(*noisy.swapaxes(0, 1)), whole

@@ -275,8 +275,8 @@ def _add_placements(writer, setup, placements, truth):
     log = []
     took = beam.turns * MIRROR_TURN
     unit = beam.unit_name
-    configuration = Configuration().changed(unit=unit)
-    writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
+    configuration = encode_configuration(Configuration().changed(unit=unit))
+    writer.add_telegrams(-1, [configuration], time_s=0.0)
     shots = shots_of(setup, placements)
     taken = zip(shots, spread(partial(photograph, setup), shots), strict=True)
     cameras = len(setup.rig.cameras)
@@ -285,9 +285,8 @@ def _add_placements(writer, setup, placements, truth):
     for placement in placements:
         number = placement.number
         images, lines = stops_of(setup, placement)
-        shot_at = clock + pause * np.arange(1, len(images.true) + 1)
+        *shot_at, first = clock + pause * np.arange(1, len(images.true) + 2)
         _add_images(writer, setup, islice(taken, cameras), truth, shot_at)
-        first = shot_at[-1] + pause
         began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
         arrived = np.round(began + took + REPLY_TIME, 4)

@@ -175,7 +175,7 @@ def draw_shots(
     parts = []
     failing = []
     missing = np.full(trials, placements)
-    while missing.any() and len(parts) < MOST_ROUNDS:
+    for _ in range(MOST_ROUNDS):
         trial = np.repeat(np.arange(trials), 2 * missing)
         conditions, shots = draw(setup, rng, T_camera_lrf[trial])
         good = np.array([*conditions.values()])
@@ -184,7 +184,9 @@ def draw_shots(
         part = {name: value[good.all(axis=0)] for name, value in shots.items()}
         parts.append(part)
         missing = np.maximum(missing - np.bincount(part["trial"], minlength=trials), 0)
-    if missing.any():
+        if not missing.any():
+            break
+    else:
         means = zip(np.mean(failing, axis=0), conditions, strict=True)
         shares = [f"{share:.0f} % {words}" for share, words in means]
         raise ValueError(
