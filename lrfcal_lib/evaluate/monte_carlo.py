@@ -254,8 +254,9 @@ def consistency(trials: Trials) -> pd.DataFrame:
         )
     bad = ~np.isfinite(trials.errors.sum(axis=1) + trials.covariances.sum(axis=(1, 2)))
     if bad.any():
-        seeds = trials.seeds[bad].tolist()[:5]
-        raise ValueError(f"errors or covariances are not finite (seeds {seeds})")
+        raise ValueError(
+            f"errors or covariances are not finite (seeds {trials.seeds[bad].tolist()[:5]})"
+        )
     groups = groups_of(trials.names) | {
         "all": (slice(None), "", 1 / sigma_of(trials.bounds))
     }

@@ -137,8 +137,7 @@ def _single(method, shots, scenario, trial, T0, obs):
     """The same of one trial, or the words of the solver's refusal."""
     try:
         if method == "joint":
-            joint = solve_joint(obs, axis=False, sensor=scenario.sensor)
-            found = joint.camera("camera")
+            found = solve_joint(obs, axis=False, sensor=scenario.sensor).camera("camera")
         else:
             planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
             options = {"method": method, "T0": T0} | PLANES[method]

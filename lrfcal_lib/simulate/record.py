@@ -107,16 +107,18 @@ def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     way = 1 if first <= last else -1
     low, high = sorted([first, last])
     lines = np.arange(np.floor(low / step), np.ceil(high / step) + 1)[::way] * step
-    stop = setup.rig.platform.stop
-    return [Stops(commanded, *stop(commanded, way, rng)) for commanded in (images, lines)]
+    return [
+        Stops(commanded, *setup.rig.platform.stop(commanded, way, rng))
+        for commanded in (images, lines)
+    ]
 
 
 def sweep_of(setup, placement):
     """The scan lines of a placement, one a stop of the sweep: words (L, B) as a device sends."""
-    pitch = stops_of(setup, placement)[1].true
+    _, lines = stops_of(setup, placement)
     world = world_of(setup, placement)
     rng = random(setup, SWEEP, placement.number)
-    return scan(setup.rig.beam, world, pitch[:, None], setup.rig.T_head_lrf, rng)
+    return scan(setup.rig.beam, world, lines.true[:, None], setup.rig.T_head_lrf, rng)
 
 
 def close_views(setup: Setup, number: int) -> list[Placement]:
@@ -132,8 +134,10 @@ def close_views(setup: Setup, number: int) -> list[Placement]:
     camera = rig.cameras[number]
     still = rig.camera_pose(camera, 0.0).inv()
     rng = random(setup, VIEWS, number)
-    poses = held_close(rig, camera, setup.intrinsics_views, rng)
-    return [Placement(CLOSE, still * pose) for pose in poses]
+    return [
+        Placement(CLOSE, still * pose)
+        for pose in held_close(rig, camera, setup.intrinsics_views, rng)
+    ]
 
 
 def shots_of(setup, placements):
@@ -158,8 +162,10 @@ def photograph(setup, shots):
     camera = rig.cameras[shots.camera]
     world = world_of(setup, shots.placement)
     rng = random(setup, *shots.key)
-    poses = rig.camera_pose(camera, shots.stops.true)
-    return [encode_jpeg(camera.render(world, pose, rng), setup.quality) for pose in poses]
+    return [
+        encode_jpeg(camera.render(world, pose, rng), setup.quality)
+        for pose in rig.camera_pose(camera, shots.stops.true)
+    ]
 
 
 def simulate(path: str | os.PathLike, setup: Setup) -> None:

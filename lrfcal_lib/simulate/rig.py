@@ -271,8 +271,14 @@ def placements_of(setup: Setup) -> list[Placement]:
     """
     out = []
     if setup.pairs:
-        rng = random(setup, PLACES)
-        out = pairs(setup.rig, setup.pairs, setup.distances, rng, setup.margin, setup.step)
+        out = pairs(
+            setup.rig,
+            setup.pairs,
+            setup.distances,
+            random(setup, PLACES),
+            setup.margin,
+            setup.step,
+        )
     if setup.room_sweep:
         for station in setup.stations or (None,):
             number = len(out) + 1

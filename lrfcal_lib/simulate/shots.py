@@ -118,8 +118,7 @@ class Scenario(Devices):
         axis in the board, anywhere in the image.
         """
         angle = rng.uniform(0, 2 * np.pi, count)
-        axis = polar_to_points(1.0, angle)
-        rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
+        rotation = Rotation.from_rotvec(polar_to_points(self.tilt, angle)) * FACING
         away = rng.uniform(*self.distances, count)
         pixels = rng.uniform(0, self.model.size, (count, 2))
         centre = away[:, None] * self.model.sights(pixels)
