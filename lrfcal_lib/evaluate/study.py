@@ -97,7 +97,7 @@ def tasks_of(scenarios, methods, n_poses, trials, seed=0) -> list[Task]:
         raise ValueError(f"{list(n_poses)} placements: 3 or more are needed for a camera")
     known = [s if isinstance(s, Scenario) else load_scenario(s) for s in scenarios]
     for scenario in known:
-        if scenario.corner and not BATCHED.keys() >= set(methods):
+        if scenario.corner and not set(methods).issubset(BATCHED):
             raise ValueError(f"{scenario.name} shows no board: use {', '.join(BATCHED)}")
     return [
         Task(scenario, tuple(methods), count, seed, first, min(CHUNK, trials - first))

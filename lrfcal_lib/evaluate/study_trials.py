@@ -33,25 +33,21 @@ from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Unknowns
 
 FAR = 10.0  # deg from the truth: another minimum, or nothing was determined
-# of crossings, solved as one batch: options of `solve_camera`
-BATCHED: dict[str, dict] = {
-    "line_printed": {},
-    "line": {},
+# of crossings, solved as one batch; others trial by trial
+BATCHED = ("line_printed", "line", "line_robust", "wasielewski_strauss")
+STUDIED = (
+    *BATCHED,
+    "zhang_pless_printed",
+    "zhang_pless",
+    "zhang_pless_k",
+    "three_planes",
+    "joint",
+)
+# of `solve_camera`; without a start value the minimal solution is searched for
+OPTIONS: dict[str, dict] = {
     "line_robust": {"method": "line", "robust": True},
-    "wasielewski_strauss": {},
+    "three_planes": {"method": "zhang_pless", "T0": None, "robust": True},
 }
-# of planes, trial by trial; without a start value the minimal solution is searched for
-PLANES: dict[str, dict] = {
-    "zhang_pless_printed": {},
-    "zhang_pless": {},
-    "zhang_pless_k": {},
-    "three_planes": {
-        "method": "zhang_pless",
-        "T0": None,
-        "robust": True,
-    },
-}
-STUDIED = (*BATCHED, *PLANES, "joint")
 LEAST_RANGE = 0.05  # metres: noise may make a near one negative
 
 
@@ -126,7 +122,8 @@ def _batch(method, shots, scenario, T0):
     """Pose, covariance and what went wrong, of every trial."""
     obs = crossing_observations(shots, scenario, last_beam=method == "line_printed")
     try:
-        solution = solve_camera(obs, **{"method": method, "T0": T0} | BATCHED[method])
+        options = {"method": method, "T0": T0} | OPTIONS.get(method, {})
+        solution = solve_camera(obs, **options)
     except DegenerateGeometry as error:
         return [str(error)] * len(T0)
     converged = np.broadcast_to(solution.converged, len(T0))
@@ -140,7 +137,7 @@ def _single(method, shots, scenario, trial, T0, obs):
             found = solve_joint(obs, axis=False, sensor=scenario.sensor).camera("camera")
         else:
             planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
-            options = {"method": method, "T0": T0} | PLANES[method]
+            options = {"method": method, "T0": T0} | OPTIONS.get(method, {})
             found = solve_camera(planes, search=False, **options)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:
         return str(error)
