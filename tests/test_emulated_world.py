@@ -40,7 +40,7 @@ def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch_of_every_beam(
 ):
     world.put("place/1")
     beam = SETUP.rig.beam
-    start = float(np.mean(placements[0].sweep))
+    start = float(np.mean(placements[0].sweep[:2]))
     world.head = Head(SETUP.rig.platform, pitch=start)
     world.head.move(0.0, start + 0.5, speed)
     times = 0.1 + QUARTERS % 4 / 75.08

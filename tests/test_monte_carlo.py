@@ -75,6 +75,9 @@ def test_bad_trials_are_refused():
     broken.errors[3, 0] = np.nan
     with pytest.raises(ValueError, match=r"not finite \(seeds \[3\]\)"):
         consistency(broken)
+    broken.covariances[5, 1, 0] = np.inf
+    with pytest.raises(ValueError, match=r"not finite \(seeds \[3, 5\]\)"):
+        consistency(broken)
 
 
 def test_refused_draws_are_counted_not_hidden():

@@ -25,8 +25,10 @@ DEADLINE = 120.0  # s, against hanging
 def rig():
     """A quick rig with one placement of five stops and one image of 64 x 48 pixels."""
     setup, placements = practice_setup()
-    low = float(np.mean(placements[0].sweep))
-    short = [replace(placements[0], sweep=(low, low + np.radians(4.0)), image_pitch=(low,))]
+    first, last, step = placements[0].sweep
+    low = (first + last) / 2
+    sweep = low, low + np.radians(4.0), step
+    short = [replace(placements[0], sweep=sweep, image_pitch=(low,))]
     setup = replace(
         setup, rig=scaled(replace(setup.rig, cameras=setup.rig.cameras[:1]), 64)
     )

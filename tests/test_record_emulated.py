@@ -46,7 +46,12 @@ def small_setup():
     setup = replace(quick, rig=replace(rig, cameras=(camera,)), pairs=2, distances=(1.3, 1.7), step=STEP,
                     intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
     found = pairs(
-        setup.rig, setup.pairs, setup.distances, random(setup, PLACES), np.radians(1.0)
+        setup.rig,
+        setup.pairs,
+        setup.distances,
+        random(setup, PLACES),
+        np.radians(1.0),
+        STEP,
     )
     return setup, [
         replace(p, image_pitch=p.image_pitch[len(p.image_pitch) // 2 :][:1]) for p in found

@@ -103,6 +103,15 @@ def test_the_data_card_has_the_sums_of_all_files(name):
     )
 
 
+def test_a_room_may_be_swept_without_an_image(tmp_path, tiny):
+    record.simulate(
+        tmp_path / "s", replace(tiny, pairs=0, room_sweep=(0.0, np.radians(1.0), 0.01))
+    )
+    session = open_session(tmp_path / "s")
+    assert list(session.placements) == [1] and not session.images()
+    assert len(session.sweep(1).pitch) == 3
+
+
 def test_an_existing_folder_is_left_alone(tmp_path, tiny, capsys):
     (tmp_path / "s").mkdir()
     with pytest.raises(ValueError, match="exists already"):
@@ -144,7 +153,8 @@ def test_impossible_settings(given, change, message):
 
 
 def lens(width, *distortion):
-    return Imager(CameraModel(width, 384, 200.0, 200.0, 255.0, 191.0, np.array(distortion)))
+    model = CameraModel(width, 384, 200.0, 200.0, 255.0, 191.0, np.array(distortion))
+    return Imager(model).rays
 
 
 def test_what_cannot_be_simulated(tmp_path, tiny, monkeypatch):
@@ -158,7 +168,7 @@ def test_what_cannot_be_simulated(tmp_path, tiny, monkeypatch):
             lambda: Platform().stop(np.radians([-10, 80]), 1, rng),
             "pitch -10.00 to 80.00 deg is asked for, it turns -60.00 to 60.00",
         ),
-        (lambda: pairs(tiny.rig, 0, (1.0, 2.0), rng, 0.03), "0 pairs"),
+        (lambda: pairs(tiny.rig, 0, (1.0, 2.0), rng, 0.03, 0.01), "0 pairs"),
         (lambda: held_close(huge, camera, 1, rng), "does not fit into the image of 'left'"),
         (lambda: World([]), "at least one thing"),
         (lambda: lens(512, -0.9, 0.0, 0.0, 0.0, 0.0), "folds the image"),

@@ -151,7 +151,7 @@ def rig_of(v):
         model = CameraModel(
             640, 480, focal, focal * rng.uniform(0.998, 1.002), *middle, lens
         )
-        cameras.append(RigCamera(name, model, mounting, None))
+        cameras.append(RigCamera(model, name=name, mounting=mounting, guess=None))
     spot, divergence = SPOTS[v.spot]
     beam = replace(
         LMS221, name=v.spot, spot_exit=spot, divergence=divergence, sigma_range=v.sigma_range, systematic=v.systematic,
@@ -375,6 +375,7 @@ def record(path, seed, **given):
         v.distances,
         np.random.default_rng([v.seed, 3]),
         np.radians(2.0),
+        v.step,
     )
     lrf = LrfInfo(
         f"{rig.beam.name} (varied)", tuple(rig.beam.bearings()[[0, -1]]), np.radians(v.resolution / 100), v.sigma_range,
@@ -434,12 +435,12 @@ def _placement(v, rig, imagers, placement, writer, truth, rng):
     number = placement.number
     truth["boards"][number] = {"T_platform_board": transform_to_json(board)}
     scene = _scene(v, rig, board, rng)
+    low, high = sorted(placement.sweep[:2])
+    way = 1 if placement.sweep[0] == low else -1
 
     def stops(commanded):
         """True pitch at rest."""
-        head = (1 + v.stretch) * np.asarray(
-            commanded
-        ) - placement.direction * v.backlash / 2
+        head = (1 + v.stretch) * np.asarray(commanded) - way * v.backlash / 2
         return head + v.stop_noise * rng.standard_normal(head.shape)
 
     commanded = placement.image_pitch if v.mount == "head" else placement.image_pitch[:1]
@@ -448,13 +449,8 @@ def _placement(v, rig, imagers, placement, writer, truth, rng):
             pose = rig.camera_pose(camera, true)
             own = {"placement": number, "pitch": float(recorded), "true": float(true)}
             _image(writer, truth, camera, imagers, scene, pose, pose * board, rng, **own)
-    low, high = sorted(placement.sweep)
-    pitch = (
-        np.arange(np.floor(low / v.step), np.ceil(high / v.step) + 1)[
-            :: placement.direction
-        ]
-        * v.step
-    )
+    lines = np.arange(np.floor(low / v.step), np.ceil(high / v.step) + 1)
+    pitch = lines[::way] * v.step
     true = stops(pitch)
     truth["sweeps"][number] = {"pitch_rad": true.tolist()}
     writer.add_sweep(number, _scan(v, rig, scene, true, rng), rig.beam.bearings(), pitch)

@@ -119,9 +119,7 @@ class EmulatedRig(Closed):
                     {
                         "number": p.number,
                         "board": p.purpose == "board",
-                        "pitch_deg": np.degrees([*p.sweep, self.setup.step_of(p)])
-                        .round(4)
-                        .tolist(),
+                        "pitch_deg": np.degrees(p.sweep).round(4).tolist(),
                         "image_pitch_deg": np.degrees(p.image_pitch).round(4).tolist(),
                     }
                     for p in self.world.placements

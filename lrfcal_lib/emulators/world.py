@@ -206,7 +206,7 @@ class CameraServer(ThreadingHTTPServer):
         camera = self.cameras[name]
         rng = np.random.default_rng([0, next(self._count)])
         pose = self.world.setup.rig.camera_pose(camera, pitch)
-        return encode_jpeg(camera.imager.render(scene, pose, rng), QUALITY)
+        return encode_jpeg(camera.render(scene, pose, rng), QUALITY)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -1,6 +1,5 @@
 """Monte-Carlo trials of the joint estimate, beside bound and truth."""
 
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -39,14 +38,14 @@ LIMITS = (0.005, 0.995)  # of what chance alone does
 FEWEST_TRIALS = 10
 MOST_SIGMA = 3e5  # standard deviations of one alone, in a direction that is left open
 LARGE = 0.3  # share of its largest component, of those that are named
-GROUPS = {  # unknowns by name: what they are together
-    r"axis_.*": "axis direction",
-    r"offset_.*": "axis offset",
-    r"edge_log_odds": "edge bias",
-    r"edge_log_softness": "edge softness",
-    r"(.+)_r[xyz]": r"\1 rotation",
-    r"(.+)_t[xyz]": r"\1 translation",
-    r"(.+)": r"\1",
+GROUPS = {  # in names of unknowns, one after the other: what they are together
+    r"^axis_.*": "axis direction",
+    r"^offset_.*": "axis offset",
+    r"^edge_log_odds$": "edge bias",
+    r"^edge_log_softness$": "edge softness",
+    r"_r[xyz]$": " rotation",
+    r"_t[xyz]$": " translation",
+    r"_": " ",
 }
 LOGARITHMS = {"edge bias": "log odds", "edge softness": "log"}  # their units
 
@@ -202,15 +201,13 @@ def bound(obs: JointObservations, truth: JointState, unknowns: Unknowns) -> np.n
     return covariance_of(total, scale, lost=())
 
 
-def groups_of(names: Sequence[str]) -> dict[str, tuple[list[int], str, float]]:
+def groups_of(names: Sequence[str]) -> dict[str, tuple[pd.Index, str, float]]:
     """Unknowns in groups of one unit: dict of words to (indices, unit, factor to that unit)."""
-    groups: dict[str, tuple[list[int], str, float]] = {}
-    for i, name in enumerate(names):
-        pattern = next(pattern for pattern in GROUPS if re.fullmatch(pattern, name))
-        words = re.sub(pattern, GROUPS[pattern], name, count=1).replace("_", " ")
-        unit, factor = unit_of(name)
-        index, *_ = groups.setdefault(words, ([], LOGARITHMS.get(words, unit), factor))
-        index.append(i)
+    words = pd.Series(names).replace(GROUPS, regex=True)
+    groups = {}
+    for group, index in words.groupby(words, sort=False).groups.items():
+        unit, factor = unit_of(names[index[0]])
+        groups[group] = index, LOGARITHMS.get(group, unit), factor
     return groups
 
 
@@ -255,10 +252,14 @@ def consistency(trials: Trials) -> pd.DataFrame:
         raise ValueError(
             f"{count} trials say nothing about consistency: at least {FEWEST_TRIALS} are needed"
         )
-    if not (np.isfinite(trials.errors).all() and np.isfinite(trials.covariances).all()):
-        bad = trials.seeds[~np.isfinite(trials.errors).all(axis=1)]
-        raise ValueError(f"errors or covariances are not finite (seeds {bad.tolist()[:5]})")
-    groups = groups_of(trials.names) | {"all": (list(range(len(trials.names))), "", None)}
+    bad = ~np.isfinite(trials.errors.sum(axis=1) + trials.covariances.sum(axis=(1, 2)))
+    if bad.any():
+        raise ValueError(
+            f"errors or covariances are not finite (seeds {trials.seeds[bad].tolist()[:5]})"
+        )
+    groups = groups_of(trials.names) | {
+        "all": (slice(None), "", 1 / sigma_of(trials.bounds))
+    }
     rows = [
         {"group": words, "unit": unit} | _judge(trials, index, factor)
         for words, (index, unit, factor) in groups.items()
@@ -267,15 +268,13 @@ def consistency(trials: Trials) -> pd.DataFrame:
 
 
 def _judge(trials, index, factor):
-    """One row: a group in its unit, or (factor None) unknowns of many units, each by its bounds."""
+    """One row: a group of unknowns, each by a factor to its unit."""
     e = trials.errors[:, index]
     C = trials.covariances[:, index][..., index]
     B = trials.bounds[:, index][..., index]
     mean = np.mean(C, axis=0)
     seen = max(round(len(e) * _freedom(mean / dyads(sigma_of(mean)))), 1)
-    unit = np.full(e.shape, factor)
-    if factor is None:
-        unit = 1 / sigma_of(B)
+    unit = np.broadcast_to(factor, e.shape)
     B = B * dyads(unit)
     crb = np.sqrt(np.mean(np.linalg.trace(B)))
     rmse = rms(np.linalg.norm(unit * e, axis=1))
@@ -285,7 +284,7 @@ def _judge(trials, index, factor):
         "crb": crb,
         "rmse_over_crb": rmse / crb,
         "coverage": np.mean(np.abs(e) < HALF_WIDTH * sigma_of(C)),
-        "nees": np.mean(np.vecdot(e, solve_each(C, e))) / len(index),
+        "nees": np.mean(e * solve_each(C, e)),
     }
     row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(
         chi2.ppf(LIMITS, free) / free

@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, as_completed
 from contextlib import suppress
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -19,7 +20,6 @@ from lrfcal_lib.simulate.shots import Scenario
 
 COUNTS = (5, 10, 20, 50, 100)  # placements
 CHUNK = 10  # trials of a task: some seconds, of which handing it over takes a thousandth
-INTERVAL = {"low": 0.05, "high": 0.95}  # of the bootstrap
 RESAMPLES = 1000
 ERRORS = ("rotation_deg", "translation_mm")
 NUMBERS = (
@@ -97,7 +97,7 @@ def tasks_of(scenarios, methods, n_poses, trials, seed=0) -> list[Task]:
         raise ValueError(f"{list(n_poses)} placements: 3 or more are needed for a camera")
     known = [s if isinstance(s, Scenario) else load_scenario(s) for s in scenarios]
     for scenario in known:
-        if scenario.corner and not BATCHED.keys() >= set(methods):
+        if scenario.corner and not set(methods).issubset(BATCHED):
             raise ValueError(f"{scenario.name} shows no board: use {', '.join(BATCHED)}")
     return [
         Task(scenario, tuple(methods), count, seed, first, min(CHUNK, trials - first))
@@ -159,17 +159,13 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
         trials=("trial", "size"), failed=("failed", "sum"), failures=("outcome", _reasons)
     )
     for name in ERRORS:
-        table[name] = every[name].median()
-        table[f"{name}_mean"] = every[name].mean()
-        for end, share in INTERVAL.items():
-            table[f"{name}_{end}"] = every[name].agg(resampled, share=share)
+        for end, statistic in OF_ERRORS.items():
+            table[name + end] = every[name].agg(statistic)
         table[f"{name}_rmse"] = good[name].agg(rms)
         for bound in (f"{name}_bound", f"{name}_known"):
             table[bound] = good[bound].agg(rms)
-    table["rmse_over_bound"] = np.sqrt(good.over_bound.mean())
-    for end, share in INTERVAL.items():
-        squares = good.over_bound.agg(resampled, share=share, statistic=np.mean)
-        table[f"rmse_over_bound_{end}"] = np.sqrt(squares)
+    for end, statistic in OF_SQUARES.items():
+        table[f"rmse_over_bound{end}"] = np.sqrt(good.over_bound.agg(statistic))
     table["nees"] = good.nees.mean()
     table["coverage"] = good.covered.mean()
     return table.reset_index().astype({"method": str})
@@ -198,6 +194,20 @@ def resampled(values: np.ndarray, share: float, statistic=np.median) -> float:
         return np.nan
     drawn = np.random.default_rng(0).choice(values, (RESAMPLES, len(values)))
     return np.quantile(statistic(drawn, axis=1), share)
+
+
+# columns of a summary by the end of their names: the interval is that of the bootstrap
+OF_ERRORS = {
+    "": "median",
+    "_mean": "mean",
+    "_low": partial(resampled, share=0.05),
+    "_high": partial(resampled, share=0.95),
+}
+OF_SQUARES = {
+    "": "mean",
+    "_low": partial(resampled, share=0.05, statistic=np.mean),
+    "_high": partial(resampled, share=0.95, statistic=np.mean),
+}
 
 
 def study_to_file(

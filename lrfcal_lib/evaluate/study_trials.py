@@ -33,25 +33,21 @@ from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_model import Unknowns
 
 FAR = 10.0  # deg from the truth: another minimum, or nothing was determined
-# of crossings, solved as one batch: options of `solve_camera`
-BATCHED: dict[str, dict] = {
-    "line_printed": {},
-    "line": {},
+# of crossings, solved as one batch; others trial by trial
+BATCHED = ("line_printed", "line", "line_robust", "wasielewski_strauss")
+STUDIED = (
+    *BATCHED,
+    "zhang_pless_printed",
+    "zhang_pless",
+    "zhang_pless_k",
+    "three_planes",
+    "joint",
+)
+# of `solve_camera`; without a start value the minimal solution is searched for
+OPTIONS: dict[str, dict] = {
     "line_robust": {"method": "line", "robust": True},
-    "wasielewski_strauss": {},
+    "three_planes": {"method": "zhang_pless", "T0": None, "robust": True},
 }
-# of planes, trial by trial; without a start value the minimal solution is searched for
-PLANES: dict[str, dict] = {
-    "zhang_pless_printed": {},
-    "zhang_pless": {},
-    "zhang_pless_k": {},
-    "three_planes": {
-        "method": "zhang_pless",
-        "T0": None,
-        "robust": True,
-    },
-}
-STUDIED = (*BATCHED, *PLANES, "joint")
 LEAST_RANGE = 0.05  # metres: noise may make a near one negative
 
 
@@ -126,7 +122,8 @@ def _batch(method, shots, scenario, T0):
     """Pose, covariance and what went wrong, of every trial."""
     obs = crossing_observations(shots, scenario, last_beam=method == "line_printed")
     try:
-        solution = solve_camera(obs, **{"method": method, "T0": T0} | BATCHED[method])
+        options = {"method": method, "T0": T0} | OPTIONS.get(method, {})
+        solution = solve_camera(obs, **options)
     except DegenerateGeometry as error:
         return [str(error)] * len(T0)
     converged = np.broadcast_to(solution.converged, len(T0))
@@ -137,11 +134,11 @@ def _single(method, shots, scenario, trial, T0, obs):
     """The same of one trial, or the words of the solver's refusal."""
     try:
         if method == "joint":
-            solution = solve_joint(obs, axis=False, sensor=scenario.sensor)
-            return solution.transforms["camera"], solution.solution.covariance[:6, :6], True
-        planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
-        options = {"method": method, "T0": T0} | PLANES[method]
-        found = solve_camera(planes, search=False, **options)
+            found = solve_joint(obs, axis=False, sensor=scenario.sensor).camera("camera")
+        else:
+            planes = plane_observations(obs, shots["pattern_pixels"][trial], scenario)
+            options = {"method": method, "T0": T0} | OPTIONS.get(method, {})
+            found = solve_camera(planes, search=False, **options)
     except (DegenerateGeometry, np.linalg.LinAlgError) as error:
         return str(error)
     return found.transform, found.covariance[:6, :6], found.converged
@@ -199,7 +196,7 @@ def crossing_observations(
     else:
         lines = np.tile(shots["lines"], (1, 1, scenario.scans, 1))
         points, covariance = _ends_of_lines(shots["ranges"], scenario, last_beam)
-    sessions, placements = points.shape[:2]
+    sessions, placements = lines.shape[:2]
     lines = lines.reshape(sessions, -1, 3)
     count = lines.shape[1]
     return CameraObservations(
@@ -213,23 +210,18 @@ def crossing_observations(
 
 
 def _ends_of_lines(ranges, setup, last_beam):
-    """Where the lines fitted to scan lines (t, p, s, B) end, (t, p, 2 s, 3), and their
+    """Where the lines fitted to scan lines (t, p, s, B) end, (t p s, 2, 3), and their
     covariances.
     """
     bearings = setup.bearings()
-    sessions, placements, _, beams = ranges.shape
-    ranges = ranges.reshape(-1, beams)
+    ranges = ranges.reshape(-1, len(bearings))
     lines, of_line = fit_lines(ranges, bearings)
     ends = bearings[row_ends(np.isfinite(ranges))[1]]
     if not last_beam:
         ends = ends + np.array([-0.5, 0.5]) * setup.step
-    of_line *= setup.sigma_range**2
-    points, noise, by_bearing = crossings_of(
-        lines.repeat(2, axis=0), of_line.repeat(2, axis=0), ends.ravel()
-    )
-    points = points.reshape(sessions, placements, -1, 3)
+    points, noise, by_bearing = crossings_of(lines, setup.sigma_range**2 * of_line, ends.T)
     covariance = dyads(noise) + dyads(by_bearing * setup.step * UNIFORM)
-    return points, covariance.reshape(*points.shape, 3)
+    return points.swapaxes(0, 1), covariance.swapaxes(0, 1)
 
 
 def plane_observations(
@@ -280,7 +272,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
         view_covariance=shots["board_covariance"][trial],
         view_placement=np.arange(count),
         edges=scenario.board.edges,
-        corners=np.asarray(scenario.board.corners, float),
+        corners=scenario.board.known_corners(),
         cameras=("camera",),
         mounts=("head",),
         T_head_lrf=RigidTransform.identity(),
@@ -289,7 +281,7 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
     boards = T_camera_lrf.inv() * pose_transform(shots["true_boards"][trial])
     return obs, joint_truth(
         obs,
-        RigidTransform.identity(),
+        obs.T_head_lrf,
         {"camera": T_camera_lrf},
         boards,
         bias=scenario.bias,
@@ -299,31 +291,28 @@ def joint_session(shots: dict, scenario: Scenario, trial: int):
 
 def _readings(shots, scenario, trial):
     """Readings of the boards, and the beams about the ends of their scan lines."""
-    ranges = shots["ranges"][trial]
-    placements, scans, beams = ranges.shape
-    of_line = np.repeat(np.arange(placements), scans)
-    edges = np.repeat(shots["edges"][trial], scans, axis=0)
-    ranges = ranges.reshape(-1, beams)
     bearings = scenario.bearings()
+    ranges = shots["ranges"][trial].reshape(-1, len(bearings))
     hit = np.isfinite(ranges)
     line, beam = np.nonzero(hit)
     _, ends = row_ends(hit)
-    at_ends = np.maximum(np.take_along_axis(ranges, ends, axis=1), LEAST_RANGE)
     # beams about either end of every scan line
-    near = np.arange(-REACH, REACH)
-    window = np.clip(ends[..., None] + [[0], [1]] + near, 0, beams - 1)
-    at_end = np.repeat(at_ends, near.size)
+    ended, end, number = np.indices((*ends.shape, 2 * REACH)).reshape(3, -1)
+    last = ends[ended, end]
+    near = np.clip(last + end + number - REACH, 0, len(bearings) - 1)
+    distance = np.maximum(ranges[ended, last], LEAST_RANGE)
+    placement = ended // scenario.scans
     return {
         "face_range": ranges[hit],
         "face_bearing": bearings[beam],
         "face_sigma": np.full(len(beam), scenario.sigma_range),
-        "face_placement": of_line[line],
-        "beam_bearing": bearings[window.ravel()],
-        "beam_hit": np.take_along_axis(hit[:, None], window, axis=2).ravel(),
-        "beam_edge": np.repeat(edges, near.size),
-        "beam_radius": scenario.radius(at_end),
-        "beam_step": scenario.step * at_end,
-        "beam_placement": np.repeat(of_line, 2 * near.size),
+        "face_placement": line // scenario.scans,
+        "beam_bearing": bearings[near],
+        "beam_hit": hit[ended, near],
+        "beam_edge": shots["edges"][trial][placement, end],
+        "beam_radius": scenario.radius(distance),
+        "beam_step": scenario.step * distance,
+        "beam_placement": placement,
     }
 
 

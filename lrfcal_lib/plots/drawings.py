@@ -12,7 +12,7 @@ from lrfcal_lib.model.camera import CameraModel, pinhole
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.plots.colors import AXES_RGB, LEFT, LRF, RIGHT, TRUTH
 from lrfcal_lib.plots.recording import CENTRED, to_scale
-from lrfcal_lib.plots.rig import Vector, look_at
+from lrfcal_lib.plots.rig import Vector, look_at, pixels
 
 DIMENSION = {
     "arrowstyle": "<|-|>",
@@ -44,8 +44,7 @@ class View:
 
     def flat(self, points: ArrayLike) -> np.ndarray:
         """Where points (..., 3), metres, stand on the axes, (..., 2)."""
-        seen = self.T_view.apply(np.asarray(points, float))
-        return seen[..., :2] / seen[..., 2:]
+        return pixels(self.T_view.apply(points), (1, 1))
 
     def line(self, points: ArrayLike, style: str = "-", **looks: Any) -> None:
         """A line through points (n, 3), metres."""
@@ -93,7 +92,7 @@ class View:
     ) -> None:
         """The distance of two points (2, 3) as in a drawing of a machine."""
         self.arrow(ends, TRUTH, DIMENSION)
-        self.name(np.asarray(ends).mean(axis=0), text, away)
+        self.name(np.mean(ends, axis=0), text, away)
 
     def box(self, T: RigidTransform, low: ArrayLike, high: ArrayLike, color: str) -> None:
         """A solid box between two corners (3,) of its own frame, metres, the far faces first."""

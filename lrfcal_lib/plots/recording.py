@@ -164,8 +164,8 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
     ax.plot(bearing[~far], raw[~far], "o", color=RAW, markersize=6, label="raw")
     if far.any():
         words = f"raw, farther: {raw[far].min():.2f} to {raw[far].max():.2f} m"
-        at_top = np.minimum(raw[far], top)
-        ax.plot(bearing[far], at_top, "^", color=RAW, clip_on=False, label=words)
+        at_top = np.where(far, top, np.nan)
+        ax.plot(bearing, at_top, "^", color=RAW, clip_on=False, label=words)
     ax.plot(bearing, scan.filtered[line, near], "x", color=TRUTH, label="filtered")
     ax.plot(bearing, fitted, color=FIT, label="line fitted to the board")
     for crossed, style in zip(edges, ("--", "-"), strict=False):
@@ -283,7 +283,6 @@ def board_view(
     margin
         Pixels around the board.
     """
-    picture(ax, image)
     color = color_of(view.camera)
     if view.pixels is not None:
         ax.plot(*view.pixels.T, "+", color=FILTERED, markersize=4, mew=0.8)
@@ -303,7 +302,7 @@ def board_view(
     unused = ""
     if view.rejected:
         unused = f"; not used: {', '.join(name for name, _ in view.rejected)}"
-    _about_lines(ax, view, image, margin, unused)
+    _picture_about_lines(ax, view, image, margin, unused)
 
 
 def seen_points(
@@ -332,7 +331,6 @@ def seen_points(
     styles
         Markers or line styles, one a method.
     """
-    picture(ax, image)
     for edge in view.edges:
         ax.plot(*stretch_in_image(edge, model).T, color="white", linewidth=1.0)
     if view.edges:
@@ -347,7 +345,7 @@ def seen_points(
             markerfacecolor="none",
         )
     ax.legend(frameon=True, framealpha=0.8, labelcolor="white", **DARK)
-    _about_lines(ax, view, image, margin)
+    _picture_about_lines(ax, view, image, margin)
 
 
 def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
@@ -356,14 +354,13 @@ def stretch_in_image(edge, model: CameraModel) -> np.ndarray:
     return redistort(np.linspace(first, last, STRETCH), model)
 
 
-def _about_lines(ax, view, image, margin, more=""):
-    """Cut an image of the board to the lines drawn in it, and say in the title which it is."""
+def _picture_about_lines(ax, view, image, margin, more=""):
+    """An image of the board behind the lines drawn so far, cut to them; the title says which."""
+    rim = ax.dataLim.get_points() + [[-margin], [margin]]  # not finite without a line
+    picture(ax, image)
     ax.set_title(f"{view.camera}, placement {view.placement}{more}")
-    points = np.vstack([[[np.nan, np.nan]], *(line.get_xydata() for line in ax.lines)])
-    if np.isfinite(points).any():
-        last = np.array(image.shape[1::-1]) - 0.5
-        rim = [np.nanmin(points, axis=0) - margin, np.nanmax(points, axis=0) + margin]
-        columns, rows = np.clip(rim, -0.5, last).T
+    if np.isfinite(rim).all():
+        columns, rows = np.clip(rim, -0.5, np.array(image.shape[1::-1]) - 0.5).T
         ax.set(xlim=columns, ylim=rows[::-1])
 
 

@@ -58,8 +58,9 @@ def residual_strips(
     for column, (_, values) in enumerate(groups):
         rms = _rms(values)
         ax.bar(column, 2 * rms, 0.8, -rms, color=color, alpha=0.2, linewidth=0)
-        at = column + 0.6 * _side_by_side(values)
-        ax.plot(at, values, ".", color=color, markersize=2.5)
+        ax.plot(
+            column + 0.6 * _side_by_side(values), values, ".", color=color, markersize=2.5
+        )
     by_placement(ax, list(groups.groups), label)
 
 

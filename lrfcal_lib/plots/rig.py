@@ -1,6 +1,7 @@
 """Coloured clouds as a camera sees them."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -168,12 +169,11 @@ def measured_edges(
     T_view, size, focal
         Of the picture.
     """
-    names = [*known, *known]  # around the outline, so that one comes after the last
+    following = dict(pairwise([*known, *known]))  # around the outline
     centre = measured.T_platform_plane[:3, 3]
     middle = pixels(T_view.apply(centre), size, focal)
     for name, length in measured.lengths.items():
-        both = names[names.index(name) :][:2]
-        ends = [measured.corner_point(corner) for corner in both]
+        ends = [measured.corner_point(corner) for corner in (name, following[name])]
         uv = pixels(T_view.apply(ends), size, focal)
         ax.plot(*uv.T, "o-", color=FIT)
         at = uv.mean(axis=0)

@@ -53,7 +53,8 @@ def print_sheet(path: str | PathLike, board: Board, dpi: float = 300) -> None:
     high = corners.max(axis=0) + PAPER
     page = Figure(figsize=(high - low) / INCH)
     ax = page.add_axes((0, 0, 1, 1))
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    columns, rows = np.transpose([low, high])
+    ax.set(xlim=columns, ylim=rows)
     ax.set_axis_off()
     squares(ax, board.pattern, ListedColormap(["black", "white"]))
     ax.fill(*corners.T, fill=False, edgecolor="black", linewidth=0.5)

@@ -4,18 +4,24 @@ As in the simulation of Gomez-Ojeda and others (ICRA 2015), who use the edge whe
 and the outer edges only to tell which shots show the whole corner.
 """
 
+from dataclasses import replace
+
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array, unit_lines
+from lrfcal_lib.model.board import UNIT_SQUARE, Board
+from lrfcal_lib.model.camera import line_through, pinhole
+from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
 
-EDGE = np.array(
-    [-0.5, -0.5, 0.70711]
-)  # where the plates meet, through the origin of the target
-PLATES = np.array(
-    [[-0.36237, 0.86237, 0.35355], [0.86237, -0.36237, 0.35355]]
-)  # from the edge
+# where the plates meet, through the origin of the target, and the plates' ways from there
+EDGE = np.array([-0.5, -0.5, 0.70711])
+PLATES = np.array([[-0.36237, 0.86237, 0.35355], [0.86237, -0.36237, 0.35355]])
+T_TARGET_PLATES = RigidTransform.from_rotation(
+    Rotation.from_matrix([np.transpose([x, EDGE, np.cross(x, EDGE)]) for x in PLATES])
+)
 SIZE = 1.5  # metres, of a plate away from the edge and along it to either side
+# with the edge on y, and x from there
+PLATE = Board("plate", (), SIZE * ([1, 2] * UNIT_SQUARE - [0, 1]))
 FEWEST_POINTS = 2  # on a plate
 LEAST_LENGTH = 15.0  # of an image line, pixels
 SAMPLES = 601  # of an edge, where it is in the image
@@ -44,18 +50,11 @@ def corner_shots(setup, rng, T_camera_lrf):
 
 def _scanned(setup, rng, T_lrf_target):
     """Where lines through the points on both plates meet, and whether there are enough points."""
-    R = T_lrf_target.rotation.as_matrix()
-    origin = (
-        T_lrf_target.translation[:, None] @ R
-    )  # in the frame of the target but for its place
     rays = polar_to_points(1.0, setup.bearings())
-    turned = rays @ R
-    plates = PLATES[:, None]  # what follows is of both plates, (2, n, B)
-    normals = np.cross(plates, EDGE)
-    ranges = np.matvec(origin, normals) / np.matvec(turned, normals)
-    on_plate = ranges[..., None] * turned - origin
-    away = np.matvec(on_plate, plates)
-    hit = (ranges > 0) & (away > 0) & (away < SIZE) & (np.abs(on_plate @ EDGE) < SIZE)
+    # what follows is of both plates, (2, n, B)
+    poses = [pose_array(T_lrf_target * plate) for plate in T_TARGET_PLATES]
+    radii, ranges = replace(setup, board=PLATE).beside(np.array(poses), rays)
+    hit = (radii < 0).all(axis=-1) & (ranges > 0)
     enough = (hit.sum(axis=-1) >= FEWEST_POINTS).all(axis=0)
     noisy = setup.noisy(rng, ranges)
     meeting = np.cross(*_fitted(noisy[..., None] * rays[:, :2], hit))
@@ -87,5 +86,4 @@ def _image_lines(setup, rng, T_camera_target):
     whole = (inside.any(axis=-1, keepdims=True) & long).all(axis=(1, 2))
 
     noisy = rng.normal(ends[:, 0], setup.sigma_px)
-    both = np.insert(noisy, 2, 1.0, axis=-1).swapaxes(0, 1)
-    return unit_lines(np.cross(*both)), whole
+    return line_through(*noisy.swapaxes(0, 1)), whole

@@ -192,7 +192,7 @@ def observe(
         "placements": np.arange(1, count + 1),
         "direction": np.resize([1, -1], count) * (span != 0),
         "edges": bench.board.edges,
-        "corners": np.asarray(bench.board.corners, float),
+        "corners": bench.board.known_corners(),
         "cameras": tuple(bench.cameras),
         "mounts": (bench.mount,) * len(bench.cameras),
     }
@@ -214,7 +214,8 @@ def _grid(bench, pose, span):
         span = 2 * (np.abs(up - middle).max() + 6 * bench.pitch_step)
     steps = int(span / 2 / bench.pitch_step)
     pitch = middle + bench.pitch_step * np.arange(-steps, steps + 1)
-    T_lrf_platform = _from_platform(bench, "head", pitch * (1 + bench.stretch))
+    true = pitch * (1 + bench.stretch)
+    T_lrf_platform = camera_at(RigidTransform.identity(), "head", bench.T_head_lrf, true)
     T_lrf_board = pose_array(T_lrf_platform * pose)
     p_lrf = apply_pose(T_lrf_board, points)
     bearing = np.arctan2(p_lrf[..., 1], p_lrf[..., 0])
@@ -230,8 +231,10 @@ def _scan_lines(bench, T_lrf_board, pitch, bearings, rng, noise):
     edge = radii.argmax(axis=-1)
     soft = np.hypot(bench.softness, bench.least_softness(r))
     jitter = noise * soft * rng.standard_normal(r.shape)
-    bias = _bias_of_sides(bench, rng)[edge]
-    hit = (radii.max(axis=-1) + jitter < bias) & sensible
+    bias = np.full(radii.shape[-1], bench.bias)  # of each edge
+    if bench.spread:
+        bias, _ = disc_edge(rng.normal(logit(disc_share(bias)), bench.spread))
+    hit = (radii.max(axis=-1) + jitter < bias[edge]) & sensible
     # near to an edge across the scan lines, and along them
     across, along = (
         maximum_filter1d(
@@ -262,26 +265,13 @@ def _scan_lines(bench, T_lrf_board, pitch, bearings, rng, noise):
     }
 
 
-def _from_platform(bench, mount, pitch):
-    """``T_source_platform`` of what is fixed to the head (the LRF) or to the platform."""
-    still = RigidTransform.identity(len(pitch))
-    return camera_at(still, mount, bench.T_head_lrf, pitch)
-
-
-def _bias_of_sides(bench, rng):
-    """How far outside each edge (E,) of a placement a spot still reads the board, spot radii."""
-    bias = np.full(len(bench.board.edges), float(bench.bias))
-    if bench.spread:
-        bias, _ = disc_edge(rng.normal(logit(disc_share(bias)), bench.spread))
-    return bias
-
-
 def _views(bench, pose, at, rng, noise):
     """Poses of the board in the cameras at recorded pitch angles, with errors."""
     pitch = at * (1 + bench.stretch)  # of the head
     if bench.sigma_stop:  # one error for all cameras
         pitch = rng.normal(pitch, noise * bench.sigma_stop)
-    T_source_platform = _from_platform(bench, bench.mount, pitch)
+    still = RigidTransform.identity(len(pitch))
+    T_source_platform = camera_at(still, bench.mount, bench.T_head_lrf, pitch)
     cameras = bench.cameras.values()
     poses = np.concatenate(
         [(camera * T_source_platform * pose).as_matrix() for camera in cameras]

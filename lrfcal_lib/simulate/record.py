@@ -41,6 +41,8 @@ from lrfcal_lib.simulate.scene import (
 )
 
 LICENCE = "CC-BY-4.0"
+# how well T_head_lrf is said to be known: direction (radians) and offset (metres)
+STATED_SIGMA = (np.radians(1.5), 0.020)
 RECORDING = (
     "stop-and-go: the head rests at every pitch step, one scan line and the images are taken at "
     "rest"
@@ -99,22 +101,24 @@ def stops_of(setup: Setup, placement: Placement) -> list[Stops]:
     setup
     placement
     """
-    step = setup.step_of(placement)
     rng = random(setup, STOPS, placement.number)
-    way = placement.direction
     images = np.array(placement.image_pitch)
-    low, high = sorted(placement.sweep)
+    first, last, step = placement.sweep
+    way = 1 if first <= last else -1
+    low, high = sorted([first, last])
     lines = np.arange(np.floor(low / step), np.ceil(high / step) + 1)[::way] * step
-    stop = setup.rig.platform.stop
-    return [Stops(commanded, *stop(commanded, way, rng)) for commanded in (images, lines)]
+    return [
+        Stops(commanded, *setup.rig.platform.stop(commanded, way, rng))
+        for commanded in (images, lines)
+    ]
 
 
 def sweep_of(setup, placement):
     """The scan lines of a placement, one a stop of the sweep: words (L, B) as a device sends."""
-    pitch = stops_of(setup, placement)[1].true
+    _, lines = stops_of(setup, placement)
     world = world_of(setup, placement)
     rng = random(setup, SWEEP, placement.number)
-    return scan(setup.rig.beam, world, pitch[:, None], setup.rig.T_head_lrf, rng)
+    return scan(setup.rig.beam, world, lines.true[:, None], setup.rig.T_head_lrf, rng)
 
 
 def close_views(setup: Setup, number: int) -> list[Placement]:
@@ -130,8 +134,10 @@ def close_views(setup: Setup, number: int) -> list[Placement]:
     camera = rig.cameras[number]
     still = rig.camera_pose(camera, 0.0).inv()
     rng = random(setup, VIEWS, number)
-    poses = held_close(rig, camera, setup.intrinsics_views, rng)
-    return [Placement(CLOSE, still * pose) for pose in poses]
+    return [
+        Placement(CLOSE, still * pose)
+        for pose in held_close(rig, camera, setup.intrinsics_views, rng)
+    ]
 
 
 def shots_of(setup, placements):
@@ -156,9 +162,9 @@ def photograph(setup, shots):
     camera = rig.cameras[shots.camera]
     world = world_of(setup, shots.placement)
     rng = random(setup, *shots.key)
-    poses = rig.camera_pose(camera, shots.stops.true)
     return [
-        encode_jpeg(camera.imager.render(world, pose, rng), setup.quality) for pose in poses
+        encode_jpeg(camera.render(world, pose, rng), setup.quality)
+        for pose in rig.camera_pose(camera, shots.stops.true)
     ]
 
 
@@ -213,7 +219,7 @@ def _record(folder, name, setup):
         name=name,
         licence=LICENCE,
         simulated=True,
-        platform_sigma=rig.stated_sigma,
+        platform_sigma=STATED_SIGMA,
         reference=reference,
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}",
     ) as writer:
@@ -275,8 +281,8 @@ def _add_placements(writer, setup, placements, truth):
     log = []
     took = beam.turns * MIRROR_TURN
     unit = beam.unit_name
-    configuration = Configuration().changed(unit=unit)
-    writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
+    configuration = encode_configuration(Configuration().changed(unit=unit))
+    writer.add_telegrams(-1, [configuration], time_s=0.0)
     shots = shots_of(setup, placements)
     taken = zip(shots, spread(partial(photograph, setup), shots), strict=True)
     cameras = len(setup.rig.cameras)
@@ -285,9 +291,8 @@ def _add_placements(writer, setup, placements, truth):
     for placement in placements:
         number = placement.number
         images, lines = stops_of(setup, placement)
-        shot_at = clock + pause * np.arange(1, len(images.true) + 1)
+        *shot_at, first = clock + pause * np.arange(1, len(images.true) + 2)
         _add_images(writer, setup, islice(taken, cameras), truth, shot_at)
-        first = shot_at[-1] + pause
         began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
         arrived = np.round(began + took + REPLY_TIME, 4)

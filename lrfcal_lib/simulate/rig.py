@@ -1,10 +1,7 @@
 """The simulated rig, the set-ups by name (``setups.json``), and where the board is put."""
 
-import json
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -27,7 +24,7 @@ from lrfcal_lib.session.stated import (
     CameraInfo,
 )
 from lrfcal_lib.simulate.beam import LMS221, Beam
-from lrfcal_lib.simulate.scenarios import in_radians
+from lrfcal_lib.simulate.scenarios import read_json
 from lrfcal_lib.simulate.scene import Exposure, Imager, need
 from lrfcal_lib.simulate.shots import PATTERN
 
@@ -107,20 +104,13 @@ class Platform:
         return np.rint(motor / step) * step if step else motor
 
 
-@dataclass(frozen=True)
-class RigCamera:
+@dataclass(frozen=True, kw_only=True)
+class RigCamera(Imager):
     """A camera on the head of the rig."""
 
     name: str
-    model: CameraModel  # true intrinsics
     mounting: RigidTransform  # T_camera_lrf
     guess: RigidTransform  # the same as a tape measure gives it
-    exposure: Exposure = Exposure()
-
-    @cached_property
-    def imager(self) -> Imager:
-        """Takes its pictures."""
-        return Imager(self.model, self.exposure)
 
 
 @dataclass(frozen=True)
@@ -136,8 +126,6 @@ class Rig:
     board: Board  # with corners
     # width of the outermost squares of the board's pattern as a share of a square
     ring: float = 0.65
-    # how well the stated transform is said to be known: direction (radians) and offset (metres)
-    stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
     def camera_pose(self, camera: RigCamera, pitch: ArrayLike) -> RigidTransform:
         """``T_camera_platform`` of a camera.
@@ -195,19 +183,13 @@ class Setup:
     stations: tuple[InstanceOf[RigidTransform], ...]
     quality: Annotated[int, Field(ge=1, le=100)]  # of JPEG
 
-    def step_of(self, placement: "Placement") -> float:
-        """Between the stops of a sweep, radians."""
-        if placement.T_platform_board is None and self.room_sweep:
-            return self.room_sweep[2]
-        return self.step
-
 
 def printed_triangle() -> Board:
     """The paper's triangle (315 and 380 mm, a right angle) with 4 x 5 inner corners beside it."""
     return triangle_board(name="triangle_315_380", pattern=PATTERN)
 
 
-SETUPS = json.loads(Path(__file__).with_name("setups.json").read_text())
+SETUPS = read_json("setups.json")
 
 
 def load_setup(name: str) -> Setup:
@@ -223,21 +205,20 @@ def load_setup(name: str) -> Setup:
         For a name that is not there.
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
-    row = in_radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
+    row = SETUPS[SETUPS[name].get("like", name)] | SETUPS[name]
     rig = Rig(
         beam=replace(LMS221, **row["beam"]),
-        platform=Platform(**in_radians(row["platform"])),
-        T_head_lrf=_placed(row["head"]),
-        T_head_lrf_stated=_placed(row["head_stated"]),
+        platform=Platform(**row["platform"]),
+        T_head_lrf=row["head"],
+        T_head_lrf_stated=row["head_stated"],
         cameras=tuple(
             _camera(key, camera, row["image_width"], row["exposure"])
             for key, camera in row["cameras"].items()
         ),
         board=printed_triangle(),
     )
-    stations = tuple(_placed(station) for station in row["stations"])
     # what else is in the row the Setup ignores
-    return Setup(**row | {"name": name, "rig": rig, "stations": stations})
+    return Setup(**row | {"name": name, "rig": rig})
 
 
 def _camera(name, row, width, exposure):
@@ -245,19 +226,14 @@ def _camera(name, row, width, exposure):
     scale = width / row["size"][0]
     turn = Rotation.from_rotvec(row["turn"], degrees=True) * AHEAD
     mounting = carry(turn, row["centre"])
-    off = Rotation.from_rotvec(row["guess"]["turn"], degrees=True)
-    shift = mounting.translation + row["guess"]["shift"]
+    off = Rotation.from_rotvec(row["guess_turn"], degrees=True)
+    shift = mounting.translation + row["guess_shift"]
     guess = RigidTransform.from_components(shift, off * mounting.rotation)
     size = [round(v * scale) for v in row["size"]]
     pinhole = [v * scale for v in row["pinhole"]]
     model = CameraModel(*size, *pinhole, np.array(row["distortion"]))
-    return RigCamera(name, model, mounting, guess, Exposure(**exposure | row["exposure"]))
-
-
-def _placed(row):
-    """The transform of a shift and a turn."""
-    turn = Rotation.from_rotvec(row["turn"], degrees=True)
-    return RigidTransform.from_components(row["shift"], turn)
+    light = Exposure(**exposure | row["exposure"])
+    return RigCamera(model, light, name=name, mounting=mounting, guess=guess)
 
 
 @dataclass(frozen=True)
@@ -267,8 +243,8 @@ class Placement:
     number: int  # CLOSE for a board that is held before a camera
     # None for a sweep of the room, with a laid table near the rig
     T_platform_board: RigidTransform | None = None
-    # pitch commands of the first and the last scan line, radians
-    sweep: tuple[float, float] = (0.0, 0.0)
+    # pitch commands of the first and the last scan line, and the step between lines, radians
+    sweep: tuple[float, float, float] = (0.0, 0.0, 1.0)
     # pitch commands of the images in the order in which they are taken, radians
     image_pitch: tuple[float, ...] = (0.0,)
     T_room_platform: RigidTransform | None = None  # of a station; room is room.json's frame
@@ -279,11 +255,6 @@ class Placement:
         if self.number == CLOSE:
             return "intrinsics"
         return "scene" if self.T_platform_board is None else "board"
-
-    @property
-    def direction(self):
-        """+1 for a sweep upwards, -1 downwards."""
-        return 1 if self.sweep[1] >= self.sweep[0] else -1
 
 
 def random(setup: Setup, *key: int) -> np.random.Generator:
@@ -300,12 +271,20 @@ def placements_of(setup: Setup) -> list[Placement]:
     """
     out = []
     if setup.pairs:
-        rng = random(setup, PLACES)
-        out = pairs(setup.rig, setup.pairs, setup.distances, rng, setup.margin)
+        out = pairs(
+            setup.rig,
+            setup.pairs,
+            setup.distances,
+            random(setup, PLACES),
+            setup.margin,
+            setup.step,
+        )
     if setup.room_sweep:
-        sweep = setup.room_sweep[:2]
         for station in setup.stations or (None,):
-            out.append(Placement(len(out) + 1, None, sweep, setup.room_images, station))
+            number = len(out) + 1
+            out.append(
+                Placement(number, None, setup.room_sweep, setup.room_images, station)
+            )
     return out
 
 
@@ -315,6 +294,7 @@ def pairs(
     distances: tuple[float, float],
     rng: np.random.Generator,
     margin: float,
+    step: float,
 ) -> list[Placement]:
     """Placements in pairs: at one place, turned by about a right angle and tilted otherwise.
 
@@ -331,6 +311,8 @@ def pairs(
     rng
     margin
         By which a sweep begins and ends outside of the board, radians.
+    step
+        Between the stops of a sweep, radians.
 
     Raises
     ------
@@ -344,7 +326,7 @@ def pairs(
     out = []
     for distance in rng.permutation(np.linspace(*distances, count)):
         for _ in range(MOST_TRIES):
-            both = _pair(rig, len(out) + 1, distance, rng, margin)
+            both = _pair(rig, len(out) + 1, distance, rng, margin, step)
             if all(both):
                 break
         else:
@@ -356,7 +338,7 @@ def pairs(
     return out
 
 
-def _pair(rig, first, distance, rng, margin):
+def _pair(rig, first, distance, rng, margin, step):
     """Two placements about one middle, by the number of the first; boards face the rig up to 35
     deg.
     """
@@ -370,12 +352,12 @@ def _pair(rig, first, distance, rng, margin):
     turned = Rotation.from_euler("z", -azimuth) * AHEAD * leant
     centre = rig.board.points().mean(axis=0)
     return [
-        _placement(rig, number, carry(rotation, centre, middle), margin)
+        _placement(rig, number, carry(rotation, centre, middle), margin, step)
         for number, rotation in enumerate(turned, first)
     ]
 
 
-def _placement(rig, number, pose, margin):
+def _placement(rig, number, pose, margin, step):
     """A Placement swept over the whole board, with images where all cameras see it.
 
     None where that is too little.
@@ -399,7 +381,7 @@ def _placement(rig, number, pose, margin):
         shares = [0.0]
     half = min(np.ptp(seen) * 0.4, np.radians(9.0))
     angles = np.degrees(np.mean(seen[[0, -1]]) + half * np.array(shares))
-    return Placement(number, pose, sweep, tuple(np.radians(np.round(angles, 2))))
+    return Placement(number, pose, (*sweep, step), tuple(np.radians(np.round(angles, 2))))
 
 
 def held_close(

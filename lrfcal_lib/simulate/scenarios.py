@@ -6,18 +6,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.stated import TransformStated, board_from_json
 from lrfcal_lib.simulate.shots import Scenario
 
-FILE = json.loads(Path(__file__).with_name("scenarios.json").read_text())
+
+def _placed(row):
+    """The transform of a shift and a turn."""
+    turn = Rotation.from_rotvec(row["turn"], degrees=True)
+    return RigidTransform.from_components(row["shift"], turn)
 
 
-MADE = {
-    "model": lambda stated: CameraModel(**stated),
-    "board": board_from_json,
-    "T_camera_lrf": lambda stated: TransformStated(**stated).made(),
+MADE = {  # of rows that have this key
+    "shift": _placed,
+    "fx": lambda row: CameraModel(**row),
+    "corners_m": board_from_json,
+    "translation_m": lambda row: TransformStated(**row).made(),
 }
 
 
@@ -25,9 +31,7 @@ def load_scenario(name: str) -> Scenario:
     """A scenario of ``scenarios.json``; ValueError names those that there are."""
     if name not in FILE:
         raise ValueError(f"unknown scenario {name!r}: use one of {', '.join(FILE)}")
-    settings = in_radians(FILE[name])
-    made = {key: MADE[key](settings[key]) for key in MADE.keys() & settings.keys()}
-    return Scenario(name=name, **settings | made)
+    return Scenario(name=name, **FILE[name])
 
 
 def in_radians(row: dict) -> dict[str, Any]:
@@ -45,6 +49,22 @@ def in_radians(row: dict) -> dict[str, Any]:
             value = tuple(value)
         turned[key.removesuffix("_deg")] = value
     return turned
+
+
+def read_json(name: str) -> dict:
+    """A file of this folder: what `MADE` knows is made, other rows are as of :func:`in_radians`."""
+    text = Path(__file__).with_name(name).read_text()
+    return json.loads(text, object_hook=_made)
+
+
+def _made(row):
+    for key, make in MADE.items():
+        if key in row:
+            return make(row)
+    return in_radians(row)
+
+
+FILE = read_json("scenarios.json")
 
 
 def varied(scenario: Scenario, key: str, value: float) -> Scenario:
@@ -68,7 +88,7 @@ def varied(scenario: Scenario, key: str, value: float) -> Scenario:
         raise ValueError(f"nothing called {key!r} can be varied: use one of {known}")
     if not value > 0 and key not in ("bias", "spread"):
         raise ValueError(f"{key}={value:g}: a positive number is needed")
-    changed = VARIED[key](scenario, value)
+    changed = in_radians(VARIED[key](scenario, value))
     return replace(scenario, varied=scenario.varied | {key: value}, **changed)
 
 
@@ -81,14 +101,14 @@ def _spot(scenario, value):
 VARIED = {
     "range_noise_mm": lambda scenario, value: {"sigma_range": value / 1000},
     "pixel_noise_px": lambda scenario, value: {"sigma_px": value},
-    "step_deg": lambda scenario, value: {"step": np.radians(value)},
+    "step_deg": lambda scenario, value: {"step_deg": value},
     "spot_mm": _spot,
     "bias": lambda scenario, value: {"bias": value},  # spot radii
     "spread": lambda scenario, value: {"spread": value},  # of the bias, spot radii
     "board_scale": lambda scenario, value: {"board": _scaled(scenario.board, value)},
-    "lean_deg": lambda scenario, value: {"lean": np.radians(value)},  # at most
+    "lean_deg": lambda scenario, value: {"lean_deg": value},  # at most
     # standard deviation; a degree comes with 17 mm
-    "start_deg": lambda scenario, value: {"start": (np.radians(value), np.radians(value))},
+    "start_deg": lambda scenario, value: {"start_deg": [value, value]},
 }
 
 

@@ -11,6 +11,7 @@ rebuilt from them to the byte.
 
 import json
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -54,12 +55,12 @@ class Thing:
     """A mesh with what its surface does with light."""
 
     mesh: np.ndarray  # corners of triangles (m, 3, 3) in the thing's own frame, metres
-    # function of points (n, 3) in the thing's frame and settings to albedo (n, 3), then the
-    # settings
+    # function of points (n, 3) in the thing's frame and settings to albedo (n, 3), or what is
+    # broadcast to that; then the settings
     texture: tuple
     pose: RigidTransform = RigidTransform.identity()  # T_platform_thing
-    # diffuse reflectivity at the LRF's wavelength (905 nm); None takes the red albedo
-    infrared: float | None = None
+    # diffuse reflectivity at the LRF's wavelength (905 nm); NaN takes the red albedo
+    infrared: float = np.nan
     # the LRF is dazzled when its spot meets it (a lamp, the sun in a window)
     dazzles: bool = False
     glow: float = 0.0  # light it gives off by itself, in units of full albedo
@@ -106,13 +107,13 @@ class World:
         corners = np.concatenate(meshes)
         first, second, third = np.moveaxis(corners, 1, 0)
         normals = np.cross(second - first, third - first)
-        # the poles of a lathe make empty triangles
-        whole = np.linalg.norm(normals, axis=1) > 1e-12
-        self.normals = unit_vector(normals[whole])
-        self.offsets = np.vecdot(self.normals, first[whole])
+        # the poles of a lathe make empty triangles, which no ray meets
+        areas = np.linalg.norm(normals, axis=1, keepdims=True)
+        self.normals = normals / np.maximum(areas, 1e-12)
+        self.offsets = np.vecdot(self.normals, first)
         sizes = [len(mesh) for mesh in meshes]
-        self.thing_of = np.repeat(np.arange(len(sizes)), sizes)[whole]
-        vertices = corners[whole].reshape(-1, 3).astype(np.float32)
+        self.thing_of = np.repeat(np.arange(len(sizes)), sizes)
+        vertices = corners.reshape(-1, 3).astype(np.float32)
         faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(vertices, faces)
@@ -175,9 +176,9 @@ class World:
         -------
         ndarray, shape (...)
         """
-        stated = np.array([t.infrared for t in self.things], float)  # NaN for None
+        stated = np.array([t.infrared for t in self.things])[thing]
         red = self.albedo(points, thing)[..., 0]
-        return np.where(np.isnan(stated[thing]), red, stated[thing])
+        return np.where(np.isnan(stated), red, stated)
 
     def radiance(self, hits: Hits) -> np.ndarray:
         """Light that comes back along rays, linear.
@@ -269,25 +270,30 @@ class Exposure:
     samples: PositiveInt = 3
 
 
+@dataclass(frozen=True)
 class Imager:
-    """A camera with the viewing ray of every corner of every pixel.
+    """A camera that takes pictures."""
 
-    Raises ValueError if the lens folds the image (two viewing rays would fall on one pixel), or for
-    an odd size.
-    """
+    model: CameraModel  # true intrinsics
+    exposure: Exposure = Exposure()
 
-    def __init__(self, model: CameraModel, exposure: Exposure | None = None):
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """Viewing rays (height + 1, width + 1, 3) of every corner of every pixel.
+
+        Raises ValueError if the lens folds the image (two viewing rays would fall on one pixel), or
+        for an odd size.
+        """
+        m = self.model
         need(
-            not np.any(model.size % BLOCK),
-            f"the image is {model.width} x {model.height} pixels, both must be multiples of "
-            f"{BLOCK}",
+            not np.any(m.size % BLOCK),
+            f"the image is {m.width} x {m.height} pixels, both must be multiples of {BLOCK}",
         )
-        self.model = model
-        self.exposure = exposure or Exposure()
-        corners = np.indices(model.size + 1).T - 0.5  # u, v
-        self.rays = model.sights(undistort(corners, model))
-        miss = np.abs(project(self.rays, model) - corners).max()
-        need(miss < 1e-3, f"lens {model.distortion} folds the image: weaken the distortion")
+        corners = np.indices(m.size + 1).T - 0.5  # u, v
+        rays = m.sights(undistort(corners, m))
+        miss = np.abs(project(rays, m) - corners).max()
+        need(miss < 1e-3, f"lens {m.distortion} folds the image: weaken the distortion")
+        return rays
 
     def render(
         self, world: World, T_camera_platform: RigidTransform, rng: np.random.Generator

@@ -69,11 +69,9 @@ def lathe(radius, height, sides=48):
     return grid_surface(x, y, np.transpose([height]))
 
 
-def cylinder(radius, height, sides=48, top=None):
-    """A closed cylinder about z from z = 0 upwards; `top` is the upper radius of a cone."""
-    return lathe(
-        [0, radius, radius if top is None else top, 0], [0, 0, height, height], sides
-    )
+def cylinder(radius, height, sides=48):
+    """A closed cylinder about z from z = 0 upwards."""
+    return lathe([0, radius, radius, 0], [0, 0, height, height], sides)
 
 
 def sphere(radius):

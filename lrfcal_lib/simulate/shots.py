@@ -118,8 +118,7 @@ class Scenario(Devices):
         axis in the board, anywhere in the image.
         """
         angle = rng.uniform(0, 2 * np.pi, count)
-        axis = polar_to_points(1.0, angle)
-        rotation = Rotation.from_rotvec(self.tilt * axis) * FACING
+        rotation = Rotation.from_rotvec(polar_to_points(self.tilt, angle)) * FACING
         away = rng.uniform(*self.distances, count)
         pixels = rng.uniform(0, self.model.size, (count, 2))
         centre = away[:, None] * self.model.sights(pixels)
@@ -175,7 +174,7 @@ def draw_shots(
     parts = []
     failing = []
     missing = np.full(trials, placements)
-    while missing.any() and len(parts) < MOST_ROUNDS:
+    for _ in range(MOST_ROUNDS):
         trial = np.repeat(np.arange(trials), 2 * missing)
         conditions, shots = draw(setup, rng, T_camera_lrf[trial])
         good = np.array([*conditions.values()])
@@ -184,7 +183,9 @@ def draw_shots(
         part = {name: value[good.all(axis=0)] for name, value in shots.items()}
         parts.append(part)
         missing = np.maximum(missing - np.bincount(part["trial"], minlength=trials), 0)
-    if missing.any():
+        if not missing.any():
+            break
+    else:
         means = zip(np.mean(failing, axis=0), conditions, strict=True)
         shares = [f"{share:.0f} % {words}" for share, words in means]
         raise ValueError(
@@ -213,10 +214,9 @@ def board_shots(setup, rng, T_camera_lrf):
     true = pose_array(T_camera_lrf * T_lrf_board)
     corners = apply_pose(true, board.points())
     uv = pinhole(corners, setup.model)
-    inside = (uv > 0) & (uv < setup.model.size)
     ahead = (corners[..., 2] > LEAST_DEPTH).all(axis=1)
     if setup.whole_image:
-        ahead &= inside.all(axis=(1, 2))
+        ahead &= ((uv > 0) & (uv < setup.model.size)).all(axis=(1, 2))
     conditions = {
         f"have fewer than {setup.fewest_beams} beams on the board": enough,
         "are crossed near a corner": clear,
@@ -246,11 +246,10 @@ def _crossed_edges(setup, pose, ends):
     """Edges (n, 2) that the scan plane crosses, at the low and the high bearing, of convex boards
     at poses (n, 3, 4) with corners there, and whether both crossings are clear of other edges.
     """
-    following = np.roll(ends, -1, axis=1)
-    height = ends[..., 2]
-    crossed = height * following[..., 2] < 0
-    share = height / np.where(crossed, height - following[..., 2], 1.0)
-    at = ends + share[..., None] * (following - ends)
+    along = np.roll(ends, -1, axis=1) - ends
+    share = -ends[..., 2] / along[..., 2]
+    crossed = (share > 0) & (share < 1)
+    at = ends + share[..., None] * along
     bearing = np.where(crossed, np.arctan2(at[..., 1], at[..., 0]), np.nan)
     edges = np.argsort(bearing, axis=1)[:, :2]  # NaN comes last
     at = np.take_along_axis(at, edges[..., None], axis=1)

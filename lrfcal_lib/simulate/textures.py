@@ -39,10 +39,10 @@ def plain(
 
     Returns
     -------
-    ndarray, shape (n, 3)
+    ndarray, shape (n, 3) or (3,)
     """
     if not rough:
-        return np.broadcast_to(color, points.shape)
+        return color
     tone = 1 + rough * (value_noise(points, cell) - 0.5)
     return tone[:, None] * color
 
@@ -94,12 +94,7 @@ def printed_page(points, width, height):
     ink |= between(x, 0.2, 0.8) & between(y, 0.075, 0.125)
     picture = between(x, 0.52, 0.88) & between(y, 0.55, 0.8)
     shades = 0.25 + 0.5 * value_noise(points, 0.02)
-    return _grey(np.select([picture, ink], [shades, 0.12], 0.86))
-
-
-def _grey(levels):
-    """Levels (n,) as colours (n, 3)."""
-    return np.tile(levels[:, None], 3)
+    return np.select([picture, ink], [shades, 0.12], 0.86)[:, None]
 
 
 def between(values, low, high):
@@ -152,4 +147,4 @@ def chessboard(points, board, dark, light, ring=0.5):
         inside = between(at, -ring, end).all(axis=1)
         even = whole_below(at).sum(axis=1) % 2 == 0
         grey[inside & even] = light
-    return _grey(grey)
+    return grey[:, None]
