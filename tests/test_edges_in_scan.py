@@ -165,3 +165,9 @@ def test_where_view_or_sweep_end_or_something_hides_the_board_is_no_edge():
     ):
         e = function(found(s))
         assert set(e.end[e.side >= 0]) == {end} and s.worst(e) < 0.012
+
+
+def test_a_board_that_is_larger_than_the_view_has_no_edges():
+    b = found(scene(pose=facing(1.3), view=(82, 98), pitch=(-9, 8)))
+    for edges in (edge_points(b), sweep_edges(b)):
+        assert not len(edges.side) and not edges.sides
