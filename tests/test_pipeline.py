@@ -51,7 +51,6 @@ def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
         None,
         None,
         {1: "a", 2: "b"},
-        {1: "a", 2: "b"},
         names={1: {}, 2: {}},
         views={"left": {1: "v", 2: "v"}},
     )
@@ -61,5 +60,5 @@ def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
     )
     ready = replace(ready, problems=(whole, part))
     left = pipeline.without(ready)
-    assert list(left.scans) == list(left.names) == list(left.edges) == [1]
+    assert list(left.scans) == list(left.names) == [1]
     assert list(left.views["left"]) == [1, 2]

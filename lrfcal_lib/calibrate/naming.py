@@ -51,10 +51,10 @@ def name_sides(prepared: Prepared) -> Prepared:
                 continue
             T_board_source = view.T_camera_board.inv() * T_camera_source
             source = source_of(prepared, camera, placement, None)
-            sides = {
-                side.number: T_board_source.apply(source.points(side.points, side.pitch))
-                for side in sides_of(prepared, placement)
-            }
+            sides = {}
+            for side in sides_of(prepared, placement):
+                p_source = source.points(side.crossed.points, side.crossed.pitch)
+                sides[side.number] = T_board_source.apply(p_source)
             names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
             for why in dropped[placement].values():
                 problems.append(

@@ -34,13 +34,9 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.kinematics import AS_RECORDED
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
-from lrfcal_lib.preprocess.prepared import (
-    LEAST_SWEEP,
-    VARIANTS,
-    PitchNoise,
-    Prepared,
-    prepare_scans,
-)
+from lrfcal_lib.preprocess.board_in_scan import LEAST_SWEEP
+from lrfcal_lib.preprocess.edges_in_scan import VARIANTS
+from lrfcal_lib.preprocess.prepared import PitchNoise, Prepared, prepare_scans
 from lrfcal_lib.preprocess.survey import all_views, prepare_images
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
@@ -278,7 +274,6 @@ def without(prepared: Prepared) -> Prepared:
         scans=kept(prepared.scans),
         names=kept(prepared.names),
         dropped=kept(prepared.dropped),
-        edges=kept(prepared.edges),
     )
 
 

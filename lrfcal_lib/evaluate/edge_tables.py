@@ -14,7 +14,8 @@ from lrfcal_lib.calibrate.outline import MeasuredBoard
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
+from lrfcal_lib.preprocess.edges_in_scan import VARIANTS
+from lrfcal_lib.preprocess.prepared import Prepared
 
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
@@ -55,7 +56,8 @@ def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
     for variant in VARIANTS:
         misses = {edge: [np.zeros(0)] for edge in lines}
         for placement, names in prepared.names.items():
-            scanned = prepared.edges[placement][variant][0]
+            scanned = prepared.scans[placement].edges[variant]
+            scanned = scanned[~scanned.across]
             pitch = truth.pitch[placement][scanned.line]
             flat = truth.on_board(truth.boards[placement], scanned.points, pitch)
             for side, edge in names.items():

@@ -367,7 +367,7 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
                 severe=True,
             )
     unknown = calibration.platform.problem("combined")
-    sweeps = any(len(ways["half_step"]) > 1 for ways in prepared.edges.values())
+    sweeps = any(scan.swept for scan in prepared.scans.values())
     if unknown and sweeps:
         yield Fault(Kind.FAR_FROM_STATED, unknown.words, severe=True)
 

@@ -1,6 +1,6 @@
 """The board in a sweep: the nearest flat surface of its size, with a straight line a scan line."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -19,6 +19,7 @@ from lrfcal_lib.preprocess.surfaces import (
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import StatedRig
 
+LEAST_SWEEP = np.deg2rad(1.0)  # a placement whose pitch spans less is a single shot
 MEDIAN_WIDTH = 5  # beams
 FEWEST_BEAMS = 4  # on a scan line, for a straight line with a covariance
 LINE_ROUNDS = 4  # of Tukey's weights
@@ -64,6 +65,17 @@ class BoardScan:
         Returns within or next to the board that were rejected: mixed pixels and outliers.
     spot : float
         Angle that the radius of the spot takes up at the board, radians; 0 where nothing states it.
+    edges : dict of str to recarray
+        Where the scan lines cross the board's sides, and, unless it is a single shot, the columns
+        (where the sweep enters and leaves the board), by edge-point variant; empty before
+        :func:`lrfcal_lib.preprocess.edges_in_scan.with_edges`. ``points``, LRF frame at the pitch
+        of the point, metres, on the fitted scan line, with their ``covariance`` and ``pitch``
+        (radians); ``line`` and ``beam`` of the last cell that hit the board, and the ``step``
+        from there to the first cell off it, likewise; ``across`` where a column crosses; ``side``,
+        the number of the straight side, -1 for outliers; ``background``, what its distance adds to
+        the log odds at which readings flip.
+    sides : tuple of ScanSide
+        The straight sides, first those that scan lines cross.
     """
 
     placement: int
@@ -79,6 +91,13 @@ class BoardScan:
     sigma_range: float
     n_jump_points: int
     spot: float = 0.0
+    edges: dict[str, np.recarray] = field(default_factory=dict)
+    sides: tuple = ()
+
+    @property
+    def swept(self) -> np.bool:
+        """Whether it is no single shot."""
+        return np.ptp(self.sweep.pitch) > LEAST_SWEEP
 
 
 def find_board(
