@@ -15,7 +15,7 @@ from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections, SourceFrame
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations, thin
-from lrfcal_lib.preprocess.board_in_scan import face_points
+from lrfcal_lib.preprocess.board_in_scan import BoardScan, face_points
 from lrfcal_lib.preprocess.edges_in_scan import ScanSide
 from lrfcal_lib.preprocess.prepared import Prepared
 
@@ -54,8 +54,8 @@ def observe(
         Known errors of what was recorded, which are taken out of points and pitch; see
         :attr:`lrfcal_lib.solvers.joint.JointSolution.corrections`.
     crossings, faces : int
-        Kept of each edge and of the face of a placement, evenly spread; without `faces` only
-        crossings are paired.
+        Kept of each edge and of the face of a placement, evenly spread; without one of them
+        only the other is paired.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def observe(
         if variant == ONE_SCAN:
             sides = _one_scan_line(prepared.board.features, view, sides)
         crossed += _crossings(prepared, view, source, sides, crossings)
-        if faces and placement in prepared.names:
+        if faces and crossings and scan.names:
             corners += _corners(prepared, view, source, rule)
     pattern = prepared.pattern_points
     model = prepared.models[camera]
@@ -118,7 +118,7 @@ def platform_observations(
     for placement, scan in prepared.scans.items():
         if not scan.swept:
             continue
-        feature = _feature_sides(list(sides_of(prepared, placement, variant)))
+        feature = _feature_sides(list(sides_of(scan, variant)))
         for number, side in enumerate(feature, 1):
             crossed = thin(side.crossed, PLATFORM_POINTS)
             sides.append(
@@ -296,30 +296,26 @@ class SweepSide:
         return self.straight.length if self.straight else 0.0
 
 
-def sides_of(
-    prepared: Prepared, placement: int, variant: str = "half_step"
-) -> Iterator[SweepSide]:
-    """The sides of a placement, in the order of their numbers.
+def sides_of(scan: BoardScan, variant: str = "half_step") -> Iterator[SweepSide]:
+    """The sides of the board in a sweep, in the order of their numbers.
 
     Parameters
     ----------
-    prepared : Prepared
-    placement : int
+    scan : BoardScan
+        With its edges.
     variant : {'half_step', 'last_beam'}
 
     Yields
     ------
     SweepSide
     """
-    names = prepared.names.get(placement, {})
-    scan = prepared.scans[placement]
     edges = scan.edges[variant]
     for number in np.unique(edges.side[edges.side >= 0]).tolist():
         straight = next((side for side in scan.sides if side.number == number), None)
         across = straight is not None and straight.across
         yield SweepSide(
             number=number,
-            name=names.get(number, ""),
+            name=scan.names.get(number, ""),
             crossed=edges[(edges.side == number) & (edges.across == across)],
             across=across,
             straight=straight,
@@ -333,8 +329,9 @@ def named_sides(
 
     Parameters
     ----------
-    prepared, placement, variant
-        See :func:`sides_of`.
+    prepared : Prepared
+    placement : int
+    variant : {'half_step', 'last_beam'}
     stretch : float
         Share of an edge that the sweep must show.
 
@@ -342,7 +339,7 @@ def named_sides(
     ------
     SweepSide
     """
-    for side in sides_of(prepared, placement, variant):
+    for side in sides_of(prepared.scans[placement], variant):
         if side.name and side.length >= stretch * prepared.board.lengths()[side.name]:
             yield side
 

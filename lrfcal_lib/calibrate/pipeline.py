@@ -265,16 +265,8 @@ def prepare(session: Session) -> Prepared:
 def without(prepared: Prepared) -> Prepared:
     """Drop the placements that are left out from everything but the images."""
     left_out = prepared.left_out
-
-    def kept(by_placement):
-        return {p: part for p, part in by_placement.items() if p not in left_out}
-
-    return replace(
-        prepared,
-        scans=kept(prepared.scans),
-        names=kept(prepared.names),
-        dropped=kept(prepared.dropped),
-    )
+    scans = {p: scan for p, scan in prepared.scans.items() if p not in left_out}
+    return replace(prepared, scans=scans)
 
 
 def find_pitch_errors(prepared: Prepared) -> PitchErrors | None:

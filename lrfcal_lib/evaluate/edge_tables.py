@@ -55,12 +55,12 @@ def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
     lines = dict(zip(truth.board.edges, truth.board.lines(), strict=True))
     for variant in VARIANTS:
         misses = {edge: [np.zeros(0)] for edge in lines}
-        for placement, names in prepared.names.items():
-            scanned = prepared.scans[placement].edges[variant]
+        for placement, scan in prepared.scans.items():
+            scanned = scan.edges[variant]
             scanned = scanned[~scanned.across]
             pitch = truth.pitch[placement][scanned.line]
             flat = truth.on_board(truth.boards[placement], scanned.points, pitch)
-            for side, edge in names.items():
+            for side, edge in scan.names.items():
                 misses[edge].append(flat[scanned.side == side] @ lines[edge])
         for edge, parts in misses.items():
             miss = pd.Series(1000 * np.concatenate(parts))
@@ -128,7 +128,7 @@ def edge_lengths(
 def _outlines(prepared, variant, T_head_lrf):
     """Outlines and their weak sides (see :func:`outline_of`) by placement, as far as they exist."""
     out = {}
-    for placement in prepared.names:
+    for placement in prepared.scans:
         with suppress(DegenerateGeometry):
             out[placement] = outline_of(prepared, placement, variant, T_head_lrf)
     return out

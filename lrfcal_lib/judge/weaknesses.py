@@ -205,12 +205,11 @@ def sides_elsewhere(prepared: Prepared) -> Iterator[Fault]:
     Fault
         One an edge.
     """
-    elsewhere = [side for sides in prepared.dropped.values() for side in sides.values()]
+    scans = prepared.scans.values()
+    elsewhere = [side for scan in scans for side in scan.dropped.values()]
     for edge in prepared.board.edges:
         dropped = [side for side in elsewhere if side.edge == edge]
-        crossed = len(dropped) + sum(
-            edge in names.values() for names in prepared.names.values()
-        )
+        crossed = len(dropped) + sum(edge in scan.names.values() for scan in scans)
         if len(dropped) >= FEWEST and len(dropped) > MOST * crossed:
             turn = np.degrees(np.median([side.turn for side in dropped]))
             off = 1000 * np.median([side.distance for side in dropped])

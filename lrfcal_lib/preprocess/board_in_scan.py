@@ -76,6 +76,11 @@ class BoardScan:
         the log odds at which readings flip.
     sides : tuple of ScanSide
         The straight sides, first those that scan lines cross.
+    names : dict of int to str
+        Board edge of each side, by its number; empty before
+        :func:`lrfcal_lib.calibrate.naming.name_sides`.
+    dropped : dict of int to DroppedSide
+        Sides that got no name because the board has no edge there, likewise.
     """
 
     placement: int
@@ -91,8 +96,10 @@ class BoardScan:
     sigma_range: float
     n_jump_points: int
     spot: float = 0.0
-    edges: dict[str, np.recarray] = field(default_factory=dict)
+    edges: dict = field(default_factory=dict)
     sides: tuple = ()
+    names: dict = field(default_factory=dict)
+    dropped: dict = field(default_factory=dict)
 
     @property
     def swept(self) -> np.bool:

@@ -91,7 +91,7 @@ class Prepared:
         With its outline, measured from the images where the session does not state it and they show
         it.
     scans : dict of int to BoardScan
-        By placement, with their edges.
+        By placement, with their edges and the names of these.
     models : dict of str to CameraModel
     views : dict of str to dict of int to BoardView
         By camera and placement; where there are images at several pitch angles, the one with most
@@ -100,10 +100,6 @@ class Prepared:
     relief : ndarray, shape (k,), or 0.0
         Heights of the pattern's corners over the sheet's mean plane, metres (see the survey of the
         images).
-    names : dict of int to dict of int to str
-        Board edge of each side of the scan, by placement and side number.
-    dropped : dict of int to dict of int to DroppedSide
-        Sides that got no name because the board has no edge there, likewise.
     pitch_noise : PitchNoise
         What the recordings themselves tell about it.
     problems : tuple of Problem
@@ -117,8 +113,6 @@ class Prepared:
     views: dict = field(default_factory=dict)
     outline: Outline | None = None
     relief: np.ndarray | float = 0.0
-    names: dict = field(default_factory=dict)
-    dropped: dict = field(default_factory=dict)
     pitch_noise: PitchNoise = PitchNoise()
     problems: tuple[Problem, ...] = ()
 
