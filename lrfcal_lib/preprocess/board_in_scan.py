@@ -107,9 +107,7 @@ class BoardScan:
         return np.ptp(self.sweep.pitch) > LEAST_SWEEP
 
 
-def find_board(
-    sweep: Sweep, rig: StatedRig, rng: np.random.Generator | None = None
-) -> BoardScan:
+def find_board(sweep: Sweep, rig: StatedRig) -> BoardScan:
     """Find the board in a sweep, filter its ranges and fit a straight line to each scan line.
 
     Parameters
@@ -118,8 +116,6 @@ def find_board(
     rig : StatedRig
         Its board tells the size by its outline, else by its pattern, its LRF the spot; the platform
         may be roughly known, without one the tilt axis is taken to be the x axis of the LRF.
-    rng : numpy.random.Generator, optional
-        For the random sampling; by default always the same.
 
     Returns
     -------
@@ -133,9 +129,7 @@ def find_board(
     T_head_lrf = rig.T_head_lrf
     if T_head_lrf is None:
         T_head_lrf = RigidTransform.identity()
-    if rng is None:
-        rng = np.random.default_rng(0)
-    surface = planar_surface(sweep, T_head_lrf, rig, rng)
+    surface = planar_surface(sweep, T_head_lrf, rig, np.random.default_rng(0))
     mask = surface.mask
     filtered = median_filter(sweep.ranges, mask)
     lines, covariance = fit_lines(filtered, sweep.bearings)
