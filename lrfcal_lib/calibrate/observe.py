@@ -405,7 +405,7 @@ def _crossings(prepared, view, source, sides, count):
             "covariance": source.covariance(crossed.covariance, pitch) + pitch_error,
             "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
             "background": crossed.background,
-            "lines": np.tile(edge.line, (len(crossed), 1)),
+            "lines": np.broadcast_to(edge.line, p_lrf.shape),
             "line_sigma": np.sqrt(edge.covariance[0, 0]),
             "placement": source.placement,
             "edge": side.name,
