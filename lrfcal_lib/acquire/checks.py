@@ -149,8 +149,8 @@ def check_scan(sweep: Sweep | None, rig: StatedRig) -> list[Light]:
 
 def _check_sides(scan):
     """How many straight sides of the board the scans cross, and how."""
-    by_number = {side.number: side for side in with_edges(scan).sides[::-1]}
-    good = [side for side in by_number.values() if side.n_points >= FEWEST_CROSSINGS]
+    sides = with_edges(scan).side_of.values()
+    good = [side for side in sides if side.n_points >= FEWEST_CROSSINGS]
     if not good:
         return Light("edges", "bad", NO_SIDE)
     each = [

@@ -61,18 +61,17 @@ def observe(
     -------
     CameraObservations
     """
-    views = prepared.views[camera]
     posed = prepared.posed(camera)
     rule = "last_beam" if variant == ONE_SCAN else variant
     on_faces = []
     crossed: list = []
     corners: list = []
     for placement, scan in prepared.scans.items():
-        if placement not in views:
+        if placement not in posed:
             continue
-        view = views[placement]
+        view = posed[placement]
         source = source_of(prepared, camera, placement, T_head_lrf, corrections)
-        if placement in posed and faces:
+        if faces:
             on_faces.append(_face(source, scan, faces))
         sides = named_sides(prepared, placement, rule)
         if variant == ONE_SCAN:
@@ -311,7 +310,7 @@ def sides_of(scan: BoardScan, variant: str = "half_step") -> Iterator[SweepSide]
     """
     edges = scan.edges[variant]
     for number in np.unique(edges.side[edges.side >= 0]).tolist():
-        straight = next((side for side in scan.sides if side.number == number), None)
+        straight = scan.side_of.get(number)
         across = straight is not None and straight.across
         yield SweepSide(
             number=number,
@@ -417,11 +416,10 @@ def _corners(prepared, view, source, variant):
     """Corners of the outline that the cloud and the image can both name: where two fitted edges
     meet.
     """
-    placement = source.placement
-    if not prepared.scans[placement].swept:
+    if not prepared.scans[source.placement].swept:
         return
     board, _ = outline_of(
-        prepared, placement, variant, source.T_head_lrf, source.corrections
+        prepared, source.placement, variant, source.T_head_lrf, source.corrections
     )
     names = prepared.board.edges
     for name in board.corners:
@@ -443,7 +441,7 @@ def _corners(prepared, view, source, variant):
             "covariance": [scatter**2 * np.eye(3) + dyads(error)],
             "pixels": [corners_of_lines(np.stack([previous.line, edge.line]))[1]],
             "sigma_px": np.sqrt(edge.covariance[0, 0] + previous.covariance[0, 0]),
-            "placement": placement,
+            "placement": source.placement,
         }
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import dyads, solve_each
@@ -13,7 +14,6 @@ from lrfcal_lib.preprocess.surfaces import (
     PLANE_NOISE,
     BoardNotFound,
     planar_surface,
-    row_ends,
     segments,
 )
 from lrfcal_lib.session.read import Sweep
@@ -100,6 +100,11 @@ class BoardScan:
     sides: tuple = ()
     names: dict = field(default_factory=dict)
     dropped: dict = field(default_factory=dict)
+
+    @property
+    def side_of(self) -> dict:
+        """The ScanSide of each number, as scan lines see it where they do."""
+        return {side.number: side for side in self.sides[::-1]}
 
     @property
     def swept(self) -> np.bool:
@@ -259,7 +264,7 @@ def jump_points(ranges: np.ndarray, fitted: np.ndarray, sigma_range: float) -> n
     pieces = segments(ranges, jump=threshold)
     size = np.bincount(pieces[pieces >= 0], minlength=1)
     small = (pieces >= 0) & (size[pieces] <= SMALLEST_PIECE)
-    beside = _span(on, -2) & ~on
+    beside = ndimage.binary_dilation(on, np.ones((1, 2 * SMALLEST_PIECE + 1))) & ~on
     return inside | (small & beside)
 
 
@@ -316,14 +321,11 @@ def _line_ranges(lines, rays):
 def _span(mask, trim=0):
     """True from the first to the last True of each row, without `trim` beams at both ends.
 
-    A number, or one a row.
+    A number, or one a row (n, 1).
     """
-    rows, ends = row_ends(mask)
-    inside = ends + np.multiply.outer(trim, [1, -1])
-    beam = np.arange(mask.shape[1])
-    span = np.zeros(mask.shape, bool)
-    span[rows] = (beam >= inside[:, :1]) & (beam <= inside[:, 1:])
-    return span
+    along = np.cumsum(np.logical_or.accumulate(mask, axis=1), axis=1)
+    back = np.cumsum(np.logical_or.accumulate(mask[:, ::-1], axis=1), axis=1)
+    return (along > trim) & (back[:, ::-1] > trim)
 
 
 def _interior(mask, angles, spot):
@@ -332,7 +334,7 @@ def _interior(mask, angles, spot):
     The latter where that leaves half of the row. A row too short for that (a sweep of one line,
     seen by columns) stays. `angles` of the cells of a row, and `spot`, in radians.
     """
-    size = np.ptp(row_ends(mask)[1], axis=1)
+    size = _span(mask).sum(axis=1, keepdims=True) - 1
     clear = CLEAR * spot / max(median_step(angles), 1e-6)
     least = np.maximum(2, np.minimum(clear, MOST_MARGIN * size))
     trim = np.maximum(least, MARGIN * size).astype(int)
