@@ -564,7 +564,7 @@ OWN = {
 
 def _survey(path):
     session = read_all(path)
-    survey(Prepared(session, session.board, {}, {}))
+    survey(Prepared(session, session.board, {}))
 
 
 def read_all(path):

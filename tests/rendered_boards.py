@@ -191,7 +191,7 @@ def up_to_a_turn(corners, exact):
 
 def surveyed(session):
     """The survey of all images of a session, without its scans."""
-    return survey.survey(Prepared(session, session.board, {}, {}))
+    return survey.survey(Prepared(session, session.board, {}))
 
 
 def seen(picture, board=SHEET, picks=()):

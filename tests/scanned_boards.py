@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import find_board
-from lrfcal_lib.preprocess.edges_in_scan import crossings
+from lrfcal_lib.preprocess.edges_in_scan import with_edges
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import LrfInfo
 
@@ -23,13 +23,18 @@ TRIANGLE = triangle_board()
 LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005)
 
 
-def edge_points(scan):
-    return crossings(scan, False, {})[0]["half_step"]
+def edge_points(scan, across=False, variant="half_step"):
+    """Points where scan lines (or columns) cross the board, and the sides that they see by number."""
+    scan = with_edges(scan)
+    edges = scan.edges[variant]
+    edges = edges[edges.across == across]
+    sides = {side.number: side for side in scan.sides if side.across == across}
+    columns = {name: edges[name] for name in edges.dtype.names}
+    return SimpleNamespace(sides=sides, end=edges.step.sum(axis=1), **columns)
 
 
 def sweep_edges(scan):
-    sides = crossings(scan, False, {})[1]
-    return crossings(scan, True, sides)[0]["half_step"]
+    return edge_points(scan, across=True)
 
 
 def facing(distance=1.6, roll=8.0, tilt=20.0, centre=(0.4, 0.35), x=0.0):

@@ -182,7 +182,6 @@ def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named):
         session=None,
         board=SimpleNamespace(pattern=PATTERN),
         scans={},
-        edges={},
         models={"left": model},
         views={"left": views},
     )

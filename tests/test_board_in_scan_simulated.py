@@ -8,6 +8,7 @@ import pytest
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import find_board
+from lrfcal_lib.preprocess.surfaces import planar_surface
 from lrfcal_lib.report.notebook import ROOT
 from lrfcal_lib.session.read import open_session
 
@@ -67,5 +68,6 @@ def test_the_board_and_hardly_anything_else_is_found(name, placement):
 @pytest.mark.parametrize("seed", range(6))
 def test_a_board_that_hangs_together_with_the_room_is_found_by_any_sample(seed):
     session, (expected, _, _) = opened("sim_lms221")[0], seen("sim_lms221", 2)
-    board = find_board(session.sweep(2), session, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    board = planar_surface(session.sweep(2), session.T_head_lrf, session, rng)
     assert np.sum(board.mask != expected.mask) < 0.03 * expected.mask.sum()

@@ -41,7 +41,6 @@ def drawn(seed, count=14, **settings):
         session=None,
         board=SimpleNamespace(pattern=None),
         scans={},
-        edges={},
         models=models,
         views={camera: {} for camera in models},
     )

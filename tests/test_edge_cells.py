@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scanned_boards import HEAD, edge_points, rig_of, scene, sweep_edges
+from scanned_boards import HEAD, rig_of, scene
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.edge_cells import edge_cells
+from lrfcal_lib.preprocess.edges_in_scan import with_edges
 from lrfcal_lib.session.stated import LrfInfo
 
 LRF = LrfInfo(
@@ -23,9 +24,7 @@ def cells_of(made, change=None):
         else replace(made.sweep, ranges=change(made.sweep.ranges.copy()))
     )
     board = board_in_scan.find_board(sweep, rig_of(made.board))
-    along = edge_points(board)
-    swept = sweep_edges(board)
-    return board, edge_cells(board, [along, swept], LRF)
+    return board, edge_cells(with_edges(board), LRF)
 
 
 def outside(made, cells):

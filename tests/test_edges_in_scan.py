@@ -16,7 +16,6 @@ from scanned_boards import (
 from scipy import ndimage
 
 from lrfcal_lib.model.geometry import lrf_to_platform
-from lrfcal_lib.preprocess.edges_in_scan import crossings
 
 
 def behind(s, centre, width, length, depth):
@@ -56,7 +55,7 @@ def test_half_step_is_unbiased_and_last_beam_lies_half_a_step_inside(across):
     rolls = [3.0] if across else np.linspace(5, 14, 7)
     for s in (scene(pose=facing(roll=roll)) for roll in rolls):
         for variant, own in errors.items():
-            e = crossings(found(s), across, {})[0][variant]
+            e = edge_points(found(s), across, variant)
             own.append(s.outwards(e) / spacing)
     last, half = (np.concatenate(own) for own in errors.values())
     assert abs(half.mean()) < 0.1 and -0.65 < last.mean() < -0.35
@@ -97,11 +96,8 @@ def test_four_sides_are_found_and_named_alike_by_lines_and_columns_in_both_varia
     assert (
         names[0] == names[1] and sorted(names[0]) == [0, 1, 2, 3] and s.worst(lines) < 0.008
     )
-    along, sides = crossings(b, False, {})
-    for e, last in (
-        (lines, along["last_beam"]),
-        (columns, crossings(b, True, sides)[0]["last_beam"]),
-    ):
+    for across, e in enumerate((lines, columns)):
+        last = edge_points(b, bool(across), "last_beam")
         np.testing.assert_array_equal([e.side, e.line], [last.side, last.line])
 
 
@@ -165,3 +161,9 @@ def test_where_view_or_sweep_end_or_something_hides_the_board_is_no_edge():
     ):
         e = function(found(s))
         assert set(e.end[e.side >= 0]) == {end} and s.worst(e) < 0.012
+
+
+def test_a_board_that_is_larger_than_the_view_has_no_edges():
+    b = found(scene(pose=facing(1.3), view=(82, 98), pitch=(-9, 8)))
+    for edges in (edge_points(b), sweep_edges(b)):
+        assert not len(edges.side) and not edges.sides

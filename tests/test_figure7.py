@@ -19,7 +19,7 @@ def ready(tmp_path_factory):
     session = open_session(
         record(folder, rectangle(0.02), 7, placements=3, image_pitch_deg=(-5.0, -2.5, 0.0))
     )
-    return prepare_images(Prepared(session, session.board, {}, {}))
+    return prepare_images(Prepared(session, session.board, {}))
 
 
 def step_across(image, stretch, reach=3.0):

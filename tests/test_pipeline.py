@@ -51,8 +51,6 @@ def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
         None,
         None,
         {1: "a", 2: "b"},
-        {1: "a", 2: "b"},
-        names={1: {}, 2: {}},
         views={"left": {1: "v", 2: "v"}},
     )
     whole = Problem(Stage.SIDES, ProblemKind.OTHER_PLANE, "off", placement=2)
@@ -61,5 +59,5 @@ def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
     )
     ready = replace(ready, problems=(whole, part))
     left = pipeline.without(ready)
-    assert list(left.scans) == list(left.names) == list(left.edges) == [1]
+    assert list(left.scans) == [1]
     assert list(left.views["left"]) == [1, 2]

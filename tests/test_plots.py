@@ -64,9 +64,9 @@ def test_edge_of_line_marks_the_crossing_of_its_end(ax, scan, end, bearing):
         [[np.cos(np.radians(b)), np.sin(np.radians(b)), 0.0] for b in (79.5, 99.5)]
     )
     found = SimpleNamespace(
-        variant="half_step", points=points, line=np.array([2, 2]), end=np.array([-1, 1])
+        points=points, line=np.array([2, 2]), step=np.array([[0, -1], [0, 1]])
     )
-    recording.edge_of_line(ax, scan, 2, end, edges=[found])
+    recording.edge_of_line(ax, scan, 2, end, edges={"half_step": found})
     (mark,) = [line for line in ax.lines if line.get_label() == "half step"]
     assert mark.get_xdata()[0] == pytest.approx(bearing)
     with pytest.raises(

@@ -36,7 +36,7 @@ def stereo(first, second, pattern=PATTERN, models=(MODEL, MODEL)):
     ]
     views, models = (dict(enumerate(each)) for each in (views, models))
     board = SimpleNamespace(pattern=pattern)
-    reference = stereo_reference(Prepared(None, board, {}, {}, models, views))
+    reference = stereo_reference(Prepared(None, board, {}, models, views))
     return reference.T_second_first, reference.covariance
 
 

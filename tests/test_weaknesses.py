@@ -196,11 +196,12 @@ def test_large_errors_forbid_trust(good):
 )
 def test_an_edge_that_lies_elsewhere_in_most_scans_is_a_reason(dropped, named, words):
     turned = DroppedSide("bc", 0.012, np.radians(8.0))
+    whole = SimpleNamespace(names={0: "ab", 1: "bc"}, dropped={})
+    half = SimpleNamespace(names={0: "ab"}, dropped={1: turned})
     prepared = SimpleNamespace(
         board=triangle_board(),
-        names={p: {0: "ab", 1: "bc"} for p in range(named)}
-        | {p: {0: "ab"} for p in range(100, 100 + dropped)},
-        dropped={p: {1: turned} for p in range(100, 100 + dropped)},
+        scans=dict.fromkeys(range(named), whole)
+        | dict.fromkeys(range(100, 100 + dropped), half),
     )
     reasons = list(sides_elsewhere(prepared))
     assert [reason.kind for reason in reasons] == ["outline"] * (words is not None)

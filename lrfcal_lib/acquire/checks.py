@@ -1,7 +1,6 @@
 """Is what was just recorded any good? Lights for one placement, from what is on the disk."""
 
 import math
-from collections import ChainMap
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
@@ -12,8 +11,8 @@ import numpy as np
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
+from lrfcal_lib.preprocess.edges_in_scan import with_edges
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
-from lrfcal_lib.preprocess.prepared import all_crossings
 from lrfcal_lib.session.faults import DARK, brightness, repeated_images, repeated_scans
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session, Sweep
@@ -150,9 +149,8 @@ def check_scan(sweep: Sweep | None, rig: StatedRig) -> list[Light]:
 
 def _check_sides(scan):
     """How many straight sides of the board the scans cross, and how."""
-    ways = all_crossings(scan)["half_step"]
-    by_number = ChainMap(*(way.sides for way in ways))
-    good = [side for side in by_number.values() if side.n_points >= FEWEST_CROSSINGS]
+    sides = with_edges(scan).side_of.values()
+    good = [side for side in sides if side.n_points >= FEWEST_CROSSINGS]
     if not good:
         return Light("edges", "bad", NO_SIDE)
     each = [

@@ -70,11 +70,10 @@ def _ranges(scans):
 
 def _beams(prepared, scans):
     """Beams about the named sides of placements, by row: columns by name."""
-    for row, (placement, scan) in enumerate(scans.items()):
-        ways = prepared.edges[placement]["half_step"]
-        cells = edge_cells(scan, ways, prepared.session.lrf)
-        for side, name in prepared.names.get(placement, {}).items():
-            about = cells[thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE)]
+    for row, scan in enumerate(scans.values()):
+        cells = edge_cells(scan, prepared.session.lrf)
+        for side, name in scan.names.items():
+            about = thin(cells[cells.side == side], CELLS_PER_EDGE)
             yield {
                 "bearing": about.bearing,
                 "pitch": about.pitch,

@@ -13,6 +13,8 @@ WIDEST = 8  # samples that a window reaches to a side at most
 SIGMAS = 2.2  # by which a reading must miss the surfaces on both sides
 ROUGH = 1.2  # residuals of the planes that readings lie on, standard deviations of a range
 HALF_A_WINDOW = 0.375  # of the spot: a window is three quarters of it wide
+# of a plane without samples, and the slope across a single line
+UNKNOWN = (1e-9, 1e-6, 1e-6)
 FARTHEST = 1.5  # lever of a place on the plane fitted to others
 # shares of the spot across the lines and along them: strips as narrow as it, and what is about them
 STRIPS = (
@@ -149,21 +151,20 @@ class _Planes:
         (n,): where their residuals are less than `rough` sigma and the place is not far from what
         they were fitted to.
         """
-        number = np.maximum(sums[:, 0, 0], 1e-9)
-        mean = sums[:, 0, 1:] / number[:, None]
-        scatter = sums[:, 1:, 1:] - np.einsum("n,ni,nj->nij", number, mean, mean)
-        by_place = scatter[:, :2, 2]
-        # a single line has no slope across
-        known = np.linalg.inv(scatter[:, :2, :2] + 1e-6 * np.eye(2))
-        slope = np.matvec(known, by_place)
-        away = at - mean[:, :2]
-        inverse = mean[:, 2] + np.vecdot(slope, away)
+        # with lines and beams counted from the place
+        moved = np.tile(np.eye(4), (len(at), 1, 1))
+        moved[:, 1:3, 0] = -at
+        products = moved @ sums @ moved.mT
+        known = np.linalg.inv(products[:, :3, :3] + np.diag(UNKNOWN))
+        by_place = products[:, :3, 3]
+        plane = np.matvec(known, by_place)
+        inverse = plane[:, 0]
         there = 1 / np.where(inverse > 0, inverse, np.nan)
-        square = scatter[:, 2, 2] - np.vecdot(slope, by_place)
+        number = sums[:, 0, 0]
+        square = products[:, 3, 3] - np.vecdot(plane, by_place)
         rms = np.sqrt(np.maximum(square, 0.0) / np.maximum(number - 3, 1))
-        lever = 1 / number + np.vecdot(away, np.matvec(known, away))
         good = (number >= 4) & (rms * there**2 < rough * self.sigma)
-        return slope, there, good & (lever < FARTHEST)
+        return plane[:, 1:], there, good & (known[:, 0, 0] < FARTHEST)
 
     def off(self, ranges, asked, share):
         """Which of the readings asked about (l, b) lie on no plane of a window about them, of which

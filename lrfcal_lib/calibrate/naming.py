@@ -37,32 +37,32 @@ def name_sides(prepared: Prepared) -> Prepared:
     Returns
     -------
     Prepared
-        With `names`, `dropped`, and the problems of :func:`rough_poses` and of sides without a
-        name.
+        With names of the sides of its scans, and the problems of :func:`rough_poses` and of sides
+        without a name.
     """
     rough, problems = rough_poses(prepared)
-    names: dict = {}
-    dropped: dict = {}
+    named: dict = {}
     if prepared.board.corners is None:
         rough = {}
     for camera, T_camera_source in rough.items():
         for placement, view in prepared.posed(camera).items():
-            if placement not in prepared.scans or placement in names:
+            if placement not in prepared.scans or placement in named:
                 continue
+            scan = prepared.scans[placement]
             T_board_source = view.T_camera_board.inv() * T_camera_source
             source = source_of(prepared, camera, placement, None)
-            sides = {
-                side.number: T_board_source.apply(source.points(side.points, side.pitch))
-                for side in sides_of(prepared, placement)
-            }
-            names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
-            for why in dropped[placement].values():
+            sides = {}
+            for side in sides_of(scan):
+                p_source = source.points(side.crossed.points, side.crossed.pitch)
+                sides[side.number] = T_board_source.apply(p_source)
+            names, dropped = nearest_edges(prepared.board, sides)
+            named[placement] = replace(scan, names=names, dropped=dropped)
+            for why in dropped.values():
                 problems.append(
                     Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement)
                 )
-    return replace(
-        prepared, names=names, dropped=dropped, problems=(*prepared.problems, *problems)
-    )
+    every = (*prepared.problems, *problems)
+    return replace(prepared, scans=prepared.scans | named, problems=every)
 
 
 def rough_poses(prepared: Prepared) -> tuple[dict[str, RigidTransform], list[Problem]]:

@@ -15,8 +15,8 @@ from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections, SourceFrame
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations, thin
-from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edges_in_scan import ScanEdges, ScanSide
+from lrfcal_lib.preprocess.board_in_scan import BoardScan, face_points
+from lrfcal_lib.preprocess.edges_in_scan import ScanSide
 from lrfcal_lib.preprocess.prepared import Prepared
 
 ONE_SCAN = "one_scan"
@@ -54,31 +54,30 @@ def observe(
         Known errors of what was recorded, which are taken out of points and pitch; see
         :attr:`lrfcal_lib.solvers.joint.JointSolution.corrections`.
     crossings, faces : int
-        Kept of each edge and of the face of a placement, evenly spread; without `faces` only
-        crossings are paired.
+        Kept of each edge and of the face of a placement, evenly spread; without one of them
+        only the other is paired.
 
     Returns
     -------
     CameraObservations
     """
-    views = prepared.views[camera]
     posed = prepared.posed(camera)
     rule = "last_beam" if variant == ONE_SCAN else variant
     on_faces = []
     crossed: list = []
     corners: list = []
     for placement, scan in prepared.scans.items():
-        if placement not in views:
+        if placement not in posed:
             continue
-        view = views[placement]
+        view = posed[placement]
         source = source_of(prepared, camera, placement, T_head_lrf, corrections)
-        if placement in posed and faces:
+        if faces:
             on_faces.append(_face(source, scan, faces))
         sides = named_sides(prepared, placement, rule)
         if variant == ONE_SCAN:
             sides = _one_scan_line(prepared.board.features, view, sides)
         crossed += _crossings(prepared, view, source, sides, crossings)
-        if faces and placement in prepared.names:
+        if faces and crossings and scan.names:
             corners += _corners(prepared, view, source, rule)
     pattern = prepared.pattern_points
     model = prepared.models[camera]
@@ -115,22 +114,22 @@ def platform_observations(
     """
     sides = []
     faces = []
-    for placement, edges in prepared.edges.items():
-        if len(edges[variant]) == 1:
-            continue  # a single shot
-        feature = _feature_sides(list(sides_of(prepared, placement, variant)))
+    for placement, scan in prepared.scans.items():
+        if not scan.swept:
+            continue
+        feature = _feature_sides(list(sides_of(scan, variant)))
         for number, side in enumerate(feature, 1):
-            rows = thin(side.rows, PLATFORM_POINTS)
+            crossed = thin(side.crossed, PLATFORM_POINTS)
             sides.append(
                 {
-                    "points": side.edges.points[rows],
-                    "covariance": side.edges.covariance[rows],
-                    "pitch": side.edges.pitch[rows],
+                    "points": crossed.points,
+                    "covariance": crossed.covariance,
+                    "pitch": crossed.pitch,
                     "placement": placement,
                     "number": number,
                 }
             )
-        points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
+        points, pitch, covariance = face_points(scan, FACE_POINTS)
         faces.append(
             {
                 "points": points,
@@ -199,7 +198,7 @@ def sides_in_cloud(
     across = {}
     for side in named_sides(prepared, placement, variant, LEAST_STRETCH):
         sides = across if side.across else along
-        sides[side.name] = source.points(side.points, side.pitch)
+        sides[side.name] = source.points(side.crossed.points, side.crossed.pitch)
     return source.points(p_lrf, pitch), along, across
 
 
@@ -276,10 +275,8 @@ class SweepSide:
         Within the placement.
     name : str
         Of the board's edge; empty where it has none.
-    edges : ScanEdges
-        That hold its points.
-    rows : ndarray of int
-        Which of them.
+    crossed : recarray
+        Where the scan crosses it: rows of the edges of a BoardScan.
     across : bool
         Whether it was found across the scan lines.
     straight : ScanSide or None
@@ -288,20 +285,9 @@ class SweepSide:
 
     number: int
     name: str
-    edges: ScanEdges
-    rows: np.ndarray
+    crossed: np.recarray
     across: bool
     straight: ScanSide | None
-
-    @property
-    def points(self) -> np.ndarray:
-        """LRF frame at their pitch, metres, shape (n, 3)."""
-        return self.edges.points[self.rows]
-
-    @property
-    def pitch(self) -> np.ndarray:
-        """As recorded, radians, shape (n,)."""
-        return self.edges.pitch[self.rows]
 
     @property
     def length(self) -> float:
@@ -309,34 +295,30 @@ class SweepSide:
         return self.straight.length if self.straight else 0.0
 
 
-def sides_of(
-    prepared: Prepared, placement: int, variant: str = "half_step"
-) -> Iterator[SweepSide]:
-    """The sides of a placement, those found along the scan lines first.
+def sides_of(scan: BoardScan, variant: str = "half_step") -> Iterator[SweepSide]:
+    """The sides of the board in a sweep, in the order of their numbers.
 
     Parameters
     ----------
-    prepared : Prepared
-    placement : int
+    scan : BoardScan
+        With its edges.
     variant : {'half_step', 'last_beam'}
 
     Yields
     ------
     SweepSide
     """
-    names = prepared.names.get(placement, {})
-    known = {-1}
-    for across, edges in enumerate(prepared.edges[placement][variant]):
-        for number in sorted(set(edges.side.tolist()) - known):
-            known.add(number)
-            yield SweepSide(
-                number=number,
-                name=names.get(number, ""),
-                edges=edges,
-                rows=np.flatnonzero(edges.side == number),
-                across=bool(across),
-                straight=edges.sides.get(number),
-            )
+    edges = scan.edges[variant]
+    for number in np.unique(edges.side[edges.side >= 0]).tolist():
+        straight = scan.side_of.get(number)
+        across = straight is not None and straight.across
+        yield SweepSide(
+            number=number,
+            name=scan.names.get(number, ""),
+            crossed=edges[(edges.side == number) & (edges.across == across)],
+            across=across,
+            straight=straight,
+        )
 
 
 def named_sides(
@@ -346,8 +328,9 @@ def named_sides(
 
     Parameters
     ----------
-    prepared, placement, variant
-        See :func:`sides_of`.
+    prepared : Prepared
+    placement : int
+    variant : {'half_step', 'last_beam'}
     stretch : float
         Share of an edge that the sweep must show.
 
@@ -355,7 +338,7 @@ def named_sides(
     ------
     SweepSide
     """
-    for side in sides_of(prepared, placement, variant):
+    for side in sides_of(prepared.scans[placement], variant):
         if side.name and side.length >= stretch * prepared.board.lengths()[side.name]:
             yield side
 
@@ -396,11 +379,10 @@ def _one_scan_line(features, view, sides):
     ]
     if len(sides) != 2:
         return
-    both = np.intersect1d(*(side.edges.line[side.rows] for side in sides))
+    both = np.intersect1d(*(side.crossed.line for side in sides))
     middle = both[len(both) // 2 :][:1]
     for side in sides:
-        on_it = np.isin(side.edges.line[side.rows], middle)
-        yield replace(side, rows=side.rows[on_it])
+        yield replace(side, crossed=side.crossed[np.isin(side.crossed.line, middle)])
 
 
 def _crossings(prepared, view, source, sides, count):
@@ -410,20 +392,19 @@ def _crossings(prepared, view, source, sides, count):
         edge = view.edge(side.name)
         if edge is None:
             continue
-        edges = side.edges
-        rows = thin(side.rows, count)
-        p_lrf = edges.points[rows]
-        pitch = edges.pitch[rows]
+        crossed = thin(side.crossed, count)
+        p_lrf = crossed.points
+        pitch = crossed.pitch
         sigma_pitch = prepared.pitch_noise.sigma(pitch, middle)
         by_pitch = source.by_pitch(p_lrf, pitch) * sigma_pitch[:, None]
         pitch_error = dyads(by_pitch)
         yield {
             "points": source.points(p_lrf, pitch),
             "pitch": pitch,
-            "covariance": source.covariance(edges.covariance[rows], pitch) + pitch_error,
+            "covariance": source.covariance(crossed.covariance, pitch) + pitch_error,
             "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
-            "background": edges.background[rows],
-            "lines": np.tile(edge.line, (len(rows), 1)),
+            "background": crossed.background,
+            "lines": np.broadcast_to(edge.line, p_lrf.shape),
             "line_sigma": np.sqrt(edge.covariance[0, 0]),
             "placement": source.placement,
             "edge": side.name,
@@ -435,11 +416,10 @@ def _corners(prepared, view, source, variant):
     """Corners of the outline that the cloud and the image can both name: where two fitted edges
     meet.
     """
-    placement = source.placement
-    if len(prepared.edges[placement][variant]) == 1:
+    if not prepared.scans[source.placement].swept:
         return
     board, _ = outline_of(
-        prepared, placement, variant, source.T_head_lrf, source.corrections
+        prepared, source.placement, variant, source.T_head_lrf, source.corrections
     )
     names = prepared.board.edges
     for name in board.corners:
@@ -461,7 +441,7 @@ def _corners(prepared, view, source, variant):
             "covariance": [scatter**2 * np.eye(3) + dyads(error)],
             "pixels": [corners_of_lines(np.stack([previous.line, edge.line]))[1]],
             "sigma_px": np.sqrt(edge.covariance[0, 0] + previous.covariance[0, 0]),
-            "placement": placement,
+            "placement": source.placement,
         }
 
 

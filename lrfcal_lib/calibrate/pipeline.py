@@ -34,13 +34,9 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.kinematics import AS_RECORDED
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
-from lrfcal_lib.preprocess.prepared import (
-    LEAST_SWEEP,
-    VARIANTS,
-    PitchNoise,
-    Prepared,
-    prepare_scans,
-)
+from lrfcal_lib.preprocess.board_in_scan import LEAST_SWEEP
+from lrfcal_lib.preprocess.edges_in_scan import VARIANTS
+from lrfcal_lib.preprocess.prepared import PitchNoise, Prepared, prepare_scans
 from lrfcal_lib.preprocess.survey import all_views, prepare_images
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
@@ -269,17 +265,8 @@ def prepare(session: Session) -> Prepared:
 def without(prepared: Prepared) -> Prepared:
     """Drop the placements that are left out from everything but the images."""
     left_out = prepared.left_out
-
-    def kept(by_placement):
-        return {p: part for p, part in by_placement.items() if p not in left_out}
-
-    return replace(
-        prepared,
-        scans=kept(prepared.scans),
-        names=kept(prepared.names),
-        dropped=kept(prepared.dropped),
-        edges=kept(prepared.edges),
-    )
+    scans = {p: scan for p, scan in prepared.scans.items() if p not in left_out}
+    return replace(prepared, scans=scans)
 
 
 def find_pitch_errors(prepared: Prepared) -> PitchErrors | None:

@@ -14,7 +14,8 @@ from lrfcal_lib.calibrate.outline import MeasuredBoard
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.truth import Truth
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
+from lrfcal_lib.preprocess.edges_in_scan import VARIANTS
+from lrfcal_lib.preprocess.prepared import Prepared
 
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
@@ -42,11 +43,12 @@ def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
     """
     lines = dict(zip(truth.board.edges, truth.board.lines(), strict=True))
     rows = [(*of_none, []) for of_none in product(VARIANTS, lines)]
-    for variant, (placement, names) in product(VARIANTS, prepared.names.items()):
-        scanned = prepared.edges[placement][variant][0]
+    for variant, (placement, scan) in product(VARIANTS, prepared.scans.items()):
+        scanned = scan.edges[variant]
+        scanned = scanned[~scanned.across]
         pitch = truth.pitch[placement][scanned.line]
         flat = truth.on_board(truth.boards[placement], scanned.points, pitch)
-        for side, edge in names.items():
+        for side, edge in scan.names.items():
             rows.append((variant, edge, 1000 * flat[scanned.side == side] @ lines[edge]))
     table = pd.DataFrame(rows, columns=["variant", "edge", "miss"]).explode("miss")
     misses = table.astype({"miss": float}).groupby(["variant", "edge"], sort=False).miss
@@ -114,7 +116,7 @@ def edge_lengths(
 def _outlines(prepared, variant, T_head_lrf):
     """Outlines and their weak sides (see :func:`outline_of`) by placement, as far as they exist."""
     out = {}
-    for placement in prepared.names:
+    for placement in prepared.scans:
         with suppress(DegenerateGeometry):
             out[placement] = outline_of(prepared, placement, variant, T_head_lrf)
     return out

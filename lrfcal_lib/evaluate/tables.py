@@ -260,7 +260,7 @@ def scans_table(prepared: Prepared) -> pd.DataFrame:
     """
     rows = []
     for placement, board in prepared.scans.items():
-        across = [side.across for side in sides_of(prepared, placement) if side.straight]
+        across = [side.across for side in sides_of(board) if side.straight]
         rows.append(
             (
                 placement,

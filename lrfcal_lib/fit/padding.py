@@ -17,7 +17,10 @@ def medians(values: np.ndarray, used: np.ndarray) -> np.ndarray:
         0 where there are none.
     """
     count = used.sum(axis=-1, keepdims=True)
-    ordered = np.sort(np.where(used, values, np.inf), axis=-1)
+    # one more, so that there is always something to take
+    ordered = np.sort(
+        np.insert(np.where(used, values, np.inf), 0, np.inf, axis=-1), axis=-1
+    )
     middle = np.concatenate([count - 1, count], axis=-1) // 2
     median = np.take_along_axis(ordered, middle, axis=-1).mean(axis=-1)
     return np.where(count[..., 0] > 0, median, 0.0)

@@ -265,8 +265,8 @@ def board_misses(prepared, reading):
             placement - reading.ahead: replace(view, pitch=reading.image_turn * view.pitch)
             for placement, view in prepared.posed(camera).items()
         }
-        read = replace(prepared, views={camera: views}, names={})
-        obs = observe(read, camera, corrections=reading, faces=POINTS)
+        read = replace(prepared, views={camera: views})
+        obs = observe(read, camera, corrections=reading, crossings=0, faces=POINTS)
         # the mirror image of a chessboard is one
         mirror = np.diag([reading.image_across, 1.0, 1.0, 1.0])
         obs = replace(obs, board_poses=mirror @ obs.board_poses @ mirror)

@@ -368,7 +368,7 @@ def _weak_cameras(calibration, method) -> Iterator[Fault]:
                 severe=True,
             )
     unknown = calibration.platform.why_not("combined")
-    if unknown and any(len(ways["half_step"]) > 1 for ways in prepared.edges.values()):
+    if unknown and any(scan.swept for scan in prepared.scans.values()):
         yield Fault(Kind.FAR_FROM_STATED, unknown, severe=True)
 
 

@@ -203,16 +203,11 @@ def sides_elsewhere(prepared: Prepared) -> Iterator[Fault]:
     Fault
         One an edge.
     """
+    scans = prepared.scans.values()
+    elsewhere = [side for scan in scans for side in scan.dropped.values()]
     for edge in prepared.board.edges:
-        dropped = [
-            side
-            for sides in prepared.dropped.values()
-            for side in sides.values()
-            if side.edge == edge
-        ]
-        crossed = len(dropped) + sum(
-            edge in names.values() for names in prepared.names.values()
-        )
+        dropped = [side for side in elsewhere if side.edge == edge]
+        crossed = len(dropped) + sum(edge in scan.names.values() for scan in scans)
         if len(dropped) >= FEWEST and len(dropped) > MOST * crossed:
             off, turn = np.median([[side.distance, side.turn] for side in dropped], axis=0)
             yield Fault(

@@ -1,6 +1,7 @@
 """What solvers take: of one camera and the LRF, and of a whole rig at once."""
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -20,7 +21,7 @@ NEEDED = {
 }
 
 
-def thin(rows: np.ndarray, count: int) -> np.ndarray:
+def thin(rows: Any, count: int) -> Any:
     """At most `count` of some rows, evenly spread."""
     if len(rows) <= count:
         return rows

@@ -1,6 +1,6 @@
 """Figures of what was recorded: scans, range images, pictures, edges; a colour for each sensor."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Any
 
@@ -130,7 +130,9 @@ def to_scale(ax: Axes, x: str, y: str) -> None:
     ax.set(xlabel=x, ylabel=y, aspect="equal", adjustable="datalim")
 
 
-def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) -> None:
+def edge_of_line(
+    ax: Axes, scan, line: int, end: int = 1, edges: Mapping | tuple = ()
+) -> None:
     """Where a scan line leaves the board: ranges raw, filtered and fitted, figure 5.
 
     Parameters
@@ -141,8 +143,9 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
         Row of its ranges.
     end
         +1 for the end at the larger bearings, -1 for the other one.
-    edges : sequence of ScanEdges
-        One or two, whose crossings of this line and end are drawn as upright lines.
+    edges : dict of str to recarray
+        One or two variants of :class:`lrfcal_lib.preprocess.board_in_scan.BoardScan`, whose
+        crossings of this line and end are drawn as upright lines.
 
     Raises
     ------
@@ -168,14 +171,14 @@ def edge_of_line(ax: Axes, scan, line: int, end: int = 1, edges: Sequence = ()) 
         ax.plot(bearing, at_top, "^", color=RAW, clip_on=False, label=words)
     ax.plot(bearing, scan.filtered[line, near], "x", color=TRUTH, label="filtered")
     ax.plot(bearing, fitted, color=FIT, label="line fitted to the board")
-    for crossed, style in zip(edges, ("--", "-"), strict=False):
-        here = (crossed.line == line) & (crossed.end == end)
+    for (variant, crossed), style in zip(dict(edges).items(), ("--", "-"), strict=False):
+        here = (crossed.line == line) & (crossed.step[:, 1] == end)
         for x, y, _ in crossed.points[here]:
             ax.axvline(
                 np.degrees(np.arctan2(y, x)),
                 color=LRF,
                 linestyle=style,
-                label=crossed.variant.replace("_", " "),
+                label=variant.replace("_", " "),
             )
     ax.invert_xaxis()
     ax.set(
@@ -192,7 +195,8 @@ def crossings(ax: Axes, edges) -> None:
     Parameters
     ----------
     ax
-    edges : ScanEdges
+    edges : recarray
+        Of :class:`lrfcal_lib.preprocess.board_in_scan.BoardScan`.
     """
     x, y, _ = edges.points.T
     points = np.degrees([np.arctan2(y, x), edges.pitch])

@@ -1,8 +1,9 @@
 """The board in a sweep: the nearest flat surface of its size, with a straight line a scan line."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import dyads, solve_each
@@ -13,12 +14,12 @@ from lrfcal_lib.preprocess.surfaces import (
     PLANE_NOISE,
     BoardNotFound,
     planar_surface,
-    row_ends,
     segments,
 )
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import StatedRig
 
+LEAST_SWEEP = np.deg2rad(1.0)  # a placement whose pitch spans less is a single shot
 MEDIAN_WIDTH = 5  # beams
 FEWEST_BEAMS = 4  # on a scan line, for a straight line with a covariance
 LINE_ROUNDS = 4  # of Tukey's weights
@@ -64,6 +65,22 @@ class BoardScan:
         Returns within or next to the board that were rejected: mixed pixels and outliers.
     spot : float
         Angle that the radius of the spot takes up at the board, radians; 0 where nothing states it.
+    edges : dict of str to recarray
+        Where the scan lines cross the board's sides, and, unless it is a single shot, the columns
+        (where the sweep enters and leaves the board), by edge-point variant; empty before
+        :func:`lrfcal_lib.preprocess.edges_in_scan.with_edges`. ``points``, LRF frame at the pitch
+        of the point, metres, on the fitted scan line, with their ``covariance`` and ``pitch``
+        (radians); ``line`` and ``beam`` of the last cell that hit the board, and the ``step``
+        from there to the first cell off it, likewise; ``across`` where a column crosses; ``side``,
+        the number of the straight side, -1 for outliers; ``background``, what its distance adds to
+        the log odds at which readings flip.
+    sides : tuple of ScanSide
+        The straight sides, first those that scan lines cross.
+    names : dict of int to str
+        Board edge of each side, by its number; empty before
+        :func:`lrfcal_lib.calibrate.naming.name_sides`.
+    dropped : dict of int to DroppedSide
+        Sides that got no name because the board has no edge there, likewise.
     """
 
     placement: int
@@ -79,11 +96,23 @@ class BoardScan:
     sigma_range: float
     n_jump_points: int
     spot: float = 0.0
+    edges: dict = field(default_factory=dict)
+    sides: tuple = ()
+    names: dict = field(default_factory=dict)
+    dropped: dict = field(default_factory=dict)
+
+    @property
+    def side_of(self) -> dict:
+        """The ScanSide of each number, as scan lines see it where they do."""
+        return {side.number: side for side in self.sides[::-1]}
+
+    @property
+    def swept(self) -> np.bool:
+        """Whether it is no single shot."""
+        return np.ptp(self.sweep.pitch) > LEAST_SWEEP
 
 
-def find_board(
-    sweep: Sweep, rig: StatedRig, rng: np.random.Generator | None = None
-) -> BoardScan:
+def find_board(sweep: Sweep, rig: StatedRig) -> BoardScan:
     """Find the board in a sweep, filter its ranges and fit a straight line to each scan line.
 
     Parameters
@@ -92,8 +121,6 @@ def find_board(
     rig : StatedRig
         Its board tells the size by its outline, else by its pattern, its LRF the spot; the platform
         may be roughly known, without one the tilt axis is taken to be the x axis of the LRF.
-    rng : numpy.random.Generator, optional
-        For the random sampling; by default always the same.
 
     Returns
     -------
@@ -107,9 +134,7 @@ def find_board(
     T_head_lrf = rig.T_head_lrf
     if T_head_lrf is None:
         T_head_lrf = RigidTransform.identity()
-    if rng is None:
-        rng = np.random.default_rng(0)
-    surface = planar_surface(sweep, T_head_lrf, rig, rng)
+    surface = planar_surface(sweep, T_head_lrf, rig, np.random.default_rng(0))
     mask = surface.mask
     filtered = median_filter(sweep.ranges, mask)
     lines, covariance = fit_lines(filtered, sweep.bearings)
@@ -239,7 +264,7 @@ def jump_points(ranges: np.ndarray, fitted: np.ndarray, sigma_range: float) -> n
     pieces = segments(ranges, jump=threshold)
     size = np.bincount(pieces[pieces >= 0], minlength=1)
     small = (pieces >= 0) & (size[pieces] <= SMALLEST_PIECE)
-    beside = _span(on, -2) & ~on
+    beside = ndimage.binary_dilation(on, np.ones((1, 2 * SMALLEST_PIECE + 1))) & ~on
     return inside | (small & beside)
 
 
@@ -296,14 +321,11 @@ def _line_ranges(lines, rays):
 def _span(mask, trim=0):
     """True from the first to the last True of each row, without `trim` beams at both ends.
 
-    A number, or one a row.
+    A number, or one a row (n, 1).
     """
-    rows, ends = row_ends(mask)
-    inside = ends + np.multiply.outer(trim, [1, -1])
-    beam = np.arange(mask.shape[1])
-    span = np.zeros(mask.shape, bool)
-    span[rows] = (beam >= inside[:, :1]) & (beam <= inside[:, 1:])
-    return span
+    along = np.cumsum(np.logical_or.accumulate(mask, axis=1), axis=1)
+    back = np.cumsum(np.logical_or.accumulate(mask[:, ::-1], axis=1), axis=1)
+    return (along > trim) & (back[:, ::-1] > trim)
 
 
 def _interior(mask, angles, spot):
@@ -312,7 +334,7 @@ def _interior(mask, angles, spot):
     The latter where that leaves half of the row. A row too short for that (a sweep of one line,
     seen by columns) stays. `angles` of the cells of a row, and `spot`, in radians.
     """
-    size = np.ptp(row_ends(mask)[1], axis=1)
+    size = _span(mask).sum(axis=1, keepdims=True) - 1
     clear = CLEAR * spot / max(median_step(angles), 1e-6)
     least = np.maximum(2, np.minimum(clear, MOST_MARGIN * size))
     trim = np.maximum(least, MARGIN * size).astype(int)

@@ -1,7 +1,5 @@
 """The beams about every boundary of the board in a scan: who read it, and what stands behind."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy import ndimage
 
@@ -9,7 +7,6 @@ from lrfcal_lib.model.geometry import cross, lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
     MIXING,
-    ScanEdges,
     background_of,
     plane_range,
     within,
@@ -23,14 +20,13 @@ CORNER = 1.0  # spot radii: a spot nearer than this to a second edge may reach o
 SURE = 5.0  # standard deviations of a range: what is nearer to the board's plane read the board
 
 
-def edge_cells(scan: BoardScan, ways: Sequence[ScanEdges], lrf: LrfInfo) -> np.recarray:
+def edge_cells(scan: BoardScan, lrf: LrfInfo) -> np.recarray:
     """The beams about every boundary of the board, along and across the scan lines.
 
     Parameters
     ----------
     scan : BoardScan
-    ways : sequence of ScanEdges
-        Of :func:`lrfcal_lib.preprocess.edges_in_scan.crossings`, along and across the scan lines.
+        With its edges.
     lrf : LrfInfo
         Knows the spot.
 
@@ -38,38 +34,38 @@ def edge_cells(scan: BoardScan, ways: Sequence[ScanEdges], lrf: LrfInfo) -> np.r
     -------
     recarray
         ``line`` and ``beam`` (every pair appears once); ``bearing`` and ``pitch``, radians;
-        ``hit``, whether the beam read the board; ``side``, its number as in ScanEdges; ``range_m``,
-        distance of the board's plane along the beam, and ``radius`` of the spot there, metres;
-        ``background``, what it adds to the log odds at which the reading flips, as far as distances
-        and incidence tell it; ``across``, whether the boundary was found across the scan lines (the
-        neighbour is a scan line, not a beam); ``step``, angle between neighbours in that direction,
-        radians. Of all straight sides, without cells in holes, at the border of the view, where
-        something nearer hides the board, with two edges in one spot, and beside a background less
-        than a pulse length (1 m) behind, whose echo melts into the board's. Where most of the
-        outline has such a background they stay, with `background` 0; so do all cells where most
-        boundaries have no return behind them (clouds cut to the board).
+        ``hit``, whether the beam read the board; ``side``, its number; ``range_m``, distance of the
+        board's plane along the beam, and ``radius`` of the spot there, metres; ``background``, what
+        it adds to the log odds at which the reading flips, as far as distances and incidence tell
+        it; ``across``, whether the boundary was found across the scan lines (the neighbour is a
+        scan line, not a beam); ``step``, angle between neighbours in that direction, radians. Of
+        all straight sides, without cells in holes, at the border of the view, where something
+        nearer hides the board, with two edges in one spot, and beside a background less than a
+        pulse length (1 m) behind, whose echo melts into the board's. Where most of the outline has
+        such a background they stay, with `background` 0; so do all cells where most boundaries have
+        no return behind them (clouds cut to the board).
     """
     sweep = scan.sweep
-    ends = [np.column_stack([e.cell, e.step, e.side])[e.side >= 0] for e in ways]
-    cell, step, side = np.split(np.concatenate(ends), [2, 4], axis=1)
+    edges = scan.edges["half_step"]
+    edges = edges[edges.side >= 0]
+    cell = np.column_stack([edges.line, edges.beam])
     rays = polar_to_points(1.0, sweep.bearings)
     board, cosine = plane_range(scan, rays, sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
     radius = lrf.spot_radius(board)
-    gap, odds = background_of(scan, board, cell, step)
+    gap, odds = background_of(scan, board, cell, edges.step)
     few = 2 * np.isfinite(gap).sum() < len(gap)
     close = few or 2 * np.sum(gap < MIXING) >= len(gap)
     usable = np.flatnonzero(close | (odds < 0))
 
-    row, k, line, beam = _neighbours(usable, cell, step, scan.mask.shape)
+    row, k, line, beam = _neighbours(usable, cell, edges.step, scan.mask.shape)
     cells = line, beam
     gaps = median_step(sweep.pitch), median_step(sweep.bearings)
     hit, keep = _readings(scan, cells, k, board, radius, gaps, close)
-    sides = [numbered for edges in ways for numbered in edges.sides.items()]
-    side = side[row, 0]
+    side = edges.side[row]
     reach = (CORNER * radius / np.abs(cosine))[cells]
-    keep &= _on_one_side(scan, cells, board, reach, sides, side)
-    across = step[row, 0] != 0
+    keep &= _on_one_side(scan, cells, board, reach, side)
+    across = edges.across[row]
     columns = {
         "line": line,
         "beam": beam,
@@ -133,7 +129,7 @@ def _neighbours(usable, cell, step, shape):
     return rows[first].T
 
 
-def _on_one_side(scan, cells, board, reach, sides, side):
+def _on_one_side(scan, cells, board, reach, side):
     """Cells on the stretch of their own side whose spot reaches no other one.
 
     All of them where sides are not known.
@@ -141,13 +137,13 @@ def _on_one_side(scan, cells, board, reach, sides, side):
     line, beam = cells
     p_lrf = polar_to_points(board[cells], scan.sweep.bearings[beam])
     points = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf)
-    keep = ~np.isin(side, [number for number, _ in sides])
+    keep = ~np.isin(side, [s.number for s in scan.sides])
     alone = np.ones(len(side), bool)
-    for number, s in sides:
+    for s in scan.sides:
         away = points - s.ends[0]
         along = away @ s.direction
         apart = np.linalg.norm(cross(away, s.direction), axis=1)
-        mine = side == number
+        mine = side == s.number
         keep |= mine & (along > 0) & (along < s.length)
         alone &= mine | ~(apart < reach)
     return keep & alone

@@ -1,7 +1,6 @@
 """Where the board's edges cross the scan: edge points with covariance, sides, background."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,12 +37,30 @@ CELLS_BEHIND = 3  # cells beyond an end that tell the range behind it: a median
 MEDIAN_CHI2 = 0.455  # the median of a squared normal variable
 
 
+# where scan lines, or columns of the range image, cross the board's edges; see `with_edges`
+CROSSING = np.dtype(
+    [
+        ("points", float, 3),
+        ("covariance", float, (3, 3)),
+        ("pitch", float),
+        ("line", int),
+        ("beam", int),
+        ("step", int, 2),
+        ("across", bool),
+        ("side", int),
+        ("background", float),
+    ]
+)
+
+
 @dataclass(frozen=True)
 class ScanSide:
     """A straight side of the board as a scan sees it.
 
     Attributes
     ----------
+    across : bool
+        Whether columns of the range image cross it, not scan lines.
     n_points : int
     length : float
         Of the stretch with points, metres.
@@ -54,18 +71,27 @@ class ScanSide:
         crossed by few scan lines and moves along with every error of the pitch.
     ends : ndarray, shape (2, 3)
         Of the stretch, nominal platform frame, metres.
+    number : int
+        Within the placement; the same where it is seen along and across the scan lines.
     """
 
+    across: bool
     n_points: int
     length: float
     rms: float
     angle: float
     ends: np.ndarray
+    number: int = -1
 
     @property
     def direction(self) -> np.ndarray:
         """From one end to the other, shape (3,), of unit length."""
         return (self.ends[1] - self.ends[0]) / self.length
+
+    @property
+    def seen(self) -> bool:
+        """Whether what crosses it tells where it is: it does not run along."""
+        return abs(self.angle - self.across * np.pi / 2) >= LEAST_ANGLE
 
     def is_same(self, other: "ScanSide") -> np.bool:
         """Whether two sides are one: the same direction, and less than two centimetres apart."""
@@ -73,51 +99,6 @@ class ScanSide:
         apart = np.linalg.norm(np.cross(between, self.direction))
         cosine = abs(self.direction @ other.direction)
         return cosine > np.cos(LEAST_TURN) and apart < SAME_SIDE
-
-
-@dataclass(frozen=True)
-class ScanEdges:
-    """Where the board's edges cross the scan lines, or the columns of the range image.
-
-    Attributes
-    ----------
-    variant : {'half_step', 'last_beam'}
-    points : ndarray, shape (n, 3)
-        LRF frame at the pitch of the point, metres; on the fitted scan line.
-    covariance : ndarray, shape (n, 3, 3)
-    pitch : ndarray, shape (n,)
-        Radians.
-    cell : ndarray of int, shape (n, 2)
-        Scan line and beam of the last cell that hit the board.
-    step : ndarray of int, shape (n, 2)
-        From it to the first cell off the board, likewise.
-    end : ndarray of int, shape (n,)
-        -1 where scan lines end at low bearings (right), +1 at high bearings (left); columns: -1 at
-        low pitch, +1 at high pitch.
-    side : ndarray of int, shape (n,)
-        Number of the straight side; -1 for outliers.
-    sides : dict of int to ScanSide
-        By number within the placement; the same in all variants, along and across.
-    background : ndarray, shape (n,)
-        What the distance of the background adds to the log odds at which readings flip
-        (:func:`background_of`).
-    """
-
-    variant: str
-    points: np.ndarray
-    covariance: np.ndarray
-    pitch: np.ndarray
-    cell: np.ndarray
-    step: np.ndarray
-    end: np.ndarray
-    side: np.ndarray
-    sides: dict[int, ScanSide]
-    background: np.ndarray
-
-    @property
-    def line(self) -> np.ndarray:
-        """Scan line of each point."""
-        return self.cell[:, 0]
 
 
 def crossings_of(
@@ -148,72 +129,65 @@ def crossings_of(
     return points, noise, _slid(np.cross([0.0, 0.0, 1.0], points), normal, rays)
 
 
-def crossings(
-    scan: BoardScan, across: bool, known: Mapping[int, ScanSide]
-) -> tuple[dict[str, ScanEdges], dict[int, ScanSide]]:
-    """Where scan lines (with `across`, columns of the range image) cross the board's edges.
+def with_edges(scan: BoardScan) -> BoardScan:
+    """A scan with the places where lines, and columns of the range image, cross the board's edges.
 
-    A column is one beam over the pitch. One rule, step (iii) of the paper's preprocessing, in which
-    bearing and pitch change places.
+    A column is one beam over the pitch: edges nearly parallel to the scan lines are found there,
+    unless it is a single shot. One rule, step (iii) of the paper's preprocessing, in which bearing
+    and pitch change places.
 
     Parameters
     ----------
     scan : BoardScan
-    across : bool
-        Edges nearly parallel to the scan lines are found here.
-    known : dict of int to ScanSide
-        Found the other way: a side that is one of them gets its number.
 
     Returns
     -------
-    edges : dict of str to ScanEdges
-        By variant. 'half_step': halfway between the last beam on the board and the first off it,
-        unbiased for an edge anywhere between them; 'last_beam': the paper's rule, half a step
-        inside on average. Ends at holes inside the board do not appear; neither do ends at the
-        border of the view (of the sweep, which may have been cut), nor where something nearer hides
-        the board. The points lie on the fitted straight line (the paper), moved along the ray by
-        what the outermost beams say where the board turns out to be warped. The covariance holds
-        the beam spacing (uniform over one step), the line fit and warp, and what a side scatters
-        more than that. Sides at less than 20 deg to the scan lines (to the columns) are left out
-        (side -1): there the pitch (the bearing) decides where a line ends.
-    sides : dict of int to ScanSide
-        All of them, with those left out.
+    BoardScan
+        With `edges` and `sides`. Of the variants 'half_step' is halfway between the last beam on
+        the board and the first off it, unbiased for an edge anywhere between them; 'last_beam' is
+        the paper's rule, half a step inside on average. Ends at holes inside the board do not
+        appear; neither do ends at the border of the view (of the sweep, which may have been cut),
+        nor where something nearer hides the board. The points lie on the fitted straight line (the
+        paper), moved along the ray by what the outermost beams say where the board turns out to be
+        warped. The covariance holds the beam spacing (uniform over one step), the line fit and
+        warp, and what a side scatters more than that. Sides at less than 20 deg to the scan lines
+        (to the columns) are left out (side -1): there the pitch (the bearing) decides where a line
+        ends.
     """
-    cell, step, end = _ends(scan, across)
+    cell, step = _ends(scan)
+    across = step[:, 0] != 0
     inner = _place(scan, cell)
     outer = _place(scan, cell + step)
     places = np.stack([inner, (inner + outer) / 2], axis=1)
-    points, noise, by_angle = _at(scan, cell, step, places, across)
+    points, noise, by_angle = _at(scan, cell, step, places)
     gap, odds = background_of(scan, scan.fitted, cell, step)
     pitch = places[0]
-    order = cell[:, int(across)]
-    side, every = _group(scan, points[1], pitch[1], order, end, gap < MIXING, known)
     # the pitch is read in steps, it may seem to stand still
-    least = median_step(scan.sweep.pitch if across else scan.sweep.bearings)
+    beam = median_step(scan.sweep.bearings)
+    least = np.where(across, median_step(scan.sweep.pitch), beam)
     sigma = np.maximum(np.abs(outer - inner).sum(axis=0), least) * UNIFORM
-    turned = _to_platform(scan, by_angle[1], pitch[1])
-    sigma = sigma * _inflation(turned, sigma, side, every)
-    covariance = noise + dyads(by_angle * sigma[:, None])
-    # to the scan lines: of sides along the lines (the columns), whose ends tell nothing of them
-    unseen = np.pi / 2 if across else 0.0
-    sides = {n: s for n, s in every.items() if abs(s.angle - unseen) >= LEAST_ANGLE}
-    if every:  # scans at one pitch have no sides, and keep all points
-        side = np.where(np.isin(side, list(sides)), side, -1)
+    spread = by_angle * sigma[:, None]
+    # neighbouring beams are so far apart where scan lines end
+    apart = beam * medians(np.linalg.norm(by_angle[0], axis=1), ~across)
+    tolerance = max(apart, EDGE_SCATTER)
+    side, more, sides = _group(
+        scan, points[1], pitch[1], spread[1], cell, step, gap < MIXING, tolerance
+    )
+    covariance = noise + dyads(spread * more[:, None])
     edges = {}
     for row, variant in enumerate(VARIANTS):
-        edges[variant] = ScanEdges(
-            variant=variant,
-            points=points[row],
-            covariance=covariance[row],
-            pitch=pitch[row],
-            cell=cell,
-            step=step,
-            end=end,
-            side=side,
-            sides=sides,
-            background=odds,
-        )
-    return edges, every
+        columns = [
+            points[row],
+            covariance[row],
+            pitch[row],
+            *cell.T,
+            step,
+            across,
+            side,
+            odds,
+        ]
+        edges[variant] = np.rec.fromarrays(columns, CROSSING)
+    return replace(scan, edges=edges, sides=sides)
 
 
 def background_of(scan, board, cell, step):
@@ -266,25 +240,28 @@ def plane_range(scan, rays, pitch) -> tuple[np.ndarray, np.ndarray]:
         return height / cosine, cosine
 
 
-def _ends(scan, across):
-    """Ends of lines (columns) that may be edges: cell, step and end, as in `ScanEdges`."""
-    sweep = scan.sweep
-    rows, ends = row_ends(scan.mask.T if across else scan.mask)
-    row = np.tile(rows, 2)
-    place = ends.T.ravel()
-    cell = np.column_stack([place, row] if across else [row, place])
-    end = np.repeat([-1, 1], len(rows))
-    step = np.outer(end, [across, not across])
-    if across and sweep.direction < 0:  # a sweep downwards
-        end = -end
+def _ends(scan):
+    """Ends of lines, then of columns, that may be edges: cells on the board and steps off it."""
+    ways = {1: scan.mask}
+    if scan.swept:
+        ways[-1] = scan.mask.T  # beams and lines change places
+    cells = []
+    steps = []
+    for turn, mask in ways.items():
+        rows, ends = row_ends(mask)
+        cells.append(np.column_stack([np.tile(rows, 2), ends.T.ravel()])[:, ::turn])
+        steps.append(np.repeat([[0, -1], [0, 1]], len(rows), axis=0)[:, ::turn])
+    cell = np.concatenate(cells)
+    step = np.concatenate(steps)
     inside = within(cell, step, scan.mask.shape) & np.isfinite(scan.lines[cell[:, 0], 0])
-    cell, step, end = cell[inside], step[inside], end[inside]
+    cell = cell[inside]
+    step = step[inside]
     here = scan.fitted[tuple(cell.T)]
-    after = sweep.ranges[tuple((cell + step).T)]
+    after = scan.sweep.ranges[tuple((cell + step).T)]
     gap = np.sum(_place(scan, cell + step) - _place(scan, cell), axis=0)
     # nothing nearer hides the board
     visible = ~(after < here - depth_jump(here, gap))
-    return cell[visible], step[visible], end[visible]
+    return cell[visible], step[visible]
 
 
 def _place(scan, cell):
@@ -293,29 +270,27 @@ def _place(scan, cell):
     return np.stack([scan.sweep.pitch[line], scan.sweep.bearings[beam]])
 
 
-def _at(scan, cell, step, places, across):
+def _at(scan, cell, step, places):
     """Crossings of fitted lines with the rays of places (2, v, n): points, their covariance by the
-    range, and their derivatives by the bearing (the pitch), (v, n, ...).
+    range, and their derivatives by the bearing (of columns by the pitch), (v, n, ...).
 
-    At another pitch than that of the line changed as the board's plane predicts; at its own moved
-    by what the warp of the board asks for.
+    At another pitch than that of the line changed as the board's plane predicts; of lines moved by
+    what the warp of the board asks for.
     """
     pitch, bearing = places
     line = cell[:, 0]
     lines = scan.lines[line]
-    points, noise, by_angle = crossings_of(lines, scan.lines_covariance[line], bearing)
+    points, noise, by_bearing = crossings_of(lines, scan.lines_covariance[line], bearing)
     rays = polar_to_points(1.0, bearing)
-    if not across:
-        shift, sigma = _warp(scan, cell, step)
-        warp = sigma[:, None] * rays
-        return points + shift[:, None] * rays, dyads(noise) + dyads(warp), by_angle
     there, _ = plane_range(scan, rays, pitch)
     here, _ = plane_range(scan, rays, scan.sweep.pitch[line])
-    points = points + (there - here)[..., None] * rays
+    shift, sigma = _warp(scan, cell, step)
+    points = points + (there - here + shift)[..., None] * rays
     rotation = scan.T_head_lrf.rotation.as_matrix()
     turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation
     normal = tilt(scan.normal, -pitch) @ rotation
-    return points, dyads(noise), _slid(turned, normal, rays)
+    by_angle = np.where(step[:, :1], _slid(turned, normal, rays), by_bearing)
+    return points, dyads(noise) + dyads(sigma[:, None] * rays), by_angle
 
 
 def _read_along(values, cell, step, count):
@@ -352,7 +327,7 @@ def _warp(scan, cell, step):
     A board bends, and cardboard reads farther than paper. The outermost eighth of a line (15 beams
     at most) says how far each end is off; how much these medians vary beyond their noise over all
     lines says how far to believe them. On a flat board that is nothing, and the ends stay on the
-    fitted lines.
+    fitted lines. Nor is it for columns, of which the lines tell nothing.
     """
     inwards = np.arange(WARPED_BEAMS)
     count = np.clip(scan.mask[cell[:, 0]].sum(axis=1) // 8, 1, WARPED_BEAMS)
@@ -370,63 +345,50 @@ def _warp(scan, cell, step):
     return middle * share, np.sqrt(noise * share)
 
 
-def _inflation(by_angle, sigma, side, sides):
-    """How much more the points of a side scatter than their spacing explains, at least 1, (n,).
-
-    The spacing is along `by_angle`.
-    """
-    factor = np.ones(len(side))
-    for number, s in sides.items():
-        rows = side == number
-        away = np.cross(by_angle[rows], s.direction)
-        expected = rms(sigma[rows] * np.linalg.norm(away, axis=1))
-        if expected > 0:
-            factor[rows] = max(1.0, s.rms / expected)
-    return factor
-
-
-def _group(scan, points, pitch, order, end, mixed, known):
-    """The straight sides in the board's plane: the side of each point (-1 for none), and the sides
-    by number.
+def _group(scan, points, pitch, spread, cell, step, mixed, tolerance):
+    """The straight sides in the board's plane: the side of each point, -1 for none; how much more
+    the points of a side scatter than their spacing `spread` (n, 3) explains, at least 1; and the
+    ScanSides.
 
     Where a post or an easel stands close behind a board, its edge is bent: such (`mixed`) points
     are left out, unless most of the board's outline lies before something close (a wall), which
     moves all of it alike.
     """
-    if not len(end) or np.ptp(scan.sweep.pitch) < SAME_PITCH:
-        return (end + 1) // 2, {}  # scans at one pitch show one point a side
+    more = np.ones(len(cell))
+    if np.ptp(scan.sweep.pitch) < SAME_PITCH:
+        return (step[:, 1] + 1) // 2, more, ()  # scans at one pitch show one point a side
+    side = np.full(len(cell), -1)
+    every: list[ScanSide] = []
     axes = plane_axes(scan.normal)
     flat = lrf_to_platform(points, pitch, scan.T_head_lrf) @ axes.T
-    side = np.full(len(flat), -1)
-    sides: dict = {}
-    tolerance = max(_spacing(scan), EDGE_SCATTER)
-    shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0))
-    usable = ~mixed | (2 * mixed.sum() >= len(flat))
-    for hand in (-1, 1):
-        candidates = np.flatnonzero((end == hand) & usable)
-        left_out = np.unique(order[(end == hand) & ~usable])  # makes no gap
+    spread = _to_platform(scan, spread, pitch)
+    for direction in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+        across = direction[1] == 0
+        way = (step[:, 1] == 0) == across
+        end = np.all(step == direction, axis=1)
+        if not end.any():
+            continue
+        usable = ~mixed | (2 * mixed[way].sum() >= way.sum())
+        candidates = np.flatnonzero(end & usable)
+        order = cell[:, int(across)]
+        left_out = np.unique(order[end & ~usable])  # makes no gap
         place = order[candidates] - np.searchsorted(left_out, order[candidates])
+        shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat[way], axis=0))
         for run in straight_runs(flat[candidates], place, tolerance, shortest):
             rows = candidates[run]
-            new = _side_through(scan, flat[rows], axes, np.mean(pitch[rows]))
-            same = (number for number, s in known.items() if s.is_same(new))
-            number = next(same, len(known) + len(sides))
-            side[rows] = number
-            sides[number] = new
-    return side, sides
+            new = _side_through(scan, flat[rows], axes, np.mean(pitch[rows]), across)
+            same = (s.number for s in every if s.across != across and s.is_same(new))
+            new = replace(new, number=next(same, len(every)))
+            every.append(new)
+            expected = rms(np.linalg.norm(np.cross(spread[rows], new.direction), axis=1))
+            if expected > 0:
+                more[rows] = max(1.0, new.rms / expected)
+            if new.seen:
+                side[rows] = new.number
+    return side, more, tuple(s for s in every if s.seen)
 
 
-def _spacing(scan):
-    """Median distance of neighbouring beams at the ends of the board's scan lines, metres."""
-    row, ends = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
-    line = np.repeat(row, 2)
-    bearing = scan.sweep.bearings[ends.ravel()]
-    _, _, apart = crossings_of(scan.lines[line], scan.lines_covariance[line], bearing)
-    spacing = np.median(np.linalg.norm(apart, axis=1))
-    return spacing * median_step(scan.sweep.bearings)
-
-
-def _side_through(scan, flat, axes, pitch):
+def _side_through(scan, flat, axes, pitch, across):
     """The ScanSide through points (n, 2) of the board's plane."""
     centre, direction, miss = fit_line(flat)
     along = (flat - centre) @ direction
@@ -435,6 +397,7 @@ def _side_through(scan, flat, axes, pitch):
     level = np.cross(scan_normal, scan.normal)  # of the scan line on the board
     cosine = abs(unit_vector(level) @ (direction @ axes))
     return ScanSide(
+        across=across,
         n_points=len(flat),
         length=np.ptp(along),
         rms=miss * np.sqrt(len(flat) / (len(flat) - 2)),

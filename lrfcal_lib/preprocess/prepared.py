@@ -8,16 +8,14 @@ import numpy as np
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.problem import LEAVES_OUT, Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_image import BoardView
-from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, BoardScan, find_board
-from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, ScanEdges, crossings
+from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
+from lrfcal_lib.preprocess.edges_in_scan import with_edges
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.outline_in_images import Outline
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.workers import spread
-
-LEAST_SWEEP = np.deg2rad(1.0)  # a placement whose pitch spans less is a single shot
 
 
 @dataclass(frozen=True)
@@ -93,11 +91,7 @@ class Prepared:
         With its outline, measured from the images where the session does not state it and they show
         it.
     scans : dict of int to BoardScan
-        By placement.
-    edges : dict of int to dict of str to list of ScanEdges
-        By placement and edge-point variant: where scan lines cross the board's sides; and, unless
-        it is a single shot, the same across the scan lines, where the sweep enters and leaves the
-        board.
+        By placement, with their edges and the names of these.
     models : dict of str to CameraModel
     views : dict of str to dict of int to BoardView
         By camera and placement; where there are images at several pitch angles, the one with most
@@ -106,10 +100,6 @@ class Prepared:
     relief : ndarray, shape (k,), or 0.0
         Heights of the pattern's corners over the sheet's mean plane, metres (see the survey of the
         images).
-    names : dict of int to dict of int to str
-        Board edge of each side of the scan, by placement and side number.
-    dropped : dict of int to dict of int to DroppedSide
-        Sides that got no name because the board has no edge there, likewise.
     pitch_noise : PitchNoise
         What the recordings themselves tell about it.
     problems : tuple of Problem
@@ -119,13 +109,10 @@ class Prepared:
     session: Session
     board: Board
     scans: dict
-    edges: dict
     models: dict = field(default_factory=dict)
     views: dict = field(default_factory=dict)
     outline: Outline | None = None
     relief: np.ndarray | float = 0.0
-    names: dict = field(default_factory=dict)
-    dropped: dict = field(default_factory=dict)
     pitch_noise: PitchNoise = PitchNoise()
     problems: tuple[Problem, ...] = ()
 
@@ -199,45 +186,18 @@ def prepare_scans(session: Session) -> Prepared:
     Prepared
         Without cameras.
     """
-    scans = {}
-    edges = {}
-    problems = []
-    for result in spread(partial(_crossed, session), session.board_placements):
-        if isinstance(result, Problem):
-            problems.append(result)
-            continue
-        scan, crossed = result
-        scans[scan.placement] = scan
-        edges[scan.placement] = crossed
-    return Prepared(session, session.board, scans, edges, problems=tuple(problems))
+    results = list(spread(partial(_board_in, session), session.board_placements))
+    problems = tuple(result for result in results if isinstance(result, Problem))
+    scans = {result.placement: result for result in results if result not in problems}
+    return Prepared(session, session.board, scans, problems=problems)
 
 
-def _crossed(session, placement):
-    """The board and its crossings in one sweep, or why not."""
+def _board_in(session, placement):
+    """The board in one sweep with its edges, or why not."""
     try:
-        scan = find_board(session.sweep(placement), session)
-        return scan, all_crossings(scan)
+        return with_edges(find_board(session.sweep(placement), session))
     except SessionError:
         words = "no range in any scan line"
     except BoardNotFound as error:
         words = str(error)
     return Problem(Stage.SCANS, ProblemKind.NO_BOARD, words, placement)
-
-
-def all_crossings(scan: BoardScan) -> dict[str, list[ScanEdges]]:
-    """Where scan lines, and columns unless it is a single shot, cross the board's edges.
-
-    Parameters
-    ----------
-    scan : BoardScan
-
-    Returns
-    -------
-    dict of str to list of ScanEdges
-        By edge-point variant.
-    """
-    along, sides = crossings(scan, False, {})
-    ways = [along]
-    if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
-        ways.append(crossings(scan, True, sides)[0])
-    return {variant: [way[variant] for way in ways] for variant in VARIANTS}

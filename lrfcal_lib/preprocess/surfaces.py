@@ -163,7 +163,7 @@ def planar_surface(
             limits = _size_limits(rig.board, rig.lrf.spot_radius(reach))
             if upright is None:
                 part = _trimmed(part, points, limits)
-            area, length = plane_size(points[part.mask], part.normal)
+            area, length = plane_size(points[part.mask] @ plane_axes(part.normal).T)
             lines = part.mask.any(axis=1).sum()
             fault = f" on {lines} of {len(ranges)} scan lines"
             if upright is None:
@@ -235,9 +235,8 @@ def best_plane(points, upright, rng) -> tuple[np.ndarray, float]:
     return normal, distance
 
 
-def plane_size(points: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
-    """Area (m2; 0 for a single line) and greatest length (m) of points in a plane."""
-    flat = points @ plane_axes(normal).T
+def plane_size(flat: np.ndarray) -> tuple[float, float]:
+    """Area (m2; 0 for a single line) and greatest length (m) of points (n, 2) in a plane."""
     hull = cv2.convexHull(flat.astype(np.float32))[:, 0]
     return cv2.contourArea(hull), pdist(hull).max()
 
@@ -289,7 +288,7 @@ def _planes(sweep, points, mask, upright, rng):
 
 def _trimmed(part, points, limits):
     """A flat surface, where it has not the board's size without thin strips of floor or wall."""
-    if limits.hold(*plane_size(points[part.mask], part.normal)):
+    if limits.hold(*plane_size(points[part.mask] @ plane_axes(part.normal).T)):
         return part
     whole = ndimage.binary_closing(part.mask, iterations=2)
     labels, count = ndimage.label(ndimage.binary_opening(whole, np.ones((5, 5))))
@@ -310,12 +309,11 @@ def _grown(surface, points):
 
 def _size_limits(board, grown):
     """Limits of a board with its outline grown (m)."""
-    corners = board.outline().astype(np.float32)
-    area = cv2.contourArea(corners)
-    length = pdist(corners).max()
+    corners = board.outline()
+    area, length = plane_size(corners)
     if board.corners is None:
         return Limits(0.3 * area, 4 * area, 2.5 * length)
-    rim = cv2.arcLength(corners, True)
+    rim = cv2.arcLength(corners.astype(np.float32), True)
     return Limits(0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown)
 
 

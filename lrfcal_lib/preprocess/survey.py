@@ -287,9 +287,8 @@ def _choices(session, purposes):
     for record in session.image_records:
         if record.purpose in purposes:
             view = _view(record)
-            alone = record.file if view.placement < 0 else None
-            group = groups.setdefault((view.camera, view.placement, alone), [])
-            group.append(Shot(record, view))
+            of = (view.camera, view.placement) if view.placement >= 0 else record.file
+            groups.setdefault(of, []).append(Shot(record, view))
     for group in groups.values():
         pitch = [shot.view.pitch for shot in group]
         middle = (min(pitch) + max(pitch)) / 2
@@ -405,16 +404,31 @@ def _ordered(shots, read, board, models):
     """
     if not shots:
         return shots, None, ""
+    pattern = board.pattern
     known = board.corners is not None
-    corners, poses, leader = _orders(shots, board.pattern, models, mirrored=known)
+    orders = pattern_orders(pattern, mirrored=known)
+    turns = turned_boards(pattern, orders)
+    poses = [
+        first_pose(pattern.points(), shot.view.pixels, models[shot.view.camera]) * turns
+        for shot in shots
+    ]
+    leader, together = alike(
+        [pose.rotation for pose in poses], [shot.view for shot in shots]
+    )
+    corners = np.array(
+        [
+            shot.view.pixels[orders[order]]
+            for shot, order in zip(shots, together, strict=True)
+        ]
+    )
     unseen = ""
     if known:
         lines = board.lines()
         score = partial(_order_scores, read=read, board=board, models=models)
-        scores = spread(score, zip(shots, poses, strict=True))
+        scores = spread(score, zip(shots, poses, together, strict=True))
         chosen = decide(np.array(scores), leader)
     else:
-        votes, up = _votes(shots, corners[:, 0], read, board.pattern, models)
+        votes, up = _votes(shots, corners[:, 0], read, pattern, models)
         turned = turned_views(votes, up, leader)
         votes[turned] = votes[turned][:, OPPOSITE]
         chosen = turned.astype(int)
@@ -435,34 +449,10 @@ def _votes(shots, corners, read, pattern, models):
     return np.array(votes), np.array(up)
 
 
-def _orders(shots, pattern, models, mirrored):
-    """The orders that the corners of m shots may have, alike in a placement.
-
-    Corners (m, n, k, 2) in n orders, those that belong together in one column, m stacks of the
-    rough ``T_camera_board`` that go with them, and the leaders of
-    :func:`lrfcal_lib.preprocess.turns.alike`.
-    """
-    orders = pattern_orders(pattern, mirrored=mirrored)
-    turns = turned_boards(pattern, orders)
-    poses = [
-        first_pose(pattern.points(), shot.view.pixels, models[shot.view.camera]) * turns
-        for shot in shots
-    ]
-    leader, together = alike(
-        [pose.rotation for pose in poses], [shot.view for shot in shots]
-    )
-    corners = []
-    posed = []
-    for shot, pose, order in zip(shots, poses, together, strict=True):
-        corners.append(shot.view.pixels[orders[order]])
-        posed.append(pose[order])
-    return np.array(corners), posed, leader
-
-
-def _order_scores(shot_and_poses, read, board, models):
+def _order_scores(shot_and_orders, read, board, models):
     """How well each order of the corners puts the known outline onto edges of the image."""
-    shot, poses = shot_and_poses
-    return order_scores(shot.image(read), board, models[shot.record.camera], poses)
+    shot, poses, order = shot_and_orders
+    return order_scores(shot.image(read), board, models[shot.record.camera], poses[order])
 
 
 def _turned_alike(views):
