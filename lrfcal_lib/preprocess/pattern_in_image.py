@@ -1,6 +1,7 @@
 """The printed chessboard in an image: its inner corners at sub-pixel level, and their orders."""
 
 from dataclasses import dataclass
+from math import comb
 
 import cv2
 import numpy as np
@@ -18,11 +19,14 @@ WIDEST_WINDOW_PX = 15.0  # half window where squares are large, but for
 LEAST_REACH = 0.25  # of a square: large images are soft
 MARGIN = 2.0  # half windows around the corners: what a turned window and its blur reach
 REFINE_ROUNDS = 20
+CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+# looks at a picture of twice the size, for small squares, at four times the time
+TWICE_AS_LARGE = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 FARTHEST_MOVE = 0.25  # of a square, in each look
 # around rough corners where sectors are looked for near by: share of their extent, pixels
 AROUND = 0.22
 AROUND_PX = 4
-SMOOTH_ENOUGH_PX = 0.07  # corners that fit a smooth grid this well need no second start
+SMOOTH_ENOUGH_PX = 0.05  # corners with less noise than this need no second start
 BEYOND = 0.3  # where to look outside the outermost corners, squares
 LEAST_BEYOND = 0.25  # contrast there, a share of that inside
 SMALL_SQUARE_PX = 9.0  # below it the blur of a corner reaches into the squares behind
@@ -72,13 +76,26 @@ def grey(image) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
-class PatternFinder:
-    """Finds the inner corners of a chessboard in images; remembers whether its squares are dark on
-    light.
+def find_pattern(image: np.ndarray, pattern: Chessboard) -> np.ndarray:
+    """The inner corners of a chessboard in an image, x right, y down on the printed side.
+
+    A chessboard looks the same when it is turned by 180 deg: :mod:`lrfcal_lib.preprocess.survey`
+    resolves that.
 
     Parameters
     ----------
+    image : ndarray of uint8, shape (h, w) or (h, w, 3)
     pattern : Chessboard
+
+    Returns
+    -------
+    ndarray, shape (columns * rows, 2)
+        Recorded pixels.
+
+    Raises
+    ------
+    PatternNotFound
+        Where no detector finds all corners.
 
     Notes
     -----
@@ -88,127 +105,75 @@ class PatternFinder:
     Both look at a reduced picture where the image is large; :func:`refine_corners` looks at the
     image itself.
     """
-
-    def __init__(self, pattern: Chessboard):
-        self.size = pattern.columns, pattern.rows
-        self.negatives = (False, True)
-
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        """The corners in an image, x right, y down on the printed side.
-
-        A chessboard looks the same when it is turned by 180 deg:
-        :mod:`lrfcal_lib.preprocess.survey` resolves that.
-
-        Parameters
-        ----------
-        image : ndarray of uint8, shape (h, w) or (h, w, 3)
-
-        Returns
-        -------
-        ndarray, shape (columns * rows, 2)
-            Recorded pixels.
-
-        Raises
-        ------
-        PatternNotFound
-            Where no detector finds all corners.
-        """
-        picture = grey(image)
-        grid = self._in_reduced(picture)
-        if grid is None:
-            columns, rows = self.size
-            raise PatternNotFound(
-                f"no chessboard with {columns} x {rows} inner corners in the image: it must be "
-                "whole, and not glare"
-            )
-        if np.linalg.det(square_axes(grid)).mean() <= 0:
-            grid = grid[::-1]  # of a mirrored image
-        return grid.reshape(-1, 2)
-
-    def _in_reduced(self, picture):
-        """Grid of corners of a large picture by way of a reduced one, or without it where that
-        shows none.
-        """
-        times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
-        if times <= 1:
-            return self._search(picture)
-        height, width = (side // times for side in picture.shape)
-        whole = picture[: height * times, : width * times]
-        reduced = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
-        grid = self._search(reduced)
-        if grid is None:
-            return self._search(picture, thorough=False)
-        # pixel (0, 0) is the centre of a pixel, of the reduced one as well
-        return refine_corners(picture, (grid + 0.5) * times - 0.5)
-
-    def _search(self, picture, thorough=True):
-        """Grid of refined corners, None where there are none; `thorough` costs most."""
-        rough = self._classic(picture)
-        if rough is not None:
-            grid = _smoothest(picture, rough)
-        else:
-            rough = sectors(picture, self.size, 0)
-            if rough is None and thorough:
-                rough = sectors(picture, self.size)
-            if rough is None:
-                return None
-            grid = refine_corners(picture, rough)
-        return grid if _ends_in_squares(picture, grid) else None
-
-    def _classic(self, picture):
-        """Grid of rough corners by the classic detector, the last successful of picture and
-        negative first.
-        """
-        for negative in self.negatives:
-            rough = classic(picture, self.size, negative)
-            if rough is not None:
-                self.negatives = (negative, not negative)
-                return rough
-        return None
+    grid = _in_reduced(grey(image), (pattern.columns, pattern.rows))
+    if grid is None:
+        raise PatternNotFound(
+            f"no chessboard with {pattern.columns} x {pattern.rows} inner corners in the image: it "
+            "must be whole, and not glare"
+        )
+    if np.linalg.det(square_axes(grid)).mean() <= 0:
+        grid = grid[::-1]  # of a mirrored image
+    return grid.reshape(-1, 2)
 
 
-def classic(picture, size, negative):
-    """Grid of rough corners by OpenCV's classic detector, also in the negative, or None."""
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    # the quick check overlooks white squares on a dark board, and saves little time there
-    if negative:
-        picture = 255 - picture
-    else:
-        flags |= cv2.CALIB_CB_FAST_CHECK
-    try:
-        return _grid(*cv2.findChessboardCorners(picture, size, flags=flags), size)
-    except cv2.error:  # some images a few pixels wide are too narrow for its thresholds
-        return None
-
-
-def sectors(picture, size, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
-    """Grid of rough corners by OpenCV's sector-based detector; None if there are none.
-
-    The flags make it look at a picture of twice the size, for small squares, at four times the
-    time.
+def _in_reduced(picture, size):
+    """Grid of corners of a large picture by way of a reduced one, or without it where that shows
+    none.
     """
-    return _grid(*cv2.findChessboardCornersSB(picture, size, flags=flags), size)
+    times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
+    if times <= 1:
+        return _search(picture, size)
+    height, width = (side // times for side in picture.shape)
+    whole = picture[: height * times, : width * times]
+    reduced = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+    grid = _search(reduced, size)
+    if grid is None:
+        return _search(picture, size, thorough=False)
+    # pixel (0, 0) is the centre of a pixel, of the reduced one as well
+    return refine_corners(picture, (grid + 0.5) * times - 0.5)
 
 
-def _grid(found, corners, size):
-    """Corners of a detector as (rows, columns, 2), where it found them."""
-    return corners.reshape(*size[::-1], 2).astype(float) if found else None
-
-
-def _smoothest(picture, rough):
-    """Grid of refined corners.
+def _search(picture, size, thorough=True):
+    """Grid of refined corners, None where there are none; `thorough` costs most.
 
     From sectors near by where rough corners were too far off for their windows.
     """
-    refined = refine_corners(picture, rough)
-    if grid_noise(refined) < SMOOTH_ENOUGH_PX:
-        return refined
-    low, place = around(rough, AROUND * np.ptp(rough, axis=(0, 1)) + AROUND_PX)
-    part = np.ascontiguousarray(picture[place])
-    start = sectors(part, rough.shape[1::-1], 0)
-    if start is None:
-        return refined
-    return min(refined, refine_corners(picture, start + low), key=grid_noise)
+    rough = _rough(picture, size, thorough)
+    if rough is None:
+        return None
+    grid = refine_corners(picture, rough)
+    if grid_noise(grid) > SMOOTH_ENOUGH_PX:
+        low, place = around(rough, AROUND * np.ptp(rough, axis=(0, 1)) + AROUND_PX)
+        start = _detected(cv2.findChessboardCornersSB, picture[place].copy(), size, 0)
+        if start is not None:
+            grid = min(grid, refine_corners(picture, start + low), key=grid_noise)
+    return grid if _ends_in_squares(picture, grid) else None
+
+
+def _rough(picture, size, thorough):
+    """Grid of rough corners by the first of OpenCV's detectors that finds them, or None."""
+    # the quick check overlooks white squares on a dark board, and saves little time there
+    ways = [
+        (cv2.findChessboardCorners, picture, CLASSIC | cv2.CALIB_CB_FAST_CHECK),
+        (cv2.findChessboardCorners, 255 - picture, CLASSIC),
+        (cv2.findChessboardCornersSB, picture, 0),
+    ]
+    if thorough:
+        ways.append((cv2.findChessboardCornersSB, picture, TWICE_AS_LARGE))
+    for detector, seen, flags in ways:
+        grid = _detected(detector, seen, size, flags)
+        if grid is not None:
+            return grid
+    return None
+
+
+def _detected(detector, picture, size, flags):
+    """Corners of a detector as (rows, columns, 2), None where it finds none."""
+    try:
+        found, corners = detector(picture, size, flags=flags)
+    except cv2.error:  # some images a few pixels wide are too narrow for its thresholds
+        return None
+    return corners.reshape(*size[::-1], 2).astype(float) if found else None
 
 
 def around(corners, margin):
@@ -222,24 +187,17 @@ def around(corners, margin):
 
 
 def grid_noise(grid):
-    """Root mean square distance of a chessboard's corners from a smooth grid, pixels.
+    """Root mean square error of a coordinate of a chessboard's corners (rows, columns, 2), pixels.
 
-    Smooth are a homography and polynomials of third order (second below 16 corners): lens
-    distortion, a bent sheet.
+    From their fourth differences (lower ones in short rows): what perspective, lens distortion and
+    a bent sheet do has next to none.
     """
-    rows, columns, _ = grid.shape
-    row, column = np.mgrid[:rows, :columns].reshape(2, -1)
-    last = max(rows, columns) - 1
-    flat = np.column_stack([column, row]) / last * 2 - 1
-    corners = grid.reshape(-1, 2)
-    order = 3 if len(flat) >= 16 else 2
-    homography = cv2.findHomography(flat, corners)[0]
-    left = corners - cv2.perspectiveTransform(flat[None], homography)[0]
-    x, y = flat.T
-    powers = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
-    design = np.column_stack([x**i * y**j for i, j in powers])
-    noise = left - design @ np.linalg.lstsq(design, left)[0]
-    return rms(np.linalg.norm(noise, axis=1))
+    noise = []
+    for axis, count in enumerate(grid.shape[:2]):
+        order = min(4, count - 1)
+        differences = np.diff(grid, order, axis=axis)
+        noise.append(differences.ravel() / np.sqrt(comb(2 * order, order)))
+    return rms(np.concatenate(noise))
 
 
 def refine_corners(picture, start):

@@ -26,8 +26,8 @@ from lrfcal_lib.preprocess.outline_in_images import (
 )
 from lrfcal_lib.preprocess.pattern_in_image import (
     SMALL_SQUARE_PX,
-    PatternFinder,
     PatternNotFound,
+    find_pattern,
     pattern_orders,
     scale_error,
     spread_views,
@@ -117,8 +117,7 @@ def survey(prepared: Prepared) -> Prepared:
         return _survey_plain(prepared, look, stated, unknown)
 
     groups = _choices(session, {"board", "intrinsics"})
-    finder = PatternFinder(board.pattern)
-    begin = partial(_begin, read=read, board=board, finder=finder, count=len(groups))
+    begin = partial(_begin, read=read, board=board, count=len(groups))
     begun = spread(partial(_first, begin=begin), groups)
     shots = [shot for shot in begun if not shot.reason]
     rough, _ = _adjusted(unknown, stated, shots, session)
@@ -183,13 +182,12 @@ def all_views(prepared) -> dict[str, list[BoardView]]:
     ]
     if prepared.board.pattern is None:
         return {camera: list(views.values()) for camera, views in known.items()}
-    finder = PatternFinder(prepared.board.pattern)
-    look = partial(_like_prepared, prepared=prepared, finder=finder)
+    look = partial(_like_prepared, prepared=prepared)
     views = spread(look, records)
     return {camera: [view for view in views if view.camera == camera] for camera in known}
 
 
-def _like_prepared(record, prepared, finder):
+def _like_prepared(record, prepared):
     """The board in one image: that of the placement where it is the same, or none shows it."""
     board = prepared.board
     known = prepared.views[record.camera][record.placement]
@@ -197,7 +195,7 @@ def _like_prepared(record, prepared, finder):
     if known.file == view.file or known.pixels is None:
         return replace(known, file=view.file, pitch=record.pitch)
     read = prepared.session.read_image
-    shot = _begin(Shot(record, view), read, board, finder, 1)
+    shot = _begin(Shot(record, view), read, board, 1)
     if shot.reason:
         return shot.view
     corners = shot.view.pixels[pattern_orders(board.pattern)]
@@ -322,14 +320,14 @@ def _survey_plain(prepared, look, models, unknown):
     return _with_views(replace(prepared, models=models), views)
 
 
-def _begin(shot, read, board, finder, count):
+def _begin(shot, read, board, count):
     """A shot with the corners of the pattern in any order, or with the reason why not.
 
     With the part of the image that is looked at again, where there is room for so many.
     """
     image = read(shot.record)
     try:
-        corners = finder(image)
+        corners = find_pattern(image, board.pattern)
     except PatternNotFound as error:
         return replace(shot, view=replace(shot.view, reason=str(error)))
     part = part_around(image, corners, board)
