@@ -123,9 +123,8 @@ def _in_reduced(picture, size):
     times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
     if times <= 1:
         return _search(picture, size)
-    height, width = (side // times for side in picture.shape)
-    whole = picture[: height * times, : width * times]
-    reduced = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+    share = 1 / times
+    reduced = cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
     grid = _search(reduced, size)
     if grid is None:
         return _search(picture, size, thorough=False)
@@ -241,10 +240,7 @@ def symmetric_points(picture, points, reach, look):
     offsets = np.stack(np.meshgrid(half, place)).reshape(2, -1)
     weight = np.prod((1 - offsets**2) ** 2, axis=0)
     spline = spline_filter(picture, look.order, np.float32) if look.order > 1 else picture
-    slopes = [
-        cv2.Sobel(picture, cv2.CV_32F, 1 - down, down, ksize=1, scale=0.5)
-        for down in (0, 1)
-    ]
+    slopes = np.gradient(picture, axis=(1, 0))
     for _ in range(REFINE_ROUNDS):
         axes = square_axes(points) * reach[..., None]
         arms = (axes @ offsets).mT  # (rows, columns, m, 2)
@@ -307,11 +303,9 @@ def _ends_in_squares(picture, grid):
         away = BEYOND * (inner - edge)
         places = np.array([edge - away, edge + away])
         visible = np.all((places >= 0) & (places <= last), axis=(0, 2))
-        outside, inside = interpolated(picture, places[:, visible])
-        sign = np.resize([1.0, -1.0], len(visible))[visible]
-        sign -= sign.sum() / max(len(sign), 1)
-        contrast = sign @ inside
-        if (sign @ outside) * contrast > -LEAST_BEYOND * contrast**2:
+        # from square to square
+        outside, inside = np.diff(interpolated(picture, places[:, visible]))
+        if outside @ inside > -LEAST_BEYOND * (inside @ inside):
             return False
     return True
 
