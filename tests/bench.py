@@ -37,7 +37,7 @@ from lrfcal_lib.evaluate.study_trials import STUDIED
 from lrfcal_lib.measure.stations import join_stations
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.model.observations import thin
-from lrfcal_lib.preprocess.pattern_in_image import find_pattern
+from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
 from lrfcal_lib.session.cluster import workers_at
 from lrfcal_lib.session.lms2xx_codec import (
     decode_scans,
@@ -330,12 +330,13 @@ def images(size):
     large = cv2.resize(small, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
     jpeg = cv2.imencode(".jpg", large)[1]
     png = cv2.imencode(".png", large)[1]
+    finder = PatternFinder(board.pattern)
     middle = (np.array([model.cx, model.cy]) + 0.5) * times - 0.5
     lens = (model.fx * times, model.fy * times, *middle, model.distortion)
     model = CameraModel(large.shape[1], large.shape[0], *lens)
 
     def find():
-        return find_pattern(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), board.pattern)
+        return finder(cv2.imdecode(jpeg, cv2.IMREAD_COLOR))
 
     def see():
         """The whole survey of one camera's images, of which all are the same."""

@@ -11,7 +11,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
-from lrfcal_lib.preprocess import pattern_in_image, survey
+from lrfcal_lib.preprocess import survey
+from lrfcal_lib.preprocess.pattern_in_image import (
+    PatternFinder,
+)
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.read import ImageRecord
 from lrfcal_lib.session.stated import CameraInfo
@@ -176,7 +179,7 @@ def score(pose, covariance, exact):
 
 
 def find_pattern(picture, pattern=PATTERN):
-    return pattern_in_image.find_pattern(picture, pattern)
+    return PatternFinder(pattern)(picture)
 
 
 def up_to_a_turn(corners, exact):

@@ -26,8 +26,8 @@ def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
     pictures = {"left": BLANK, "right": BLANK + 1}
     monkeypatch.setattr(
         survey,
-        "find_pattern",
-        lambda image, pattern: pixels_of_squares(12.0 if image.any() else 7.0),
+        "PatternFinder",
+        lambda pattern: lambda image: pixels_of_squares(12.0 if image.any() else 7.0),
     )
     session = seen_by(
         dict.fromkeys(pictures, MODEL),

@@ -12,7 +12,7 @@ import numpy as np
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
-from lrfcal_lib.preprocess.pattern_in_image import PatternNotFound, find_pattern, grey
+from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
 from lrfcal_lib.preprocess.prepared import all_crossings
 from lrfcal_lib.session.faults import DARK, brightness, repeated_images, repeated_scans
 from lrfcal_lib.session.files import SessionError
@@ -185,7 +185,7 @@ def check_image(
     if pattern is None:
         return _check_plain(image, board, model, name)
     try:
-        corners = find_pattern(image, pattern)
+        corners = PatternFinder(pattern)(image)
     except PatternNotFound as error:
         text = str(error)
         if brightness(image) < DARK:

@@ -1,7 +1,6 @@
 """The printed chessboard in an image: its inner corners at sub-pixel level, and their orders."""
 
 from dataclasses import dataclass
-from math import comb
 
 import cv2
 import numpy as np
@@ -26,7 +25,7 @@ FARTHEST_MOVE = 0.25  # of a square, in each look
 # around rough corners where sectors are looked for near by: share of their extent, pixels
 AROUND = 0.22
 AROUND_PX = 4
-SMOOTH_ENOUGH_PX = 0.05  # corners with less noise than this need no second start
+SMOOTH_ENOUGH_PX = 0.07  # corners that fit a smooth grid this well need no second start
 BEYOND = 0.3  # where to look outside the outermost corners, squares
 LEAST_BEYOND = 0.25  # contrast there, a share of that inside
 SMALL_SQUARE_PX = 9.0  # below it the blur of a corner reaches into the squares behind
@@ -76,26 +75,13 @@ def grey(image) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
-def find_pattern(image: np.ndarray, pattern: Chessboard) -> np.ndarray:
-    """The inner corners of a chessboard in an image, x right, y down on the printed side.
-
-    A chessboard looks the same when it is turned by 180 deg: :mod:`lrfcal_lib.preprocess.survey`
-    resolves that.
+class PatternFinder:
+    """Finds the inner corners of a chessboard in images; remembers whether its squares are dark on
+    light.
 
     Parameters
     ----------
-    image : ndarray of uint8, shape (h, w) or (h, w, 3)
     pattern : Chessboard
-
-    Returns
-    -------
-    ndarray, shape (columns * rows, 2)
-        Recorded pixels.
-
-    Raises
-    ------
-    PatternNotFound
-        Where no detector finds all corners.
 
     Notes
     -----
@@ -105,65 +91,96 @@ def find_pattern(image: np.ndarray, pattern: Chessboard) -> np.ndarray:
     Both look at a reduced picture where the image is large; :func:`refine_corners` looks at the
     image itself.
     """
-    grid = _in_reduced(grey(image), (pattern.columns, pattern.rows))
-    if grid is None:
-        raise PatternNotFound(
-            f"no chessboard with {pattern.columns} x {pattern.rows} inner corners in the image: it "
-            "must be whole, and not glare"
+
+    def __init__(self, pattern: Chessboard):
+        self.size = pattern.columns, pattern.rows
+        self.negative = False
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """The corners in an image, x right, y down on the printed side.
+
+        A chessboard looks the same when it is turned by 180 deg:
+        :mod:`lrfcal_lib.preprocess.survey` resolves that.
+
+        Parameters
+        ----------
+        image : ndarray of uint8, shape (h, w) or (h, w, 3)
+
+        Returns
+        -------
+        ndarray, shape (columns * rows, 2)
+            Recorded pixels.
+
+        Raises
+        ------
+        PatternNotFound
+            Where no detector finds all corners.
+        """
+        grid = self._in_reduced(grey(image))
+        if grid is None:
+            columns, rows = self.size
+            raise PatternNotFound(
+                f"no chessboard with {columns} x {rows} inner corners in the image: it must be "
+                "whole, and not glare"
+            )
+        if np.linalg.det(square_axes(grid)).mean() <= 0:
+            grid = grid[::-1]  # of a mirrored image
+        return grid.reshape(-1, 2)
+
+    def _in_reduced(self, picture):
+        """Grid of corners of a large picture by way of a reduced one, or without it where that
+        shows none.
+        """
+        times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
+        if times <= 1:
+            return self._search(picture)
+        share = 1 / times
+        reduced = cv2.resize(
+            picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA
         )
-    if np.linalg.det(square_axes(grid)).mean() <= 0:
-        grid = grid[::-1]  # of a mirrored image
-    return grid.reshape(-1, 2)
+        grid = self._search(reduced)
+        if grid is None:
+            return self._search(picture, thorough=False)
+        # pixel (0, 0) is the centre of a pixel, of the reduced one as well
+        return refine_corners(picture, (grid + 0.5) * times - 0.5)
 
+    def _search(self, picture, thorough=True):
+        """Grid of refined corners, None where there are none; `thorough` costs most.
 
-def _in_reduced(picture, size):
-    """Grid of corners of a large picture by way of a reduced one, or without it where that shows
-    none.
-    """
-    times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
-    if times <= 1:
-        return _search(picture, size)
-    share = 1 / times
-    reduced = cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-    grid = _search(reduced, size)
-    if grid is None:
-        return _search(picture, size, thorough=False)
-    # pixel (0, 0) is the centre of a pixel, of the reduced one as well
-    return refine_corners(picture, (grid + 0.5) * times - 0.5)
+        From sectors near by where rough corners were too far off for their windows.
+        """
+        rough = self._rough(picture, thorough)
+        if rough is None:
+            return None
+        grid = refine_corners(picture, rough)
+        if grid_noise(grid) > SMOOTH_ENOUGH_PX:
+            low, place = around(rough, AROUND * np.ptp(rough, axis=(0, 1)) + AROUND_PX)
+            part = picture[place].copy()
+            start = _detected(cv2.findChessboardCornersSB, part, self.size, 0)
+            if start is not None:
+                grid = min(grid, refine_corners(picture, start + low), key=grid_noise)
+        return grid if _ends_in_squares(picture, grid) else None
 
-
-def _search(picture, size, thorough=True):
-    """Grid of refined corners, None where there are none; `thorough` costs most.
-
-    From sectors near by where rough corners were too far off for their windows.
-    """
-    rough = _rough(picture, size, thorough)
-    if rough is None:
+    def _rough(self, picture, thorough):
+        """Grid of rough corners by the first of OpenCV's detectors that finds them, or None: the
+        last successful of picture and negative first.
+        """
+        # the quick check overlooks white squares on a dark board, and saves little time there
+        ways = [
+            (cv2.findChessboardCorners, picture, CLASSIC | cv2.CALIB_CB_FAST_CHECK),
+            (cv2.findChessboardCorners, 255 - picture, CLASSIC),
+        ]
+        if self.negative:
+            ways.reverse()
+        ways.append((cv2.findChessboardCornersSB, picture, 0))
+        if thorough:
+            ways.append((cv2.findChessboardCornersSB, picture, TWICE_AS_LARGE))
+        for detector, shown, flags in ways:
+            grid = _detected(detector, shown, self.size, flags)
+            if grid is not None:
+                self.negative = shown is not picture
+                return grid
         return None
-    grid = refine_corners(picture, rough)
-    if grid_noise(grid) > SMOOTH_ENOUGH_PX:
-        low, place = around(rough, AROUND * np.ptp(rough, axis=(0, 1)) + AROUND_PX)
-        start = _detected(cv2.findChessboardCornersSB, picture[place].copy(), size, 0)
-        if start is not None:
-            grid = min(grid, refine_corners(picture, start + low), key=grid_noise)
-    return grid if _ends_in_squares(picture, grid) else None
-
-
-def _rough(picture, size, thorough):
-    """Grid of rough corners by the first of OpenCV's detectors that finds them, or None."""
-    # the quick check overlooks white squares on a dark board, and saves little time there
-    ways = [
-        (cv2.findChessboardCorners, picture, CLASSIC | cv2.CALIB_CB_FAST_CHECK),
-        (cv2.findChessboardCorners, 255 - picture, CLASSIC),
-        (cv2.findChessboardCornersSB, picture, 0),
-    ]
-    if thorough:
-        ways.append((cv2.findChessboardCornersSB, picture, TWICE_AS_LARGE))
-    for detector, seen, flags in ways:
-        grid = _detected(detector, seen, size, flags)
-        if grid is not None:
-            return grid
-    return None
 
 
 def _detected(detector, picture, size, flags):
@@ -186,17 +203,22 @@ def around(corners, margin):
 
 
 def grid_noise(grid):
-    """Root mean square error of a coordinate of a chessboard's corners (rows, columns, 2), pixels.
+    """Root mean square distance of a chessboard's corners from a smooth grid, pixels.
 
-    From their fourth differences (lower ones in short rows): what perspective, lens distortion and
-    a bent sheet do has next to none.
+    Smooth are a homography and polynomials of third order (second below 16 corners): lens
+    distortion, a bent sheet.
     """
-    noise = []
-    for axis, count in enumerate(grid.shape[:2]):
-        order = min(4, count - 1)
-        differences = np.diff(grid, order, axis=axis)
-        noise.append(differences.ravel() / np.sqrt(comb(2 * order, order)))
-    return rms(np.concatenate(noise))
+    rows, columns, _ = grid.shape
+    flat = np.mgrid[:columns, :rows].T.reshape(-1, 2).astype(float)
+    corners = grid.reshape(-1, 2)
+    homography = cv2.findHomography(flat, corners)[0]
+    left = corners - cv2.perspectiveTransform(flat[None], homography)[0]
+    order = 3 if len(flat) >= 16 else 2
+    x, y = flat.T
+    design = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)]
+    design = np.stack(design, axis=1)
+    noise = left - design @ np.linalg.lstsq(design, left)[0]
+    return rms(np.linalg.norm(noise, axis=1))
 
 
 def refine_corners(picture, start):

@@ -26,8 +26,8 @@ from lrfcal_lib.preprocess.outline_in_images import (
 )
 from lrfcal_lib.preprocess.pattern_in_image import (
     SMALL_SQUARE_PX,
+    PatternFinder,
     PatternNotFound,
-    find_pattern,
     pattern_orders,
     scale_error,
     spread_views,
@@ -117,7 +117,8 @@ def survey(prepared: Prepared) -> Prepared:
         return _survey_plain(prepared, look, stated, unknown)
 
     groups = _choices(session, {"board", "intrinsics"})
-    begin = partial(_begin, read=read, board=board, count=len(groups))
+    finder = PatternFinder(board.pattern)
+    begin = partial(_begin, read=read, board=board, finder=finder, count=len(groups))
     begun = spread(partial(_first, begin=begin), groups)
     shots = [shot for shot in begun if not shot.reason]
     rough, _ = _adjusted(unknown, stated, shots, session)
@@ -182,12 +183,13 @@ def all_views(prepared) -> dict[str, list[BoardView]]:
     ]
     if prepared.board.pattern is None:
         return {camera: list(views.values()) for camera, views in known.items()}
-    look = partial(_like_prepared, prepared=prepared)
+    finder = PatternFinder(prepared.board.pattern)
+    look = partial(_like_prepared, prepared=prepared, finder=finder)
     views = spread(look, records)
     return {camera: [view for view in views if view.camera == camera] for camera in known}
 
 
-def _like_prepared(record, prepared):
+def _like_prepared(record, prepared, finder):
     """The board in one image: that of the placement where it is the same, or none shows it."""
     board = prepared.board
     known = prepared.views[record.camera][record.placement]
@@ -195,7 +197,7 @@ def _like_prepared(record, prepared):
     if known.file == view.file or known.pixels is None:
         return replace(known, file=view.file, pitch=record.pitch)
     read = prepared.session.read_image
-    shot = _begin(Shot(record, view), read, board, 1)
+    shot = _begin(Shot(record, view), read, board, finder, 1)
     if shot.reason:
         return shot.view
     corners = shot.view.pixels[pattern_orders(board.pattern)]
@@ -320,14 +322,14 @@ def _survey_plain(prepared, look, models, unknown):
     return _with_views(replace(prepared, models=models), views)
 
 
-def _begin(shot, read, board, count):
+def _begin(shot, read, board, finder, count):
     """A shot with the corners of the pattern in any order, or with the reason why not.
 
     With the part of the image that is looked at again, where there is room for so many.
     """
     image = read(shot.record)
     try:
-        corners = find_pattern(image, board.pattern)
+        corners = finder(image)
     except PatternNotFound as error:
         return replace(shot, view=replace(shot.view, reason=str(error)))
     part = part_around(image, corners, board)
