@@ -243,7 +243,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     of_pairs = sum((pairs_pull(*station, rig, start) for station in stations), [])
     nothing = np.zeros_like(start)
     return Held(
-        shifts=suspects(of_creases, of_pairs, rig),
+        shifts=suspects([*of_creases, *of_pairs], rig),
         walls=walls,
         passes=passes_of(session),
         creases=sum(seen.pull(nothing, NEAR).groups for seen in of_creases),

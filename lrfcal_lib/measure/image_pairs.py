@@ -22,7 +22,7 @@ from lrfcal_lib.measure.pulls import (
     without,
 )
 from lrfcal_lib.measure.surfaces import BENT
-from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
+from lrfcal_lib.model.camera import pinhole, project
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import sample
 
@@ -96,7 +96,7 @@ def pairs_pull(
         return []
     cameras = dict.fromkeys(view.camera for view in views)
     poses = np.array([poses_of(rig, camera) for camera in cameras])
-    noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
+    noise = np.repeat([BENT, PITCH_NOISE], [surfaces.shape[1], len(stops)])
     # what moves both images alike stays where creases have it, and all else that is no pose
     sigma = np.full(len(start), STILL)
     sigma[poses] = SPREAD / 4
@@ -175,16 +175,16 @@ def _samples(patches, view):
 
 
 def _shifted(view, rig, patches, surfaces, stops):
-    """Derivatives (n, 2, c) of the pixels of patches by the unknowns of a Pull, by the pitch at
-    which the head stopped, and by the height of each surface.
+    """Derivatives (n, 2, c) of the pixels of patches by the unknowns of a Pull, by the height of
+    each surface, and by the pitch at which the head stopped.
     """
-    p_camera, J = seen(patches.points, view, rig)
+    raised = surfaces[..., None] * patches.normals[:, None]
+    _, J = seen(patches.points, raised, view, rig)
     on_head = rig.cameras[view.camera].mount == "head"
     here = on_head & (stops == view.pitch)
-    raised = view.T_camera_platform.rotation.apply(patches.normals)
+    by_pitch = J[..., len(rig.uncertainty.names), None]
     # an image pitched more sees what a sweep pitched less shows
-    parts = [J, -J[..., -1:] * here, raised[..., None] * surfaces[:, None]]
-    return pinhole_jacobian(p_camera, view.model) @ np.concatenate(parts, axis=-1)
+    return np.concatenate([J, -by_pitch * here], axis=-1)
 
 
 def _compared(pair, sharp, x):
