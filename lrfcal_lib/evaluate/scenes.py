@@ -71,10 +71,10 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     world = world_of(load_setup(truth.setup), station)
     recorded = session.sweep(placement).pitch
     true_pitch = truth.pitch[placement]
-    turn, shift = truth.gauge(rig, placement, recorded)
+    gauge = truth.gauge(rig, placement, recorded)
     order = np.argsort(recorded)
     pitch = np.interp(cloud.pitch, recorded[order], true_pitch[order])
-    points = tilt(cloud.points, turn) + shift
+    points = gauge.apply(cloud.points)
     origins = tilt(truth.T_head_lrf.translation, pitch)
     length = np.linalg.norm(points - origins, axis=1)
     directions = unit_vector(points - origins)
@@ -86,7 +86,7 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     blocked = np.zeros(len(points), bool)
     for view in views_of(session, rig, placement):
         painted = (cloud.image == view.number) & np.isfinite(depth)
-        eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
+        eye = (gauge * view.T_camera_platform.inv()).translation
         blocked[painted] = _hidden(world, eye, true[painted])
     return SceneErrors(
         depth=depth,

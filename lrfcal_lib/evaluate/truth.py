@@ -19,6 +19,7 @@ from lrfcal_lib.model.geometry import (
     tilt,
     transform_difference,
 )
+from lrfcal_lib.model.kinematics import platform_from_head
 from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.session.files import naming, read_json
 from lrfcal_lib.session.read import Session
@@ -69,9 +70,9 @@ class Truth:
 
     def gauge(
         self, rig: CalibratedRig, placement: int, recorded: np.ndarray
-    ) -> tuple[float, np.ndarray]:
-        """The turn about the tilt axis (radians) and then the shift along it (3,) that lead from a
-        rig's platform frame to the true one, which no data can show.
+    ) -> RigidTransform:
+        """The turn about the tilt axis and shift along it that lead from a rig's platform frame to
+        the true one, which no data can show.
 
         Parameters
         ----------
@@ -83,7 +84,8 @@ class Truth:
         apart = self.T_head_lrf * rig.T_head_lrf.inv()
         turn = apart.rotation.as_rotvec()[0]
         turn += np.mean(self.pitch[placement] - rig.corrections.pitch(placement, recorded))
-        return turn, apart.translation * [1, 0, 0]
+        shift = RigidTransform.from_translation(apart.translation * [1, 0, 0])
+        return shift * platform_from_head(turn)
 
 
 def read_truth(session: Session) -> Truth | None:
