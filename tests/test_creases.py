@@ -1,5 +1,7 @@
 """Where surfaces meet, also behind a skirting board, and what edges beside that ask for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from holds_draws import ROOM, true_rig
@@ -44,9 +46,9 @@ def test_a_crease_is_where_readings_beside_it_are(rig, thick):
     for seed in range(20):
         creases = corner(rig, seed, thick, 0.09)
         assert len(creases.points) > 30
-        np.testing.assert_allclose(np.abs(creases.along[:, 0]), 1.0, atol=1e-3)
+        np.testing.assert_allclose(np.abs(creases.motions[:, 2, 0]), 1.0, atol=1e-3)
         miss = creases.points - [0.0, 3.0 - thick, -1.0]
-        off = np.linalg.norm(creases.off, axis=1)
+        off = np.linalg.norm(creases.motions[:, :2], axis=1)
         squares.append((miss / off)[:, 1:].mean(axis=0) ** 2)
         assert (off[:, 1] > 0.003).all() == (thick > 0)
         assert np.abs(miss[:, 1]).max() < 0.006
@@ -55,7 +57,7 @@ def test_a_crease_is_where_readings_beside_it_are(rig, thick):
 
 def test_surfaces_that_do_not_reach_each_other_have_no_crease(rig):
     creases = corner(rig, 1)
-    assert creases.off.shape == (len(creases.points), 2, 3)
+    assert creases.motions.shape == (len(creases.points), 3, 3)
     cloud = Cloud(**{name: np.zeros((0, 3)) for name in ("points", "normals", *COLUMNS)})
     assert len(creases_of(cloud, [], np.zeros(0, int)).points) == 0
 
@@ -63,11 +65,13 @@ def test_surfaces_that_do_not_reach_each_other_have_no_crease(rig):
 def sights_of(seed, places=30, edges=5, unknowns=4):
     """Places with edges at random."""
     rng = np.random.default_rng(seed)
+    place = np.repeat(np.arange(places), edges)
     return Sights(
-        by_unknown=rng.normal(size=(places, unknowns)),
-        across=rng.uniform(-1, 1, (places, edges)),
-        clear=rng.uniform(0, 1, (places, edges)),
-        sigma=rng.uniform(EDGE, 0.3, places),
+        place=place,
+        by_unknown=rng.normal(size=(places, unknowns))[place],
+        across=rng.uniform(-1, 1, len(place)),
+        clear=rng.uniform(0, 1, len(place)),
+        sigma=rng.uniform(EDGE, 0.3, places)[place],
     )
 
 
@@ -88,9 +92,7 @@ def test_edges_ask_for_what_makes_them_likelier():
 
 def test_places_without_an_edge_say_nothing():
     sights = sights_of(3)
-    blind = Sights(
-        sights.by_unknown, sights.across, np.zeros_like(sights.clear), sights.sigma
-    )
+    blind = replace(sights, clear=np.zeros_like(sights.clear))
     pull = blind.pull(np.zeros(4), 0.1)
     assert not pull.information.any() and not pull.slope.any() and pull.groups == 0
     assert blind.explained(np.ones(4)) == 0
@@ -98,7 +100,7 @@ def test_places_without_an_edge_say_nothing():
 
 def test_edges_are_heard_from_farther_away_while_they_are_sought():
     sights = Sights(
-        np.ones((8, 1)), np.full((8, 1), 0.3), np.ones((8, 1)), np.full(8, EDGE)
+        np.arange(8), np.ones((8, 1)), np.full(8, 0.3), np.ones(8), np.full(8, EDGE)
     )
     start = np.zeros(1)
     assert sights.pull(start, 0.3).groups > 100 * sights.pull(start, 0.0).groups

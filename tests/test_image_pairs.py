@@ -97,7 +97,7 @@ def evidence_of(rig, columns):
         rig,
         np.zeros(len(rig.uncertainty.names) + 1),
     )
-    return max(shift.evidence for shift in suspects([], [pull], rig)), pull
+    return max(shift.evidence for shift in suspects([pull], rig)), pull
 
 
 def test_what_stands_before_a_wall_is_not_taken_for_the_wall(rig, monkeypatch):

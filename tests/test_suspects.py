@@ -56,10 +56,11 @@ def seen_by(rig, suspect, rng, clutter=3):
         others = rng.uniform(-1, 1, (CREASES, clutter))
         across = np.column_stack([edge, others])
         rows = np.repeat(np.arange(CREASES), PLACES)
-        sigma = np.full(len(rows), EDGE)
-        seen.append(
-            Sights(by_unknown[rows], across[rows], np.full_like(across[rows], 0.8), sigma)
-        )
+        place = np.repeat(np.arange(len(rows)), 1 + clutter)
+        clear = np.full(len(place), 0.8)
+        sigma = np.full(len(place), EDGE)
+        crease = rows[place]
+        seen.append(Sights(place, by_unknown[crease], across[rows].ravel(), clear, sigma))
     return seen
 
 
@@ -72,7 +73,7 @@ def test_who_moved_is_named_and_by_how_much(rig, suspect):
     parameters = 0
     for seed in range(8):
         seen = seen_by(rig, suspect, np.random.default_rng(seed))
-        (named,) = most_likely(suspects(seen, [], rig))
+        (named,) = most_likely(suspects(seen, rig))
         assert (named.camera or "head") == suspect
         miss = named.change - MOVES[suspect]
         pooled += miss @ np.linalg.solve(named.covariance, miss)
@@ -86,26 +87,26 @@ def test_where_nothing_has_moved_nothing_is_named(rig, mount):
         rig = on_base(rig, 0.0)
     for seed in range(6):
         seen = seen_by(rig, None, np.random.default_rng(seed))
-        shifts = suspects(seen, [], rig)
+        shifts = suspects(seen, rig)
         assert len(shifts) == 2 + (mount == "platform")
         assert not most_likely(shifts)
 
 
 def test_what_shows_needs_less_of_a_change_the_more_is_seen(rig):
     seen = seen_by(rig, None, np.random.default_rng(1))
-    few = suspects([replace(part, clear=part.clear / 50) for part in seen], [], rig)
-    for less, more in zip(few, suspects(seen, [], rig), strict=True):
+    few = suspects([replace(part, clear=part.clear / 50) for part in seen], rig)
+    for less, more in zip(few, suspects(seen, rig), strict=True):
         assert less.shows[0] > more.shows[0] and less.shows[1] > more.shows[1]
 
 
 def test_where_nothing_was_observed_nobody_is_suspected(rig):
-    assert suspects([], [], rig) == []
+    assert suspects([], rig) == []
 
 
 def test_of_suspects_those_that_are_nearly_as_likely_are_said_too(rig):
     """The most likely first; odds of 20 to 1 are enough to name it alone."""
     seen = seen_by(rig, "left", np.random.default_rng(2))
-    left, right = suspects(seen, [], rig)
+    left, right = suspects(seen, rig)
     head = replace(left, camera=None, evidence=70.0)
     left = replace(left, evidence=80.0)
     near = replace(right, evidence=80.0 + 0.9 * SURE)
@@ -119,5 +120,5 @@ def test_a_slip_of_no_account_raises_no_alarm(rig):
     """However sure it is."""
     rig = on_base(rig, 0.0)
     seen = seen_by(rig, "head", np.random.default_rng(3))
-    head = replace(suspects(seen, [], rig)[-1], evidence=1e6)
+    head = replace(suspects(seen, rig)[-1], evidence=1e6)
     assert head.odds == 1e6 and not most_likely([replace(head, change=head.change / 10)])

@@ -9,10 +9,11 @@ import numpy as np
 from lrfcal_lib.acquire.checks import Light, check_scene
 from lrfcal_lib.acquire.record import Boards
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
+from lrfcal_lib.calibrate.clouds import station_of
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.drivers.rig_file import ListedPlacement, Placement, RigFile
 from lrfcal_lib.measure.planning import plan_images
-from lrfcal_lib.measure.scene import colored_blocks, station_of
+from lrfcal_lib.measure.scene import colored_blocks
 from lrfcal_lib.preprocess.closing_scan import closing_of
 from lrfcal_lib.session.read import Session
 

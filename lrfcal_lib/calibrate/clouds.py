@@ -105,6 +105,34 @@ def sweep_blocks(
     )
 
 
+def station_of(
+    session: Session, rig: CalibratedRig, number: int
+) -> tuple[Sweep, list[View]]:
+    """A place where the rig stood and recorded a scene, with its images posed.
+
+    Parameters
+    ----------
+    session : Session
+    rig : CalibratedRig
+        That recorded it.
+    number : int
+        Placement.
+
+    Returns
+    -------
+    sweep : Sweep
+        Without the scan that closed it.
+    views : list of View
+
+    Raises
+    ------
+    ValueError
+        For images that the rig cannot pose or that have another size.
+    """
+    sweep, _ = without_closing(session.sweep(number))
+    return sweep, views_of(session, rig.for_scenes, number)
+
+
 def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]:
     """The images of a placement as a rig poses them; without those of which no pitch is known.
 

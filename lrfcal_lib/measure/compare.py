@@ -200,7 +200,10 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
     second_there = in_gauge_of(first, second)
     steps = _steps(first, second_there, shared)
     step = pd.concat(steps.values())
-    covariance = _covariance(first) + _covariance(second)
+    covariance = sum(
+        pd.DataFrame(known.trusted, known.names, known.names)
+        for known in map(uncertainty_of, (first, second))
+    )
     # nothing bounds what only one estimated
     covariance = covariance.reindex(index=step.index, columns=step.index).fillna(np.inf)
     images = {name: shifts(first, second_there, name) for name in shared}
@@ -299,12 +302,6 @@ def _steps(first, second, shared):
             [f"{name}_{pose}" for pose in POSE_NAMES],
         )
     return steps
-
-
-def _covariance(rig):
-    """Covariance to rely on of shared unknowns, a DataFrame."""
-    known = uncertainty_of(rig)
-    return pd.DataFrame(known.trusted, known.names, known.names)
 
 
 def shifts(

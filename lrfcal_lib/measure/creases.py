@@ -14,7 +14,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.features import SYSTEMATIC, Feature
 from lrfcal_lib.measure.pulls import Pull, seen
 from lrfcal_lib.measure.surfaces import BENT, LIMIT
-from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
+from lrfcal_lib.model.camera import pinhole, project
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import (
     ACROSS_STEP_PX,
@@ -43,15 +43,15 @@ class Creases:
 
     Attributes
     ----------
-    points, along : ndarray, shape (n, 3)
-        Metres, and unit vectors along the crease.
-    off : ndarray, shape (n, 2, 3)
-        By how much an error of each surface, of one standard deviation, moves the place.
+    points : ndarray, shape (n, 3)
+        Metres.
+    motions : ndarray, shape (n, 3, 3)
+        By how much an error of each surface, of one standard deviation, moves the place; and the
+        unit vector along the crease.
     """
 
     points: np.ndarray
-    along: np.ndarray
-    off: np.ndarray
+    motions: np.ndarray
 
 
 def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Creases:
@@ -67,7 +67,7 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
     -------
     Creases
     """
-    creases = [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)))]
+    creases = [(np.zeros((0, 3)), np.zeros((0, 3, 3)))]
     surfaces = [(plane, cloud.points[of_point == k]) for k, plane in enumerate(planes)]
     for pair in combinations(surfaces, 2):
         (first, _), (second, _) = pair
@@ -92,8 +92,8 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
             _sigma(plane, places, np.hypot(rim, lift / 2))
             for plane, lift in zip((first, second), lifts, strict=True)
         ]
-        off = np.einsum("kn,ik->nki", sigma, by_height[:, :2])
-        creases.append((places, np.tile(way, (len(common), 1)), off))
+        steps = np.transpose([*sigma, np.ones_like(common)])
+        creases.append((places, steps[..., None] * by_height.T))
     return Creases(*map(np.concatenate, zip(*creases, strict=True)))
 
 
@@ -120,18 +120,21 @@ def _sigma(plane, points, systematic):
 
 @dataclass(frozen=True)
 class Sights:
-    """Places of creases as an image sees them, a row each; lengths are shares of `REACH` of it.
+    """Edges of an image near places of creases, a row each; lengths are shares of `REACH` of it.
 
     Attributes
     ----------
+    place : ndarray of int, shape (n,)
+        The number of the place; several edges may be near it.
     by_unknown : ndarray, shape (n, c)
         How far the place moves along the normal of the crease, by the unknowns of a Pull.
-    across, clear : ndarray, shape (n, k)
-        Distances along the normal, and how clear an edge of the image is there, 0 to 1.
+    across, clear : ndarray, shape (n,)
+        How far from it along the normal the edge is, and how clear, 0 to 1.
     sigma : ndarray, shape (n,)
         How well the place and its edge are known.
     """
 
+    place: np.ndarray
     by_unknown: np.ndarray
     across: np.ndarray
     clear: np.ndarray
@@ -152,14 +155,12 @@ class Sights:
         Pull
             Its groups are as many observations as have an edge.
         """
-        share, miss, sigma = self._shares(change, width)
-        matched = share.sum(axis=1)
-        weight = 1 / (PLACES * sigma**2)
-        wanted = np.vecdot(share, miss) + matched * (self.by_unknown @ change)
+        share, sigma = self._shares(change, width)
+        weighted = self.by_unknown.T * (share / (PLACES * sigma**2))
         return Pull(
-            information=(self.by_unknown.T * (weight * matched)) @ self.by_unknown,
-            slope=self.by_unknown.T @ (weight * wanted),
-            groups=matched.sum() / PLACES,
+            information=weighted @ self.by_unknown,
+            slope=weighted @ self.across,
+            groups=share.sum() / PLACES,
         )
 
     def explained(self, change: np.ndarray) -> float:
@@ -169,16 +170,16 @@ class Sights:
         ----------
         change : ndarray, shape (c,)
         """
-        share, _, _ = self._shares(change, 0.0)
-        return -np.log(1 - share.sum(axis=1)).sum() / PLACES
+        share, _ = self._shares(change, 0.0)
+        return -np.log(1 - np.bincount(self.place, share)).sum() / PLACES
 
     def _shares(self, change, width):
-        """What each edge has of its place (n, k), how far off it is, and how far it may be (n,)."""
+        """What each edge has of its place, and how far off it may be, both (n,)."""
         sigma = np.hypot(self.sigma, width)
-        miss = self.across - (self.by_unknown @ change)[:, None]
-        likely = self.clear * np.exp(-0.5 * (miss / sigma[:, None]) ** 2)
-        others = OTHERS * sigma
-        return likely / (others + likely.sum(axis=1))[:, None], miss, sigma
+        miss = self.across - self.by_unknown @ change
+        likely = self.clear * np.exp(-0.5 * (miss / sigma) ** 2)
+        of_place = np.bincount(self.place, likely)[self.place]
+        return likely / (OTHERS * sigma + of_place), sigma
 
 
 def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
@@ -197,32 +198,30 @@ def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
         Of places inside the image.
     """
     model = view.model
-    points, J = seen(creases.points, view, rig)
+    points, J = seen(creases.points, creases.motions, view, rig)
     reach = REACH * model.width
     inside = model.shows(project(points, model), reach)
-    by_point = pinhole_jacobian(points[inside], model)
-    R = view.T_camera_platform.rotation.as_matrix()
-    way = creases.along[inside] @ R.T
-    tangent = unit_vector(np.matvec(by_point, way))
+    J = J[inside]
+    tangent = unit_vector(J[..., -1])
     normal = tangent[:, ::-1] * [-1, 1]
-    across, clear = _edges(view, reach, pinhole(points[inside], model), tangent, normal)
-    by_place = np.vecmat(normal, by_point) / reach
-    off = np.matvec(creases.off[inside] @ R.T, by_place)
+    pixels = pinhole(points[inside], model)
+    place, across, contrast = _edges(view, reach, pixels, tangent, normal)
+    moved = np.vecmat(normal, J)[place] / reach
     return Sights(
-        by_unknown=np.vecmat(by_place, J[inside]),
+        place=place,
+        by_unknown=moved[:, :-3],
         across=across / reach,
-        clear=clear,
-        sigma=np.hypot(np.linalg.norm(off, axis=1), EDGE),
+        clear=contrast / (contrast + FULL_CONTRAST),
+        sigma=np.hypot(np.linalg.norm(moved[:, -3:], axis=1), EDGE),
     )
 
 
 def _edges(view, reach, places, tangent, normal):
-    """Offsets (n, k) of edges, up to some pixels, from pixels (n, 2) along their normals (n, 2),
-    and how clear each is, 0 to 1.
+    """Edges up to some pixels from pixels (n, 2) along their normals (n, 2): the number of the
+    pixel, how far from it, and contrast.
     """
     grid = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    across = np.tile(grid, (len(places), 1))
-    clear = np.zeros_like(across)
+    height = np.zeros((len(grid), len(places)))
     if len(places):
         side = np.arange(ALONG) - ALONG // 2
         profile = places[:, None] + side[:, None] * tangent[:, None]
@@ -230,8 +229,5 @@ def _edges(view, reach, places, tangent, normal):
         strips = sample(view.image, view.model, profile + away)
         mean = strips.mean(axis=2)  # NaN outside the image
         height = step_contrast(mean, SMOOTH_PX / ACROSS_STEP_PX, along=1)
-        row, place, contrast = peaks(height)
-        cell = place.round().astype(int)
-        across[row, cell] = grid[0] + ACROSS_STEP_PX * place
-        clear[row, cell] = contrast / (contrast + FULL_CONTRAST)
-    return across, clear
+    number, cell, contrast = peaks(height)
+    return number, grid[0] + ACROSS_STEP_PX * cell, contrast

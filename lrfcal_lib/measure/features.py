@@ -65,6 +65,32 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
     return replace(cloud, sigma=sigma)
 
 
+def moved_along(normals: np.ndarray, cloud: Cloud, rig: CalibratedRig) -> np.ndarray:
+    """How errors move the points of a sweep along directions, whatever stands on the head.
+
+    Parameters
+    ----------
+    normals : ndarray, shape (n, 3) or (3,)
+        Platform frame.
+    cloud : Cloud
+        Of n points.
+    rig : CalibratedRig
+        That made it.
+
+    Returns
+    -------
+    ndarray, shape (n, 15)
+        By what the calibration may have wrong, see `COLUMNS`, and by one sigma of the sweep's own
+        offset and stretch of the pitch.
+    """
+    chain = replace(chain_of(rig), on_head=False)
+    _, J, by_pitch = carried(chain, cloud.bearing, cloud.pitch, cloud.range)
+    turn = np.vecdot(normals, by_pitch)
+    by_stretch = chain.sweep.stretch * cloud.pitch * turn
+    by_rig = np.vecmat(normals, J)
+    return np.column_stack([by_rig, chain.sweep.offset * turn, by_stretch])
+
+
 def largest_plane(cloud: Cloud, tolerance: float = 0.04) -> np.ndarray:
     """Which points lie on the largest plane and face as it does to 15 deg.
 
@@ -369,10 +395,10 @@ def length_between(first: Feature, second: Feature) -> Length:
     by_axis = height * across / size / metres
     if kind != Kind.PLANE:
         by_axis *= -1
-    by_first = np.append(-by_place, weights[0] * by_axis)
-    by_second = np.append(by_place, weights[1] * by_axis)
-    noise = by_first @ first.noise @ by_first + by_second @ second.noise @ by_second
-    moved = np.array([by_first @ first.jacobian, by_second @ second.jacobian])
+    # by centre and axis of both, (2, 6)
+    by = np.hstack([np.outer([-1.0, 1.0], by_place), np.outer(weights, by_axis)])
+    noise = np.sum(by * np.vecmat(by, [first.noise, second.noise]))
+    moved = np.vecmat(by, [first.jacobian, second.jacobian])
     by_sweep = moved[:, -3:-1]
     if first.placement == second.placement:
         by_sweep = by_sweep.sum(axis=0)

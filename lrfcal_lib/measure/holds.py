@@ -12,9 +12,9 @@ from lrfcal_lib.calibrate.cloud import Cloud, join
 from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.judge.uncertainty import carried, chain_of, uncertainty_of
+from lrfcal_lib.judge.uncertainty import chain_of, uncertainty_of
 from lrfcal_lib.measure.creases import creases_of, sights
-from lrfcal_lib.measure.features import flatness, largest_plane
+from lrfcal_lib.measure.features import flatness, largest_plane, moved_along
 from lrfcal_lib.measure.image_pairs import pairs_pull
 from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.measure.suspects import (
@@ -243,7 +243,7 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     of_pairs = sum((pairs_pull(*station, rig, start) for station in stations), [])
     nothing = np.zeros_like(start)
     return Held(
-        shifts=suspects(of_creases, of_pairs, rig),
+        shifts=suspects([*of_creases, *of_pairs], rig),
         walls=walls,
         passes=passes_of(session),
         creases=sum(seen.pull(nothing, NEAR).groups for seen in of_creases),
@@ -300,15 +300,11 @@ def wall_of(wall: Cloud, rig: CalibratedRig, placement: int) -> Wall:
     placement : int
     """
     normal, _, _ = fit_plane(wall.points)
-    chain = chain_of(rig)
-    _, J, _ = carried(
-        chain, wall.bearing, rig.corrections.pitch(-1, wall.pitch), wall.range
-    )
-    by_link = normal @ chain.head.rotation.as_matrix() @ J
+    by_rig = moved_along(normal, wall, rig)[:, :-2]
     # a plane turns and shifts with the errors: only what bends it shows
     plane = np.insert(wall.points - wall.points.mean(axis=0), 0, 1.0, axis=1)
-    by_link -= plane @ np.linalg.lstsq(plane, by_link)[0]
-    squares = np.vecdot(by_link @ chain.covariances, by_link)
+    by_rig -= plane @ np.linalg.lstsq(plane, by_rig)[0]
+    squares = np.vecdot(by_rig @ chain_of(rig).covariances, by_rig)
     allowed = np.sqrt(squares.mean(axis=1).max() + UNEVEN**2)
     return Wall(placement, flatness(wall.points)[1], allowed)
 
@@ -325,22 +321,17 @@ def passes_of(session: Session) -> list[Passes]:
     passes = []
     for pair in pairwise(_swept(session)):
         one, other = (session.sweep(placement) for placement in pair)
-        if one.direction * other.direction < 0:
-            passes += _over_one_place(pair, one, other, session.lrf.sigma_range)
+        few = min(len(one.pitch), len(other.pitch)) < 2
+        if few or one.direction * other.direction >= 0:
+            continue
+        at_pitch = interp1d(other.pitch, other.ranges, axis=0, bounds_error=False)
+        miss = at_pitch(one.pitch) - one.ranges
+        growth = np.gradient(one.ranges, one.pitch, axis=0)
+        smooth = (np.abs(growth) < STEEP) & (np.abs(miss) < STEEP * WANTED * 3)
+        # fewer agree where they are of different places
+        if smooth.sum() >= max(FEWEST_POINTS, SAME_PLACE * np.isfinite(miss).sum()):
+            slope = growth[smooth]
+            slip = slope @ miss[smooth] / (slope @ slope)
+            rough = max(np.std(miss[smooth] - slip * slope), session.lrf.sigma_range)
+            passes.append(Passes(pair, -slip, rough / np.sqrt(slope @ slope)))
     return passes
-
-
-def _over_one_place(placements, one, other, noise):
-    """The Passes of two sweeps; none where they are of different places."""
-    if min(len(one.pitch), len(other.pitch)) < 2:
-        return []
-    at_pitch = interp1d(other.pitch, other.ranges, axis=0, bounds_error=False)
-    miss = at_pitch(one.pitch) - one.ranges
-    growth = np.gradient(one.ranges, one.pitch, axis=0)
-    smooth = (np.abs(growth) < STEEP) & (np.abs(miss) < STEEP * WANTED * 3)
-    if smooth.sum() < max(FEWEST_POINTS, SAME_PLACE * np.isfinite(miss).sum()):
-        return []
-    slope = growth[smooth]
-    slip = slope @ miss[smooth] / (slope @ slope)
-    rough = max(np.std(miss[smooth] - slip * slope), noise)
-    return [Passes(placements, -slip, rough / np.sqrt(slope @ slope))]

@@ -22,7 +22,7 @@ from lrfcal_lib.measure.pulls import (
     without,
 )
 from lrfcal_lib.measure.surfaces import BENT
-from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project
+from lrfcal_lib.model.camera import pinhole, project
 from lrfcal_lib.model.geometry import unit_vector
 from lrfcal_lib.preprocess.edges_in_image import sample
 
@@ -46,15 +46,14 @@ BEFORE = 4.0  # standard deviations of a range by which something else is nearer
 
 
 @dataclass(frozen=True)
-class _Pair:
-    """Patches that two images show, a row each: samples (n, s, 2) in both, by how much a change of
-    the unknowns shifts each (n, 2, c), and cells (n,).
+class _Side:
+    """Patches that an image shows, a row each: samples (n, s, 2), and by how much a change of the
+    unknowns shifts each (n, 2, c).
     """
 
-    views: tuple[View, View]
-    uv: list[np.ndarray]
-    by_unknown: list[np.ndarray]
-    cell: np.ndarray
+    view: View
+    uv: np.ndarray
+    by_unknown: np.ndarray
 
 
 def pairs_pull(
@@ -92,11 +91,11 @@ def pairs_pull(
             both = clear[first.number] & clear[second.number]
             rows = cloud.rows(patches[both])
             pairs.append(_pair(rows, surfaces[both], (first, second), rig, stops))
-    if sum(len(pair.cell) for pair in pairs) < FEWEST:
+    if sum(len(cell) for _, cell in pairs) < FEWEST:
         return []
     cameras = dict.fromkeys(view.camera for view in views)
     poses = np.array([poses_of(rig, camera) for camera in cameras])
-    noise = np.repeat([PITCH_NOISE, BENT], [len(stops), surfaces.shape[1]])
+    noise = np.repeat([BENT, PITCH_NOISE], [surfaces.shape[1], len(stops)])
     # what moves both images alike stays where creases have it, and all else that is no pose
     sigma = np.full(len(start), STILL)
     sigma[poses] = SPREAD / 4
@@ -106,7 +105,7 @@ def pairs_pull(
     for blur in BLURS:
         sharp = {view.number: cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
         x = begun + step
-        parts = [_compared(pair, sharp, x) for pair in pairs]
+        parts = [_compared(*pair, sharp, x) for pair in pairs]
         H, b, D, cell = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
         by_row = np.vecmat(-b, D)
@@ -141,7 +140,9 @@ def clear_places(cloud, view, rig):
 
 
 def _pair(patches, surfaces, views, rig, stops):
-    """The clearest patches that two images show, each of one of some surfaces (n, s)."""
+    """The clearest patches that two images show, each of one of some surfaces (n, s), as the Sides
+    of both, and their cells (n,).
+    """
     first = views[0]
     points = _samples(patches, first)
     inside = np.ones(len(points), bool)
@@ -154,12 +155,11 @@ def _pair(patches, surfaces, views, rig, stops):
     order = np.argsort(-texture)[:CLEAREST]
     rows = order[texture[order] > LEAST_TEXTURE]
     patches = patches.rows(rows)
-    return _Pair(
-        views=views,
-        uv=[pixels[rows] for pixels in uv],
-        by_unknown=[_shifted(view, rig, patches, surfaces[rows], stops) for view in views],
-        cell=np.floor(patches.bearing / CELL) + 1000 * np.floor(patches.pitch / CELL),
-    )
+    sides = [
+        _Side(view, pixels[rows], _shifted(view, rig, patches, surfaces[rows], stops))
+        for view, pixels in zip(views, uv, strict=True)
+    ]
+    return sides, np.floor(patches.bearing / CELL) + 1000 * np.floor(patches.pitch / CELL)
 
 
 def _samples(patches, view):
@@ -175,38 +175,36 @@ def _samples(patches, view):
 
 
 def _shifted(view, rig, patches, surfaces, stops):
-    """Derivatives (n, 2, c) of the pixels of patches by the unknowns of a Pull, by the pitch at
-    which the head stopped, and by the height of each surface.
+    """Derivatives (n, 2, c) of the pixels of patches by the unknowns of a Pull, by the height of
+    each surface, and by the pitch at which the head stopped.
     """
-    p_camera, J = seen(patches.points, view, rig)
+    raised = surfaces[..., None] * patches.normals[:, None]
+    _, J = seen(patches.points, raised, view, rig)
     on_head = rig.cameras[view.camera].mount == "head"
     here = on_head & (stops == view.pitch)
-    raised = view.T_camera_platform.rotation.apply(patches.normals)
+    by_pitch = J[..., len(rig.uncertainty.names), None]
     # an image pitched more sees what a sweep pitched less shows
-    parts = [J, -J[..., -1:] * here, raised[..., None] * surfaces[:, None]]
-    return pinhole_jacobian(p_camera, view.model) @ np.concatenate(parts, axis=-1)
+    return np.concatenate([J, -by_pitch * here], axis=-1)
 
 
-def _compared(pair, sharp, x):
+def _compared(sides, cell, sharp, x):
     """Of each patch of a pair: tensor (2, 2), slope (2,), derivatives (2, c), and its cell."""
-    (first, of_first), (second, of_second) = (
-        _normalised(sharp[view.number], view.model, uv + (J @ x)[:, None])
-        for view, uv, J in zip(pair.views, pair.uv, pair.by_unknown, strict=True)
-    )
+    shown = [_normalised(side, sharp[side.view.number], x) for side in sides]
+    (first, of_first), (second, of_second) = shown
     alike = np.mean(first * second, axis=1)
     weight = np.clip((alike - ALIKE) / (1 - ALIKE), 0, None) ** 2
     gradient = (of_first + of_second) / 2
     weighted = gradient * weight[:, None, None]
     tensor = weighted.mT @ gradient
     slope = np.vecmat(second - first, weighted)
-    by_first, by_second = pair.by_unknown
-    return np.nan_to_num(tensor), np.nan_to_num(slope), by_second - by_first, pair.cell
+    moved = sides[1].by_unknown - sides[0].by_unknown
+    return np.nan_to_num(tensor), np.nan_to_num(slope), moved, cell
 
 
-def _normalised(image, model, uv):
+def _normalised(side, image, x):
     """Patches (n, s) of mean 0 and standard deviation 1, and their gradients (n, s, 2)."""
-    places = uv + ABOUT[:, None, None]
-    values = sample(image, model, places)[..., 0]
+    places = side.uv + (side.by_unknown @ x)[:, None] + ABOUT[:, None, None]
+    values = sample(image, side.view.model, places)[..., 0]
     values -= values.mean(axis=-1, keepdims=True)
     middle, right, left, below, above = values
     spread = np.maximum(middle.std(axis=1), 1.0)[:, None]

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.cloud import Cloud, join
-from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
+from lrfcal_lib.calibrate.clouds import station_of, sweep_blocks
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
@@ -29,7 +29,6 @@ from lrfcal_lib.measure.features import (
 )
 from lrfcal_lib.measure.surfaces import planes_of
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
-from lrfcal_lib.preprocess.closing_scan import without_closing
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 
@@ -144,8 +143,7 @@ def features_of_station(session: Session, rig: CalibratedRig, number: int) -> Sc
     SceneFeatures
     """
     rig = rig.for_scenes
-    views = views_of(session, rig, number)
-    sweep, _ = without_closing(session.sweep(number))
+    sweep, views = station_of(session, rig, number)
     return features_of(join(sweep_blocks(session, rig, sweep, views)), rig, views)
 
 

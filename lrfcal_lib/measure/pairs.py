@@ -6,21 +6,24 @@ refined, and judged by what overlaps and by what stands where the other station 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from heapq import nlargest
 from itertools import permutations, product
+from operator import itemgetter
 
 import numpy as np
 import small_gicp
-from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.signal import fftconvolve
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.robust import biweight, robust_sigma, sums_by
-from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of
+from lrfcal_lib.judge.uncertainty import COLUMNS
+from lrfcal_lib.measure.features import moved_along
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
     move_pose,
@@ -134,10 +137,13 @@ def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> S
         If no part of it is smooth.
     """
     whole = cloud.rows(np.isfinite(cloud.normals).all(axis=1))
+    moves = np.zeros((len(whole.points), len(COLUMNS) + 2))
+    if rig is not None:
+        moves = moved_along(whole.normals, whole, rig)
     columns = [
         whole.points,
         whole.normals,
-        _moves(whole, rig),
+        moves,
         whole.sigma**2,
         np.ones(len(whole.points)),
     ]
@@ -156,19 +162,6 @@ def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> S
         nearest=_look(cloud.points),
         tree=KDTree(points),
     )
-
-
-def _moves(cloud, rig):
-    """Motions (n, 13 + 2) of points along their normals: by the rig, by the sweep's pitch."""
-    if rig is None:
-        return np.zeros((len(cloud.points), len(COLUMNS) + 2))
-    # as the platform sees it, whatever stands on the head
-    chain = replace(chain_of(rig), on_head=False)
-    _, J, by_pitch = carried(chain, cloud.bearing, cloud.pitch, cloud.range)
-    by_rig = np.vecmat(cloud.normals, J)
-    turn = np.vecdot(cloud.normals, by_pitch)
-    by_stretch = chain.sweep.stretch * cloud.pitch * turn
-    return np.column_stack([by_rig, chain.sweep.offset * turn, by_stretch])
 
 
 def _cells(points):
@@ -249,8 +242,7 @@ def starts(first: Surface, second: Surface) -> list[RigidTransform]:
     found = []
     for turn in _turns(first.directions, second.directions):
         found += _shifts(blurred, low, second, turn)
-    found.sort(key=lambda scored: -scored[0])
-    return [T for _, T in found[:STARTS]]
+    return [T for _, T in nlargest(STARTS, found, key=itemgetter(0))]
 
 
 def _turns(first, second):
@@ -278,10 +270,7 @@ def _shifts(blurred, low, second, turn):
     face the same way.
     """
     there, low_moved = _on_grid(turn.apply(second.points), turn.apply(second.normals))
-    room = np.add(blurred.shape, there.shape)[1:]
-    size = [next_fast_len(int(cells), real=True) for cells in room]
-    spectra = rfftn(blurred, size, GRID) * rfftn(np.flip(there, GRID), size, GRID)
-    score = irfftn(spectra.sum(axis=0), size)
+    score = fftconvolve(blurred, np.flip(there, GRID), axes=GRID).sum(axis=0)
     top = np.where(score == maximum_filter(score, 5), score, 0.0)
     best = np.argpartition(top, -PEAKS, axis=None)[-PEAKS:]
     cells = np.transpose(np.unravel_index(best, top.shape)) - there.shape[1:] + 1
@@ -295,7 +284,7 @@ def _on_grid(points, values):
     """
     low = points.min(axis=0) - ROOM * CELL
     cells = np.rint((points - low) / CELL).astype(int)
-    grid = np.zeros((3, *cells.max(axis=0) + ROOM + 1))
+    grid = np.zeros((3, *cells.max(axis=0) + ROOM + 1), np.float32)
     np.add.at(grid, (slice(None), *cells.T), values.T)
     return grid, low
 

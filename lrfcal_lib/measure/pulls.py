@@ -7,8 +7,10 @@ import numpy as np
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
+from lrfcal_lib.fit.least_squares import eliminate
 from lrfcal_lib.fit.robust import sums_by
 from lrfcal_lib.judge.uncertainty import carried, chain_of
+from lrfcal_lib.model.camera import pinhole_jacobian
 from lrfcal_lib.model.kinematics import beams_to
 
 # a camera's likely changes, radians and metres of its pose
@@ -53,7 +55,7 @@ def poses_of(rig: CalibratedRig, camera: str) -> np.ndarray:
 
 
 def seen(
-    points: np.ndarray, view: View, rig: CalibratedRig
+    points: np.ndarray, motions: np.ndarray, view: View, rig: CalibratedRig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Scanned points as a camera of a calibrated rig sees them.
 
@@ -61,6 +63,8 @@ def seen(
     ----------
     points : ndarray, shape (n, 3)
         Platform frame, metres.
+    motions : ndarray, shape (n, m, 3)
+        What else moves each of them, platform frame.
     view : View
     rig : CalibratedRig
         That knows its uncertainty.
@@ -69,14 +73,16 @@ def seen(
     -------
     p_camera : ndarray, shape (n, 3)
         Camera frame, metres.
-    by_unknown : ndarray, shape (n, 3, c)
-        Their derivatives by the unknowns of a Pull.
+    by_unknown : ndarray, shape (n, 2, c + m)
+        Derivatives of their undistorted pixels by the unknowns of a Pull, and by the motions.
     """
     beams = beams_to(points, rig.T_head_lrf)
     chain = chain_of(rig, view.camera)
     p_camera, by_link, by_pitch = carried(chain, *beams, view.pitch)
     by_rig = by_link @ chain.links
-    return p_camera, np.concatenate([by_rig, by_pitch[..., None]], axis=-1)
+    moved = view.T_camera_platform.rotation.as_matrix() @ motions.mT
+    by_all = np.concatenate([by_rig, by_pitch[..., None], moved], axis=-1)
+    return p_camera, pinhole_jacobian(p_camera, view.model) @ by_all
 
 
 def pull_of_groups(
@@ -119,12 +125,9 @@ def without(pull: Pull, sigma: np.ndarray) -> Pull:
     sigma : ndarray, shape (s,)
         Of the last unknowns before.
     """
-    kept = slice(len(pull.slope) - len(sigma))
-    last = slice(kept.stop, None)
-    known = pull.information[last, last] + np.diag(sigma**-2.0)
-    share = np.linalg.solve(known, pull.information[last, kept])
-    return replace(
-        pull,
-        information=pull.information[kept, kept] - pull.information[kept, last] @ share,
-        slope=pull.slope[kept] - pull.slope[last] @ share,
+    kept = len(pull.slope) - len(sigma)
+    whole = pull.information + np.diag(np.pad(sigma**-2.0, (kept, 0)))
+    (information,), (slope,), _ = eliminate(
+        whole[None], pull.slope[None], kept, regular=True
     )
+    return replace(pull, information=information, slope=slope)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib.calibrate.cloud import Cloud, join, write_ply
-from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
+from lrfcal_lib.calibrate.clouds import station_of, sweep_blocks
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.measure.cloud_files import write_pcd
@@ -20,7 +20,7 @@ from lrfcal_lib.measure.features import with_sigma
 from lrfcal_lib.measure.lengths import SceneFeatures, features_of, for_page
 from lrfcal_lib.measure.stations import Joined, joined_cloud, placed
 from lrfcal_lib.plots.interactive import MOST_POINTS, rig_lines, scene_page
-from lrfcal_lib.preprocess.closing_scan import closing_of, without_closing
+from lrfcal_lib.preprocess.closing_scan import closing_of
 from lrfcal_lib.session.faults import repeated_scans
 from lrfcal_lib.session.read import Session, Sweep
 from lrfcal_lib.session.write import whole
@@ -80,34 +80,6 @@ def _refuse_moved(session, number):
         )
 
 
-def station_of(
-    session: Session, rig: CalibratedRig, number: int
-) -> tuple[Sweep, list[View]]:
-    """A place where the rig stood, with its images posed.
-
-    Parameters
-    ----------
-    session : Session
-    rig : CalibratedRig
-        That recorded it.
-    number : int
-        Of :func:`stations_of`.
-
-    Returns
-    -------
-    sweep : Sweep
-        Without the scan that closed it.
-    views : list of View
-
-    Raises
-    ------
-    ValueError
-        For a sweep without a range, or images that the rig cannot pose or that have another size.
-    """
-    sweep, _ = without_closing(session.sweep(number))
-    return sweep, views_of(session, rig.for_scenes, number)
-
-
 def colored_blocks(
     session: Session, rig: CalibratedRig, sweep: Sweep, views: list[View]
 ) -> Iterator[Cloud]:
@@ -118,7 +90,7 @@ def colored_blocks(
     session : Session
     rig : CalibratedRig
     sweep, views
-        Of :func:`station_of`.
+        Of :func:`lrfcal_lib.calibrate.clouds.station_of`.
 
     Returns
     -------

@@ -102,16 +102,14 @@ def join_stations(clouds: Mapping[int, Cloud], rig: CalibratedRig | None = None)
     """
     if len(clouds) < 2:
         raise ValueError(f"{len(clouds)} station: two or more are needed to join them")
-    coarse = {}
-    fine = {}
+    surfaces = {}
     for number, cloud in clouds.items():
         try:
-            coarse[number] = surface_of(cloud, COARSE)
-            fine[number] = surface_of(cloud, FINE, rig)
+            surfaces[number] = surface_of(cloud, COARSE), surface_of(cloud, FINE, rig)
         except ValueError as error:
             raise ValueError(f"station {number}: {error}") from error
     numbers = sorted(clouds)
-    results = [join_pair(names, coarse, fine) for names in combinations(numbers, 2)]
+    results = [join_pair(names, surfaces) for names in combinations(numbers, 2)]
     pairs = [result for result in results if isinstance(result, Pair)]
     problems = [result for result in results if isinstance(result, Problem)]
     of_rig = chain_of(rig).covariances[-1] if rig else np.zeros((len(COLUMNS),) * 2)
@@ -119,9 +117,7 @@ def join_stations(clouds: Mapping[int, Cloud], rig: CalibratedRig | None = None)
 
 
 def join_pair(
-    names: tuple[int, int],
-    coarse: Mapping[int, Surface],
-    fine: Mapping[int, Surface],
+    names: tuple[int, int], surfaces: Mapping[int, tuple[Surface, Surface]]
 ) -> Pair | Problem:
     """Two stations beside each other.
 
@@ -129,7 +125,7 @@ def join_pair(
     ----------
     names : tuple of int
         Their numbers.
-    coarse, fine : dict of int to Surface
+    surfaces : dict of int to tuple of Surface
         By station, in patches of `COARSE` and of `FINE`.
 
     Returns
@@ -137,8 +133,8 @@ def join_pair(
     Pair or Problem
         Why they are not joined.
     """
-    first, second = names
-    tried = candidates(coarse[first], coarse[second])
+    coarse, fine = zip(*(surfaces[name] for name in names), strict=True)
+    tried = candidates(*coarse)
     good = [c for c in tried if c.overlap > LEAST_OVERLAP and c.against < MOST_AGAINST]
     if not good:
         words = "they have no two directions of walls in common"
@@ -162,7 +158,7 @@ def join_pair(
                 f"(overlap {100 * best.overlap:.0f} % and {100 * other.overlap:.0f} %): the scene "
                 "repeats itself or is symmetric",
             )
-    pair = fitted(names, fine[first], fine[second], best.T_first_second)
+    pair = fitted(names, *fine, best.T_first_second)
     turn_and_shift = [pair.covariance[:3, :3], pair.covariance[3:, 3:]]
     variance = np.linalg.norm(turn_and_shift, 2, axis=(1, 2))  # in the worst direction
     if pair.held < LEAST_HELD or np.any(np.sqrt(variance) > MOST_SIGMA):

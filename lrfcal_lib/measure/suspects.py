@@ -3,7 +3,9 @@
 Where a crease has its edge depends on what has moved: each suspect is asked with edges of its own.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
@@ -28,6 +30,7 @@ WANTED_MOVE = 0.008
 AWAY = 3.0  # metres, where shifts are stated
 # of the range in which an edge is sought, while a change is found
 WIDTHS = np.append(np.geomspace(0.3, 0.01, 20), np.zeros(8))
+LIKELIHOOD = attrgetter("evidence")  # of a Fit
 
 
 @dataclass(frozen=True)
@@ -114,27 +117,27 @@ def most_likely(shifts: list[Shift]) -> list[Shift]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """What observations ask for: a change of the unknowns (c,), their slope (c,) and information
-    (c, c) there, and the logarithm of the evidence.
+    """What observations ask for if one suspect moved, None for the head: a change of the unknowns
+    (c,) and the logarithm of its evidence. Of the k that the suspect moves by, their information
+    (k, k) and slope (k,) where the calibration errs as it may.
     """
 
+    camera: str | None
     change: np.ndarray
-    slope: np.ndarray
-    information: np.ndarray
     evidence: float
+    information: np.ndarray
+    slope: np.ndarray
 
 
-def suspects(seen: list[Sights], pairs: list[Pull], rig: CalibratedRig) -> list[Shift]:
+def suspects(seen: Sequence[Sights | Pull], rig: CalibratedRig) -> list[Shift]:
     """What each camera, and the head under cameras on the base, would have to have done.
 
     Each alone, of a calibration that else errs as its covariance allows.
 
     Parameters
     ----------
-    seen : list of Sights
-        Of all images.
-    pairs : list of Pull
-        Of pairs of images, by station.
+    seen : sequence of Sights and Pull
+        Of images, and of pairs of images.
     rig : CalibratedRig
 
     Returns
@@ -142,53 +145,46 @@ def suspects(seen: list[Sights], pairs: list[Pull], rig: CalibratedRig) -> list[
     list of Shift
         Empty where nothing was observed.
     """
-    nothing, asked = _asked([*seen, *pairs], rig)
-    if not nothing.information.any():
+    nothing, *moved = _asked(seen, rig)
+    if not any(fit.information.any() for fit in moved):
         return []
-    return [
-        _shift(camera, columns, fit, fit.evidence - nothing.evidence, rig)
-        for camera, columns, fit in asked
-    ]
+    return [_shift(fit, nothing, rig) for fit in moved]
 
 
-def likeliest_change(seen: list[Sights], rig: CalibratedRig) -> np.ndarray:
+def likeliest_change(seen: Sequence[Sights], rig: CalibratedRig) -> np.ndarray:
     """The change of the unknowns, shape (c,), by which creases alone are explained best.
 
     Parameters
     ----------
-    seen : list of Sights
+    seen : sequence of Sights
         Of all images.
     rig : CalibratedRig
     """
-    nothing, asked = _asked(seen, rig)
-    fits = [nothing, *(fit for _, _, fit in asked)]
-    return max(fits, key=lambda fit: fit.evidence).change
+    return max(_asked(seen, rig), key=LIKELIHOOD).change
 
 
 def _asked(seen, rig):
-    """The Fit where nothing has moved; and of each suspect the camera, None for the head, columns
-    of the unknowns that it moves by, and the likeliest Fit.
-    """
-    C = _allowed(rig)
+    """The Fit where nothing has moved, and the likeliest of each suspect."""
     turns = np.arange(6) < 3
     ways = [SPREAD * turns, SPREAD * ~turns, SPREAD]
-    moves = [(camera, poses_of(rig, camera), ways) for camera in rig.cameras]
+    moves = [(None, [], [0.0])]
+    moves += [(camera, poses_of(rig, camera), ways) for camera in rig.cameras]
     if any(camera.mount == "platform" for camera in rig.cameras.values()):
-        moves.append((None, np.array([-1]), [SLIP]))
-    asked = []
-    for camera, columns, ways in moves:
-        fits = [_fitted(seen, C, columns, likely) for likely in ways]
-        asked.append((camera, columns, max(fits, key=lambda fit: fit.evidence)))
-    return _fitted(seen, C, [], 0.0), asked
+        moves.append((None, [-1], [SLIP]))
+    C = _allowed(rig)
+    return [
+        max((_fitted(seen, C, *suspect, likely) for likely in ways), key=LIKELIHOOD)
+        for *suspect, ways in moves
+    ]
 
 
-def _fitted(seen, C, columns, likely):
-    """The Fit of changes that are likely to a covariance C (c, c), and in some columns to standard
-    deviations besides: expectation and maximisation, with edges that are sought nearer and nearer,
-    and Laplace's approximation of the evidence.
+def _fitted(seen, C, camera, columns, likely):
+    """The Fit of changes that are likely to a covariance C (c, c), and in the columns of a suspect
+    to standard deviations besides: expectation and maximisation, with edges that are sought nearer
+    and nearer, and Laplace's approximation of the evidence.
     """
-    C = C.copy()
-    C[columns, columns] += likely**2
+    wider = C.copy()
+    wider[columns, columns] += likely**2
     change = np.zeros(len(C))
     for width in WIDTHS:
         information = np.zeros_like(C)
@@ -197,11 +193,18 @@ def _fitted(seen, C, columns, likely):
             pull = each.pull(change, width)
             information += pull.information
             slope += pull.slope
-        shares = np.eye(len(C)) + C @ information
-        change = np.linalg.solve(shares, C @ slope)
+        shares = np.eye(len(C)) + wider @ information
+        change = np.linalg.solve(shares, wider @ slope)
     evidence = sum(each.explained(change) for each in seen)
     cost = change @ (slope - information @ change) + np.linalg.slogdet(shares)[1]
-    return _Fit(change, slope, information, evidence - cost / 2)
+    both = np.eye(len(C)) + information @ C
+    return _Fit(
+        camera=camera,
+        change=change,
+        evidence=evidence - cost / 2,
+        information=np.linalg.solve(both, information)[np.ix_(columns, columns)],
+        slope=np.linalg.solve(both, slope)[columns],
+    )
 
 
 def _allowed(rig):
@@ -218,33 +221,29 @@ def _allowed(rig):
     return C + common @ common.T
 
 
-def _shift(camera, columns, fit, evidence, rig):
-    """The Shift of one suspect, of unknowns in these columns."""
-    likely = SPREAD if camera else SLIP
-    # what is known of its changes where the calibration errs as it may
-    both = np.eye(len(fit.change)) + fit.information @ _allowed(rig)
-    known = np.linalg.solve(both, fit.information)[np.ix_(columns, columns)]
-    score = np.linalg.solve(both, fit.slope)[columns]
+def _shift(fit, nothing, rig):
+    """The Shift of a suspect, beside the Fit where nothing has moved."""
+    likely = SPREAD if fit.camera else SLIP
     # a turn, a move: the first three unknowns, and the others
     shows = []
     for part in (slice(3), slice(3, None)):
-        if columns[part].size:
-            information = known[part, part]
+        if likely[part].size:
+            information = fit.information[part, part]
             shares = np.eye(len(information)) + information * likely[part] ** 2
             sigma = max(np.linalg.eigvalsh(information)[0], 1e-12) ** -0.5
             wanted = np.sqrt(2 * SURE + np.linalg.slogdet(shares)[1])
             shows.append((wanted + IN_9_OF_10) * sigma)
-    covariance = np.linalg.inv(known + np.diag(likely**-2.0))
+    covariance = np.linalg.inv(fit.information + np.diag(likely**-2.0))
     motion = None
-    if camera:
+    if fit.camera:
         ahead = np.array([0.0, 0.0, AWAY])
-        by_point = pinhole_jacobian(ahead, rig.cameras[camera].model)
+        by_point = pinhole_jacobian(ahead, rig.cameras[fit.camera].model)
         motion = gradient_by_pose(ahead, by_point)
     return Shift(
-        camera=camera,
-        change=covariance @ score,
+        camera=fit.camera,
+        change=covariance @ fit.slope,
         covariance=covariance,
         motion=motion,
-        evidence=evidence,
+        evidence=fit.evidence - nothing.evidence,
         shows=shows,
     )

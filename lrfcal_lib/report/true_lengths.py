@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.measure.features import SYSTEMATIC
-from lrfcal_lib.measure.lengths import END, IN_PLACE, ON_IT, SceneFeatures
+from lrfcal_lib.measure.lengths import IN_PLACE, ON_IT, PICKED, SceneFeatures
 from lrfcal_lib.session.read import Session
 
 NEAR = 0.03  # metres from a true face to a point of the cloud that shows it
@@ -51,6 +51,11 @@ def true_picks(
     if truth is None:
         return pd.DataFrame()
     poses = poses or dict.fromkeys(scenes, IN_PLACE)
+    in_room = {
+        station: truth.stations[station]
+        * truth.gauge(rig, station, session.sweep(station).pitch)
+        for station in scenes
+    }
     rows = []
     for length in truth.lengths:
         row = {"name": length["name"], "true_m": length["metres"]}
@@ -60,19 +65,19 @@ def true_picks(
             look = _on_face if kind == "plane" else _on_edge
             by_station = {}
             for station, scene in scenes.items():
-                gauge = truth.gauge(rig, station, session.sweep(station).pitch)
-                corners = (truth.stations[station] * gauge).inv().apply(end)
+                corners = in_room[station].inv().apply(end)
                 by_station[station] = poses[station].apply(look(scene, corners))
             nothing = poses[station].apply(corners.mean(axis=0))
             shown.append((by_station, nothing))
         both = [s for s in scenes if all(len(places[s]) for places, _ in shown)]
-        for number, (kind, (places, place)) in enumerate(zip(kinds, shown, strict=True), 1):
+        ends = []
+        for kind, (places, place) in zip(kinds, shown, strict=True):
             picked = np.concatenate([places[station] for station in both or scenes])
             if len(picked):
                 away = np.linalg.norm(picked - picked.mean(axis=0), axis=1)
                 place = picked[np.argmin(away)]
-            row |= zip([f"{what}_{number}" for what in END], (kind, *place), strict=True)
-        rows.append(row)
+            ends += [kind, *place]
+        rows.append(row | dict(zip(PICKED, ends, strict=True)))
     return pd.DataFrame(rows)
 
 
