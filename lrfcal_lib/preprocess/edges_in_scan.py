@@ -199,7 +199,7 @@ def background_of(scan, board, cell, step):
     board : ndarray, shape (L, B)
         Ranges of the board, metres.
     cell, step : ndarray of int, shape (n, 2)
-        As in `ScanEdges`.
+        The last cells on the board, line and beam, and the steps to the first cells off it.
 
     Returns
     -------
