@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import dyads, solve_each
@@ -14,6 +13,7 @@ from lrfcal_lib.preprocess.surfaces import (
     PLANE_NOISE,
     BoardNotFound,
     planar_surface,
+    row_ends,
     segments,
 )
 from lrfcal_lib.session.read import Sweep
@@ -264,7 +264,7 @@ def jump_points(ranges: np.ndarray, fitted: np.ndarray, sigma_range: float) -> n
     pieces = segments(ranges, jump=threshold)
     size = np.bincount(pieces[pieces >= 0], minlength=1)
     small = (pieces >= 0) & (size[pieces] <= SMALLEST_PIECE)
-    beside = ndimage.binary_dilation(on, np.ones((1, 2 * SMALLEST_PIECE + 1))) & ~on
+    beside = _span(on, -SMALLEST_PIECE) & ~on
     return inside | (small & beside)
 
 
@@ -321,11 +321,14 @@ def _line_ranges(lines, rays):
 def _span(mask, trim=0):
     """True from the first to the last True of each row, without `trim` beams at both ends.
 
-    A number, or one a row (n, 1).
+    A number, or one a row.
     """
-    along = np.cumsum(np.logical_or.accumulate(mask, axis=1), axis=1)
-    back = np.cumsum(np.logical_or.accumulate(mask[:, ::-1], axis=1), axis=1)
-    return (along > trim) & (back[:, ::-1] > trim)
+    rows, ends = row_ends(mask)
+    inside = ends + np.multiply.outer(trim, [1, -1])
+    beam = np.arange(mask.shape[1])
+    span = np.zeros(mask.shape, bool)
+    span[rows] = (beam >= inside[:, :1]) & (beam <= inside[:, 1:])
+    return span
 
 
 def _interior(mask, angles, spot):
@@ -334,7 +337,7 @@ def _interior(mask, angles, spot):
     The latter where that leaves half of the row. A row too short for that (a sweep of one line,
     seen by columns) stays. `angles` of the cells of a row, and `spot`, in radians.
     """
-    size = _span(mask).sum(axis=1, keepdims=True) - 1
+    size = np.ptp(row_ends(mask)[1], axis=1)
     clear = CLEAR * spot / max(median_step(angles), 1e-6)
     least = np.maximum(2, np.minimum(clear, MOST_MARGIN * size))
     trim = np.maximum(least, MARGIN * size).astype(int)

@@ -199,7 +199,7 @@ def background_of(scan, board, cell, step):
     board : ndarray, shape (L, B)
         Ranges of the board, metres.
     cell, step : ndarray of int, shape (n, 2)
-        As in `ScanEdges`.
+        The last cells on the board, line and beam, and the steps to the first cells off it.
 
     Returns
     -------
@@ -355,25 +355,22 @@ def _group(scan, points, pitch, spread, cell, step, mixed, tolerance):
     moves all of it alike.
     """
     more = np.ones(len(cell))
-    if np.ptp(scan.sweep.pitch) < SAME_PITCH:
+    if not len(cell) or np.ptp(scan.sweep.pitch) < SAME_PITCH:
         return (step[:, 1] + 1) // 2, more, ()  # scans at one pitch show one point a side
     side = np.full(len(cell), -1)
     every: list[ScanSide] = []
     axes = plane_axes(scan.normal)
     flat = lrf_to_platform(points, pitch, scan.T_head_lrf) @ axes.T
     spread = _to_platform(scan, spread, pitch)
+    usable = ~mixed | (2 * mixed.sum() >= len(mixed))
+    shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0))
     for direction in ((0, -1), (0, 1), (-1, 0), (1, 0)):
         across = direction[1] == 0
-        way = (step[:, 1] == 0) == across
         end = np.all(step == direction, axis=1)
-        if not end.any():
-            continue
-        usable = ~mixed | (2 * mixed[way].sum() >= way.sum())
         candidates = np.flatnonzero(end & usable)
         order = cell[:, int(across)]
         left_out = np.unique(order[end & ~usable])  # makes no gap
         place = order[candidates] - np.searchsorted(left_out, order[candidates])
-        shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat[way], axis=0))
         for run in straight_runs(flat[candidates], place, tolerance, shortest):
             rows = candidates[run]
             new = _side_through(scan, flat[rows], axes, np.mean(pitch[rows]), across)

@@ -300,12 +300,13 @@ def _first(group, begin):
     """What begins with the first image of a list that shows the board; the first one if none
     does.
     """
-    begun = []
+    first = None
     for shot in group:
-        begun.append(begin(shot))
-        if not begun[-1].reason:
-            return begun[-1]
-    return begun[0]
+        begun = begin(shot)
+        if not begun.reason:
+            return begun
+        first = first or begun
+    return first
 
 
 def _survey_plain(prepared, look, models, unknown):
@@ -361,12 +362,10 @@ def _adjusted(cameras, models, shots, session, relief=False):
     For the heights the corners are in one order; the sheet is flat without cameras.
     """
     estimate = partial(_adjustment, shots=shots, session=session, relief=relief)
-    adjusted = dict(models)
-    reliefs = []
-    for camera, adjustment in zip(cameras, spread(estimate, cameras), strict=True):
-        adjusted[camera] = adjustment.models[0]
-        reliefs.append(adjustment.relief)
-    return adjusted, np.mean(reliefs or [0.0], axis=0)
+    adjustments = spread(estimate, cameras)
+    adjusted = [adjustment.models[0] for adjustment in adjustments]
+    reliefs = [adjustment.relief for adjustment in adjustments] or [0.0]
+    return models | dict(zip(cameras, adjusted, strict=True)), np.mean(reliefs, axis=0)
 
 
 def _adjustment(name, shots, session, relief):

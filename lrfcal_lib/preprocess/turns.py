@@ -110,9 +110,8 @@ def decide(scores: np.ndarray, leader: np.ndarray) -> np.ndarray:
     """
     total = np.zeros(scores.shape)
     np.add.at(total, leader, scores)
-    usual, mirrored = np.split(total, 2, axis=1)
-    if mirrored.max(axis=1).sum() < CLEARLY * usual.max(axis=1).sum():
-        best = usual.argmax(axis=1)
-    else:
-        best = usual.shape[1] + mirrored.argmax(axis=1)
+    halves = total.reshape(len(total), 2, -1)
+    usual, mirrored = halves.max(axis=2).sum(axis=0)
+    half = int(mirrored >= CLEARLY * usual)
+    best = half * halves.shape[2] + halves[:, half].argmax(axis=1)
     return best[leader]
