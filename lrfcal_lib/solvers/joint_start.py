@@ -168,8 +168,8 @@ def start_states(obs: JointObservations, axis: bool = True) -> Iterator[list[Joi
         raise DegenerateGeometry(
             "no ranges on the boards' faces: a start value needs them; give one as start="
         )
-    backwards = Rotation.from_euler("z", np.pi)
-    heads = [RigidTransform.identity(), RigidTransform.from_rotation(backwards)]
+    both_ways = Rotation.from_euler("z", [[0.0], [np.pi]])
+    heads = [*RigidTransform.from_rotation(both_ways)]
     if obs.T_head_lrf is not None:
         heads.insert(0, obs.T_head_lrf)
     if not axis:
