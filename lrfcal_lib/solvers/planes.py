@@ -267,6 +267,19 @@ def plane_residuals(pose, triangles, boards, offset=0.0):
     return np.matvec(triangles, source_planes(pose, boards)) + offset
 
 
+def plane_error(obs: CameraObservations, solution: Solution) -> float:
+    """Size of the errors common to a placement: rms over the placements of their mean distance,
+    metres.
+
+    Zero where chi-square agrees with the stated noise (``solution.inflation`` is 1).
+    """
+    if solution.inflation == 1.0:
+        return 0.0
+    distance = plane_residuals_m(obs, solution.transform)
+    placements = np.unique(obs.plane_placement)
+    return rms(ndimage.mean(distance, obs.plane_placement, placements))
+
+
 def planes_and_pattern(state, planes, obs: CameraObservations, lens) -> list[Block]:
     """Residuals by placement of pose, intrinsics and board poses (p, 3, 4): point-plane distances,
     pattern corners.
@@ -309,8 +322,8 @@ def estimate_with_lens(
 
     The start is the estimate from planes with the board poses and the model that the observations
     hold; points are compressed once more at the first solution. An error that all points of a
-    placement have in common (a bent board, a wrong pitch) is allowed for, as large as the mean
-    distances of placements: without it thousands of points would overrule the pattern.
+    placement have in common (a bent board, a wrong pitch; see :func:`plane_error`) is allowed for:
+    without it thousands of points would overrule the pattern.
 
     Parameters
     ----------
@@ -341,11 +354,7 @@ def estimate_with_lens(
     solution = estimate_from_planes(
         plane_block, obs, pose, method=method, uses=uses, **options
     )
-    error = 0.0
-    if solution.inflation > 1.0:  # not where chi-square agrees with the stated noise
-        distance = plane_residuals_m(obs, solution.transform)
-        placements = np.unique(obs.plane_placement)
-        error = rms(ndimage.mean(distance, obs.plane_placement, placements))
+    error = plane_error(obs, solution)
     # of a board's pose: tilt over a lever, offset
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)
     sets = plane_sets(obs, scanned=False)
