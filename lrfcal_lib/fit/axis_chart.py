@@ -9,6 +9,7 @@ import numpy as np
 
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model.geometry import (
+    POSE,
     axis_of,
     head_from_axis,
     move_pose,
@@ -85,7 +86,7 @@ def by_chart(function: Callable, head: np.ndarray) -> tuple[np.ndarray, np.ndarr
     values : ndarray, shape (m,)
     derivatives : ndarray, shape (m, 4)
     """
-    steps = SMALL * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
+    steps = SMALL * np.vstack([np.zeros(4), np.eye(4), -np.eye(4)])
     here, ahead, behind = np.split(function(move_head(head, steps)), [1, 5])
     return here[0], (ahead - behind).T / (2 * SMALL)
 
@@ -99,6 +100,4 @@ def move_head(head: np.ndarray, step: np.ndarray) -> np.ndarray:
     step : ndarray, shape (..., 4)
         See `AXIS_COLUMNS`, radians and metres.
     """
-    delta = np.zeros(step.shape[:-1] + (6,))
-    delta[..., AXIS_COLUMNS] = step
-    return move_pose(head, delta)
+    return move_pose(head, step @ np.eye(POSE)[AXIS_COLUMNS])

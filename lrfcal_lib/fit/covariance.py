@@ -146,8 +146,7 @@ def covariance_of(hessian, scales, lost):
     if not lost:  # or many trials
         return covariance
     lost = np.any(np.abs(null_space(hessian, scales, np.inf)) > PARTAKES, axis=0)
-    covariance[lost] = 0.0
-    covariance[:, lost] = 0.0
+    covariance *= dyads(~lost)
     covariance[lost, lost] = np.inf
     return covariance
 

@@ -269,9 +269,9 @@ def _step(hessian, gradient, damping, shared):
     promises: of each trial, or of all placements.
     """
     diagonal = np.linalg.diagonal(hessian)
-    extra = damping[..., None] * diagonal
     # what nobody sees stays where it is
-    extra = extra + (1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300)
+    least = 1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300
+    extra = damping[..., None] * diagonal + least
     damped = hessian + extra[..., None] * np.eye(hessian.shape[-1])
     if shared:
         reduced, right, by_shared = eliminate(damped, gradient, shared, regular=True)
@@ -286,8 +286,8 @@ def _step(hessian, gradient, damping, shared):
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended, trial by trial, the cost before each iteration and at the end, and
-    the blocks there, with their weights.
+    """Where a minimisation ended, trial by trial, the cost before each iteration and at the end,
+    and the blocks there, with their weights.
     """
 
     state: Any

@@ -166,7 +166,6 @@ def under_intrinsics(obs: CameraObservations, solution: Solution) -> CameraObser
                 cv2.Rodrigues(pose[:3, :3])[0],
                 pose[:3, 3:].copy(),
                 useExtrinsicGuess=True,
-                flags=cv2.SOLVEPNP_ITERATIVE,
             )
             pose[:3] = np.hstack([cv2.Rodrigues(rotvec)[0], shift])
     return replace(obs, model=model, crossing_lines=moved, board_poses=boards)

@@ -169,10 +169,9 @@ def beams_to(
     R = T_head_lrf.rotation.as_matrix()
     t = T_head_lrf.translation
     k = R[:, 2]  # normal of the scan plane: k . (Rx(-pitch) x - t) = 0
-    y = points[..., 1]
-    z = points[..., 2]
-    a = k[1] * y + k[2] * z
-    b = k[1] * z - k[2] * y
+    across = points[..., 1:]
+    a = np.vecdot(across, k[1:])
+    b = np.vecdot(across, [-k[2], k[1]])
     c = k @ t - k[0] * points[..., 0]
     with np.errstate(invalid="ignore"):
         pitch = np.arctan2(b, a) + np.arccos(c / np.hypot(a, b))

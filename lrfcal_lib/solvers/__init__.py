@@ -312,12 +312,11 @@ def best_method(
     """
     errors = []
     for method in CANDIDATES:
-        of_cameras = [(np.nan, np.nan)]  # of none
+        of_cameras = [[np.nan, np.nan]]  # of none
         for camera, obs in observations.items():
             if (camera, method) in solutions:
                 pairs = left_out(obs, obs.along(), method, solutions[camera, method])
-                edges, faces = left_out_residuals(pairs)
-                of_cameras.append((rms(edges), rms(faces)))
+                of_cameras.append([*map(rms, left_out_residuals(pairs))])
         known = np.ma.masked_invalid(of_cameras)
         errors.append(known.mean(axis=0).filled(np.nan))
     table = np.array(errors)
@@ -380,26 +379,17 @@ def find_outlying_placements(obs: CameraObservations) -> tuple[list[int], dict[i
     """
     plain = partial(solve_camera, method="zhang_pless", weighted=False)
     T = plain(obs, robust=True).transform
-    placements, mean = _mean_squares(obs, T)
+    placements = np.intersect1d(obs.placements, obs.plane_placement)
     accepted = np.ones(len(placements), bool)
     for number in range(OUTLIER_ROUNDS):
+        squares = plane_residuals_m(obs, T) ** 2
+        mean = ndimage.mean(squares, obs.plane_placement, placements)
         level = np.median(mean[accepted]) / chdtri(NUMBERS, 0.5)
         before = accepted
         accepted = mean <= level * chdtri(NUMBERS, 1 - ACCEPTED)
         if number > 0 and np.array_equal(before, accepted):
             break
-        inliers = obs.select(placements[accepted])
-        T = plain(inliers, T0=T, search=False).transform
-        _, mean = _mean_squares(obs, T)
+        T = plain(obs.select(placements[accepted]), T0=T, search=False).transform
     rest = placements[~accepted].tolist()
     errors = np.sqrt(mean[~accepted]).tolist()
     return placements[accepted].tolist(), dict(zip(rest, errors, strict=True))
-
-
-def _mean_squares(obs, transform):
-    """Placements, and mean squares of their points' distances from the planes."""
-    placements = np.unique(obs.plane_placement)
-    squares = plane_residuals_m(obs, transform) ** 2
-    mean = ndimage.mean(squares, obs.plane_placement, placements)
-    known = np.isfinite(mean)
-    return placements[known], mean[known]

@@ -145,7 +145,7 @@ def solve_joint(
         len(obs.cameras),
         len(obs.edges),
         axis=chosen.axis,
-        sensor=tuple(chosen.sensor),
+        sensor=chosen.sensor,
         sweep=chosen.sweep,
         sides=chosen.sides,
     )
@@ -181,10 +181,11 @@ def solve_again(obs: JointObservations, like: JointSolution) -> JointSolution:
 
     Raises DegenerateGeometry when these placements leave a motion open.
     """
-    rows = np.flatnonzero(np.isin(like.observations.placements, obs.placements))
+    rows = np.isin(like.observations.placements, obs.placements)
     obs = obs.select(like.observations.placements)
     data = gather(obs, like.data.levels)
-    state = minimum(like.state.of_placements(rows), data, like.unknowns, LAST_STEP).state
+    start = like.state.of_placements(rows)
+    state = minimum(start, data, like.unknowns, LAST_STEP).state
     return finished(obs, state, data, like.unknowns, required=True, excluded=like.excluded)
 
 
@@ -206,9 +207,8 @@ def in_stated_gauge(state: JointState, obs: JointObservations) -> JointState:
     found = pose_transform(state.head)
     head = head_from_axis(axis_of(found), obs.T_head_lrf)
     change = head * found.inv()
-    cameras = state.cameras.copy()
-    on_base = ~obs.on_head
-    cameras[on_base] = pose_array(pose_transform(cameras[on_base]) * change.inv())
+    on_base = pose_array(pose_transform(state.cameras) * change.inv())
+    cameras = np.where(obs.on_head[:, None, None], state.cameras, on_base)
     boards = pose_array(change * pose_transform(state.boards))
     return replace(state, head=pose_array(head), boards=boards, cameras=cameras)
 

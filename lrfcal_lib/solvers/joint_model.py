@@ -173,7 +173,7 @@ class Levels:
         The same of all cameras' board poses.
     sigma_pitch : float
         Standard deviation of the recorded pitch at a stop, radians: what a head at rest is off by
-        (see :mod:`lrfcal_lib.fit.stops`).
+        (see :class:`lrfcal_lib.solvers.joint_residuals.ViewBlock`).
     face_share, beam_share : float
         Share of independent errors per observation, below one where neighbours repeat each other's.
     lapse : float

@@ -168,8 +168,8 @@ def start_states(obs: JointObservations, axis: bool = True) -> Iterator[list[Joi
         raise DegenerateGeometry(
             "no ranges on the boards' faces: a start value needs them; give one as start="
         )
-    backwards = Rotation.from_euler("z", np.pi)
-    heads = [RigidTransform.identity(), RigidTransform.from_rotation(backwards)]
+    both_ways = Rotation.from_euler("z", [[0.0], [np.pi]])
+    heads = [*RigidTransform.from_rotation(both_ways)]
     if obs.T_head_lrf is not None:
         heads.insert(0, obs.T_head_lrf)
     if not axis:
@@ -193,9 +193,10 @@ def _states(obs, head):
     best = np.array([poses[0] for poses in minima])
     choices = [best]
     for camera, poses in enumerate(minima):
-        others = np.repeat(best[None], len(poses) - 1, axis=0)
-        others[:, camera] = poses[1:]
-        choices += [*others]
+        for pose in poses[1:]:
+            other = best.copy()
+            other[camera] = pose
+            choices.append(other)
     return [state_of(obs, pose_array(head), cameras) for cameras in choices]
 
 
@@ -208,11 +209,12 @@ def _camera(obs, camera, head):
     first = mine[np.unique(obs.view_placement[mine], return_index=True)[1]]
     views = thin(first, VIEWS)
     placements = obs.view_placement[views]
-    rows = [thin(np.flatnonzero(obs.face_placement == p), POINTS) for p in placements]
-    image = np.repeat(views, [*map(len, rows)])
-    rows = np.concatenate(rows)
+    rows = np.concatenate(
+        [thin(np.flatnonzero(obs.face_placement == p), POINTS) for p in placements]
+    )
     if len(rows) == 0:
         raise DegenerateGeometry(f"camera '{name}' never sees a board that the scans hit")
+    image = views[np.searchsorted(placements, obs.face_placement[rows])]
     frame = SourceFrame(head, obs.mounts[camera], obs.view_pitch[image])
     p_lrf = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
     seen = CameraObservations(

@@ -126,7 +126,6 @@ class _Rows(NamedTuple):
     camera: np.ndarray  # index
     # root of a point's share in the mean square of its face, or of its edge, over `SIGMA`
     weight: np.ndarray
-    on_face: np.ndarray
 
 
 def estimate_pitch_errors(
@@ -232,7 +231,6 @@ def gather(cameras):
             placement=face,
             camera=np.full(len(face), number),
             weight=_shares(face) / unit,
-            on_face=np.ones(len(face), bool),
         )
         placement = np.searchsorted(placements, obs.crossing_placement)
         _, edge = np.unique(obs.crossing_edge, return_inverse=True)
@@ -245,7 +243,6 @@ def gather(cameras):
             placement=placement,
             camera=np.full(len(placement), number),
             weight=_shares(placement + len(placements) * edge) / unit,
-            on_face=np.zeros(len(placement), bool),
         )
         parts += [on_board, on_sight]
     return _Rows(*map(np.concatenate, zip(*parts, strict=True)))
@@ -330,7 +327,7 @@ def _model(name, solution, rows, by_unknown, numbers):
         offset_sigma=sigma_of(offsets @ of_unknowns @ offsets.T),
         stretch=stretches @ errors,
         misfit=misfit,
-        plane_rms=rms(distances[rows.on_face]),
+        plane_rms=rms(distances[rows.distance != 0]),  # planes of sight hold the camera
         n_parameters=POSE + free,
         converged=solution.converged,
     )

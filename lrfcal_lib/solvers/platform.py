@@ -138,7 +138,7 @@ def solve_platform(
             n_observations=points,
             required=final,
         )
-        gauge = head_from_axis(axis_of(solution.transform))
+        gauge = start_head(solution.transform)
     return PlatformSolution(solution, boards.placements, boards.skipped)
 
 
@@ -356,7 +356,7 @@ def solve_projected(
         )
         freedom = max(len(solution.residuals) - 4, 1)
         scatter = max(np.sqrt(np.sum(solution.residuals**2) / freedom), LEAST_SCATTER)
-        gauge = head_from_axis(axis_of(solution.transform))
+        gauge = start_head(solution.transform)
     return PlatformSolution(solution, np.array(list(groups)), skipped)
 
 
@@ -372,21 +372,27 @@ def _slanted(obs, p_platform):
     for placement in np.unique(obs.edge_placement).tolist():
         here = obs.edge_placement == placement
         edges = [np.flatnonzero(here & (obs.edge_number == number)) for number in (1, 2)]
-        reasons = []
-        for number, rows in enumerate(edges, start=1):
-            if len(rows) < 3:
-                reasons.append(f"edge {number} has {len(rows)} points, at least 3 needed")
-                continue
-            direction = np.abs(fit_line(p_platform[rows])[1])
-            for axis, plane in ((2, "xy"), (1, "xz")):
-                if direction[axis] < LEAST_SLOPE:
-                    parallel = f"edge {number} is parallel to the {plane} plane"
-                    reasons.append(f"{parallel}: its projected fits divide by zero")
-        if reasons:
-            skipped[placement] = reasons[0]
+        flaw = _flaw([p_platform[rows] for rows in edges])
+        if flaw:
+            skipped[placement] = flaw
         else:
             groups[placement] = edges
     return groups, skipped
+
+
+def _flaw(edges):
+    """Why points of edges 1 and 2 have no projected fits; None where they have."""
+    for number, points in enumerate(edges, start=1):
+        if len(points) < 3:
+            return f"edge {number} has {len(points)} points, at least 3 needed"
+        _, y, z = np.abs(fit_line(points)[1])
+        for slope, plane in ((z, "xy"), (y, "xz")):
+            if slope < LEAST_SLOPE:
+                return (
+                    f"edge {number} is parallel to the {plane} plane: its projected fits divide "
+                    "by zero"
+                )
+    return None
 
 
 def projected_block(head, obs, groups, scatter=1.0, printed=False):
