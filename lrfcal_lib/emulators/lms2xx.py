@@ -183,11 +183,9 @@ class EmulatedLms(SerialDevice):
                 self.set_mode(data, at)
             case 0x30, b"\x01" if not self._selection.head:
                 # the scan that is being measured when the request is whole
-                begun = at + ACK_S + 2 * self.byte_s
-                scans = math.floor((begun - self._zero) / MIRROR_TURN / memory.turns)
-                self._measure(
-                    scans * memory.turns, -1, partial(self.emit, then=self._finish)
-                )
+                self._stream_from(at + ACK_S + 2 * self.byte_s)
+                before = self._turn - memory.turns
+                self._measure(before, -1, partial(self.emit, then=self._finish))
             case _ if (reply := memory.reply(code, data)) is not None:
                 delay = WRITE_S if code in WRITTEN else REPLY_S
                 self.answer(at, 0x80 | code, reply, delay=delay)
