@@ -10,7 +10,6 @@ from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
 
 BURST = 508  # bytes that leave in a turn of the mirror at 500 kBd
-PARTIAL = 181  # values of the first of four interlaced scans; the others have one less
 # arrivals in the last so many turns, 2 s, tell the host's clock from the device's
 WINDOW = 2.0 / MIRROR_TURN
 OFF_S = 1.2  # how far a scan may arrive off its expected instant
@@ -149,12 +148,11 @@ class Assembler:
         self.interlaced = interlaced
         self._clock = clock
         self._parts: list[Reading] = []
+        if interlaced:
+            variant = (180, 1.0)  # as each part is
         view, resolution = variant
         values = round(view / resolution) + 1
         self.turns = round(1 / resolution)
-        if interlaced:
-            values = PARTIAL
-            self.turns = 1
         # number of values, unit, and whether there are indices and parts
         self._kind = (
             values,

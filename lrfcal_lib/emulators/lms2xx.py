@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.drivers.lms2xx_scans import BURST, PARTIAL
+from lrfcal_lib.drivers.lms2xx_scans import BURST
 from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.line import SENDING, SerialDevice
 from lrfcal_lib.emulators.lms2xx_memory import (
@@ -43,6 +43,8 @@ STOP_S = 0.52
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 # A stream that lags so far leaves scans out, as no host can know how late they are.
 LATE_S = 0.5
+# values of the first of four interlaced scans; the others have one less
+PARTIAL = 181
 POWERED_S = 60.0  # how long ago it was switched on
 WHITE = 100  # reflectivity of all that answers: the simulated world states none
 
@@ -183,11 +185,9 @@ class EmulatedLms(SerialDevice):
                 self.set_mode(data, at)
             case 0x30, b"\x01" if not self._selection.head:
                 # the scan that is being measured when the request is whole
-                begun = at + ACK_S + 2 * self.byte_s
-                scans = math.floor((begun - self._zero) / MIRROR_TURN / memory.turns)
-                self._measure(
-                    scans * memory.turns, -1, partial(self.emit, then=self._finish)
-                )
+                self._stream_from(at + ACK_S + 2 * self.byte_s)
+                before = self._turn - memory.turns
+                self._measure(before, -1, partial(self.emit, then=self._finish))
             case _ if (reply := memory.reply(code, data)) is not None:
                 delay = WRITE_S if code in WRITTEN else REPLY_S
                 self.answer(at, 0x80 | code, reply, delay=delay)

@@ -81,8 +81,19 @@ class Memory:
             changes.
         """
         match code:
-            case 0x31:
-                return self.status_data()
+            case 0x31:  # what no driver reads is 0
+                return struct.pack(
+                    "<7sB 93x B 4x 2H 5x H 2x 2B 2B 29x",
+                    self.model[14:21].encode(),
+                    self.mode,
+                    self.configuration.measuring_mode,
+                    *self.variant,
+                    BAUD_WORD[self.baudrate],
+                    self.address,
+                    1,
+                    UNITS.index(self.configuration.unit),
+                    1,
+                )
             case 0x32:
                 return b""
             case 0x3A:
@@ -119,21 +130,6 @@ class Memory:
         self.configuration = Configuration(block)
         self.flash_writes += 1
         return True
-
-    def status_data(self) -> bytes:
-        """Data of the status reply 0xB1, 152 bytes. What no driver reads is 0."""
-        return struct.pack(
-            "<7sB 93x B 4x 2H 5x H 2x 2B 2B 29x",
-            self.model[14:21].encode(),
-            self.mode,
-            self.configuration.measuring_mode,
-            *self.variant,
-            BAUD_WORD[self.baudrate],
-            self.address,
-            1,
-            UNITS.index(self.configuration.unit),
-            1,
-        )
 
 
 def selection_of(mode: int, parameters: bytes) -> Selection | None:

@@ -116,15 +116,14 @@ def ranges_beyond(session) -> Iterator[Fault]:
     known = ranges[np.isfinite(ranges)]
     limit = session.lrf.max_range
     share = (known > limit).mean()
-    if share <= BEYOND:
-        return
-    yield Fault(
-        "beyond range",
-        f"{100 * share:.3g} % of the ranges exceed the max_range_m of {limit:g} m that "
-        f"session.json states (half of all ranges: {np.median(known):.3g} m or more, largest: "
-        f"{known.max():.3g} m): state the range finder's own max_range_m, or convert the ranges "
-        "to metres",
-    )
+    if share > BEYOND:
+        yield Fault(
+            "beyond range",
+            f"{100 * share:.3g} % of the ranges exceed the max_range_m of {limit:g} m that "
+            f"session.json states (half of all ranges: {np.median(known):.3g} m or more, largest: "
+            f"{known.max():.3g} m): state the range finder's own max_range_m, or convert the "
+            "ranges to metres",
+        )
 
 
 def bearings_beyond(session) -> Iterator[Fault]:

@@ -207,10 +207,8 @@ def decode_scans(
 
 # field of view and step of whole scans, deg
 VARIANTS = ((100, 1.0), (100, 0.5), (100, 0.25), (180, 1.0), (180, 0.5))
-# number of values -> first bearing and step in quarters of a degree
-GRIDS = {
-    round(view / step) + 1: (2 * (180 - view), round(4 * step)) for view, step in VARIANTS
-}
+# number of values -> first bearing in quarters of a degree
+GRIDS = {round(view / step) + 1: 2 * (180 - view) for view, step in VARIANTS}
 
 
 def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
@@ -240,8 +238,8 @@ def scan_quarters(values: int, partial: int = -1) -> np.ndarray:
                 f"a whole scan has {short(sorted(GRIDS))} values, got {values}: only a sub-range "
                 "was asked for?"
             )
-        first, step = GRIDS[values]
-        return first + step * np.arange(values)
+        first = GRIDS[values]
+        return np.linspace(first, 720 - first, values, dtype=int)
     quarters = np.arange(partial, 721, 4)
     if len(quarters) != values:
         raise TelegramError(

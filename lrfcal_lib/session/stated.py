@@ -59,7 +59,7 @@ SYSTEMATIC_ERROR = {
 ASSUMED_SYSTEMATIC_ERROR = 5.0
 # degrees between beams of LMS and TiM: parts of a full turn that the sensor's own disc divides, so
 # that their scale has no error
-SICK_STEPS = np.array([0.1, 1 / 6, 0.2, 0.25, 1 / 3, 0.5, 2 / 3, 1.0])
+SICK_STEPS = (0.1, 1 / 6, 0.2, 0.25, 1 / 3, 0.5, 2 / 3, 1.0)
 SAME_STEP = 0.001  # of a step; one that is rounded to three digits
 # standard deviation of other steps, a fraction: anything within 1 %, which nobody notices
 ASSUMED_STEP_ERROR = 0.0058

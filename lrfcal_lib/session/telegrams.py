@@ -154,10 +154,8 @@ def _index(rows, size, file):
 
 def _place(index, row):
     """Where a telegram is, as text."""
-    return (
-        f"line {row + 2}, offset {index.offset[row]}, length {index.length[row]}, placement "
-        f"{index.placement[row]}"
-    )
+    where = "line {}, offset {}, length {}, placement {}"
+    return where.format(row + 2, *index[row].tolist()[1:4])
 
 
 def _modes(data, index, sound):

@@ -93,14 +93,27 @@ def _packed(work, item):
 
 
 def _forked(work, items, cores):
-    """Results by number, of forked processes and of this one, which keeps what it has read."""
+    """Results by number, of forked processes and of this one, which keeps what it has read.
+
+    The others end with this one, however it ends, and at once after Ctrl-C.
+    """
     loop = (work, items, FORK.Value("i"))
-    with _pool(cores - 1, loop) as pool, _setting(_cores, 1):
-        others = [pool.submit(_take_part) for _ in range(cores - 1)]
-        results = _rounds(*loop)
-        for other in others:
-            with suppress(BrokenExecutor):
-                results |= other.result()
+    ours, theirs = FORK.Pipe()
+    with (
+        ours,
+        theirs,
+        ProcessPoolExecutor(cores - 1, FORK, _begin, (ours, theirs, loop)) as pool,
+        _setting(_cores, 1),
+    ):
+        try:
+            others = [pool.submit(_take_part) for _ in range(cores - 1)]
+            results = _rounds(*loop)
+            for other in others:
+                with suppress(BrokenExecutor):
+                    results |= other.result()
+        except (KeyboardInterrupt, SystemExit):
+            ours.close()
+            raise
     return results
 
 
@@ -123,25 +136,6 @@ def _setting(variable, value):
         yield
     finally:
         variable.reset(token)
-
-
-@contextmanager
-def _pool(count, loop):
-    """Processes that end with this one, however it ends, and at once after Ctrl-C."""
-    ours, theirs = FORK.Pipe()
-    with (
-        ours,
-        theirs,
-        ProcessPoolExecutor(count, FORK, _begin, (ours, theirs, loop)) as pool,
-    ):
-        try:
-            yield pool
-        except Exception:  # what others are writing they finish, or clean up
-            pool.shutdown(cancel_futures=True)
-            raise
-        except BaseException:
-            ours.close()
-            raise
 
 
 def _begin(ours, theirs, loop):
