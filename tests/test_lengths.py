@@ -12,6 +12,7 @@ from shared import DATA
 
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.calibrate.calibration_file import load_calibration
+from lrfcal_lib.calibrate.clouds import views_of
 from lrfcal_lib.measure import features, lengths
 from lrfcal_lib.measure.edges import edges_of
 from lrfcal_lib.measure.lengths import nearest_edge
@@ -102,7 +103,7 @@ def test_derivatives_of_an_edge_are_those_of_the_edge_of_a_moved_camera(quick, s
     session = quick.prepared.session
     rig = scene.rig
     number = session.scene_placements[0]
-    views = lengths.views_of(session, rig, number)
+    views = views_of(session, rig, number)
     step = 1e-4
     name = views[0].camera
     surfaces = (scene.planes, scene.of_point)

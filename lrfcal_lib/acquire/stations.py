@@ -9,6 +9,7 @@ import numpy as np
 from lrfcal_lib.acquire.checks import Light, check_scene
 from lrfcal_lib.acquire.record import Boards
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
+from lrfcal_lib.calibrate.cloud import join
 from lrfcal_lib.calibrate.clouds import station_of
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.drivers.rig_file import ListedPlacement, Placement, RigFile
@@ -97,8 +98,8 @@ class Stations(Boards):
         if self.rig is not None:
             require_same_rig(self.rig, session)
             station = station_of(session, self.rig, number)
-            seen = [cloud.seen for cloud in colored_blocks(session, self.rig, *station)]
-            share = sum(map(np.sum, seen)) / max(1, sum(map(len, seen)))
+            seen = join(colored_blocks(session, self.rig, *station)).seen
+            share = seen.sum() / max(1, len(seen))
             light = Light(
                 name="colour",
                 state="ok" if share > EXPECTED * self.share else "warn",

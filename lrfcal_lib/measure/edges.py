@@ -87,8 +87,8 @@ def _segments(view):
     flat = cv2.undistort(grey, view.model.matrix, view.model.distortion)
     lines = cv2.createLineSegmentDetector(scale=1.0).detect(flat)[0]
     if lines is None:
-        return np.zeros((0, 2, 2))
-    ends = lines.reshape(-1, 2, 2).astype(float)
+        lines = []
+    ends = np.reshape(lines, (-1, 2, 2)).astype(float)
     return ends[np.linalg.norm(np.ptp(ends, axis=1), axis=1) >= SHORTEST_PX]
 
 

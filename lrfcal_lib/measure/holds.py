@@ -9,7 +9,7 @@ from scipy.interpolate import interp1d
 
 from lrfcal_lib.calibrate.calibration_file import require_same_rig
 from lrfcal_lib.calibrate.cloud import Cloud, join
-from lrfcal_lib.calibrate.clouds import sweep_blocks, views_of
+from lrfcal_lib.calibrate.clouds import station_of, sweep_blocks
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.judge.uncertainty import chain_of, uncertainty_of
@@ -226,18 +226,19 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
     stations = []
     walls = []
     for placement in _stations(session, rig):
-        cloud = join(sweep_blocks(session, rig.for_scenes, session.sweep(placement), []))
-        planes, of_point = planes_of(cloud, rig)
+        sweep, shown = station_of(session, rig, placement)
+        cloud = join(sweep_blocks(session, rig.for_scenes, sweep, []))
+        surfaces = planes_of(cloud, rig)
         wall = cloud.rows(largest_plane(cloud))
         if len(wall.points) > FEWEST_POINTS:
             walls.append(wall_of(wall, rig, placement))
         views: dict[tuple[str, float], View] = {}
-        for view in views_of(session, rig.for_scenes, placement):
+        for view in shown:
             # a camera on the base sees the same again
             views.setdefault((view.camera, view.pitch), view)
-        creases = creases_of(cloud, planes, of_point)
+        creases = creases_of(cloud, *surfaces)
         of_creases += [sights(creases, view, rig) for view in views.values()]
-        moved, of_flat = flattened(cloud, planes, of_point)
+        moved, of_flat = flattened(cloud, *surfaces)
         stations.append((moved, of_flat, list(views.values())))
     start = likeliest_change(of_creases, rig)
     of_pairs = sum((pairs_pull(*station, rig, start) for station in stations), [])

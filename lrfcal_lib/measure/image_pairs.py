@@ -105,7 +105,7 @@ def pairs_pull(
     for blur in BLURS:
         sharp = {view.number: cv2.GaussianBlur(view.grey, (0, 0), blur) for view in views}
         x = begun + step
-        parts = [_compared(*pair, sharp, x) for pair in pairs]
+        parts = [_compared(sides, cell, sharp, x) for sides, cell in pairs]
         H, b, D, cell = (np.concatenate(part) for part in zip(*parts, strict=True))
         information = np.einsum("nia,nij,njb->ab", D, H, D)
         by_row = np.vecmat(-b, D)

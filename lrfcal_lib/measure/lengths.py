@@ -75,21 +75,22 @@ class SceneFeatures:
         if kind == Kind.EDGE:
             return nearest_edge([e for e in self.edges if e.lies_along(axis)], place)
         away = np.linalg.norm(self.cloud.points - place, axis=1)
+        if kind == Kind.PLANE:
+            fits = np.array([*(plane.lies_along(axis) for plane in self.planes), False])
+            away[~fits[self.of_point]] = np.inf
+        about = np.argsort(away)[:ABOUT]
+        nearest = away[about[0]]
         if kind == Kind.POINT:
-            about = np.argsort(away)[:ABOUT]
-            return fit_feature(self.cloud, about, self.rig, plane=False), away.min()
-        fits = np.array([*(plane.lies_along(axis) for plane in self.planes), False])
-        rows = np.flatnonzero(fits[self.of_point])
-        about = rows[np.argsort(away[rows])[:ABOUT]]
-        if not len(about):
-            return None, np.inf
+            return fit_feature(self.cloud, about, self.rig, plane=False), nearest
+        if nearest == np.inf:
+            return None, nearest
         if axis is None:  # at a crease the nearest point tells which way the surface faces
             return self.at(kind, place, self.planes[self.of_point[about[0]]].axis)
         middle = self.cloud.points[about].mean(axis=0)
         # where a picture hangs, the nearest point may be one of the wall that noise put on it
         planes = [self.planes[number] for number in np.unique(self.of_point[about])]
         plane = min(planes, key=lambda each: np.linalg.norm(each.foot(middle) - middle))
-        return plane, away[about[0]]
+        return plane, nearest
 
 
 def nearest_edge(
@@ -121,10 +122,8 @@ def features_of(cloud: Cloud, rig: CalibratedRig, views: Sequence[View]) -> Scen
     -------
     SceneFeatures
     """
-    planes, of_point = planes_of(cloud, rig)
-    return SceneFeatures(
-        cloud, rig, planes, of_point, edges=edges_of(cloud, (planes, of_point), views)
-    )
+    surfaces = planes_of(cloud, rig)
+    return SceneFeatures(cloud, rig, *surfaces, edges_of(cloud, surfaces, views))
 
 
 @cached

@@ -112,7 +112,7 @@ def join_stations(clouds: Mapping[int, Cloud], rig: CalibratedRig | None = None)
     results = [join_pair(names, surfaces) for names in combinations(numbers, 2)]
     pairs = [result for result in results if isinstance(result, Pair)]
     problems = [result for result in results if isinstance(result, Problem)]
-    of_rig = chain_of(rig).covariances[-1] if rig else np.zeros((len(COLUMNS),) * 2)
+    of_rig = chain_of(rig).covariances[-1] if rig else np.eye(len(COLUMNS))
     return _joined(numbers, pairs, problems, of_rig)
 
 
@@ -133,8 +133,8 @@ def join_pair(
     Pair or Problem
         Why they are not joined.
     """
-    coarse, fine = zip(*(surfaces[name] for name in names), strict=True)
-    tried = candidates(*coarse)
+    (coarse, fine), (other_coarse, other_fine) = (surfaces[name] for name in names)
+    tried = candidates(coarse, other_coarse)
     good = [c for c in tried if c.overlap > LEAST_OVERLAP and c.against < MOST_AGAINST]
     if not good:
         words = "they have no two directions of walls in common"
@@ -158,7 +158,7 @@ def join_pair(
                 f"(overlap {100 * best.overlap:.0f} % and {100 * other.overlap:.0f} %): the scene "
                 "repeats itself or is symmetric",
             )
-    pair = fitted(names, *fine, best.T_first_second)
+    pair = fitted(names, fine, other_fine, best.T_first_second)
     turn_and_shift = [pair.covariance[:3, :3], pair.covariance[3:, 3:]]
     variance = np.linalg.norm(turn_and_shift, 2, axis=(1, 2))  # in the worst direction
     if pair.held < LEAST_HELD or np.any(np.sqrt(variance) > MOST_SIGMA):

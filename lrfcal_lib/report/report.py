@@ -248,16 +248,13 @@ def report_session(session: str | Path, out: str | Path | None, jobs: int = 2) -
     begin = time.monotonic()
     out = Path(out or ROOT / "reports" / Path(session).resolve().name).resolve()
     runs = make_report(session, out, jobs)
-    good = len(runs)
-    for run in runs:
-        if run.error:
-            good -= 1
-            print(
-                f"{run.name} failed:", run.error.strip().splitlines()[-1], file=sys.stderr
-            )
+    failed = [run for run in runs if run.error]
+    for run in failed:
+        print(f"{run.name} failed:", run.error.strip().splitlines()[-1], file=sys.stderr)
+    good = len(runs) - len(failed)
     seconds = time.monotonic() - begin
     print(f"{good} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
-    return int(good < len(runs))
+    return int(bool(failed))
 
 
 def _store_all(session):

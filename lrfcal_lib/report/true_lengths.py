@@ -51,11 +51,6 @@ def true_picks(
     if truth is None:
         return pd.DataFrame()
     poses = poses or dict.fromkeys(scenes, IN_PLACE)
-    in_room = {
-        station: truth.stations[station]
-        * truth.gauge(rig, station, session.sweep(station).pitch)
-        for station in scenes
-    }
     rows = []
     for length in truth.lengths:
         row = {"name": length["name"], "true_m": length["metres"]}
@@ -65,7 +60,9 @@ def true_picks(
             look = _on_face if kind == "plane" else _on_edge
             by_station = {}
             for station, scene in scenes.items():
-                corners = in_room[station].inv().apply(end)
+                gauge = truth.gauge(rig, station, session.sweep(station).pitch)
+                in_room = truth.stations[station] * gauge
+                corners = in_room.inv().apply(end)
                 by_station[station] = poses[station].apply(look(scene, corners))
             nothing = poses[station].apply(corners.mean(axis=0))
             shown.append((by_station, nothing))
