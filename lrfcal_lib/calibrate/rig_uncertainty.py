@@ -83,11 +83,6 @@ def columns_of(names: tuple[str, ...], camera: str | None = None) -> np.ndarray:
     return pd.Index(names).get_indexer(wanted)
 
 
-def selection(names: tuple[str, ...], camera: str | None = None) -> np.ndarray:
-    """Which of c shared unknowns each of `COLUMNS` is: ones, a row of zeros where none, (13, c)."""
-    return np.eye(len(names) + 1, len(names))[columns_of(names, camera)]
-
-
 def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
     """What a joint estimate says about its rig.
 

@@ -168,9 +168,9 @@ def likeliest_step(solution):
             if BESIDE <= np.searchsorted(shown, row) <= len(shown) - BESIDE:
                 tested.append(Step(camera, row, *_chance_of_step(score, columns, row)))
     best = min(tested, key=lambda step: step.p_value, default=None)
-    if best is None or best.p_value * len(tested) > LEVEL:
-        return None
-    return best
+    if best and best.p_value * len(tested) <= LEVEL:
+        return best
+    return None
 
 
 def _chance_of_step(score, columns, row):
