@@ -249,7 +249,7 @@ def change_between(solution, first, later, camera, prepared):
         motion_px=np.median(np.linalg.norm(motion, axis=1)),
         zoom=zoom,
         zoom_sigma=zoom_sigma,
-        corner_px=abs(zoom) * np.hypot(model.width, model.height) / 2,
+        corner_px=abs(zoom) * np.linalg.norm(model.size) / 2,
     )
 
 
