@@ -199,12 +199,8 @@ def platform_calibration_table(
         parameters[method,] = names, [*axis.parameters, *phi, ty], sigma
     table = parameter_table(["method"], parameters)
     if truth is not None:
-        for column, name in AXIS_ERRORS.items():
-            errors = {
-                method: axis_errors(axis, truth)[name]
-                for method, axis in platform.axes.items()
-            }
-            table[column] = table.method.map(errors)
+        errors = [axis_errors(platform.axes[method], truth) for method in table.method]
+        table[[*AXIS_ERRORS]] = pd.DataFrame(errors)[[*AXIS_ERRORS.values()]]
     return table
 
 
