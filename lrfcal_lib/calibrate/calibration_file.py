@@ -306,9 +306,11 @@ def require_same_rig(rig: CalibratedRig, other: Session | CalibratedRig) -> None
     if not (known <= recorded or recorded <= known):
         differences.append(f"its cameras are {sorted(recorded)}, not {sorted(known)}")
     expected = _facts(rig)
-    for what, value in _facts(other).items():
-        if value != expected.get(what, value):
-            differences.append(f"{what} {value}, not {expected[what]}")
+    differences += [
+        f"{what} {value}, not {expected[what]}"
+        for what, value in _facts(other).items()
+        if value != expected.get(what, value)
+    ]
     if differences:
         raise ValueError(
             f"{other.name} is of another rig than the calibration of '{rig.session}': "

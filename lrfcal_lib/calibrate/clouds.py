@@ -11,6 +11,7 @@ from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.preprocess.closing_scan import without_closing
+from lrfcal_lib.session.files import short
 from lrfcal_lib.session.read import Session, Sweep
 
 MARGIN = 20  # scan lines and beams about a board that are worked on with it
@@ -173,11 +174,10 @@ def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[View]
     if records and not views:
         why = "the pitch of none is known: state pitch_deg in images.csv"
         if not of_rig:
-            cameras = ", ".join(sorted({record.camera for record in records}))
-            known = ", ".join(rig.cameras) or "no camera"
+            cameras = short(sorted({record.camera for record in records}))
             why = (
-                f"they are of {cameras}, the calibration by '{rig.method}' poses {known}: take "
-                "that of the same rig"
+                f"they are of {cameras}, the calibration by '{rig.method}' poses "
+                f"{', '.join(rig.cameras) or 'no camera'}: take that of the same rig"
             )
         raise ValueError(
             f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; "

@@ -72,7 +72,7 @@ def reconstruct(
     _refuse(sweep, lrf)
     if mask is None:
         mask = np.isfinite(sweep.ranges)
-    steps = (_pitch_step(sweep), lrf.bearing_step)
+    steps = (sweep.pitch_step, lrf.bearing_step)
     painter = Painter(views, max(steps), BEHIND * lrf.sigma_range)
     blocks_of = partial(_blocks, sweep, steps, T_head_lrf, corrections, lrf, continuous, {})
     if sweep.ranges.size <= KEPT:
@@ -105,14 +105,6 @@ def _refuse(sweep, lrf):
             f"placement {sweep.placement}: bearings {first} to {last} deg, '{lrf.model}' sees "
             f"{right} to {left} deg: take the calibration of the rig that recorded it"
         )
-
-
-def _pitch_step(sweep):
-    """Between scan lines, radians; 0 where nothing moves."""
-    turns = np.abs(np.diff(sweep.pitch))
-    if not turns.any():
-        return 0.0
-    return np.median(turns[turns > 0])
 
 
 def _coloured(block, sweep, painter, wanted, sigma_range):
@@ -241,8 +233,8 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     variances, directions = np.linalg.eigh(spread)
     least, middle, _ = np.moveaxis(variances, -1, 0)
     known = (share > 1 / 3) & (middle > LEAST_SPREAD)
-    rough = np.where(known, np.maximum(least, 0.0), np.inf).ravel()
-    flattest = rough.argsort()  # numbers of windows
+    rough = np.where(known, np.maximum(least, 0.0), np.nan).ravel()
+    flattest = rough.argsort()  # numbers of windows, unknown ones last
     rank = flattest.argsort().reshape(valid.shape)
     nine = np.zeros((width, width))
     nine[::WINDOW, ::WINDOW] = 1
@@ -250,6 +242,6 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     normals = directions[..., 0].reshape(-1, 3)[best]
     away = np.vecdot(normals, points - origins) > 0
     normals[away] *= -1
-    sound = valid & np.isfinite(rough[best])
-    normals[~sound] = np.nan
-    return normals, np.sqrt(np.where(sound, rough[best], np.nan))
+    scatter = np.sqrt(np.where(valid, rough[best], np.nan))
+    normals[np.isnan(scatter)] = np.nan
+    return normals, scatter

@@ -10,7 +10,7 @@ import pandas as pd
 from pydantic import PlainValidator
 from scipy.linalg import block_diag
 
-from lrfcal_lib.fit.covariance import null_space
+from lrfcal_lib.fit.covariance import dyads, null_space
 from lrfcal_lib.fit.least_squares import reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES, Solution
 from lrfcal_lib.model.geometry import POSE_NAMES
@@ -79,13 +79,8 @@ class RigUncertainty:
 @cache  # asked for at every edge of a scene
 def columns_of(names: tuple[str, ...], camera: str | None = None) -> np.ndarray:
     """Where each of `COLUMNS` stands among shared unknowns, -1 where it was none, (13,)."""
-    wanted = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
-    return pd.Index(names).get_indexer(wanted)
-
-
-def selection(names: tuple[str, ...], camera: str | None = None) -> np.ndarray:
-    """Which of c shared unknowns each of `COLUMNS` is: ones, a row of zeros where none, (13, c)."""
-    return np.eye(len(names) + 1, len(names))[columns_of(names, camera)]
+    poses = [f"{camera}_{name}" for name in POSE_NAMES]
+    return pd.Index(names).get_indexer([*AXIS_NAMES, *poses, *COLUMNS[10:]])
 
 
 def joint_uncertainty(solution: JointSolution) -> RigUncertainty:
@@ -177,7 +172,7 @@ def _unseen(information, names, camera=None):
     order = np.concatenate([links, np.setdiff1d(np.arange(len(names)), links)])
     scales = np.array([SCALES.get(name, 1.0) for name in names])[order]
     whole = information[np.ix_(order, order)]
-    hessian = reduced_hessian((whole * scales[:, None] * scales)[None], len(links))[0]
+    hessian = reduced_hessian((whole * dyads(scales))[None], len(links))[0]
     motions = null_space(hessian, np.ones(len(links)), UNSEEN)
     unseen = np.zeros((len(motions), len(COLUMNS)))
     unseen[:, known] = motions * scales[: len(links)]

@@ -105,8 +105,10 @@ def edge_lengths(
             sizes = [true, board.lengths.get(name, np.nan), board.sigma.get(name, np.nan)]
             where = (prepared.session.name, placement, name, ends, variant)
             rows.append((*where, *np.multiply(1000, sizes)))
-    for name, (true, length) in PAPER_EDGES_MM.items():
-        rows.append(("paper", np.nan, name, "scan", "last_beam", true, length, np.nan))
+    rows += [
+        ("paper", np.nan, name, "scan", "last_beam", true, length, np.nan)
+        for name, (true, length) in PAPER_EDGES_MM.items()
+    ]
     columns = ["source", "placement", "edge", "ends", "variant"]
     columns += ["true_mm", "measured_mm", "sigma_mm"]
     table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})

@@ -21,6 +21,7 @@ from lrfcal_lib.model.geometry import (
     move_pose,
     transform_difference,
 )
+from lrfcal_lib.session.files import short
 from lrfcal_lib.solvers.joint import solve_again
 from lrfcal_lib.solvers.joint_solution import JointSolution
 
@@ -75,8 +76,7 @@ def view_residuals(
         If there is no such camera.
     """
     if camera not in solution.transforms:
-        cameras = ", ".join(solution.transforms) or "none"
-        raise ValueError(f"cameras are {cameras}; got '{camera}'")
+        raise ValueError(f"cameras are {short(solution.transforms)}; got '{camera}'")
     obs = solution.observations
     mine = obs.view_camera == obs.cameras.index(camera)
     pose = obs.view_pose[mine, :3]

@@ -199,12 +199,8 @@ def platform_calibration_table(
         parameters[method,] = names, [*axis.parameters, *phi, ty], sigma
     table = parameter_table(["method"], parameters)
     if truth is not None:
-        for column, name in AXIS_ERRORS.items():
-            errors = {
-                method: axis_errors(axis, truth)[name]
-                for method, axis in platform.axes.items()
-            }
-            table[column] = table.method.map(errors)
+        errors = [axis_errors(platform.axes[method], truth) for method in table.method]
+        table[[*AXIS_ERRORS]] = pd.DataFrame(errors)[[*AXIS_ERRORS.values()]]
     return table
 
 
@@ -219,16 +215,13 @@ def sweeps_table(session: Session) -> pd.DataFrame:
     -------
     DataFrame
         Columns placement, n_scan_lines, n_returns, invalid_percent, pitch_from_deg, pitch_to_deg,
-        pitch_step_deg (median), direction (+1 up, -1 down, 0 neither), n_images.
+        pitch_step_deg (median, where it moves), direction (+1 up, -1 down, 0 neither), n_images.
     """
     rows = []
     for placement in session.placements:
         sweep = session.sweep(placement)
         pitch = np.rad2deg(sweep.pitch)
         valid = np.isfinite(sweep.ranges)
-        step = 0.0
-        if len(pitch) > 1:
-            step = np.median(np.abs(np.diff(pitch)))
         rows.append(
             {
                 "placement": placement,
@@ -237,7 +230,7 @@ def sweeps_table(session: Session) -> pd.DataFrame:
                 "invalid_percent": 100 * (1 - valid.mean()),
                 "pitch_from_deg": pitch[0],
                 "pitch_to_deg": pitch[-1],
-                "pitch_step_deg": step,
+                "pitch_step_deg": np.rad2deg(sweep.pitch_step),
                 "direction": sweep.direction,
                 "n_images": len(session.images(placement=placement)),
             }

@@ -168,9 +168,9 @@ def likeliest_step(solution):
             if BESIDE <= np.searchsorted(shown, row) <= len(shown) - BESIDE:
                 tested.append(Step(camera, row, *_chance_of_step(score, columns, row)))
     best = min(tested, key=lambda step: step.p_value, default=None)
-    if best is None or best.p_value * len(tested) > LEVEL:
-        return None
-    return best
+    if best and best.p_value * len(tested) <= LEVEL:
+        return best
+    return None
 
 
 def _chance_of_step(score, columns, row):
@@ -249,7 +249,7 @@ def change_between(solution, first, later, camera, prepared):
         motion_px=np.median(np.linalg.norm(motion, axis=1)),
         zoom=zoom,
         zoom_sigma=zoom_sigma,
-        corner_px=abs(zoom) * np.hypot(model.width, model.height) / 2,
+        corner_px=abs(zoom) * np.linalg.norm(model.size) / 2,
     )
 
 

@@ -225,12 +225,10 @@ def pitches_of_images(boards, solution, rig):
     inside &= np.abs(pitch) < LARGEST_PITCH
     visible = np.tile(inside.all(axis=1), (len(LATTICE), 1))
     for name, camera in rig.cameras.items():
-        border = MARGIN * camera.model.size
         poses = pose_array(rig.camera_at(name, LATTICE))
         # far outside the image a lens model would fold back
         uv = pinhole(apply_pose(poses[..., None, :, :], points), camera.model)
-        inside = (uv > border) & (uv < camera.model.size - border)
-        visible &= inside.all(axis=(-2, -1))
+        visible &= camera.model.shows(uv, MARGIN * camera.model.size).all(axis=-1)
 
     seen, ends = row_ends(visible.T)
     first, last = LATTICE[ends].T

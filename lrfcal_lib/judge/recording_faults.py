@@ -164,7 +164,7 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
         found += faults_of_changes(
             camera_changes(joint.solution, prepared, joint.settings), prepared.views
         )
-        found += exchanged_placements(calibration)
+        found += exchanged_placements(joint)
     return found
 
 
@@ -354,16 +354,16 @@ def faults_of_changes(changes, cameras) -> Iterator[Fault]:
         )
 
 
-def exchanged_placements(calibration) -> Iterator[Fault]:
+def exchanged_placements(joint) -> Iterator[Fault]:
     """Pairs of placements that are left out, and whose images fit the scans of each other."""
-    prepared = calibration.prepared
-    lost = sorted(prepared.left_out | calibration.joint.solution.excluded_placements)
+    prepared = joint.prepared
+    lost = sorted(prepared.left_out | joint.solution.excluded_placements)
     scans = boards_in(prepared.session, lost[:MOST_LOST], AS_STATED)
 
-    strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
+    strange = [p for p, scan in scans.items() if not _same_board(joint, scan, p)]
     for first, second in combinations(strange, 2):
-        if _same_board(calibration, scans[first], second) and _same_board(
-            calibration, scans[second], first
+        if _same_board(joint, scans[first], second) and _same_board(
+            joint, scans[second], first
         ):
             yield Fault(
                 "exchanged",
@@ -374,15 +374,15 @@ def exchanged_placements(calibration) -> Iterator[Fault]:
             )
 
 
-def _same_board(calibration, scan, placement):
+def _same_board(joint, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
-    solution = calibration.joint.solution
+    solution = joint.solution
     middle = solution.observations.corners.mean(axis=0)
     p_lrf, pitch, _ = face_points(scan, POINTS)
     p_platform = lrf_to_platform(p_lrf, pitch, solution.T_head_lrf)
     agree = []
     for camera in solution.transforms:
-        view = calibration.prepared.posed(camera).get(placement)
+        view = joint.prepared.posed(camera).get(placement)
         if view is not None:
             p_camera = solution.camera_at(camera, view.pitch).apply(p_platform)
             on_board = view.T_camera_board.inv().apply(p_camera)

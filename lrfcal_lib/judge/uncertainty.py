@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, selection
+from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, columns_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
@@ -45,8 +45,7 @@ class Chain:
         Of `COLUMNS` (increments ``[w, v]`` of the transforms). Where there are several, the one
         that gives more counts, quantity by quantity.
     links : ndarray, shape (13, c)
-        Which of the rig's shared unknowns each of `COLUMNS` is, see
-        :func:`lrfcal_lib.calibrate.rig_uncertainty.selection`.
+        Which of the rig's shared unknowns each of `COLUMNS` is: ones, a row of zeros where none.
     unseen : ndarray, shape (m, 13)
         Motions that nothing determines: what depends on them has no bound.
     sweep : PitchNoise
@@ -79,7 +78,8 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
         Where nothing says how well the rig is known.
     """
     known = uncertainty_of(rig)
-    links = selection(known.names, camera)
+    count = len(known.names)
+    links = np.eye(count + 1, count)[columns_of(known.names, camera)]
     both = [known.covariance, known.trusted]
     # zero for what is known; what has no bound is among `unseen`
     bounded = np.nan_to_num(both, nan=0.0, posinf=0.0, neginf=0.0)

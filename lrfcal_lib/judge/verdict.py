@@ -156,8 +156,10 @@ class Verdict:
         if self.reasons:
             first += f": {'; '.join(reason.words for reason in self.reasons)}"
         sentences = [f"{first}."]
-        for distance, error in self.errors.items():
-            sentences.append(f"Expected error at {distance:g} m: {error.words()}.")
+        sentences += [
+            f"Expected error at {distance:g} m: {error.words()}."
+            for distance, error in self.errors.items()
+        ]
         sentences += self.notes
         if self.errors:
             sentences.append(

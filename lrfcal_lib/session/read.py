@@ -229,6 +229,14 @@ class Sweep:
             return 0
         return int(np.sign(moved))
 
+    @property
+    def pitch_step(self) -> float:
+        """Between scan lines, radians; 0 where nothing moves."""
+        turns = np.abs(np.diff(self.pitch))
+        if not turns.any():
+            return 0.0
+        return np.median(turns[turns > 0])
+
     def part(self, lines, beams=slice(None)) -> "Sweep":
         """Some of the scan lines, and of their beams.
 
