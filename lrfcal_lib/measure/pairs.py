@@ -14,8 +14,8 @@ from operator import itemgetter
 
 import numpy as np
 import small_gicp
+from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
-from scipy.signal import fftconvolve
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -270,7 +270,10 @@ def _shifts(blurred, low, second, turn):
     face the same way.
     """
     there, low_moved = _on_grid(turn.apply(second.points), turn.apply(second.normals))
-    score = fftconvolve(blurred, np.flip(there, GRID), axes=GRID).sum(axis=0)
+    room = np.add(blurred.shape, there.shape)[1:]
+    size = [next_fast_len(int(cells), real=True) for cells in room]
+    spectra = rfftn(blurred, size, GRID) * rfftn(np.flip(there, GRID), size, GRID)
+    score = irfftn(spectra.sum(axis=0), size)
     top = np.where(score == maximum_filter(score, 5), score, 0.0)
     best = np.argpartition(top, -PEAKS, axis=None)[-PEAKS:]
     cells = np.transpose(np.unravel_index(best, top.shape)) - there.shape[1:] + 1
