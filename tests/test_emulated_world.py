@@ -2,6 +2,7 @@
 
 import urllib.error
 import urllib.request
+from copy import copy
 
 import numpy as np
 import pytest
@@ -23,9 +24,15 @@ def placements():
     return placements_of(SETUP)[:4]
 
 
-@pytest.fixture
-def world(placements):
+@pytest.fixture(scope="module")
+def made(placements):
     return EmulatedWorld(SETUP, placements=placements)
+
+
+@pytest.fixture
+def world(made):
+    """With the board nowhere, whatever other tests did."""
+    return copy(made)
 
 
 @pytest.fixture

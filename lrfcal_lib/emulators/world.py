@@ -10,7 +10,7 @@ import secrets
 import threading
 import time
 from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
@@ -44,6 +44,9 @@ class EmulatedWorld:
 
     Attributes
     ----------
+    places : dict of str to Placement
+        Where the board can be: place/none, place/NUMBER of a placement, and close/CAMERA/VIEW,
+        held close to a camera, in one of the views for its intrinsics.
     current : World
         As it is now, without the board at first.
     """
@@ -61,20 +64,13 @@ class EmulatedWorld:
         self._rng = np.random.default_rng([0, 3])
         # what was looked at last, and what was seen without noise
         self._seen: tuple = (None, None)
-        self.current = world_of(setup, Placement(0))
-
-    @cached_property
-    def places(self) -> dict[str, Placement]:
-        """Where the board can be: place/none, place/NUMBER of a placement, and close/CAMERA/VIEW,
-        held close to a camera, in one of the views for its intrinsics.
-        """
-        places = {"place/none": Placement(0)}
+        self.places = {"place/none": Placement(0)}
         for placement in self.placements:
-            places[f"place/{placement.number}"] = placement
-        for number, camera in enumerate(self.setup.rig.cameras):
-            for view, close in enumerate(close_views(self.setup, number)):
-                places[f"close/{camera.name}/{view}"] = close
-        return places
+            self.places[f"place/{placement.number}"] = placement
+        for number, camera in enumerate(setup.rig.cameras):
+            for view, close in enumerate(close_views(setup, number)):
+                self.places[f"close/{camera.name}/{view}"] = close
+        self.put("place/none")
 
     def put(self, place: str) -> None:
         """Put the board at one of the places.
