@@ -7,7 +7,7 @@ import pytest
 
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.plots.sheet import INCH, PAPER, print_sheet, sheet
-from lrfcal_lib.preprocess.pattern_in_image import sectors
+from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
 from lrfcal_lib.session.stated import BoardStated, board_to_json
 
 DPI = 127  # five pixels a millimetre
@@ -19,9 +19,7 @@ def test_corners_are_printed_where_the_board_says(tmp_path):
     picture = (255 * matplotlib.image.imread(tmp_path / "board.png")[..., 0]).astype(
         np.uint8
     )
-    found = sectors(cv2.blur(picture, (3, 3)), (6, 5))
-    assert found is not None
-    pixels = np.reshape(found, (-1, 2))
+    pixels = PatternFinder(board.pattern)(cv2.blur(picture, (3, 3)))
     height = len(picture)
     points = board.pattern.points()[:, :2] + PAPER  # from the lower left corner of the page
     expected = points * DPI / INCH * [1, -1] + [-0.5, height - 0.5]

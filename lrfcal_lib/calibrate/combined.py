@@ -22,6 +22,7 @@ from lrfcal_lib.calibrate.outline import (
     plane_frame,
 )
 from lrfcal_lib.calibrate.pipeline import JointCalibration
+from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel
@@ -186,14 +187,8 @@ def case_of(joint, observations, placement):
         prepared, placement, "half_step", solution.T_head_lrf, solution.corrections
     )
     obs = observations.with_cameras(solution.observations.cameras).select([placement])
-    images = []
-    for row, number in enumerate(obs.view_camera):
-        camera = obs.cameras[number]
-        visible = prepared.views[camera][placement].edges
-        if visible:
-            sides_shown = np.array([edges.index(edge.name) for edge in visible])
-            images.append(ImageSides(row, sides_shown, visible, prepared.models[camera]))
-    sides = along | edges_in_cloud(solution, obs, images, face)
+    images, in_images = sides_in_images(prepared, solution, obs, plane_frame(face))
+    sides = along | in_images
     rough = measure_board(face, sides, edges)
     board = rough.T_platform_plane
     lines = np.where(np.isnan(rough.lines), [1.0, 0.0, -1.0], rough.lines)
@@ -215,32 +210,39 @@ def case_of(joint, observations, placement):
     )
 
 
-def edges_in_cloud(solution, obs, images, face):
-    """Where lines of sight of the edges of ImageSides meet the plane of a face (n, 3), under a
-    JointSolution: points (k, 3) by edge, platform frame, metres.
+def sides_in_images(prepared, solution, obs, plane):
+    """The ImageSides of a placement, and where lines of sight of their edges meet a plane (3, 4),
+    under a JointSolution: points (k, 3) by edge, platform frame, metres.
     """
-    plane = plane_frame(face)
+    (placement,) = obs.placements.tolist()
+    names = prepared.board.edges
     normal = plane[:, 2]
+    images = []
     sides: dict = {}
-    for image in images:
-        pitch = solution.corrections.pitch(obs.placements[0], obs.view_pitch[image.row])
-        camera = obs.cameras[obs.view_camera[image.row]]
+    for row, number in enumerate(obs.view_camera):
+        camera = obs.cameras[number]
+        edges = prepared.views[camera][placement].edges
+        if not edges:
+            continue
+        model = prepared.models[camera]
+        numbers = np.array([names.index(edge.name) for edge in edges])
+        images.append(ImageSides(row, numbers, edges, model))
+        pitch = solution.corrections.pitch(placement, obs.view_pitch[row])
         T_platform_camera = solution.camera_at(camera, pitch).inv()
         centre = T_platform_camera.translation
-        height = (plane[:, 3] - centre) @ normal
-        for edge in image.edges:
-            sight = T_platform_camera.rotation.apply(image.model.sights(edge.ends))
-            points = centre + (height / (sight @ normal))[:, None] * sight
+        for edge in edges:
+            sight = T_platform_camera.rotation.apply(model.sights(edge.ends))
+            reach = (plane[:, 3] - centre) @ normal / (sight @ normal)
+            points = centre + reach[:, None] * sight
             sides.setdefault(edge.name, []).append(points)
-    return {name: np.concatenate(points) for name, points in sides.items()}
+    return images, {name: np.concatenate(points) for name, points in sides.items()}
 
 
 def whitener_of(covariance):
     """Whitener (c, c) of what has this covariance; NaN where nothing determines it."""
     known = np.isfinite(covariance)
     spread = np.where(np.diag(known), KNOWN, UNKNOWN)
-    variances, axes = np.linalg.eigh(np.where(known, covariance, 0.0) + np.diag(spread))
-    return axes.T / np.sqrt(np.maximum(variances, KNOWN))[:, None]
+    return inverse_root(np.where(known, covariance, 0.0) + np.diag(spread))
 
 
 def moved(case, state, step):
@@ -354,8 +356,6 @@ def _measured(case, state, covariance):
     )
     scanned = (beams >= FEWEST_CELLS) & ~shown
     good = scanned | shown
-    if not good.any():
-        raise DegenerateGeometry("nothing shows a side")
     lines = np.where(good[:, None], state.lines, np.nan)
     of_sides = covariance[-2 * len(edges) :, -2 * len(edges) :]
     board = bounded(state.joint.boards[0], edges, lines, case.middle, of_sides)

@@ -18,6 +18,9 @@ WIDEST_WINDOW_PX = 15.0  # half window where squares are large, but for
 LEAST_REACH = 0.25  # of a square: large images are soft
 MARGIN = 2.0  # half windows around the corners: what a turned window and its blur reach
 REFINE_ROUNDS = 20
+CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+# looks at a picture of twice the size, for small squares, at four times the time
+TWICE_AS_LARGE = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 FARTHEST_MOVE = 0.25  # of a square, in each look
 # around rough corners where sectors are looked for near by: share of their extent, pixels
 AROUND = 0.22
@@ -91,7 +94,7 @@ class PatternFinder:
 
     def __init__(self, pattern: Chessboard):
         self.size = pattern.columns, pattern.rows
-        self.negatives = (False, True)
+        self.negative = False
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """The corners in an image, x right, y down on the printed side.
@@ -113,8 +116,7 @@ class PatternFinder:
         PatternNotFound
             Where no detector finds all corners.
         """
-        picture = grey(image)
-        grid = self._in_reduced(picture)
+        grid = self._in_reduced(grey(image))
         if grid is None:
             columns, rows = self.size
             raise PatternNotFound(
@@ -132,9 +134,10 @@ class PatternFinder:
         times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
         if times <= 1:
             return self._search(picture)
-        height, width = (side // times for side in picture.shape)
-        whole = picture[: height * times, : width * times]
-        reduced = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+        share = 1 / times
+        reduced = cv2.resize(
+            picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA
+        )
         grid = self._search(reduced)
         if grid is None:
             return self._search(picture, thorough=False)
@@ -142,73 +145,51 @@ class PatternFinder:
         return refine_corners(picture, (grid + 0.5) * times - 0.5)
 
     def _search(self, picture, thorough=True):
-        """Grid of refined corners, None where there are none; `thorough` costs most."""
-        rough = self._classic(picture)
-        if rough is not None:
-            grid = _smoothest(picture, rough)
-        else:
-            rough = sectors(picture, self.size, 0)
-            if rough is None and thorough:
-                rough = sectors(picture, self.size)
-            if rough is None:
-                return None
-            grid = refine_corners(picture, rough)
+        """Grid of refined corners, None where there are none; `thorough` costs most.
+
+        From sectors near by where rough corners were too far off for their windows.
+        """
+        rough = self._rough(picture, thorough)
+        if rough is None:
+            return None
+        grid = refine_corners(picture, rough)
+        if grid_noise(grid) > SMOOTH_ENOUGH_PX:
+            low, place = around(rough, AROUND * np.ptp(rough, axis=(0, 1)) + AROUND_PX)
+            part = picture[place].copy()
+            start = _detected(cv2.findChessboardCornersSB, part, self.size, 0)
+            if start is not None:
+                grid = min(grid, refine_corners(picture, start + low), key=grid_noise)
         return grid if _ends_in_squares(picture, grid) else None
 
-    def _classic(self, picture):
-        """Grid of rough corners by the classic detector, the last successful of picture and
-        negative first.
+    def _rough(self, picture, thorough):
+        """Grid of rough corners by the first of OpenCV's detectors that finds them, or None: the
+        last successful of picture and negative first.
         """
-        for negative in self.negatives:
-            rough = classic(picture, self.size, negative)
-            if rough is not None:
-                self.negatives = (negative, not negative)
-                return rough
+        # the quick check overlooks white squares on a dark board, and saves little time there
+        ways = [
+            (cv2.findChessboardCorners, picture, CLASSIC | cv2.CALIB_CB_FAST_CHECK),
+            (cv2.findChessboardCorners, 255 - picture, CLASSIC),
+        ]
+        if self.negative:
+            ways.reverse()
+        ways.append((cv2.findChessboardCornersSB, picture, 0))
+        if thorough:
+            ways.append((cv2.findChessboardCornersSB, picture, TWICE_AS_LARGE))
+        for detector, shown, flags in ways:
+            grid = _detected(detector, shown, self.size, flags)
+            if grid is not None:
+                self.negative = shown is not picture
+                return grid
         return None
 
 
-def classic(picture, size, negative):
-    """Grid of rough corners by OpenCV's classic detector, also in the negative, or None."""
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    # the quick check overlooks white squares on a dark board, and saves little time there
-    if negative:
-        picture = 255 - picture
-    else:
-        flags |= cv2.CALIB_CB_FAST_CHECK
+def _detected(detector, picture, size, flags):
+    """Corners of a detector as (rows, columns, 2), None where it finds none."""
     try:
-        return _grid(*cv2.findChessboardCorners(picture, size, flags=flags), size)
+        found, corners = detector(picture, size, flags=flags)
     except cv2.error:  # some images a few pixels wide are too narrow for its thresholds
         return None
-
-
-def sectors(picture, size, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
-    """Grid of rough corners by OpenCV's sector-based detector; None if there are none.
-
-    The flags make it look at a picture of twice the size, for small squares, at four times the
-    time.
-    """
-    return _grid(*cv2.findChessboardCornersSB(picture, size, flags=flags), size)
-
-
-def _grid(found, corners, size):
-    """Corners of a detector as (rows, columns, 2), where it found them."""
     return corners.reshape(*size[::-1], 2).astype(float) if found else None
-
-
-def _smoothest(picture, rough):
-    """Grid of refined corners.
-
-    From sectors near by where rough corners were too far off for their windows.
-    """
-    refined = refine_corners(picture, rough)
-    if grid_noise(refined) < SMOOTH_ENOUGH_PX:
-        return refined
-    low, place = around(rough, AROUND * np.ptp(rough, axis=(0, 1)) + AROUND_PX)
-    part = np.ascontiguousarray(picture[place])
-    start = sectors(part, rough.shape[1::-1], 0)
-    if start is None:
-        return refined
-    return min(refined, refine_corners(picture, start + low), key=grid_noise)
 
 
 def around(corners, margin):
@@ -228,16 +209,14 @@ def grid_noise(grid):
     distortion, a bent sheet.
     """
     rows, columns, _ = grid.shape
-    row, column = np.mgrid[:rows, :columns].reshape(2, -1)
-    last = max(rows, columns) - 1
-    flat = np.column_stack([column, row]) / last * 2 - 1
+    flat = np.mgrid[:columns, :rows].T.reshape(-1, 2).astype(float)
     corners = grid.reshape(-1, 2)
-    order = 3 if len(flat) >= 16 else 2
     homography = cv2.findHomography(flat, corners)[0]
     left = corners - cv2.perspectiveTransform(flat[None], homography)[0]
+    order = 3 if len(flat) >= 16 else 2
     x, y = flat.T
-    powers = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
-    design = np.column_stack([x**i * y**j for i, j in powers])
+    design = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)]
+    design = np.stack(design, axis=1)
     noise = left - design @ np.linalg.lstsq(design, left)[0]
     return rms(np.linalg.norm(noise, axis=1))
 
@@ -283,10 +262,7 @@ def symmetric_points(picture, points, reach, look):
     offsets = np.stack(np.meshgrid(half, place)).reshape(2, -1)
     weight = np.prod((1 - offsets**2) ** 2, axis=0)
     spline = spline_filter(picture, look.order, np.float32) if look.order > 1 else picture
-    slopes = [
-        cv2.Sobel(picture, cv2.CV_32F, 1 - down, down, ksize=1, scale=0.5)
-        for down in (0, 1)
-    ]
+    slopes = np.gradient(picture, axis=(1, 0))
     for _ in range(REFINE_ROUNDS):
         axes = square_axes(points) * reach[..., None]
         arms = (axes @ offsets).mT  # (rows, columns, m, 2)
@@ -349,11 +325,9 @@ def _ends_in_squares(picture, grid):
         away = BEYOND * (inner - edge)
         places = np.array([edge - away, edge + away])
         visible = np.all((places >= 0) & (places <= last), axis=(0, 2))
-        outside, inside = interpolated(picture, places[:, visible])
-        sign = np.resize([1.0, -1.0], len(visible))[visible]
-        sign -= sign.sum() / max(len(sign), 1)
-        contrast = sign @ inside
-        if (sign @ outside) * contrast > -LEAST_BEYOND * contrast**2:
+        # from square to square
+        outside, inside = np.diff(interpolated(picture, places[:, visible]))
+        if outside @ inside > -LEAST_BEYOND * (inside @ inside):
             return False
     return True
 
