@@ -47,6 +47,7 @@ UNKNOWN = 1e6  # variance of what nothing determines
 KNOWN = 1e-18  # variance of what is held
 # share of its length by which an edge may be uncertain and still count as measured
 WIDEST = 0.1
+NO_SIDE = np.array(-1)  # number of the side of what is about none
 ITERATIONS = 30
 TOLERANCE = 0.02  # sigma
 
@@ -275,13 +276,13 @@ def blocks_of(state, case, scale):
     unknowns = case.unknowns
     data = replace(case.data, lines=state.lines)
     named = joint_residuals.named_blocks(state.joint, data, unknowns)
-    if "beam" in named:
-        beams = named["beam"]
-        jacobian = with_sides(beams.jacobian, case.data.beam["edge"], state, case)
-        named["beam"] = replace(beams, jacobian=jacobian)
     # no view and nothing that is usual: image edges and the calibration say it
-    blocks = [named[name] for name in ("face", "beam", "sweep", "side") if name in named]
-    blocks += image_blocks(state, case, scale)
+    about = {"face": NO_SIDE, "beam": data.beam["edge"], "sweep": NO_SIDE, "side": NO_SIDE}
+    for name, edge in about.items():
+        if name in named:
+            block = named[name]
+            yield replace(block, jacobian=with_sides(block.jacobian, edge, state, case))
+    yield from image_blocks(state, case, scale)
     board = state.joint.boards[0]
     known = block_diag(
         case.whitener,
@@ -292,11 +293,7 @@ def blocks_of(state, case, scale):
     )
     off = np.zeros(len(known))
     off[: unknowns.shared] = case.whitener @ state.change
-    blocks.append(_rows(off, known))
-    for block in blocks:
-        missing = known.shape[1] - block.jacobian.shape[-1]
-        jacobian = np.pad(block.jacobian, {-1: (0, missing)})
-        yield replace(block, jacobian=jacobian)
+    yield _rows(off, known)
 
 
 def _rows(residuals, jacobian):
@@ -313,13 +310,13 @@ def with_sides(J, edge, state, case):
     R = state.joint.boards[0, :, :3]
     outward = state.lines[:, :2] @ R[:, :2].T
     arm = case.middle @ R[:, :2].T
-    motions = np.zeros((len(arm), 2, geometry.POSE))  # of the board that take a side along
-    motions[:, 0, 3:] = outward
-    motions[:, 1, :3] = R[:, 2]
-    motions[:, 1, 3:] = np.cross(arm, R[:, 2])
-    by_all = J[..., case.unknowns.columns["board"]] @ np.concatenate(motions).T
+    turn, shift = np.split(J[..., case.unknowns.columns["board"]], 2, axis=-1)
+    # by motions of the board that take a side along
+    by_turn = turn @ R[:, 2:] + shift @ np.cross(arm, R[:, 2]).T
+    by_side = np.stack([shift @ outward.T, by_turn], axis=-1)
     mine = edge[..., None] == np.arange(len(arm))
-    return np.concatenate([J, by_all * np.repeat(mine, 2, axis=-1)], axis=-1)
+    of_sides = (by_side * mine[..., None]).reshape(*J.shape[:-1], -1)
+    return np.concatenate([J, of_sides], axis=-1)
 
 
 def image_blocks(state, case, scale):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.board import corners_of_lines
+from lrfcal_lib.model.board import corners_of_lines, side_lengths
 from lrfcal_lib.model.camera import line_distance, line_through
 from lrfcal_lib.model.geometry import fit_line
 
@@ -120,8 +120,7 @@ def bounded(
     def outline(lines):
         """Corners (..., E, 2) and lengths (..., E) with lines (..., E, 3); NaN where some miss."""
         corners = corners_of_lines(lines)
-        along = np.roll(corners, -1, axis=-2) - corners
-        return corners, np.linalg.norm(along, axis=-1)
+        return corners, side_lengths(corners)
 
     corners, lengths = outline(lines)
     steps = STEP * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
