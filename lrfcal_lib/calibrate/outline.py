@@ -116,16 +116,11 @@ def bounded(
     MeasuredBoard
         Its corners are those of two known neighbours, its lengths those between two corners.
     """
-
-    def outline(lines):
-        """Corners (..., E, 2) and lengths (..., E) with lines (..., E, 3); NaN where some miss."""
-        corners = corners_of_lines(lines)
-        return corners, side_lengths(corners)
-
-    corners, lengths = outline(lines)
+    corners = corners_of_lines(lines)
+    lengths = side_lengths(corners)
     steps = STEP * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
-    _, after = outline(moved_lines(lines, middle, steps))
-    J = (after - lengths).T / STEP
+    after = corners_of_lines(moved_lines(lines, middle, steps))
+    J = (side_lengths(after) - lengths).T / STEP
     sigma = np.sqrt(np.vecdot(J @ covariance, J))
     return MeasuredBoard(
         T_platform_plane=pose,

@@ -80,9 +80,11 @@ class CameraModel:
         covariance : ndarray, shape (9, 9), optional
         rms_px : float, optional
         """
-        of_pinhole = map(float, values[:4])
+        fx, fy, cx, cy = map(float, values[:4])
         lens = np.array(values[4:])
-        return CameraModel(self.width, self.height, *of_pinhole, lens, covariance, rms_px)
+        return CameraModel(
+            self.width, self.height, fx, fy, cx, cy, lens, covariance, rms_px
+        )
 
 
 def pinhole(p_camera: ArrayLike, model: CameraModel) -> np.ndarray:

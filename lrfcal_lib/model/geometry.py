@@ -109,7 +109,10 @@ def polar_to_points(ranges: ArrayLike, bearings: ArrayLike) -> np.ndarray:
 
 
 def polar_covariance(
-    ranges: ArrayLike, bearings: ArrayLike, sigma_range: ArrayLike, sigma_bearing: ArrayLike
+    ranges: np.ndarray,
+    bearings: np.ndarray,
+    sigma_range: float | np.ndarray,
+    sigma_bearing: float | np.ndarray,
 ) -> np.ndarray:
     """Covariance of polar points from independent errors along and across the beam.
 

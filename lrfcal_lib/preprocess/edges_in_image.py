@@ -148,7 +148,7 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     centre = ends.mean(axis=0)
     return ImageEdge(
         name=name,
-        line=outward_line(*ends, centre - inner),
+        line=outward_line(ends[0], ends[1], centre - inner),
         covariance=PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2]),
         centre=centre,
         ends=ends,
