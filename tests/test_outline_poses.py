@@ -16,7 +16,7 @@ from rendered_boards import (
 )
 
 from lrfcal_lib.model.board import Board, corners_of_lines
-from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.camera import project, undistort
 from lrfcal_lib.preprocess.board_in_image import (
     view_board,
 )
@@ -58,9 +58,13 @@ def test_picked_edges_tell_which_side_is_which_and_all_of_them_need_no_detector(
     corners = on_board(pose, TRIANGLE.corners, project)
     picks = {name: corners[[i, (i + 1) % 3]] for i, name in enumerate(TRIANGLE.edges)}
     view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, picks={"bc": picks["bc"]})
-    assert view.edge("bc").n_points == 2 and worst_edge(view, pose, TRIANGLE) < 0.1
+    picked = {name: undistort(ends, MODEL) for name, ends in picks.items()}
+    np.testing.assert_allclose(view.edge("bc").ends, picked["bc"])
+    assert worst_edge(view, pose, TRIANGLE) < 0.1
     view = view_board(BLANK, TRIANGLE, MODEL, picks=picks)
-    assert view.reason == "" and all(e.n_points == 2 for e in view.edges)
+    assert view.reason == ""
+    for edge in view.edges:
+        np.testing.assert_allclose(edge.ends, picked[edge.name])
     np.testing.assert_allclose(
         nearest(view, pose).T_camera_board.as_matrix(), pose.as_matrix(), atol=1e-6
     )

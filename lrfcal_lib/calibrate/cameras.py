@@ -11,8 +11,13 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.fit.result import Solution
-from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, unit_vector
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    TiltAxis,
+    head_from_axis,
+    pose_array,
+    unit_vector,
+)
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.solvers import METHODS, row_of, solve_camera
@@ -204,11 +209,11 @@ def combine(estimated: KnownAxis, stated: KnownAxis) -> KnownAxis:
     gain = prior @ np.linalg.inv(prior + estimated.covariance)
     change = gain @ (estimated.parameters - stated.parameters)
     axis = axis_from_chart(stated.parameters + change)
-    head = geometry.head_from_axis(axis, stated.T_head_lrf)
+    head = head_from_axis(axis, stated.T_head_lrf)
     return KnownAxis(head, prior - gain @ prior)
 
 
-def axis_from_chart(parameters: np.ndarray) -> geometry.TiltAxis:
+def axis_from_chart(parameters: np.ndarray) -> TiltAxis:
     """The axis of two angles and two offsets.
 
     Undoes :func:`lrfcal_lib.fit.axis_chart.chart_parameters`.
@@ -217,4 +222,4 @@ def axis_from_chart(parameters: np.ndarray) -> geometry.TiltAxis:
     away = parameters[2:]
     along = np.array([1.0, -sideways, rise])
     foot = np.r_[along[1:] @ away, -away]
-    return geometry.TiltAxis(unit_vector(along), foot)
+    return TiltAxis(unit_vector(along), foot)

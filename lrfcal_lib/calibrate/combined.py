@@ -24,12 +24,18 @@ from lrfcal_lib.calibrate.outline import (
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise
-from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.geometry import POSE, DegenerateGeometry, move_pose
 from lrfcal_lib.preprocess.edges_in_image import ImageEdge
 from lrfcal_lib.preprocess.pose_from_lines import line_misses
-from lrfcal_lib.solvers import joint_model, joint_residuals
+from lrfcal_lib.solvers.joint_model import (
+    JointData,
+    JointState,
+    Unknowns,
+    gather,
+    undisturbed,
+)
+from lrfcal_lib.solvers.joint_residuals import named_blocks, view_block
 
 FEWEST_CELLS = 8  # beams about a side that no image shows
 # information roots of a side of which nothing is known: ten metres and a radian are far
@@ -47,6 +53,7 @@ UNKNOWN = 1e6  # variance of what nothing determines
 KNOWN = 1e-18  # variance of what is held
 # share of its length by which an edge may be uncertain and still count as measured
 WIDEST = 0.1
+NO_SIDE = np.array(-1)  # number of the side of what is about none
 ITERATIONS = 30
 TOLERANCE = 0.02  # sigma
 
@@ -67,7 +74,7 @@ class State(NamedTuple):
     calibration (c,).
     """
 
-    joint: joint_model.JointState
+    joint: JointState
     lines: np.ndarray
     change: np.ndarray
 
@@ -90,8 +97,8 @@ class Case:
     start : State
     """
 
-    data: joint_model.JointData
-    unknowns: joint_model.Unknowns
+    data: JointData
+    unknowns: Unknowns
     whitener: np.ndarray
     images: list[ImageSides]
     middle: np.ndarray
@@ -119,7 +126,7 @@ def combined_outlines(
     -------
     dict of int to (MeasuredBoard, frozenset of str)
         By placement, with standard deviations, and the sides that no image shows; placements that
-        span no plane or show no edge are missing.
+        span no plane are missing.
     """
     prepared = joint.prepared
     views = {
@@ -128,7 +135,7 @@ def combined_outlines(
     observations = observe_joint(prepared, views)
     cases = {}
     for placement in observations.placements.tolist():
-        with suppress(DegenerateGeometry):
+        with suppress(DegenerateGeometry, np.linalg.LinAlgError):
             cases[placement] = case_of(joint, observations, placement)
     scale = 1.0
     for _ in range(SCALE_ROUNDS + 1):
@@ -177,7 +184,7 @@ def as_scattered(
 def case_of(joint, observations, placement):
     """A placement as a Case.
 
-    DegenerateGeometry if its face spans no plane or nothing shows a side of it.
+    DegenerateGeometry if its face spans no plane.
     """
     prepared = joint.prepared
     solution = joint.without.get(placement, joint.solution)
@@ -195,12 +202,13 @@ def case_of(joint, observations, placement):
     lines *= -np.copysign(1.0, lines[:, 2:])  # outwards: the face is in the middle
     obs = obs.keep(beam=np.isin(obs.beam_edge, [edges.index(name) for name in sides]))
     moving = solution.state
-    state = joint_model.undisturbed(
-        obs, moving.head, moving.cameras, moving.sensor, board[None]
-    )
-    whitener = whitener_of(solution.solution.trusted)
+    state = undisturbed(obs, moving.head, moving.cameras, moving.sensor, board[None])
+    covariance = solution.solution.trusted
+    known = np.isfinite(covariance)
+    spread = np.where(np.diag(known), KNOWN, UNKNOWN)
+    whitener = inverse_root(np.where(known, covariance, 0.0) + np.diag(spread))
     return Case(
-        data=joint_model.gather(obs, replace(solution.data.levels, prior=None)),
+        data=gather(obs, replace(solution.data.levels, prior=None)),
         unknowns=solution.unknowns,
         whitener=whitener,
         images=images,
@@ -238,13 +246,6 @@ def sides_in_images(prepared, solution, obs, plane):
     return images, {name: np.concatenate(points) for name, points in sides.items()}
 
 
-def whitener_of(covariance):
-    """Whitener (c, c) of what has this covariance; NaN where nothing determines it."""
-    known = np.isfinite(covariance)
-    spread = np.where(np.diag(known), KNOWN, UNKNOWN)
-    return inverse_root(np.where(known, covariance, 0.0) + np.diag(spread))
-
-
 def moved(case, state, step):
     """Everything a step on; the last two numbers of each side are its own."""
     joint, lines = np.split(step, [case.unknowns.size], axis=1)
@@ -273,14 +274,14 @@ def blocks_of(state, case, scale):
     """All that is known of a placement, each a Block (1, n, width)."""
     unknowns = case.unknowns
     data = replace(case.data, lines=state.lines)
-    named = joint_residuals.named_blocks(state.joint, data, unknowns)
-    if "beam" in named:
-        beams = named["beam"]
-        jacobian = with_sides(beams.jacobian, case.data.beam["edge"], state, case)
-        named["beam"] = replace(beams, jacobian=jacobian)
+    named = named_blocks(state.joint, data, unknowns)
     # no view and nothing that is usual: image edges and the calibration say it
-    blocks = [named[name] for name in ("face", "beam", "sweep", "side") if name in named]
-    blocks += image_blocks(state, case, scale)
+    about = {"face": NO_SIDE, "beam": data.beam["edge"], "sweep": NO_SIDE, "side": NO_SIDE}
+    for name, edge in about.items():
+        if name in named:
+            block = named[name]
+            yield replace(block, jacobian=with_sides(block.jacobian, edge, state, case))
+    yield from image_blocks(state, case, scale)
     board = state.joint.boards[0]
     known = block_diag(
         case.whitener,
@@ -291,11 +292,7 @@ def blocks_of(state, case, scale):
     )
     off = np.zeros(len(known))
     off[: unknowns.shared] = case.whitener @ state.change
-    blocks.append(_rows(off, known))
-    for block in blocks:
-        missing = known.shape[1] - block.jacobian.shape[-1]
-        jacobian = np.pad(block.jacobian, {-1: (0, missing)})
-        yield replace(block, jacobian=jacobian)
+    yield _rows(off, known)
 
 
 def _rows(residuals, jacobian):
@@ -312,13 +309,13 @@ def with_sides(J, edge, state, case):
     R = state.joint.boards[0, :, :3]
     outward = state.lines[:, :2] @ R[:, :2].T
     arm = case.middle @ R[:, :2].T
-    motions = np.zeros((len(arm), 2, geometry.POSE))  # of the board that take a side along
-    motions[:, 0, 3:] = outward
-    motions[:, 1, :3] = R[:, 2]
-    motions[:, 1, 3:] = np.cross(arm, R[:, 2])
-    by_all = J[..., case.unknowns.columns["board"]] @ np.concatenate(motions).T
+    turn, shift = np.split(J[..., case.unknowns.columns["board"]], 2, axis=-1)
+    # by motions of the board that take a side along
+    by_turn = turn @ R[:, 2:] + shift @ np.cross(arm, R[:, 2]).T
+    by_side = np.stack([shift @ outward.T, by_turn], axis=-1)
     mine = edge[..., None] == np.arange(len(arm))
-    return np.concatenate([J, by_all * np.repeat(mine, 2, axis=-1)], axis=-1)
+    of_sides = (by_side * mine[..., None]).reshape(*J.shape[:-1], -1)
+    return np.concatenate([J, of_sides], axis=-1)
 
 
 def image_blocks(state, case, scale):
@@ -326,11 +323,11 @@ def image_blocks(state, case, scale):
     shows it, whitened: a Block for each image.
     """
     view = case.data.view
-    off = joint_residuals.view_block(state.joint, case.data, case.unknowns).residuals
-    poses = geometry.move_pose(view["pose"][..., :3, :], off.reshape(1, -1, 6))
+    off = view_block(state.joint, case.data, case.unknowns).residuals
+    poses = move_pose(view["pose"][..., :3, :], off.reshape(1, -1, 6))
     # with the poses as they are predicted: derivatives of [w, v] of every T_camera_board
     data = replace(case.data, view=view | {"pose": poses})
-    J = joint_residuals.view_block(state.joint, data, case.unknowns).jacobian
+    J = view_block(state.joint, data, case.unknowns).jacobian
     by_all = J.reshape(-1, 6, J.shape[-1])
     for image in case.images:
         a, b, c = state.lines[image.numbers].T[..., None]

@@ -4,10 +4,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lrfcal_lib.model import geometry
-from lrfcal_lib.model.board import corners_of_lines
+from lrfcal_lib.model.board import corners_of_lines, side_lengths
 from lrfcal_lib.model.camera import line_distance, line_through
-from lrfcal_lib.model.geometry import fit_line
+from lrfcal_lib.model.geometry import fit_line, fit_plane, plane_axes
 
 STEP = 1e-6  # of shifts and turns of lines, metres and radians: for derivatives of lengths
 
@@ -82,11 +81,11 @@ def measure_board(
 
 def plane_frame(points: np.ndarray) -> np.ndarray:
     """A frame (3, 4) in the plane of points: origin in their middle, z towards their origin."""
-    away, distance, _ = geometry.fit_plane(points)
+    away, distance, _ = fit_plane(points)
     normal = -away
     centre = np.nanmean(points, axis=0)
     origin = centre - normal * (normal @ centre + distance)
-    return np.column_stack([*geometry.plane_axes(normal), normal, origin])
+    return np.column_stack([*plane_axes(normal), normal, origin])
 
 
 def bounded(
@@ -116,17 +115,11 @@ def bounded(
     MeasuredBoard
         Its corners are those of two known neighbours, its lengths those between two corners.
     """
-
-    def outline(lines):
-        """Corners (..., E, 2) and lengths (..., E) with lines (..., E, 3); NaN where some miss."""
-        corners = corners_of_lines(lines)
-        along = np.roll(corners, -1, axis=-2) - corners
-        return corners, np.linalg.norm(along, axis=-1)
-
-    corners, lengths = outline(lines)
+    corners = corners_of_lines(lines)
+    lengths = side_lengths(corners)
     steps = STEP * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
-    _, after = outline(moved_lines(lines, middle, steps))
-    J = (after - lengths).T / STEP
+    after = corners_of_lines(moved_lines(lines, middle, steps))
+    J = (side_lengths(after) - lengths).T / STEP
     sigma = np.sqrt(np.vecdot(J @ covariance, J))
     return MeasuredBoard(
         T_platform_plane=pose,

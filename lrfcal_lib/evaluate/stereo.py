@@ -55,14 +55,14 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
         raise ValueError(
             f"a stereo reference needs two cameras and a pattern, got {len(prepared.views)} cameras"
         )
-    first, second = list(prepared.views)[:2]
-    shown = [prepared.patterned(first), prepared.patterned(second)]
+    pair = tuple(prepared.views)[:2]
+    shown = list(map(prepared.patterned, pair))
     common = sorted(shown[0].keys() & shown[1].keys())
     if not common:
         raise ValueError(
             "no placement shows the pattern to both cameras: the stereo check needs at least one"
         )
-    models = [prepared.models[first], prepared.models[second]]
+    models = [prepared.models[camera] for camera in pair]
     pixels = np.array([[of_camera[p].pixels for p in common] for of_camera in shown])
     poses = [
         RigidTransform.concatenate([of_camera[p].T_camera_board for p in common])
@@ -84,9 +84,7 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
         lens=lens,
         wavy=np.any(prepared.relief),
     )
-    return StereoReference(
-        (first, second), adjusted.mounting[1], adjusted.mounting_covariance[0]
-    )
+    return StereoReference(pair, adjusted.mounting[1], adjusted.mounting_covariance[0])
 
 
 def stereo_check(solutions: dict, reference: StereoReference) -> pd.DataFrame:

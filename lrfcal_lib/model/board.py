@@ -31,10 +31,8 @@ class Chessboard:
 
     def points(self):
         """Inner corners row by row in the board frame, shape (rows * columns, 3), metres."""
-        y, x = np.mgrid[: self.rows, : self.columns] * self.square
-        return np.stack([x + self.origin[0], y + self.origin[1], 0.0 * x], axis=-1).reshape(
-            -1, 3
-        )
+        squares = np.mgrid[: self.columns, : self.rows].T.reshape(-1, 2)
+        return np.insert(squares * self.square + self.origin, 2, 0.0, axis=1)
 
     def grid(self, corners: ArrayLike) -> np.ndarray:
         """What belongs to the inner corners, (rows * columns, 2), as (rows, columns, 2)."""
@@ -79,9 +77,7 @@ class Board:
 
     def lengths(self):
         """Edge lengths in metres, keyed by edge name."""
-        corners = self.known_corners()
-        sides = np.roll(corners, -1, axis=0) - corners
-        return dict(zip(self.edges, np.linalg.norm(sides, axis=1), strict=True))
+        return dict(zip(self.edges, side_lengths(self.known_corners()), strict=True))
 
     def points(self):
         """Corners of the outline in space, board frame, metres, shape (n, 3)."""
@@ -139,6 +135,21 @@ def corners_of_lines(lines: ArrayLike) -> np.ndarray:
     """
     points = cross(np.roll(lines, 1, axis=-2), lines)
     return points[..., :2] / points[..., 2:]
+
+
+def side_lengths(corners: np.ndarray) -> np.ndarray:
+    """Lengths of the sides of polygons.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (..., n, k)
+
+    Returns
+    -------
+    ndarray, shape (..., n)
+        From corner i to i + 1.
+    """
+    return np.linalg.norm(np.roll(corners, -1, axis=-2) - corners, axis=-1)
 
 
 def side_ends(corners: np.ndarray, inset: float = 0.0) -> np.ndarray:

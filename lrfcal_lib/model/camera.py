@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -209,15 +208,7 @@ def fold(model: CameraModel) -> float:
         Infinite for a lens that never does: ``1 + 3 k1 r^2 + 5 k2 r^4 + 7 k5 r^6`` is the slope of
         equation (18).
     """
-    radial = model.distortion[[0, 1, 4]]
-    return _fold(*radial.tolist())
-
-
-@lru_cache
-def _fold(k1, k2, k5):
-    """The same by the radial terms; asked for each of the thousands of strips that images are
-    sampled in.
-    """
+    k1, k2, _, _, k5 = model.distortion
     roots = np.roots([7 * k5, 5 * k2, 3 * k1, 1.0])
     real = roots[np.abs(roots.imag) < 1e-9].real
     return float(min(real[real > 0], default=np.inf))

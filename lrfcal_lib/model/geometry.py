@@ -109,13 +109,16 @@ def polar_to_points(ranges: ArrayLike, bearings: ArrayLike) -> np.ndarray:
 
 
 def polar_covariance(
-    ranges: ArrayLike, bearings: ArrayLike, sigma_range: ArrayLike, sigma_bearing: ArrayLike
+    ranges: np.ndarray,
+    bearings: np.ndarray,
+    sigma_range: float | np.ndarray,
+    sigma_bearing: float | np.ndarray,
 ) -> np.ndarray:
     """Covariance of polar points from independent errors along and across the beam.
 
     Parameters
     ----------
-    ranges, bearings : array_like, shape (...)
+    ranges, bearings : ndarray, shape (...)
         Metres and radians.
     sigma_range, sigma_bearing : array_like, broadcastable to `ranges`
         Standard deviations, metres and radians.
@@ -125,7 +128,6 @@ def polar_covariance(
     ndarray, shape (..., 3, 3)
         LRF frame, square metres.
     """
-    ranges, bearings, sigma_range = np.broadcast_arrays(ranges, bearings, sigma_range)
     along = polar_to_points(sigma_range, bearings)
     across = polar_to_points(ranges * sigma_bearing, bearings + np.pi / 2)
     axes = np.stack([along, across], axis=-1)
@@ -268,11 +270,9 @@ def paper_parameters(T_head_lrf: RigidTransform) -> tuple[np.ndarray, float]:
         Metres, never negative. With ``ty = 0`` the axis meets the LRF's origin and phi_x cannot be
         known (0 is given).
     """
-    axis = axis_of(T_head_lrf)
-    x, y, z = axis.direction
-    phi_y = np.arctan2(z, np.hypot(x, y))
-    phi_z = np.arctan2(-y, x)
-    _, away_y, away_z = Rotation.from_euler("YZ", [phi_y, phi_z]).apply(-axis.foot)
+    about_x, phi_y, phi_z = T_head_lrf.rotation.as_euler("XYZ")
+    back = Rotation.from_euler("X", -about_x)
+    _, away_y, away_z = back.apply(T_head_lrf.translation)
     ty = float(np.hypot(away_y, away_z))
     phi_x = 0.0
     if ty > 0:

@@ -206,16 +206,15 @@ def _view_pattern(view, image, board, model, picked, lines, relief):
         return replace(view, rejected=tuple(unknown))
     inner = undistort(np.nanmean(pixels, axis=0), model)
     ends = side_ends(corners_of_lines(lines), CORNER_INSET)
+    middle = ends.mean(axis=1, keepdims=True)
+    beside = middle + WINDOW * lines[:, None, :2]
+    places = on_board(np.concatenate([ends, middle, beside], axis=1), pose, model)
     edges = []
     rejected = []
-    for name, line, (start, end) in zip(board.edges, lines, ends, strict=True):
+    for name, (a, b, middle_px, beside_px) in zip(board.edges, places, strict=True):
         if name in picked:
             edges.append(picked_edge(name, picked[name], inner))
             continue
-        middle = (start + end) / 2
-        beside = middle + WINDOW * line[:2]
-        places = np.stack([start, end, middle, beside])
-        a, b, middle_px, beside_px = on_board(places, pose, model)
         window = np.linalg.norm(beside_px - middle_px)
         reach = np.clip(window, LEAST_REACH_PX, MOST_REACH_PX)
         prior = max(window / WINDOW * PREDICTION_SIGMA, 1.0)

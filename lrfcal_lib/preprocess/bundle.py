@@ -219,7 +219,7 @@ def adjust(
         return Block(misses, jacobian[visible] * unknown)
 
     bundle = minimise(evaluate, start, Bundle.moved).state
-    adjusted = _adjusted(bundle, evaluate(bundle), pixels, points, basis, unknown, models)
+    adjusted = _adjusted(bundle, pixels, points, basis, unknown, models)
     return adjusted if lens else replace(adjusted, models=tuple(models))
 
 
@@ -238,13 +238,12 @@ def adjust_robust(pixels, points, models, poses, mounting=ALONE, **options) -> A
     -------
     Adjustment
     """
+    start = models, poses, mounting
     used = np.isfinite(pixels[..., :1])
     for _ in range(ROBUST_ROUNDS):
         kept = np.where(used, pixels, np.nan)
-        result = adjust(kept, points, models, poses, mounting, **options)
-        models = result.models
-        poses = result.poses
-        mounting = result.mounting
+        result = adjust(kept, points, *start, **options)
+        start = result.models, result.poses, result.mounting
         distance = np.linalg.norm(pixels - result.predicted, axis=-1, keepdims=True)
         sigma = max(np.nanmedian(distance) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX)
         before = used
@@ -272,14 +271,15 @@ def better(result: Adjustment, points, **options) -> Adjustment:
     return other if other.bic < result.bic else result
 
 
-def _adjusted(bundle, block, pixels, points, basis, unknown, models):
+def _adjusted(bundle, pixels, points, basis, unknown, models):
     """The Adjustment that a solved bundle is."""
-    predicted = bundle.predict(points, basis)[0]
+    predicted, jacobian = bundle.predict(points, basis)
     residuals = pixels - predicted
-    count = len(block.residuals)
-    error = block.residuals @ block.residuals
+    visible = np.isfinite(pixels)
+    count = visible.sum()
+    error = np.nansum(residuals**2)
     variance = max(error / max(count - unknown.sum(), 1), 1e-18)
-    lens, mount, pose = _covariances(bundle, variance, block.jacobian)
+    lens, mount, pose = _covariances(bundle, variance, jacobian[visible] * unknown)
     rms = np.sqrt(2 * np.nanmean(residuals**2, axis=(1, 2, 3)))  # as OpenCV counts it
     adjusted = zip(models, bundle.lenses, lens, rms.tolist(), strict=True)
     return Adjustment(

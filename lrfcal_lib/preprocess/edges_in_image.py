@@ -53,8 +53,6 @@ class ImageEdge:
         Point of the line.
     ends : ndarray, shape (2, 2)
         Ends of the stretch that was really seen.
-    n_points : int
-        Profiles that the line was fitted to (2 for a pick).
     """
 
     name: str
@@ -62,7 +60,6 @@ class ImageEdge:
     covariance: np.ndarray
     centre: np.ndarray
     ends: np.ndarray
-    n_points: int
 
 
 class EdgeNotSeen(ValueError):
@@ -129,7 +126,6 @@ def refine_edge(
         covariance=_line_covariance(columns, misses),
         centre=centre,
         ends=np.stack([first, last]),
-        n_points=len(columns),
     )
 
 
@@ -156,7 +152,6 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
         covariance=PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2]),
         centre=centre,
         ends=ends,
-        n_points=2,
     )
 
 
@@ -203,9 +198,8 @@ def step_contrast(strip, sigma, along=AVERAGED_PROFILES):
     `along` averaged profiles, norm over the colours.
     """
     wide = int(4 * sigma + 0.5)
-    places = np.arange(-wide, wide + 1)
-    bell = np.exp(-0.5 * (places / sigma) ** 2)
-    slope = places / sigma * bell / bell.sum() * np.sqrt(2 * np.pi)
+    bell = cv2.getGaussianKernel(2 * wide + 1, sigma)[:, 0]
+    slope = np.arange(-wide, wide + 1) / sigma * bell * np.sqrt(2 * np.pi)
     mean = np.full(along, 1 / along)
     filled = np.nan_to_num(strip)
     steps = cv2.sepFilter2D(filled, cv2.CV_32F, mean, slope, borderType=cv2.BORDER_REFLECT)

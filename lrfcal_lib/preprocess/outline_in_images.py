@@ -11,8 +11,15 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.robust import robust_sigma
-from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, side_ends
+from lrfcal_lib.fit.padding import medians
+from lrfcal_lib.fit.robust import NORMAL
+from lrfcal_lib.model.board import (
+    Board,
+    Chessboard,
+    corners_of_lines,
+    side_ends,
+    side_lengths,
+)
 from lrfcal_lib.model.camera import CameraModel, line_distance, line_through
 from lrfcal_lib.model.geometry import DegenerateGeometry, unit_lines, unit_vector
 from lrfcal_lib.preprocess.edges_in_image import (
@@ -161,15 +168,12 @@ def common_lines(votes: np.ndarray, board) -> tuple[np.ndarray | None, str]:
     count = visible.sum(axis=0)
     mean = wide.sum(axis=0, where=visible) / np.maximum(count, 1)
     mean[count < min(3, len(votes))] = 0
-    places = []
-    for name, of_side in zip(SIDES, gaussian_filter1d(mean, 1.0), strict=True):
-        place = _outer_peak(of_side)
-        if place is None:
-            return None, (
-                f"the images do not agree on the {name} edge of board '{board.name}': give the "
-                "corners of the board or pick edges by hand"
-            )
-        places.append(place)
+    places = list(map(_outer_peak, gaussian_filter1d(mean, 1.0)))
+    if None in places:
+        return None, (
+            f"the images do not agree on the {SIDES[places.index(None)]} edge of board "
+            f"'{board.name}': give the corners of the board or pick edges by hand"
+        )
     return side_lines(board.pattern, _distances(board.pattern)[places]), ""
 
 
@@ -235,12 +239,11 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
     offsets = -line_distance(ends, lines[:, :, None]) / cosine[..., None]
     ends += np.nanmedian(offsets, axis=0)[..., None] * normals[:, None]
     fitted = line_through(ends[:, 0], ends[:, 1])
-    corners = corners_of_lines(lines)
-    lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).T
+    lengths = side_lengths(corners_of_lines(lines)).T
     return Outline(
         board=replace(board, corners=corners_of_lines(fitted)),
-        line_sd=np.array([_spread(offset) for offset in offsets.mean(axis=2).T]),
-        length_sd=dict(zip(board.edges, map(_spread, lengths), strict=True)),
+        line_sd=_spread(offsets.mean(axis=2).T),
+        length_sd=dict(zip(board.edges, _spread(lengths), strict=True)),
         n_lengths=dict(zip(board.edges, np.isfinite(lengths).sum(axis=1), strict=True)),
     )
 
@@ -274,8 +277,7 @@ def _outer_peak(votes):
 
 
 def _spread(values):
-    """Standard deviation about the median; NaN below two values that are known."""
-    values = values[np.isfinite(values)]
-    if len(values) < 2:
-        return np.nan
-    return robust_sigma(values - np.median(values))
+    """Standard deviations (k,) about the medians of rows (k, n); NaN below two known values."""
+    known = np.isfinite(values)
+    misses = np.abs(values - medians(values, known)[:, None])
+    return np.where(known.sum(axis=1) > 1, NORMAL * medians(misses, known), np.nan)
