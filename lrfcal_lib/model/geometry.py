@@ -330,6 +330,25 @@ def transform_difference(a: RigidTransform, b: RigidTransform) -> tuple[float, f
     return float(turn.magnitude()), float(np.linalg.norm(a.translation - b.translation))
 
 
+def rms(values: np.ndarray) -> float:
+    """Root mean square.
+
+    Parameters
+    ----------
+    values : array_like
+
+    Returns
+    -------
+    float
+        Of the finite values; NaN where there are none.
+    """
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return np.nan
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def _principal(points):
     """Centre of points (n, 3), and variances along their principal axes (columns), the smallest
     first.

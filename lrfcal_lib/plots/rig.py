@@ -80,9 +80,8 @@ def pixels(
     -------
     ndarray, shape (..., 2)
     """
-    height, width = size
-    centre = np.array([width - 1, height - 1]) / 2
-    return (focal or width) * seen[..., :2] / seen[..., 2:] + centre
+    centre = (np.array(size[::-1]) - 1) / 2
+    return (focal or size[1]) * seen[..., :2] / seen[..., 2:] + centre
 
 
 def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidTransform:

@@ -21,7 +21,7 @@ T_TARGET_PLATES = RigidTransform.from_rotation(
 )
 SIZE = 1.5  # metres, of a plate away from the edge and along it to either side
 # with the edge on y, and x from there
-PLATE = Board("plate", (), SIZE * ([1, 2] * UNIT_SQUARE - [0, 1]))
+PLATE = Board("plate", (), SIZE * (UNIT_SQUARE * [1, 2] - [0, 1]))
 FEWEST_POINTS = 2  # on a plate
 LEAST_LENGTH = 15.0  # of an image line, pixels
 SAMPLES = 601  # of an edge, where it is in the image

@@ -290,8 +290,7 @@ def posed(spin, lean, centre, middle):
     for a lean (n, 2) about x and y, and are turned in their plane by a spin (n,).
     """
     leant = np.column_stack([lean, 0 * spin])
-    turned = np.outer(spin, [0.0, 0.0, 1.0])
-    facing = AHEAD * Rotation.from_rotvec(leant) * Rotation.from_rotvec(turned)
+    facing = AHEAD * Rotation.from_rotvec(leant) * Rotation.from_euler("z", spin[:, None])
     return carry(facing, middle, centre)
 
 

@@ -34,6 +34,7 @@ FLOOR = -1.1  # metres, below the platform
 SKY = (0.95, 0.98, 1.0)  # light from where there is nothing
 FLAT = 0.03  # difference of light over a block of pixels below which its four corners tell the rest
 BLOCK = 2  # pixels
+RING = 0.65  # width of the outermost squares of a board's pattern as a share of a square
 BATCH = 1 << 19  # rays that are cast at once
 ROOM = json.loads(Path(__file__).with_name("room.json").read_text())
 
@@ -123,9 +124,9 @@ class World:
         back = T_world_platform.inv()
         things = [replace(thing, pose=back * thing.pose) for thing in self.things]
         lights = self.lights
-        if lights is not None:
-            lights = replace(lights, positions=back.apply(lights.positions))
-        return World(things, lights)
+        return World(
+            things, lights and replace(lights, positions=back.apply(lights.positions))
+        )
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """Follow rays to the first surface.
@@ -232,7 +233,7 @@ def furnished_room(*more: Thing) -> World:
     return World([*furnished(*ROOM["parts"]), *more], Lights(**ROOM["lights"]))
 
 
-def board_on_stand(board, T_platform_board, ring):
+def board_on_stand(board, T_platform_board):
     """The board, a sheet of no thickness whose edges are its outline, and a tripod behind it."""
     centre = np.mean(board.corners, axis=0)
     middle, behind = T_platform_board.apply([[*centre, -0.004], [*centre, -0.07]])
@@ -244,7 +245,7 @@ def board_on_stand(board, T_platform_board, ring):
     feet = polar_to_points(0.38, np.radians([80, 200, 320])) + [*head[:2], FLOOR]
     rods += [(knee, foot, 0.010) for foot in feet]
     sheet = Thing(
-        polygon(board.corners), (chessboard, board, 0.07, 0.75, ring), T_platform_board
+        polygon(board.corners), (chessboard, board, 0.07, 0.75, RING), T_platform_board
     )
     return [sheet, *(Thing(rod(*each), (plain, (0.4, 0.41, 0.43))) for each in rods)]
 
