@@ -5,7 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lrfcal_lib.model.geometry import cross, unit_lines
+from lrfcal_lib.model.geometry import (
+    cross,
+    length_of,
+    unit_lines,
+)
 
 UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # its corners in order
 
@@ -81,7 +85,7 @@ class Board:
         """Edge lengths in metres, keyed by edge name."""
         corners = self.known_corners()
         sides = np.roll(corners, -1, axis=0) - corners
-        return dict(zip(self.edges, np.linalg.norm(sides, axis=1), strict=True))
+        return dict(zip(self.edges, length_of(sides), strict=True))
 
     def points(self):
         """Corners of the outline in space, board frame, metres, shape (n, 3)."""

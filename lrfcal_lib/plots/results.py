@@ -9,7 +9,10 @@ from matplotlib.collections import PathCollection
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import rms
+from lrfcal_lib.model.geometry import (
+    length_of,
+    rms,
+)
 from lrfcal_lib.plots.colors import LRF, OUTLIER, RAW, TRUTH, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
@@ -260,7 +263,7 @@ def residuals_by_region(
     """
     title = f"{name}: no board in any image"
     if len(uv):
-        length = np.linalg.norm(shift, axis=1)
+        length = length_of(shift)
         longest = length.max()
         unit = float(f"{longest / 2:.1g}")
         drawn = ax.quiver(

@@ -7,7 +7,12 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import carry, fit_plane, unit_vector
+from lrfcal_lib.model.geometry import (
+    carry,
+    fit_plane,
+    length_of,
+    unit_vector,
+)
 from lrfcal_lib.plots.colors import FIT
 from lrfcal_lib.plots.recording import CENTRED
 
@@ -140,7 +145,7 @@ def face_on(
     normal, _, _ = fit_plane(points)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
 
-    wide = 2 * np.linalg.norm(points - middle, axis=1).max()
+    wide = 2 * length_of(points - middle).max()
     T_view = look_at(middle - FAR * wide * normal, middle)
     spread = np.ptp(pixels(T_view.apply(points), size, 1.0), axis=0)
     focal = fill * (size[::-1] / spread).min()

@@ -11,7 +11,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import UNIT_SQUARE, Board
 from lrfcal_lib.model.camera import line_through, pinhole
-from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
+from lrfcal_lib.model.geometry import (
+    apply_pose,
+    length_of,
+    polar_to_points,
+    pose_array,
+)
 
 # where the plates meet, through the origin of the target, and the plates' ways from there
 EDGE = np.array([-0.5, -0.5, 0.70711])
@@ -82,7 +87,7 @@ def _image_lines(setup, rng, T_camera_target):
     first = inside.argmax(axis=-1)
     last = SAMPLES - 1 - inside[..., ::-1].argmax(axis=-1)
     ends = np.take_along_axis(uv, np.stack([first, last], axis=-1)[..., None], axis=2)
-    long = np.linalg.norm(np.diff(ends, axis=2), axis=-1) > LEAST_LENGTH
+    long = length_of(np.diff(ends, axis=2)) > LEAST_LENGTH
     whole = (inside.any(axis=-1, keepdims=True) & long).all(axis=(1, 2))
 
     noisy = rng.normal(ends[:, 0], setup.sigma_px)
