@@ -112,13 +112,13 @@ class World:
         corners = np.concatenate(meshes)
         first, second, third = np.moveaxis(corners, 1, 0)
         normals = np.cross(second - first, third - first)
-        # the poles of a lathe make empty triangles, which no ray meets
-        areas = np.linalg.norm(normals, axis=1, keepdims=True)
-        self.normals = normals / np.maximum(areas, 1e-12)
-        self.offsets = np.vecdot(self.normals, first)
+        # the poles of a lathe make empty triangles
+        whole = length_of(normals) > 1e-12
+        self.normals = unit_vector(normals[whole])
+        self.offsets = np.vecdot(self.normals, first[whole])
         sizes = [len(mesh) for mesh in meshes]
-        self.thing_of = np.repeat(np.arange(len(sizes)), sizes)
-        vertices = corners.reshape(-1, 3).astype(np.float32)
+        self.thing_of = np.repeat(np.arange(len(sizes)), sizes)[whole]
+        vertices = corners[whole].reshape(-1, 3).astype(np.float32)
         faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(vertices, faces)
