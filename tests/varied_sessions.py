@@ -43,6 +43,7 @@ from lrfcal_lib.simulate.draw import AHEAD
 from lrfcal_lib.simulate.rig import Platform, Rig, RigCamera, held_close, pairs
 from lrfcal_lib.simulate.scene import Imager
 
+RING = 1.0  # squares, width of the outermost ones of a pattern
 SAMPLES = 3  # rays across a pixel and down a pixel, where the board is
 COARSE = 4  # pixels between the rays to what is behind the board
 BLUR = 0.7
@@ -160,9 +161,7 @@ def rig_of(v):
     platform = Platform(backlash=v.backlash, stretch=v.stretch)
     board = _board(v, v.square_px * np.mean(v.distances) / focal)
     kind = BaseRig if v.mount == "platform" else Rig
-    return kind(
-        beam, platform, head, RigidTransform.identity(), tuple(cameras), board, ring=1.0
-    )
+    return kind(beam, platform, head, RigidTransform.identity(), tuple(cameras), board)
 
 
 def _board(v, square):
@@ -246,7 +245,7 @@ def _scene(v, rig, T_platform_board, rng):
     """What a ray may meet, for the LRF or for a camera: the settings of `_cast` by 'lrf' and 'camera'."""
     pattern = rig.board.pattern
     settings = np.array(
-        [*pattern.origin, pattern.square, pattern.columns, pattern.rows, rig.ring]
+        [*pattern.origin, pattern.square, pattern.columns, pattern.rows, RING]
     )
     far = T_platform_board.apply(rig.board.points())[:, 1].max()
     ground = (
@@ -300,12 +299,9 @@ def _scan(v, rig, scene, pitch, rng):
     energy = np.where(hit, value * cosine / np.where(hit, distance, 1.0) ** 2, 0.0).reshape(
         -1, len(disc)
     )
-    reading, total = echo(
-        beam, distance.reshape(-1, len(disc)), energy * weight / weight.sum()
-    )
-    ranges, reasons = measured(
-        beam, Readings(reading, total, np.zeros(len(reading), bool)), rng
-    )
+    reading, _ = echo(beam, distance.reshape(-1, len(disc)), energy * weight / weight.sum())
+    ideal = Readings(reading, np.isnan(reading).astype(int))
+    ranges, reasons = measured(beam, ideal, rng)
     ranges = np.where(reasons == 0, np.round(ranges / beam.unit) * beam.unit, np.nan)
     return ranges.reshape(len(pitch), len(bearings))
 

@@ -25,7 +25,7 @@ from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.fit.covariance import inverse_root
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import POSE, DegenerateGeometry, move_pose
+from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose
 from lrfcal_lib.preprocess.edges_in_image import ImageEdge
 from lrfcal_lib.preprocess.pose_from_lines import line_misses
 from lrfcal_lib.solvers.joint_model import (

@@ -5,7 +5,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.observe import FACE_POINTS, stack
 from lrfcal_lib.model.camera import LENS, CameraModel, project_jacobians
-from lrfcal_lib.model.geometry import gradient_by_pose
+from lrfcal_lib.model.geometry import bearings_of, gradient_by_pose
 from lrfcal_lib.model.observations import JointObservations, thin
 from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.board_in_scan import face_points
@@ -61,7 +61,7 @@ def _ranges(scans):
         p_lrf, pitch, _ = face_points(scan, FACE_POINTS)
         yield {
             "range": np.linalg.norm(p_lrf, axis=1),
-            "bearing": np.arctan2(p_lrf[:, 1], p_lrf[:, 0]),
+            "bearing": bearings_of(p_lrf),
             "pitch": pitch,
             "sigma": scan.sigma_range,
             "placement": row,

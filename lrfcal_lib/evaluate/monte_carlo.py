@@ -23,6 +23,7 @@ from lrfcal_lib.fit.edge_likelihood import disc_share
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
+    length_of,
     pose_array,
     pose_step,
     pose_transform,
@@ -277,7 +278,7 @@ def _judge(trials, index, factor):
     unit = np.broadcast_to(factor, e.shape)
     B = B * dyads(unit)
     crb = np.sqrt(np.mean(np.linalg.trace(B)))
-    rmse = rms(np.linalg.norm(unit * e, axis=1))
+    rmse = rms(length_of(unit * e))
     free = len(e) * _freedom(np.mean(B, axis=0))
     row = {
         "rmse": rmse,

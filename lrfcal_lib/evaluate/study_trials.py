@@ -16,6 +16,7 @@ from lrfcal_lib.fit.covariance import dyads, sigma_of
 from lrfcal_lib.model.geometry import (
     POSE_UNITS,
     DegenerateGeometry,
+    length_of,
     move_pose,
     polar_to_points,
     pose_step,
@@ -170,7 +171,7 @@ def _judged(estimate, true, bounds):
 
 def _sizes(step, end=""):
     """Lengths of the turn and the shift of a step (6,), by column."""
-    turn, shift = np.linalg.norm(np.split(POSE_UNITS * step, 2), axis=1)
+    turn, shift = length_of(np.split(POSE_UNITS * step, 2))
     return {f"rotation_deg{end}": turn, f"translation_mm{end}": shift}
 
 

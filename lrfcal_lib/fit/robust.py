@@ -7,6 +7,8 @@ One rule for every fit that does not go through :func:`lrfcal_lib.fit.least_squa
 import numpy as np
 from scipy.sparse import csr_array
 
+from lrfcal_lib.model.geometry import rms as rms
+
 # standard deviation of a normal variable over the median of its absolute value
 NORMAL = 1.4826
 # standard deviations; a fit with these weights is 95 % as good as least squares for normal errors
@@ -23,25 +25,6 @@ def robust_sigma(misses: np.ndarray, least: float = 0.0) -> float:
         Never smaller than this.
     """
     return max(NORMAL * float(np.median(np.abs(misses))), least)
-
-
-def rms(values: np.ndarray) -> float:
-    """Root mean square.
-
-    Parameters
-    ----------
-    values : array_like
-
-    Returns
-    -------
-    float
-        Of the finite values; NaN where there are none.
-    """
-    values = np.asarray(values, float)
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return np.nan
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def biweight(misses: np.ndarray, sigma: float | np.ndarray) -> np.ndarray:

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lrfcal_lib.model.geometry import cross, unit_lines
+from lrfcal_lib.model.geometry import (
+    cross,
+    unit_lines,
+)
 
 UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # its corners in order
 

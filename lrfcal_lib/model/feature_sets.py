@@ -3,7 +3,10 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import (
+    length_of,
+    unit_vector,
+)
 
 
 def point_set(
@@ -23,7 +26,7 @@ def point_set(
     -------
     ndarray of bool, shape (...)
     """
-    away = np.linalg.norm(np.subtract(positions, point), axis=-1)
+    away = length_of(np.subtract(positions, point))
     return np.abs(away - distance) <= tolerance
 
 
@@ -49,7 +52,7 @@ def line_set(
     -------
     ndarray of bool, shape (...)
     """
-    away = np.linalg.norm(np.cross(np.subtract(positions, point), direction), axis=-1)
+    away = length_of(np.cross(np.subtract(positions, point), direction))
     return away <= distance + tolerance
 
 

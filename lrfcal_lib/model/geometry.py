@@ -40,6 +40,11 @@ def cross(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     return forward - backward
 
 
+def length_of(vectors: np.ndarray) -> np.ndarray:
+    """Lengths (...) of vectors (..., k)."""
+    return np.linalg.norm(vectors, axis=-1)
+
+
 def unit_vector(vectors: np.ndarray) -> np.ndarray:
     """Vectors of length 1 that point the same way.
 
@@ -106,6 +111,13 @@ def polar_to_points(ranges: ArrayLike, bearings: ArrayLike) -> np.ndarray:
     x = ranges * np.cos(bearings)
     y = ranges * np.sin(bearings)
     return np.stack([x, y, 0.0 * x], axis=-1)
+
+
+def bearings_of(points: np.ndarray) -> np.ndarray:
+    """Bearings (...) of points (..., 3) in the LRF frame: the way back of
+    :func:`polar_to_points`.
+    """
+    return np.arctan2(points[..., 1], points[..., 0])
 
 
 def polar_covariance(
@@ -328,6 +340,25 @@ def transform_difference(a: RigidTransform, b: RigidTransform) -> tuple[float, f
     """
     turn = a.rotation * b.rotation.inv()
     return float(turn.magnitude()), float(np.linalg.norm(a.translation - b.translation))
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square.
+
+    Parameters
+    ----------
+    values : array_like
+
+    Returns
+    -------
+    float
+        Of the finite values; NaN where there are none.
+    """
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return np.nan
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _principal(points):

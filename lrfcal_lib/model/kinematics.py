@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import lrf_to_platform, tilt
+from lrfcal_lib.model.geometry import (
+    bearings_of,
+    length_of,
+    lrf_to_platform,
+    tilt,
+)
 
 TILT_AXIS = np.array([1.0, 0.0, 0.0])  # of the head and of the platform
 # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real LMS200
@@ -177,4 +182,4 @@ def beams_to(
         pitch = np.arctan2(b, a) + np.arccos(c / np.hypot(a, b))
     pitch = (pitch + np.pi) % (2 * np.pi) - np.pi
     p = (tilt(points, -pitch) - t) @ R
-    return np.arctan2(p[..., 1], p[..., 0]), pitch, np.linalg.norm(p, axis=-1)
+    return bearings_of(p), pitch, length_of(p)

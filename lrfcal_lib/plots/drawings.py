@@ -92,7 +92,7 @@ class View:
     ) -> None:
         """The distance of two points (2, 3) as in a drawing of a machine."""
         self.arrow(ends, TRUTH, DIMENSION)
-        self.name(np.mean(ends, axis=0), text, away)
+        self.name(np.asarray(ends).mean(axis=0), text, away)
 
     def box(self, T: RigidTransform, low: ArrayLike, high: ArrayLike, color: str) -> None:
         """A solid box between two corners (3,) of its own frame, metres, the far faces first."""

@@ -36,31 +36,31 @@ def plane_constraint(
     away = points.mean(axis=0) - origin
     section = np.stack([unit_vector(away - up * (up @ away)), up])
     flat = points @ section.T
-    lrf = section @ origin
+    x, y = section @ origin  # of the LRF
     first = flat[:, 0].min() - 0.15
     last = flat[:, 0].max() + 0.15
     ax.plot([first, last], [height, height], color=TRUTH, linewidth=2)
     ax.hlines(height, 0, first, TRUTH, linewidth=0.6, linestyle=":")
-    beams = np.array([[lrf, point] for point in thin(flat, BEAMS)])
+    beams = np.array([[(x, y), point] for point in thin(flat, BEAMS)])
     ax.plot(*beams.T, color=LRF, linewidth=0.5, alpha=0.6)
     ax.plot(*flat.T, ".", color=LRF, markersize=3)
-    ax.plot(*lrf, "o", color=LRF, markersize=8)
+    ax.plot(x, y, "o", color=LRF, markersize=8)
     ax.plot(0, 0, "s", color=LEFT, markersize=8)
     ax.annotate("", (0, height), (0, 0), arrowprops={"arrowstyle": "->"})
     ax.text(last, height + ABOVE, "plane of the board", ha="right")
     ax.text(-ABOVE, height / 2, f"n, d = {height:.2f} m", ha="right")
     # each name on the side where the other sensor is not
-    beside = np.copysign(ABOVE, lrf[0])
+    beside = np.copysign(ABOVE, x)
     sides = ("right", "left")[:: int(np.sign(beside))]
     ax.text(-beside, 0, "camera", va="center", ha=sides[0], color=LEFT)
-    ax.text(lrf[0] + beside, lrf[1], "LRF", va="center", ha=sides[1], color=LRF)
+    ax.text(x + beside, y, "LRF", va="center", ha=sides[1], color=LRF)
     ax.set(
         xlabel="along the board [m]",
         ylabel="along its normal [m]",
         aspect="equal",
         xlim=(
-            min(0.0, first, lrf[0]) - ROOM * height,
-            max(last, lrf[0] + ROOM * height),
+            min(0.0, first, x) - ROOM * height,
+            max(last, x + ROOM * height),
         ),
     )
 
@@ -92,7 +92,7 @@ def spot_over_edge(ax: Axes, radius: float, bias: float) -> None:
     top = 6.2 * r
     ax.text(-0.97 * reach, top, "board", va="center")
     ax.text(0.97 * reach, top, "beyond", va="center", ha="right")
-    ax.plot([0, b], [0.9 * r, 0.9 * r], color=FIT, linewidth=2)
+    ax.hlines(0.9 * r, 0, b, FIT, linewidth=2)
     ax.text(b / 2, 1.15 * r, "b", ha="center", va="center", color=FIT)
     ax.set(
         xlabel="distance u of the beam from the edge [mm]",

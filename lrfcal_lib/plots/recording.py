@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from lrfcal_lib.model.board import Board, Chessboard, side_ends
 from lrfcal_lib.model.camera import CameraModel, redistort
-from lrfcal_lib.model.geometry import polar_to_points
+from lrfcal_lib.model.geometry import bearings_of, polar_to_points
 from lrfcal_lib.plots.colors import COLORS as COLORS
 from lrfcal_lib.plots.colors import (
     FILTERED,
@@ -173,9 +173,9 @@ def edge_of_line(
     ax.plot(bearing, fitted, color=FIT, label="line fitted to the board")
     for (variant, crossed), style in zip(dict(edges).items(), ("--", "-"), strict=False):
         here = (crossed.line == line) & (crossed.step[:, 1] == end)
-        for x, y, _ in crossed.points[here]:
+        for crossing in np.degrees(bearings_of(crossed.points[here])):
             ax.axvline(
-                np.degrees(np.arctan2(y, x)),
+                crossing,
                 color=LRF,
                 linestyle=style,
                 label=variant.replace("_", " "),
@@ -198,8 +198,7 @@ def crossings(ax: Axes, edges) -> None:
     edges : recarray
         Of :class:`lrfcal_lib.preprocess.board_in_scan.BoardScan`.
     """
-    x, y, _ = edges.points.T
-    points = np.degrees([np.arctan2(y, x), edges.pitch])
+    points = np.degrees([bearings_of(edges.points), edges.pitch])
     unused = edges.side < 0
     for index, side in enumerate(np.unique(edges.side[~unused])):
         at = edges.side == side

@@ -9,6 +9,10 @@ from matplotlib.collections import PathCollection
 from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import (
+    length_of,
+    rms,
+)
 from lrfcal_lib.plots.colors import LRF, OUTLIER, RAW, TRUTH, color_of, series
 
 BINS = 8  # of distances, with as many residuals each
@@ -35,11 +39,6 @@ def _side_by_side(values):
     return (np.arange(count) + 0.5) / count - 0.5
 
 
-def _rms(values):
-    """Root mean square."""
-    return np.sqrt(np.mean(values**2))
-
-
 def residual_strips(
     ax: Axes, residuals: np.ndarray, placement: np.ndarray, label: str, color: str
 ) -> None:
@@ -56,8 +55,8 @@ def residual_strips(
     """
     groups = pd.Series(residuals).groupby(placement)
     for column, (_, values) in enumerate(groups):
-        rms = _rms(values)
-        ax.bar(column, 2 * rms, 0.8, -rms, color=color, alpha=0.2, linewidth=0)
+        size = rms(values)
+        ax.bar(column, 2 * size, 0.8, -size, color=color, alpha=0.2, linewidth=0)
         ax.plot(
             column + 0.6 * _side_by_side(values), values, ".", color=color, markersize=2.5
         )
@@ -240,7 +239,7 @@ def residuals_by_range(ax: Axes, distance: np.ndarray, residual: np.ndarray) -> 
         xlabel="range [m]",
         ylabel="predicted - measured [mm]",
         ylim=(-limit, limit),
-        title=f"Ranges: {_rms(points.residual):.2g} mm rms",
+        title=f"Ranges: {rms(points.residual):.2g} mm rms",
     )
     ax.legend()
 
@@ -264,7 +263,7 @@ def residuals_by_region(
     """
     title = f"{name}: no board in any image"
     if len(uv):
-        length = np.linalg.norm(shift, axis=1)
+        length = length_of(shift)
         longest = length.max()
         unit = float(f"{longest / 2:.1g}")
         drawn = ax.quiver(
@@ -277,7 +276,7 @@ def residuals_by_region(
             width=0.005,
         )
         ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S")
-        title = f"{name}: {_rms(length):.2g} px rms, predicted - seen"
+        title = f"{name}: {rms(length):.2g} px rms, predicted - seen"
     ax.set(
         xlim=(0, model.width),
         ylim=(model.height, 0),

@@ -7,7 +7,12 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import carry, fit_plane, unit_vector
+from lrfcal_lib.model.geometry import (
+    carry,
+    fit_plane,
+    length_of,
+    unit_vector,
+)
 from lrfcal_lib.plots.colors import FIT
 from lrfcal_lib.plots.recording import CENTRED
 
@@ -80,9 +85,8 @@ def pixels(
     -------
     ndarray, shape (..., 2)
     """
-    height, width = size
-    centre = np.array([width - 1, height - 1]) / 2
-    return (focal or width) * seen[..., :2] / seen[..., 2:] + centre
+    centre = (np.array(size[::-1]) - 1) / 2
+    return (focal or size[1]) * seen[..., :2] / seen[..., 2:] + centre
 
 
 def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidTransform:
@@ -141,7 +145,7 @@ def face_on(
     normal, _, _ = fit_plane(points)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
 
-    wide = 2 * np.linalg.norm(points - middle, axis=1).max()
+    wide = 2 * length_of(points - middle).max()
     T_view = look_at(middle - FAR * wide * normal, middle)
     spread = np.ptp(pixels(T_view.apply(points), size, 1.0), axis=0)
     focal = fill * (size[::-1] / spread).min()

@@ -176,11 +176,12 @@ def echo(
 
 
 class Readings(NamedTuple):
-    """Of beams, without noise, offset and rounding: metres (NaN without an echo), energy, light."""
+    """Of beams, without noise, offset and rounding: metres (NaN without an echo), and why there is
+    none, index into REASONS.
+    """
 
     reading: np.ndarray
-    total: np.ndarray
-    dazzled: np.ndarray
+    reasons: np.ndarray
 
 
 def ideal_readings(
@@ -220,7 +221,9 @@ def ideal_readings(
     reflected = world.infrared(hits.points, hits.thing) * hits.cosine
     energy = reflected / hits.distance**2 / len(disc)
     reading, total = echo(beam, hits.distance, energy)
-    return Readings(reading, total, world.dazzling[hits.thing].any(axis=1))
+    dazzled = world.dazzling[hits.thing].any(axis=1)
+    known = [dazzled, np.isfinite(reading), total > 0]
+    return Readings(reading, np.select(known, [DAZZLED, 0, WEAK], NOT_VALID))
 
 
 def measured(
@@ -241,8 +244,7 @@ def measured(
         Metres, and why there is none: index into REASONS.
     """
     ranges = rng.normal(ideal.reading + beam.systematic, beam.sigma_range)
-    known = [ideal.dazzled, np.isfinite(ideal.reading), ideal.total > 0]
-    return np.maximum(ranges, 0), np.select(known, [DAZZLED, 0, WEAK], NOT_VALID)
+    return np.maximum(ranges, 0), ideal.reasons
 
 
 def scan(

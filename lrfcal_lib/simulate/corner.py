@@ -11,7 +11,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import UNIT_SQUARE, Board
 from lrfcal_lib.model.camera import line_through, pinhole
-from lrfcal_lib.model.geometry import apply_pose, polar_to_points, pose_array
+from lrfcal_lib.model.geometry import (
+    apply_pose,
+    length_of,
+    polar_to_points,
+    pose_array,
+)
 
 # where the plates meet, through the origin of the target, and the plates' ways from there
 EDGE = np.array([-0.5, -0.5, 0.70711])
@@ -21,7 +26,7 @@ T_TARGET_PLATES = RigidTransform.from_rotation(
 )
 SIZE = 1.5  # metres, of a plate away from the edge and along it to either side
 # with the edge on y, and x from there
-PLATE = Board("plate", (), SIZE * ([1, 2] * UNIT_SQUARE - [0, 1]))
+PLATE = Board("plate", (), SIZE * (UNIT_SQUARE * [1, 2] - [0, 1]))
 FEWEST_POINTS = 2  # on a plate
 LEAST_LENGTH = 15.0  # of an image line, pixels
 SAMPLES = 601  # of an edge, where it is in the image
@@ -82,7 +87,7 @@ def _image_lines(setup, rng, T_camera_target):
     first = inside.argmax(axis=-1)
     last = SAMPLES - 1 - inside[..., ::-1].argmax(axis=-1)
     ends = np.take_along_axis(uv, np.stack([first, last], axis=-1)[..., None], axis=2)
-    long = np.linalg.norm(np.diff(ends, axis=2), axis=-1) > LEAST_LENGTH
+    long = length_of(np.diff(ends, axis=2)) > LEAST_LENGTH
     whole = (inside.any(axis=-1, keepdims=True) & long).all(axis=(1, 2))
 
     noisy = rng.normal(ends[:, 0], setup.sigma_px)

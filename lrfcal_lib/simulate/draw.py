@@ -19,6 +19,7 @@ from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import (
     AHEAD,
     apply_pose,
+    bearings_of,
     carry,
     gradient_by_pose,
     move_pose,
@@ -217,8 +218,7 @@ def _grid(bench, pose, span):
     true = pitch * (1 + bench.stretch)
     T_lrf_platform = camera_at(RigidTransform.identity(), "head", bench.T_head_lrf, true)
     T_lrf_board = pose_array(T_lrf_platform * pose)
-    p_lrf = apply_pose(T_lrf_board, points)
-    bearing = np.arctan2(p_lrf[..., 1], p_lrf[..., 0])
+    bearing = bearings_of(apply_pose(T_lrf_board, points))
     first = round(bearing.min() / bench.step) - MARGIN
     last = round(bearing.max() / bench.step) + MARGIN
     return pitch, T_lrf_board, bench.step * np.arange(first, last + 1)
@@ -290,8 +290,7 @@ def posed(spin, lean, centre, middle):
     for a lean (n, 2) about x and y, and are turned in their plane by a spin (n,).
     """
     leant = np.column_stack([lean, 0 * spin])
-    turned = np.outer(spin, [0.0, 0.0, 1.0])
-    facing = AHEAD * Rotation.from_rotvec(leant) * Rotation.from_rotvec(turned)
+    facing = AHEAD * Rotation.from_rotvec(leant) * Rotation.from_euler("z", spin[:, None])
     return carry(facing, middle, centre)
 
 

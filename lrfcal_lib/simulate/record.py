@@ -87,7 +87,7 @@ def world_of(setup: Setup, placement: Placement) -> World:
         room = furnished_room(*furnished("still life"))
         station = placement.T_room_platform
         return room if station is None else room.seen_from(station)
-    things = board_on_stand(setup.rig.board, placement.T_platform_board, setup.rig.ring)
+    things = board_on_stand(setup.rig.board, placement.T_platform_board)
     return furnished_room(*(things if placement.purpose == "board" else things[:1]))
 
 

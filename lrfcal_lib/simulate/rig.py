@@ -124,8 +124,6 @@ class Rig:
     T_head_lrf_stated: RigidTransform
     cameras: tuple[RigCamera, ...]
     board: Board  # with corners
-    # width of the outermost squares of the board's pattern as a share of a square
-    ring: float = 0.65
 
     def camera_pose(self, camera: RigCamera, pitch: ArrayLike) -> RigidTransform:
         """``T_camera_platform`` of a camera.
@@ -368,11 +366,10 @@ def _placement(rig, number, pose, margin, step):
         for camera in rig.cameras
     ]
     seen = PITCH_GRID[np.all(shown, axis=0)]
-    if len(seen) < 2 or np.ptp(seen) <= LEAST_SPAN:
-        return None
     bearing, pitch, _ = beams_to(pose.apply(points), rig.T_head_lrf)
-    half_field = np.radians(rig.beam.field_of_view / 2)
-    if np.abs(bearing - np.pi / 2).max() >= half_field - 2 * margin:
+    reach = np.radians(rig.beam.field_of_view / 2) - 2 * margin
+    outside = np.abs(bearing - np.pi / 2).max() >= reach
+    if outside or len(seen) < 2 or np.ptp(seen) <= LEAST_SPAN:
         return None
     sweep = (pitch.min() - margin, pitch.max() + margin)
     shares = [-1.0, 0.0, 1.0]

@@ -25,7 +25,11 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, project, undistort
-from lrfcal_lib.model.geometry import polar_to_points, unit_vector
+from lrfcal_lib.model.geometry import (
+    length_of,
+    polar_to_points,
+    unit_vector,
+)
 from lrfcal_lib.simulate import shapes, textures
 from lrfcal_lib.simulate.shapes import polygon, rod
 from lrfcal_lib.simulate.textures import chessboard, plain
@@ -34,6 +38,7 @@ FLOOR = -1.1  # metres, below the platform
 SKY = (0.95, 0.98, 1.0)  # light from where there is nothing
 FLAT = 0.03  # difference of light over a block of pixels below which its four corners tell the rest
 BLOCK = 2  # pixels
+RING = 0.65  # width of the outermost squares of a board's pattern as a share of a square
 BATCH = 1 << 19  # rays that are cast at once
 ROOM = json.loads(Path(__file__).with_name("room.json").read_text())
 
@@ -107,13 +112,13 @@ class World:
         corners = np.concatenate(meshes)
         first, second, third = np.moveaxis(corners, 1, 0)
         normals = np.cross(second - first, third - first)
-        # the poles of a lathe make empty triangles, which no ray meets
-        areas = np.linalg.norm(normals, axis=1, keepdims=True)
-        self.normals = normals / np.maximum(areas, 1e-12)
-        self.offsets = np.vecdot(self.normals, first)
+        # the poles of a lathe make empty triangles
+        whole = length_of(normals) > 1e-12
+        self.normals = unit_vector(normals[whole])
+        self.offsets = np.vecdot(self.normals, first[whole])
         sizes = [len(mesh) for mesh in meshes]
-        self.thing_of = np.repeat(np.arange(len(sizes)), sizes)
-        vertices = corners.reshape(-1, 3).astype(np.float32)
+        self.thing_of = np.repeat(np.arange(len(sizes)), sizes)[whole]
+        vertices = corners[whole].reshape(-1, 3).astype(np.float32)
         faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(vertices, faces)
@@ -123,9 +128,9 @@ class World:
         back = T_world_platform.inv()
         things = [replace(thing, pose=back * thing.pose) for thing in self.things]
         lights = self.lights
-        if lights is not None:
-            lights = replace(lights, positions=back.apply(lights.positions))
-        return World(things, lights)
+        return World(
+            things, lights and replace(lights, positions=back.apply(lights.positions))
+        )
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """Follow rays to the first surface.
@@ -199,7 +204,7 @@ class World:
         lamps = zip(self.lights.positions, self.lights.strengths, strict=True)
         for position, strength in lamps:
             way = position - hits.points
-            share = np.vecdot(hits.normal, way) / np.linalg.norm(way, axis=-1) ** 3
+            share = np.vecdot(hits.normal, way) / length_of(way) ** 3
             # 2 mm off, so that no surface shades itself
             rays = _rays(hits.points + 2e-3 * hits.normal, 0.999 * way)
             dark = self._scene.test_occlusions(rays, 0.0, 1.0).numpy()
@@ -232,7 +237,7 @@ def furnished_room(*more: Thing) -> World:
     return World([*furnished(*ROOM["parts"]), *more], Lights(**ROOM["lights"]))
 
 
-def board_on_stand(board, T_platform_board, ring):
+def board_on_stand(board, T_platform_board):
     """The board, a sheet of no thickness whose edges are its outline, and a tripod behind it."""
     centre = np.mean(board.corners, axis=0)
     middle, behind = T_platform_board.apply([[*centre, -0.004], [*centre, -0.07]])
@@ -244,7 +249,7 @@ def board_on_stand(board, T_platform_board, ring):
     feet = polar_to_points(0.38, np.radians([80, 200, 320])) + [*head[:2], FLOOR]
     rods += [(knee, foot, 0.010) for foot in feet]
     sheet = Thing(
-        polygon(board.corners), (chessboard, board, 0.07, 0.75, ring), T_platform_board
+        polygon(board.corners), (chessboard, board, 0.07, 0.75, RING), T_platform_board
     )
     return [sheet, *(Thing(rod(*each), (plain, (0.4, 0.41, 0.43))) for each in rods)]
 

@@ -10,7 +10,9 @@ from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import pinhole
 from lrfcal_lib.model.geometry import (
     apply_pose,
+    bearings_of,
     carry,
+    length_of,
     polar_to_points,
     pose_array,
     unit_lines,
@@ -250,7 +252,7 @@ def _crossed_edges(setup, pose, ends):
     share = -ends[..., 2] / along[..., 2]
     crossed = (share > 0) & (share < 1)
     at = ends + share[..., None] * along
-    bearing = np.where(crossed, np.arctan2(at[..., 1], at[..., 0]), np.nan)
+    bearing = np.where(crossed, bearings_of(at), np.nan)
     edges = np.argsort(bearing, axis=1)[:, :2]  # NaN comes last
     at = np.take_along_axis(at, edges[..., None], axis=1)
     radii, away = setup.beside(pose, unit_vector(at))
@@ -270,7 +272,7 @@ def _scans(setup, rng, pose, ends):
     soft = np.hypot(setup.softness, setup.least_softness(ranges))[:, None]
     flips = rng.standard_normal((len(pose), setup.scans, ranges.shape[1]))
     # rays along the board meet its plane far away, where the least softness means nothing
-    farthest = np.linalg.norm(ends, axis=-1).max(axis=-1, keepdims=True)
+    farthest = length_of(ends).max(axis=-1, keepdims=True)
     sensible = (ranges > 0) & (ranges < FARTHER * farthest)
     hit = (outside < setup.bias + soft * flips) & sensible[:, None]
     enough = hit.sum(axis=-1) >= setup.fewest_beams

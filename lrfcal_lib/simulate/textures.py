@@ -42,7 +42,7 @@ def plain(
     ndarray, shape (n, 3) or (3,)
     """
     if not rough:
-        return color
+        return np.asarray(color)
     tone = 1 + rough * (value_noise(points, cell) - 0.5)
     return tone[:, None] * color
 
