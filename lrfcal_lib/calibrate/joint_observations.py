@@ -5,7 +5,11 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.observe import FACE_POINTS, stack
 from lrfcal_lib.model.camera import LENS, CameraModel, project_jacobians
-from lrfcal_lib.model.geometry import bearings_of, gradient_by_pose
+from lrfcal_lib.model.geometry import (
+    bearings_of,
+    gradient_by_pose,
+    length_of,
+)
 from lrfcal_lib.model.observations import JointObservations, thin
 from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.board_in_scan import face_points
@@ -60,7 +64,7 @@ def _ranges(scans):
     for row, scan in enumerate(scans.values()):
         p_lrf, pitch, _ = face_points(scan, FACE_POINTS)
         yield {
-            "range": np.linalg.norm(p_lrf, axis=1),
+            "range": length_of(p_lrf),
             "bearing": bearings_of(p_lrf),
             "pitch": pitch,
             "sigma": scan.sigma_range,

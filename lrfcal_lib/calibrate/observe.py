@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.calibrate.outline import MeasuredBoard, measure_board
 from lrfcal_lib.fit.covariance import dyads
 from lrfcal_lib.model.board import corners_of_lines
+from lrfcal_lib.model.geometry import length_of
 from lrfcal_lib.model.kinematics import AS_RECORDED, TILT_AXIS, Corrections, SourceFrame
 from lrfcal_lib.model.observations import CameraObservations, PlatformObservations, thin
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, face_points
@@ -402,7 +403,7 @@ def _crossings(prepared, view, source, sides, count):
             "points": source.points(p_lrf, pitch),
             "pitch": pitch,
             "covariance": source.covariance(crossed.covariance, pitch) + pitch_error,
-            "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
+            "radius": prepared.session.lrf.spot_radius(length_of(p_lrf)),
             "background": crossed.background,
             "lines": np.broadcast_to(edge.line, p_lrf.shape),
             "line_sigma": np.sqrt(edge.covariance[0, 0]),

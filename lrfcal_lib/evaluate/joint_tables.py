@@ -18,6 +18,7 @@ from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import (
     POSE_UNITS,
     DegenerateGeometry,
+    length_of,
     move_pose,
     transform_difference,
 )
@@ -140,7 +141,7 @@ def edge_bias_mm(joint: JointCalibration) -> pd.DataFrame:
     """
     solution = joint.solution
     obs = joint.observations
-    distance = np.linalg.norm(solution.board_poses[:, :, 3], axis=1)
+    distance = length_of(solution.board_poses[:, :, 3])
     odds = obs.beam_background + solution.side_odds[obs.beam_placement, obs.beam_edge]
     radii = disc_edge(solution.sensor["edge_log_odds"] + odds)[0]
     columns = {

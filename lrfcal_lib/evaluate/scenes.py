@@ -9,7 +9,11 @@ from lrfcal_lib.calibrate.clouds import views_of
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.calibrate.reconstruct import reconstruct
 from lrfcal_lib.evaluate.truth import read_truth
-from lrfcal_lib.model.geometry import tilt, unit_vector
+from lrfcal_lib.model.geometry import (
+    length_of,
+    tilt,
+    unit_vector,
+)
 from lrfcal_lib.model.kinematics import AS_RECORDED
 
 # metres along the beam by which a reading is of another surface than the beam's centre meets
@@ -75,7 +79,7 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
     pitch = np.interp(cloud.pitch, recorded[order], truth.pitch[placement][order])
     points = gauge.apply(cloud.points)
     origins = tilt(truth.T_head_lrf.translation, pitch)
-    length = np.linalg.norm(points - origins, axis=1)
+    length = length_of(points - origins)
     directions = unit_vector(points - origins)
     hits = world.cast(origins, directions)
     depth = np.where(np.isfinite(hits.distance), length - hits.distance, np.nan)
@@ -88,7 +92,7 @@ def scene_errors(cloud: Cloud, calibration: Calibration, method: str) -> SceneEr
         eye = gauge.apply(view.T_camera_platform.inv().translation)
         way = true[painted] - eye
         met = world.cast(eye, unit_vector(way))
-        blocked[painted] = met.distance < np.linalg.norm(way, axis=1) - CLEAR
+        blocked[painted] = met.distance < length_of(way) - CLEAR
     light = 255 * world.radiance(hits)
     ratio = cloud.colors[cloud.seen] / np.maximum(light[cloud.seen], 1e-9)
     exposed = np.clip(light * np.median(ratio), 0, 255)

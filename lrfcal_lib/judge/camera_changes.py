@@ -11,7 +11,14 @@ from scipy.special import chdtrc, fdtrc
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse, sigma_of
 from lrfcal_lib.judge.next_placement import board_middle, outline
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import POSE, DegenerateGeometry, apply_pose, carry, pose_step
+from lrfcal_lib.model.geometry import (
+    POSE,
+    DegenerateGeometry,
+    apply_pose,
+    carry,
+    length_of,
+    pose_step,
+)
 from lrfcal_lib.preprocess.bundle import adjust_robust
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.solvers.joint import solve_joint
@@ -203,7 +210,7 @@ def largest_motion(solution, step, model):
     turn = Rotation.from_rotvec(step.change[:3])
     moved = carry(turn, origin, origin + step.change[3:]).apply(corners)
     motion = project(moved, model) - project(corners, model)
-    return np.max(np.linalg.norm(motion, axis=-1))
+    return np.max(length_of(motion))
 
 
 def with_two_poses(obs, step, name):
@@ -246,7 +253,7 @@ def change_between(solution, first, later, camera, prepared):
         turn=change.rotation.magnitude(),
         shift=np.linalg.norm(step[3:]),
         p_value=chdtrc(POSE, square),
-        motion_px=np.median(np.linalg.norm(motion, axis=1)),
+        motion_px=np.median(length_of(motion)),
         zoom=zoom,
         zoom_sigma=zoom_sigma,
         corner_px=abs(zoom) * np.linalg.norm(model.size) / 2,

@@ -18,6 +18,7 @@ from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     apply_pose,
     carry,
+    length_of,
     pose_array,
     pose_transform,
 )
@@ -144,7 +145,7 @@ def total_sigma(information, solution):
     unit = dyads(scales_of(solution))
     scaled = np.linalg.inv(information * unit + np.eye(len(unit)))
     asked = solution.columns(*AXIS_NAMES, *solution.transforms)
-    return np.linalg.norm(sigma_of(scaled)[..., asked], axis=-1)
+    return length_of(sigma_of(scaled)[..., asked])
 
 
 def scales_of(solution: JointSolution) -> np.ndarray:
@@ -170,11 +171,7 @@ def group_sigma(covariance: np.ndarray, solution: JointSolution) -> dict[str, np
     columns = {"the axis": solution.columns(*AXIS_NAMES)}
     for camera in solution.transforms:
         columns[f"camera '{camera}'"] = solution.columns(camera)
-    return {
-        name: np.linalg.norm(sigma[..., index], axis=-1)
-        for name, index in columns.items()
-        if index
-    }
+    return {name: length_of(sigma[..., index]) for name, index in columns.items() if index}
 
 
 def outline(solution: JointSolution) -> np.ndarray:
@@ -284,7 +281,7 @@ def scan_sigma(solution, boards):
 def solid_angle(solution, boards):
     """How large boards (n, 3, 4) look from the LRF, relative to their area, (n,)."""
     sight = sights(boards, solution)
-    return np.abs(np.vecdot(sight, boards[:, :, 2])) / np.linalg.norm(sight, axis=1) ** 3
+    return np.abs(np.vecdot(sight, boards[:, :, 2])) / length_of(sight) ** 3
 
 
 def image_sigma(solution, camera, model):

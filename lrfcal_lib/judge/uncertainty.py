@@ -17,6 +17,7 @@ from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
     gradient_by_pose,
+    length_of,
     polar_to_points,
     tilt,
     unit_vector,
@@ -149,7 +150,7 @@ def projection_sigma(
     sigma_pitch = chain.sweep.sigma(pitch, sum(pitches) / 2)
     if chain.on_head:  # the offset is that of the image, too
         sigma_pitch = chain.sweep.stretch * (pitch - image_pitch)
-    by_sweep = sigma_pitch * np.linalg.norm(np.matvec(P, by_pitch), axis=-1)
+    by_sweep = sigma_pitch * length_of(np.matvec(P, by_pitch))
     sigma = np.hypot(spread(chain, P @ by_link), by_sweep)
     low, high = pitches
     return np.where((pitch >= low) & (pitch <= high), sigma, np.nan)
@@ -192,7 +193,7 @@ def point_sigma(
     """
     pitch = pitches[:, None]
     _, by_link, by_pitch = carried(chain, bearings, pitch, distance, reference)
-    by_sweep = chain.sweep.sigma(pitch, reference) * np.linalg.norm(by_pitch, axis=-1)
+    by_sweep = chain.sweep.sigma(pitch, reference) * length_of(by_pitch)
     return np.hypot(spread(chain, by_link), by_sweep)
 
 
@@ -297,8 +298,8 @@ def spread(chain: Chain, jacobian: np.ndarray) -> np.ndarray:
     variance = np.einsum("...ik,nkl,...il->n...", jacobian, chain.covariances, jacobian)
     moved = chain.unseen @ jacobian.mT
     size = np.linalg.norm(jacobian, axis=(-2, -1))[..., None]
-    least = SEEN * size * np.linalg.norm(chain.unseen, axis=-1)
-    matters = np.linalg.norm(moved, axis=-1) > least
+    least = SEEN * size * length_of(chain.unseen)
+    matters = length_of(moved) > least
     sigma = np.sqrt(variance.max(axis=0, initial=0.0))
     return np.where(np.any(matters, axis=-1), np.inf, sigma)
 

@@ -11,6 +11,7 @@ from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.findings import Kind
 from lrfcal_lib.judge.next_placement import group_sigma, sights
 from lrfcal_lib.judge.placements import NO_IMAGE, placements_table
+from lrfcal_lib.model.geometry import length_of
 from lrfcal_lib.model.problem import LEAVES_OUT
 from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault
@@ -79,7 +80,7 @@ def weak_placements(solution) -> Iterator[Fault]:
             f"only {count} placements, {FEW} or more are needed to see errors of the model",
             severe=count < FEWEST,
         )
-    distance = np.linalg.norm(sights(solution.board_poses, solution), axis=1)
+    distance = length_of(sights(solution.board_poses, solution))
     if count > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance):
         yield Fault(
             Kind.DISTANCE,

@@ -25,7 +25,11 @@ from lrfcal_lib.judge.uncertainty import (
     uncertainty_of,
 )
 from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.model.geometry import POSE_NAMES, pose_step
+from lrfcal_lib.model.geometry import (
+    POSE_NAMES,
+    length_of,
+    pose_step,
+)
 from lrfcal_lib.session.read import open_session
 
 DISTANCE = 2.0  # metres, at which differences are looked at, as the verdict does
@@ -110,7 +114,7 @@ class Shifts:
         """Root mean squares as an Amount, times `scale`."""
         return Amount(
             what=f"at {DISTANCE:g} m",
-            value=scale * rms(np.linalg.norm(self.off, axis=-1)),
+            value=scale * rms(length_of(self.off)),
             claimed=scale * root_mean_square(self.claimed),
             unit=unit,
         )

@@ -15,7 +15,10 @@ from lrfcal_lib.measure.features import SYSTEMATIC, Feature
 from lrfcal_lib.measure.pulls import Pull, seen
 from lrfcal_lib.measure.surfaces import BENT, LIMIT
 from lrfcal_lib.model.camera import pinhole, project
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import (
+    length_of,
+    unit_vector,
+)
 from lrfcal_lib.preprocess.edges_in_image import (
     ACROSS_STEP_PX,
     FULL_CONTRAST,
@@ -102,7 +105,7 @@ def _beside(points, plane, way):
     and how far these are off it, metres, if that is not chance: there is a skirting board, a frame.
     """
     place = points @ way
-    near = np.linalg.norm(points - place[:, None] * way, axis=1) < BESIDE
+    near = length_of(points - place[:, None] * way) < BESIDE
     height = points[near] @ plane.axis
     lift = 0.0
     if abs(height.sum()) > BENT * len(height) + LIMIT * np.linalg.norm(height):
@@ -212,7 +215,7 @@ def sights(creases: Creases, view: View, rig: CalibratedRig) -> Sights:
         by_unknown=moved[:, :-3],
         across=across / reach,
         clear=contrast / (contrast + FULL_CONTRAST),
-        sigma=np.hypot(np.linalg.norm(moved[:, -3:], axis=1), EDGE),
+        sigma=np.hypot(length_of(moved[:, -3:]), EDGE),
     )
 
 

@@ -18,7 +18,11 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.measure.features import Feature, Kind, beams_moved
 from lrfcal_lib.model.camera import pinhole
-from lrfcal_lib.model.geometry import pose_array, unit_vector
+from lrfcal_lib.model.geometry import (
+    length_of,
+    pose_array,
+    unit_vector,
+)
 from lrfcal_lib.model.kinematics import beams_to
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, refine_edge
 from lrfcal_lib.session.workers import spread
@@ -70,7 +74,7 @@ def _edges_in(cloud, surfaces, views, view):
     about_image = view.model.shows(uv, -view.model.width / 2)
     near = about_image & np.isin(cloud.image, of_camera)
     points = np.column_stack([uv, p_camera[:, 2], of_point, cloud.image])[near]
-    reach = np.linalg.norm(np.ptp(segments, axis=1), axis=1) / 2 + BESIDE_PX[1]
+    reach = length_of(np.ptp(segments, axis=1)) / 2 + BESIDE_PX[1]
     about = KDTree(points[:, :2]).query_ball_point(segments.mean(axis=1), reach)
     bounds = []
     for ends, rows in zip(segments, about, strict=True):
@@ -89,7 +93,7 @@ def _segments(view):
     if lines is None:
         lines = []
     ends = np.reshape(lines, (-1, 2, 2)).astype(float)
-    return ends[np.linalg.norm(np.ptp(ends, axis=1), axis=1) >= SHORTEST_PX]
+    return ends[length_of(np.ptp(ends, axis=1)) >= SHORTEST_PX]
 
 
 def _refined(view, ends, segments):

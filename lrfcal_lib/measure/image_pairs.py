@@ -23,7 +23,10 @@ from lrfcal_lib.measure.pulls import (
 )
 from lrfcal_lib.measure.surfaces import BENT
 from lrfcal_lib.model.camera import pinhole, project
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import (
+    length_of,
+    unit_vector,
+)
 from lrfcal_lib.preprocess.edges_in_image import sample
 
 EVERY = 9  # points of a surface between patches
@@ -127,7 +130,7 @@ def clear_places(cloud, view, rig):
     cells = tuple((uv[clear] / APART).astype(int).T)
     nearness = 1 / p_camera[:, 2]
     normals = view.T_camera_platform.rotation.apply(cloud.normals[clear])
-    slope = np.linalg.norm(normals[:, :2], axis=1) / np.abs(np.vecdot(normals, p_camera))
+    slope = length_of(normals[:, :2]) / np.abs(np.vecdot(normals, p_camera))
     noise = BEFORE * rig.lrf.sigma_range * nearness**2
     off = REACH * slope / model.fx + noise
     alone = np.ones(len(nearness), bool)
@@ -165,7 +168,7 @@ def _pair(patches, surfaces, views, rig, stops):
 def _samples(patches, view):
     """Points (n, s, 3) of patches, `SPACING` pixels of an image apart; platform frame."""
     right = np.cross(patches.normals, [0.0, 0.0, 1.0])
-    right[np.linalg.norm(right, axis=1) < 0.1] = [1.0, 0.0, 0.0]
+    right[length_of(right) < 0.1] = [1.0, 0.0, 0.0]
     right = unit_vector(right)
     down = np.cross(patches.normals, right)
     depth = view.T_camera_platform.apply(patches.points)[:, 2]

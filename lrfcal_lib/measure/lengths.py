@@ -28,7 +28,11 @@ from lrfcal_lib.measure.features import (
     shared_covariances,
 )
 from lrfcal_lib.measure.surfaces import planes_of
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    length_of,
+    pose_array,
+)
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 
@@ -74,7 +78,7 @@ class SceneFeatures:
         """
         if kind == Kind.EDGE:
             return nearest_edge([e for e in self.edges if e.lies_along(axis)], place)
-        away = np.linalg.norm(self.cloud.points - place, axis=1)
+        away = length_of(self.cloud.points - place)
         if kind == Kind.PLANE:
             fits = np.array([*(plane.lies_along(axis) for plane in self.planes), False])
             away[~fits[self.of_point]] = np.inf
@@ -103,7 +107,7 @@ def nearest_edge(
     way = last - first
     along = np.vecdot(place - first, way) / np.vecdot(way, way)
     foot = first + np.clip(along, 0, 1)[:, None] * way
-    away = np.linalg.norm(foot - place, axis=1)
+    away = length_of(foot - place)
     nearest = int(np.argmin(away))
     return edges[nearest], away[nearest]
 

@@ -26,6 +26,7 @@ from lrfcal_lib.judge.uncertainty import COLUMNS
 from lrfcal_lib.measure.features import moved_along
 from lrfcal_lib.model.geometry import (
     gradient_by_pose,
+    length_of,
     move_pose,
     pose_array,
     pose_step,
@@ -149,7 +150,7 @@ def surface_of(cloud: Cloud, size: float, rig: CalibratedRig | None = None) -> S
     ]
     sums = sums_by(np.floor(whole.points / size) @ IN_ONE, np.column_stack(columns))
     means = sums / sums[:, -1:]
-    flat = np.linalg.norm(means[:, 3:6], axis=1) > FLAT
+    flat = length_of(means[:, 3:6]) > FLAT
     if not flat.any():
         raise ValueError("no part of the cloud is a smooth surface")
     points, normals, moves, _ = np.split(means[flat], [3, 6, -2], axis=1)

@@ -11,6 +11,7 @@ from lrfcal_lib.fit.least_squares import eliminate
 from lrfcal_lib.fit.robust import sums_by
 from lrfcal_lib.judge.uncertainty import carried, chain_of
 from lrfcal_lib.model.camera import pinhole_jacobian
+from lrfcal_lib.model.geometry import length_of
 from lrfcal_lib.model.kinematics import beams_to
 
 # a camera's likely changes, radians and metres of its pose
@@ -107,7 +108,7 @@ def pull_of_groups(
         Which of them were fitted: by their slopes groups scatter.
     """
     sums = sums_by(group, by_row[:, fitted])
-    load = sums_by(group, np.linalg.norm(by_row, axis=1))
+    load = sums_by(group, length_of(by_row))
     groups = load.sum() ** 2 / max(load @ load, 1e-300)
     own = np.linalg.pinv(information[np.ix_(fitted, fitted)], rcond=1e-9, hermitian=True)
     excess = np.trace(own @ sums.T @ sums) / len(fitted)

@@ -30,7 +30,11 @@ from lrfcal_lib.measure.pairs import (
     surface_of,
 )
 from lrfcal_lib.measure.pose_graph import connected, solved
-from lrfcal_lib.model.geometry import gradient_by_pose, transform_difference
+from lrfcal_lib.model.geometry import (
+    gradient_by_pose,
+    length_of,
+    transform_difference,
+)
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 
 # Of pairs that were drawn (tests/rooms.py, other seeds than any test): right ones have an overlap
@@ -72,7 +76,7 @@ class Joined:
         That is the error which loops through it leave there; 0 without loops.
         """
         miss = pair.miss(self.T_world_station).reshape(2, 3)
-        return np.linalg.norm(miss, axis=1)
+        return length_of(miss)
 
 
 def alone(station: int) -> Joined:

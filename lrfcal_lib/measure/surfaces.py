@@ -11,7 +11,11 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.robust import TUKEY, robust_sigma
 from lrfcal_lib.measure.features import FACING, Feature, fit_feature
-from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    fit_plane,
+    length_of,
+)
 
 SEED = 0.15  # metres about a point, where a plane begins
 CELL = 0.1  # metres, side of the cells by which it grows
@@ -50,7 +54,7 @@ def planes_of(cloud: Cloud, rig: CalibratedRig) -> tuple[list[Feature], np.ndarr
             continue
         place = cloud.points[seed]
         rows = np.flatnonzero(left.normals @ cloud.normals[seed] > FACING)
-        rows = rows[np.linalg.norm(left.points[rows] - place, axis=1) <= SEED]
+        rows = rows[length_of(left.points[rows] - place) <= SEED]
         surface = free[_grown(left.points, left.normals, rows, place)]
         if len(surface) >= FEWEST:
             of_point[surface] = len(planes)

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from lrfcal_lib.model.geometry import (
     cross,
+    length_of,
     unit_lines,
 )
 
@@ -152,7 +153,7 @@ def side_lengths(corners: np.ndarray) -> np.ndarray:
     ndarray, shape (..., n)
         From corner i to i + 1.
     """
-    return np.linalg.norm(np.roll(corners, -1, axis=-2) - corners, axis=-1)
+    return length_of(np.roll(corners, -1, axis=-2) - corners)
 
 
 def side_ends(corners: np.ndarray, inset: float = 0.0) -> np.ndarray:

@@ -3,7 +3,12 @@
 import numpy as np
 from scipy import ndimage
 
-from lrfcal_lib.model.geometry import cross, lrf_to_platform, polar_to_points
+from lrfcal_lib.model.geometry import (
+    cross,
+    length_of,
+    lrf_to_platform,
+    polar_to_points,
+)
 from lrfcal_lib.preprocess.board_in_scan import BoardScan, median_step
 from lrfcal_lib.preprocess.edges_in_scan import (
     MIXING,
@@ -142,7 +147,7 @@ def _on_one_side(scan, cells, board, reach, side):
     for s in scan.sides:
         away = points - s.ends[0]
         along = away @ s.direction
-        apart = np.linalg.norm(cross(away, s.direction), axis=1)
+        apart = length_of(cross(away, s.direction))
         mine = side == s.number
         keep |= mine & (along > 0) & (along < s.length)
         alone &= mine | ~(apart < reach)

@@ -8,6 +8,7 @@ from scipy.ndimage import map_coordinates
 
 from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.model.camera import CameraModel, line_through, pinhole, redistort
+from lrfcal_lib.model.geometry import length_of
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -203,7 +204,7 @@ def step_contrast(strip, sigma, along=AVERAGED_PROFILES):
     mean = np.full(along, 1 / along)
     filled = np.nan_to_num(strip)
     steps = cv2.sepFilter2D(filled, cv2.CV_32F, mean, slope, borderType=cv2.BORDER_REFLECT)
-    height = np.linalg.norm(steps.reshape(strip.shape), axis=-1)
+    height = length_of(steps.reshape(strip.shape))
     gone = np.isnan(strip[..., 0]).astype(np.uint8)
     reach = int(np.ceil(2 * sigma))
     height[cv2.dilate(gone, np.ones((2 * reach + 1, along), np.uint8)) > 0] = 0

@@ -9,6 +9,7 @@ from lrfcal_lib.fit.padding import medians
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     fit_line,
+    length_of,
     lrf_to_platform,
     plane_axes,
     polar_to_points,
@@ -168,7 +169,7 @@ def with_edges(scan: BoardScan) -> BoardScan:
     sigma = np.maximum(np.abs(outer - inner).sum(axis=0), least) * UNIFORM
     spread = by_angle * sigma[:, None]
     # neighbouring beams are so far apart where scan lines end
-    apart = beam * medians(np.linalg.norm(by_angle[0], axis=1), ~across)
+    apart = beam * medians(length_of(by_angle[0]), ~across)
     tolerance = max(apart, EDGE_SCATTER)
     side, more, sides = _group(
         scan, points[1], pitch[1], spread[1], cell, step, gap < MIXING, tolerance
@@ -377,7 +378,7 @@ def _group(scan, points, pitch, spread, cell, step, mixed, tolerance):
             same = (s.number for s in every if s.across != across and s.is_same(new))
             new = replace(new, number=next(same, len(every)))
             every.append(new)
-            expected = rms(np.linalg.norm(np.cross(spread[rows], new.direction), axis=1))
+            expected = rms(length_of(np.cross(spread[rows], new.direction)))
             if expected > 0:
                 more[rows] = max(1.0, new.rms / expected)
             if new.seen:

@@ -8,7 +8,10 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.camera import CameraModel, pinhole
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import (
+    length_of,
+    unit_vector,
+)
 from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen
 from lrfcal_lib.preprocess.intrinsics import opencv_poses
 from lrfcal_lib.preprocess.pattern_in_image import grey
@@ -111,7 +114,7 @@ def outline_poses(edges, board: Board, model: CameraModel, view) -> list:
                 pose, covariance, chi2 = pose_from_edges(named, board, model, start)
             except np.linalg.LinAlgError:  # sides that bear wrong names
                 continue
-            off = np.linalg.norm(pinhole(pose.apply(flat), model) - corners, axis=1).max()
+            off = length_of(pinhole(pose.apply(flat), model) - corners).max()
             exact = off < EXACT_PX or chi2 < EXACT_CHI2 * len(corners)
             known = any(
                 pose.rotation.approx_equal(other.T_camera_board.rotation, SAME_POSE)

@@ -9,6 +9,7 @@ from scipy.spatial.distance import cdist
 
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.board import Chessboard
+from lrfcal_lib.model.geometry import length_of
 
 # larger images are searched at a reduced size: the detectors' time grows with it
 SEARCH_PIXELS = 1.5e6
@@ -218,7 +219,7 @@ def grid_noise(grid):
     design = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)]
     design = np.stack(design, axis=1)
     noise = left - design @ np.linalg.lstsq(design, left)[0]
-    return rms(np.linalg.norm(noise, axis=1))
+    return rms(length_of(noise))
 
 
 def refine_corners(picture, start):

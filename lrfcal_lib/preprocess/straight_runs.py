@@ -2,7 +2,11 @@
 
 import numpy as np
 
-from lrfcal_lib.model.geometry import fit_line, unit_vector
+from lrfcal_lib.model.geometry import (
+    fit_line,
+    length_of,
+    unit_vector,
+)
 
 FEWEST_POINTS = 5  # of a run
 MOST_RUNS = 4  # on one hand of a board
@@ -69,7 +73,7 @@ def _consensus(points, tolerance, apart, rng):
     """Which points lie near the line that most agree with, after two least-squares refinements."""
     a, b = points[rng.integers(len(points), size=(2, TRIALS))]
     along = b - a
-    far = np.linalg.norm(along, axis=1) > apart
+    far = length_of(along) > apart
     if not far.any():
         return np.zeros(len(points), bool)
     normal = unit_vector(along[far, ::-1] * [-1, 1])

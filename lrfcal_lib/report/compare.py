@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lrfcal_lib.measure.compare import Comparison, compare, rig_at
+from lrfcal_lib.model.geometry import length_of
 from lrfcal_lib.report.notebook import STYLE
 from lrfcal_lib.session.write import whole
 
@@ -103,6 +104,6 @@ def _shift_map(ax: Axes, at: np.ndarray, off: np.ndarray, unit: str, **looks: st
     Shifts `off`, shape (r, c, k), NaN where there is none, stand where `at` (r, c, 2) says; `looks`
     are title and labels.
     """
-    drawn = ax.pcolormesh(*np.moveaxis(at, -1, 0), np.linalg.norm(off, axis=-1), vmin=0)
+    drawn = ax.pcolormesh(*np.moveaxis(at, -1, 0), length_of(off), vmin=0)
     ax.figure.colorbar(drawn, ax=ax, label=f"[{unit}]")
     ax.set(**looks)

@@ -11,6 +11,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.measure.features import SYSTEMATIC
 from lrfcal_lib.measure.lengths import IN_PLACE, ON_IT, PICKED, SceneFeatures
+from lrfcal_lib.model.geometry import length_of
 from lrfcal_lib.session.read import Session
 
 NEAR = 0.03  # metres from a true face to a point of the cloud that shows it
@@ -71,7 +72,7 @@ def true_picks(
         for kind, (places, place) in zip(kinds, shown, strict=True):
             picked = np.concatenate([places[station] for station in both or scenes])
             if len(picked):
-                away = np.linalg.norm(picked - picked.mean(axis=0), axis=1)
+                away = length_of(picked - picked.mean(axis=0))
                 place = picked[np.argmin(away)]
             ends += [kind, *place]
         rows.append(row | dict(zip(PICKED, ends, strict=True)))

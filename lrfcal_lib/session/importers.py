@@ -9,7 +9,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import INTRINSIC_NAMES
-from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.model.geometry import (
+    length_of,
+    lrf_to_platform,
+    polar_to_points,
+)
 from lrfcal_lib.session.files import (
     LARGEST_TEXT,
     SessionError,
@@ -212,7 +216,7 @@ def recover_polar(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     rebuilt = lrf_to_platform(
         polar_to_points(ranges, bearing), pitch[line], LASERSETERO_HEAD
     )
-    miss = float(np.linalg.norm(rebuilt - p_platform, axis=1).max())
+    miss = float(length_of(rebuilt - p_platform).max())
     if not miss <= LARGEST_MISS:
         raise ValueError(
             f"rebuilding the points misses by {1000 * miss:.4f} mm, more than "

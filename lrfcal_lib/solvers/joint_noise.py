@@ -7,6 +7,7 @@ import numpy as np
 from lrfcal_lib.fit.covariance import pseudo_inverse
 from lrfcal_lib.fit.least_squares import likeliest, linearise
 from lrfcal_lib.fit.result import beyond_chance
+from lrfcal_lib.model.geometry import length_of
 from lrfcal_lib.solvers.joint_model import SWEEPS, JointData, JointState, Levels, Unknowns
 from lrfcal_lib.solvers.joint_residuals import (
     SIDE_FREEDOM,
@@ -151,7 +152,7 @@ def with_beam_share(state, data, block, shared, spread):
     """
     before = data.levels.beam_share
     by_own = block.white_jacobian[..., shared:]
-    root = np.linalg.norm(by_own[..., 3:6], axis=-1)  # root information
+    root = length_of(by_own[..., 3:6])  # root information
     lapsed = data.levels.lapse * np.exp(block.cost / before)
     bent = (root * block.residuals) ** 2 * lapsed / (1 - lapsed)
     gain = max(1 - np.sum(bent) / np.sum(root**2), LEAST_CURVATURE)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.fit.padding import medians
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
+    length_of,
     polar_to_points,
     pose_array,
     pose_transform,
@@ -292,7 +293,7 @@ def refuse_contradiction(
     if not len(place):
         return
     boards = boards_in_images(obs, state.head, state.cameras)
-    misses = np.linalg.norm(boards[..., 3] - state.boards[place, :, 3], axis=1)
+    misses = length_of(boards[..., 3] - state.boards[place, :, 3])
     stated = np.sqrt(np.linalg.trace(obs.view_covariance[:, 3:, 3:]))
     before = sum(p.kind == CONTRADICTS and p.camera is None for p in left_out)
     shown = np.unique(place)

@@ -21,6 +21,7 @@ from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     apply_pose,
     gradient_by_pose,
+    length_of,
     move_pose,
     pose_transform,
     rotate_and_move,
@@ -41,7 +42,7 @@ def distance_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     focal length / depth.
     """
     normals = sight_normals(obs.crossing_lines, obs.model)
-    length = np.linalg.norm(obs.crossing_lines @ obs.model.matrix, axis=-1)
+    length = length_of(obs.crossing_lines @ obs.model.matrix)
     plain = sight_block(pose, obs.crossing_points, normals)
     depth = apply_pose(pose, obs.crossing_points)[..., 2]
     noise = moved_noise(pose, normals, obs.crossing_covariance)

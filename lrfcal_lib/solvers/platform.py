@@ -31,6 +31,7 @@ from lrfcal_lib.model.geometry import (
     fit_plane,
     gradient_by_pose,
     head_from_axis,
+    length_of,
     lrf_to_platform,
     move_pose,
     pose_array,
@@ -439,7 +440,7 @@ def _six_terms(first, second):
     errors1, u1, p1 = _projected_line(first)
     errors2, u2, p2 = _projected_line(second)
     normal = cross(u1, u2)
-    gap = np.vecdot(normal, p1 - p2) / np.linalg.norm(normal, axis=-1)
+    gap = np.vecdot(normal, p1 - p2) / length_of(normal)
     return np.column_stack([errors1, errors2, np.vecdot(u1, u2), gap])
 
 
