@@ -118,7 +118,7 @@ def platform_observations(
     for placement, scan in prepared.scans.items():
         if not scan.swept:
             continue
-        feature = _feature_sides(list(sides_of(scan, variant)))
+        feature = _feature_sides(sides_of(scan, variant))
         for number, side in enumerate(feature, 1):
             crossed = thin(side.crossed, PLATFORM_POINTS)
             sides.append(
@@ -296,8 +296,8 @@ class SweepSide:
         return self.straight.length if self.straight else 0.0
 
 
-def sides_of(scan: BoardScan, variant: str = "half_step") -> Iterator[SweepSide]:
-    """The sides of the board in a sweep, in the order of their numbers.
+def sides_of(scan: BoardScan, variant: str = "half_step") -> list[SweepSide]:
+    """The sides of the board in a sweep, those found along the scan lines first.
 
     Parameters
     ----------
@@ -305,21 +305,25 @@ def sides_of(scan: BoardScan, variant: str = "half_step") -> Iterator[SweepSide]
         With its edges.
     variant : {'half_step', 'last_beam'}
 
-    Yields
-    ------
-    SweepSide
+    Returns
+    -------
+    list of SweepSide
     """
     edges = scan.edges[variant]
+    sides = []
     for number in np.unique(edges.side[edges.side >= 0]).tolist():
         straight = scan.side_of.get(number)
         across = straight is not None and straight.across
-        yield SweepSide(
-            number=number,
-            name=scan.names.get(number, ""),
-            crossed=edges[(edges.side == number) & (edges.across == across)],
-            across=across,
-            straight=straight,
+        sides.append(
+            SweepSide(
+                number=number,
+                name=scan.names.get(number, ""),
+                crossed=edges[(edges.side == number) & (edges.across == across)],
+                across=across,
+                straight=straight,
+            )
         )
+    return sorted(sides, key=lambda side: side.across)
 
 
 def named_sides(

@@ -1,4 +1,4 @@
-"""Rows of placements as padded rectangles. No equations."""
+"""Rows of placements as padded rectangles, and rows of one thing as rows of all. No equations."""
 
 import numpy as np
 
@@ -54,3 +54,22 @@ def pad(
         out[key] = np.zeros(used.shape + value.shape[1:], value.dtype)
         out[key][used] = value[order]
     return out
+
+
+def among(by_one: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:
+    """Jacobian rows by the unknowns of one thing, such as a camera, as rows by those of all.
+
+    Parameters
+    ----------
+    by_one : ndarray, shape (..., k)
+    index : ndarray of int, broadcastable to (...)
+        Which thing that is.
+    count : int
+
+    Returns
+    -------
+    ndarray, shape (..., count k)
+    """
+    mine = index[..., None] == np.arange(count)
+    among_all = by_one[..., None, :] * mine[..., None]
+    return among_all.reshape(*by_one.shape[:-1], -1)

@@ -590,22 +590,3 @@ def gradient_by_pose(rotated: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     ndarray, shape (..., n, 6)
     """
     return np.concatenate([cross(rotated, gradient), gradient], axis=-1)
-
-
-def among(by_one: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:
-    """Jacobian rows by the unknowns of one thing, such as a camera, as rows by those of all.
-
-    Parameters
-    ----------
-    by_one : ndarray, shape (..., k)
-    index : ndarray of int, broadcastable to (...)
-        Which thing that is.
-    count : int
-
-    Returns
-    -------
-    ndarray, shape (..., count k)
-    """
-    mine = index[..., None] == np.arange(count)
-    among_all = by_one[..., None, :] * mine[..., None]
-    return among_all.reshape(*by_one.shape[:-1], -1)

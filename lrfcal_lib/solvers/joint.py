@@ -12,10 +12,10 @@ from scipy.linalg import block_diag
 
 from lrfcal_lib.fit.covariance import dyads, pseudo_inverse
 from lrfcal_lib.fit.least_squares import solve
+from lrfcal_lib.fit.padding import among
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
-    among,
     axis_of,
     head_from_axis,
     pose_array,

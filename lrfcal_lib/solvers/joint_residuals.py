@@ -14,8 +14,8 @@ import numpy as np
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS, PRIOR_FREEDOM, prior_terms
 from lrfcal_lib.fit.edge_likelihood import beam_terms, edge_shift, flip_sigma
 from lrfcal_lib.fit.least_squares import Block, Minimum, minimise
+from lrfcal_lib.fit.padding import among
 from lrfcal_lib.model.geometry import (
-    among,
     cross,
     gradient_by_pose,
     hat,

@@ -11,13 +11,13 @@ from scipy.special import fdtrc
 
 from lrfcal_lib.fit.covariance import sigma_of
 from lrfcal_lib.fit.least_squares import Block, solve
+from lrfcal_lib.fit.padding import among
 from lrfcal_lib.fit.residuals import sight_normals
 from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.model.geometry import (
     POSE,
     POSE_NAMES,
     DegenerateGeometry,
-    among,
     cross,
     fit_plane,
     gradient_by_pose,
