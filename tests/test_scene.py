@@ -1,5 +1,7 @@
 """A recorded scene becomes a coloured cloud in four files that say the same."""
 
+import gc
+import sys
 from dataclasses import replace
 
 import cv2
@@ -178,11 +180,17 @@ def test_points_without_a_color_are_as_grey_as_their_echoes(session, rig, cloud)
     assert np.corrcoef(grey[:, 0], shaded.intensity[~shaded.seen])[0, 1] > 0.99
 
 
-def test_a_file_that_breaks_off_is_not_there(session, rig, tmp_path, little_space):
+def test_a_file_that_breaks_off_is_not_there(
+    session, rig, tmp_path, little_space, monkeypatch
+):
+    complaints = []
+    monkeypatch.setattr(sys, "unraisablehook", complaints.append)
     number = session.scene_placements[0]
     with little_space(100_000), pytest.raises(ValueError, match="cannot be written"):
         write_scene(tmp_path, session, rig, alone(number), ABOUT)
     assert list(tmp_path.iterdir()) == []
+    gc.collect()
+    assert not complaints
 
 
 def test_the_scan_that_closes_a_sweep_makes_no_points(quick, session, rig, cloud):

@@ -59,6 +59,7 @@ class E57Writer(AbstractContextManager):
             self._image_file.close()
         except libe57.E57Exception as failed:
             error = error or failed
+        del self._file.image_file  # it would be closed once more, and complain at that
         if isinstance(error, libe57.E57Exception):
             raise OSError(errno.EIO, f"E57: {error}") from error
 
