@@ -194,7 +194,10 @@ def decode_scans(
         words[same, :size] = cut(data, begin[same], 2 * size).view("<u2")
     top = np.array([*TOP.values()], np.uint16)[modes[rows], None]
     counts = words & top
-    reasons = REASON_BELOW_TOP.take(top - counts, mode="clip")
+    below = (top - counts).ravel()
+    special = np.flatnonzero(below < len(REASON_BELOW_TOP))  # few
+    reasons = np.zeros(counts.shape, np.uint8)
+    reasons.flat[special] = REASON_BELOW_TOP[below[special]]
     unit = heads >> 14
     ranges = counts * np.array([*METRES.values()])[unit, None]
     ranges[reasons > 0] = np.nan
