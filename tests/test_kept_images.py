@@ -1,5 +1,7 @@
 """Parts of images that are kept."""
 
+from types import SimpleNamespace
+
 import numpy as np
 from rendered_boards import CORNERS, PATTERN, SHEET, on_board, pose_of, record, render
 
@@ -17,7 +19,7 @@ def test_an_image_is_decoded_once_and_kept_where_the_board_is():
     part = part_around(picture, on_board(pose, PATTERN.points()[:, :2], project), SHEET)
     reads = []
     shot = survey.Shot(record("left", "a.png", 3), BoardView(), part)
-    image = shot.image(reads.append)
+    image = shot.image(SimpleNamespace(read_image=reads.append))
     assert reads == []
     low = np.floor(on_board(pose, CORNERS, project).min(axis=0)).astype(int) - 40
     high = np.ceil(on_board(pose, CORNERS, project).max(axis=0)).astype(int) + 40
@@ -25,6 +27,5 @@ def test_an_image_is_decoded_once_and_kept_where_the_board_is():
     np.testing.assert_array_equal(image[board], picture[board])
     assert np.any(image != picture)  # the rest is not kept
     other = survey.Shot(record("left", "b.png", 4), BoardView())
-    assert other.image(lambda r: reads.append(r) or picture) is picture and reads == [
-        other.record
-    ]
+    session = SimpleNamespace(read_image=lambda r: reads.append(r) or picture)
+    assert other.image(session) is picture and reads == [other.record]

@@ -70,7 +70,7 @@ ROUND = 1e-9  # a rotation's matrix may be off by so much
 def _pose(whole):
     """A RigidTransform of a matrix (4, 4), to the last bit."""
     R = whole[:3, :3]
-    proper = np.abs(R @ R.T - np.eye(3)).max() < ROUND and np.linalg.det(R) > 0
+    proper = np.allclose(R @ R.T, np.eye(3), 0, ROUND) and np.linalg.det(R) > 0
     if not proper or whole[3].tolist() != [0, 0, 0, 1]:
         raise ValueError("it is no rotation and translation")
     return pose_transform(whole[:3], proper=True)

@@ -284,7 +284,7 @@ def find_pitch_errors(prepared: Prepared) -> PitchErrors | None:
     """
     session = prepared.session
     fixed = [c for c in prepared.views if session.cameras[c].mount == "platform"]
-    if not fixed or not prepared.scans:
+    if not fixed:
         return None
     direction = {p: scan.sweep.direction for p, scan in prepared.scans.items()}
     middle = {p: np.mean(scan.sweep.pitch) for p, scan in prepared.scans.items()}

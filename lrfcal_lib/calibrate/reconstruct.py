@@ -14,7 +14,7 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.mixed import mixed
 from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.fit.covariance import dyads
-from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, unit_vector
 from lrfcal_lib.model.kinematics import MIRROR_TURN, Corrections
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import LrfInfo
@@ -77,15 +77,14 @@ def reconstruct(
     blocks_of = partial(_blocks, sweep, steps, T_head_lrf, corrections, lrf, continuous, {})
     if sweep.ranges.size <= KEPT:
         blocks_of = partial(iter, list(blocks_of()))
-    points = []
-    normals = []
+    samples = []
     every = max(1, sweep.ranges.size // GAIN_POINTS)
     for block in blocks_of():
         painter.hide(block.hiding.reshape(-1, 3))
+        sound = np.stack([block.points, block.normals])[:, block.good]
         # a view would keep the whole block
-        points.append(block.points[block.good][::every].copy())
-        normals.append(block.normals[block.good][::every].copy())
-    painter.compare_exposures(np.concatenate(points), np.concatenate(normals))
+        samples.append(sound[:, ::every].copy())
+    painter.compare_exposures(*np.concatenate(samples, axis=1))
     for block in blocks_of():
         yield _coloured(block, sweep, painter, mask[block.lines], lrf.sigma_range)
 
@@ -153,10 +152,9 @@ def _blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous, sound):
     does not know them yet.
     """
     rate = np.zeros(len(sweep.pitch))
-    after = np.zeros(len(sweep.bearings))
     if continuous and len(sweep.pitch) > 1:
         rate = np.gradient(sweep.pitch, sweep.time_s)
-        after = after_middle(sweep.bearings, lrf)
+    after = after_middle(sweep.bearings, lrf)
     lines, beams = sweep.ranges.shape
     size = max(1, BLOCK // beams)
     for start in range(0, lines, size):
@@ -173,8 +171,7 @@ def _blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous, sound):
         if spot_stated and start not in sound:
             nearer = mixed(ranges, steps, lrf)
             good = sound[start] = good & (nearer == 0)
-            length = np.linalg.norm(p_lrf, axis=-1, keepdims=True)
-            surface = p_lrf * (1 - nearer[..., None] / length)
+            surface = p_lrf - nearer[..., None] * unit_vector(p_lrf)
             hiding = lrf_to_platform(surface, pitch, T_head_lrf)
         origin = lrf_to_platform(np.zeros(3), pitch, T_head_lrf)
         normals, scatter = grid_normals(np.where(good[..., None], points, np.nan), origin)
@@ -227,7 +224,7 @@ def grid_normals(points: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, n
     width = 2 * WINDOW + 1
     # means over all windows, where nothing is counts as zero
     means = partial(uniform_filter, size=width, mode="constant", axes=(0, 1))
-    share = means(valid.astype(float))
+    share = means(valid, output=float)
     whole = np.maximum(share, 0.5 / width**2)[..., None]
     spread = means(dyads(p)) / whole[..., None] - dyads(means(p) / whole)
     variances, directions = np.linalg.eigh(spread)

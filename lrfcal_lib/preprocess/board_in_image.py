@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.fit.covariance import solve_each
 from lrfcal_lib.model.board import Board, corners_of_lines, side_ends
 from lrfcal_lib.model.camera import CameraModel, line_distance, undistort
-from lrfcal_lib.model.geometry import pose_array
+from lrfcal_lib.model.geometry import length_of, pose_array
 from lrfcal_lib.preprocess.edges_in_image import (
     FULL_CONTRAST,
     EdgeNotSeen,
@@ -157,7 +157,7 @@ def order_scores(
     height = step_contrast(sample(image, model, uv), COARSE_SMOOTH, along=1)
     expected = np.exp(-0.5 * (offset / PREDICTION_SIGMA) ** 2)
     weight = height / (height + FULL_CONTRAST) * expected[:, None]
-    of_profiles = weight.max(axis=0).reshape(len(poses), len(lines), COARSE_PROFILES)
+    of_profiles = weight.max(axis=0).reshape(len(poses), -1, COARSE_PROFILES)
     return np.median(of_profiles, axis=2).sum(axis=1)
 
 
@@ -215,7 +215,7 @@ def _view_pattern(view, image, board, model, picked, lines, relief):
         if name in picked:
             edges.append(picked_edge(name, picked[name], inner))
             continue
-        window = np.linalg.norm(beside_px - middle_px)
+        window = length_of(beside_px - middle_px)
         reach = np.clip(window, LEAST_REACH_PX, MOST_REACH_PX)
         prior = max(window / WINDOW * PREDICTION_SIGMA, 1.0)
         outward = middle_px - inner

@@ -95,7 +95,7 @@ class BoardScan:
     distance: float
     sigma_range: float
     n_jump_points: int
-    spot: float = 0.0
+    spot: float
     edges: dict = field(default_factory=dict)
     sides: tuple = ()
     names: dict = field(default_factory=dict)
@@ -141,10 +141,9 @@ def find_board(sweep: Sweep, rig: StatedRig) -> BoardScan:
     rays = polar_to_points(1.0, sweep.bearings)[:, :2]
     fitted = np.where(_span(mask), _line_ranges(lines, rays), np.nan)
     residuals = (sweep.ranges - fitted)[mask]
-    residuals = residuals[np.abs(residuals) <= PLANE_NOISE * 2]
-    if not residuals.size:
+    sigma = rms(residuals[np.abs(residuals) <= PLANE_NOISE * 2])
+    if np.isnan(sigma):
         raise BoardNotFound(f"no scan line has {FEWEST_BEAMS} beams on the board")
-    sigma = rms(residuals)
     spot = 0.0
     if rig.lrf.spot_exit is not None:
         reach = np.nanmedian(fitted)
@@ -339,6 +338,5 @@ def _interior(mask, angles, spot):
     """
     size = np.ptp(row_ends(mask)[1], axis=1)
     clear = CLEAR * spot / max(median_step(angles), 1e-6)
-    least = np.maximum(2, np.minimum(clear, MOST_MARGIN * size))
-    trim = np.maximum(least, MARGIN * size).astype(int)
+    trim = np.clip(clear, np.maximum(2, MARGIN * size), MOST_MARGIN * size).astype(int)
     return _span(mask, np.where(size < SHORTEST_ROW, 0, trim))

@@ -48,15 +48,13 @@ class Bundle:
 
     @property
     def ends(self) -> np.ndarray:
-        """Where the unknowns of each kind end, in the order of the attributes: (4,)."""
+        """Where the unknowns of each kind but the last one end, (3,)."""
         mounts = POSE * (len(self.mounting) - 1)
-        return np.cumsum(
-            [self.lenses.size, mounts, POSE * len(self.poses), len(self.shape)]
-        )
+        return np.cumsum([self.lenses.size, mounts, POSE * len(self.poses)])
 
     def moved(self, step: np.ndarray) -> "Bundle":
         """After a step (n,) of all unknowns; poses move by ``[w, v]``."""
-        lens, mount, pose, shape = np.split(step, self.ends[:-1])
+        lens, mount, pose, shape = np.split(step, self.ends)
         others = move_pose(self.mounting[1:], mount.reshape(-1, POSE))
         return Bundle(
             lenses=self.lenses + lens.reshape(-1, LENS),
@@ -82,7 +80,7 @@ class Bundle:
         pixels : ndarray, shape (c, v, k, 2)
         jacobian : ndarray, shape (c, v, k, 2, n)
         """
-        raised = points + (basis @ self.shape)[:, None] * UP
+        raised = points + np.outer(basis @ self.shape, UP)
         turned, p_first = rotate_and_move(self.poses, raised)
         views = np.eye(len(self.poses))[:, None, None, :, None]
         pixels = []
@@ -204,8 +202,8 @@ def adjust(
         poses=pose_array(poses),
         shape=np.zeros(basis.shape[1]),
     )
-    unknown = np.ones(start.ends[-1], bool)
-    unknown[: start.ends[0]] = np.tile(np.arange(LENS) < lens, len(models))
+    unknown = np.ones(start.ends[-1] + len(start.shape), bool)
+    unknown[: start.lenses.size] = np.tile(np.arange(LENS) < lens, len(models))
     visible = np.isfinite(pixels)
     if visible.sum() < unknown.sum():
         raise ValueError(
@@ -303,7 +301,7 @@ def _covariances(bundle, variance, jacobian):
     seen = np.diag(normal)
     scales = 1 / np.sqrt(np.where(seen > 0, seen, np.inf))
     covariance = variance * covariance_of(normal, scales, lost=())
-    kinds = np.split(np.arange(len(normal)), bundle.ends[:-1])
+    kinds = np.split(np.arange(len(normal)), bundle.ends)
     for unknowns, size in zip(kinds, (LENS, POSE, POSE), strict=False):
         rows = unknowns.reshape(-1, size)
         yield covariance[rows[:, :, None], rows[:, None]]

@@ -104,7 +104,7 @@ def refine_edge(
     EdgeNotSeen
         With the reason.
     """
-    length = np.linalg.norm(end - start)
+    length = length_of(end - start)
     if not LEAST_PROFILES <= length < LONGEST * max(image.shape):
         raise EdgeNotSeen(f"its predicted length is {length:.0f} px")
     along = (end - start) / length
@@ -112,7 +112,7 @@ def refine_edge(
     columns = np.arange(int(length) + 1)
     reach = half_width + MARGIN_PX
     across = np.arange(-reach, reach + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    on_edge = start + columns[None, :, None] * along
+    on_edge = start + np.outer(columns, along)
     strip = sample(image, model, on_edge + across[:, None, None] * normal)
     visible = np.isfinite(strip[np.abs(across) <= NEAR_PX, :, 0]).all(axis=0).sum()
     if visible < max(LEAST_PROFILES, LEAST_SHARE * len(columns)):
@@ -145,7 +145,7 @@ def picked_edge(name: str, ends: np.ndarray, inner: np.ndarray) -> ImageEdge:
     -------
     ImageEdge
     """
-    length = np.linalg.norm(ends[1] - ends[0])
+    length = length_of(ends[1] - ends[0])
     centre = ends.mean(axis=0)
     return ImageEdge(
         name=name,
@@ -256,8 +256,8 @@ def _line_in_strip(strip, visible, across, half_width, prior_px):
     turned, at = np.unravel_index(np.argmax(votes * allowed), votes.shape)
     slope = ACROSS_STEP_PX * slopes[turned]
     offset = across[at] - slope * (count - 1) / 2
-    line = np.array([slope, offset])
-    line, columns, misses = _fit_line(column, across[0] + ACROSS_STEP_PX * place, line)
+    places = across[0] + ACROSS_STEP_PX * place
+    line, columns, misses = _fit_line(column, places, (slope, offset))
     support = len(np.unique(columns)) / visible
     if support < LEAST_SUPPORT:
         raise EdgeNotSeen(
@@ -302,8 +302,7 @@ def _line_covariance(column, residuals):
 def _correlation_factor(column, residuals):
     """Integrated autocorrelation of residuals along the edge, ``1 + 2 sum rho``."""
     place = column - column.min()
-    series = np.zeros(place.max() + 1)
-    present = np.zeros_like(series)
+    series, present = np.zeros((2, place.max() + 1))
     series[place] = residuals
     present[place] = 1.0
     products, pairs = (
@@ -313,8 +312,7 @@ def _correlation_factor(column, residuals):
     rho = mean_product / max(mean_product[0], 1e-300)
     # a line was taken out: the residuals of white noise already sum to about -1, so no further
     # correction is needed
-    rho[0] = 0.0
-    total = 1 + 2 * np.cumsum(rho[: max(len(rho) // 3, 1)])
+    total = 2 * np.cumsum(rho[: len(rho) // 3]) - 1
     wide = np.arange(len(total)) >= SOKAL * total
     wide[-1] = True
     return total[wide.argmax()]

@@ -96,7 +96,7 @@ class ScanSide:
 
     def is_same(self, other: "ScanSide") -> np.bool:
         """Whether two sides are one: the same direction, and less than two centimetres apart."""
-        between = other.ends.mean(axis=0) - self.ends.mean(axis=0)
+        between = np.mean(other.ends - self.ends, axis=0)
         apart = np.linalg.norm(np.cross(between, self.direction))
         cosine = abs(self.direction @ other.direction)
         return cosine > np.cos(LEAST_TURN) and apart < SAME_SIDE
@@ -176,17 +176,8 @@ def with_edges(scan: BoardScan) -> BoardScan:
     )
     covariance = noise + dyads(spread * more[:, None])
     edges = {}
-    for row, variant in enumerate(VARIANTS):
-        columns = [
-            points[row],
-            covariance[row],
-            pitch[row],
-            *cell.T,
-            step,
-            across,
-            side,
-            odds,
-        ]
+    for variant, *own in zip(VARIANTS, points, covariance, pitch, strict=True):
+        columns = [*own, *cell.T, step, across, side, odds]
         edges[variant] = np.rec.fromarrays(columns, CROSSING)
     return replace(scan, edges=edges, sides=sides)
 
@@ -364,7 +355,7 @@ def _group(scan, points, pitch, spread, cell, step, mixed, tolerance):
     flat = lrf_to_platform(points, pitch, scan.T_head_lrf) @ axes.T
     spread = _to_platform(scan, spread, pitch)
     usable = ~mixed | (2 * mixed.sum() >= len(mixed))
-    shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0))
+    shortest = SHORTEST_SIDE * length_of(np.ptp(flat, axis=0))
     for direction in ((0, -1), (0, 1), (-1, 0), (1, 0)):
         across = direction[1] == 0
         end = np.all(step == direction, axis=1)
@@ -391,7 +382,7 @@ def _side_through(scan, flat, axes, pitch, across):
     centre, direction, miss = fit_line(flat)
     along = (flat - centre) @ direction
     ends = centre + np.outer([along.min(), along.max()], direction)
-    scan_normal = _to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch)
+    scan_normal = _to_platform(scan, [0.0, 0.0, 1.0], pitch)
     level = np.cross(scan_normal, scan.normal)  # of the scan line on the board
     cosine = abs(unit_vector(level) @ (direction @ axes))
     return ScanSide(

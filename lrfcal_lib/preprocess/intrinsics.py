@@ -232,9 +232,8 @@ def scale_covariance(pose: RigidTransform, pixels, pattern: Chessboard) -> np.nd
         Of ``[w, v]``.
     """
     side = square_px(pattern.grid(pixels))
-    away = np.zeros(6)
-    away[3:] = scale_error(side) * pose.apply(pattern.points().mean(axis=0))
-    return dyads(away)
+    away = scale_error(side) * pose.apply(pattern.points().mean(axis=0))
+    return dyads(np.append(np.zeros(3), away))
 
 
 def raised_points(pattern: Chessboard, relief: np.ndarray | float) -> np.ndarray:

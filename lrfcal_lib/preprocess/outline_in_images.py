@@ -104,7 +104,7 @@ def edge_votes(
         along = np.abs(normal[::-1])
         s = np.arange(-square, size @ along + square, APART * STEP * square)
         corner = pattern.origin + np.maximum(normal, 0) * size
-        xy = corner + s[None, :, None] * along + distances[:, None, None] * normal
+        xy = corner + np.outer(s, along) + distances[:, None, None] * normal
         strip = sample(image, model, on_board(xy, pose, model))
         height = step_contrast(strip, SMOOTH_STEPS, along=AVERAGED_PROFILES)
         column, place, _ = peaks(height, LEAST_CONTRAST)
@@ -232,8 +232,9 @@ def measure_outline(views, board: Board, models: dict[str, CameraModel]) -> Outl
             f"edge '{board.edges[unseen.argmax()]}' of board '{board.name}' was found in none of "
             f"{len(views)} images: pick it by hand in edges.csv or give the corners of the board"
         )
-    ends = side_ends(corners_of_lines(np.nanmedian(lines, axis=0)))
-    normals = unit_vector(np.nanmedian(lines[..., :2], axis=0))
+    middle = np.nanmedian(lines, axis=0)
+    ends = side_ends(corners_of_lines(middle))
+    normals = unit_vector(middle[:, :2])
     # where every line crosses the normals raised at the two ends of its edge
     cosine = np.vecdot(lines[..., :2], normals)
     offsets = -line_distance(ends, lines[:, :, None]) / cosine[..., None]

@@ -14,6 +14,7 @@ from lrfcal_lib.fit.robust import robust_sigma
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     fit_plane,
+    length_of,
     lrf_to_platform,
     plane_axes,
     polar_to_points,
@@ -58,6 +59,10 @@ class Surface:
     normal: np.ndarray
     distance: float
 
+    def size(self, points):
+        """See :func:`plane_size`, of the points (L, B, 3) in its cells."""
+        return plane_size(points[self.mask] @ plane_axes(self.normal).T)
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -85,12 +90,11 @@ def segments(ranges, *, jump=DEPTH_NOISE, bridge=0) -> np.ndarray:
     """
     valid = np.isfinite(ranges)
     line, beam = np.nonzero(valid)
-    jump = np.broadcast_to(jump, ranges.shape)[valid]
-    bridge = np.broadcast_to(bridge, ranges.shape)[valid]
+    _, jump, bridge = np.broadcast_arrays(ranges, jump, bridge)
     gap = np.diff(beam, prepend=0)
     change = np.abs(np.diff(ranges[valid], prepend=0.0))
     broken = np.diff(line, prepend=-1) != 0  # as the first return
-    broken |= (gap - 1 > bridge) | (change > gap * jump)
+    broken |= (gap - 1 > bridge[valid]) | (change > gap * jump[valid])
     labels = np.full(ranges.shape, -1)
     labels[valid] = np.cumsum(broken) - 1
     return labels
@@ -151,7 +155,9 @@ def planar_surface(
         raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
     p_lrf = polar_to_points(ranges, sweep.bearings)
     points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)  # (L, B, 3), metres
-    upright = _upright(sweep, T_head_lrf)
+    upright = None  # of a plane at right angles to the scan plane
+    if np.ptp(sweep.pitch) <= SAME_PITCH:
+        upright = tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), sweep.pitch[0])
     rejected = []
     best = None
     best_reach = np.inf
@@ -163,7 +169,7 @@ def planar_surface(
             limits = _size_limits(rig.board, rig.lrf.spot_radius(reach))
             if upright is None:
                 part = _trimmed(part, points, limits)
-            area, length = plane_size(points[part.mask] @ plane_axes(part.normal).T)
+            area, length = part.size(points)
             lines = part.mask.any(axis=1).sum()
             fault = f" on {lines} of {len(ranges)} scan lines"
             if upright is None:
@@ -182,13 +188,6 @@ def planar_surface(
         words = "; ".join(rejected[:4]) or "no flat surface"
         raise BoardNotFound(f"no flat surface of the board's size; seen: {words}")
     return _grown(best, points)
-
-
-def _upright(sweep, T_head_lrf):
-    """The normal at right angles to the scan plane, where all scan lines have one pitch."""
-    if np.ptp(sweep.pitch) > SAME_PITCH:
-        return None
-    return tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), sweep.pitch[0])
 
 
 def best_plane(points, upright, rng) -> tuple[np.ndarray, float]:
@@ -220,8 +219,8 @@ def best_plane(points, upright, rng) -> tuple[np.ndarray, float]:
     others = sample[np.argpartition(-lots, 1, axis=1)[:, :2]]
     second = others[:, 1] - seeds if upright is None else upright
     normals = np.cross(others[:, 0] - seeds, second)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals /= np.where(length > 1e-9, length, np.nan)
+    normals[length_of(normals) <= 1e-9] = np.nan
+    normals = unit_vector(normals)
     offsets = np.vecdot(normals, seeds)
     misses = np.abs(normals @ sample.T - offsets[:, None])
     best = np.sum(misses < PLANE_NOISE, axis=1).argmax()
@@ -288,7 +287,7 @@ def _planes(sweep, points, mask, upright, rng):
 
 def _trimmed(part, points, limits):
     """A flat surface, where it has not the board's size without thin strips of floor or wall."""
-    if limits.hold(*plane_size(points[part.mask] @ plane_axes(part.normal).T)):
+    if limits.hold(*part.size(points)):
         return part
     whole = ndimage.binary_closing(part.mask, iterations=2)
     labels, count = ndimage.label(ndimage.binary_opening(whole, np.ones((5, 5))))

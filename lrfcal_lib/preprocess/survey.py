@@ -60,9 +60,9 @@ class Shot:
         """Why it cannot be used."""
         return self.view.reason
 
-    def image(self, read):
+    def image(self, session):
         """The image; black away from the board where a part is kept."""
-        return read(self.record) if self.part is None else self.part.image()
+        return session.read_image(self.record) if self.part is None else self.part.image()
 
 
 def prepare_images(prepared: Prepared) -> Prepared:
@@ -111,20 +111,19 @@ def survey(prepared: Prepared) -> Prepared:
     board = session.board
     stated = {name: camera.model for name, camera in session.cameras.items()}
     unknown = [name for name, model in stated.items() if model is None]
-    read = session.read_image
-    look = partial(_look, read=read, board=board, picks=session.picks)
+    look = partial(_look, session=session, board=board)
     if board.pattern is None:
         return _survey_plain(prepared, look, stated, unknown)
 
     groups = _choices(session, {"board", "intrinsics"})
     finder = PatternFinder(board.pattern)
-    begin = partial(_begin, read=read, board=board, finder=finder, count=len(groups))
+    begin = partial(_begin, session=session, board=board, finder=finder, count=len(groups))
     begun = spread(partial(_first, begin=begin), groups)
     shots = [shot for shot in begun if not shot.reason]
     rough, _ = _adjusted(unknown, stated, shots, session)
     if board.corners is None:
         _check_measurable(board, begun)
-    shots, lines, unseen = _ordered(shots, read, board, rough)
+    shots, lines, unseen = _ordered(shots, session, board, rough)
     often = [name for name in rough if len(_corners(shots, name)) >= LEAST_VIEWS_FOR_RELIEF]
     models, relief = _adjusted(often, rough, shots, session, relief=True)
     shots = [shot for shot in shots if shot.record.purpose != "intrinsics"]
@@ -196,8 +195,8 @@ def _like_prepared(record, prepared, finder):
     view = _view(record)
     if known.file == view.file or known.pixels is None:
         return replace(known, file=view.file, pitch=record.pitch)
-    read = prepared.session.read_image
-    shot = _begin(Shot(record, view), read, board, finder, 1)
+    session = prepared.session
+    shot = _begin(Shot(record, view), session, board, finder, 1)
     if shot.reason:
         return shot.view
     corners = shot.view.pixels[pattern_orders(board.pattern)]
@@ -205,9 +204,8 @@ def _like_prepared(record, prepared, finder):
     return _look(
         _with_pixels(shot, corners[order]),
         prepared.models,
-        read=read,
+        session=session,
         board=board,
-        picks=prepared.session.picks,
         lines=None if board.corners is None else board.lines(),
         relief=prepared.relief,
     )
@@ -257,16 +255,16 @@ def _view(record):
     return BoardView(record.camera, record.file.name, placement, record.pitch)
 
 
-def _look(shot, models, *, read, board, picks, lines=None, relief=0.0):
+def _look(shot, models, *, session, board, lines=None, relief=0.0):
     """The board in one image, with what was picked in it by hand."""
     record = shot.record
     ends = {
         pick.edge: pick.ends
-        for pick in picks
+        for pick in session.picks
         if (pick.camera, pick.file) == (record.camera, record.file)
     }
     return view_board(
-        shot.image(read),
+        shot.image(session),
         board,
         models[record.camera],
         shot.view,
@@ -322,12 +320,12 @@ def _survey_plain(prepared, look, models, unknown):
     return _with_views(replace(prepared, models=models), views)
 
 
-def _begin(shot, read, board, finder, count):
+def _begin(shot, session, board, finder, count):
     """A shot with the corners of the pattern in any order, or with the reason why not.
 
     With the part of the image that is looked at again, where there is room for so many.
     """
-    image = read(shot.record)
+    image = session.read_image(shot.record)
     try:
         corners = finder(image)
     except PatternNotFound as error:
@@ -395,7 +393,7 @@ def _check_measurable(board, shots):
         )
 
 
-def _ordered(shots, read, board, models):
+def _ordered(shots, session, board, models):
     """Shots with their corners in the order that the outline asks for, alike in a placement.
 
     And the lines of the outline (E, 3): rough where it is not known; None, and the reason why,
@@ -423,11 +421,11 @@ def _ordered(shots, read, board, models):
     unseen = ""
     if known:
         lines = board.lines()
-        score = partial(_order_scores, read=read, board=board, models=models)
+        score = partial(_order_scores, session=session, board=board, models=models)
         scores = spread(score, zip(shots, poses, together, strict=True))
         chosen = decide(np.array(scores), leader)
     else:
-        votes, up = _votes(shots, corners[:, 0], read, pattern, models)
+        votes, up = _votes(shots, corners[:, 0], session, pattern, models)
         turned = turned_views(votes, up, leader)
         votes[turned] = votes[turned][:, OPPOSITE]
         chosen = turned.astype(int)
@@ -436,22 +434,23 @@ def _ordered(shots, read, board, models):
     return list(map(_with_pixels, shots, pixels)), lines, unseen
 
 
-def _votes(shots, corners, read, pattern, models):
+def _votes(shots, corners, session, pattern, models):
     """For edges (m, 4, n) of m shots, see :func:`edge_votes`, and how far y points down in them."""
     votes = []
     up = []
     for shot, pixels in zip(shots, corners, strict=True):
         model = models[shot.record.camera]
         pose = board_pose(pixels, pattern, model)[0]
-        votes.append(edge_votes(shot.image(read), pattern, model, pose))
+        votes.append(edge_votes(shot.image(session), pattern, model, pose))
         up.append(pose.rotation.as_matrix()[1, 1])
     return np.array(votes), np.array(up)
 
 
-def _order_scores(shot_and_orders, read, board, models):
+def _order_scores(shot_and_orders, session, board, models):
     """How well each order of the corners puts the known outline onto edges of the image."""
     shot, poses, order = shot_and_orders
-    return order_scores(shot.image(read), board, models[shot.record.camera], poses[order])
+    model = models[shot.record.camera]
+    return order_scores(shot.image(session), board, model, poses[order])
 
 
 def _turned_alike(views):
