@@ -69,9 +69,9 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
         for of_camera in shown
     ]
     rough = (poses[1] * poses[0].inv()).mean()
-    lens = LENS
-    if all(model.distortion[4] == 0 for model in models):
-        lens = K5
+    lens = K5
+    if any(model.distortion[4] for model in models):
+        lens = LENS
     adjusted = adjust_robust(
         pixels,
         pattern.points(),
