@@ -32,9 +32,10 @@ def simulate(setup, dst):
 def report(sessions, out, scheduler, jobs, store):
     """Execute the notebooks on sessions, here or on a cluster."""
     if scheduler is not None:
+        from lrfcal_lib.report.many import each_session
         from lrfcal_lib.report.report import report_session
 
-        return use_sessions(report_session, sessions, out, scheduler)
+        return each_session(report_session, sessions, out, scheduler)
     from lrfcal_lib.report.report import main
 
     return main(sessions, out, jobs, store)
@@ -109,31 +110,25 @@ def import_recording(src, dst):
 def calibrate(**options):
     """Calibrate the rigs of sessions."""
     from lrfcal_lib.report.calibrate import calibrate_session
+    from lrfcal_lib.report.many import each_session
 
-    return use_sessions(calibrate_session, **options)
+    return each_session(calibrate_session, **options)
 
 
 def reconstruct(**options):
     """Make coloured clouds of scenes."""
+    from lrfcal_lib.report.many import each_session
     from lrfcal_lib.report.reconstruct import reconstruct_session
 
-    return use_sessions(reconstruct_session, **options)
+    return each_session(reconstruct_session, **options)
 
 
 def merge(**options):
     """Join the stations of scenes."""
+    from lrfcal_lib.report.many import each_session
     from lrfcal_lib.report.merge import merge_session
 
-    return use_sessions(merge_session, **options)
-
-
-def use_sessions(work, sessions, out, scheduler, **options):
-    """Do something with each of some sessions, here or on a cluster."""
-    from functools import partial
-
-    from lrfcal_lib.report.many import each_session
-
-    return each_session(partial(work, **options), sessions, out, scheduler)
+    return each_session(merge_session, **options)
 
 
 def check(session, calibration):

@@ -218,15 +218,12 @@ def stored(tmp_path_factory):
     """Pages of the notebooks as they are stored."""
     folder = tmp_path_factory.mktemp("stored")
     names = sorted((ROOT / "notebooks").glob("*.ipynb"))
+    nothing = {"figures": [], "tables": [], "findings": [], "verdicts": []}
     runs = [
-        report.Run(path.stem, path.stem, "", 0.0, "", nbformat.read(path, 4))
+        report.Run(path.stem, path.stem, "", 0.0, "", nbformat.read(path, 4), nothing)
         for path in names
     ]
-    found = {
-        run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []}
-        for run in runs
-    }
-    report.write_pages(folder, report.open_session(report.SHIPPED), runs, found, 0.0)
+    report.write_pages(folder, report.open_session(report.SHIPPED), runs, 0.0)
     return folder
 
 

@@ -24,7 +24,7 @@ from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import Placement, read_rig_file, rig_of
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.judge.verdict import YES, judge, verdict
-from lrfcal_lib.model.geometry import POSE_UNITS, DegenerateGeometry
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import Session, open_session
 from lrfcal_lib.solvers import CANDIDATES
 
@@ -430,9 +430,8 @@ class Collector(Closed):
         if judged.errors:
             method = handed_over(calibration)
             for camera, solution in calibration.cameras(method).items():
-                told = POSE_UNITS * [solution.parameters[:6], solution.trusted_sigma[:6]]
                 poses[camera] = tuple(
-                    f"{value:.2f} ± {sigma:.2f}" for value, sigma in told.T
+                    f"{value:.2f} ± {sigma:.2f}" for value, sigma in solution.shown.T
                 )
             file = path.with_name(f"{path.name}_calibration") / "calibration.json"
             write_calibration(file, calibration_record(calibration, method, judged))

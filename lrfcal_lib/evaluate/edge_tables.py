@@ -42,17 +42,17 @@ def edge_point_table(prepared: Prepared, truth: Truth) -> pd.DataFrame:
         Columns variant, edge, n, bias_mm (positive outside the board), sd_mm.
     """
     lines = dict(zip(truth.board.edges, truth.board.lines(), strict=True))
-    rows = [(*of_none, []) for of_none in product(VARIANTS, lines)]
+    misses = {key: [] for key in product(VARIANTS, lines)}
     for variant, (placement, scan) in product(VARIANTS, prepared.scans.items()):
         scanned = scan.edges[variant]
         scanned = scanned[~scanned.across]
         pitch = truth.pitch[placement][scanned.line]
         flat = truth.on_board(truth.boards[placement], scanned.points, pitch)
         for side, edge in scan.names.items():
-            rows.append((variant, edge, 1000 * flat[scanned.side == side] @ lines[edge]))
-    table = pd.DataFrame(rows, columns=["variant", "edge", "miss"]).explode("miss")
-    misses = table.astype({"miss": float}).groupby(["variant", "edge"], sort=False).miss
-    return misses.agg(n="count", bias_mm="mean", sd_mm="std").reset_index()
+            misses[variant, edge].extend(1000 * flat[scanned.side == side] @ lines[edge])
+    each = pd.Series(misses).explode().astype(float).groupby(level=[0, 1], sort=False)
+    table = each.agg(n="count", bias_mm="mean", sd_mm="std")
+    return table.reset_index(names=["variant", "edge"])
 
 
 def edge_lengths(
@@ -92,11 +92,14 @@ def edge_lengths(
     edges = prepared.board.edges
     for variant, placement in product(measured, prepared.session.board_placements):
         board, weak = measured[variant].get(placement, (UNMEASURED, frozenset()))
-        views = [
-            views[placement] for views in prepared.views.values() if placement in views
-        ]
+        seen = {
+            edge.name
+            for views in prepared.views.values()
+            if placement in views
+            for edge in views[placement].edges
+        }
         for i, (name, true) in enumerate(known.items()):
-            if not any(view.edge(name) for view in views):
+            if name not in seen:
                 continue
             ends = "not measured"
             if name in board.lengths:

@@ -60,11 +60,13 @@ def calibration_record(
     if method == "joint":
         record["sensor"] = _sensor(calibration.joint.solution)
     # numbers of this recording stand behind those of the rig, hashes last
-    record["uncertainty"] = record.pop("uncertainty")
-    record["formulas"] = FORMULAS
-    record["lrfcal"] = __version__
-    record["inputs_sha256"] = file_hashes(session)
-    return record
+    uncertainty = record.pop("uncertainty")
+    return record | {
+        "uncertainty": uncertainty,
+        "formulas": FORMULAS,
+        "lrfcal": __version__,
+        "inputs_sha256": file_hashes(session),
+    }
 
 
 def _sensor(solution):

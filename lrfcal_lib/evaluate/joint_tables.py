@@ -9,6 +9,7 @@ from lrfcal_lib.calibrate.cameras import KnownAxis
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.evaluate.tables import parameter_table
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
+from lrfcal_lib.fit.covariance import sigma_turn_shift
 from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.fit.result import AXIS_NAMES
@@ -233,9 +234,8 @@ def random_halves(joint: JointCalibration, pairs: int = 8) -> pd.DataFrame:
             apart = transform_difference(
                 first.transforms[camera], second.transforms[camera]
             )
-            of_camera = variances[solution.columns(camera)].reshape(2, 3)
-            predicted = 2 * np.sqrt(of_camera.sum(axis=1))
-            rows.append((pair, camera, *DEG_MM * apart, *DEG_MM * predicted))
+            sigma = sigma_turn_shift(np.diag(variances[solution.columns(camera)]))
+            rows.append((pair, camera, *DEG_MM * apart, *(2 * DEG_MM * sigma)))
     return pd.DataFrame(
         rows,
         columns=[

@@ -68,13 +68,10 @@ def stereo_reference(prepared: Prepared) -> StereoReference:
         RigidTransform.concatenate([of_camera[p].T_camera_board for p in common])
         for of_camera in shown
     ]
-    between = poses[1] * poses[0].inv()
-    rough = RigidTransform.from_components(
-        np.median(between.translation, axis=0), between.rotation.mean()
-    )
-    lens = LENS
-    if all(model.distortion[4] == 0 for model in models):
-        lens = K5
+    rough = (poses[1] * poses[0].inv()).mean()
+    lens = K5
+    if any(model.distortion[4] for model in models):
+        lens = LENS
     adjusted = adjust_robust(
         pixels,
         pattern.points(),

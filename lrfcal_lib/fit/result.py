@@ -9,6 +9,7 @@ from scipy.special import polygamma
 
 from lrfcal_lib.fit.covariance import dyads, sigma_of
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import POSE_UNITS
 
 AXIS_NAMES = (
     "axis_out_of_scan_plane",
@@ -162,6 +163,13 @@ class Solution:
     def trusted_sigma(self):
         """Standard deviations from `trusted`, shape (..., k)."""
         return sigma_of(self.trusted)
+
+    @property
+    def shown(self):
+        """Rotation vector and translation of a pose, and their trusted standard deviations,
+        shape (2, 6), degrees and millimetres.
+        """
+        return POSE_UNITS * [self.parameters[:6], self.trusted_sigma[:6]]
 
     def __repr__(self):
         converged = "converged" if np.all(self.converged) else "NOT converged"

@@ -9,7 +9,6 @@ from lrfcal_lib.calibrate.pipeline import Calibration, calibrate, handed_over
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.judge.verdict import NO, judge
 from lrfcal_lib.measure.cloud_files import cloud_tasks
-from lrfcal_lib.model.geometry import POSE_UNITS
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.workers import spread
 
@@ -75,8 +74,7 @@ def poses_in_words(calibration: Calibration) -> list[str]:
     """The pose of every camera by every method, and what could not be used, a line each."""
     lines = []
     for (camera, method), solution in calibration.solutions.items():
-        both = [solution.parameters[:6], solution.trusted_sigma[:6]]
-        values, sigma = (POSE_UNITS * both).round(2)
+        values, sigma = solution.shown.round(2)
         lines.append(
             f"{camera:>8} {method:<20} rotation vector {values[:3]} +- {sigma[:3]} deg, "
             f"translation {values[3:]} +- {sigma[3:]} mm"

@@ -19,14 +19,11 @@ MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way 
 NO_VERDICT = {"sentences": [], "record": None}
 
 
-def first_screen(out, verdicts, drawn):
+def first_screen(out, verdicts, figures):
     """What the first screen of a report in a folder shows, by the names of its template."""
     # the one with a record, else any
     main = max(verdicts, key=lambda entry: bool(entry["record"]), default=NO_VERDICT)
     errors = (main["record"] or {}).get("expected_error_at_m", {})
-    figures = {}
-    for of_notebook, _ in drawn.values():
-        figures |= of_notebook
     return {
         "main": main,
         # the answer comes first, then a sentence for each distance, which numbers tell

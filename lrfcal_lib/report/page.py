@@ -53,29 +53,17 @@ class Renderer(IPythonRenderer):
 
 
 def render(
-    notebook: nbformat.NotebookNode, found: dict, number: str, folder: Path
-) -> tuple[str, dict[str, str], dict[str, str]]:
-    """The body of a notebook's page, and its figures and tables by name, as HTML.
+    notebook: nbformat.NotebookNode, figures: dict[str, str], tables: dict[str, str]
+) -> str:
+    """The body of a notebook's page.
 
     Parameters
     ----------
     notebook
         Executed.
-    found
-        Entries of :mod:`lrfcal_lib.report.notebook`.
-    number
-        Of the notebook.
-    folder
-        Of the report, where its figures are.
+    figures, tables
+        Of the report by name, as HTML: see :func:`figure_of` and :func:`table_of`.
     """
-    figures = {
-        entry["name"]: _figure(folder, entry, f"Figure {number}.{n}")
-        for n, entry in enumerate(found["figures"], start=1)
-    }
-    tables = {
-        e["name"]: _table(e, f"Table {number}.{n}")
-        for n, e in enumerate(found["tables"], start=1)
-    }
     body = []
     color = Highlight2HTML(pygments_lexer="ipython3")
     for cell in notebook.cells:
@@ -101,7 +89,7 @@ def render(
                     body.append(tables[styled[1]])
                 else:
                     body.append(turned(shown))
-    return "\n".join(body), figures, tables
+    return "\n".join(body)
 
 
 def _output(output):
@@ -117,9 +105,9 @@ def _output(output):
     return f"<pre>{html.escape(output.get('text') or data.get('text/plain', ''))}</pre>"
 
 
-def _figure(folder, entry, label):
-    """A figure that holds its picture, as large as it was drawn; '' where its notebook failed
-    before drawing it.
+def figure_of(folder, entry, label):
+    """A figure of the report in a folder that holds its picture, as large as it was drawn; '' where
+    its notebook failed before drawing it.
     """
     if not (file := folder / "figures" / f"{entry['name']}.png").is_file():
         return ""
@@ -128,7 +116,7 @@ def _figure(folder, entry, label):
     return str(PIECES.figure(entry, label, base64.b64encode(data).decode(), width))
 
 
-def _table(entry, label):
+def table_of(entry, label):
     """A table, folded where it is long."""
     made = turned(entry["html"])
     return str(PIECES.table(entry, label, made, made.count("<tr>") - 1, SHORT))

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from tqdm import tqdm
 
 from lrfcal_lib.report.first_screen import first_screen
 from lrfcal_lib.report.notebook import ROOT, SHIPPED
-from lrfcal_lib.report.page import TEMPLATES, render
+from lrfcal_lib.report.page import TEMPLATES, figure_of, render, table_of
 from lrfcal_lib.session.cache import VARIABLE as CACHE
 from lrfcal_lib.session.files import SessionError
 from lrfcal_lib.session.read import open_session
@@ -69,7 +70,7 @@ _CLIENTS: set[NotebookClient] = set()  # of the notebooks that are being execute
 @dataclass(frozen=True)
 class Run:
     """One executed notebook: file name without suffix, first heading, first paragraph; `error` is a
-    traceback or ''.
+    traceback or ''; `found` are its figures, tables, findings and verdicts.
     """
 
     name: str
@@ -78,6 +79,12 @@ class Run:
     seconds: float
     error: str
     notebook: nbformat.NotebookNode
+    found: Mapping[str, list]
+
+    @property
+    def number(self) -> str:
+        """Of the notebook, which begins its name."""
+        return self.name[:2].removeprefix("0")
 
 
 def make_report(session_path, out, jobs=2, notebooks=None):
@@ -118,11 +125,8 @@ def make_report(session_path, out, jobs=2, notebooks=None):
             RECORDINGS: cache,
         }
         runs = _execute_all(paths, environment, jobs)
-        found = {run.name: defaultdict(list) for run in runs}
-        for part in (new / "parts").glob("*.json"):
-            found[part.stem] = defaultdict(list, json.loads(part.read_text()))
         shutil.rmtree(new / "parts", ignore_errors=True)
-        write_pages(new, session, runs, found, time.monotonic() - begin)
+        write_pages(new, session, runs, time.monotonic() - begin)
     return runs
 
 
@@ -365,11 +369,15 @@ def _run(path, environment):
     # by their marks the first lines of each kind: title and thesis
     first = dict(reversed(re.findall("^([#>]) (.*)$", text, re.MULTILINE)))
     thesis = re.sub(r"[*`]", "", first.get(">", ""))
-    seconds = time.monotonic() - begin
-    return Run(path.stem, first.get("#") or path.stem, thesis, seconds, error, notebook)
+    title = first.get("#") or path.stem
+    found = defaultdict(list)
+    with suppress(FileNotFoundError):
+        part = Path(environment["LRFCAL_REPORT"], "parts", f"{path.stem}.json")
+        found |= json.loads(part.read_text())
+    return Run(path.stem, title, thesis, time.monotonic() - begin, error, notebook, found)
 
 
-def write_pages(out, session, runs, found, seconds):
+def write_pages(out, session, runs, seconds):
     """The pages and the findings of notebooks, of what is in the report's folder.
 
     Parameters
@@ -378,49 +386,48 @@ def write_pages(out, session, runs, found, seconds):
         Folder of the report.
     session : Session
     runs : list of Run
-    found : dict of str to dict
-        What each notebook kept: its figures, tables, findings and verdicts.
     seconds : float
         That the notebooks took.
     """
-    numbers = {run.name: run.name[:2].removeprefix("0") for run in runs}
-    drawn = {}  # figures and tables of each notebook, as HTML
+    figures = {
+        entry["name"]: figure_of(out, entry, f"Figure {run.number}.{n}")
+        for run in runs
+        for n, entry in enumerate(run.found["figures"], start=1)
+    }
+    tables = {
+        entry["name"]: table_of(entry, f"Table {run.number}.{n}")
+        for run in runs
+        for n, entry in enumerate(run.found["tables"], start=1)
+    }
     for before, run, after in zip([None, *runs], runs, [*runs[1:], None], strict=False):
-        body, *drawn[run.name] = render(
-            run.notebook, found[run.name], numbers[run.name], out
-        )
         _write_page(
             out / f"{run.name}.html",
             "notebook.html.jinja",
             session=session,
             run=run,
-            body=body,
+            body=render(run.notebook, figures, tables),
             before=before,
             after=after,
         )
 
     findings = [
-        {"notebook": run.name, **entry}
-        for run in runs
-        for entry in found[run.name]["findings"]
+        {"notebook": run.name, **entry} for run in runs for entry in run.found["findings"]
     ]
     (out / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
-    verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
+    verdicts = [entry for run in runs for entry in run.found["verdicts"]]
     _write_page(
         out / "index.html",
         "report.html.jinja",
         session=session,
         runs=runs,
-        found=found,
         seconds=seconds,
-        failed=[run for run in runs if run.error],
-        numbers=numbers,
-        drawn=drawn,
+        figures=figures,
+        tables=tables,
         verdicts=verdicts,
         told={entry["key"]: entry for entry in findings},
         files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
-        **first_screen(out, verdicts, drawn),
+        **first_screen(out, verdicts, figures),
     )
 
 
@@ -430,9 +437,7 @@ def _write_page(file, template, **values):
 
 
 def _provenance(session):
-    """Pairs of name and value that tell what the report was made from; the commit where git knows
-    one.
-    """
+    """What the report was made from, by name; the commit is '' where git knows none."""
     digest = hashlib.sha256((session.path / "session.json").read_bytes()).hexdigest()
     try:
         commit = subprocess.run(
@@ -443,11 +448,10 @@ def _provenance(session):
         ).stdout.strip()
     except FileNotFoundError:
         commit = ""
-    pairs = {
+    return {
         "session.json (SHA-256)": digest,
         "date": date.today().isoformat(),
         "commit": commit,
         "Python": platform.python_version(),
         **{name: version(name) for name in PACKAGES},
     }
-    return [(name, value) for name, value in pairs.items() if value]

@@ -27,14 +27,12 @@ def with_stored_outputs(notebook, stored):
 
     Both are notebooks as JSON has them, and so is what comes back.
     """
-    known = {cell["id"]: cell for cell in stored["cells"]}
+    known = {(cell["id"], "".join(cell["source"])): cell for cell in stored["cells"]}
     cells = []
     for cell in notebook["cells"]:
-        before = known.get(cell.get("id"))
-        if before is not None and "".join(before["source"]) == "".join(cell["source"]):
-            cells.append(before)
-        elif cell["cell_type"] == "code":
-            cells.append(cell | {"outputs": [], "execution_count": None})
-        else:
-            cells.append(cell)
+        changed = cell
+        if cell["cell_type"] == "code":
+            changed = cell | {"outputs": [], "execution_count": None}
+        unchanged = (cell.get("id"), "".join(cell["source"]))
+        cells.append(known.get(unchanged, changed))
     return dict(stored) | {"cells": cells}

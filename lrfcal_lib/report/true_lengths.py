@@ -11,7 +11,7 @@ from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.measure.features import SYSTEMATIC
 from lrfcal_lib.measure.lengths import IN_PLACE, ON_IT, PICKED, SceneFeatures
-from lrfcal_lib.model.geometry import length_of
+from lrfcal_lib.model.geometry import length_of, unit_vector
 from lrfcal_lib.session.read import Session
 
 NEAR = 0.03  # metres from a true face to a point of the cloud that shows it
@@ -94,18 +94,16 @@ def _on_face(scene, corners):
 
 def _on_edge(scene, ends):
     """Middles of the edges that a station shows along one with these ends (2, 3)."""
-    way = ends[1] - ends[0]
-    length = np.linalg.norm(way)
-    way = way / length
+    way = unit_vector(ends[1] - ends[0])
     shown = []
     for edge in scene.edges:
-        off = edge.centre - ends[0]
+        off = edge.centre - ends
         along = off @ way
-        miss = off - along * way
+        miss = off[0] - along[0] * way
         away = np.linalg.norm(miss)
         by_surface = SYSTEMATIC * miss @ edge.jacobian[:3, -1]
         sigma = np.sqrt(miss @ edge.noise[:3, :3] @ miss + by_surface**2) / away
-        same = abs(edge.axis @ way) > PARALLEL and 0 < along < length
+        same = abs(edge.axis @ way) > PARALLEL and along[0] > 0 > along[1]
         if same and away < max(ON_IT, 3 * sigma):
             shown.append(edge.centre)
     return np.array(shown).reshape(-1, 3)
