@@ -163,38 +163,33 @@ def _blocks(evaluate, state):
 
 
 class Linearised(NamedTuple):
-    """Normal equations (..., k, k) and (..., k) of whitened blocks at a state, and the cost."""
+    """Normal equations (..., k, k) and (..., k) of whitened blocks at a state."""
 
     hessian: np.ndarray
     gradient: np.ndarray
-    cost: np.ndarray
 
 
-def linearise(blocks: Iterable[Block], axes=(-2, -1)) -> Linearised:
+def linearise(blocks: Iterable[Block]) -> Linearised:
     """Normal equations of blocks with the placement as leading axis, or of trials.
 
     Parameters
     ----------
     blocks : iterable of Block
-    axes : int or tuple of int
-        Over which the cost is summed: placements and residuals, or -1 for residuals of trials.
     """
-    hessian = gradient = cost = np.zeros(())
-    for block in blocks:
-        J = block.white_jacobian
-        transposed = J.mT
-        hessian = hessian + transposed @ J
-        gradient = gradient + np.matvec(transposed, block.white)
-        cost = cost + _cost(block, axes)
-    return Linearised(hessian, gradient, cost)
+    r, J = _stacked(blocks)
+    return Linearised(J.mT @ J, np.matvec(J.mT, r))
 
 
-def _cost(block, axes):
-    """Half the sum of squares, or the negative log likelihood."""
-    cost = block.cost
-    if cost is None:
-        cost = 0.5 * block.white**2
-    return cost.sum(axis=axes)
+def _stacked(blocks):
+    """White residuals (..., n) of all blocks, and their Jacobian (..., n, k)."""
+    r = np.concatenate([block.white for block in blocks], axis=-1)
+    return r, np.concatenate([block.white_jacobian for block in blocks], axis=-2)
+
+
+def _cost(blocks, axes):
+    """Halves of the sums of squares, or the negative log likelihoods, of all blocks."""
+    costs = [0.5 * block.white**2 if block.cost is None else block.cost for block in blocks]
+    return sum(cost.sum(axis=axes) for cost in costs)
 
 
 def eliminate(
@@ -292,7 +287,6 @@ class Minimum(NamedTuple):
 
     state: Any
     converged: bool | np.ndarray
-    iterations: int
     cost_history: np.ndarray
     blocks: list[Block]
 
@@ -329,24 +323,25 @@ def minimise(
     axes = _axes(shared)
     problem = _weighted(evaluate, robust, axes)
     blocks, roots = problem(state)
-    at = linearise(blocks, axes)
-    history = [at.cost]
-    converged = np.zeros_like(at.cost, bool)
-    damping = np.full_like(at.cost, FIRST_DAMPING)
+    cost = _cost(blocks, axes)
+    history = [cost]
+    converged = np.zeros_like(cost, bool)
+    damping = np.full_like(cost, FIRST_DAMPING)
     nowhere = min(LEADS_NOWHERE, NOWHERE_TOLERANCES * tolerance)
     while len(history) <= max_iterations and not converged.all():
-        step, length, promised = _step(at.hessian, at.gradient, damping, shared)
+        hessian, gradient = linearise(blocks)
+        step, length, promised = _step(hessian, gradient, damping, shared)
         trial = retract(state, step)
         tried, _ = problem(trial, roots)
-        after = sum(_cost(block, axes) for block in tried)
-        accepted = after <= at.cost * (1 + 1e-12) + 1e-26
-        small = (length < tolerance**2) | (length < 1e-14 * at.cost)
+        after = _cost(tried, axes)
+        accepted = after <= cost * (1 + 1e-12) + 1e-26
+        small = (length < tolerance**2) | (length < 1e-14 * cost)
         held = damping >= SMALL_DAMPING
         began = (1 + damping) ** 2 * length  # so long the step was before it was held
         arrived = np.where(held, began < nowhere**2, small)
         converged = converged | (arrived & np.isfinite(after))
-        gain = np.ones_like(at.cost)
-        np.divide(at.cost - after, promised, out=gain, where=promised > 3e-15 * at.cost)
+        gain = np.ones_like(cost)
+        np.divide(cost - after, promised, out=gain, where=promised > 3e-15 * cost)
         damping = _next_damping(damping, gain, accepted)
         if accepted.all():
             state = trial
@@ -355,9 +350,9 @@ def minimise(
             state = np.where(accepted.T, trial.T, state.T).T
         if robust or not accepted.all():
             blocks, roots = problem(state)
-        at = linearise(blocks, axes)
-        history.append(at.cost)
-    return Minimum(state, converged[()], len(history) - 1, np.array(history), blocks)
+        cost = _cost(blocks, axes)
+        history.append(cost)
+    return Minimum(state, converged[()], np.array(history), blocks)
 
 
 def _next_damping(damping, gain, accepted):
@@ -501,12 +496,6 @@ def solve(
     return _solution(question, minimum, blocks, shared)
 
 
-def _stacked(blocks):
-    """White residuals (..., n) of all blocks, and their Jacobian (..., n, k)."""
-    r = np.concatenate([block.white for block in blocks], axis=-1)
-    return r, np.concatenate([block.white_jacobian for block in blocks], axis=-2)
-
-
 def _by_placement(r, J, groups, shared):
     """Normal equations of the reported unknowns by placement (one group where they are not told
     apart).
@@ -541,7 +530,6 @@ def _solution(question, minimum, blocks, shared):
         parameters,
         tuple(question.names),
         converged=minimum.converged,
-        iterations=minimum.iterations,
         cost_history=minimum.cost_history,
         state=minimum.state,
         residuals=r,

@@ -177,9 +177,12 @@ def hopeless(joint):
     """Whether a JointCalibration (or None) explains so little, or only by an axis that points
     backwards, that something may be misread.
     """
-    if joint is None or not explains(joint.solution) or joint.solution.unobservable:
-        return True
-    return any(far.severe for far in far_axis(joint))
+    return (
+        joint is None
+        or not explains(joint.solution)
+        or joint.solution.unobservable
+        or any(far.severe for far in far_axis(joint))
+    )
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:

@@ -337,7 +337,7 @@ class JointSolution:
                 J = np.insert(block.white_jacobian, shared, by_one_more, axis=-1)
                 blocks[name] = Block(block.white, J)
             shared += 1
-        hessian, gradient, *_ = linearise(blocks.values())
+        hessian, gradient = linearise(blocks.values())
         return Score(*eliminate(hessian, gradient, shared)[:2])
 
     def board_information(self) -> np.ndarray:

@@ -133,7 +133,7 @@ def solve_platform(
             words=WORDS,
             shared=4,
             read=lambda state: _read_head(state[0]),
-            freedom=points + on_edges + 2 * p - 4 - 8 * p,
+            freedom=points + on_edges - 6 * p - 4,  # a board: 8 unknowns, 2 bends
             limit=0.5,
             max_iterations=100,
             n_observations=points,
@@ -356,7 +356,7 @@ def solve_projected(
             max_iterations=100,
         )
         freedom = max(len(solution.residuals) - 4, 1)
-        scatter = max(np.sqrt(np.sum(solution.residuals**2) / freedom), LEAST_SCATTER)
+        scatter = max(float(np.sqrt(solution.chi2 / freedom)), LEAST_SCATTER)
         gauge = start_head(solution.transform)
     return PlatformSolution(solution, np.array(list(groups)), skipped)
 
