@@ -219,10 +219,9 @@ def motion_words(delta: np.ndarray, frame: str) -> str:
         ``[w, v]``.
     frame : str
     """
-    w = delta[:3]
-    v = delta[3:]
-    turn = np.linalg.norm(w)
-    shift = np.linalg.norm(v)
+    w, v = np.split(delta, 2)
+    turn = length_of(w)
+    shift = length_of(v)
     if turn < 0.02 * shift:
         return f"translation along {axis_words(v)} of the {frame} frame"
     words = f"rotation about {axis_words(w)} of the {frame} frame"

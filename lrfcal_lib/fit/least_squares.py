@@ -12,7 +12,7 @@ Jacobian at the point moved onto its constraint, which a block hands over as `co
 weights are frozen while a step is judged and renewed for the next one.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -137,14 +137,14 @@ def _weighted(evaluate, robust, axes):
     """A problem whose blocks may have robust weights."""
 
     def problem(state, roots=()):
-        """Blocks at a state, and the roots of their weights: given ones, or those there."""
+        """Blocks at a state, the roots of their weights (given ones, or those there), the cost."""
         blocks = _blocks(evaluate, state)
         roots = roots or [_roots(block, axes, robust) for block in blocks]
         weighted = [
             replace(block, whitener=block.whitener * root)
             for block, root in zip(blocks, roots, strict=True)
         ]
-        return weighted, roots
+        return weighted, roots, _cost(weighted, axes)
 
     return problem
 
@@ -169,18 +169,18 @@ class Linearised(NamedTuple):
     gradient: np.ndarray
 
 
-def linearise(blocks: Iterable[Block]) -> Linearised:
+def linearise(blocks: Collection[Block]) -> Linearised:
     """Normal equations of blocks with the placement as leading axis, or of trials.
 
     Parameters
     ----------
-    blocks : iterable of Block
+    blocks : collection of Block
     """
-    r, J = _stacked(blocks)
+    r, J = stacked(blocks)
     return Linearised(J.mT @ J, np.matvec(J.mT, r))
 
 
-def _stacked(blocks):
+def stacked(blocks: Collection[Block]) -> tuple[np.ndarray, np.ndarray]:
     """White residuals (..., n) of all blocks, and their Jacobian (..., n, k)."""
     r = np.concatenate([block.white for block in blocks], axis=-1)
     return r, np.concatenate([block.white_jacobian for block in blocks], axis=-2)
@@ -322,8 +322,7 @@ def minimise(
     """
     axes = _axes(shared)
     problem = _weighted(evaluate, robust, axes)
-    blocks, roots = problem(state)
-    cost = _cost(blocks, axes)
+    blocks, roots, cost = problem(state)
     history = [cost]
     converged = np.zeros_like(cost, bool)
     damping = np.full_like(cost, FIRST_DAMPING)
@@ -332,8 +331,7 @@ def minimise(
         hessian, gradient = linearise(blocks)
         step, length, promised = _step(hessian, gradient, damping, shared)
         trial = retract(state, step)
-        tried, _ = problem(trial, roots)
-        after = _cost(tried, axes)
+        tried, _, after = problem(trial, roots)
         accepted = after <= cost * (1 + 1e-12) + 1e-26
         small = (length < tolerance**2) | (length < 1e-14 * cost)
         held = damping >= SMALL_DAMPING
@@ -346,11 +344,11 @@ def minimise(
         if accepted.all():
             state = trial
             blocks = tried
+            cost = after
         elif accepted.any():  # transposed, trials come last
             state = np.where(accepted.T, trial.T, state.T).T
         if robust or not accepted.all():
-            blocks, roots = problem(state)
-        cost = _cost(blocks, axes)
+            blocks, roots, cost = problem(state)
         history.append(cost)
     return Minimum(state, converged[()], np.array(history), blocks)
 
@@ -512,8 +510,8 @@ def _by_placement(r, J, groups, shared):
 
 def _solution(question, minimum, blocks, shared):
     """The Solution at a minimum, with the blocks there without their robust weights."""
-    r, J = _stacked(blocks)
-    weighted_r, weighted_J = _stacked(minimum.blocks)
+    r, J = stacked(blocks)
+    weighted_r, weighted_J = stacked(minimum.blocks)
     hessians, scores = _by_placement(weighted_r, weighted_J, question.groups, shared)
     hessian = np.sum(hessians, axis=-3)
     scales = np.broadcast_to(question.scales, hessian.shape[-1:])

@@ -210,7 +210,7 @@ def _start_board(edges, face):
     if len(edges) == 2:
         point2, second, _ = fit_line(edges[1])
         z = np.cross(x, second)
-        if np.linalg.norm(z) < np.sin(np.radians(30)):
+        if length_of(z) < np.sin(np.radians(30)):
             raise DegenerateGeometry(
                 "the two edges are nearly parallel: edges 1 and 2 must be perpendicular"
             )
