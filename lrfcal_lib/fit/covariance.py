@@ -219,7 +219,7 @@ def motion_words(delta: np.ndarray, frame: str) -> str:
         ``[w, v]``.
     frame : str
     """
-    w, v = np.split(delta, 2)
+    w, v = np.reshape(delta, (2, 3))
     turn = length_of(w)
     shift = length_of(v)
     if turn < 0.02 * shift:
