@@ -259,7 +259,7 @@ def test_large_residual_problem_converges_where_gauss_newton_diverges():
             np.ones(2),
         )
 
-    state, converged, _, history, _ = minimise(
+    state, converged, history, _ = minimise(
         evaluate, np.array([0.1]), np.add, max_iterations=200
     )
     assert converged and np.all(np.diff(history) <= 1e-12)

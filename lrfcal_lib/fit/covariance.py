@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import qr
 
-from lrfcal_lib.model.geometry import unit_vector
+from lrfcal_lib.model.geometry import length_of, unit_vector
 
 # eigenvalues of scaled normal equations below this share of the largest are rounding errors
 RANK = 1e-13
@@ -58,7 +58,7 @@ def sigma_turn_shift(covariance: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (2,)
     """
-    return np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
+    return length_of(sigma_of(covariance).reshape(2, -1))
 
 
 def solve_each(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -190,13 +190,8 @@ def placement_covariance(hessians: np.ndarray, scores: np.ndarray) -> np.ndarray
     diagonal = np.sqrt(np.maximum(np.linalg.diagonal(total), 1e-300))
     outer = dyads(diagonal)
     scaled = (total - hessians) / outer
-    unknown = np.full_like(hessians[..., 0, :, :], np.nan)
-    try:  # squared pivots: what the others say about one unknown more
-        pivots = np.linalg.diagonal(np.linalg.cholesky(scaled))
-    except np.linalg.LinAlgError:
-        return unknown
-    if hessians.shape[-3] < FEWEST or pivots.min() < 1e-6:
-        return unknown
+    if hessians.shape[-3] < FEWEST or np.linalg.eigvalsh(scaled).min() < RANK:
+        return np.full_like(hessians[..., 0, :, :], np.nan)
     without = np.linalg.inv(scaled)
     changes = np.matvec(without, scores / diagonal) / diagonal
     whole = np.linalg.diagonal(np.linalg.inv(total / outer))
@@ -224,10 +219,9 @@ def motion_words(delta: np.ndarray, frame: str) -> str:
         ``[w, v]``.
     frame : str
     """
-    w = delta[:3]
-    v = delta[3:]
-    turn = np.linalg.norm(w)
-    shift = np.linalg.norm(v)
+    w, v = np.reshape(delta, (2, 3))
+    turn = length_of(w)
+    shift = length_of(v)
     if turn < 0.02 * shift:
         return f"translation along {axis_words(v)} of the {frame} frame"
     words = f"rotation about {axis_words(w)} of the {frame} frame"

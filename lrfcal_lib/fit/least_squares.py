@@ -12,7 +12,7 @@ Jacobian at the point moved onto its constraint, which a block hands over as `co
 weights are frozen while a step is judged and renewed for the next one.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -137,14 +137,14 @@ def _weighted(evaluate, robust, axes):
     """A problem whose blocks may have robust weights."""
 
     def problem(state, roots=()):
-        """Blocks at a state, and the roots of their weights: given ones, or those there."""
+        """Blocks at a state, the roots of their weights (given ones, or those there), the cost."""
         blocks = _blocks(evaluate, state)
         roots = roots or [_roots(block, axes, robust) for block in blocks]
         weighted = [
             replace(block, whitener=block.whitener * root)
             for block, root in zip(blocks, roots, strict=True)
         ]
-        return weighted, roots
+        return weighted, roots, _cost(weighted, axes)
 
     return problem
 
@@ -163,38 +163,33 @@ def _blocks(evaluate, state):
 
 
 class Linearised(NamedTuple):
-    """Normal equations (..., k, k) and (..., k) of whitened blocks at a state, and the cost."""
+    """Normal equations (..., k, k) and (..., k) of whitened blocks at a state."""
 
     hessian: np.ndarray
     gradient: np.ndarray
-    cost: np.ndarray
 
 
-def linearise(blocks: Iterable[Block], axes=(-2, -1)) -> Linearised:
+def linearise(blocks: Collection[Block]) -> Linearised:
     """Normal equations of blocks with the placement as leading axis, or of trials.
 
     Parameters
     ----------
-    blocks : iterable of Block
-    axes : int or tuple of int
-        Over which the cost is summed: placements and residuals, or -1 for residuals of trials.
+    blocks : collection of Block
     """
-    hessian = gradient = cost = np.zeros(())
-    for block in blocks:
-        J = block.white_jacobian
-        transposed = J.mT
-        hessian = hessian + transposed @ J
-        gradient = gradient + np.matvec(transposed, block.white)
-        cost = cost + _cost(block, axes)
-    return Linearised(hessian, gradient, cost)
+    r, J = stacked(blocks)
+    return Linearised(J.mT @ J, np.matvec(J.mT, r))
 
 
-def _cost(block, axes):
-    """Half the sum of squares, or the negative log likelihood."""
-    cost = block.cost
-    if cost is None:
-        cost = 0.5 * block.white**2
-    return cost.sum(axis=axes)
+def stacked(blocks: Collection[Block]) -> tuple[np.ndarray, np.ndarray]:
+    """White residuals (..., n) of all blocks, and their Jacobian (..., n, k)."""
+    r = np.concatenate([block.white for block in blocks], axis=-1)
+    return r, np.concatenate([block.white_jacobian for block in blocks], axis=-2)
+
+
+def _cost(blocks, axes):
+    """Halves of the sums of squares, or the negative log likelihoods, of all blocks."""
+    costs = [0.5 * block.white**2 if block.cost is None else block.cost for block in blocks]
+    return sum(cost.sum(axis=axes) for cost in costs)
 
 
 def eliminate(
@@ -292,7 +287,6 @@ class Minimum(NamedTuple):
 
     state: Any
     converged: bool | np.ndarray
-    iterations: int
     cost_history: np.ndarray
     blocks: list[Block]
 
@@ -328,36 +322,35 @@ def minimise(
     """
     axes = _axes(shared)
     problem = _weighted(evaluate, robust, axes)
-    blocks, roots = problem(state)
-    at = linearise(blocks, axes)
-    history = [at.cost]
-    converged = np.zeros_like(at.cost, bool)
-    damping = np.full_like(at.cost, FIRST_DAMPING)
+    blocks, roots, cost = problem(state)
+    history = [cost]
+    converged = np.zeros_like(cost, bool)
+    damping = np.full_like(cost, FIRST_DAMPING)
     nowhere = min(LEADS_NOWHERE, NOWHERE_TOLERANCES * tolerance)
     while len(history) <= max_iterations and not converged.all():
-        step, length, promised = _step(at.hessian, at.gradient, damping, shared)
+        hessian, gradient = linearise(blocks)
+        step, length, promised = _step(hessian, gradient, damping, shared)
         trial = retract(state, step)
-        tried, _ = problem(trial, roots)
-        after = sum(_cost(block, axes) for block in tried)
-        accepted = after <= at.cost * (1 + 1e-12) + 1e-26
-        small = (length < tolerance**2) | (length < 1e-14 * at.cost)
+        tried, _, after = problem(trial, roots)
+        accepted = after <= cost * (1 + 1e-12) + 1e-26
+        small = (length < tolerance**2) | (length < 1e-14 * cost)
         held = damping >= SMALL_DAMPING
         began = (1 + damping) ** 2 * length  # so long the step was before it was held
         arrived = np.where(held, began < nowhere**2, small)
         converged = converged | (arrived & np.isfinite(after))
-        gain = np.ones_like(at.cost)
-        np.divide(at.cost - after, promised, out=gain, where=promised > 3e-15 * at.cost)
+        gain = np.ones_like(cost)
+        np.divide(cost - after, promised, out=gain, where=promised > 3e-15 * cost)
         damping = _next_damping(damping, gain, accepted)
         if accepted.all():
             state = trial
             blocks = tried
+            cost = after
         elif accepted.any():  # transposed, trials come last
             state = np.where(accepted.T, trial.T, state.T).T
         if robust or not accepted.all():
-            blocks, roots = problem(state)
-        at = linearise(blocks, axes)
-        history.append(at.cost)
-    return Minimum(state, converged[()], len(history) - 1, np.array(history), blocks)
+            blocks, roots, cost = problem(state)
+        history.append(cost)
+    return Minimum(state, converged[()], np.array(history), blocks)
 
 
 def _next_damping(damping, gain, accepted):
@@ -501,12 +494,6 @@ def solve(
     return _solution(question, minimum, blocks, shared)
 
 
-def _stacked(blocks):
-    """White residuals (..., n) of all blocks, and their Jacobian (..., n, k)."""
-    r = np.concatenate([block.white for block in blocks], axis=-1)
-    return r, np.concatenate([block.white_jacobian for block in blocks], axis=-2)
-
-
 def _by_placement(r, J, groups, shared):
     """Normal equations of the reported unknowns by placement (one group where they are not told
     apart).
@@ -523,8 +510,8 @@ def _by_placement(r, J, groups, shared):
 
 def _solution(question, minimum, blocks, shared):
     """The Solution at a minimum, with the blocks there without their robust weights."""
-    r, J = _stacked(blocks)
-    weighted_r, weighted_J = _stacked(minimum.blocks)
+    r, J = stacked(blocks)
+    weighted_r, weighted_J = stacked(minimum.blocks)
     hessians, scores = _by_placement(weighted_r, weighted_J, question.groups, shared)
     hessian = np.sum(hessians, axis=-3)
     scales = np.broadcast_to(question.scales, hessian.shape[-1:])
@@ -541,7 +528,6 @@ def _solution(question, minimum, blocks, shared):
         parameters,
         tuple(question.names),
         converged=minimum.converged,
-        iterations=minimum.iterations,
         cost_history=minimum.cost_history,
         state=minimum.state,
         residuals=r,

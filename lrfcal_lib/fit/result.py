@@ -71,7 +71,7 @@ class Solution:
         For a transform its rotation vector and translation (radians, metres), then whatever else
         was unknown.
     names : tuple of str, length k
-    converged, iterations, cost_history
+    converged, cost_history
         The last, shape (iterations + 1, ...): half the sum of squared whitened residuals (or of the
         loss).
     residuals, jacobian : ndarray, shapes (..., n) and (..., n, k)
@@ -107,7 +107,6 @@ class Solution:
     parameters: np.ndarray
     names: tuple[str, ...]
     converged: bool | np.ndarray
-    iterations: int
     cost_history: np.ndarray
     residuals: np.ndarray
     jacobian: np.ndarray
@@ -123,6 +122,11 @@ class Solution:
     board_poses: np.ndarray | None = None
     rival: RigidTransform | None = None
     state: Any = None
+
+    @property
+    def iterations(self):
+        """How many steps were tried."""
+        return len(self.cost_history) - 1
 
     @property
     def sigma(self):

@@ -251,12 +251,12 @@ def change_between(solution, first, later, camera, prepared):
         camera=camera,
         after=after,
         turn=change.rotation.magnitude(),
-        shift=np.linalg.norm(step[3:]),
+        shift=length_of(step[3:]),
         p_value=chdtrc(POSE, square),
         motion_px=np.median(length_of(motion)),
         zoom=zoom,
         zoom_sigma=zoom_sigma,
-        corner_px=abs(zoom) * np.linalg.norm(model.size) / 2,
+        corner_px=abs(zoom) * length_of(model.size) / 2,
     )
 
 

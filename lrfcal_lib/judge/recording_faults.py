@@ -20,6 +20,7 @@ from lrfcal_lib.judge.findings import by_sign
 from lrfcal_lib.model.geometry import (
     POSE,
     DegenerateGeometry,
+    length_of,
     lrf_to_platform,
 )
 from lrfcal_lib.model.observations import thin
@@ -177,9 +178,12 @@ def hopeless(joint):
     """Whether a JointCalibration (or None) explains so little, or only by an axis that points
     backwards, that something may be misread.
     """
-    if joint is None or not explains(joint.solution) or joint.solution.unobservable:
-        return True
-    return any(far.severe for far in far_axis(joint))
+    return (
+        joint is None
+        or not explains(joint.solution)
+        or joint.solution.unobservable
+        or any(far.severe for far in far_axis(joint))
+    )
 
 
 def misread_recording(prepared: Prepared) -> list[Fault]:
@@ -386,7 +390,7 @@ def _same_board(joint, scan, placement):
         if view is not None:
             p_camera = solution.camera_at(camera, view.pitch).apply(p_platform)
             on_board = view.T_camera_board.inv().apply(p_camera)
-            beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
+            beside = length_of(on_board[:, :2].mean(axis=0) - middle)
             away = np.median(np.abs(on_board[:, 2]))
             agree.append(away < GOOD and beside < BESIDE)
     return bool(agree) and all(agree)

@@ -83,7 +83,7 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
     links = np.eye(count + 1, count)[columns_of(known.names, camera)]
     both = [known.covariance, known.trusted]
     # zero for what is known; what has no bound is among `unseen`
-    bounded = np.nan_to_num(both, nan=0.0, posinf=0.0, neginf=0.0)
+    bounded = np.nan_to_num(both, posinf=0.0, neginf=0.0)
     # boards of a wrong size stand elsewhere before the cameras: the range offset or the cameras'
     # places have taken it up
     taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
@@ -314,6 +314,4 @@ def beams_of_pixels(chain, model, uv, distance, image_pitch):
             x = chain.head.apply(x)
         bearing, pitch, reached = beams_to(x, chain.head)
         depth = depth + distance - reached
-    if chain.on_head:
-        pitch = pitch + image_pitch
-    return bearing, pitch
+    return bearing, pitch + chain.on_head * image_pitch

@@ -308,17 +308,16 @@ def _expected(rig, pitch, doubt):
             pixels[name] = bounded(root_mean_square(off))
         errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud)), pixels)
 
-    reasons: tuple[Fault, ...] = ()
+    judged = Verdict((), errors, range_noise_mm=1000 * range_noise(rig))
     large = errors[WORKING].words(above=1.0)
-    if large:
-        reasons = (
-            Fault(
-                Kind.ERROR,
-                f"the expected error at {WORKING:g} m is {large}",
-                bool(errors[WORKING].words(BAD)),
-            ),
-        )
-    return Verdict(reasons, errors, range_noise_mm=1000 * range_noise(rig))
+    if not large:
+        return judged
+    fault = Fault(
+        Kind.ERROR,
+        f"the expected error at {WORKING:g} m is {large}",
+        severe=bool(errors[WORKING].words(BAD)),
+    )
+    return judged.because([fault])
 
 
 def _refused(calibration, findings):

@@ -39,7 +39,7 @@ SETTLED = 0.02  # change of the logarithm of a noise level
 def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> JointData:
     """Padded observations with noise levels from the residuals at a solution."""
     blocks = named_blocks(state, data, unknowns)
-    hessian, gradient, *_ = linearise(blocks.values())
+    hessian, gradient = linearise(blocks.values())
     c = unknowns.shared
     own = hessian[:, c:, c:]
     spread = pseudo_inverse(own)  # shared ones held
@@ -179,7 +179,7 @@ def with_view_levels(data, block, hessian, gradient, shared):
     One scale serves all cameras: with one view each, a camera could buy itself perfection at the
     other's cost.
     """
-    views, view_gradient, *_ = linearise([block])
+    views, view_gradient = linearise([block])
     others = hessian - views
     other_gradient = gradient - view_gradient
     rows = 6 * data.view["used"].sum()
@@ -212,7 +212,8 @@ def judged(block, factor, others, other_gradient, rows, shared):
     of residuals. One row more is believed to be as large as the factor says: where nothing else
     shows the scale, it stays as it is.
     """
-    hessian, gradient, half_square = linearise([block])
+    hessian, gradient = linearise([block])
+    square = np.sum(block.white**2)
     for _ in range(SCALE_ROUNDS):
         f2 = factor**2
         whole = others + hessian / f2
@@ -225,8 +226,9 @@ def judged(block, factor, others, other_gradient, rows, shared):
         taken = np.sum(covariance * hessian)
         own = np.linalg.slogdet(whole[:, shared:, shared:])[1].sum()
         freedom = own - np.linalg.slogdet(covariance[0, :shared, :shared])[1]
-        cost = half_square / f2 + 0.5 * (
-            np.vecdot(moved, right).sum()
+        cost = 0.5 * (
+            square / f2
+            + np.vecdot(moved, right).sum()
             + rows * np.log(f2)
             + block.log_determinant
             + freedom

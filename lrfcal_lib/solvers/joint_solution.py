@@ -12,7 +12,13 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.covariance import motion_words, pseudo_inverse
 from lrfcal_lib.fit.edge_likelihood import disc_edge
-from lrfcal_lib.fit.least_squares import Block, eliminate, linearise, reduced_hessian
+from lrfcal_lib.fit.least_squares import (
+    Block,
+    eliminate,
+    linearise,
+    reduced_hessian,
+    stacked,
+)
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model.geometry import (
     POSE,
@@ -326,19 +332,14 @@ class JointSolution:
         step : float
             The value of that unknown there.
         """
-        blocks = self.blocks
+        r, J = stacked(self.blocks.values())
         shared = self.unknowns.shared
         if changed is not None:
             data = gather(changed, self.data.levels)
-            after = named_blocks(self.state, data, self.unknowns)
-            blocks = {}
-            for name, block in self.blocks.items():
-                by_one_more = (after[name].white - block.white) / step
-                J = np.insert(block.white_jacobian, shared, by_one_more, axis=-1)
-                blocks[name] = Block(block.white, J)
+            after, _ = stacked(named_blocks(self.state, data, self.unknowns).values())
+            J = np.insert(J, shared, (after - r) / step, axis=-1)
             shared += 1
-        hessian, gradient, *_ = linearise(blocks.values())
-        return Score(*eliminate(hessian, gradient, shared)[:2])
+        return Score(*eliminate(J.mT @ J, np.matvec(J.mT, r), shared)[:2])
 
     def board_information(self) -> np.ndarray:
         """What the scans of every placement say about the pose of its board, shape (p, 6, 6).

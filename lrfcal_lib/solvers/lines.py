@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.covariance import inverse_root
-from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
+from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds
 from lrfcal_lib.fit.residuals import (
     moved_noise,
     noise_correction,
@@ -28,7 +28,7 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.plane_start import on_planes, sizes_of_minima
-from lrfcal_lib.solvers.planes import pose_unknowns
+from lrfcal_lib.solvers.planes import solve_pose
 
 ROTATIONS = 200  # random ones, beside the 24 of a cube
 AHEAD = 0.8  # of the points at least lie before the camera
@@ -106,8 +106,9 @@ def estimate_pose(
         equally = partial(_equally, problem)
         problem, pose = minimise_in_rounds(equally, pose, move_pose, 2, **options)
     placements = getattr(obs, f"{uses}_placement")
-    unknowns = pose_unknowns(method, obs.camera)
-    return solve(problem, pose, move_pose, groups=placements, **unknowns, **options)
+    return solve_pose(
+        problem, pose, obs.camera, method=method, groups=placements, **options
+    )
 
 
 def _equally(problem, pose, _):

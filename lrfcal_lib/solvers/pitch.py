@@ -213,7 +213,7 @@ def gather(cameras):
     """The rows of all cameras, which see the same placements; the faces are those of the first."""
     faces = cameras[0]
     placements, face = np.unique(faces.plane_placement, return_inverse=True)
-    scatter = np.zeros(faces.plane_points.shape)
+    scatter = np.zeros_like(faces.plane_points)
     for index in range(len(placements)):
         points = faces.plane_points[face == index]
         normal, distance, _ = fit_plane(points)
@@ -229,19 +229,19 @@ def gather(cameras):
             distance=np.vecdot(board[:, :3, 2], board[:, :3, 3]),
             pitch=faces.plane_pitch,
             placement=face,
-            camera=np.full(len(face), number),
+            camera=np.full_like(face, number),
             weight=_shares(face) / unit,
         )
         placement = np.searchsorted(placements, obs.crossing_placement)
         _, edge = np.unique(obs.crossing_edge, return_inverse=True)
         on_sight = _Rows(
             points=obs.crossing_points,
-            scatter=np.zeros((len(placement), 3)),
+            scatter=np.zeros_like(obs.crossing_points),
             normal=sight_normals(obs.crossing_lines, obs.model),
-            distance=np.zeros(len(placement)),
+            distance=np.zeros_like(obs.crossing_pitch),
             pitch=obs.crossing_pitch,
             placement=placement,
-            camera=np.full(len(placement), number),
+            camera=np.full_like(placement, number),
             weight=_shares(placement + len(placements) * edge) / unit,
         )
         parts += [on_board, on_sight]

@@ -2,6 +2,7 @@
 sees; with the intrinsics, too.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -110,27 +111,32 @@ def estimate_from_planes(
     problem, pose = minimise_in_rounds(freeze, pose, move_pose, rounds, **options)
     chi2_rest = correct_and_compress(sets, pose)[2] if weighted else 0.0
     count = sets.number.sum()
-    return solve(
+    return solve_pose(
         problem,
         pose,
-        move_pose,
+        obs.camera,
+        method=method,
         groups=sets.placements,
         freedom=count - POSE,
         n_observations=count,
         chi2_rest=chi2_rest,
-        **pose_unknowns(method, obs.camera),
         **options,
     )
 
 
-def pose_unknowns(method: str, camera: str) -> dict:
-    """What :func:`lrfcal_lib.fit.least_squares.solve` has to know of a pose as the only unknown."""
-    return {
-        "method": method,
-        "names": POSE_NAMES,
-        "read": read_pose,
-        "words": lambda direction: motion_words(direction, camera),
-    }
+def solve_pose(evaluate: Callable, pose: np.ndarray, camera: str, **asked) -> Solution:
+    """The Solution of a problem whose only unknown is the pose (..., 3, 4) of a camera; what is
+    asked as of :func:`lrfcal_lib.fit.least_squares.solve`.
+    """
+    return solve(
+        evaluate,
+        pose,
+        move_pose,
+        names=POSE_NAMES,
+        read=read_pose,
+        words=lambda direction: motion_words(direction, camera),
+        **asked,
+    )
 
 
 def plane_sets(obs: CameraObservations, scanned: bool = True) -> PlaneSets:

@@ -133,7 +133,7 @@ def solve_platform(
             words=WORDS,
             shared=4,
             read=lambda state: _read_head(state[0]),
-            freedom=points + on_edges + 2 * p - 4 - 8 * p,
+            freedom=points + on_edges - 6 * p - 4,  # a board: 8 unknowns, 2 bends
             limit=0.5,
             max_iterations=100,
             n_observations=points,
@@ -210,7 +210,7 @@ def _start_board(edges, face):
     if len(edges) == 2:
         point2, second, _ = fit_line(edges[1])
         z = np.cross(x, second)
-        if np.linalg.norm(z) < np.sin(np.radians(30)):
+        if length_of(z) < np.sin(np.radians(30)):
             raise DegenerateGeometry(
                 "the two edges are nearly parallel: edges 1 and 2 must be perpendicular"
             )
@@ -356,7 +356,7 @@ def solve_projected(
             max_iterations=100,
         )
         freedom = max(len(solution.residuals) - 4, 1)
-        scatter = max(np.sqrt(np.sum(solution.residuals**2) / freedom), LEAST_SCATTER)
+        scatter = max(float(np.sqrt(solution.chi2 / freedom)), LEAST_SCATTER)
         gauge = start_head(solution.transform)
     return PlatformSolution(solution, np.array(list(groups)), skipped)
 
