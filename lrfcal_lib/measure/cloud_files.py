@@ -118,9 +118,7 @@ def write_pcd(path, ply, comments=()):
 
 def _pcd_header(count, comments):
     """The lines before the points of a PCD file."""
-    types = []
-    for kind, names in PCD_COLUMNS.values():
-        types += [np.dtype(kind)] * len(names.split())
+    types = [np.dtype(k) for k, names in PCD_COLUMNS.values() for _ in names.split()]
     told = "".join(f"# {words}\n" for words in comments)
     return (
         f"{told}VERSION 0.7\n"

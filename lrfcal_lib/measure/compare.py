@@ -14,7 +14,6 @@ from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.fit.robust import rms
 from lrfcal_lib.judge.uncertainty import (
     beams_of_pixels,
     carried,
@@ -114,7 +113,7 @@ class Shifts:
         """Root mean squares as an Amount, times `scale`."""
         return Amount(
             what=f"at {DISTANCE:g} m",
-            value=scale * rms(length_of(self.off)),
+            value=scale * root_mean_square(length_of(self.off)),
             claimed=scale * root_mean_square(self.claimed),
             unit=unit,
         )

@@ -322,8 +322,7 @@ def passes_of(session: Session) -> list[Passes]:
     passes = []
     for pair in pairwise(_swept(session)):
         one, other = (session.sweep(placement) for placement in pair)
-        few = min(len(one.pitch), len(other.pitch)) < 2
-        if few or one.direction * other.direction >= 0:
+        if one.direction * other.direction >= 0:
             continue
         at_pitch = interp1d(other.pitch, other.ranges, axis=0, bounds_error=False)
         miss = at_pitch(one.pitch) - one.ranges
