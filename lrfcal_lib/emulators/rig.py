@@ -114,7 +114,7 @@ class EmulatedRig(Closed):
             ),
             "devices": self._devices(),
             "plan": {
-                "intrinsics_images": self.setup.intrinsics_views,
+                "intrinsics_images": setup.intrinsics_views,
                 "placements": [
                     {
                         "number": p.number,

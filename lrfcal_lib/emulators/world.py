@@ -195,7 +195,7 @@ class CameraServer(ThreadingHTTPServer):
         now = self.world.host.now()
         if self.quit.is_set() or not head.settled(now, self.rest_s):
             return None
-        return self.world.current, round(float(head.pitch(now)), 7)
+        return self.world.current, round(head.pitch(now), 7)
 
     def _drawn(self, name, scene, pitch):
         """JPEG of what a camera sees."""
