@@ -206,7 +206,7 @@ class Assembler:
             bearings=np.radians(quarters / 4),
             time_s=times[0],
             beam_times_s=times,
-            telegram_index=int(scans.telegram_index[0]),
+            telegram_index=scans.telegram_index[0],
         )
         if self.interlaced:
             return self._merged(partial, reading)

@@ -402,7 +402,7 @@ class MjpegStream:
         _, image = self.retrieve()
         if image is None:
             return 0.0
-        return float(image.shape[(HEIGHT, WIDTH).index(key)])
+        return image.shape[(HEIGHT, WIDTH).index(key)]
 
     def _next(self):
         """The next whole image: as long as is stated before it (it may hold another one), else up

@@ -127,6 +127,11 @@ def refused(wrong, words):
     return AfterValidator(check)
 
 
+def repeated(values):
+    """Whether some of the values are the same."""
+    return len(set(values)) < len(values)
+
+
 NOT_PLAIN = "this becomes a file name: letters, digits, '_', '-' and '.' only"
 NOT_SHOWN = "names of edges stand in figures: no line ends, no '$' (a formula)"
 Name = Annotated[
@@ -165,22 +170,20 @@ class TransformStated(BaseModel):
         )
 
 
-def transform_to_json(transform: RigidTransform | None) -> dict | None:
+def transform_to_json(transform: RigidTransform) -> dict:
     """A transform as rotation vector and translation, as it stands in files.
 
     Parameters
     ----------
     transform
     """
-    if transform is None:
-        return None
     return {
         "rotation_vector_rad": transform.rotation.as_rotvec().tolist(),
         "translation_m": transform.translation.tolist(),
     }
 
 
-Transform = Annotated[TransformStated | None, PlainSerializer(transform_to_json)]
+Transform = Annotated[TransformStated, PlainSerializer(transform_to_json)] | None
 
 
 def plain(values):
@@ -243,7 +246,7 @@ class BoardStated(BaseModel):
     @model_validator(mode="after")
     def made(self):
         """As a Board."""
-        if len(set(self.edges)) < len(self.edges):
+        if repeated(self.edges):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
             raise ValueError(
@@ -560,9 +563,7 @@ class SessionStated(BaseModel):
     simulated: bool
     board: BoardStated
     rig: RigStated
-    placements: Annotated[
-        Numbers, refused(lambda p: len(set(p)) < len(p), "placements are different numbers")
-    ]
+    placements: Annotated[Numbers, refused(repeated, "placements are different numbers")]
     reference: dict = {}
     unfinished: Numbers | None = None
 

@@ -302,7 +302,7 @@ class SessionWriter(contextlib.AbstractContextManager):
         write_file(self.path, name, image)
         self._note_placement(placement)
         row = (
-            float(time_s),
+            time_s,
             camera,
             name,
             number_cell(placement),
