@@ -80,7 +80,7 @@ def test_axis_and_cameras_are_close_to_the_authors(lms400):
     assert (np.abs(data - stated) < 3 * np.sqrt(np.diag(its + known))).all()
     authors = from_json(
         TransformStated, lms400.prepared.session.reference["T_left_platform"]
-    ).made()
+    )
     angle, shift = transform_difference(
         lms400.solutions["left", "zhang_pless"].transform, authors
     )

@@ -31,9 +31,7 @@ def test_the_cut_leaves_half_a_square_around_the_pattern():
     board = sheet(6, 5, 0.03)
     margin = board.pattern.outline() - board.known_corners()
     np.testing.assert_allclose(np.abs(margin), 0.015)
-    assert (
-        BoardStated.model_validate(board_to_json(board)).made().lengths() == board.lengths()
-    )
+    assert BoardStated.model_validate(board_to_json(board)).lengths() == board.lengths()
 
 
 def test_the_command_writes_a_page_of_its_size_and_says_what_to_state(tmp_path, capsys):

@@ -45,7 +45,7 @@ def test_a_centred_chessboard_is_turned_alike_in_all_images_of_a_placement(centr
     ):
         true = from_json(
             TransformStated, truth[f"images/{view.camera}/{view.file}"]["T_camera_board"]
-        ).made()
+        )
         turns.setdefault(view.placement, []).append(
             true.rotation.inv() * view.T_camera_board.rotation
         )

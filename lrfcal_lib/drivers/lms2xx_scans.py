@@ -204,9 +204,9 @@ class Assembler:
             telegrams=(raw,),
             ranges=np.nan_to_num(scans.ranges[0], nan=np.nan, posinf=np.nan),
             bearings=np.radians(quarters / 4),
-            time_s=float(times[0]),
+            time_s=times[0],
             beam_times_s=times,
-            telegram_index=int(scans.telegram_index[0]),
+            telegram_index=scans.telegram_index[0],
         )
         if self.interlaced:
             return self._merged(partial, reading)

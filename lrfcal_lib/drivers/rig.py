@@ -486,7 +486,7 @@ def unchanged(scans: Iterable[np.ndarray]) -> bool:
     steps = (np.diff(ranges, axis=0) ** 2).sum(axis=0)
     spread = len(ranges) * ranges.var(axis=0)
     ratio = (steps + 2 * LEAST_SPREAD) / (spread + LEAST_SPREAD)
-    return bool(ratio.sum() > STILL * ratio.size)
+    return ratio.sum() > STILL * ratio.size
 
 
 def _camera(stated, name):

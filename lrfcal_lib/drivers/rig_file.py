@@ -20,7 +20,13 @@ from pydantic import (
 from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.drivers.pelco_d import FASTEST
 from lrfcal_lib.session.files import SessionError, read_json, short
-from lrfcal_lib.session.stated import SessionStated, StatedRig, parse_session, refused
+from lrfcal_lib.session.stated import (
+    SessionStated,
+    StatedRig,
+    parse_session,
+    refused,
+    repeated,
+)
 from lrfcal_lib.session.write import ABOUT
 
 MOST_STOPS = 5000
@@ -310,7 +316,7 @@ class Plan(Stated):
     def numbered(self):
         """Placements have different numbers."""
         numbers = [placement.number for placement in self.to_do()]
-        if len(set(numbers)) < len(numbers):
+        if repeated(numbers):
             raise ValueError(f"placements: numbers must differ, got {numbers}")
         return self
 

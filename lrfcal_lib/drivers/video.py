@@ -118,7 +118,7 @@ class Camera(Closed):
             )
             self._thread.start()
 
-    def newest(self, after: float | None = None, timeout: float = 5.0) -> Frame:
+    def newest(self, after: float = -math.inf, timeout: float = 5.0) -> Frame:
         """The newest frame; of a recorded source the next image.
 
         Parameters
@@ -140,7 +140,7 @@ class Camera(Closed):
 
         def fresh():
             frame = self._frame
-            return frame is not None and frame.time_s > (after or -math.inf)
+            return frame is not None and frame.time_s > after
 
         with self._new:
             if self._remedy:
@@ -402,7 +402,7 @@ class MjpegStream:
         _, image = self.retrieve()
         if image is None:
             return 0.0
-        return float(image.shape[(HEIGHT, WIDTH).index(key)])
+        return image.shape[(HEIGHT, WIDTH).index(key)]
 
     def _next(self):
         """The next whole image: as long as is stated before it (it may hold another one), else up

@@ -110,7 +110,7 @@ class Head:
         instant
             Seconds.
         """
-        return bool(instant < self._knots[-1, 0])
+        return instant < self._knots[-1, 0]
 
     def settled(self, instant: float, rest_s: float) -> bool:
         """Whether the head has been at rest for the time in which it settles.
@@ -122,7 +122,7 @@ class Head:
         rest_s
             For so long, seconds.
         """
-        return bool(instant >= self._knots[-1, 0] + self.platform.settle + rest_s)
+        return instant >= self._knots[-1, 0] + self.platform.settle + rest_s
 
     def pitch(self, instant: float | np.ndarray) -> np.ndarray:
         """True pitch: where the gear, which has some play, has dragged the head.

@@ -267,14 +267,14 @@ class Terminal(threading.Thread):
 
     def _listen(self):
         """Take the bytes of the host; see whether it holds the port open."""
+        self.open = True
         try:
             data = os.read(self._master, 4096)
         except BlockingIOError:  # it says nothing
-            self.open = True
+            pass
         except OSError:
             self.open = False
         else:
-            self.open = True
             self._device.hear(data)
 
     def put(self, data: bytes) -> None:

@@ -76,7 +76,7 @@ class EmulatedRig(Closed):
             self.folder = Path(stack.enter_context(folder))
             self.world = EmulatedWorld(setup, host, placements)
             self.camera_server = stack.enter_context(
-                contextlib.closing(CameraServer(self.world, rest_s=rest_s))
+                CameraServer(self.world, rest_s=rest_s)
             )
             self.camera_urls = {
                 name: f"{self.camera_server.url}/{name}.mjpg"
@@ -114,7 +114,7 @@ class EmulatedRig(Closed):
             ),
             "devices": self._devices(),
             "plan": {
-                "intrinsics_images": self.setup.intrinsics_views,
+                "intrinsics_images": setup.intrinsics_views,
                 "placements": [
                     {
                         "number": p.number,

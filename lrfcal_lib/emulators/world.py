@@ -15,7 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
-from lrfcal_lib.drivers.port import REAL, Host
+from lrfcal_lib.drivers.port import REAL, Closed, Host
 from lrfcal_lib.emulators.head import Head
 from lrfcal_lib.session.files import short
 from lrfcal_lib.session.images import encode_jpeg
@@ -63,7 +63,7 @@ class EmulatedWorld:
         self.placements = placements or placements_of(setup)
         self._rng = np.random.default_rng([0, 3])
         # what was looked at last, and what was seen without noise
-        self._seen: tuple = (None, None)
+        self._seen: dict = {}
         self.places = {"place/none": Placement(0)}
         for placement in self.placements:
             self.places[f"place/{placement.number}"] = placement
@@ -115,16 +115,14 @@ class EmulatedWorld:
         pitch = self.head.pitch(times)
         # a head at rest sees the same again and again
         key = world, quarters.tobytes(), np.rint(pitch / STILL).tobytes()
-        if self._seen[0] != key:
+        if key not in self._seen:
             bearings = np.radians(quarters / 4)
-            self._seen = (
-                key,
-                lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf),
-            )
-        return lrf.measured(rig.beam, self._seen[1], self._rng)
+            ideal = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
+            self._seen = {key: ideal}
+        return lrf.measured(rig.beam, self._seen[key], self._rng)
 
 
-class CameraServer(ThreadingHTTPServer):
+class CameraServer(Closed, ThreadingHTTPServer):
     """The cameras of a world, and who puts its board elsewhere, over HTTP.
 
     `url` has ``NAME.mjpg`` of all `cameras`; `control` obeys POST of any place of the world. A web
@@ -195,7 +193,7 @@ class CameraServer(ThreadingHTTPServer):
         now = self.world.host.now()
         if self.quit.is_set() or not head.settled(now, self.rest_s):
             return None
-        return self.world.current, round(float(head.pitch(now)), 7)
+        return self.world.current, round(head.pitch(now), 7)
 
     def _drawn(self, name, scene, pitch):
         """JPEG of what a camera sees."""

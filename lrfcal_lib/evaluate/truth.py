@@ -23,7 +23,7 @@ from lrfcal_lib.model.kinematics import platform_from_head
 from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.session.files import naming, read_json
 from lrfcal_lib.session.read import Session
-from lrfcal_lib.session.stated import TransformStated, board_from_json, from_json
+from lrfcal_lib.session.stated import BoardStated, TransformStated, from_json
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def read_truth(session: Session) -> Truth | None:
                 name: _pose(entry.get("T_camera_lrf") or entry["T_camera_platform"])
                 for name, entry in data["cameras"].items()
             },
-            board=board_from_json(data["board"]),
+            board=from_json(BoardStated, data["board"]),
             boards=by_placement(data["boards"], "T_platform_board", _pose),
             pitch=by_placement(data["sweeps"], "pitch_rad", np.array),
             stations=by_placement(data.get("stations", {}), "T_room_platform", _pose),
@@ -130,7 +130,7 @@ def read_truth(session: Session) -> Truth | None:
 
 def _pose(stated):
     """A transform that must be there, unlike those that a session may leave out."""
-    return from_json(TransformStated, stated).made()
+    return from_json(TransformStated, stated)
 
 
 def camera_errors(solution: Solution, truth: Truth, camera: str) -> dict[str, float]:

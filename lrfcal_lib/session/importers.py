@@ -216,7 +216,7 @@ def recover_polar(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     rebuilt = lrf_to_platform(
         polar_to_points(ranges, bearing), pitch[line], LASERSETERO_HEAD
     )
-    miss = float(length_of(rebuilt - p_platform).max())
+    miss = length_of(rebuilt - p_platform).max()
     if not miss <= LARGEST_MISS:
         raise ValueError(
             f"rebuilding the points misses by {1000 * miss:.4f} mm, more than "

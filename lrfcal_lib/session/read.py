@@ -415,17 +415,17 @@ def open_session(path: str | os.PathLike) -> Session:
         unfinished = facts.pop("unfinished")
     scans, log, unused = read_scans(path)
     records = read_images(path, facts, unfinished)
-    problems = [
+    problems = (
         *missing_parts(
             facts["placements"], scans, records, facts["cameras"], unfinished or ()
         ),
         *unused,
-    ]
+    )
     return Session(
         path=path,
         image_records=records,
         picks=read_edges(path, facts, records),
-        problems=tuple(problems),
+        problems=problems,
         scans=scans,
         telegrams=log,
         **facts,
@@ -449,8 +449,7 @@ def validate(path: str | os.PathLike) -> list[str]:
         session = open_session(path)
     except SessionError as error:
         return [str(error)]
-    found = [*session.problems, *_times_back(session)]
-    found += [fault.words for fault in faults_of_files(session)]
+    faults = faults_of_files(session)
     broken = []
     for record in session.image_records:
         try:
@@ -458,8 +457,14 @@ def validate(path: str | os.PathLike) -> list[str]:
         except SessionError as error:
             broken.append(str(error))
     if not broken:
-        found += [fault.words for fault in dark_images(session)]
-    return [printable(problem) for problem in found + broken]
+        faults += dark_images(session)
+    found = [
+        *session.problems,
+        *_times_back(session),
+        *[fault.words for fault in faults],
+        *broken,
+    ]
+    return [printable(problem) for problem in found]
 
 
 def _times_back(session):

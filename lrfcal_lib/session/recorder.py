@@ -57,10 +57,9 @@ class SessionRecorder(SessionWriter):
                         f"{_first_difference(data[key], now, key)}, unlike the rig now: go on with "
                         "the same rig file, or begin another one"
                     )
-        self.data = data
+        self.data = data | {"unfinished": known["unfinished"] or ()}
         mend_tables(self.path)
-        for placement in known["unfinished"] or ():
-            self._mark_dropped(placement)
+        self._drop_unfinished()
         self._state(unfinished=[])
 
     def begin_placement(self, placement: int) -> None:
@@ -75,8 +74,7 @@ class SessionRecorder(SessionWriter):
         SessionError
             If it was recorded already.
         """
-        for other in self.data["unfinished"]:
-            self.drop_placement(other)
+        self._drop_unfinished()
         if placement in self.finished or placement < 0:
             raise SessionError(
                 f"{self.path}: placement {placement} cannot be begun; recorded: "
@@ -114,6 +112,10 @@ class SessionRecorder(SessionWriter):
         self._mark_dropped(placement)
         self._state(unfinished=[])
 
+    def _drop_unfinished(self):
+        for placement in self.data["unfinished"]:
+            self.drop_placement(placement)
+
     def add_platform(self, rows: Iterable[tuple[float, float, float]]) -> None:
         """Append to the log of the platform.
 
@@ -129,8 +131,7 @@ class SessionRecorder(SessionWriter):
 
     def finish(self) -> None:
         """Close the recording: nothing can be half done in it any more."""
-        for placement in self.data["unfinished"]:
-            self.drop_placement(placement)
+        self._drop_unfinished()
         del self.data["unfinished"]
         self._state()
         self.close()

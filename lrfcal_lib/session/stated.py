@@ -19,6 +19,7 @@ from pydantic import (
     Field,
     FiniteFloat,
     PlainSerializer,
+    model_validator,
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -65,6 +66,8 @@ SAME_STEP = 0.001  # of a step; one that is rounded to three digits
 ASSUMED_STEP_ERROR = 0.0058
 # metres; only the unit of the edge bias where nobody stated the spot
 ASSUMED_SPOT_RADIUS = 0.005
+# standard deviations of the platform's direction (radians) and offset (metres)
+ASSUMED_PLATFORM_SIGMA = (math.radians(0.5), 0.010)
 
 
 def in_words(error):
@@ -124,6 +127,11 @@ def refused(wrong, words):
     return AfterValidator(check)
 
 
+def repeated(values):
+    """Whether some of the values are the same."""
+    return len(set(values)) < len(values)
+
+
 NOT_PLAIN = "this becomes a file name: letters, digits, '_', '-' and '.' only"
 NOT_SHOWN = "names of edges stand in figures: no line ends, no '$' (a formula)"
 Name = Annotated[
@@ -134,6 +142,7 @@ EdgeName = Annotated[
     str, refused(lambda name: "$" in name or not name.isprintable(), NOT_SHOWN)
 ]
 Whole = Annotated[int, Field(ge=0, le=1_000_000)]
+Numbers = Annotated[tuple[Whole, ...], Field(fail_fast=True)]
 Inner = Annotated[int, Field(ge=3, le=MOST_CORNERS)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Length = Annotated[FiniteFloat, Field(gt=0, le=1)]
@@ -143,15 +152,17 @@ Angle = Annotated[
     PlainSerializer(lambda a: round(math.degrees(a), 9)),
 ]
 Step = Annotated[Angle, Field(gt=0)]  # radians here, degrees in the file
+AsArray = AfterValidator(np.array)
 Pair, Triple, Lens, Row = (tuple[(FiniteFloat,) * n] for n in (2, 3, 5, 9))
 
 
 class TransformStated(BaseModel):
-    """A transform as it stands in a file."""
+    """A transform as it stands in a file; it becomes a RigidTransform."""
 
     rotation_vector_rad: Triple
     translation_m: tuple[(Annotated[FiniteFloat, Field(ge=-10, le=10)],) * 3]
 
+    @model_validator(mode="after")
     def made(self):
         """As a RigidTransform."""
         return RigidTransform.from_components(
@@ -159,22 +170,20 @@ class TransformStated(BaseModel):
         )
 
 
-def transform_to_json(transform: RigidTransform | None) -> dict | None:
+def transform_to_json(transform: RigidTransform) -> dict:
     """A transform as rotation vector and translation, as it stands in files.
 
     Parameters
     ----------
     transform
     """
-    if transform is None:
-        return None
     return {
         "rotation_vector_rad": transform.rotation.as_rotvec().tolist(),
         "translation_m": transform.translation.tolist(),
     }
 
 
-Transform = Annotated[TransformStated, AfterValidator(TransformStated.made)] | None
+Transform = Annotated[TransformStated, PlainSerializer(transform_to_json)] | None
 
 
 def plain(values):
@@ -189,8 +198,8 @@ class LensStated(BaseModel):
     fy: Positive
     cx: FiniteFloat
     cy: FiniteFloat
-    distortion: Annotated[Lens, AfterValidator(np.array)]
-    covariance: Annotated[tuple[(Row,) * 9], AfterValidator(np.array)] | None = None
+    distortion: Annotated[Lens, AsArray]
+    covariance: Annotated[tuple[(Row,) * 9], AsArray] | None = None
     rms_px: FiniteFloat | None = None
 
 
@@ -205,7 +214,7 @@ def model_to_json(model: CameraModel) -> dict:
 
 
 class PatternStated(BaseModel):
-    """A chessboard as it stands in a file."""
+    """A chessboard as it stands in a file; it becomes a Chessboard."""
 
     kind: Literal["chessboard"]
     columns: Inner
@@ -213,6 +222,7 @@ class PatternStated(BaseModel):
     square_m: Length
     origin_m: Pair = (0.0, 0.0)
 
+    @model_validator(mode="after")
     def made(self):
         """As a Chessboard."""
         if self.columns * self.rows > MOST_CORNERS:
@@ -221,21 +231,22 @@ class PatternStated(BaseModel):
 
 
 class BoardStated(BaseModel):
-    """A board as it stands in a file."""
+    """A board as it stands in a file; it becomes a Board."""
 
     name: str
     edges: tuple[EdgeName, ...] = Field(
         fail_fast=True, min_length=3, max_length=MOST_CORNERS
     )
     features: tuple[str, str]
-    corners: (
-        Annotated[tuple[Pair, ...], Field(fail_fast=True), AfterValidator(np.array)] | None
-    ) = Field(alias="corners_m")
-    pattern: Annotated[PatternStated, AfterValidator(PatternStated.made)] | None
+    corners: Annotated[tuple[Pair, ...], Field(fail_fast=True), AsArray] | None = Field(
+        alias="corners_m"
+    )
+    pattern: PatternStated | None
 
+    @model_validator(mode="after")
     def made(self):
         """As a Board."""
-        if len(set(self.edges)) < len(self.edges):
+        if repeated(self.edges):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
             raise ValueError(
@@ -293,22 +304,6 @@ def board_to_json(board: Board) -> dict:
     )
 
 
-def board_from_json(data: dict) -> Board:
-    """Inverse of :func:`board_to_json`.
-
-    Parameters
-    ----------
-    data
-
-    Raises
-    ------
-    ValueError
-        For a wrong one.
-    """
-    return from_json(BoardStated, data).made()
-
-
-StatedBoard = Annotated[BoardStated, AfterValidator(BoardStated.made)]
 View = Annotated[
     tuple[Angle, Angle],
     refused(
@@ -477,7 +472,7 @@ class CameraInfo:
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1), AfterValidator(_few_pixels)]
     model: Annotated[Lens, Field(alias="intrinsics")] = None
-    guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
+    guess: Transform = None
 
 
 @dataclass(frozen=True)
@@ -507,7 +502,7 @@ def rig_to_json(
     lrf: LrfInfo,
     T_head_lrf: RigidTransform | None,
     cameras: dict[str, CameraInfo],
-    sigma: tuple[float, float] | None = None,
+    sigma: tuple[float, float] = ASSUMED_PLATFORM_SIGMA,
     continuous: bool = False,
 ) -> dict:
     """A rig as it stands in session.json.
@@ -517,16 +512,16 @@ def rig_to_json(
     lrf, T_head_lrf, cameras, sigma, continuous
         Fields of a Session; sigma is `platform_sigma`, radians and metres.
     """
-    platform: dict[str, Any] = {"T_head_lrf": transform_to_json(T_head_lrf)}
-    if sigma is not None:
-        direction, offset = sigma
-        platform["sigma_direction_deg"] = round(math.degrees(direction), 9)
-        platform["sigma_offset_m"] = offset
-    if continuous:
-        platform["continuous"] = True
+    direction, offset = sigma
+    platform = PlatformStated.model_construct(
+        T_head_lrf=T_head_lrf,
+        sigma_direction=direction,
+        sigma_offset=offset,
+        continuous=continuous,
+    )
     return {
         "lrf": lrf_to_json(lrf),
-        "platform": platform,
+        "platform": platform.model_dump(by_alias=True, exclude_defaults=True),
         "cameras": adapter(dict[str, CameraInfo]).dump_python(cameras, by_alias=True),
     }
 
@@ -544,8 +539,10 @@ class PlatformStated(BaseModel):
     """The platform and how well it is known as they stand in a file."""
 
     T_head_lrf: Transform
-    sigma_direction: Step = Field(default=math.radians(0.5), alias="sigma_direction_deg")
-    sigma_offset: Length = Field(default=0.010, alias="sigma_offset_m")
+    sigma_direction: Step = Field(
+        default=ASSUMED_PLATFORM_SIGMA[0], alias="sigma_direction_deg"
+    )
+    sigma_offset: Length = Field(default=ASSUMED_PLATFORM_SIGMA[1], alias="sigma_offset_m")
     continuous: bool = False
 
 
@@ -564,15 +561,11 @@ class SessionStated(BaseModel):
     licence: str
     source: str
     simulated: bool
-    board: StatedBoard
+    board: BoardStated
     rig: RigStated
-    placements: Annotated[
-        tuple[Whole, ...],
-        Field(fail_fast=True),
-        refused(lambda p: len(set(p)) < len(p), "placements are different numbers"),
-    ]
+    placements: Annotated[Numbers, refused(repeated, "placements are different numbers")]
     reference: dict = {}
-    unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None
+    unfinished: Numbers | None = None
 
 
 def parse_session(data: dict, kind: type = SessionStated) -> dict:

@@ -69,7 +69,7 @@ class SessionWriter(contextlib.AbstractContextManager):
         cameras: Iterable[CameraInfo] = (),
         T_head_lrf: RigidTransform | None = None,
         *,
-        platform_sigma: tuple[float, float] | None = None,
+        platform_sigma: tuple[float, float] = stated.ASSUMED_PLATFORM_SIGMA,
         continuous: bool = False,
         reference: dict | None = None,
         **about,
@@ -302,7 +302,7 @@ class SessionWriter(contextlib.AbstractContextManager):
         write_file(self.path, name, image)
         self._note_placement(placement)
         row = (
-            float(time_s),
+            time_s,
             camera,
             name,
             number_cell(placement),

@@ -54,6 +54,9 @@ class Devices:
     softness: float = 0.1  # standard deviation of that from beam to beam, in spot radii
     # least softness, in beam steps; real edges have none, the model of the joint estimate has
     floor: float = 0.0
+    # uneven backgrounds: standard deviation of the edge from side to side, in log odds (of a
+    # Bench), or of its bias in spot radii (of single shots)
+    spread: float = 0.0
 
     def radius(self, ranges):
         """Of the spot, metres."""
@@ -96,8 +99,6 @@ class Bench(Devices):
     stretch: float = 0.0  # of the recorded pitch: the head turns 1 + stretch times as far
     # standard deviation of the recorded pitch at the stop of an image, radians
     sigma_stop: float = 0.0
-    # standard deviation of the log odds of the edge from side to side: uneven backgrounds
-    spread: float = 0.0
 
 
 def bench(

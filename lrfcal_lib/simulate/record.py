@@ -301,7 +301,7 @@ def _add_placements(writer, setup, placements, truth):
             angles = np.degrees([stops.commanded, stops.measured])
             log += zip(times, *angles, strict=True)
         truth["sweeps"][number] = {"pitch_rad": lines.true.tolist()}
-        clock = float(began[-1] + took + pause)
+        clock = began[-1] + took + pause
     return log
 
 
@@ -321,7 +321,7 @@ def _add_images(writer, setup, taken, truth, times):
                 time_s=np.round(time_s, 4),
                 purpose=shot.placement.purpose,
             )
-            known = {"pitch_rad": float(true)}
+            known = {"pitch_rad": true}
             if board is not None:
                 T_camera_board = rig.camera_pose(camera, true) * board
                 known["T_camera_board"] = transform_to_json(T_camera_board)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.session.stated import TransformStated, board_from_json
+from lrfcal_lib.session.stated import BoardStated, TransformStated, from_json
 from lrfcal_lib.simulate.shots import Scenario
 
 
@@ -22,8 +23,8 @@ def _placed(row):
 MADE = {  # of rows that have this key
     "shift": _placed,
     "fx": lambda row: CameraModel(**row),
-    "corners_m": board_from_json,
-    "translation_m": lambda row: TransformStated(**row).made(),
+    "corners_m": partial(from_json, BoardStated),
+    "translation_m": partial(from_json, TransformStated),
 }
 
 

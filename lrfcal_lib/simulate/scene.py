@@ -13,14 +13,13 @@ import json
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import open3d as o3d
 import pydantic
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
-from pydantic import Field, NonNegativeFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -262,7 +261,7 @@ class Exposure:
     # linear, as machine vision
     # cameras have it; automatic exposure puts the brightest 0.2 % of the image at bright within
     # these limits.
-    gain: tuple[Annotated[float, Field(gt=0)], float] = (70.0, 300.0)
+    gain: tuple[PositiveFloat, float] = (70.0, 300.0)
     bright: NonNegativeFloat = 235.0  # grey level
     # standard deviation of the point spread of lens and sensor together, pixels
     blur_px: NonNegativeFloat = 0.7

@@ -54,8 +54,6 @@ class Scenario(Devices):
     field_of_view: tuple[float, float] = (np.radians(40.0), np.radians(140.0))
     uniform: bool = False  # the errors of ranges; normal otherwise
     floor: float = LEAST_STEP
-    # standard deviation of `bias` from edge to edge of every placement: uneven backgrounds
-    spread: float = 0.0
     scans: int = 1  # lines of a placement, of the LRF at rest
     fewest_beams: int = 8  # of a scan line on a board
     whole_image: bool = True  # placements with corners outside the image are drawn anew
