@@ -66,8 +66,6 @@ SAME_STEP = 0.001  # of a step; one that is rounded to three digits
 ASSUMED_STEP_ERROR = 0.0058
 # metres; only the unit of the edge bias where nobody stated the spot
 ASSUMED_SPOT_RADIUS = 0.005
-# standard deviations of the platform's direction (radians) and offset (metres)
-ASSUMED_PLATFORM_SIGMA = (math.radians(0.5), 0.010)
 
 
 def in_words(error):
@@ -502,7 +500,7 @@ def rig_to_json(
     lrf: LrfInfo,
     T_head_lrf: RigidTransform | None,
     cameras: dict[str, CameraInfo],
-    sigma: tuple[float, float] = ASSUMED_PLATFORM_SIGMA,
+    sigma: tuple[float, float] | None = None,
     continuous: bool = False,
 ) -> dict:
     """A rig as it stands in session.json.
@@ -512,16 +510,16 @@ def rig_to_json(
     lrf, T_head_lrf, cameras, sigma, continuous
         Fields of a Session; sigma is `platform_sigma`, radians and metres.
     """
-    direction, offset = sigma
-    platform = PlatformStated.model_construct(
-        T_head_lrf=T_head_lrf,
-        sigma_direction=direction,
-        sigma_offset=offset,
-        continuous=continuous,
-    )
+    platform: dict[str, Any] = {"T_head_lrf": T_head_lrf}
+    if sigma is not None:
+        direction, offset = sigma
+        platform |= {"sigma_direction": direction, "sigma_offset": offset}
+    if continuous:
+        platform["continuous"] = True
+    written = PlatformStated.model_construct(**platform)
     return {
         "lrf": lrf_to_json(lrf),
-        "platform": platform.model_dump(by_alias=True, exclude_defaults=True),
+        "platform": written.model_dump(by_alias=True, exclude_unset=True),
         "cameras": adapter(dict[str, CameraInfo]).dump_python(cameras, by_alias=True),
     }
 
@@ -539,10 +537,8 @@ class PlatformStated(BaseModel):
     """The platform and how well it is known as they stand in a file."""
 
     T_head_lrf: Transform
-    sigma_direction: Step = Field(
-        default=ASSUMED_PLATFORM_SIGMA[0], alias="sigma_direction_deg"
-    )
-    sigma_offset: Length = Field(default=ASSUMED_PLATFORM_SIGMA[1], alias="sigma_offset_m")
+    sigma_direction: Step = Field(default=math.radians(0.5), alias="sigma_direction_deg")
+    sigma_offset: Length = Field(default=0.010, alias="sigma_offset_m")
     continuous: bool = False
 
 

@@ -69,7 +69,7 @@ class SessionWriter(contextlib.AbstractContextManager):
         cameras: Iterable[CameraInfo] = (),
         T_head_lrf: RigidTransform | None = None,
         *,
-        platform_sigma: tuple[float, float] = stated.ASSUMED_PLATFORM_SIGMA,
+        platform_sigma: tuple[float, float] | None = None,
         continuous: bool = False,
         reference: dict | None = None,
         **about,
