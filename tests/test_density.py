@@ -10,7 +10,7 @@ LIBRARY = sorted((ROOT / "lrfcal_lib").rglob("*.py"))
 TESTS = sorted((ROOT / "tests").glob("*.py"))
 MOST = {  # see CONTRIBUTING.md
     "library": {
-        "nodes": 130_000,
+        "nodes": 129_500,
         "median": 5,
         "densest tenth": 13,
         "parallel": 8,

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.geometry import length_of
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.edges_in_scan import with_edges
@@ -189,7 +190,7 @@ def check_image(
         if brightness(image) < DARK:
             text += f"; {DARKNESS}"
         return Light(name, "bad", text)
-    scale = math.ceil(LEAST_SQUARE_PX / np.linalg.norm(corners[1] - corners[0]))
+    scale = math.ceil(LEAST_SQUARE_PX / length_of(corners[1] - corners[0]))
     large = cv2.resize(
         grey(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR
     )

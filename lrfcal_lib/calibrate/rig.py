@@ -77,6 +77,16 @@ class CalibratedRig:
         return f"the calibration of '{self.session}'"
 
     @property
+    def known(self) -> RigUncertainty:
+        """Its uncertainty, or a ValueError that nothing says how well it is known."""
+        if self.uncertainty is None:
+            raise ValueError(
+                f"the calibration of '{self.session}' by '{self.method}' does not say how well the "
+                "rig is known: calibrate it by 'joint'"
+            )
+        return self.uncertainty
+
+    @property
     def T_head_lrf(self) -> RigidTransform:
         """Of its axis."""
         return self.axis.T_head_lrf

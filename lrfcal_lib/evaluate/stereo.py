@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.geometry import transform_difference
+from lrfcal_lib.model.geometry import length_of, transform_difference
 from lrfcal_lib.preprocess.bundle import LENS, adjust_robust
 from lrfcal_lib.preprocess.intrinsics import K5
 from lrfcal_lib.preprocess.prepared import Prepared
@@ -100,7 +100,7 @@ def stereo_check(solutions: dict, reference: StereoReference) -> pd.DataFrame:
         Both calibrations use the same LRF points, so the check cannot see an error of the cloud.
     """
     rows = []
-    baseline = np.linalg.norm(reference.T_second_first.translation)
+    baseline = length_of(reference.T_second_first.translation)
     for method in (*METHODS, "joint"):
         both = [
             solutions[camera, method].transform
@@ -111,7 +111,7 @@ def stereo_check(solutions: dict, reference: StereoReference) -> pd.DataFrame:
             continue
         between = both[1] * both[0].inv()
         turn, shift = transform_difference(between, reference.T_second_first)
-        length = np.linalg.norm(between.translation)
+        length = length_of(between.translation)
         off = length - baseline
         rows.append((method, 1000 * length, 1000 * off, 1000 * shift, np.rad2deg(turn)))
     columns = [

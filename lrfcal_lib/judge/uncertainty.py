@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, RigUncertainty, columns_of
+from lrfcal_lib.calibrate.rig_uncertainty import COLUMNS, columns_of
 from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
 from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
@@ -78,7 +78,7 @@ def chain_of(rig: CalibratedRig, camera: str | None = None, doubt: float = 0.0) 
     ValueError
         Where nothing says how well the rig is known.
     """
-    known = uncertainty_of(rig)
+    known = rig.known
     count = len(known.names)
     links = np.eye(count + 1, count)[columns_of(known.names, camera)]
     both = [known.covariance, known.trusted]
@@ -201,26 +201,6 @@ def root_mean_square(sigma: np.ndarray) -> float:
     """Of what scans reach (no NaN); inf where they reach nothing."""
     reached = sigma[~np.isnan(sigma)]
     return np.sqrt(np.mean(reached**2)) if reached.size else np.inf
-
-
-def range_noise(rig: CalibratedRig) -> float:
-    """Standard deviation of one range as the calibration found or took it, metres.
-
-    Parameters
-    ----------
-    rig
-    """
-    return uncertainty_of(rig).range_noise
-
-
-def uncertainty_of(rig: CalibratedRig) -> RigUncertainty:
-    """How well a rig is known, or a ValueError that nothing says so."""
-    if rig.uncertainty is None:
-        raise ValueError(
-            f"the calibration of '{rig.session}' by '{rig.method}' does not say how well the "
-            "rig is known: calibrate it by 'joint'"
-        )
-    return rig.uncertainty
 
 
 def carried(

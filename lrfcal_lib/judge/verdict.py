@@ -20,7 +20,6 @@ from lrfcal_lib.judge.uncertainty import (
     chain_of,
     point_sigma,
     projection_sigma,
-    range_noise,
     root_mean_square,
 )
 from lrfcal_lib.judge.weaknesses import (
@@ -308,7 +307,7 @@ def _expected(rig, pitch, doubt):
             pixels[name] = bounded(root_mean_square(off))
         errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud)), pixels)
 
-    judged = Verdict((), errors, range_noise_mm=1000 * range_noise(rig))
+    judged = Verdict((), errors, range_noise_mm=1000 * rig.known.range_noise)
     large = errors[WORKING].words(above=1.0)
     if not large:
         return judged

@@ -21,7 +21,6 @@ from lrfcal_lib.judge.uncertainty import (
     pixel_grid,
     root_mean_square,
     spread,
-    uncertainty_of,
 )
 from lrfcal_lib.model.camera import project, project_jacobians
 from lrfcal_lib.model.geometry import (
@@ -205,7 +204,7 @@ def compare(first: CalibratedRig, second: CalibratedRig) -> Comparison:
     step = pd.concat(steps.values())
     covariance = sum(
         pd.DataFrame(known.trusted, known.names, known.names)
-        for known in map(uncertainty_of, (first, second))
+        for known in (first.known, second.known)
     )
     # nothing bounds what only one estimated
     covariance = covariance.reindex(index=step.index, columns=step.index).fillna(np.inf)
@@ -229,7 +228,7 @@ def _part(name, names, step, covariance, images):
         amounts.append(
             Amount(
                 what=what,
-                value=scale * np.linalg.norm(step[members]),
+                value=scale * length_of(step[members]),
                 claimed=scale * np.sqrt(np.trace(covariance.loc[members, members])),
                 unit=unit,
             )
@@ -257,7 +256,7 @@ def _chi2(step, covariance, names) -> tuple[float, int, float]:
 
 def _without_lens(rig):
     """A rig whose intrinsics are exact."""
-    known = uncertainty_of(rig)
+    known = rig.known
     known = replace(
         known,
         covariance=known.covariance - known.lens,

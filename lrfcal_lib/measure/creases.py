@@ -75,7 +75,7 @@ def creases_of(cloud: Cloud, planes: list[Feature], of_point: np.ndarray) -> Cre
     for pair in combinations(surfaces, 2):
         (first, _), (second, _) = pair
         way = np.cross(first.axis, second.axis)
-        sine = np.linalg.norm(way)
+        sine = length_of(way)
         if sine < LEAST_SINE:
             continue
         way /= sine

@@ -117,7 +117,7 @@ def _surface_at(ends, points, planes, view, pose):
     the image that counts most.
     """
     first, last = ends
-    length = np.linalg.norm(last - first)
+    length = length_of(last - first)
     along = (last - first) / length
     off = points[:, :2] - first
     s = off @ along
@@ -199,7 +199,7 @@ def _on_plane(plane, line, view, pose, of_image, of_scan):
     by_shared[..., -1] = by_height
 
     # from both ends to middle and direction
-    length = np.linalg.norm(way)
+    length = length_of(way)
     of_line = np.kron([[0.5, 0.5], [-1 / length, 1 / length]], np.eye(3))
     by_noise = of_line @ by_noise.reshape(6, -1)
     return replace(

@@ -13,11 +13,9 @@ from lrfcal_lib.judge.uncertainty import (
     COLUMNS,
     carried,
     chain_of,
-    range_noise,
     spread,
-    uncertainty_of,
 )
-from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, unit_vector
+from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, length_of, unit_vector
 
 AT_ONCE = 1 << 16  # points
 ALIKE = np.radians(15.0)  # between normals of one plane
@@ -50,7 +48,7 @@ def with_sigma(cloud: Cloud, rig: CalibratedRig) -> Cloud:
     Cloud
     """
     chain = chain_of(rig)
-    noise = range_noise(rig)
+    noise = rig.known.range_noise
     sigma = np.zeros(len(cloud.points))
     for rows in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
         part = cloud.rows(rows)
@@ -262,10 +260,12 @@ def mean_length(lengths: Sequence[Length]) -> Length:
 
 def shared_covariances(rig: CalibratedRig) -> list[np.ndarray]:
     """Covariances (c, c) of a rig's unknowns, of which the one that gives more counts."""
-    known = uncertainty_of(rig)
+    known = rig.known
     unbounded = UNBOUNDED * np.eye(len(known.names))
-    both = (known.covariance, known.trusted)
-    return [np.where(np.isfinite(whole), whole, unbounded) for whole in both]
+    return [
+        np.where(np.isfinite(covariance), covariance, unbounded)
+        for covariance in (known.covariance, known.trusted)
+    ]
 
 
 def beams_moved(
@@ -340,7 +340,7 @@ def fit_feature(
         noise = rough**2 / count * block_diag(np.outer(normal, normal), -turned)
     else:
         beams = unit_vector(part.points)
-        of_ranges = range_noise(rig) ** 2 * beams.T @ beams / count**2
+        of_ranges = rig.known.range_noise**2 * beams.T @ beams / count**2
         noise = np.pad(of_ranges, (0, 3))
     return Feature(
         kind=Kind.PLANE if plane else Kind.POINT,
@@ -382,14 +382,14 @@ def length_between(first: Feature, second: Feature) -> Length:
     _refuse_askew(first, second)
     kind, weights = _axes(first, second)
     along = weights @ [first.axis, second.axis]
-    size = max(np.linalg.norm(along), SURE)
+    size = max(length_of(along), SURE)
     along /= size
     way = second.centre - first.centre
     height = along @ way
     upright = height * along
     across = way - upright
     measured = upright if kind == Kind.PLANE else across
-    metres = np.linalg.norm(measured)
+    metres = length_of(measured)
     # by the second centre, and by the weighted sum of axes
     by_place = measured / metres
     by_axis = height * across / size / metres
@@ -402,7 +402,7 @@ def length_between(first: Feature, second: Feature) -> Length:
     by_sweep = moved[:, -3:-1]
     if first.placement == second.placement:
         by_sweep = by_sweep.sum(axis=0)
-    noise += np.sum((by_sweep * uncertainty_of(first.rig).sweep_sigma) ** 2)
+    noise += np.sum((by_sweep * first.rig.known.sweep_sigma) ** 2)
     return Length(
         metres=float(metres),
         noise=noise,

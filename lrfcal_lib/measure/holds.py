@@ -12,7 +12,7 @@ from lrfcal_lib.calibrate.cloud import Cloud, join
 from lrfcal_lib.calibrate.clouds import station_of, sweep_blocks
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
-from lrfcal_lib.judge.uncertainty import chain_of, uncertainty_of
+from lrfcal_lib.judge.uncertainty import chain_of
 from lrfcal_lib.measure.creases import creases_of, sights
 from lrfcal_lib.measure.features import flatness, largest_plane, moved_along
 from lrfcal_lib.measure.image_pairs import pairs_pull
@@ -221,7 +221,6 @@ def holds(session: Session, rig: CalibratedRig) -> Held:
         If the rig does not say how well it is known, or the session has no sweep, no image, no
         camera of the rig at a known pitch, or images of another size.
     """
-    uncertainty_of(rig)
     of_creases = []
     stations = []
     walls = []

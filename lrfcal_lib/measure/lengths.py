@@ -13,7 +13,6 @@ from lrfcal_lib.calibrate.clouds import station_of, sweep_blocks
 from lrfcal_lib.calibrate.painting import View
 from lrfcal_lib.calibrate.rig import CalibratedRig
 from lrfcal_lib.calibrate.rig_uncertainty import columns_of
-from lrfcal_lib.judge.uncertainty import chain_of, uncertainty_of
 from lrfcal_lib.measure.edges import edges_of
 from lrfcal_lib.measure.features import (
     ALIKE,
@@ -93,7 +92,7 @@ class SceneFeatures:
         middle = self.cloud.points[about].mean(axis=0)
         # where a picture hangs, the nearest point may be one of the wall that noise put on it
         planes = [self.planes[number] for number in np.unique(self.of_point[about])]
-        plane = min(planes, key=lambda each: np.linalg.norm(each.foot(middle) - middle))
+        plane = min(planes, key=lambda each: length_of(each.foot(middle) - middle))
         return plane, nearest
 
 
@@ -235,7 +234,7 @@ def _shown(scenes, poses, row, number) -> dict[int, Feature]:
         T = poses[station].inv() * poses[clicked]
         there = T.apply(foot)
         other, away = scene.at(kind, there, T.rotation.apply(feature.axis))
-        if away < REACH and np.linalg.norm(other.foot(there) - there) < ON_IT:
+        if away < REACH and length_of(other.foot(there) - there) < ON_IT:
             shown.setdefault(station, other)
     return shown
 
@@ -313,7 +312,7 @@ def for_page(
         for f in features
     ]
     rig = next(iter(scenes.values())).rig
-    known = uncertainty_of(rig)
+    known = rig.known
     return {
         "kinds": [feature.kind for feature in features],
         "placements": [feature.placement for feature in features],
@@ -331,7 +330,7 @@ def for_page(
         "sweep_sigma": known.sweep_sigma,
         "range_noise": known.range_noise,
         "systematic": SYSTEMATIC,
-        "head": pose_array(chain_of(rig).head).tolist(),
+        "head": pose_array(rig.T_head_lrf).tolist(),
         "alike": ALIKE,
         "reach": REACH,
         "on_it": ON_IT,

@@ -272,7 +272,7 @@ def _shifts(blurred, low, second, turn):
     """
     there, low_moved = _on_grid(turn.apply(second.points), turn.apply(second.normals))
     room = np.add(blurred.shape, there.shape)[1:]
-    size = [next_fast_len(int(cells), real=True) for cells in room]
+    size = [next_fast_len(cells, real=True) for cells in room]
     spectra = rfftn(blurred, size, GRID) * rfftn(np.flip(there, GRID), size, GRID)
     score = irfftn(spectra.sum(axis=0), size)
     top = np.where(score == maximum_filter(score, 5), score, 0.0)

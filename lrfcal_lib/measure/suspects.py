@@ -209,7 +209,7 @@ def _fitted(seen, C, camera, columns, likely):
 
 def _allowed(rig):
     """Covariance (c, c) of the unknowns where nothing has moved, the pitch of sweeps last."""
-    known = rig.uncertainty
+    known = rig.known
     C = np.pad(np.nan_to_num(known.trusted, posinf=0.0, neginf=0.0), (0, 1))
     common = np.zeros((len(C), 6))
     for name, camera in rig.cameras.items():

@@ -319,9 +319,9 @@ def axis_difference(a: TiltAxis, b: TiltAxis) -> tuple[float, float]:
     offset : float
         Distance of their foot points, metres.
     """
-    sine = np.linalg.norm(np.cross(a.direction, b.direction))
+    sine = length_of(np.cross(a.direction, b.direction))
     angle = float(np.arctan2(sine, a.direction @ b.direction))
-    return angle, float(np.linalg.norm(a.foot - b.foot))
+    return angle, float(length_of(a.foot - b.foot))
 
 
 def transform_difference(a: RigidTransform, b: RigidTransform) -> tuple[float, float]:
@@ -339,7 +339,7 @@ def transform_difference(a: RigidTransform, b: RigidTransform) -> tuple[float, f
         Of the translations, metres.
     """
     turn = a.rotation * b.rotation.inv()
-    return float(turn.magnitude()), float(np.linalg.norm(a.translation - b.translation))
+    return float(turn.magnitude()), float(length_of(a.translation - b.translation))
 
 
 def rms(values: np.ndarray) -> float:

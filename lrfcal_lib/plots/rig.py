@@ -112,7 +112,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> RigidT
     start, end = np.array([eye, target], float)
     ahead = end - start
     right = np.cross(ahead, up)
-    if np.linalg.norm(right) <= PARALLEL * np.linalg.norm(ahead):
+    if length_of(right) <= PARALLEL * length_of(ahead):
         raise ValueError(
             f"no view from {start} to {end} with {up} upwards: choose another eye or another up"
         )

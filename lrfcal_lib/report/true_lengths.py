@@ -100,7 +100,7 @@ def _on_edge(scene, ends):
         off = edge.centre - ends
         along = off @ way
         miss = off[0] - along[0] * way
-        away = np.linalg.norm(miss)
+        away = length_of(miss)
         by_surface = SYSTEMATIC * miss @ edge.jacobian[:3, -1]
         sigma = np.sqrt(miss @ edge.noise[:3, :3] @ miss + by_surface**2) / away
         same = abs(edge.axis @ way) > PARALLEL and along[0] > 0 > along[1]
