@@ -516,10 +516,11 @@ def rig_to_json(
         platform |= {"sigma_direction": direction, "sigma_offset": offset}
     if continuous:
         platform["continuous"] = True
-    written = PlatformStated.model_construct(**platform)
     return {
         "lrf": lrf_to_json(lrf),
-        "platform": written.model_dump(by_alias=True, exclude_unset=True),
+        "platform": PlatformStated.model_construct(**platform).model_dump(
+            by_alias=True, exclude_unset=True
+        ),
         "cameras": adapter(dict[str, CameraInfo]).dump_python(cameras, by_alias=True),
     }
 
