@@ -266,8 +266,8 @@ def fitted(case, scale):
         shared=case.unknowns.shared,
         max_iterations=ITERATIONS,
         tolerance=TOLERANCE,
-    )[0]
-    return state, np.linalg.inv(linearise(evaluate(state)).hessian[0])
+    ).state
+    return state, np.linalg.inv(linearise(list(evaluate(state))).hessian[0])
 
 
 def blocks_of(state, case, scale):
