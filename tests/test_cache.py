@@ -53,6 +53,16 @@ def test_the_same_is_worked_out_once(folder, session):
     assert sorted(file.suffix for file in folder.iterdir()) == [".lock", ".pickle"]
 
 
+def test_what_is_kept_is_read_without_writing(folder, session):
+    """A folder of root's may be read by others."""
+    stage = Stage()
+    stage.run(session)
+    for lock in folder.glob("*.lock"):
+        lock.unlink()
+    stage.run(session)
+    assert stage.calls == 1 and list(folder.glob("*.lock")) == []
+
+
 def test_nothing_is_kept_unless_a_folder_is_named(session, tmp_path, monkeypatch):
     monkeypatch.delenv(cache.VARIABLE, raising=False)
     stage = Stage()

@@ -54,20 +54,31 @@ def cached(stage):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         _refuse_shared(folder)
         session = getattr(getattr(of, "prepared", of), "session", of)
-        call = (stage.__qualname__, of, args, sorted(options.items()))
-        versions = (source_digest(), np.__version__, scipy.__version__, cv2.__version__)
-        key = hashlib.sha256(pickle.dumps((call, versions)))
+        call = (
+            stage.__qualname__,
+            of,
+            args,
+            sorted(options.items()),
+            source_digest(),
+            np.__version__,
+            scipy.__version__,
+            cv2.__version__,
+        )
+        key = hashlib.sha256(pickle.dumps(call))
         for record in session.image_records:
             key.update(record.file.read_bytes() if record.file.is_file() else b"missing")
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
-        with opened(file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT) as lock:
-            # of two notebooks at the same time the second waits
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if not file.is_file():
-                result = pickle.dumps(stage(of, *args, **options))
-                with NamedTemporaryFile(dir=folder, delete=False) as part:
-                    part.write(result)
-                os.replace(part.name, file)  # whole or not at all
+        if not file.is_file():  # else the folder may be one to read only
+            with opened(
+                file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT
+            ) as lock:
+                # of two notebooks at the same time the second waits
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if not file.is_file():
+                    result = pickle.dumps(stage(of, *args, **options))
+                    with NamedTemporaryFile(dir=folder, delete=False) as part:
+                        part.write(result)
+                    os.replace(part.name, file)  # whole or not at all
         with opened(file, folder, most=LARGEST_RESULT) as stream:
             # of what is open: the name may be another's file by now
             _refuse_others(file, os.fstat(stream.fileno()))
